@@ -109,3 +109,5 @@ def test_impossible_correlations_are_refused():
     names = dict.fromkeys("abc", jj.Normal(0.0, 1.0))
     with pytest.raises(ValueError, match="not positive definite"):
         jj.Design(names, samples=8, correlation={("a", "b"): 0.9, ("b", "c"): 0.9, ("a", "c"): -0.9})
+    with pytest.raises(ValueError, match="give it once"):
+        jj.Design(names, samples=8, correlation={("a", "b"): 0.9, ("b", "a"): -0.9})

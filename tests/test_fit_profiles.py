@@ -47,9 +47,9 @@ def test_the_interval_ends_where_a_fit_with_the_unknown_held_is_that_much_worse(
         held = jj.fit(fit.scene.replace(offset=end), data, ("inertia",), tolerance=1e-6)
         if sigma:
             rise = float(held.chi_square - fit.chi_square)
-        else:  # 2 F = 2 sum n log sigma, and the covariance was multiplied by N / (N - 2)
-            count = 2 * len(ts)
-            rise = sum(2 * len(ts) * np.log(float(held.sigma[name] / fit.sigma[name])) for name in names) * (count - 2) / count
+        else:  # 2 F = 2 sum n log sigma, of sigmas that allow for no unknowns
+            likeliest = [{e.channel: e.rms * float(found.sigma[e.channel]) for e in found.residual_summary()} for found in (held, fit)]
+            rise = sum(2 * len(ts) * np.log(likeliest[0][name] / likeliest[1][name]) for name in names) / fit.statistics.of_rise[0]
         assert rise == pytest.approx(RISE, rel=0.02)
     assert any(one.is_closed)
 

@@ -171,7 +171,7 @@ def test_profiles_and_a_bootstrap_stand_beside_the_intervals(fitted, tmp_path):
     assert inertia["profile"] == "-"
     assert float(inertia["high (bootstrap)"]) == pytest.approx(np.quantile(again.values[:, 1], 0.975), rel=1e-5)
     assert "quantiles of 40 fits of repeats; 0 did not converge" in (tmp_path / "fit.html").read_text(encoding="utf-8")
-    with pytest.raises(ValueError, match="`bootstrap` is Fit of ChaplyginSleigh"):
+    with pytest.raises(ValueError, match="`bootstrap` is a Fit"):
         fit.report(tmp_path / "fit.html", bootstrap=fit)
     with pytest.raises(ValueError, match="profiles and a bootstrap are computed from the runs"):
         fit.report(tmp_path / "fit.html", bootstrap=True)

@@ -583,12 +583,14 @@ def test_sigmas_that_are_not_known_are_estimated_channel_by_channel():
         exact = cart_run(values={"mine": scale * x}, sigma=None, inputs=None, sensors={"mine": jj.Sensor("x", gain=scale)})
         met = fit(Cart(mass=1.7), exact, ("mass",))
         assert met.converged
-        assert float(met.sigma["mine"]) == pytest.approx(1e-10 * scale * np.max(np.abs(x)))
+        assert float(met.sigma["mine"]) == pytest.approx(1e-10 * scale * np.max(np.abs(x)), rel=1e-3)
     known = fit(Cart(mass=1.7), cart_run(ts=run.ts, values=run.values, sigma={name: float(s) for name, s in found.sigma.items()}), THREE)
-    np.testing.assert_allclose(found.values, known.values, rtol=1e-5)
-    np.testing.assert_allclose(found.standard_errors, known.standard_errors * np.sqrt(402 / 399), rtol=1e-4)
+    np.testing.assert_allclose(found.values, known.values, rtol=2e-4)
+    np.testing.assert_allclose(found.standard_errors, known.standard_errors, rtol=1e-3)
     assert "sigma of `x`, estimated: 0.0" in str(found)
-    assert found.residual_summary()[0].rms == pytest.approx(1.0, rel=1e-6)
+    # sigma_c^2 = sum e^2 / (n_c - p_c), and the p_c of both channels are the three unknowns
+    assert sum(201 * (1 - one.rms**2) for one in found.residual_summary()) == pytest.approx(3.0, rel=1e-6)
+    assert float(found.reduced_chi_square) == pytest.approx(1.0, rel=1e-6)
 
 
 def test_noise_with_a_memory_is_warned_of_and_runs_tell_honest_errors():
@@ -646,7 +648,7 @@ def told(J, size, local=0, runs=1):
     blocks = [np.concatenate([J[i::runs, shared + i * local : shared + (i + 1) * local], J[i::runs, :shared]], axis=1) for i in range(runs)]
     triangles = np.stack([triangle(np.column_stack([block, np.zeros(len(block))])) for block in blocks])[None]
     places = np.arange(J.shape[1])
-    return information(arrow(triangles, local), np.asarray(size, float)[None], places, np.zeros((1, len(places)), bool), np.zeros(1, bool), 1e-6, True)
+    return information(arrow(triangles, local), np.asarray(size, float)[None], places, np.zeros((1, len(places)), bool), np.zeros(1, bool), 1e-6).only()
 
 
 def test_information_of_full_rank_is_the_inverse():

@@ -148,3 +148,12 @@ def test_a_parameter_of_the_other_sign_is_no_other_domain():
     motion = jax.vmap(lambda p: jj.simulate(Weighed(p=p), {"x": 1.0}, t1=1.0, rtol=1e-9, atol=1e-9))(jnp.array([1.5, -1.5]))
     np.testing.assert_array_equal(motion.result, 0)
     np.testing.assert_allclose(motion.q_end[:, 0], np.cos(np.sqrt(1.5)), rtol=1e-7)
+
+
+def test_an_array_is_taken_apart_as_newer_versions_of_jax_do_where_it_is_iterated_over():
+    def law(x):
+        a, b = jnp.unstack(x)  # from JAX 0.12 on also `a, b = x`
+        return a * b**2
+
+    np.testing.assert_allclose(to_second_order(law, (2.0, 3.0)), by_jax(law, (2.0, 3.0)), rtol=1e-14)
+    assert uncompiled(law)(np.array([2.0, 3.0])) == 18.0

@@ -61,7 +61,7 @@ class TakenUp:
         unknowns, theta = self.problem.unknowns, self.theta
         bound = ((theta <= self.limits.low) | (theta >= self.limits.high)) & ~self.limits.fixed
         size, fails = unknowns.sizes(theta), ~np.isfinite(self.at.cost)
-        return information(self.at.arrow, size, unknowns.estimated, bound, fails, self.asked.control.cutoff, True)
+        return information(self.at.arrow, size, unknowns.estimated, bound, fails, self.asked.control.cutoff).only()
 
 
 def taken_up(fit, data: Experiment | Sequence[Experiment]) -> TakenUp:
@@ -73,7 +73,12 @@ def taken_up(fit, data: Experiment | Sequence[Experiment]) -> TakenUp:
     again.theta[0, unknowns.estimated] = fit.values
     if isinstance(again.problem.lanes, Piecewise):
         again.problem.lanes.put_nodes(again.theta, fit.shooting)
-    pairs = [(np.nan_to_num(r), np.nan_to_num(again.residuals(run).get(name, np.nan))) for run, of in enumerate(fit.residuals) for name, r in of.items()]
+    sigma = dict(zip(again.problem.estimated, again.at.sigma[0].tolist(), strict=True))  # as F has it; that of a fit allows for its unknowns
+
+    def here(run: int, name: str) -> np.ndarray:
+        return np.nan_to_num(again.residuals(run).get(name, np.nan)) * (sigma.get(name, 1.0) / fit.sigma.get(name, 1.0))
+
+    pairs = [(np.nan_to_num(r), here(run, name)) for run, of in enumerate(fit.residuals) for name, r in of.items()]
     if not all(a.shape == b.shape and np.max(np.abs(a - b), initial=0.0) < _SAME for a, b in pairs):
         raise ValueError("`data` are not those of the fit: its residuals are others there; give the runs that it was fitted to")
     return again

@@ -62,8 +62,8 @@ class Around:
         """The standard error that an unknown at its bound had if it were free, infinite where it does not show, and the size of the slope of F."""
         others, estimated, arrow = self.at_bound[b : b + 1], np.flatnonzero(~self.limits.fixed), self.found.at.arrow.at([b])
         others[0, place] = False
-        known = information(arrow, self.limits.size(self.found.theta[b : b + 1]), estimated, others, np.zeros(1, bool), self.control.cutoff, True)
-        error = float(known.standard_errors[np.searchsorted(estimated, place)])
+        known = information(arrow, self.limits.size(self.found.theta[b : b + 1]), estimated, others, np.zeros(1, bool), self.control.cutoff)
+        error = float(known.standard_errors[0, np.searchsorted(estimated, place)])
         return error if np.isfinite(error) else np.inf, abs(float(arrow.gradient[0, place]))
 
 

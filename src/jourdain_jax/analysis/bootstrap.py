@@ -4,7 +4,7 @@
     mean*  = theta + S M^-1 e           of priors: they were measured, too, and are drawn anew about the estimates; S, M: see `joint_prior`
 
 Each repeat is fitted as the data were, from the estimates on. Ends of the 95 % interval are the 2.5 and 97.5 % quantiles of what is found, bias is its mean
-less the estimate. Where all sigmas are estimated, or e is drawn from residuals, sigma is sqrt(samples / (samples - unknowns)) times larger than residuals are.
+less the estimate. Where e is drawn from residuals, sigma is sqrt(samples / (samples - unknowns)) times larger than these are.
 Source: B. Efron and R. J. Tibshirani, An Introduction to the Bootstrap (1993), chapters 9, 10 and 13; at a bound: D. W. K. Andrews, Econometrica 68 (2000) 399.
 """
 
@@ -147,7 +147,7 @@ def _fitted(fit, again: TakenUp, generator: np.random.Generator, count: int, noi
 def _drawn(fit, problem: Problem, generator: np.random.Generator, count: int, noise: str) -> tuple[Experiment, ...]:
     """The runs with so many repeats of their values; what is missing is so in each."""
     runs, from_residuals = [], noise == "residuals"
-    larger = math.sqrt(fit.samples / max(int(fit.degrees_of_freedom), 1)) if from_residuals or problem.all_estimated else 1.0
+    larger = math.sqrt(fit.samples / max(float(fit.degrees_of_freedom), 1.0)) if from_residuals else 1.0
     whitened = {name: np.concatenate([np.ravel(of[name]) for of in fit.whitened if name in of]) for of in fit.whitened for name in of}
     pools = {name: w[np.isfinite(w)] - np.nanmean(w) for name, w in whitened.items()}
     for run, of_run in zip(problem.runs, of_fitted(fit, problem.runs), strict=True):

@@ -112,8 +112,11 @@ def lowest(f: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndar
 
 
 def correlation_limits(ts: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Shortest and longest correlation time that is looked for, s."""
-    return SHORTEST * min(float(np.min(np.diff(t))) for t in ts if len(t) > 1), LONGEST * max(float(t[-1] - t[0]) for t in ts)
+    """Shortest and longest correlation time that is looked for, s. ValueError where no run has two samples."""
+    intervals = [float(np.min(np.diff(t))) for t in ts if len(t) > 1]
+    if not intervals:
+        raise ValueError("a correlation time is None, but each run has one sample, and neighbours in a run tell it; give a number in s, or 0 for white noise")
+    return SHORTEST * min(intervals), LONGEST * max(float(t[-1] - t[0]) for t in ts)
 
 
 def log_density(r, weight, ts, tau) -> Float[Array, ""]:

@@ -87,10 +87,10 @@ def fit(
     its own size). So unstable motions are fitted that no first guess would follow to their end. The lower minimum counts, and `Fit.grown` says which one it
     was.
 
-    **Returns** a `Fit`: estimates with covariance and 95 % intervals (sigmas that were given are taken as known), residuals, the fitted
-    scene, and in words what the measurements cannot tell. An unknown at its bound has a one-sided interval, by profile likelihood. `converged` is False
-    where no minimum was found. Runs of equal structure go through one compiled program, whatever their number and lengths; time and memory are
-    proportional to the number of runs.
+    **Returns** a `Fit`: estimates with covariance and 95 % intervals (sigmas that were given are taken as known; where they are None, or under a robust loss,
+    intervals are those of Student's t), residuals, the fitted scene, and in words what the measurements cannot tell. An unknown at its bound has a one-sided
+    interval, by profile likelihood. `converged` is False where no minimum was found. Runs of equal structure go through one compiled program, whatever their
+    number and lengths; time and memory are proportional to the number of runs.
 
     **Raises** ValueError for names, shapes or numbers that do not fit, no or too many unknowns, and a start that contradicts the
     constraints; DifferentiationModeError inside `jit`, `vmap` or a derivative, since steps are chosen outside of compiled code.
@@ -125,7 +125,7 @@ def fit_batch(
 
     Every array in the `values` of `data` has a leading axis `repeats`; all else is shared. `free`, `cutoff`, `tolerance`,
     `max_iterations`, `loss`, `errors` and `simulation` as in `fit`. **Returns** a `Fit` whose arrays have the leading axis; a repeat that fails has
-    `converged` False and harms no other. **Raises** as `fit`.
+    `converged` False and harms no other, as does one with fewer samples than unknowns. **Raises** as `fit`.
     """
     return _fit(scene, data, free, simulation, Control(tolerance, max_iterations, cutoff), loss, errors, True)
 
@@ -145,7 +145,7 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
     unknowns = unknowns_of(scene, runs, free)
     check_starts(scene, runs, unknowns)
     members = _repeats(runs) if repeats else None
-    _check_enough(runs, unknowns, repeats)
+    enough = _check_enough(runs, unknowns, repeats)
     asked = Asked(scene, free, simulation, loss or LEAST_SQUARES, control, shooting)
     of_runs = scene, runs, unknowns.layout, simulation, members
     pieces = None if shooting is None else Piecewise(*of_runs, unknowns, shooting)
@@ -165,6 +165,7 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
         control = replace(control, cutoff=cutoff_of(pieces, control, np.arange(len(pieces.at.theta))))
         asked = replace(asked, control=control)
     found, at_bounds = off_bounds(problem, with_memory(problem, found if members else found.lowest(), limits, control), limits, control, pieces)
+    found.converged &= enough
     if pieces is not None:
         found.converged &= pieces.closed(np.arange(len(found.converged)))
     return _result(problem, found, limits, at_bounds, asked, errors, guesses, same, None if pieces is None else pieces.told())
@@ -204,16 +205,19 @@ def _repeats(runs: Sequence[Experiment]) -> int:
     return counts.pop()
 
 
-def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool) -> None:
+def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool) -> np.ndarray:
+    """Which repeats have as many measured values as unknowns; ValueError where none has."""
     known = [np.isfinite(values) & np.isfinite(run.sigma_of(name, repeats)) for run in runs for name, values in run.values.items()]
     counts = [one.reshape(*one.shape[: int(repeats)], -1).sum(axis=-1) for one in known]
-    samples, sigmas = int(np.max(sum(counts))) + len(unknowns.with_prior), len({name for run in runs for name in run.unknown_sigma})
+    each, sigmas = sum(counts) + len(unknowns.with_prior), len({name for run in runs for name in run.unknown_sigma})
+    samples = int(np.max(each))
     if samples < len(unknowns.labels) + sigmas:
         and_sigmas = f" and {sigmas} sigmas" if sigmas else ""
         raise ValueError(
             f"{samples} measured values cannot determine {len(unknowns.labels)} unknowns{and_sigmas}; measure more, or free fewer of "
             f"{', '.join(unknowns.labels)}"
         )
+    return np.asarray(each >= len(unknowns.labels) + sigmas)
 
 
 def _result(

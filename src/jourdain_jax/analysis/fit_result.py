@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -98,6 +98,7 @@ class Fit(Printed):
     correlation_time = _of_minimum(lambda found: found.correlation_time, "Correlation times in s, of channels where they were estimated; near zero: white.")
     chi_square = _of_minimum(lambda found: found.chi_square, "Sum of squared whitened residuals; NaN where the motion fails.")
     samples = _of_minimum(lambda found: found.samples, "How many samples have a finite sigma.")
+    degrees_of_freedom = _of_minimum(lambda found: found.degrees_of_freedom, "Samples less the directions that they determined; priors take their share.")
 
     def __getitem__(self, name: str) -> Estimated:
         if name not in self.labels:
@@ -119,11 +120,6 @@ class Fit(Printed):
     def correlation(self) -> Float[np.ndarray, "*repeats unknowns unknowns"]:
         """Correlation of the estimates."""
         return self.covariance / (self.standard_errors[..., :, None] * self.standard_errors[..., None, :])
-
-    @property
-    def degrees_of_freedom(self) -> Int[np.ndarray, "*repeats"]:
-        """Samples less the directions that were determined."""
-        return np.asarray(self.samples - self.information.rank)
 
     @property
     def reduced_chi_square(self) -> Float[np.ndarray, "*repeats"]:
@@ -220,14 +216,15 @@ class Fit(Printed):
         """The profile likelihood of the unknowns in `names` (default: all that are not of one run alone), by name: how far each may be moved, all others
         being fitted anew, before 2 (F - F_min) reaches 3.84, and whether that is "bounded", "one-sided" or "flat". `data`: the runs fitted.
 
-        It takes ten to thirty fits for each name. Where sigmas are estimated or a robust loss was used, the rise is divided by what the covariance is
-        multiplied by. ValueError for a fit of a batch or one that failed, and other data than the fit's; KeyError for names that were not estimated.
+        It takes ten to thirty fits for each name. Where sigmas are estimated, a robust loss was used, or errors="runs", the rise is divided by what variances
+        and quantiles are the larger for it. ValueError for a fit of a batch or one that failed, and other data than the fit's; KeyError for names that were
+        not estimated.
         """
         self._check_one()
         of_all = [name for name in self.labels if not name.startswith("run ")] or self.labels
         fitted = taken_up(self, data)
-        inflation = float(fitted.problem.inflation(self.residuals, self.samples, self.information.rank)[0])
-        return profiles(fitted, as_names(names) or of_all, dict(zip(self.labels, self.standard_errors.tolist(), strict=True)), inflation)
+        errors, of_rise = (dict(zip(self.labels, x.tolist(), strict=True)) for x in (self.standard_errors, self.statistics.of_rise))
+        return profiles(fitted, as_names(names) or of_all, errors, of_rise)
 
     def bootstrap(self, data: Experiment | Sequence[Experiment], repeats: int = 1000, *, seed: int = 0, noise: str = "sigmas") -> Bootstrap:
         """The parametric bootstrap: measurements of so many repeats of the experiment, drawn about what the fit predicts, and fitted side by side.
@@ -261,7 +258,7 @@ class Fit(Printed):
         *,
         held_out: Experiment | Sequence[Experiment] = (),
         profiles: "bool | str | Iterable[str] | Mapping[str, Profile]" = False,
-        bootstrap: "bool | Bootstrap" = False,
+        bootstrap: Any = False,  # bool or `Bootstrap`
         units: Mapping[str, str] | None = None,
     ) -> None:
         """Write this fit as one HTML file that loads nothing from elsewhere: estimates, warnings, what the data do not tell, correlations, residuals, the way

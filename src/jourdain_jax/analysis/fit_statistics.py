@@ -1,9 +1,11 @@
 """What follows from the minimum that a fit found: standard errors and intervals, residuals by channel, the fitted scene.
 
 interval      estimate -+ q e,  within the bounds      e: standard error, q: 97.5 % quantile of the normal distribution, or Student's t where noise is estimated
+freedom       samples - rank + tr(C P)       what the samples determined is less than the rank by what priors tell; P: their information, C: covariance
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -12,16 +14,18 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.analysis.arrow import Arrow
 from jourdain_jax.analysis.asked import Asked
-from jourdain_jax.analysis.at_bounds import Around, AtBounds, moved_from_bounds, too_narrow_near_bounds
+from jourdain_jax.analysis.at_bounds import RISE_95, Around, AtBounds, moved_from_bounds, too_narrow_near_bounds
 from jourdain_jax.analysis.events_met import events_met
-from jourdain_jax.analysis.information import Information, information, students_t_95
+from jourdain_jax.analysis.information import Information, information, students_t_95, variances
 from jourdain_jax.analysis.levenberg_marquardt import LEAST, Limits, Minimum
+from jourdain_jax.analysis.noise_levels import noise_levels
 from jourdain_jax.analysis.oddities import oddities
 from jourdain_jax.analysis.problem import Problem
+from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.scene.scene import Scene
 
 _NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
-_FEWEST_DEGREES = 4  # of freedom
+_FEWEST_DEGREES = 4  # of freedom, that an estimated correlation time leaves
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +45,11 @@ class Statistics:
     whitened: tuple[dict[str, Float[np.ndarray, "..."]], ...]
     sigma: dict[str, Float[np.ndarray, "*repeats"]]
     correlation_time: dict[str, Float[np.ndarray, "*repeats"]]
+    untold: tuple[str, ...]  # channels that do not tell their sigma, in any repeat
     chi_square: Float[np.ndarray, "*repeats"]
     samples: Int[np.ndarray, "*repeats"]
+    degrees_of_freedom: Float[np.ndarray, "*repeats"]
+    of_rise: Float[np.ndarray, "*repeats unknowns"]  # by what 2 (F - F_min) is to be divided, for an interval that ends where it is `RISE_95`
     from_prior: Float[np.ndarray, "*repeats unknowns"]  # in standard deviations of the prior; NaN where there is none
     oddities: tuple[str, ...]  # sentences about what is odd in the runs
     events_met: tuple[str, ...]  # sentences about events before the end of a run, or not met; none in a batch, and where runs were fitted in pieces
@@ -58,28 +65,33 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, e
     low, high = limits.low[places], limits.high[places]
     bound = (theta <= limits.low) | (theta >= limits.high)
     limit = one(at_bounds.limit[:, places])
-    residuals = tuple(problem.by_channel(run, found.at, one) for run in range(len(problem.runs)))
-    white = tuple(problem.by_channel(run, found.at, one, white=True) for run in range(len(problem.runs)))
+    told_by = partial(information, size=size, estimated=places, bound=bound, fails=fails, cutoff=control.cutoff)
+    of_loss = problem.loss.inflation if errors == "sigmas" else lambda r, _: problem.loss.bend(r)
+    levels = noise_levels(problem, theta, found.at, told_by, of_loss)
+    residuals = tuple(problem.by_channel(run, levels.at, one) for run in range(len(problem.runs)))
+    white = tuple(problem.by_channel(run, levels.at, one, white=True) for run in range(len(problem.runs)))
     samples = sum(np.sum(np.isfinite(r), axis=tuple(range(0 if single else 1, r.ndim))) for run in residuals for r in run.values())
-    known = information(found.at.arrow, size, places, bound, fails, control.cutoff, single)
+    determined = np.where(fails, 0.0, _determined(levels.known, unknowns))
 
     def elsewhere(arrow: Arrow) -> tuple[np.ndarray, np.ndarray]:
         norms = np.where(arrow.column_norms > 0, arrow.column_norms, 1.0)
         moved = arrow.step(np.full(len(theta), LEAST), norms, limits.fixed | bound, np.zeros_like(theta), control.cutoff)
-        return information(arrow, size, places, bound, fails, control.cutoff, False).standard_errors, moved[:, places]
+        return told_by(arrow).standard_errors, moved[:, places]
 
-    more, doubt = (one(x) for x in problem.doubt(theta, elsewhere))
-    quantiles = _normal_or_t(doubt, (samples - known.rank)[..., None] if problem.all_estimated else np.inf) * np.sqrt(1 + more)
-    inflation = one(problem.inflation(residuals, samples, known.rank))
-    plain, known = known.standard_errors, known.times(inflation)
+    known, plain = (x.only() if single else x for x in (levels.known, told_by(found.at.arrow)))
+    more, of_memory = (one(x) for x in problem.doubt(theta, elsewhere))
+    of_sigmas = one(levels.doubt)
+    quantiles = _normal_or_t(of_memory, of_sigmas) * np.sqrt(1 + more)
     if errors == "runs":
-        known, quantiles = known.between_runs(one(found.at.arrow.scores)), students_t_95(len(problem.runs) - 1)
+        known = known.between_runs(one((levels if problem.estimated else found).at.arrow.scores))
+        quantiles, of_sigmas = students_t_95(len(problem.runs) - 1), np.zeros(1)
     reach = quantiles * known.standard_errors
     too_narrow = []
     if single and found.converged[0]:
         too_narrow = moved_from_bounds(at_bounds, theta[0], reach, places, unknowns.labels)
         if errors == "sigmas":
-            too_narrow += too_narrow_near_bounds(Around(problem.linearised, found, limits, control), at_bounds, plain, unknowns.labels)
+            around = Around(problem.linearised, found, limits, control)
+            too_narrow += too_narrow_near_bounds(around, at_bounds, plain.standard_errors, unknowns.labels)
     values = one(theta[:, places])
     shared, local = unknowns.split(theta)
     scene = unknowns.layout.scene(problem.scene, one(shared))
@@ -97,10 +109,13 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, e
         information=known,
         residuals=residuals,
         whitened=white,
-        sigma={name: one(found.at.sigma[:, k]) for k, name in enumerate(problem.estimated)},
+        sigma={name: one(levels.at.sigma[:, k]) for k, name in enumerate(problem.estimated)},
         correlation_time={name: one(problem.tau[:, k]) for k, name in enumerate(problem.with_memory)},
+        untold=tuple(name for name, wrong in zip(problem.estimated, levels.untold.T, strict=True) if wrong.any()),
         chi_square=np.where(one(fails), np.nan, sum(_sum_of_squares(r, single) for run in white for r in run.values())),
         samples=np.asarray(samples),
+        degrees_of_freedom=np.asarray(samples - one(determined)),
+        of_rise=_of_rise(known.standard_errors / plain.standard_errors, quantiles, of_sigmas),
         from_prior=(values - unknowns.prior_mean[places]) / unknowns.prior_sigma[places],
         oddities=oddities(problem.scene, problem.runs, not single),
         events_met=events_met(problem, theta[0], asked.simulation) if single and asked.shooting is None else (),
@@ -108,15 +123,35 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, e
     )
 
 
-def _normal_or_t(doubt: np.ndarray, left) -> np.ndarray:
-    """97.5 % quantile by which a standard error is multiplied: normal where correlation times are known, else Student's t of that standard deviation.
+def _normal_or_t(of_memory: np.ndarray, of_sigmas: np.ndarray) -> np.ndarray:
+    """97.5 % quantile by which a standard error is multiplied: normal where the noise is known, else Student's t.
 
-    Its degrees of freedom are 2 / var(log C): F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110. `left`: samples less unknowns, where sigmas are estimated.
+    Its degrees of freedom are 2 / var(log C): F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110. The variances are those that estimated correlation times
+    and sigmas leave. C is a mean over correlation times, so that t is to have that variance, without its n / (n - 2).
     """
-    if not np.any(doubt > 0):
-        return np.asarray(_NORMAL_95)
-    doubt = np.clip(doubt, 1e-12, 2 / _FEWEST_DEGREES)
-    return students_t_95(np.maximum(2 / (doubt + 2 / left), _FEWEST_DEGREES)) * np.sqrt(1 - doubt)  # t has the variance n / (n - 2)
+    of_memory = np.minimum(of_memory, 2 / _FEWEST_DEGREES)
+    doubt = of_memory + of_sigmas
+    return np.where(doubt > 0, students_t_95(2 / np.maximum(doubt, 1e-12)) * np.sqrt(1 - of_memory), _NORMAL_95)
+
+
+def _of_rise(wider: np.ndarray, quantiles: np.ndarray, of_sigmas: np.ndarray) -> np.ndarray:
+    """What the rise of 2 F is to be divided by. With n degrees of freedom 2 F rises by n log(1 + t^2 / n) where an unknown is t standard errors away.
+
+    `wider`: standard errors over those that F alone foretells; where an unknown has none, the largest of others is taken.
+    """
+    n = 2 / np.maximum(of_sigmas, 1e-12)
+    found = wider**2 * n * np.log1p(quantiles**2 / n) / RISE_95
+    return np.where(np.isfinite(found), found, np.max(found, where=np.isfinite(found), initial=1.0))
+
+
+def _determined(known: Information, unknowns: Unknowns) -> Float[np.ndarray, "members"]:
+    """How many unknowns the samples determined: rank - tr(C P)."""
+    q, p = known.shared.shape[-1], len(unknowns.whitening)
+    M, weight = np.eye(q), np.where(np.isfinite(unknowns.prior_mean), 1 / unknowns.prior_sigma, 0.0)
+    M[:p, :p] = unknowns.whitening
+    rows = M * weight[:q]
+    of_shared = np.einsum("ij,bjk,ik->b", rows, known.shared, rows)
+    return known.rank - of_shared - variances(known.shared, known.own, known.follow)[:, q:] @ weight[q:] ** 2
 
 
 def _sum_of_squares(r: np.ndarray, single: bool) -> np.ndarray:

@@ -31,6 +31,11 @@ def warnings_of(fit) -> tuple[str, ...]:
         names = [f"`{name}`" for name, far in zip(fit.labels, fit.beyond, strict=True) if far > FAR_BEYOND]
         verb = "lies at a bound, which decides its value" if len(names) == 1 else "lie at bounds, which decide their values"
         found.append(f"{', '.join(names)} {verb}; all standard errors lose their meaning: widen the bounds")
+    for name in fit.statistics.untold:
+        found.append(
+            f"the samples of `{name}` determine as many unknowns as they are, so that they do not tell its sigma, which is None: estimates are drawn to meet "
+            "them exactly, and intervals take nothing from them; give a number"
+        )
     found += fit.impossible
     found += fit.statistics.events_met
     found += fit.statistics.oddities
@@ -89,7 +94,7 @@ def _by_chance(spread: float, deviations: float) -> float:
 
 def _sizes_of_residuals(fit) -> list[_Size]:
     """Sizes of the residuals of all channels whose sigmas are known, then of one by one; under a robust loss those of most, since some are far out."""
-    robust, determined = fit.asked.loss != LEAST_SQUARES, int(fit.samples - fit.degrees_of_freedom)
+    robust, determined = fit.asked.loss != LEAST_SQUARES, float(fit.samples - fit.degrees_of_freedom)
     names = [name for name in dict.fromkeys(name for run in fit.whitened for name in run) if name not in fit.sigma]
     found = []
     for channels in (names, *([name] for name in names)):
@@ -98,11 +103,11 @@ def _sizes_of_residuals(fit) -> list[_Size]:
         if squares.size:
             some = len(channels) < len(names)
             named = f" of {', '.join(f'`{name}`' for name in channels)}" if some else ""
-            found.append(_Size(channels, named, *_mean_square(squares, 0 if some else determined, robust), *_mean_square(squares, determined, robust)))
+            found.append(_Size(channels, named, *_mean_square(squares, 0.0 if some else determined, robust), *_mean_square(squares, determined, robust)))
     return found
 
 
-def _mean_square(squares: np.ndarray, determined: int, robust: bool) -> tuple[float, float]:
+def _mean_square(squares: np.ndarray, determined: float, robust: bool) -> tuple[float, float]:
     """The mean square of residuals that determined so many unknowns, and its standard deviation where they are normal; `robust`: from their median."""
     degrees = max(squares.size - determined, 1)
     if robust:  # the median of w^2 is 0.4549 for a normal w; relative to it, that of n has the standard deviation 2.33 / sqrt(n)

@@ -11,6 +11,7 @@ would be its standard error, while all unknowns move along V_0 by about their si
 Source: G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), sections 2.1 and 3.4; G. H. Golub and V. Pereyra, Inverse Problems 19 (2003) R1.
 """
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -22,6 +23,9 @@ from jourdain_jax.analysis.arrow import Arrow
 
 _ARRAYS = ["singular_values", "hidden", "least_part", "rank", "identifiable", "standard_errors", "shared", "own", "follow"]
 _WHOLE = 0.01  # how far from a multiple of one half an exponent may be, to be taken as that, and two changes from being equal
+_NORMAL = 1e7  # degrees of freedom, beyond which Student's t is normal
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
+_NODES = (_NODES + 1) / 2
 _MOVES = 0.1  # standard errors: an unknown that moves so far along a direction that does not show has a part in it
 
 
@@ -59,12 +63,9 @@ class Information:
         places = np.array(self.estimated, int)
         return whole[..., places[:, None], places]
 
-    def times(self, factor: Float[np.ndarray, "*members"]) -> "Information":
-        """The information with all covariances multiplied by this factor."""
-        if np.all(factor == 1):
-            return self
-        f = factor[..., None]
-        return replace(self, standard_errors=self.standard_errors * np.sqrt(f), shared=self.shared * f[..., None], own=self.own * f[..., None, None])
+    def only(self) -> "Information":
+        """That of the only member, without the axis of members."""
+        return replace(self, **{name: np.asarray(getattr(self, name)[0]) for name in _ARRAYS if name != "hidden"})
 
     def between_runs(self, scores: Float[np.ndarray, "*members runs shared"]) -> "Information":
         """Takes the covariance of the shared unknowns from how much runs differ: C (sum g g') C n / (n - 1), g: scores of n runs, C: the covariance so far.
@@ -84,22 +85,22 @@ def variances(shared: np.ndarray, own: np.ndarray, follow: np.ndarray) -> Float[
 
 
 def students_t_95(degrees):
-    """97.5 % quantile of Student's t, to 0.1 % from four degrees of freedom on: M. Abramowitz and I. A. Stegun, Handbook (1964), 26.7.5."""
-    z, n = 1.959963984540054, degrees
-    terms = z**3 + z, 5 * z**5 + 16 * z**3 + 3 * z, 3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z, 79 * z**9 + 776 * z**7 + 1482 * z**5 - 1920 * z**3 - 945 * z
-    return z + sum(term / (scale * n ** (k + 1)) for k, (term, scale) in enumerate(zip(terms, (4, 96, 384, 92160), strict=True)))
+    """97.5 % quantile q of Student's t with one degree of freedom or more: q = sqrt(n) tan a,   2 c integral_0^a cos^(n - 1) = 0.95."""
+    n = np.clip(np.asarray(degrees, float), 1.0, _NORMAL)
+    c, a = np.vectorize(lambda x: np.exp(math.lgamma((x + 1) / 2) - math.lgamma(x / 2)) / np.sqrt(np.pi))(n), np.zeros(n.shape)
+    for _ in range(12):  # Newton's method, from below: what is integrated falls
+        area = a / 2 * (np.cos(a[..., None] * _NODES) ** (n[..., None] - 1) @ _WEIGHTS)
+        a = a + (0.475 / c - area) / np.cos(a) ** (n - 1)
+    return np.asarray(np.sqrt(n) * np.tan(a))
 
 
-def information(arrow: Arrow, size: Float[np.ndarray, "members places"], estimated: np.ndarray, bound, fails, cutoff: float, single: bool) -> Information:
+def information(arrow: Arrow, size: Float[np.ndarray, "members places"], estimated: np.ndarray, bound, fails, cutoff: float) -> Information:
     """Information of an arrow in units of sigma.
 
     `size`: magnitude of each unknown, in its unit; `estimated`: places of unknowns; `bound`: (members, places), which lie at a bound, and are held there;
-    `fails`: (members,), of which nothing is known; `cutoff`: singular values below this fraction of the largest count as zero. `single`: without the axis of
-    members.
+    `fails`: (members,), of which nothing is known; `cutoff`: singular values below this fraction of the largest count as zero.
     """
     found = [_information(arrow.at([b]), size[b], estimated, bound[b], not fails[b], cutoff) for b in range(len(size))]
-    if single:
-        return found[0]
     stacked = {name: np.stack([getattr(one, name) for one in found]) for name in _ARRAYS if name != "hidden"}
     return Information(**stacked, hidden=tuple(one.hidden[0] for one in found), estimated=tuple(estimated.tolist()))
 

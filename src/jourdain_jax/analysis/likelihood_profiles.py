@@ -48,14 +48,14 @@ class Profile(Printed, eqx.Module):
         return "; ".join((f"`{self.name}` = {self.estimate:.6g}{unit}, profile {self.kind}: {ends}", *self.notes))
 
 
-def profiles(fitted: TakenUp, names: Iterable[str], errors: dict[str, float], inflation: float) -> dict[str, Profile]:
-    """Profiles of the unknowns named. `errors`: standard errors by name, for the first step; `inflation`: by what the covariance was multiplied."""
+def profiles(fitted: TakenUp, names: Iterable[str], errors: dict[str, float], inflation: dict[str, float]) -> dict[str, Profile]:
+    """Profiles of the unknowns named. `errors`: standard errors by name, for the first step; `inflation`: by what the rise is divided."""
     unknowns, found = fitted.problem.unknowns, {}
     for name in names:
         if name not in unknowns.labels:
             raise UnknownNameError(f"`{name}` was not estimated; {nearest(name, unknowns.labels)}")
         place = int(unknowns.estimated[unknowns.labels.index(name)])
-        sides = [_Side(fitted, place, errors[name], inflation, way) for way in (-1.0, 1.0)]
+        sides = [_Side(fitted, place, errors[name], inflation[name], way) for way in (-1.0, 1.0)]
         ends = [side.end() for side in sides]
         points = sorted({(float(fitted.theta[0, place]), 0.0), *sides[0].points, *sides[1].points})
         closed = sides[0].is_closed, sides[1].is_closed

@@ -152,8 +152,9 @@ class LogDensity(eqx.Module):
         covariance = np.zeros((len(theta), len(theta)))
         covariance[: fit.values.size, : fit.values.size] = fit.covariance
         for i, name in enumerate((*self.sigmas, *self.with_memory), fit.values.size):
-            samples = sum(np.count_nonzero(np.asarray(group.weights[name])) for group in self.groups if name in group.weights)
-            covariance[i, i] = theta[i] ** 2 / (2 * samples) if i < last.start else 1 / samples
+            samples = np.concatenate([np.ravel(run[name][np.isfinite(run[name])]) for run in fit.whitened if name in run])
+            # sum of squares in units of sigma: degrees of freedom
+            covariance[i, i] = theta[i] ** 2 / (2 * max(np.sum(samples**2), 0.5)) if i < last.start else 1 / samples.size
         factor = np.linalg.cholesky(slopes[:, None] * covariance * slopes)
         return eqx.tree_at(lambda d: (d.centre, d.factor), self, (np.asarray(x), factor))
 

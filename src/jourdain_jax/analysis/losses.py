@@ -4,7 +4,8 @@ minimise sum rho(r)       weights w = rho'(r) / r: a weighted least-squares prob
 Huber        rho = r^2/2 for |r| <= k, k |r| - k^2/2 beyond          w = min(1, k / |r|)
 Student-t    rho = (nu + 1)/2 log(1 + r^2/nu)                        w = (nu + 1) / (nu + r^2)
 
-Covariance: (J'J)^-1 mean(psi^2) / mean(psi')^2 with psi = rho'; J'J from the weighted J'WJ, divided by the mean weight.
+Covariance: K^2 (J'J)^-1 sum psi^2 / (n - p) / mean(psi')^2,   K = 1 + p var(psi') / (n mean(psi')^2)     psi = rho'; n residuals, p unknowns
+J'J from the weighted J'WJ, divided by the mean weight.
 Source: P. J. Huber and E. M. Ronchetti, Robust Statistics, 2nd ed. (2009), section 7.6; K. L. Lange, R. J. A. Little and J. M. G. Taylor, JASA 84 (1989) 881.
 """
 
@@ -46,14 +47,23 @@ class Loss:
         """Rows times the roots of their weights."""
         return rows if math.isinf(self.parameter) else xp.sqrt(self.weight(r, xp))[..., None] * rows
 
-    def inflation(self, r: Float[np.ndarray, "samples"]) -> float:
-        """The factor by which the covariance (J'WJ)^-1 is to be multiplied, from the residuals that count."""
+    def inflation(self, r: Float[np.ndarray, "samples"], determined: float) -> float:
+        """The factor by which the covariance (J'WJ)^-1 is to be multiplied, from the residuals that count, which determined so many unknowns."""
+        if not np.isfinite(bend := self.bend(r)):
+            return bend
+        psi, slope = self.weight(r) * r, self._slope(r)
+        left, K = max(r.size - determined, 1.0), 1 + determined / r.size * np.var(slope) / np.mean(slope) ** 2
+        return bend * K**2 * float(np.sum(psi**2) / left / np.mean(slope))
+
+    def bend(self, r: Float[np.ndarray, "samples"]) -> float:
+        """The factor by which (J'WJ)^-1 is to be multiplied to be the inverse of the second derivatives of F; infinite where F is not convex in residuals."""
+        slope = float(np.mean(self._slope(r)))
+        return float(np.mean(self.weight(r))) / slope if slope > 0 else math.inf
+
+    def _slope(self, r: Float[np.ndarray, "samples"]) -> Float[np.ndarray, "samples"]:
+        """psi'."""
         k = self.parameter
-        if not np.isfinite(k):
-            return 1.0
-        w = self.weight(r)
-        slope = (k + 1) * (k - r**2) / (k + r**2) ** 2 if self.kind == "student-t" else (np.abs(r) <= k).astype(float)
-        return float(np.mean(w) * np.mean((w * r) ** 2) / np.mean(slope) ** 2)
+        return (k + 1) * (k - r**2) / (k + r**2) ** 2 if self.kind == "student-t" else (np.abs(r) <= k).astype(float)
 
 
 LEAST_SQUARES = Loss("least squares", np.inf)

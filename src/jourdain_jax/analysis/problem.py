@@ -32,7 +32,7 @@ class Problem:
         self.scene, self.runs, self.unknowns, self.lanes, self.loss = scene, runs, unknowns, lanes, loss
         self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))  # channels whose sigma is
         largest = [max(float(np.nanmax(np.abs(run.values[name]))) for run in runs if name in run.values) for name in self.estimated]
-        self._least = _LEAST_SIGMA * np.array([x or 1.0 for x in largest])  # sigma of each of these
+        self.least_sigma = _LEAST_SIGMA * np.array([x or 1.0 for x in largest])  # sigma of each of these
         self.shares: np.ndarray | None = None  # of each run's span, from its start, by member: samples beyond do not count
         self.begun = np.zeros((0, 0))  # first guesses of the members, where spans grow
         self.prior_mean = np.tile(unknowns.prior_mean, (lanes.members or 1, 1))  # by member
@@ -97,7 +97,7 @@ class Problem:
                 whole = self.lanes.whitened(j, members[b], plain, {name: tau[b] for name, tau in taus.items()})
                 if shares is not None:
                     whole = np.where(self.lanes.within(j, shares[b])[..., None], whole, 0.0)
-                for k, rows in enumerate(self._kinds(int(j[0]), whole)):
+                for k, rows in enumerate(self.kinds(int(j[0]), whole)):
                     r = rows[..., -1]
                     triangles[b, j, k] = triangle(closed(self.loss.weighted(rows, r), m + p))
                     if k:
@@ -113,20 +113,26 @@ class Problem:
             if not math.isfinite(triangles.sum() + cost.sum()):
                 failed = ~np.isfinite(triangles.sum(axis=(1, 2, 3, 4)) + cost)
                 triangles[failed], cost[failed] = 0.0, np.inf
-        together = triangles[:, :, 0]
         if kinds > 1:
             samples = self._counted[members if self.lanes.members else np.zeros(count, int)]
-            sigma = np.sqrt(np.maximum(squares.sum(axis=1)[:, 1:] / samples, self._least**2))
+            sigma = np.sqrt(np.maximum(squares.sum(axis=1)[:, 1:] / np.maximum(samples, 1), self.least_sigma**2))
             cost = cost + np.sum(samples * np.log(sigma), axis=1)
-            scaled = triangles / np.concatenate([np.ones((count, 1)), sigma], axis=1)[:, None, :, None, None]
-            together = np.linalg.qr(scaled.reshape(count, runs, -1, m + p + 1), mode="r")
-        whole = arrow(together, m if runs > 1 else 0)
-        if shares is not None or self.unknowns.with_prior.size:
-            mean, spread = self._known_before(theta, members, shares)
-            r, M = np.where(np.isfinite(mean), (theta - mean) / spread, 0.0), self.unknowns.whitening
-            cost = cost + 0.5 * (np.sum((r[:, :p] @ M.T) ** 2, axis=1) + np.sum(r[:, p:] ** 2, axis=1))
-            whole = with_prior(whole, r, mean, spread, M)
+        whole, of_priors = self.joined(theta, members, triangles, np.concatenate([np.ones((count, 1)), sigma], axis=1), shares)
+        cost = cost + of_priors
         return Linearised(cost, whole, kept, sigma)
+
+    def joined(self, theta: np.ndarray, members: np.ndarray, triangles: np.ndarray, sigma: np.ndarray, shares=None) -> tuple[Arrow, np.ndarray | float]:
+        """The arrow of triangles (members, runs, kinds, width, width) with these sigmas (members, kinds) and all priors; what priors add to F."""
+        (p, m), (count, runs, kinds, *_) = self.unknowns.layout.sizes, triangles.shape
+        together = triangles[:, :, 0]
+        if kinds > 1 or np.any(sigma != 1):
+            together = np.linalg.qr((triangles / sigma[:, None, :, None, None]).reshape(count, runs, -1, m + p + 1), mode="r")
+        whole = arrow(together, m if runs > 1 else 0)
+        if shares is None and not self.unknowns.with_prior.size:
+            return whole, 0.0
+        mean, spread = self._known_before(theta, members, shares)
+        r, M = np.where(np.isfinite(mean), (theta - mean) / spread, 0.0), self.unknowns.whitening
+        return with_prior(whole, r, mean, spread, M), 0.5 * (np.sum((r[:, :p] @ M.T) ** 2, axis=1) + np.sum(r[:, p:] ** 2, axis=1))
 
     def is_followed(self, at: Linearised, shares: Float[np.ndarray, "shares"], most: float) -> Bool[np.ndarray, "members shares"]:
         """Over which shares of the span the squares of residuals are on average at most so many times those of noise."""
@@ -231,21 +237,8 @@ class Problem:
                 parts[name] = parts[name] / sigma.reshape(sigma.shape + (1,) * (parts[name].ndim - sigma.ndim))
         return parts
 
-    def inflation(self, residuals, samples, rank) -> np.ndarray:
-        """The factor by which the covariance of each member is to be multiplied: for the loss, and for sigmas that are estimated."""
-        members = self.lanes.members or 1
-        by_member = [np.concatenate([r.reshape(members, -1)[b] for run in residuals for r in run.values()]) for b in range(members)]
-        of_loss = np.array([self.loss.inflation(r[np.isfinite(r)]) if np.isfinite(r).any() else np.nan for r in by_member])
-        left = np.maximum(samples - rank, 1)
-        return of_loss * np.broadcast_to(samples / left if self.all_estimated else 1.0, (members,))
-
-    @property
-    def all_estimated(self) -> bool:
-        """Whether no sigma is known."""
-        return bool(self.estimated) and all(set(run.values) <= set(self.estimated) for run in self.runs)
-
-    def _kinds(self, run: int, whole: np.ndarray) -> list[np.ndarray]:
-        """[J r] of lanes: of channels whose sigma is known, then of each other channel."""
+    def kinds(self, run: int, whole: np.ndarray) -> list[np.ndarray]:
+        """[J r] of lanes of a run: of channels whose sigma is known, then of each other channel."""
         if not self.estimated:
             return [whole]
         channels = self.lanes.channels(run)

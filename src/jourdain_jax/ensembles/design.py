@@ -113,6 +113,8 @@ class Design(Printed):
                     raise ValueError(f"`correlation` names `{name}`, which does not vary; {nearest(name, names)}")
             if len(set(pair)) != 2 or not -1 < value < 1:
                 raise ValueError(f"the correlation of {pair} is {value}, expected two names and a number between -1 and 1")
+            if (back := self.correlation.get(pair[::-1], value)) != value:
+                raise ValueError(f"the correlation of {pair} is both {value} and {back}; give it once")
             i, j = map(names.index, pair)
             matrix[i, j] = matrix[j, i] = value
         try:

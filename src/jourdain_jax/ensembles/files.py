@@ -18,6 +18,7 @@ try:
 except ImportError:  # not on this system: no lock is held there
     fcntl = None  # type: ignore[assignment]
 
+_BINARY = getattr(os, "O_BINARY", 0)  # without it, Windows writes two bytes for every one that is a line feed
 _OURS, _count = secrets.token_hex(4), itertools.count()  # in names of files, other than those of all processes
 
 
@@ -25,7 +26,7 @@ def write_whole(path: Path, content: bytes, *, wait: bool = False) -> None:
     """Put a file in its place; `wait`: until it is on the disk."""
     beside = f"{path.parent}/.{path.name}.{os.getpid()}.{_OURS}.{next(_count)}"
     try:
-        file = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        file = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BINARY, 0o666)
         try:
             written = 0
             while written < len(content):

@@ -46,7 +46,7 @@ def resident() -> int:
 
 def give_back_at_once() -> None:
     """Have the allocator give large freed arrays back to the system; ValueError where that is not glibc's."""
-    library = ctypes.CDLL(None)
+    library: Any = ctypes.CDLL(None) if os.name == "posix" else None
     if not hasattr(library, "mallopt") or not library.mallopt(_M_MMAP_THRESHOLD, 2**20) or not library.mallopt(_M_TRIM_THRESHOLD, 2**24):
         raise ValueError(_NOT_HERE)
 

@@ -10,6 +10,7 @@
 A chunk counts as done if its receipt is whole and its arrays are there with the checksums of the receipt; otherwise it is computed again.
 """
 
+import contextlib
 import errno
 import json
 import math
@@ -102,6 +103,8 @@ class Store:
                 (beside / name / "c").mkdir(exist_ok=True)
             entries = {name: vars(column) | {"attributes": dict(column.attributes)} for name, column in columns.items()}
             write_whole(beside / "run" / "study.json", json.dumps({"format": FORMAT, **study, "columns": entries}, indent=1).encode(), wait=True)
+            with contextlib.suppress(OSError):  # an empty folder, whose place Windows does not give to another one
+                path.rmdir()
             try:
                 os.rename(beside, path)
             except OSError as error:

@@ -19,6 +19,10 @@ from jourdain_jax.ensembles.run import Runner
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
 
+_NONE_BEGAN = (
+    "no worker of this study could begin, as what it printed says. Each imports the program that was started: run studies in it under "
+    '`if __name__ == "__main__":`, and define scenes and outputs in a module; or take processes=1'
+)
 _asked: list[tuple[Task, Store]] = []  # of this worker, one
 _runner: list[Runner] = []  # made for its first chunk
 
@@ -45,7 +49,7 @@ class _Survives:
         self.pool: ProcessPoolExecutor | None = None
 
     def __call__(self, first: int, last: int) -> bool:
-        self.pool = self.pool or self.stack.enter_context(_pool(self.sent, self.store, 1))
+        self.pool = self.pool or self.stack.enter_context(_pool(self.sent, self.store, 1, get_context("spawn").Event()))
         try:
             self.pool.submit(_try, first, last).result()
         except BrokenProcessPool:
@@ -67,7 +71,8 @@ def _until_a_worker_dies(sent: bytes, store: Store, numbers: list[int], count: i
     """Run chunks; returns the numbers of those that were under way when a worker died, empty where none did."""
     left = iter(numbers)
     running: dict[Future, int] = {}
-    with _pool(sent, store, count) as pool:
+    begun = get_context("spawn").Event()
+    with _pool(sent, store, count, begun) as pool:
         try:
             while True:
                 while len(running) < count and not interrupted() and (number := next(left, None)) is not None:
@@ -78,35 +83,39 @@ def _until_a_worker_dies(sent: bytes, store: Store, numbers: list[int], count: i
                     yield future.result()
                     del running[future]
         except BrokenProcessPool:
+            if not begun.is_set():
+                raise RuntimeError(_NONE_BEGAN) from None
             receipts = {number: store.receipt(number) for number in running.values()}
             yield from (receipt.lanes for receipt in receipts.values() if receipt is not None)  # kept before the worker died
             return [number for number, receipt in receipts.items() if receipt is None]
 
 
-def _pool(sent: bytes, store: Store, count: int) -> ProcessPoolExecutor:
+def _pool(sent: bytes, store: Store, count: int, begun) -> ProcessPoolExecutor:
+    """Workers of a study; `begun`: an event that is set once one of them can compute."""
     context = get_context("spawn")
     places = context.Queue()
     for place in range(count):
         places.put((place, count))
-    return ProcessPoolExecutor(count, mp_context=context, initializer=_begin, initargs=(sent, str(store.path), places))
+    return ProcessPoolExecutor(count, mp_context=context, initializer=_begin, initargs=(sent, str(store.path), places, begun))
 
 
-def _begin(sent: bytes, path: str, places) -> None:
+def _begin(sent: bytes, path: str, places, begun) -> None:
     """Start a worker: its cores, no Ctrl-C (which is for the parent), an end with the parent's."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if parent := parent_process():
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
     keep_to_share(*places.get())
     _asked.append((pickle.loads(sent), Store(path)))
+    begun.set()
 
 
 def keep_to_share(place: int, count: int) -> None:
     """Keep this thread, and all that it starts, to the cores of process number `place` of `count`; before JAX begins, for its threads are then one per core."""
-    with contextlib.suppress(AttributeError, OSError):  # not every system knows cores
-        cores = sorted(os.sched_getaffinity(0))
-        own = cores[place::count] or cores
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+    own = cores[place::count] or cores
+    os.environ["JOURDAIN_JAX_THREADS"] = str(len(own))
+    with contextlib.suppress(AttributeError, OSError):  # not every system lets a process choose its cores
         os.sched_setaffinity(0, own)
-        os.environ["JOURDAIN_JAX_THREADS"] = str(len(own))
 
 
 def _end_with(parent: int) -> None:

@@ -18,7 +18,7 @@ _DIGEST = 32  # bytes
 
 
 def folder() -> Path | None:
-    """Where code is kept; None where `JOURDAIN_JAX_CACHE` is 0."""
+    """Where code is kept; None where `JOURDAIN_JAX_CACHE` is 0, or there is no place for it."""
     stated = os.environ.get("JOURDAIN_JAX_CACHE", "")
     if stated == "0":
         return None
@@ -26,7 +26,10 @@ def folder() -> Path | None:
         return Path(stated)
     if jax.config.jax_compilation_cache_dir:
         return Path(jax.config.jax_compilation_cache_dir) / "jourdain_jax"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jourdain_jax"
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jourdain_jax"
+    except RuntimeError:  # a user without a home
+        return None
 
 
 def kept(name: str, make: Callable[[], bytes]) -> bytes:
@@ -53,7 +56,10 @@ def kept(name: str, make: Callable[[], bytes]) -> bytes:
         _make_room(place)
         with tempfile.NamedTemporaryFile(dir=place, delete=False) as beside:
             beside.write(hashlib.sha256(code).digest() + code)
-        os.replace(beside.name, file)
+        try:
+            os.replace(beside.name, file)
+        except OSError:  # under Windows, while another process reads it
+            os.unlink(beside.name)
     except OSError:
         pass
     return code

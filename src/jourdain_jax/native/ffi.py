@@ -59,7 +59,7 @@ def reason_against() -> str:
 
 def _stated_version() -> tuple[int, int] | None:
     try:
-        header = (Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h").read_text()
+        header = (Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h").read_text(encoding="utf-8")
     except OSError:
         return None
     numbers = [re.search(rf"#define XLA_FFI_API_{part} (\d+)", header) for part in ("MAJOR", "MINOR")]

@@ -10,11 +10,16 @@ from typing import Any
 from jourdain_jax.native.libm import PREFIX
 from jourdain_jax.native.math_functions import LIBM
 
+llvm: Any = None
+_NOT_IMPORTED = "llvmlite is not installed"
 try:
     from llvmlite import binding
-except ImportError:  # an optional dependency
-    binding = None
-llvm: Any = binding
+
+    llvm = binding
+except ModuleNotFoundError:  # an optional dependency
+    pass
+except (ImportError, OSError) as error:
+    _NOT_IMPORTED = f"llvmlite cannot be imported ({error})"
 
 _LANES = (("avx512f", 8), ("avx", 4))  # doubles of a register; else 2, as every 64-bit machine has
 # How much LLVM does, at most; no number depends on it: nothing here allows LLVM to round differently.
@@ -26,27 +31,39 @@ _lock = threading.Lock()
 _engines: list = []  # what machine code lives in: as long as the process, which may call it
 
 
+# Functions of C that machine code calls besides those of libm. LLVM ends the process where it finds one of them missing.
+_CALLED = ("aligned_alloc", "free", "malloc", "memcpy", "memset", "pthread_attr_init", "pthread_attr_setstacksize", "pthread_create", "pthread_join")
+# A module with what llvmlite must be able to read: those of LLVM 15 and older are not.
+_TRIAL = "define <2 x double> @trial(ptr %at) {\n  %x = load <2 x double>, ptr %at\n  %y = fadd <2 x double> %x, splat (double 1.0)\n  ret <2 x double> %y\n}\n"
+
+
 @functools.cache
 def reason_against() -> str:
     """Why no machine code is made here; empty where it is."""
+    if os.name != "posix":
+        return "it is made under Linux and macOS alone"
     if llvm is None:
-        return "llvmlite is not installed"
+        return _NOT_IMPORTED
     try:
         llvm.initialize_native_target()
         llvm.initialize_native_asmprinter()
-        _machine(0)
-        libm = ctypes.CDLL(ctypes.util.find_library("m"))
+        process, libm = ctypes.CDLL(None), ctypes.CDLL(ctypes.util.find_library("m"))
+        for name in _CALLED:
+            getattr(process, name)
         for name in LIBM.values():
             llvm.add_symbol(PREFIX + name, ctypes.cast(getattr(libm, name), ctypes.c_void_p).value)
-    except (OSError, RuntimeError, AttributeError) as error:
-        return f"LLVM does not know this machine ({str(error).splitlines()[0]})"
+        address(object_code(_TRIAL, 0), "trial")
+    except Exception as error:  # whatever a system lacks: motions are integrated by XLA there
+        version, said = ".".join(map(str, llvm.llvm_version_info)), str(error).split("\n")[0]
+        return f"LLVM {version} of llvmlite does not serve here ({said})"
     return ""
 
 
 @functools.cache
 def features() -> dict[str, bool]:
-    """What the processor can do."""
-    return dict(llvm.get_host_cpu_features())
+    """What the processor can do. Of Apple's, LLVM says nothing; every 64-bit one of ARM has vector registers, and rounds products and sums once."""
+    found = dict(llvm.get_host_cpu_features())
+    return found | {"neon": True} if llvm.get_process_triple().startswith(("aarch64", "arm64")) else found
 
 
 def lanes() -> int:
@@ -63,8 +80,6 @@ def registers() -> int:
 @functools.cache
 def threads() -> int:
     """How many threads share a batch: one for every core that this process may use, or as many as `JOURDAIN_JAX_THREADS` says."""
-    if not hasattr(ctypes.CDLL(None), "pthread_create"):
-        return 1
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, int(os.environ.get("JOURDAIN_JAX_THREADS", cores)))
 
@@ -82,7 +97,8 @@ def _machine(effort: int):
 
 def description() -> str:
     """What machine code depends on besides the program."""
-    return f"{EFFORT} {llvm.llvm_version_info} {llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
+    machine = f"{llvm.get_process_triple()} {llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
+    return f"{EFFORT} {llvm.llvm_version_info} {machine}"
 
 
 def object_code(text: str, effort: int) -> bytes:

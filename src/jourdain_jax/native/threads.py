@@ -4,6 +4,7 @@ from jourdain_jax.native.ffi import Given, product, write_handler
 from jourdain_jax.native.ir import Value, Writer
 
 MANY = 8  # times as many lanes as side by side make it worth while to start another thread, which takes some 30 us
+STACK = 2**23  # bytes for each thread, as the first one has in most systems; macOS gives others 512 kB
 NEXT, COUNT, IN, OUT = range(4)  # words of a job of rows: the number of the next row, how many there are, pointers to those given and to those returned
 
 
@@ -11,10 +12,14 @@ def share(w: Writer, job: Value, count: Value, threads: int) -> None:
     """Calls the module's `loop(job)` in so many threads, in fewer where lanes are few."""
     loop, nothing, others, started = Value(w, "ptr", "@loop"), Value(w, "ptr", "null"), w.room("i64", threads), w.room("i64")
     w.store(w.literal(0, "i64"), started)
+    how = w.room("i64", 16)  # a `pthread_attr_t`, which takes up to 64 bytes
+    if threads > 1:
+        w.external("pthread_attr_init", "i32", how)
+        w.external("pthread_attr_setstacksize", "i32", how, w.literal(STACK, "i64"))
     for more in range(1, threads):
         with w.when(count >= (more + 1) * MANY * w.lanes):
             number = w.load("i64", started)
-            failed = w.external("pthread_create", "i32", w.at(others, number, "i64"), nothing, loop, job)
+            failed = w.external("pthread_create", "i32", w.at(others, number, "i64"), how, loop, job)
             w.store(number + w.where(failed.equals(0), w.literal(1, "i64"), 0), started)
     w.call("loop", "ptr", job)
     if threads > 1:

@@ -165,7 +165,7 @@ def _scatter_add(graph, inputs, params):
 # Which operands hold entries; the others are indices.
 _MOVES: dict[str, Callable[[int], Collection[int]]] = {
     **dict.fromkeys(("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "rev", "slice", "dynamic_slice", "split"), lambda n: (0,)),
-    **dict.fromkeys(("gather", "copy", "copy_p", "stop_gradient"), lambda n: (0,)),
+    **dict.fromkeys(("gather", "copy", "copy_p", "stop_gradient", "unstack"), lambda n: (0,)),
     **dict.fromkeys(("concatenate", "stack", "optimization_barrier"), range),
     **dict.fromkeys(("pad", "dynamic_update_slice"), lambda n: (0, 1)),
     **dict.fromkeys(("scatter", "scatter-add"), lambda n: (0, 2)),

@@ -32,21 +32,21 @@ def called(text: Callable[[int, int], str], shapes: Callable, of_samples: int = 
     """
 
     @cache
-    def handler(lanes: int) -> str:
-        return ffi.registered(text(lanes, 1 if lanes == ALONE else host.threads()), effort)
+    def handler(lanes: int, threads: int) -> str:
+        return ffi.registered(text(lanes, threads), effort)
 
-    def call(lanes: int, *arguments):
-        return tuple(_call_p.bind(*arguments, handler=handler, lanes=lanes, shapes=shapes))
+    def call(lanes: int, threads: int, *arguments):
+        return tuple(_call_p.bind(*arguments, handler=handler, lanes=lanes, threads=threads, shapes=shapes))
 
     @jax.custom_batching.custom_vmap
     def run(*arguments):
-        return call(ALONE, *arguments)
+        return call(ALONE, 1, *arguments)
 
     @run.def_vmap
     def run_many(count, batched: list[bool], *arguments):
         stays = [has_axis or k < of_samples for k, has_axis in enumerate(batched)]
         every = [x if stay else jnp.broadcast_to(x, (count, *x.shape)) for x, stay in zip(arguments, stays, strict=True)]
-        found = call(host.lanes(), *every)
+        found = call(host.lanes(), host.threads(), *every)
         return found, (True,) * len(found)
 
     return run
@@ -56,9 +56,9 @@ def _results(*arguments, shapes: Callable, **_) -> list:
     return [arguments[-1].update(shape=(*arguments[-1].shape[:-1], *shape), weak_type=False) for shape in shapes(*arguments)]
 
 
-def _at_once(*arguments, handler: Callable, lanes: int, shapes: Callable) -> list:
+def _at_once(*arguments, handler: Callable, lanes: int, threads: int, shapes: Callable) -> list:
     results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in _results(*map(jax.typeof, arguments), shapes=shapes)]
-    return jax.ffi.ffi_call(handler(lanes), results)(*arguments)
+    return jax.ffi.ffi_call(handler(lanes, threads), results)(*arguments)
 
 
 # The call itself: machine code is made where a program is lowered that holds it, not for what is only traced.
@@ -66,7 +66,9 @@ _call_p = Primitive("jourdain_machine_code")
 _call_p.multiple_results = True
 _call_p.def_impl(_at_once)
 _call_p.def_abstract_eval(_results)
-mlir.register_lowering(_call_p, lambda ctx, *arguments, handler, lanes, shapes: jax.ffi.ffi_lowering(handler(lanes))(ctx, *arguments), platform="cpu")
+mlir.register_lowering(
+    _call_p, lambda ctx, *arguments, handler, lanes, threads, shapes: jax.ffi.ffi_lowering(handler(lanes, threads))(ctx, *arguments), platform="cpu"
+)
 batching.primitive_batchers[_call_p] = lambda values, axes, **how: (found := _call_p.bind(*with_lanes_first(values, axes), **how), [0] * len(found))
 
 
