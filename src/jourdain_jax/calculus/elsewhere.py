@@ -116,6 +116,7 @@ def _computed(*values, here, elsewhere):
 
 _either_p = Primitive("jourdain_or_elsewhere")
 _either_p.multiple_results = True
+_either_p.is_high = lambda *_, **__: False  # what JAX 0.12 still has to lower in a program, it lowers where that is written
 _either_p.def_impl(_computed)
 _either_p.def_abstract_eval(lambda *_, here, elsewhere: [v.aval for v in here.outvars])
 mlir.register_lowering(_either_p, _lowered)

@@ -11,12 +11,14 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jaxlib.version
 
 from jourdain_jax.calculus.collecting import without_collecting
 from jourdain_jax.calculus.jaxprs import loops
 from jourdain_jax.calculus.reals import is_array_type, nothing_is_traced
 
-QUICK: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
+# From jaxlib 0.11.1 on, XLA has these emitters alone.
+QUICK: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jaxlib.version.__version_info__ < (0, 11, 1) else {}
 RUN_SELDOM: dict[str, Any] = QUICK | {"xla_backend_optimization_level": 0}  # where a function's costs are those of its compilation
 MOST_STRUCTURES = 1024  # of arguments, arrays left out, for which one function is kept compiled
 

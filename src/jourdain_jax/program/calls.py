@@ -161,8 +161,8 @@ def description(x, details: Callable = lambda equation: equation.params, of_othe
             return tuple(map(of, x))
         if isinstance(x, dict):
             return tuple((key, of(value)) for key, value in sorted(x.items()))
-        if hasattr(x, "consts") and hasattr(x, "jaxpr"):
-            return "closed", of(x.jaxpr), tuple(map(of, x.consts))
+        if hasattr(x, "consts"):  # from JAX 0.12 on, every jaxpr has them
+            return "closed", of_jaxpr(x.jaxpr), tuple(map(of, x.consts))
         if hasattr(x, "eqns"):
             return of_jaxpr(x)
         if (is_array(x) and not np.asarray(x).dtype.hasobject) or isinstance(x, float):
