@@ -69,6 +69,24 @@ def test_the_equations_are_those_of_mujoco(name):
         assert relative_error(jj.accelerations(scene, 0.0, q, u, pushes).udot, data.qacc) < tolerance("closed_form")
 
 
+@pytest.mark.parametrize(
+    ("defaults", "gear"),
+    [('<general gear="7"/>', 7), ('<position gear="5"/><motor gear="3"/>', 3), ('<motor gear="3"/><position gear="5" kp="2"/>', 5)],
+)
+def test_motors_share_the_defaults_of_all_actuators(defaults, gear):
+    text = _body(HINGE, '<actuator><motor name="m" joint="j"/></actuator>', f"<default>{defaults}</default>")
+    np.testing.assert_allclose(jj.generalized_forces(jj.from_mjcf(text)(), 0.0, np.zeros(1), np.zeros(1), {"m": 2.0}), [2.0 * gear])
+
+
+@pytest.mark.parametrize("near", [1e-9, 1e-7, 1e-5, 1e-3])
+def test_an_axis_that_points_nearly_down_is_reached_by_the_shortest_turn(near):
+    # half a turn less `near` about y: x goes to -x, and y stays
+    text = f'<mujoco><worldbody><body zaxis="{near} 0 -1"><joint name="j"/><geom size="0.1" pos="1 2 0"/></body></worldbody></mujoco>'
+    (body,) = jj.pose_at(jj.from_mjcf(text)(), 0.0, np.zeros(1)).bodies.values()
+    slope = np.array([near, -1.0]) / np.hypot(near, 1.0)  # of the axis: its x and z
+    np.testing.assert_allclose(body.position, [slope[1], 2.0, -slope[0]], rtol=0, atol=1e-15)
+
+
 def test_the_stated_pose_is_the_example():
     scene = jj.from_mjcf(DEGREES)()
     start = jj.start(scene, **scene.example)
@@ -221,7 +239,14 @@ BAD = {
     "default-without-class": (_body(HINGE, compiler="<default><default/></default>"), r"a `default` inside the class `main` has no `class`"),
     "free-below": (_body(f'{HINGE}<body name="c"><freejoint/><geom size="1"/></body>'), r"body `c` has a free joint and a parent"),
     "two-of-a-name": (_body(f'{HINGE}<body name="b"><geom size="1"/></body>'), r"two bodies are called `b`"),
-    "quaternion-zero": (_body(f'{HINGE}<body name="c" quat="0 0 0 0"/>'), r"quat of body `c` is zero"),
+    "quaternion-zero": (_body(f'{HINGE}<body name="c" quat="0 0 0 0"/>'), r"quat of body `c` is `0 0 0 0`, which is no rotation"),
+    "no-axis": (_body(f'{HINGE}<body name="c" axisangle="0 0 0 30"/>'), r"axisangle of body `c` is `0 0 0 30`, which is no rotation"),
+    "parallel-axes": (_body(f'{HINGE}<body name="c" xyaxes="1 0 0 2 0 0"/>'), r"xyaxes of body `c` is `1 0 0 2 0 0`, which is no rotation"),
+    "two-rotations": (_body(f'{HINGE}<body name="c" euler="1 2 3" quat="1 0 0 0"/>'), r"body `c` is turned by `quat` and by `euler`; expected one of them"),
+    "unit-of-angles": (_body(HINGE, compiler='<compiler angle="radians"/>'), r"`angle` of `compiler` is `radians`; did you mean `radian`\?"),
+    "sequence": (_body(HINGE, compiler='<compiler eulerseq="xyq"/>'), r"`eulerseq` of `compiler` is `xyq`, expected three letters"),
+    "geom-of-negative-mass": (_body(f'{HINGE}<geom size="1" mass="-1"/>'), r"mass of a geom of body `b` is -1"),
+    "renamed-main": (_body(HINGE, compiler='<default class="robot"><joint damping="3"/></default>'), r"outermost `default` is of the class `robot`"),
     "axis-zero": (_body('<joint name="j" axis="0 0 0"/>'), r"axis of joint `j` is zero"),
 }
 

@@ -243,6 +243,8 @@ BAD = {
     "unknown-motor": ({"path": _robot(_joint()), "motors": ["jj"]}, r"`motors` names `jj`, which is no joint of one coordinate"),
     "unknown-free-link": ({"path": _robot(_joint()), "free": "bb"}, r"`free` names `bb`, which is no link; did you mean `b`"),
     "unknown-leader": ({"path": _robot(_joint(inside='<mimic joint="x"/>'))}, r"`mimic` of joint `j`: `x` is no joint"),
+    "leader-of-itself": ({"path": _robot(_joint(inside='<mimic joint="j" multiplier="2"/>'))}, r"joint `j` mimics itself"),
+    "quaternion": ({"path": _robot(_joint(inside='<origin quat_xyzw="0 0 0 1"/>'))}, r"`quat_xyzw` of the origin of joint `j` is not read"),
     "nothing-moves": ({"path": _robot(_joint("fixed"))}, r"no joint moves anything"),
     "no-name": ({"path": "<robot><link/></robot>"}, r"a link has no `name`"),
     "two-names-become-one": (

@@ -130,6 +130,10 @@ def test_errors_of_runs_under_a_robust_loss_hold_where_sigmas_are_far_too_small(
     # H = J'J mean psi', with J'J from the weighted one
     H = sum(np.sum(w * slope**2) for w in weights) * np.mean(bend) / np.mean(weights)
     np.testing.assert_allclose(found.standard_errors, [np.sqrt(np.sum(np.square(scores)) * 6 / 5) / H], rtol=1e-6)
+    # how runs differ says nothing of what is a run's own
+    own = [run(ts, {"x": y}, 0.1, ("x",), t0=0.0) for y in ys]
+    errors = [jj.fit(Bead(), own, errors=whence, loss=loss).standard_errors for whence in ("runs", "sigmas")]
+    np.testing.assert_allclose(*errors, rtol=1e-6)
 
 
 def test_a_robust_loss_does_not_widen_what_a_prior_tells():

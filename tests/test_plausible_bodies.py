@@ -140,3 +140,26 @@ def test_a_ground_that_another_body_carries_is_refused(ground):
 )
 def test_a_ground_that_no_other_body_carries_unsaid_is_accepted(ground):
     assert jj.structure_of(OnSledge(ground)).faults == ()
+
+
+class OnLift(OnSledge):
+    """The ball on a sledge that is lifted or tilted, on a ground that is built of the coordinate that does it, not of the sledge's pose."""
+
+    coordinates = jj.coordinates("sledge x roll rise")
+    domain = {"rise": (-0.3, 0.3)}
+
+    def bodies(self, t, q):
+        made = super().bodies(t, q)
+        up = jnp.stack([0.0 * q.rise, 0.0 * q.rise, q.rise])
+        ball = self.ground(q, up).plane_at(up)
+        at = ball.origin + q.x * ball.axes[:, 0] + 0.1 * ball.normal
+        return made | {"ball": jj.RigidBody.ball(1.0, 0.1, position=at, orientation=jj.rot_y(q.roll))}
+
+    def contacts(self, pose):
+        return {"back": jj.ball_contact(pose["ball"], 0.1, ground=self.ground(pose.q, jnp.stack([0.0 * pose.q.rise, 0.0 * pose.q.rise, pose.q.rise])))}
+
+
+@pytest.mark.parametrize("ground", [lambda q, up: jj.Plane(up), lambda q, up: jj.Plane(tilt=q.rise)])
+def test_a_ground_that_a_coordinate_moves_along_its_normal_is_refused(ground):
+    with pytest.raises(ValueError, match=r"the plane of contact `back` of `OnLift` moves along its normal .* where coordinates move it, leave"):
+        jj.structure_of(OnLift(ground))

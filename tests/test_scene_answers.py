@@ -88,6 +88,11 @@ def test_a_direction_of_gravity_that_is_computed_is_looked_at_when_the_scene_is_
     jj.simulate(tilted, {}, t1=0.1)
     with pytest.raises(ValueError, match=r"the direction of gravity of `Described` has a length that differs from 1 by .*, expected a unit vector"):
         jj.simulate(tilted.replace(mass=1.5), {}, t1=0.1)
+    with pytest.raises(ValueError, match=r"the direction of gravity of `Described`"):
+        jj.accelerations(tilted.replace(mass=1.5), 0.0, np.zeros(2), np.zeros(2))
+    (failed,) = [check for check in jj.verify(tilted.replace(mass=1.5)).checks if check.name == "inertia"]
+    assert not failed.passed
+    assert failed.culprit == "load 1 (on `bead`): its direction is no unit vector"
 
 
 def test_a_direction_of_gravity_that_is_traced_hides_nothing_else():

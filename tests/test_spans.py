@@ -45,6 +45,12 @@ def test_an_implicit_solver_serves_a_projected_scene():
     np.testing.assert_allclose(implicit.q_end, explicit.q_end, atol=1e-6)
 
 
+def test_the_first_step_has_a_length_whichever_way_time_runs():
+    ends = [jj.simulate(Falling(), {"x_rate": 0.5}, t0=2.0, t1=1.0, dt0=dt0, solver=jj.RadauIIA()).q_end for dt0 in (0.01, -0.01)]
+    np.testing.assert_allclose(ends[0], [-0.5, -0.5 * 9.81], rtol=1e-9)
+    assert np.array_equal(*ends)
+
+
 def test_a_motion_starts_at_the_time_of_its_state():
     start = jj.start(Falling(), t0=3.0, x_rate=1.0)
     motion = jj.simulate(Falling(), start, t1=3.5)

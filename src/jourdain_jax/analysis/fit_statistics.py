@@ -4,7 +4,7 @@ interval      estimate -+ q e,  within the bounds      e: standard error, q: 97.
 freedom       samples - rank + tr(C P)       what the samples determined is less than the rank by what priors tell; P: their information, C: covariance
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
@@ -66,8 +66,7 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, e
     bound = (theta <= limits.low) | (theta >= limits.high)
     limit = one(at_bounds.limit[:, places])
     told_by = partial(information, size=size, estimated=places, bound=bound, fails=fails, cutoff=control.cutoff)
-    of_loss = problem.loss.inflation if errors == "sigmas" else lambda r, _: problem.loss.bend(r)
-    levels = noise_levels(problem, theta, found.at, told_by, of_loss)
+    levels = noise_levels(problem, theta, found.at, told_by, problem.loss.inflation)
     residuals = tuple(problem.by_channel(run, levels.at, one) for run in range(len(problem.runs)))
     white = tuple(problem.by_channel(run, levels.at, one, white=True) for run in range(len(problem.runs)))
     samples = sum(np.sum(np.isfinite(r), axis=tuple(range(0 if single else 1, r.ndim))) for run in residuals for r in run.values())
@@ -83,7 +82,9 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, e
     of_sigmas = one(levels.doubt)
     quantiles = _normal_or_t(of_memory, of_sigmas) * np.sqrt(1 + more)
     if errors == "runs":
-        known = known.between_runs(one((levels if problem.estimated else found).at.arrow.scores))
+        of_runs = levels if problem.estimated else noise_levels(problem, theta, found.at, told_by, lambda r, _: problem.loss.bend(r))
+        scores = (levels if problem.estimated else found).at.arrow.scores
+        known = replace(of_runs.known.only() if single else of_runs.known, own=known.own).between_runs(one(scores))
         quantiles, of_sigmas = students_t_95(len(problem.runs) - 1), np.zeros(1)
     reach = quantiles * known.standard_errors
     too_narrow = []

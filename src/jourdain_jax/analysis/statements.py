@@ -1,6 +1,7 @@
 """What a scene states (bodies, loads, potentials, rows), checked piece by piece, so that a wrong one is named.
 
 inertia        m >= 0,  I = I' >= 0,  I_3 <= I_1 + I_2,  R'R = 1      per body
+               e.e = 1                                                per gravity
 potentials     Z' (Q_i + N' dV_i/dq) = 0                              per load i that states a potential V_i
 derivatives    d/ds of every piece along one direction in (parameters, t, q, u): autodiff against central differences; no kink there
 """
@@ -16,7 +17,7 @@ from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import Velocities, coordinate_rates, motion_at, partial_velocities, pose_at
 from jourdain_jax.equations.rows import position_rows, velocity_rows
 from jourdain_jax.scene.bodies import RigidBody
-from jourdain_jax.scene.loads import Load
+from jourdain_jax.scene.loads import Gravity, Load
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import loads_of, potential_of
@@ -38,7 +39,7 @@ def statement_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds colu
 @eval_numpy
 def _evaluate(scene: Scene, t, q, u, inputs, Z) -> tuple[dict, dict]:
     motion = motion_at(scene, t, q, u, inputs)
-    return _inertia(motion), _potentials(scene, motion, Z)
+    return _inertia(motion) | _gravity(scene, motion), _potentials(scene, motion, Z)
 
 
 def _inertia(motion: Motion) -> dict[str, Float[Array, ""]]:
@@ -56,6 +57,11 @@ def _inertia(motion: Motion) -> dict[str, Float[Array, ""]]:
         values[f"body `{name}`: a principal moment of inertia exceeds the sum of the other two"] = excess / size
         values[f"body `{name}`: its orientation is no rotation matrix"] = jnp.max(jnp.abs(body.orientation.T @ body.orientation - jnp.eye(3)))
     return values
+
+
+def _gravity(scene: Scene, motion: Motion) -> dict[str, Float[Array, ""]]:
+    directions = {_name(i, load): load.direction for i, load in enumerate(loads_of(scene, motion)) if isinstance(load, Gravity)}
+    return {f"{name}: its direction is no unit vector": jnp.abs(jnp.linalg.norm(e) - 1) for name, e in directions.items()}
 
 
 def _potentials(scene: Scene, motion: Motion, Z) -> dict[str, Float[Array, ""]]:

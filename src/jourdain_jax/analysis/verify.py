@@ -1,6 +1,7 @@
 """A scene's equations checked against each other at one state: different ways must give the same numbers.
 
-inertia            masses and inertias are those of a body, orientations are rotations      (these three piece by piece: `statements`)
+inertia            masses and inertias are those of a body, orientations are rotations, directions of gravity unit vectors
+                                                                            (this and the next two piece by piece: `statements`)
 potentials         every load with a potential is its gradient
 derivatives        of every body, load, potential and row: autodiff against central differences
 reductions         udot and A' lambda by every applicable reduction

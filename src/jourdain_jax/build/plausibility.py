@@ -2,7 +2,7 @@
 
 m >= 0,   I = I' >= 0,   R' R = 1,   det R = 1
 n.n = 1,   e.e = 1 of gravity,   gap = 0 where the coordinates keep a body on the ground
-d[n.(p - o)]/dt at a fixed point p = - n.(v + w x (p - o))        a plane's motion, stated twice: by o(t), n(t) and by v, w
+d[n.(p - o)]/dt at a fixed point p = - n.(v + w x (p - o))        a plane's motion, stated twice: by o(t, q), n(t, q) and by v, w
 dg/dt along the motion of the other bodies = 0  or  v, w != 0      g: all that says where the ground of a contact is
 """
 
@@ -26,6 +26,7 @@ from jourdain_jax.scene.validated import contacts_of, loads_of
 
 TOLERANCE = 1e-4  # relative: constants may be typed with a few digits, mistakes are larger
 _ROUNDED = 1e-2  # relative: of thin wheels the last moment is the sum of the others, and published moments have three digits
+_ROWS_INSTEAD = "write its rows in `velocity_constraints`: tangents @ (rolling.velocity_at(point) - ground.velocity_at(point))"
 
 
 class PoseNumbers(eqx.Module):
@@ -52,7 +53,7 @@ def numbers_of(scene: Scene, motion: Motion) -> PoseNumbers:
         position={name: body.position for name, body in pose.bodies.items()},
         inertia={name: body.inertia for name, body in rigid.items()},
         orientation={name: body.orientation for name, body in rigid.items()},
-        planes=_normal_velocities(scene, pose, contacts),
+        planes=_normal_velocities(scene, motion, contacts),
         carried={name: _carried_speeds(scene, motion, name, contact) for name, contact in contacts.items() if contact.ground is not None},
         normals={name: jnp.stack([contact.plane.normal @ contact.plane.normal, jnp.sum(jnp.abs(contact.point))]) for name, contact in contacts.items()},
         downwards={str(k): load.direction @ load.direction for k, load in enumerate(loads_of(scene, motion)) if isinstance(load, Gravity)},
@@ -64,15 +65,19 @@ def numbers_of(scene: Scene, motion: Motion) -> PoseNumbers:
     )
 
 
-def _normal_velocities(scene: Scene, pose: Pose, contacts: dict[str, Contact]) -> dict[str, Float[Array, "3"]]:
-    """Velocity of every contact's plane along its normal at the contact point, twice; and how large either could be."""
+def _normal_velocities(scene: Scene, motion: Motion, contacts: dict[str, Contact]) -> dict[str, Float[Array, "3"]]:
+    """Velocity of every contact's plane along its normal at the contact point, twice; and how large either could be.
 
-    def planes(t):
-        contacts = contacts_of(scene, Pose(t, pose.q, pose.bodies))
+    A plane that is tangent to a ground at rest has none, wherever on it the contact moves.
+    """
+
+    def planes(t, q, bodies):
+        contacts = contacts_of(scene, Pose(t, scene.coordinate_names.view(q), bodies))
         return {name: (contact.plane.normal, contact.plane.origin) for name, contact in contacts.items()}
 
     found = {}
-    _, rates = jax.jvp(planes, (pose.t,), (jnp.ones_like(pose.t),))
+    along = jnp.ones_like(motion.t), motion.qdot.array, {name: body.rate_of_pose() for name, body in motion.bodies.items()}
+    _, rates = jax.jvp(planes, (motion.t, motion.q.array, motion.pose().bodies), along)
     for name, contact in contacts.items():
         plane, arm, (normal_rate, origin_rate) = contact.plane, contact.point - contact.plane.origin, rates[name]
         by_pose = plane.normal @ origin_rate - normal_rate @ arm
@@ -154,8 +159,8 @@ def implausible(scene: Scene, numbers: PoseNumbers) -> tuple[str, ...]:
     sentences += [_of_mass(f"body `{name}` of `{who}`", mass) for name, mass in numbers.mass.items()]
     sentences += [_of_inertia(f"body `{name}` of `{who}`", I) for name, I in numbers.inertia.items()]
     sentences += [_of_orientation(f"body `{name}` of `{who}`", R) for name, R in numbers.orientation.items()]
-    sentences += [_of_plane(f"the plane of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.planes.items()]
     sentences += [_of_carried(f"the ground of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.carried.items()]
+    sentences += [_of_plane(f"the plane of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.planes.items()]
     sentences += [_of_normal(f"contact `{name}` of `{who}`", squares) for name, squares in numbers.normals.items()]
     sentences += [_of_gap(f"contact `{name}` of `{who}`", gaps) for name, gaps in numbers.gaps.items()]
     return tuple(sentence for sentence in sentences if sentence)
@@ -211,7 +216,8 @@ def _of_plane(what: str, speeds: np.ndarray) -> str:
     k = int(np.argmax(off))
     return (
         f"{what} moves along its normal at {by_pose[k]:.4g} m/s by `origin` and `tilt`, but at {by_velocity[k]:.4g} m/s by `velocity` and "
-        "`angular_velocity`; state the motion in both: velocity = d origin/dt, angular_velocity = (0, d tilt/dt, 0)"
+        "`angular_velocity`; state the motion in both: velocity = d origin/dt, angular_velocity = (0, d tilt/dt, 0); where coordinates move it, leave the "
+        f"contact away and {_ROWS_INSTEAD}"
     )
 
 
@@ -221,7 +227,7 @@ def _of_carried(what: str, speeds: np.ndarray) -> str:
         return ""
     return (
         f"{what} moves with another body, but its `velocity` and `angular_velocity` are zero; where it is a body of the scene, leave the contact away and "
-        "write its rows in `velocity_constraints`: tangents @ (rolling.velocity_at(point) - ground.velocity_at(point))"
+        f"{_ROWS_INSTEAD}"
     )
 
 

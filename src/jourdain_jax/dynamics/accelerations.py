@@ -118,11 +118,14 @@ def accelerations(
     - `usual`: what the rows are at most states, by which is judged whether they lose rank at this one (default: as found for this scene).
 
     Pure: works under any nesting of jit, vmap, jvp and vjp, with right derivatives wherever the rank of the rows is constant. Look at `applicable`
-    and `residual`: nothing is raised for a state that a reduction cannot serve. ValueError for an unknown reduction. Eqs. (41), (68)-(70).
+    and `residual`: nothing is raised for a state that a reduction cannot serve. ValueError for an unknown reduction, and for known parameters with which
+    numbers of bodies, loads or planes cannot be. Eqs. (41), (68)-(70).
     """
     f = inputs if inputs is None or isinstance(inputs, ChangingInputs) else as_input_vector(scene, inputs)
     arguments = as_time(t), as_coordinates(scene, q), as_speeds(scene, u), f
-    usual = usual_rows(scene) if usual is None else usual
+    if usual is None:
+        structure_of(scene)  # numbers that cannot be those of a scene are refused by name
+        usual = usual_rows(scene)
     return _accelerations(scene, *arguments, as_reduction(scene, reduction), as_stabilisation(stabilisation), usual)
 
 

@@ -47,7 +47,8 @@ def coordinate_rates(scene: Scene, t, q: Numbers, u: Numbers) -> Float[Array, "c
 
 def pose_at(scene: Scene, t, q: Numbers) -> Pose:
     """Poses of all bodies (m, inertial frame), sorted by name: the order in which JAX returns dictionaries, so that it is the same everywhere."""
-    t, named = as_time(t), scene.coordinate_names.view(as_coordinates(scene, q))
+    t, q = as_time(t), as_coordinates(scene, q)
+    named = scene.coordinate_names.view(q)
     return Pose(t, named, {name: BodyPose(name, body) for name, body in sorted(bodies_of(scene, t, named).items())})
 
 

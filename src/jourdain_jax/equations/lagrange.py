@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, generalized_forces, kinetic_energy
-from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
+from jourdain_jax.scene.arguments import as_coordinates, as_scene, as_speeds, as_time
 from jourdain_jax.scene.scene import Scene
 
 
@@ -21,7 +21,7 @@ def lagrange_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquat
 
     `inputs`: values of the scene's inputs (default: zero). ValueError where the speeds are not the coordinate rates.
     """
-    if not speeds_are_rates(scene):
+    if not speeds_are_rates(as_scene(scene)):
         raise ValueError(
             f"Lagrange's equations hold for coordinate rates, and the speeds of `{type(scene).__name__}` are quasi-velocities; use Appell's equations"
         )

@@ -42,7 +42,7 @@ def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> 
     mass centre), `<joint>_damping`, `<joint>_stiffness` and `gravity` (m/s^2); and of bodies that `free` names `<body>_origin` (m). Inertias of geoms come from
     their mass or density. The pose that the file states is the `example`.
 
-    Geoms are drawn; what they touch is not read: rolling is stated in `contacts` of a subclass. Limits stop nothing; they become the `domain`.
+    Geoms are drawn; what they touch is not read: rolling is stated in `contacts` of a subclass. Limits stop nothing; those of joints become the `domain`.
 
     **Raises** ValueError, by name: a file that cannot be read, a body that moves and has no mass, and whatever changes the motion and is not read, such as
     `equality`, `tendon`, `armature` or `frictionloss`, unless `ignore` names it. A warning lists what else is left out.
@@ -65,6 +65,9 @@ class _Reader:
         self.file, self.defaults = file, Defaults(file)
         self.compiler, self.option = attributes_of(file, "compiler"), attributes_of(file, "option")
         self.unit = 1.0 if self.compiler.get("angle") == "radian" else math.pi / 180
+        self.sequence = self.compiler.get("eulerseq", "xyz")
+        if len(self.sequence) != 3 or set(self.sequence.lower()) - set("xyz"):
+            raise file.fault(f"`eulerseq` of `compiler` is `{self.sequence}`, expected three letters out of x, y, z, X, Y, Z")
         self.meshes = {mesh.get("name") or (mesh.get("file") or "").rpartition("/")[2].partition(".")[0]: mesh for mesh in file.root.findall("asset/mesh")}
         self.links: list[Link] = []
         self.start: dict[str, float] = {}
@@ -185,14 +188,18 @@ class _Reader:
     def _mass_of_geom(self, geom: Element, childclass: str | None, body: str) -> Mass | None:
         given, kind, what = self._geom(geom, childclass, f"body `{body}`")
         density = self.file.number(given.get("density"), f"density of {what}", _WATER)
-        mass = self.file.number(given.get("mass"), f"mass of {what}", -1.0)
-        if mass == 0 or (mass < 0 and density == 0):
+        stated = "mass" in given
+        mass = self.file.number(given.get("mass"), f"mass of {what}", 0.0)
+        for word, number in (("mass", mass), ("density", density)):
+            if number < 0:
+                raise self.file.fault(f"{word} of {what} is {number:g}, expected a number that is not negative")
+        if (mass if stated else density) == 0:
             return None
         if kind not in SIZES:
             self.file.refuse(kind, f"the mass of {what}, of the type `{kind}`,", 'give body an `inertial`, or the geom mass="0"')
             return None
         position, turn, size = self._solid(given, kind, what)
-        mass = density * volume(kind, size) if mass < 0 else mass
+        mass = mass if stated else density * volume(kind, size)
         return Mass(mass, position, turn @ np.diag(mass * moments(kind, size)) @ turn.T)
 
     def _solid(self, given: dict[str, str], kind: str, what: str) -> tuple[Vector, Matrix, np.ndarray]:
@@ -235,27 +242,35 @@ class _Reader:
         return None
 
     def _place(self, given: dict[str, str], what: str) -> tuple[Vector, Matrix]:
-        """Position and rotation that attributes state."""
+        """Position and rotation that attributes state. ValueError for several rotations, or numbers that say none."""
         position = self.file.numbers(given.get("pos"), 3, f"pos of {what}", np.zeros(3))
-        if "quat" in given:
-            q = self.file.numbers(given["quat"], 4, f"quat of {what}")
-            if not np.any(q):
-                raise self.file.fault(f"quat of {what} is zero, which is no rotation")
-            return position, by_quaternion(q)
-        if "axisangle" in given:
-            *axis, angle = self.file.numbers(given["axisangle"], 4, f"axisangle of {what}")
-            return position, about(np.array(axis) / np.linalg.norm(axis), angle * self.unit)
-        if "euler" in given:
-            return position, by_euler_angles(self.file.numbers(given["euler"], 3, f"euler of {what}") * self.unit, self.compiler.get("eulerseq", "xyz"))
-        if "xyaxes" in given:
-            x, y = np.split(self.file.numbers(given["xyaxes"], 6, f"xyaxes of {what}"), 2)
-            x = x / np.linalg.norm(x)
-            y = y - (x @ y) * x
-            y = y / np.linalg.norm(y)
-            return position, np.stack([x, y, np.cross(x, y)], axis=1)
-        if "zaxis" in given:
-            return position, onto_axis(self.file.numbers(given["zaxis"], 3, f"zaxis of {what}"))
-        return position, np.eye(3)
+        stated = [word for word in ("quat", "axisangle", "euler", "xyaxes", "zaxis") if word in given]
+        if not stated:
+            return position, np.eye(3)
+        if len(stated) > 1:
+            raise self.file.fault(f"{what} is turned by {' and by '.join(f'`{word}`' for word in stated)}; expected one of them")
+        (word,) = stated
+        numbers = self.file.numbers(given[word], {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}[word], f"{word} of {what}")
+        with np.errstate(invalid="ignore"):
+            turn = self._turn(word, numbers)
+        if not np.all(np.isfinite(turn)):
+            raise self.file.fault(f"{word} of {what} is `{given[word]}`, which is no rotation")
+        return position, turn
+
+    def _turn(self, word: str, x: np.ndarray) -> Matrix:
+        """The rotation that an attribute states by these numbers; NaN where they state none."""
+        if word == "quat":
+            return by_quaternion(x)
+        if word == "axisangle":
+            return about(x[:3] / np.linalg.norm(x[:3]), x[3] * self.unit)
+        if word == "euler":
+            return by_euler_angles(x * self.unit, self.sequence)
+        if word == "zaxis":
+            return onto_axis(x)
+        along = x[:3] / np.linalg.norm(x[:3])
+        across = x[3:] - (along @ x[3:]) * along
+        across = across / np.linalg.norm(across)
+        return np.stack([along, across, np.cross(along, across)], axis=1)
 
     def _motors(self) -> Iterable[Motor]:
         names = [joint.name for link in self.links for joint in link.joints if joint.kind in ("hinge", "slide")]

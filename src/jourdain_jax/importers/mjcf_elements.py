@@ -6,6 +6,7 @@ Source: the XML reference of MuJoCo's documentation, version 3.
 from typing import Any
 
 from jourdain_jax.importers.xml_file import Element, XmlFile
+from jourdain_jax.scene.names import nearest
 
 _PLACE = "pos quat axisangle xyaxes zaxis euler"
 _CONTACT = "contype conaffinity condim group priority friction solmix solref solimp margin gap user fitscale fluidcoef"
@@ -58,12 +59,19 @@ OFF = {
     "option": {"density": "0", "viscosity": "0"},
     "flag": dict.fromkeys(("spring", "damper", "passive", "gravity", "actuation"), "enable") | {"fwdinv": "disable enable", "override": "disable"},
 }
+# values that an attribute may have
+WORDS = {"compiler": {"angle": ("degree", "radian"), "inertiafromgeom": ("true", "false", "auto")}}
+# actuators that share their defaults with `motor`, as far as it has the attribute
+_ACTUATORS = {"general", "position", "velocity", "intvelocity", "damper", "cylinder", "muscle"}
 # elements that move nothing, beside those that are read
 IDLE_ELEMENTS = {"camera", "light", "site", "visual", "statistic", "size", "sensor", "keyframe", "custom", "contact", "texture", "material", "hfield", "skin"}
 
 
 def check_attributes(file: XmlFile, kind: str, attributes: dict[str, str], what: str) -> None:
-    """A ValueError for an attribute that would move something and is not read, unless it is to be ignored."""
+    """A ValueError for an attribute that would move something and is not read, unless it is to be ignored; or for one with an unknown value."""
+    for name, words in WORDS.get(kind, {}).items():
+        if attributes.get(name, words[0]) not in words:
+            raise file.fault(f"`{name}` of {what} is `{attributes[name]}`; {nearest(attributes[name], words)}")
     off = OFF.get(kind, {})
     for name, value in attributes.items():
         if name in READ.get(kind, "").split() or name in IDLE.get(kind, "").split():
@@ -90,13 +98,18 @@ class Defaults:
         self._file = file
         self._classes: dict[str, dict[str, dict[str, str]]] = {"main": {}}
         for section in file.root.findall("default"):
-            self._read(section, section.get("class") or "main", {})
+            if section.get("class", "main") != "main":
+                raise file.fault(f"the outermost `default` is of the class `{section.get('class')}`, expected `main`: put a `default` of that class into it")
+            self._read(section, "main", {})
 
     def _read(self, section: Element, name: str, inherited: dict[str, dict[str, str]]) -> None:
         known = {kind: dict(attributes) for kind, attributes in inherited.items()}
         for element in section:
             if element.tag != "default":
                 known[element.tag] = known.get(element.tag, {}) | dict(element.attrib)
+            if element.tag in _ACTUATORS:
+                shared = {name: value for name, value in element.attrib.items() if name in f"{READ['motor']} {IDLE['motor']}".split()}
+                known["motor"] = known.get("motor", {}) | shared
         self._classes[name] = self._classes.get(name, {}) | known
         for element in section.findall("default"):
             inner = element.get("class")

@@ -37,12 +37,13 @@ def by_quaternion(q: Float[np.ndarray, "4"]) -> Matrix:
 
 
 def onto_axis(direction: Vector) -> Matrix:
-    """The shortest rotation that takes z to a direction."""
+    """The shortest rotation that takes z to a direction k: `1 + [v]x + (1 - c)/s^2 [v]x [v]x` with v = z x k, s = |v|, c = z.k; half a turn about x to -z."""
     k = direction / np.linalg.norm(direction)
     v = np.cross([0.0, 0.0, 1.0], k)
-    if k[2] < -1 + 1e-12:
+    if k[2] < 0 and np.linalg.norm(v) < 1e-10:
         return np.diag([1.0, -1.0, -1.0])
-    return np.eye(3) + cross_matrix(v) + cross_matrix(v) @ cross_matrix(v) / (1 + k[2])
+    factor = 1 / (1 + k[2]) if k[2] > 0 else (1 - k[2]) / (v @ v)
+    return np.eye(3) + cross_matrix(v) + factor * cross_matrix(v) @ cross_matrix(v)
 
 
 def combined(masses: list[Mass]) -> Mass:

@@ -147,12 +147,16 @@ class _Reader:
         for end in (name, leader):
             if end not in names:
                 raise self.file.fault(f"`mimic` of joint `{name}`: `{end}` is no joint of one coordinate; {nearest(end, names)}")
+        if leader == name:
+            raise self.file.fault(f"joint `{name}` mimics itself; expected another joint")
         factor = self.file.number(mimic.get("multiplier"), f"multiplier of joint `{name}`", 1.0)
         return Follower(name, leader, factor, self.file.number(mimic.get("offset"), f"offset of joint `{name}`", 0.0))
 
     def _origin(self, element: Element, what: str) -> tuple[Vector, Matrix]:
         origin = element.find("origin")
         xyz, rpy = (None, None) if origin is None else (origin.get("xyz"), origin.get("rpy"))
+        for word in () if origin is None else set(origin.attrib) - {"xyz", "rpy"}:
+            self.file.refuse(word, f"`{word}` of the origin of {what}", "state the rotation by `rpy`")
         zero = np.zeros(3)
         return self.file.numbers(xyz, 3, f"xyz of {what}", zero), by_roll_pitch_yaw(self.file.numbers(rpy, 3, f"rpy of {what}", zero))
 

@@ -19,7 +19,7 @@ from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.inputs_in_rows import check_inputs_in_rows
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
-from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted, takes_even_steps
+from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted
 from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method, as_solver
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import nan_is_a_mark
@@ -178,7 +178,7 @@ def _set_up(
         saveat = None if saveat is None else _checked_saveat(saveat)
         integrator = diffrax_steps.Diffrax(as_solver(solver), stepsize_controller, adjoint, saveat, **static)
     tolerances = tuple(as_array(x, start.q.dtype) for x in (rtol, atol))  # arrays: another tolerance is no other program
-    first_step = _first_step(solver, dt0, t0, t1)  # diffrax's own guess costs two more copies of the vector field to compile
+    first_step = _first_step(dt0, t0, t1)  # diffrax's own guess costs two more copies of the vector field to compile
     setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, integrator)
     if backend == "native" and (reason := setup.reason_against_machine_code):
         raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
@@ -187,10 +187,10 @@ def _set_up(
     return setup
 
 
-def _first_step(solver, dt0, t0, t1):
+def _first_step(dt0, t0, t1):
     if dt0 is None:
         return 1e-4 * (t1 - t0)
-    return jnp.abs(dt0) * jnp.sign(t1 - t0) if takes_even_steps(solver) else jnp.asarray(dt0, jnp.result_type(t0))
+    return jnp.abs(dt0) * jnp.sign(t1 - t0)  # its length counts: the span says which way
 
 
 def _checked_saveat(saveat: "diffrax.SaveAt") -> "diffrax.SaveAt":
