@@ -12,6 +12,7 @@ where the rows or rates depend on time or are not homogeneous; its dimension is 
 Source: Wang and Pao (2003), section II; for the growth vector A. M. Vershik and V. Ya. Gershkovich, Dynamical Systems VII (1994).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -24,7 +25,7 @@ from jourdain_jax.scene.scene import Scene
 
 INTEGRABLE = 1e-9  # size of dw on the velocities that w admits, relative to the derivatives of w
 STEP = {"float64": 0.02, "float32": 0.1}  # of the differences, along unit directions
-BATCH = 32  # points evaluated together
+BATCH = 256  # points evaluated together
 
 
 @dataclass(frozen=True)
@@ -82,13 +83,14 @@ def _frobenius_violation(w: np.ndarray, derivative: np.ndarray, frame: np.ndarra
 
 def _forms_at(rows: RowsOverStates, x: np.ndarray, u: np.ndarray):
     """Forms over (t, q), derivatives (component, direction), a frame of the possible velocities, and which rows are nonlinear."""
-    here, along = rows(x, u, [np.tile(e, (len(x), 1)) for e in np.eye(x.shape[1])])
-    other, _ = rows(x, -0.7 * u[:, ::-1], [])
+    here, along = rows(x, u)
+    other, _ = rows(x, -0.7 * u[:, ::-1])
     inverse = np.linalg.pinv(here.N, rcond=1e-12)
     alpha = here.A @ inverse
     forms = np.concatenate([(here.d - _times(alpha, here.nu))[:, :, None], alpha], axis=2)
     derivatives = np.empty((*forms.shape, x.shape[1]))
-    for k, change in enumerate(along):
+    for k, e in enumerate(np.eye(x.shape[1])):
+        change = along(np.tile(e, (len(x), 1)))
         dalpha = change.A @ inverse + here.A @ _derivative_of_inverse(here.N, inverse, change.N)
         derivatives[:, :, 0, k] = change.d - _times(dalpha, here.nu) - _times(alpha, change.nu)
         derivatives[:, :, 1:, k] = dalpha
@@ -172,16 +174,24 @@ def _brackets(fields: "_Fields", x: np.ndarray, parts: np.ndarray) -> tuple[np.n
 
     `x` has shape (brackets, coordinates), `parts` (brackets, fields in each, generators): the coefficients of X, Y, ...
     """
-    here, _ = fields(x, np.zeros_like(x))
+    if len(x) > BATCH:
+        pieces = [_brackets(fields, x[i : i + BATCH], parts[i : i + BATCH]) for i in range(0, len(x), BATCH)]
+        values, sizes = zip(*pieces, strict=True)
+        return np.concatenate(values), np.concatenate(sizes)
+    return _brackets_of(fields, x, *fields(x), parts)
+
+
+def _brackets_of(fields: "_Fields", x: np.ndarray, here: np.ndarray, along: Callable, parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As `_brackets`, from the generators at these points and their derivatives `along` directions."""
     first = np.einsum("bng,bg->bn", here, parts[:, 0])
     if parts.shape[1] == 1:
         return first, np.abs(first).max(axis=1)
-    rest, _ = _brackets(fields, x, parts[:, 1:])
+    rest, _ = _brackets_of(fields, x, here, along, parts[:, 1:])
     if parts.shape[1] == 2:
-        along_first = np.einsum("bng,bg->bn", fields(x, first)[1], parts[:, 1])
+        along_first = np.einsum("bng,bg->bn", along(first), parts[:, 1])
     else:
         along_first = _differences(lambda x, parts: _brackets(fields, x, parts)[0], x, first, parts[:, 1:])
-    along_rest = np.einsum("bng,bg->bn", fields(x, rest)[1], parts[:, 0])
+    along_rest = np.einsum("bng,bg->bn", along(rest), parts[:, 0])
     # [X, Y] = DY X - DX Y
     return along_first - along_rest, np.abs(along_first).max(axis=1) + np.abs(along_rest).max(axis=1)
 
@@ -207,36 +217,37 @@ class _Fields:
         self.independent = list(independent)
         self.dependent = [i for i in range(len(scene.speed_names)) if i not in independent]
 
-    def __call__(self, x: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Values and derivatives along `direction` at many points."""
-        if not self.with_time:
-            x, direction = (np.pad(a, ((0, 0), (1, 0))) for a in (x, direction))
-        parts = [self._some(x[i : i + BATCH], direction[i : i + BATCH]) for i in range(0, len(x), BATCH)]
-        return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
-
-    def _some(self, x, direction) -> tuple[np.ndarray, np.ndarray]:
-        here, (change,) = self.rows(x, np.tile(self.u, (len(x), 1)), [direction])
+    def __call__(self, x: np.ndarray) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+        """Values at many points, and derivatives as a function of one direction for each."""
+        padded = lambda a: a if self.with_time else np.pad(a, ((0, 0), (1, 0)))  # noqa: E731
+        here, change_along = self.rows(padded(x), np.tile(self.u, (len(x), 1)))
         length = np.linalg.norm(here.A, axis=2, keepdims=True)
         scale = 1 / np.where(length > 0, length, 1.0)
-        A, d, dA, dd = scale * here.A, scale[..., 0] * here.d, scale * change.A, scale[..., 0] * change.d
+        A, d = scale * here.A, scale[..., 0] * here.d
         # A (C, c) = (0, -d);  A dC = -dA C,  A dc = -dA c - dd, in the dependent speeds only
-        C, dC = (np.zeros((len(x), A.shape[2], 1 + len(self.independent))) for _ in range(2))
+        C = np.zeros((len(x), A.shape[2], 1 + len(self.independent)))
         C[:, self.independent, np.arange(1, 1 + len(self.independent))] = 1.0
-        right = -A @ C
-        right[:, :, 0] -= d
-        C[:, self.dependent] = self._solved(A, right)
-        right = -dA @ C
-        right[:, :, 0] -= dd
-        dC[:, self.dependent] = self._solved(A, right)
-        X, dX = here.N @ C, change.N @ C + here.N @ dC
-        if not self.with_time:
-            return X[:, :, 1:], dX[:, :, 1:]
-        X[:, :, 0], dX[:, :, 0] = X[:, :, 0] + here.nu, dX[:, :, 0] + change.nu
-        X, dX = (np.pad(a, ((0, 0), (1, 0), (0, 0))) for a in (X, dX))
-        X[:, 0, 0] = 1.0
-        return X, dX
+        C[:, self.dependent] = self._solved(A, -A @ C, d)
 
-    def _solved(self, A, right) -> np.ndarray:
-        """`A_z^-1 right`."""
+        def along(direction: np.ndarray) -> np.ndarray:
+            change = change_along(padded(direction))
+            dA, dd, dC = scale * change.A, scale[..., 0] * change.d, np.zeros_like(C)
+            dC[:, self.dependent] = self._solved(A, -dA @ C, dd)
+            return self._columns(change.N @ C + here.N @ dC, change.nu, 0.0)
+
+        return self._columns(here.N @ C, here.nu, 1.0), along
+
+    def _columns(self, X: np.ndarray, nu: np.ndarray, time: float) -> np.ndarray:
+        """Columns over (t, q) with `(time, X_0)` first where time counts, over q where not."""
+        if not self.with_time:
+            return X[:, :, 1:]
+        X[:, :, 0] += nu
+        X = np.pad(X, ((0, 0), (1, 0), (0, 0)))
+        X[:, 0, 0] = time
+        return X
+
+    def _solved(self, A, right, drift) -> np.ndarray:
+        """`A_z^-1 (right - (drift, 0, ...))`."""
+        right[:, :, 0] -= drift
         A_z = A[:, :, self.dependent]
         return np.linalg.solve(A_z, right) if A_z.shape[1] == A_z.shape[2] else np.linalg.pinv(A_z, rcond=1e-12) @ right

@@ -5,6 +5,7 @@
 From the scene's scalar graph, on which derivatives are sparse: nothing is compiled for it.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,22 +41,23 @@ class RowsOverStates:
         changes = jacobian(g, self.values, variables)
         self.changes = [(i, variables.index(n), node) for i, row in enumerate(changes) for n, node in row.items()]
 
-    def __call__(self, x: np.ndarray, u: np.ndarray, directions: list[np.ndarray]) -> tuple[LinearRows, list[LinearRows]]:
-        """Values at the points, taken at the speeds u (which matter where rows are nonlinear in them), and derivatives along each of the directions.
+    def __call__(self, x: np.ndarray, u: np.ndarray) -> tuple[LinearRows, Callable[[np.ndarray], LinearRows]]:
+        """Values at the points, taken at the speeds u (which matter where rows are nonlinear in them), and derivatives as a function of directions.
 
-        `x`, `u` and each direction have a leading axis of points.
+        `x`, `u` and what that function takes have a leading axis of points.
         """
         named = named_values(self.scene, x[:, 0], x[:, 1:], u, np.zeros((len(x), len(self.scene.inputs))))
         probes = Probes(self.traced.graph, {name: np.asarray(value, float) for name, value in named.items()})
         found = probes([*self.values, *(node for _, _, node in self.changes)])
         value, change = found[: len(self.values)], found[len(self.values) :]
-        here, along = self._arranged(value, u), []
         place, variable = (np.array([c[k] for c in self.changes], int) for k in (0, 1))
-        for direction in directions:
+
+        def along(direction: np.ndarray) -> LinearRows:
             rate = np.zeros_like(value)
             np.add.at(rate, place, change * direction.T[variable])
-            along.append(self._arranged(rate, u))
-        return here, along
+            return self._arranged(rate, u)
+
+        return self._arranged(value, u), along
 
     def _arranged(self, flat: np.ndarray, u: np.ndarray) -> LinearRows:
         """The rows and coordinate rates in values with a last axis of points."""

@@ -8,6 +8,9 @@ coordinates: the first form with the privileged speeds changed to (pdot, the oth
 Source: Wang and Pao (2003), eqs. (25)-(31), (41); D. L. Peterson, G. Gede and M. Hubbard, Multibody System Dynamics 33 (2015) 143.
 """
 
+from collections.abc import Callable
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,12 +21,15 @@ from jourdain_jax.analysis.table import linearization_text
 from jourdain_jax.analysis.tangent import Flow, carried_along, dependent_coordinates, eliminated, flow_of, others, perturbations, privileged_speeds
 from jourdain_jax.calculus.reals import Numbers
 from jourdain_jax.motion.arguments import as_state
+from jourdain_jax.motion.quick_compilation import RUN_SELDOM, quickly_compiled
 from jourdain_jax.motion.start import State
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
 from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
+
+_compiled = partial(quickly_compiled, options=RUN_SELDOM)  # of a bicycle in 2.3 s of processor time, not in 11.4; run as quickly
 
 
 class Modes(eqx.Module):
@@ -55,7 +61,7 @@ class Linearization(Printed, eqx.Module):
 
     def eigenvalues(self) -> Complex[Array, "modes"]:
         """Roots of `det(M s^2 + C s + K) = 0`, 1/s, by ascending real part. Differentiable where distinct."""
-        return _ascending(jnp.linalg.eigvals(self._companion()))
+        return _roots(self, Linearization._companion)
 
     def modes(self) -> Modes:
         """Eigenvalues, as `eigenvalues` gives them, with the shapes of the modes in the named coordinates (no derivative)."""
@@ -71,7 +77,7 @@ class Linearization(Printed, eqx.Module):
         Ignorable coordinates, and speeds that a steady motion may have at will, add zeros, often in Jordan blocks: a root of
         round-off then stands in their place. `eigenvalues` is free of them.
         """
-        return _ascending(jnp.linalg.eigvals(self.A))
+        return _roots(self, _state_matrix)
 
     def _companion(self) -> Float[Array, "modes modes"]:
         k = len(self.coordinates)
@@ -120,7 +126,7 @@ def linearize(
     return _linearize(scene, state, f, y, tuple(dependent_s.tolist()), coordinates)
 
 
-@eqx.filter_jit
+@_compiled
 def _linearize(scene: Scene, state: State, f, y: tuple[int, ...], dependent: tuple[int, ...], coordinates: tuple[str, ...] | None) -> Linearization:
     perturbed = perturbations(scene, state.q)
     dependent_s = np.array(dependent, int)
@@ -193,7 +199,14 @@ def _relative(neglected, kept):
     return jnp.max(jnp.abs(neglected), initial=0.0) / jnp.where(size > 0, size, 1.0)
 
 
-def _ascending(values: Complex[Array, "modes"]) -> Complex[Array, "modes"]:
+def _state_matrix(found: Linearization) -> Float[Array, "states states"]:
+    return found.A
+
+
+@_compiled
+def _roots(found: Linearization, matrix: Callable) -> Complex[Array, "modes"]:
+    """Eigenvalues of a matrix of a linearization, by ascending real part."""
+    values = jnp.linalg.eigvals(matrix(found))
     return values[jnp.lexsort((values.imag, values.real))]
 
 

@@ -10,12 +10,11 @@ from jaxtyping import Array, Float, Int
 
 from jourdain_jax.build.structure import structure_of, usual_rows
 from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
-from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.dynamics.reactions import ContactForce
-from jourdain_jax.eager.eager import eval_numpy
+from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.motion.inputs import Constant, Sampled
 from jourdain_jax.motion.marks import with_nan_as_a_mark
-from jourdain_jax.motion.trajectories.over_times import Checked, Checks, Record, map_over_times, uncompiled_over_times
+from jourdain_jax.motion.trajectories.over_times import Checked, Checks, Record, map_over_times
 from jourdain_jax.motion.trajectories.results import FALLBACKS
 from jourdain_jax.motion.vector_fields.choice import reason_for_matrices
 
@@ -78,18 +77,16 @@ def diagnose(trajectory: Record) -> Diagnostics:
     if not hasattr(trajectory, "scene"):
         raise ValueError(f"`diagnose` was given a {type(trajectory).__name__}, expected a `Trajectory`; of a rollout take one lane, as `rollout.lane(0)`")
     checks = Checks(jax.tree.map(jnp.asarray, usual_rows(trajectory.scene)))
-    if trajectory.ts.shape[0] <= FEW_TIMES and not is_traced(trajectory):
-        return jax.tree.map(jnp.asarray, _uncompiled(trajectory, uncompiled_over_times(checks, trajectory, by_inputs=True)))
     return _diagnosed(trajectory, map_over_times(checks, trajectory, by_inputs=True))
 
 
-FEW_TIMES = 1000
 COARSE = 1e-3  # of a step: a clock that resolves less rounds times visibly
 VIOLATED = 1e-4  # residual of a row, relative to the state
 DRIFTED = 1e-2  # of the energy that moves
 _ROUND_OFF = 1e-6  # of the whole energy: where less than that moves, as at rest, nothing is said of its drift
 
 
+@eager_if_concrete
 def _diagnosed(trajectory: Record, found: Checked) -> Diagnostics:
     energy = Energies(*found.energies, trajectory.work)
     geometric, rows = found.residuals
@@ -105,9 +102,6 @@ def _diagnosed(trajectory: Record, found: Checked) -> Diagnostics:
         invariant_drifts={name: _span(values) for name, values in found.invariants.items()},
         contacts={name: _extremes(force) for name, force in found.contacts.items()},
     )
-
-
-_uncompiled = eval_numpy(_diagnosed)
 
 
 def _extremes(force: ContactForce) -> ContactExtremes:

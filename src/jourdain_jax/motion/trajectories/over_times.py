@@ -17,6 +17,7 @@ from jourdain_jax.dynamics.reactions import ContactForce, contact_forces, row_re
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.projection import closure_residual
+from jourdain_jax.equations.reductions import NullSpaceSVD
 from jourdain_jax.equations.rows import UsualRows, velocity_residual
 from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.motion.input_programs import for_programs
@@ -25,6 +26,7 @@ from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import invariants_of
 
+FEW_TIMES = 1000  # of one motion that is known: NumPy is done before a program is compiled (contact forces of a bicycle at 101 times: 1 s, not 7)
 MOST_ENTRIES = 4_000_000  # of square matrices of the coordinates, at once: of 200 trailers at 201 times the derivatives of all poses took more than 23 GB
 
 
@@ -64,9 +66,12 @@ def map_over_times(f, record: Record, by_inputs: bool = False):
 
     `by_inputs`: f needs the rates of the inputs, where rows depend on some that change. Of a batch of motions: with its axes of lanes first.
     """
+    by_inputs, known = by_inputs and _needs_rates(record), not is_traced((f, record))
+    if known and record.q.ndim == 2 and len(record.ts) <= FEW_TIMES:
+        return jax.tree.map(jnp.asarray, _on_numpy(f, record, by_inputs))
     mapped = _compiled(record.inputs.programs)
-    whole = jax.config.jax_debug_nans and not is_traced(record) and bool(jnp.all(jnp.isfinite(record.q)))  # then NaN is no mark
-    return (mapped if whole else with_nan_as_a_mark(mapped))(f, record, by_inputs and _needs_rates(record))
+    whole = jax.config.jax_debug_nans and known and bool(jnp.all(jnp.isfinite(record.q)))  # then NaN is no mark
+    return (mapped if whole else with_nan_as_a_mark(mapped))(f, record, by_inputs)
 
 
 def _mapped(f, record: Record, by_inputs: bool):
@@ -97,11 +102,9 @@ def _largest_block(record: Record) -> int:
     return max(1, MOST_ENTRIES // record.q.shape[-1] ** 2)
 
 
-@with_usual_promotion
-def uncompiled_over_times(f, record: Record, by_inputs: bool = False):
-    """As `map_over_times`, of one motion, on NumPy: compiling a function takes longer than running it once."""
+def _on_numpy(f, record: Record, by_inputs: bool):
     by_time, size = (record.ts, record.q, record.u), _largest_block(record)
-    blocks = [_uncompiled(f, record, by_inputs and _needs_rates(record), lanes=[x[k : k + size] for x in by_time]) for k in range(0, len(record.ts), size)]
+    blocks = [_uncompiled(f, record, by_inputs, lanes=[x[k : k + size] for x in by_time]) for k in range(0, len(record.ts), size)]
     return jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
 
 
@@ -135,7 +138,7 @@ class AccelerationsBySvd(eqx.Module):
     usual: UsualRows | None = None
 
     def __call__(self, scene, t, q, u, inputs) -> Accelerations:
-        return accelerations(scene, t, q, u, inputs, reduction="svd", usual=self.usual)
+        return accelerations(scene, t, q, u, inputs, reduction=NullSpaceSVD(), usual=self.usual)
 
 
 def reactions(scene, t, q, u, inputs):
