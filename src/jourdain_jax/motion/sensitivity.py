@@ -149,8 +149,8 @@ def warns_of_jumps(setup: Setup) -> Setup:
     def tell():
         if jump := jump_of_loads(known):
             text = (
-                f"derivatives of motions of `{type(known).__name__}` that meet a jump of its loads are wrong, for they leave out how the time of the jump moves: "
-                f"{jump}. Let it change within a short time or length, as by `jnp.tanh`, or end the motion there by an event and start another; the motions "
+                f"derivatives of motions of `{type(known).__name__}` that meet a jump of loads are wrong: they leave out how the time of the jump moves. "
+                f"Here {jump}. Let it change within a short time or length, as by `jnp.tanh`, or end the motion there by an event and start another; the motions "
                 "themselves are right"
             )
             warnings.warn(text, SensitivityWarning, stacklevel=1)  # always in this place: Python shows it once
