@@ -53,6 +53,8 @@ KINKS = {
     "Hunt and Crossley": lambda m, p: 1e5 * jnp.maximum(p - m.q.y, 0.0) ** 1.5 * (1.0 - 0.3 * m.u.y_rate),
     "equal pieces": lambda m, p: jnp.where(m.q.x > p, m.q.x**2, p**2 + 2.0 * p * (m.q.x - p)),
     "a guarded quotient": lambda m, p: jnp.where(m.q.x == 0.0, 1.0, jnp.sin(m.q.x) / jnp.where(m.q.x == 0.0, 1.0, m.q.x)),
+    "a root of what may be negative": lambda m, p: jnp.sqrt(m.q.y) + jnp.abs(m.q.x),
+    "nothing but NaN": lambda m, p: jnp.sqrt(-1.0 - jnp.abs(m.q.y)),
     "a pole": lambda m, p: p / m.q.x + jnp.abs(m.q.y),
     "a table that slides": lambda m, p: jnp.interp(m.t, TS + p, jnp.cos(TS)),
     "a time that no parameter moves": lambda m, p: p * jnp.where(m.t > 0.3, 1.0, 0.0),
@@ -157,3 +159,15 @@ def test_a_fit_across_a_jump_warns():
     y = np.asarray(jj.simulate(scene, {"y_rate": 1.0}, ts=ts)["y"])
     data = jj.Experiment(ts, {"y": y}, 1e-3, start={"y_rate": 1.0})
     assert warned(lambda: jj.fit(scene.replace(size=0.25), data, ("size",)).scene.size)
+
+
+@jax.custom_jvp
+def sine_by_a_callback(x):
+    return jax.pure_callback(np.sin, jax.ShapeDtypeStruct((), x.dtype), x)
+
+
+sine_by_a_callback.defjvp(lambda x, dx: (sine_by_a_callback(*x), jnp.cos(x[0]) * dx[0]))
+
+
+def test_callbacks_without_a_form_for_lanes_are_not_looked_at():
+    assert jump_of_loads(Pushed(push=lambda m, p: jnp.sign(m.u.y_rate) - p * sine_by_a_callback(m.q.y))) == ""

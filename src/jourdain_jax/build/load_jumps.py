@@ -3,7 +3,7 @@
     y' = f_1 before and f_2 after the time s(p) of the jump:     dy/dp = (what JAX finds) + (f_1 - f_2) ds/dp
 
 What is decided by a comparison or an index on the way to the loads is looked at along lines in t, and across coordinates, speeds and inputs. A branch that
-these lines do not meet, and a jump without a branch (x / sqrt(x^2)), are not seen.
+these lines do not meet, a jump without a branch (x / sqrt(x^2)), and loads by a callback that has no form for lanes, are not seen.
 """
 
 import jax
@@ -16,6 +16,7 @@ from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.smoothness import across, in_time
 from jourdain_jax.build.structure import structure_whatever_its_faults
 from jourdain_jax.build.trace import jaxpr_of_scene
+from jourdain_jax.calculus.collecting import without_collecting
 from jourdain_jax.calculus.jumps import jumps
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import inertias_of, motion_at
@@ -49,20 +50,28 @@ def jump_of_loads(scene: Scene) -> str:
     q = structure_whatever_its_faults(scene).coordinates if in_parameters or in_state else np.zeros((0, 0))
     if not q.size:
         return ""
+    with without_collecting(), np.errstate(all="ignore"):  # what is no number on a line does not count there
+        try:
+            return _first_jump(scene, q, in_parameters, in_state)
+        except NotImplementedError:  # callbacks that take one state at a time
+            return ""
+
+
+def _first_jump(scene: Scene, q: np.ndarray, in_parameters: bool, in_state: bool) -> str:
     generator = np.random.default_rng(7)
     low, high = speed_bounds(scene)
     inputs = generator.uniform(-1.0, 1.0, (STATES, len(scene.inputs)))
     states = np.column_stack([q[np.arange(STATES) % len(q)], generator.uniform(low, high, (STATES, len(low))), inputs])
     for looked_at, where, (a, b, _) in ((in_parameters, "at t = {:.3g} s", in_time(scene, states)), (in_state, "as the state changes", across(states))):
-        if looked_at and (found := _first_jump(scene, a, b)):
+        if looked_at and (found := _jump_between(scene, a, b)):
             k, t = found
             return f"{_names(scene)[k]} jumps {where.format(t)}"
     return ""
 
 
-def _first_jump(scene: Scene, a: np.ndarray, b: np.ndarray) -> tuple[int, float] | None:
+def _jump_between(scene: Scene, a: np.ndarray, b: np.ndarray) -> tuple[int, float] | None:
     """The number of an entry that jumps between points `a` and `b`, and when."""
-    usual = np.nanmax(np.abs(_loads(scene, a)), axis=(0, 1))
+    usual = np.nanmax(np.abs(_loads(scene, a)), axis=(0, 1), initial=0.0)
     for k, before, behind in jumps(lambda points: _loads(scene, points), a, b):
         difference = np.diff(_loads(scene, np.stack([before, behind]))[:, 0, k])
         if abs(difference) < POLE * usual[k]:

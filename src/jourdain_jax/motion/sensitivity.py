@@ -150,7 +150,7 @@ def warns_of_jumps(setup: Setup) -> Setup:
         if jump := jump_of_loads(known):
             text = (
                 f"derivatives of motions of `{type(known).__name__}` that meet a jump of loads are wrong: they leave out how the time of the jump moves. "
-                f"Here {jump}. Let it change within a short time or length, as by `jnp.tanh`, or end the motion there by an event and start another; the motions "
+                f"Here {jump}. Let it change within a short time or length, as by `jnp.tanh`, or end the motion there by an event and start another; motions "
                 "themselves are right"
             )
             warnings.warn(text, SensitivityWarning, stacklevel=1)  # always in this place: Python shows it once
