@@ -56,6 +56,28 @@ def test_every_way_of_integrating_watches_its_pivots(options):
     assert np.all(asked.result == results.SINGULAR_PARTITION)
 
 
+class BladeTwice(jj.Scene):
+    """A blade whose row is stated twice; its speed along x determines that along y until it heads along y."""
+
+    coordinates = jj.coordinates("x y heading")
+    privileged = ("x_rate", "heading_rate")
+
+    def bodies(self, t, q):
+        return {"blade": jj.RigidBody(1.0, 0.4 * jnp.ones(3), jnp.stack([q.x, q.y, 0.0 * q.x]), jj.rot_z(q.heading))}
+
+    def velocity_constraints(self, motion):
+        blade = motion["blade"]
+        row = jj.knife_edge(blade, blade.position, blade.orientation[:, 1])
+        return {"once": row, "twice": 2.0 * row}
+
+
+def test_rows_stated_twice_hide_no_singular_partition():
+    options = {"ts": [0.5, 2.0], "formulation": jj.Formulation("minimal"), "backend": "dense", "rtol": 1e-6, "atol": 1e-6}
+    motion = jj.simulate(BladeTwice(), {"x_rate": 1.0, "heading_rate": 1.0}, **options)
+    np.testing.assert_allclose(motion.q[0], [np.sin(0.5), 1.0 - np.cos(0.5), 0.5], rtol=1e-5)  # a circle, heading along y at pi/2
+    assert int(motion.result) == results.SINGULAR_PARTITION
+
+
 def _parallelograms(count: int, **options):
     w, a_0, ts = np.linspace(0.5, 8.0, count), 0.7, np.linspace(0.0, 3.0, 201)
     starts = {"a": np.full(count, a_0), "b": np.zeros(count), "c": np.full(count, a_0), "a_rate": w, "b_rate": 0 * w, "c_rate": w}

@@ -29,8 +29,9 @@ def dense_accelerations(scene, t, q, u):
 
 @eval_numpy
 def privileged_accelerations(scene, t, q, y):
-    independent = structure_of(PlanarRobot(turned=0.4)).independent
-    return accelerations_of(scene, minimal_kinematics(scene, independent, t, q, y), t, q)[1].udot[jnp.array(independent)]
+    structure = structure_of(PlanarRobot(turned=0.4))
+    known = minimal_kinematics(scene, structure.independent, structure.kept_rows, t, q, y)
+    return accelerations_of(scene, known, t, q)[1].udot[jnp.array(structure.independent)]
 
 
 def at_states(scene, program, t, q, u, nodes):

@@ -108,14 +108,14 @@ SMOOTH_ENOUGH = ["table", "callback with a rule", *(pytest.param(name, marks=pyt
 
 def rates_of(scene):
     """The rates of a state (q, y) by the program and by the dense path, for scenes of this class."""
-    program = jj.lower(scene)
+    program, rows = jj.lower(scene), jj.structure_of(scene).kept_rows
 
     def by_program(scene, q, y):
         qdot, ydot, _ = program.rates(program.fixed_values(scene), jnp.zeros(()), tuple(q), tuple(y), jnp.zeros(0))
         return jnp.stack([*qdot, *ydot])
 
     def dense(scene, q, y):
-        known = minimal_kinematics(scene, program.independent, jnp.zeros(()), q, y)
+        known = minimal_kinematics(scene, program.independent, rows, jnp.zeros(()), q, y)
         motion, found = accelerations_of(scene, known, jnp.zeros(()), q)
         return jnp.concatenate([motion.qdot.array, found.udot[np.array(program.independent)]])
 

@@ -239,6 +239,12 @@ def test_workers_share_threads_also_where_a_process_cannot_choose_its_cores(monk
     assert environ == {"JOURDAIN_JAX_THREADS": "1"}
 
 
+def test_a_number_of_threads_that_is_none_is_named(monkeypatch):
+    monkeypatch.setenv("JOURDAIN_JAX_THREADS", "all")
+    with pytest.raises(ValueError, match="JOURDAIN_JAX_THREADS is 'all', expected a number of threads"):
+        host.threads.__wrapped__()
+
+
 def test_a_bound_on_memory_is_refused_where_there_is_no_library_of_c_to_ask(monkeypatch):
     monkeypatch.setattr(memory, "os", SimpleNamespace(name="nt"))
     monkeypatch.setattr(memory.ctypes, "CDLL", _no_library)

@@ -81,5 +81,6 @@ def test_numbers_of_extended_precision_are_rounded_and_complex_ones_named():
     lanes = jj.rollout(Spring(), {"x": wide[:1].repeat(2)}, parameters={"stiffness": wide}, ts=wide - 1)
     np.testing.assert_allclose(lanes["x"][:, -1], np.cos([3.0, 6.0]), atol=1e-6)
     assert jj.Sampled(wide, wide)(2.0) == 2.0
+    assert all(scene.stiffness.dtype == np.float64 for scene in (Spring(stiffness=wide[1]), Spring().replace(stiffness=np.array(4.0, np.longdouble))))
     with pytest.raises(ValueError, match="`ts` of `Sampled` is of type complex256, expected real numbers"):
         jj.Sampled(wide.astype(np.clongdouble), wide)

@@ -11,21 +11,21 @@ from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.dynamics.reactions import contact_forces
-from jourdain_jax.equations.minimal import speeds_from_privileged
+from jourdain_jax.equations.minimal import minimal_kinematics
 from jourdain_jax.equations.projection import project_positions
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 
 BICYCLE = WhippleBicycle()
 NAMES = WhippleBicycle.coordinates.names.entries
 LEAN, STEER = NAMES.index("lean"), NAMES.index("steer")
-INDEPENDENT = jj.structure_of(BICYCLE).independent
+STRUCTURE = jj.structure_of(BICYCLE)
 
 
 def state(bicycle, lean, steer, lean_rate, steer_rate, speed):
     """The admissible state with the front wheel rolling at `speed`; the pitch follows from the front contact."""
     q = project_positions(bicycle, 0.0, bicycle.named(lean=lean, steer=steer)[0], free=jnp.array([n == "pitch" for n in NAMES]))
     y = jnp.stack([lean_rate, steer_rate, speed / bicycle.rF])
-    return q, speeds_from_privileged(bicycle, INDEPENDENT, 0.0, q, y)
+    return q, minimal_kinematics(bicycle, STRUCTURE.independent, STRUCTURE.kept_rows, 0.0, q, y).u
 
 
 @eqx.filter_jit

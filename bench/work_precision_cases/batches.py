@@ -9,7 +9,7 @@ import numpy as np
 from baselines import heyoka_disc, heyoka_lowered
 
 import jourdain_jax as jj
-from jourdain_jax.equations.minimal import speeds_from_privileged
+from jourdain_jax.equations.minimal import minimal_kinematics
 from jourdain_jax.motion.integrators.taylor import order_for
 from work_precision_cases import peer_c, peer_diffrax, peer_heyoka
 from work_precision_cases import record as records
@@ -35,11 +35,11 @@ def starts(problem: Problem, lanes: int) -> np.ndarray:
 def by_rollout(problem: Problem, solver=None) -> Callable:
     """`rollout` under `jit`, by Dopri8 unless said; the consistent starts are given."""
     scene, independent, n = problem.scene, problem.independent, len(problem.scene.coordinate_names.entries)
-    known = problem.state
+    known, rows = problem.state, jj.structure_of(scene).kept_rows
 
     @jax.jit
     def states(y):
-        u = jax.vmap(lambda y: speeds_from_privileged(scene, independent, jnp.zeros(()), y[:n], y[n:]))(y)
+        u = jax.vmap(lambda y: minimal_kinematics(scene, independent, rows, jnp.zeros(()), y[:n], y[n:]).u)(y)
         same = jax.tree.map(lambda x: jnp.broadcast_to(0.0 * x, (len(y), *jnp.shape(x))), known)
         return jj.State(same.t, y[:, :n], u, same.moved_q, same.moved_u, same.residual, known.names, same.guess)
 

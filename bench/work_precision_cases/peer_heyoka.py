@@ -11,7 +11,7 @@ from baselines import heyoka_disc, heyoka_lowered
 from baselines.heyoka_lowered import MISSING, heyoka
 
 import jourdain_jax as jj
-from jourdain_jax.equations.minimal import speeds_from_privileged
+from jourdain_jax.equations.minimal import minimal_kinematics
 from work_precision_cases.curve import Curve, Prepared, Solved
 from work_precision_cases.problem import Problem
 
@@ -57,8 +57,9 @@ def extended(problem: Problem) -> dict[str, float]:
     found = dict(zip(names, solver.state.astype(float), strict=True))
     scene, independent = problem.scene, jj.lower(problem.scene).independent
     q, v = (jnp.array([found[name] for name in which]) for which in (names[: len(names) - len(independent)], names[len(names) - len(independent) :]))
-    u = speeds_from_privileged(scene, tuple(independent), jnp.asarray(problem.end), q, v) if len(independent) < len(scene.speed_names) else v
-    return dict(zip(scene.speed_names.entries, np.asarray(u), strict=True)) | found
+    if len(independent) < len(scene.speed_names):
+        v = minimal_kinematics(scene, tuple(independent), jj.structure_of(scene).kept_rows, jnp.asarray(problem.end), q, v).u
+    return dict(zip(scene.speed_names.entries, np.asarray(v), strict=True)) | found
 
 
 def _prepared(problem: Problem, equations: list, start: np.ndarray, minimal: list[int], compact: bool) -> Prepared:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jourdain_jax as jj
-from jourdain_jax.equations.minimal import speeds_from_privileged
+from jourdain_jax.equations.minimal import minimal_kinematics
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,8 @@ class Judge:
 
     def _all_speeds(self, y):
         q = y[: len(self.problem.scene.coordinate_names.entries)]
-        return q, speeds_from_privileged(self.problem.scene, self.problem.independent, jnp.asarray(self.problem.end), q, y[len(q) :])
+        scene, end = self.problem.scene, jnp.asarray(self.problem.end)
+        return q, minimal_kinematics(scene, self.problem.independent, jj.structure_of(scene).kept_rows, end, q, y[len(q) :]).u
 
     def _measured(self, t, q, u):
         scene = self.problem.scene

@@ -42,13 +42,13 @@ def check_smoothness(scene: Scene, q: np.ndarray, u: np.ndarray) -> None:
     if not _may_bend(scene):
         return
     names, velocity_rows = _names(scene), names_of_rows(scene)[len(names_of_position_rows(scene)) :]
-    for k, before, behind in _kinks(scene, u[0], *_in_time(scene, q)):
+    for k, before, behind in _kinks(scene, u[0], *in_time(scene, q)):
         if k < len(names):
             raise ValueError(_said(scene, names[k], f"at t = {behind[0]:.6g} s"))
         if not _sets_in(scene, before[0], behind[0], q[0], u[0]):
             row = velocity_rows[k - len(names)]
             raise ValueError(f"row `{row}` of `{type(scene).__name__}` jumps at t = {behind[0]:.6g} s: {SPEEDS_WOULD_JUMP}")
-    found = [names[k] for k, *_ in _kinks(scene, u[0], *_across(q)) if k < len(names)]
+    found = [names[k] for k, *_ in _kinks(scene, u[0], *across(q)) if k < len(names)]
     for name in dict.fromkeys(found):
         if found.count(name) >= MANY:
             raise ValueError(_said(scene, name, "at several places on its way"))
@@ -97,8 +97,8 @@ def _kinks(scene: Scene, u: np.ndarray, a: np.ndarray, b: np.ndarray, along: np.
     return jumps(lambda points: _along(scene, u, points, along), a, b)
 
 
-def _in_time(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Intervals of time, and their direction: the usual span, and around all numbers in arrays of the scene, which may be knots."""
+def in_time(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Intervals of time at one of some states `q`, and their direction: the usual span, and around all numbers in arrays of the scene, which may be knots."""
     span = float(scene.example_span)
     t = np.linspace(1e-6 * span, span, EVENLY + 1)
     low, high = [t[:-1]], [t[1:]]
@@ -115,8 +115,8 @@ def _in_time(scene: Scene, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nd
     return np.column_stack([low, here]), np.column_stack([high, here]), np.column_stack([np.ones_like(low), np.zeros_like(here)])
 
 
-def _across(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Intervals on lines across the coordinates, at random times, and their directions."""
+def across(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Intervals on lines across the box that holds some states `q`, at random times, and their directions."""
     generator = np.random.default_rng(3)
     ends = generator.uniform(q.min(axis=0), q.max(axis=0), (2, LINES, q.shape[1]))
     points = ends[0] + np.linspace(0.0, 1.0, ACROSS + 1)[:, None, None] * (ends[1] - ends[0])

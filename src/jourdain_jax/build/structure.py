@@ -89,9 +89,14 @@ class Structure:
         return len(self.independent)
 
     @property
+    def kept_rows(self) -> tuple[int, ...]:
+        """Numbers of the rows that are not redundant."""
+        return tuple(s for s, name in enumerate(self.row_names) if name not in self.redundant_rows)
+
+    @property
     def dependent_rows(self) -> bool:
         """Whether rows depend on each other although none may be left out: each is needed somewhere."""
-        return len(self.row_names) - len(self.redundant_rows) > self.rank
+        return len(self.kept_rows) > self.rank
 
     @property
     def rows_may_contradict(self) -> bool:

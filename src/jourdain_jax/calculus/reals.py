@@ -33,12 +33,19 @@ def as_real(x) -> Float[Array, "*shape"]:
 
     TypeError for complex numbers, whose imaginary parts are not dropped, and truth values.
     """
-    array = x if isinstance(x, jax.Array) else jnp.asarray(np.asarray(x, real_type()) if type(x) in (int, float) else x)
+    array = _of_jax(x)
     if jnp.issubdtype(array.dtype, jnp.floating):
         return jnp.asarray(array, array.dtype) if array.weak_type else array
     if not jnp.issubdtype(array.dtype, jnp.integer):
         raise TypeError(f"real numbers are expected, but these are of type {array.dtype}")
     return jnp.asarray(array, real_type())
+
+
+def _of_jax(x) -> Array:
+    """`x` as an array of JAX, which has no extended precision."""
+    if isinstance(x, jax.Array):
+        return x
+    return jnp.asarray(np.asarray(x, real_type()) if type(x) in (int, float) or getattr(x, "dtype", None) == np.longdouble else x)
 
 
 def checked_real(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str = "check how it is put together") -> Array:
@@ -52,12 +59,10 @@ def checked_real(value, what: str, shape: tuple[int, ...] | None = None, *, advi
 
     **Raises** ValueError: no real numbers, or another shape.
     """
-    kind = getattr(value, "dtype", None)
     try:
-        convert = type(value) is float or kind == np.longdouble  # the latter JAX does not have
-        array = value if isinstance(value, jax.Array) else jnp.asarray(np.asarray(value, real_type()) if convert else value)
+        array = _of_jax(value)
     except (TypeError, ValueError):
-        if kind == np.clongdouble:
+        if getattr(value, "dtype", None) == np.clongdouble:
             _check(value, what, shape, advice)
         raise ValueError(f"{what} is {described(value)}, expected real numbers; {advice}") from None
     _check(array, what, shape, advice)

@@ -134,9 +134,10 @@ def _probe(scene: Scene, t, q, u, shifts):
 
 def _quantities(scene: Scene, t, q, u) -> dict[str, Float[Array, "entries"]]:
     """The rates `B y + b`, the privileged accelerations, and what a cyclic coordinate must not appear in (inertial frame)."""
-    chosen = np.array(structure_of(scene).independent, int)
+    structure = structure_of(scene)
+    chosen = np.array(structure.independent, int)
     y = u[chosen]
-    known = minimal_kinematics(scene, tuple(chosen.tolist()), t, q, y)
+    known = minimal_kinematics(scene, structure.independent, structure.kept_rows, t, q, y)
     motion, found = accelerations_of(scene, known, t, q)
     rates = _rates_of(scene, t, q, known)
     C = rates.C
@@ -159,8 +160,9 @@ def _quantities(scene: Scene, t, q, u) -> dict[str, Float[Array, "entries"]]:
 
 def admissible_rates(scene: Scene, t, q, u) -> AdmissibleRates:
     """C, c, B and b at one state of a scene whose rows are affine in the speeds."""
-    independent = structure_of(scene).independent
-    return _rates_of(scene, t, q, minimal_kinematics(scene, independent, t, q, u[jnp.array(independent, jnp.int32)]))
+    structure = structure_of(scene)
+    y = u[jnp.array(structure.independent, jnp.int32)]
+    return _rates_of(scene, t, q, minimal_kinematics(scene, structure.independent, structure.kept_rows, t, q, y))
 
 
 def _rates_of(scene: Scene, t, q, known: MinimalKinematics) -> AdmissibleRates:
@@ -218,8 +220,8 @@ def _groups(droppable: set[int], needs) -> list[list[int]]:
 
 def reduced_accelerations(scene: Scene, t, kept: Float[Array, "kept"], y) -> Float[Array, "freedoms"]:
     """Privileged accelerations of the reduced equations (42) from time, kept coordinates and privileged speeds alone."""
-    independent = structure_of(scene).independent
+    structure = structure_of(scene)
     places = [scene.coordinate_names.index(name, "coordinate") for name in reduced_coordinates(scene).kept]
     q = jnp.asarray(scene.coordinates.reference()).at[jnp.array(places, jnp.int32)].set(kept)  # the dropped ones at the reference
-    known = minimal_kinematics(scene, independent, t, q, y)
-    return accelerations_of(scene, known, t, q)[1].udot[jnp.array(independent, jnp.int32)]
+    known = minimal_kinematics(scene, structure.independent, structure.kept_rows, t, q, y)
+    return accelerations_of(scene, known, t, q)[1].udot[jnp.array(structure.independent, jnp.int32)]

@@ -4,13 +4,14 @@
     udot = C ydot + c'                 from their rates
     C' (M (C ydot + c') + h - Q) = 0   Jourdain's principle for the virtual velocities C dy             (41)
 
-A, C and the partial velocities do not depend on u: they are worked out once, at `u = (y, 0)`, and serve both levels.
+A, C and the partial velocities do not depend on u: they are worked out once, at `u = (y, 0)`, and serve both levels. A holds the rows that are asked for:
+without those that follow from the others A_z is square, and its determinant changes its sign where it is singular.
 Source: Wang and Pao (2003), sections III and IV.
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.equations.instant import Instant, VelocityLevel, derivatives_in_speeds, rates_along_motion
@@ -31,29 +32,20 @@ class MinimalKinematics(eqx.Module):
     split: Partition  # of the scaled rows d A c
     c: Float[Array, "speeds"]
     d: Float[Array, "rows"]
+    rows: tuple[int, ...] = eqx.field(static=True)  # which of the scene's
 
 
-def minimal_kinematics(scene: Scene, independent: tuple[int, ...], t, q, y, inputs=None) -> MinimalKinematics:
-    """`u = C y + c`."""
+def minimal_kinematics(scene: Scene, independent: tuple[int, ...], rows: tuple[int, ...], t, q, y, inputs=None) -> MinimalKinematics:
+    """`u = C y + c`, by the `rows` of these numbers."""
     at_rest = jnp.zeros(len(scene.speed_names), q.dtype).at[jnp.array(independent, jnp.int32)].set(y)
     partial, value, motion = derivatives_in_speeds(scene, t, q, at_rest, inputs)
     weights = inertias_of(motion)
     c = speed_scale(mass_matrix(weights.mass, weights.inertia, partial.bodies.linear, partial.bodies.angular))
-    d = row_scale(partial.rows * c)
-    split = Partition(d[:, None] * partial.rows * c, independent)
+    A, phi = partial.rows[np.array(rows, int)], value.rows[np.array(rows, int)]
+    d = row_scale(A * c)
+    split = Partition(d[:, None] * A * c, independent)
     # A (u - at_rest) = -phi(at_rest), with a difference in the dependent speeds only
-    return MinimalKinematics(at_rest + c * split.particular(-d * value.rows), partial, weights, split, c, d)
-
-
-def speeds_from_privileged(scene: Scene, independent: tuple[int, ...], t, q, y, inputs=None) -> Float[Array, "speeds"]:
-    """All speeds from the independent ones, `u = C y + c`."""
-    return minimal_kinematics(scene, independent, t, q, y, inputs).u
-
-
-def speeds_and_pivot(scene: Scene, independent: tuple[int, ...], t, q, y, inputs=None) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
-    """All speeds, and the signed pivot of the scaled A_z: it passes through zero where these privileged speeds do not serve."""
-    found = minimal_kinematics(scene, independent, t, q, y, inputs)
-    return found.u, Partition(jax.lax.stop_gradient(found.split.A), independent).signed_pivot()
+    return MinimalKinematics(at_rest + c * split.particular(-d * phi), partial, weights, split, c, d, rows)
 
 
 def accelerations_of(scene: Scene, known: MinimalKinematics, t, q, inputs=None) -> tuple[Motion, Reduced]:
@@ -63,5 +55,5 @@ def accelerations_of(scene: Scene, known: MinimalKinematics, t, q, inputs=None) 
     c = known.c
     # in scaled speeds, where definiteness has no units
     M, f = c[:, None] * equations.M * c, c * (equations.Q - equations.h)
-    w, pivot, applicable = appell(M, f, known.split.C, known.split.particular(-known.d * rate.rows), known.split.pivot())
+    w, pivot, applicable = appell(M, f, known.split.C, known.split.particular(-known.d * rate.rows[np.array(known.rows, int)]), known.split.pivot())
     return motion, reduced(c * w, pivot, applicable, equations)

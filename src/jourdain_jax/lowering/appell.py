@@ -65,7 +65,7 @@ class AppellOnGraph:
     def __init__(self, traced: TracedScene, structure: Structure, kept: KeptRows | None, probes: Probes, far, reference):
         self.traced, self.graph, self.structure, self.probes = traced, traced.graph, structure, probes
         self.rows_work = not (structure.affine and structure.homogeneous)
-        every, rows = range(len(traced.u)), [s for s, name in enumerate(structure.row_names) if name not in structure.redundant_rows]
+        every, rows = range(len(traced.u)), list(structure.kept_rows)
         self.independent = list(every) if kept or not rows else list(structure.independent)
         self.dependent = [k for k in every if k not in self.independent]
         self.kept, self.rows, self.multiplied = kept, *(([], rows) if kept else (rows, []))

@@ -46,7 +46,7 @@ def dense_rates(scene: Scene, structure: Structure, independent: tuple[int, ...]
     `independent`: speeds in the state; where these are not all, the others follow from the rows.
     """
     traced = _Traced(scene, structure.potentials_of_inputs)
-    kept = [s for s, name in enumerate(structure.row_names) if name not in structure.redundant_rows]
+    kept = list(structure.kept_rows)
     parts = range(0, len(t), max(1, LANES // max(1, u.shape[1])))
     found = [_rates(traced, structure, kept, independent, *jax.tree.map(lambda x, i=i: x[i : i + parts.step], (parameters, t, q, u, inputs))) for i in parts]
     return DenseRates(*(np.concatenate([getattr(x, name) for x in found]) for name in ("qdot", "ydot", "events")))

@@ -25,7 +25,7 @@ from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.own_steps import own_steps, reason_against_series
 from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
-from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
+from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned, warns_of_jumps
 from jourdain_jax.motion.setup import MOST_STEPS, TOLERANCE, Setup
 from jourdain_jax.motion.start import State, Unmoved, named_unmoved, put_on_rows, unmoved
 from jourdain_jax.motion.trajectories import results
@@ -184,7 +184,7 @@ def _set_up(
         raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
     if order is not None and (reason := reason_against_series(setup, order)):
         raise ValueError(f"solver=jj.Taylor() cannot integrate `{type(scene).__name__}`: {reason}; leave `solver` away, or use solver=diffrax.Dopri8()")
-    return setup
+    return warns_of_jumps(setup)
 
 
 def _first_step(dt0, t0, t1):

@@ -81,7 +81,10 @@ def registers() -> int:
 def threads() -> int:
     """How many threads share a batch: one for every core that this process may use, or as many as `JOURDAIN_JAX_THREADS` says."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, int(os.environ.get("JOURDAIN_JAX_THREADS", cores)))
+    stated = os.environ.get("JOURDAIN_JAX_THREADS", str(cores))
+    if not stated.isdecimal():
+        raise ValueError(f"the environment variable JOURDAIN_JAX_THREADS is {stated!r}, expected a number of threads, such as 2")
+    return max(1, int(stated))
 
 
 def fuses() -> bool:

@@ -26,7 +26,7 @@ from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.calculus.newton import newton_root
 from jourdain_jax.equations.kinematics import motion_at, partial_velocities, pose_at
 from jourdain_jax.equations.lagrange import speeds_are_rates
-from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
+from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.rows import position_residual, velocity_residual
 from jourdain_jax.equations.virtual_power import energies_at, resultants
 from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step
@@ -197,8 +197,7 @@ def _projected(args, over: Interval, q0, q1) -> Float[Array, "speeds"]:
 
 def _kept(scene: Scene, rows: Float[Array, "rows"]) -> Float[Array, "kept_rows"]:
     """The rows without those that may be left out everywhere."""
-    redundant = structure_of(scene).redundant_rows
-    return rows[np.array([i for i, name in enumerate(names_of_rows(scene)) if name not in redundant], int)]
+    return rows[np.array(structure_of(scene).kept_rows, int)]
 
 
 def _fault(scene: Scene, structure: Structure) -> str:
@@ -209,7 +208,7 @@ def _fault(scene: Scene, structure: Structure) -> str:
         return "its rows are nonlinear in the speeds"
     if structure.varying_inertia:
         return "its masses or inertias change along the motion, which a Lagrangian does not describe"
-    if len(structure.row_names) - len(structure.redundant_rows) > structure.rank:
+    if structure.dependent_rows:
         return "its rows are dependent, and none may be left out everywhere"
     return ""
 

@@ -68,7 +68,7 @@ def map_over_times(f, record: Record, by_inputs: bool = False):
     """
     by_inputs, known = by_inputs and _needs_rates(record), not is_traced((f, record))
     if known and record.q.ndim == 2 and len(record.ts) <= FEW_TIMES:
-        return jax.tree.map(jnp.asarray, _on_numpy(f, record, by_inputs))
+        return _on_numpy(f, record, by_inputs)
     mapped = _compiled(record.inputs.programs)
     whole = jax.config.jax_debug_nans and known and bool(jnp.all(jnp.isfinite(record.q)))  # then NaN is no mark
     return (mapped if whole else with_nan_as_a_mark(mapped))(f, record, by_inputs)
@@ -102,10 +102,11 @@ def _largest_block(record: Record) -> int:
     return max(1, MOST_ENTRIES // record.q.shape[-1] ** 2)
 
 
+@with_nan_as_a_mark
 def _on_numpy(f, record: Record, by_inputs: bool):
     by_time, size = (record.ts, record.q, record.u), _largest_block(record)
     blocks = [_uncompiled(f, record, by_inputs, lanes=[x[k : k + size] for x in by_time]) for k in range(0, len(record.ts), size)]
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
+    return jax.tree.map(lambda *parts: jnp.asarray(np.concatenate(parts)), *blocks)
 
 
 _uncompiled = eval_numpy(_at_one_time)

@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -12,9 +13,9 @@ from jourdain_jax.dynamics.accelerations import Baumgarte, bare_accelerations
 from jourdain_jax.dynamics.power import rate_of_work
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.equations.minimal import accelerations_of, minimal_kinematics, speeds_and_pivot, speeds_from_privileged
+from jourdain_jax.equations.minimal import MinimalKinematics, accelerations_of, minimal_kinematics
 from jourdain_jax.equations.projection import project_positions, project_speeds
-from jourdain_jax.equations.reductions import Privileged
+from jourdain_jax.equations.reductions import Partition, Privileged
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
@@ -52,6 +53,7 @@ class MinimalByMatrices(ByMatrices):
     """Coordinates and privileged speeds."""
 
     independent: tuple[int, ...] = eqx.field(static=True)
+    rows: tuple[int, ...] = eqx.field(static=True)  # that determine the dependent speeds
 
     @property
     def has_pivots(self) -> bool:
@@ -59,19 +61,23 @@ class MinimalByMatrices(ByMatrices):
         return True
 
     def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "speeds"]:
-        return speeds_from_privileged(scene, self.independent, t, y.q, y.v, inputs)
+        return self._kinematics(scene, t, y, inputs).u
 
     def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
         """All speeds, and the pivot with the sign of det A_z."""
-        return speeds_and_pivot(scene, self.independent, t, y.q, y.v, inputs)
+        found = self._kinematics(scene, t, y, inputs)
+        return found.u, Partition(jax.lax.stop_gradient(found.split.A), self.independent).signed_pivot()
 
     def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Integrated, Float[Array, "pivots"]]:
         """As `rates`, and the sign of det A_z."""
-        known = minimal_kinematics(scene, self.independent, t, y.q, y.v, inputs)
+        known = self._kinematics(scene, t, y, inputs)
         own = isinstance(self.reduction, Privileged) and self.reduction.independent == self.independent and self.stabilisation is None
         motion, found = accelerations_of(scene, known, t, y.q, inputs) if own else self.solved(scene, t, y.q, known.u, inputs)
         v = found.udot[jnp.array(self.independent, jnp.int32)]
         return Integrated(motion.qdot.array, v, self.power(scene, motion, found)), known.split.orientation()[None]
+
+    def _kinematics(self, scene: Scene, t, y: Integrated, inputs) -> MinimalKinematics:
+        return minimal_kinematics(scene, self.independent, self.rows, t, y.q, y.v, inputs)
 
 
 class FullByMatrices(ByMatrices):

@@ -116,7 +116,7 @@ def _vector_field(scene: Scene, formulation: Formulation, work: bool, backend: s
         return ByProgram(**common, program=program, affine=structure.affine)
     common |= {"stabilisation": formulation.baumgarte, "usual": usual_lengths(scene), "inputs_in_rows": inputs_in_rows, "cutoff": cutoff}
     if minimal:
-        return MinimalByMatrices(**common)
+        return MinimalByMatrices(**common, rows=structure.kept_rows)
     return FullByMatrices(**common, may_branch=cutoff is not None and isinstance(reduction, NullSpaceQR) and bool(names_of_position_rows(scene)))
 
 

@@ -1,0 +1,173 @@
+"""Derivatives of motions whose loads jump: JAX leaves out how the time of the jump moves, and a warning says so. Kinks are none of this."""
+
+import warnings
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.build import load_jumps
+from jourdain_jax.build.load_jumps import jump_of_loads, loads_may_jump
+
+TS = jnp.linspace(0.0, 2.0, 9)
+
+
+class Pushed(jj.Scene):
+    """A particle in a plane, pushed along y."""
+
+    push: Callable = eqx.field(static=True)
+    size: float = jj.parameter(0.4)
+    coordinates = jj.coordinates("x y")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, y_rate=self.push(motion, self.size)),)
+
+
+JUMPS = {
+    "at a place": lambda m, p: jnp.where(m.q.x > 0.2, 1.0, 2.0),
+    "at a time that is a parameter": lambda m, p: jnp.where(m.t > p, 1.0, 0.0),
+    "friction": lambda m, p: -p * jnp.sign(m.u.y_rate),
+    "steps": lambda m, p: p * jnp.floor(3.0 * m.q.x),
+    "the largest": lambda m, p: jnp.array([1.0, 2.0, 4.0])[jnp.argmax(jnp.stack([m.q.x, m.q.y, p]))],
+    "a wrapped angle": lambda m, p: jnp.arctan2(m.q.y, m.q.x),
+    "a damper that sets in": lambda m, p: jnp.where(m.q.y < 0.0, -m.q.y - p * m.u.y_rate, 0.0),
+    "a branch": lambda m, p: jax.lax.cond(m.q.x > p, lambda x: 1.0 + x, lambda x: 3.0 - x, m.q.x),
+}
+KINKS = {
+    "smooth": lambda m, p: -p * jnp.sin(m.q.x),
+    "a magnitude": lambda m, p: -p * jnp.abs(m.q.x) * m.u.y_rate,
+    "one-sided": lambda m, p: jnp.maximum(m.q.x - p, 0.0),
+    "limited": lambda m, p: jnp.clip(m.u.y_rate, -p, p),
+    "a table": lambda m, p: jnp.interp(m.q.x, TS, p * jnp.sin(TS)) + jnp.interp(m.t, TS, jnp.cos(TS)),
+    "a spline": lambda m, p: jj.Spline(TS, jnp.sin(3.0 * TS))(m.t) + jnp.abs(p),
+    "a root": lambda m, p: jnp.sqrt(jnp.maximum(m.q.y, 0.0)),
+    "steep": lambda m, p: -p * jnp.tanh(1e4 * m.u.y_rate) + jnp.abs(m.q.x),
+    "Hertz": lambda m, p: 1e5 * jnp.maximum(p - m.q.y, 0.0) ** 1.5,
+    "Hunt and Crossley": lambda m, p: 1e5 * jnp.maximum(p - m.q.y, 0.0) ** 1.5 * (1.0 - 0.3 * m.u.y_rate),
+    "equal pieces": lambda m, p: jnp.where(m.q.x > p, m.q.x**2, p**2 + 2.0 * p * (m.q.x - p)),
+    "a guarded quotient": lambda m, p: jnp.where(m.q.x == 0.0, 1.0, jnp.sin(m.q.x) / jnp.where(m.q.x == 0.0, 1.0, m.q.x)),
+    "a root of what may be negative": lambda m, p: jnp.sqrt(m.q.y) + jnp.abs(m.q.x),
+    "nothing but NaN": lambda m, p: jnp.sqrt(-1.0 - jnp.abs(m.q.y)),
+    "a pole": lambda m, p: p / m.q.x + jnp.abs(m.q.y),
+    "a table that slides": lambda m, p: jnp.interp(m.t, TS + p, jnp.cos(TS)),
+    "a time that no parameter moves": lambda m, p: p * jnp.where(m.t > 0.3, 1.0, 0.0),
+}
+
+
+def end(push, start=0.4):
+    """Where the particle ends, as a function of its speed along x."""
+
+    def of(speed, size=0.4):
+        motion = jj.simulate(Pushed(push=push, size=size), {"x": start, "x_rate": speed, "y_rate": 0.1}, ts=[1.0], work=False)
+        return motion.q_end[1]
+
+    return of
+
+
+def warned(f, *arguments):
+    """What differentiating says of jumps."""
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always")
+        jax.block_until_ready(f(*arguments))
+    return [str(w.message) for w in given if issubclass(w.category, jj.SensitivityWarning) and "jump" in str(w.message)]
+
+
+@pytest.mark.parametrize("name", JUMPS)
+def test_jumps_are_seen(name):
+    assert "the force along `y_rate` jumps" in jump_of_loads(Pushed(push=JUMPS[name]))
+
+
+@pytest.mark.parametrize("name", KINKS)
+def test_kinks_are_no_jumps(name):
+    assert jump_of_loads(Pushed(push=KINKS[name])) == ""
+
+
+def test_a_derivative_across_a_jump_warns_in_every_mode():
+    f, speeds = end(JUMPS["at a place"]), jnp.array([-1.0, -2.0])
+    alone = jax.grad(f), jax.jacfwd(f), jax.jit(jax.grad(f)), jax.grad(jax.jit(f))
+    for slope, speed in [*((slope, -1.0) for slope in alone), (jax.vmap(jax.grad(f)), speeds), (jax.jit(jax.vmap(jax.jacfwd(f))), speeds)]:
+        (said,) = warned(slope, speed)
+        assert "`Pushed`" in said
+        assert "leave out how the time of the jump moves" in said
+
+
+class UntilThere(Pushed):
+    """Ends at the place of the jump."""
+
+    def events(self, motion):
+        return {"there": motion.q.x - 0.2}
+
+
+def test_a_motion_that_ends_at_the_jump_and_another_after_it_have_the_right_derivative():
+    """With the jump at s = 0.2/k, y(1) = s^2/2 + s (1 - s) + (1 - s)^2 and dy/dk = -(1 - s) ds/dk = 0.2 (1 - s)/k^2."""
+    before, after = UntilThere(push=lambda m, p: 1.0 + 0.0 * p), Pushed(push=lambda m, p: 2.0 + 0.0 * p)
+
+    def in_two(k):
+        first = jj.simulate(before, {"x": 0.4, "x_rate": -k}, t1=1.0, work=False)
+        second = jj.simulate(after, first.end, t1=1.0, work=False)
+        return second.q_end[1]
+
+    def in_one(k):
+        return jj.simulate(Pushed(push=JUMPS["at a place"]), {"x": 0.4, "x_rate": -k}, t1=1.0, work=False).q_end[1]
+
+    value, slope = jax.value_and_grad(in_two)(0.5)
+    assert float(value) == pytest.approx(0.08 + 0.4 * 0.6 + 0.36, abs=1e-6)
+    assert float(slope) == pytest.approx(0.2 * 0.6 / 0.25, abs=1e-6)
+    assert float(in_one(0.5)) == pytest.approx(float(value), abs=1e-6)
+    with pytest.warns(jj.SensitivityWarning):
+        assert abs(float(jax.grad(in_one)(0.5) - slope)) > 0.4  # what the warning is about
+    assert not warned(jax.grad(in_two), 0.5)
+
+
+def test_second_derivatives_warn_once():
+    assert len(warned(jax.hessian(end(JUMPS["at a place"])), -1.0)) == 1
+
+
+def test_values_and_kinks_do_not_warn():
+    f, kinked = end(JUMPS["at a place"]), end(KINKS["one-sided"])
+    assert not warned(f, -1.0)
+    assert not warned(jax.jit(f), -1.0)
+    assert not warned(jax.vmap(f), jnp.array([-1.0, -2.0]))
+    assert not warned(jax.grad(kinked), -1.0)
+
+
+def test_of_scenes_without_branches_nothing_is_looked_at(monkeypatch):
+    monkeypatch.setattr(load_jumps, "jumps", None)
+    scene = Pushed(push=KINKS["smooth"], size=0.5)
+    assert loads_may_jump(scene) == (False, False)
+    assert not warned(jax.grad(end(KINKS["smooth"])), -1.0)
+
+
+def test_derivatives_of_lanes_warn():
+    def mean(size):
+        lanes = jj.rollout(Pushed(push=JUMPS["friction"], size=size), {"y_rate": jnp.array([0.5, 1.0])}, ts=[0.5], work=False)
+        return jnp.mean(lanes["y"][:, -1])
+
+    assert len(warned(jax.grad(mean), 0.3)) == 1
+
+
+def test_a_fit_across_a_jump_warns():
+    scene = Pushed(push=JUMPS["friction"], size=0.3)
+    ts = np.linspace(0.1, 1.0, 10)
+    y = np.asarray(jj.simulate(scene, {"y_rate": 1.0}, ts=ts)["y"])
+    data = jj.Experiment(ts, {"y": y}, 1e-3, start={"y_rate": 1.0})
+    assert warned(lambda: jj.fit(scene.replace(size=0.25), data, ("size",)).scene.size)
+
+
+@jax.custom_jvp
+def sine_by_a_callback(x):
+    return jax.pure_callback(np.sin, jax.ShapeDtypeStruct((), x.dtype), x)
+
+
+sine_by_a_callback.defjvp(lambda x, dx: (sine_by_a_callback(*x), jnp.cos(x[0]) * dx[0]))
+
+
+def test_callbacks_without_a_form_for_lanes_are_not_looked_at():
+    assert jump_of_loads(Pushed(push=lambda m, p: jnp.sign(m.u.y_rate) - p * sine_by_a_callback(m.q.y))) == ""
