@@ -54,8 +54,11 @@ def warns_of_jumps(setup: Setup) -> Setup:
 def _may_jump(inputs: Inputs, moves: Inputs) -> Iterator[bool]:
     """Whether a branch of each input is decided by an array of its own that `moves`."""
     for channel, moving in zip(inputs.channels, moves.channels, strict=True):
-        variables = [len(channel.program.numbers) + k for k, x in enumerate(moving.held) if x] if isinstance(channel, FunctionOfTime) else []
-        yield bool(variables) and any(may_bend(channel.program.closed, variables))
+        if isinstance(channel, FunctionOfTime) and isinstance(moving, FunctionOfTime):
+            first = len(channel.program.numbers)
+            yield any(may_bend(channel.program.closed, [first + k for k, moves in enumerate(moving.held) if moves]))
+        else:
+            yield False
 
 
 def _jump_of_inputs(names, inputs: Inputs, moves: Inputs, span) -> str:
