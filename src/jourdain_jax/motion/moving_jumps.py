@@ -71,7 +71,8 @@ def _jump_of_inputs(names, inputs: Inputs, moves: Inputs, span) -> str:
 
 def _with_numbers(setup: Setup) -> tuple[Inputs, tuple[float, float]]:
     """The inputs, with times of the motion in place of numbers that are not known; and the span, the usual one where it is not known."""
-    inputs, *span = jax.lax.stop_gradient((setup.inputs, setup.t0, setup.t1))  # known where they are being differentiated outside of `jit`
+    given = setup.inputs, setup.t0, setup.t1
+    inputs, *span = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if is_traced(x) else x, given)  # known where differentiated outside of `jit`
     t0, t1 = (0.0, float(setup.scene.example_span)) if is_traced(span) else map(float, span)
     generator = np.random.default_rng(11)
     return jax.tree.map(lambda x: np.sort(generator.uniform(t0, t1, np.shape(x)), axis=None).reshape(np.shape(x)) if is_traced(x) else x, inputs), (t0, t1)
