@@ -60,6 +60,7 @@ def row_program(scene: Scene) -> RowProgram | None:
 def _as_text(scene: Scene) -> bytes:
     try:
         nodes = looked_at(scene)
+        right = _right(scene, nodes.traced)
     except Unsupported:
         return _TEXTLESS
     graph, traced = nodes.graph, nodes.traced
@@ -67,7 +68,6 @@ def _as_text(scene: Scene) -> bytes:
     g, phi = [int(n) for n in nodes.closures], traced.at.phi.tolist()
     G, A = _entries(nodes.of_closures, q), _entries(nodes.rows, u)
     M = _mass_matrix(nodes, u)
-    right = _right(scene, traced)
     needed = [right, *g, *G.values(), *phi, *A.values(), *({} if M is None else M).values()]
     if graph.calls(needed):
         return _TEXTLESS

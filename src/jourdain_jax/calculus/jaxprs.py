@@ -41,6 +41,18 @@ def called(name: str, params: Mapping) -> ClosedJaxpr | None:
     return found if hasattr(found, "consts") else ClosedJaxpr(found, [])
 
 
+def parts_of_scan(equation) -> tuple[int, int]:
+    """How many inputs of a scan are constants, and how many it carries: these have the same axes in its body as outside, all others one less.
+
+    The parameters that say so are not the same in all versions of JAX.
+    """
+    body = equation.params["jaxpr"].jaxpr
+    whole, carried = (
+        sum(x.aval.ndim == y.aval.ndim for x, y in zip(*pair, strict=True)) for pair in ((equation.invars, body.invars), (equation.outvars, body.outvars))
+    )
+    return whole - carried, carried
+
+
 def is_jaxpr(x) -> bool:
     """Whether this is a traced function, closed or not."""
     return hasattr(x, "eqns") or hasattr(x, "jaxpr")

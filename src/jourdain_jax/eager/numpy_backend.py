@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from jourdain_jax.calculus.jaxprs import called, evaluated
+from jourdain_jax.calculus.jaxprs import called, evaluated, parts_of_scan
 from jourdain_jax.calculus.scalar_operations import VALUES
 from jourdain_jax.eager.indexing import gathered, scattered
 
@@ -26,8 +26,8 @@ def applied(equation, inputs) -> list[np.ndarray]:
     inner = called(name, params)
     if inner is not None:
         return evaluated(inner, inputs, applied)
-    if name == "while":
-        return _while(equation, inputs)
+    if name in _LOOPS:
+        return _LOOPS[name](equation, inputs)
     if name in _CONTROL:
         return _CONTROL[name](params, inputs)
     if name in ENTRYWISE:
@@ -45,8 +45,8 @@ def applied(equation, inputs) -> list[np.ndarray]:
 # Control flow: everything is known, so branches are taken and loops are run.
 
 
-def _scan(params, inputs) -> list[np.ndarray]:
-    fixed, carried = params["num_consts"], params["num_carry"]
+def _scan(equation, inputs) -> list[np.ndarray]:
+    params, (fixed, carried) = equation.params, parts_of_scan(equation)
     constants, carry, xs = inputs[:fixed], inputs[fixed : fixed + carried], inputs[fixed + carried :]
     outs: list[list] = [[] for _ in range(len(params["jaxpr"].jaxpr.outvars) - carried)]
     order = range(params["length"])
@@ -112,8 +112,8 @@ def _linear_map(params, inputs) -> list[np.ndarray]:
     return evaluated(closed, inputs, applied)
 
 
+_LOOPS: dict[str, Callable] = {"scan": _scan, "while": _while}
 _CONTROL: dict[str, Callable] = {
-    "scan": _scan,
     "cond": lambda params, inputs: evaluated(params["branches"][int(inputs[0])], inputs[1:], applied),
     "jourdain_linear_map": _linear_map,
     "jourdain_or_elsewhere": _here,

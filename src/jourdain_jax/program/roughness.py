@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from jax.extend.core import Literal
 
-from jourdain_jax.calculus.jaxprs import inner_jaxprs
+from jourdain_jax.calculus.jaxprs import inner_jaxprs, parts_of_scan
 from jourdain_jax.calculus.scalar_operations import BRANCHES
 
 ROUGH = BRANCHES | {"clamp", "reduce_max", "reduce_min", "cummax", "cummin", "sort", "atan2", "select_n"}
@@ -42,7 +42,7 @@ def _results(equation, given: list[int], smooth: frozenset[str]) -> list[int]:
     if name == "select_n" and given[0] == _SMOOTH:
         return [max(given)]
     if name == "scan":
-        return _repeated(params["jaxpr"].jaxpr, given, params["num_consts"], params["num_carry"], smooth)
+        return _repeated(params["jaxpr"].jaxpr, given, *parts_of_scan(equation), smooth)
     if name == "while":
         conditions, constants = params["cond_nconsts"], params["body_nconsts"]
         found = _repeated(params["body_jaxpr"].jaxpr, given[conditions:], constants, len(given) - conditions - constants, smooth)
