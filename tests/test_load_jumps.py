@@ -171,3 +171,34 @@ sine_by_a_callback.defjvp(lambda x, dx: (sine_by_a_callback(*x), jnp.cos(x[0]) *
 
 def test_callbacks_without_a_form_for_lanes_are_not_looked_at():
     assert jump_of_loads(Pushed(push=lambda m, p: jnp.sign(m.u.y_rate) - p * sine_by_a_callback(m.q.y))) == ""
+
+
+class ByInput(Pushed):
+    """The push along x is an input."""
+
+    inputs = jj.inputs("pull")
+
+    def loads(self, motion):
+        return (*super().loads(motion), jj.generalized_force(motion, x_rate=motion.inputs.pull))
+
+
+PULLS = {
+    "switched on": (True, lambda on: lambda t: jnp.where(t > on, 1.0, 0.0)),
+    "steps": (True, lambda on: lambda t: jnp.floor(t / (0.5 * on))),
+    "switched on at a time that does not move": (False, lambda on: lambda t: jnp.where(t > 0.4, on, 0.0)),
+    "a ramp": (False, lambda on: lambda t: jnp.clip(3.0 * (t - on), 0.0, 1.0)),
+    "samples": (False, lambda on: jj.Sampled(jnp.stack([0.0 * on, on, 2.0 * on]), jnp.array([0.0, 1.0, 0.0]))),
+}
+
+
+@pytest.mark.parametrize("name", PULLS)
+def test_inputs_that_jump_at_a_time_that_moves(name):
+    jumps, pull = PULLS[name]
+
+    def f(on, size=0.4):
+        return jj.simulate(ByInput(push=KINKS["smooth"], size=size), {}, t1=1.0, inputs={"pull": pull(on)}, work=False).q_end[0]
+
+    for slope in (jax.grad(f), *([jax.jit(jax.jacfwd(f))] if name == "switched on" else [])):
+        assert [text.partition("Here ")[2][:18] for text in warned(slope, 0.4)] == ["input `pull` jumps"] * jumps
+    if name == "switched on":
+        assert not warned(jax.jit(jax.grad(f, 1)), 0.4, 0.4)

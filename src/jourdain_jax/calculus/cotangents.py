@@ -51,7 +51,7 @@ ad.primitive_jvps[_tangents_p] = lambda primals, tangents, *, look: (_tangents_p
 
 
 def _told(primals, tangents, *, tell: Callable):
-    tell()
+    tell([type(tangent) is not ad.Zero for tangent in tangents])
     return list(primals), list(tangents)  # once: derivatives of derivatives do not meet it again
 
 
@@ -68,6 +68,6 @@ def tap_cotangents(values: tuple, look: Callable) -> tuple:
     return tuple(_shown_p.bind(*values, look=look))
 
 
-def tap_differentiation(values: list, tell: Callable[[], None]) -> list:
-    """`values`, arrays; `tell` is called where a derivative with respect to any of them is traced, in either mode."""
+def tap_differentiation(values: list, tell: Callable[[list[bool]], None]) -> list:
+    """`values`, arrays; `tell` is called with which of them vary where a derivative with respect to any is traced, in either mode."""
     return _told_p.bind(*values, tell=tell)

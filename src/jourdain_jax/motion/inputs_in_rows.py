@@ -31,7 +31,7 @@ def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
     with jax.ensure_compile_time_eval():  # all is known, also inside a `jit`
         in_rows = _in_rows(scene, inputs, known.coordinates[0], t0)
         for k in rough:
-            if in_rows[k] and (t := _first_jump(inputs.channels[k], float(t0), float(t1))) is not None:
+            if in_rows[k] and (t := first_jump(inputs.channels[k], float(t0), float(t1))) is not None:
                 name = scene.inputs.entries[k]
                 raise ValueError(f"input `{name}` of `{type(scene).__name__}` jumps at t = {t:.6g} s, and velocity rows depend on it: {SPEEDS_WOULD_JUMP}")
 
@@ -47,7 +47,8 @@ def _in_rows(scene: Scene, inputs: Inputs, q: np.ndarray, t0) -> Bool[np.ndarray
     return np.any(np.nan_to_num(np.asarray(slopes)) != 0, axis=0)
 
 
-def _first_jump(channel: Callable, t0: float, t1: float) -> float | None:
+def first_jump(channel: Callable, t0: float, t1: float) -> float | None:
+    """When an input jumps between these times; None where it is not seen to."""
     values, ts = uncompiled(jax.vmap(channel)), np.linspace(t0, t1, EVENLY + 1)[:, None]
     found = jumps(lambda t: np.asarray(values(t[:, 0]), float)[:, None, None], ts[:-1], ts[1:])
     return next((float(behind[0]) for _, _, behind in found), None)

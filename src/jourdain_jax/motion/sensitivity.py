@@ -1,4 +1,4 @@
-"""Warnings about derivatives through motions that amplify errors, by what differentiation finds out anyway, and through motions whose loads jump.
+"""Warnings about derivatives through motions that amplify errors, by what differentiation finds out anyway.
 
 A value L of a motion has the cotangents g = dL/dy at the states it looks at and g_0 = dL/dy_0 at the start. With s = atol + rtol |y|, what the step-size
 control lets pass at one state,
@@ -19,9 +19,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jourdain_jax.build.load_jumps import jump_of_loads, loads_may_jump
-from jourdain_jax.build.reference_parameters import with_reference_parameters
-from jourdain_jax.calculus.cotangents import tap_cotangents, tap_differentiation, tap_tangents
+from jourdain_jax.calculus.cotangents import tap_cotangents, tap_tangents
 from jourdain_jax.calculus.reals import is_traced, nothing_is_traced
 from jourdain_jax.motion.setup import Setup
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -134,29 +132,6 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory | None:
     for shown, size in sizes:
         parts = shown(parts, size.ends(seen[:-1], int(seen[-1])))
     return eqx.tree_at(lambda m: (m.q, m.u, m.q_end, m.u_end), motion, parts)
-
-
-def warns_of_jumps(setup: Setup) -> Setup:
-    """The setup; where loads of its scene jump, a derivative with respect to what may move the time of a jump warns, inside `jit`, too."""
-    if nothing_is_traced() or not any(loads_may_jump(setup.scene)):
-        return setup
-    moving, others = eqx.partition((setup.scene, setup.start, setup.inputs, setup.t0), lambda x: eqx.is_inexact_array(x) and is_traced(x))
-    leaves, treedef = jax.tree.flatten(moving)
-    if not leaves:
-        return setup
-    known = with_reference_parameters(setup.scene)
-
-    def tell():
-        if jump := jump_of_loads(known):
-            text = (
-                f"derivatives of motions of `{type(known).__name__}` that meet a jump of loads are wrong: they leave out how the time of the jump moves. "
-                f"Here {jump}. Let it change within a short time or length, as by `jnp.tanh`, or end the motion there by an event and start another; motions "
-                "themselves are right"
-            )
-            warnings.warn(text, SensitivityWarning, stacklevel=1)  # always in this place: Python shows it once
-
-    told = eqx.combine(jax.tree.unflatten(treedef, tap_differentiation(leaves, tell)), others)
-    return setup._replace(**dict(zip(("scene", "start", "inputs", "t0"), told, strict=True)))
 
 
 def _known(values) -> tuple | None:

@@ -23,9 +23,10 @@ from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted
 from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method, as_solver
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import nan_is_a_mark
+from jourdain_jax.motion.moving_jumps import warns_of_jumps
 from jourdain_jax.motion.own_steps import own_steps, reason_against_series
 from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
-from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned, warns_of_jumps
+from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
 from jourdain_jax.motion.setup import MOST_STEPS, TOLERANCE, Setup
 from jourdain_jax.motion.start import State, Unmoved, named_unmoved, put_on_rows, unmoved
 from jourdain_jax.motion.trajectories import results
