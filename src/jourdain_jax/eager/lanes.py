@@ -35,7 +35,8 @@ def uncompiled_lanes(f: Callable, shared: int | None = 0) -> Callable:
 
     @lru_cache(maxsize=64)
     def traced(treedef, shapes):
-        closed, shape = jax.make_jaxpr(f, return_shape=True)(*jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(*s) for s in shapes]))
+        arrays = [jax.ShapeDtypeStruct(shape, jax.dtypes.canonicalize_dtype(dtype)) for shape, dtype in shapes]
+        closed, shape = jax.make_jaxpr(f, return_shape=True)(*jax.tree.unflatten(treedef, arrays))
         return needed_only(closed), jax.tree.structure(shape)
 
     @wraps(f)

@@ -106,7 +106,7 @@ def _largest_block(record: Record) -> int:
 def _on_numpy(f, record: Record, by_inputs: bool):
     by_time, size = (record.ts, record.q, record.u), _largest_block(record)
     blocks = [_uncompiled(f, record, by_inputs, lanes=[x[k : k + size] for x in by_time]) for k in range(0, len(record.ts), size)]
-    return jax.tree.map(lambda *parts: jnp.asarray(np.concatenate(parts)), *blocks)
+    return jax.tree.map(lambda *parts: jax.device_put(np.concatenate(parts)), *blocks)
 
 
 _uncompiled = eval_numpy(_at_one_time)
