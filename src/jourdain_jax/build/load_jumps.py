@@ -58,6 +58,7 @@ def jump_of_loads(scene: Scene) -> str:
 
 
 def _first_jump(scene: Scene, q: np.ndarray, in_parameters: bool, in_state: bool) -> str:
+    """What jumps first on lines through configurations `q`, in words; empty where nothing does."""
     generator = np.random.default_rng(7)
     low, high = speed_bounds(scene)
     inputs = generator.uniform(-1.0, 1.0, (STATES, len(scene.inputs)))
