@@ -99,6 +99,7 @@ def bicycle(line="", **changes):
 
 
 b, sleigh, chain = Bead(), ChaplyginSleigh(), TrailerChain()
+several = jax.vmap(lambda mass: Bead(mass=mass))(jnp.array([1.0, 2.0, 3.0]))
 pose, moving = jj.pose_at(b, 0.0, two), jj.motion_at(b, 0.0, two, two)
 bead, rest, fixed = pose["bead"], jj.start(b), jj.fixed_point(o)
 run = jj.simulate(b, {"x_rate": 1.0}, t1=0.1, ts=[0.0, 0.1])
@@ -289,6 +290,8 @@ STATES: dict[str, Case] = {
     "jj.pose_at(Bead, 0.0, two)": ("ValueError", "`scene` is the class `Bead`, expected a scene of it"),
     "jj.sample_states(Bead, 3)": ("ValueError", "`scene` is the class `Bead`, expected a scene of it"),
     "jj.linearize(b, jj.steady(b, {}))": ("ValueError", "`state` is a SteadyMotion, expected a State (from `jj.start` or `jj.consistent`), a dictionary of"),
+    "jj.accelerations(several, 0.0, two, two)": ("ValueError", "`Bead` cannot be evaluated: its `mass` has the shape (3,), `stiffness` has the shape (3,)"),
+    "jj.simulate(several, {'x': 1.0}, t1=1.0)": ("ValueError", "for many scenes at once use `jax.vmap` over them, or `rollout` with `parameters="),
     "jj.accelerations(b, 'now', two, two)": ("ValueError", "`t` is the text 'now', expected real numbers; give one time in s"),
     "jj.accelerations(b, two, two, two)": ("ValueError", "`t` has shape (2,), expected one number; give one time in s; use `jax.vmap` for many"),
     "jj.accelerations(b, 0.0, two, 'fast')": ("ValueError", "`u` of `Bead` is the text 'fast', expected real numbers; one number for each of x_rate, y_rate"),

@@ -87,7 +87,7 @@ sleigh = MODELS["chaplygin-sleigh"]()
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     tight = jj.simulate(sleigh, sleigh.example, t1=0.1, rtol=1e-8, atol=1e-8)
-found["tight"] = {"warnings": [str(w.message) for w in caught], "finite": bool(jnp.all(jnp.isfinite(tight.q)))}
+found["tight"] = {"warnings": [str(w.message) for w in caught], "files": [w.filename for w in caught], "finite": bool(jnp.all(jnp.isfinite(tight.q)))}
 found["few steps"] = motion_of(sleigh, sleigh.example, max_steps=3).message
 try:
     found["contradiction"] = str(motion_of(MODELS["skate"](), {"heading": 0.0, "x_rate": 1.0, "y_rate": 0.1, "heading_rate": 0.0}).u[0])
@@ -256,6 +256,7 @@ def test_gradients_in_single_precision_are_those_of_double_precision(name, singl
 
 def test_tolerances_below_single_precision_are_warned_of(single):
     assert any("asks for more digits than float32 has" in text for text in single["tight"]["warnings"])
+    assert single["tight"]["files"] == ["<string>"]  # the line of the call
     assert single["tight"]["finite"]
 
 

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Generator, Iterator
 
 from jourdain_jax.ensembles.store import Store
+from jourdain_jax.scene.tracebacks import users_level
 
 MOST_DEATHS = 3  # of processes on one chunk, before it is searched for the lane
 MOST_SKIPPED = 8  # lanes of one chunk
@@ -71,7 +72,7 @@ def _say_skipped(store: Store, before: tuple[int, ...]) -> None:
         warnings.warn(
             f"processes died again and again on the lanes {named} of `{store.path}`, which are skipped; simulate them alone with "
             "`result.lane(k).simulate()`, in a process of its own, to see why",
-            stacklevel=4,
+            stacklevel=users_level(),
         )
 
 

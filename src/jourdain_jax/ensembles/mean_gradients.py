@@ -27,6 +27,7 @@ from jourdain_jax.motion.trajectories import results
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
+from jourdain_jax.scene.tracebacks import users_level
 
 LANES = 2048  # with their tangents, at once
 SHIFT = "shift"  # of all values of a column of a table, or of all levels of a grid
@@ -157,5 +158,5 @@ def _gathered(task: Task, names, values: np.ndarray, derivatives: np.ndarray, en
                 "end to another, the share of lanes that pass between them is missing; compare with differences of the mean"
             )
     for text in warned:
-        warnings.warn(text, SensitivityWarning, stacklevel=4)
+        warnings.warn(text, SensitivityWarning, stacklevel=users_level())
     return MeanGradients(tuple(task.outputs), tuple(names), mean, gradient, error, count, failed, tuple(warned))

@@ -27,6 +27,7 @@ from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Lanes, Task, receipt_of
 from jourdain_jax.motion.trajectories.versions import version_of
 from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.tracebacks import users_level
 
 MOST_CHUNKS = 1000
 PACKAGES = ("jourdain-jax", "jax", "jaxlib", "diffrax", "numpy", "scipy", "zarr", "llvmlite")
@@ -50,7 +51,7 @@ class Runner:
             warnings.warn(
                 f"the first {task.block} lanes of `{store.path}` come out with other bits here than where the study was begun (another machine, or other "
                 "versions); results are right, but not bit-equal to those of one machine",
-                stacklevel=2,
+                stacklevel=users_level(),
             )
         self.grid = Grid.from_dict(kept)
 
@@ -173,7 +174,9 @@ def _check_same(store: Store, task: Task, chunk: int | None) -> None:
         raise ValueError(f"`{store.path}` was begun with chunks of {store.chunk} lanes, and `chunk` is {chunk}; leave `chunk` out")
     changed = [f"{name} {held} (now {versions()[name]})" for name, held in store.study["versions"].items() if versions().get(name) != held]
     if changed:
-        warnings.warn(f"`{store.path}` was begun with other versions: {', '.join(changed)}; what is computed now may differ in its last digits", stacklevel=3)
+        warnings.warn(
+            f"`{store.path}` was begun with other versions: {', '.join(changed)}; what is computed now may differ in its last digits", stacklevel=users_level()
+        )
 
 
 def _difference(part: str, was: dict, now: dict) -> str:
@@ -219,7 +222,7 @@ def run(task: Task, path, *, chunk: int | None, progress: bool, shard: tuple[int
         done, torn = store.done()
         if torn:
             some = ", ".join(map(str, torn[:10])) + (" ..." if len(torn) > 10 else "")
-            warnings.warn(f"{len(torn)} chunks of `{path}` are damaged and are computed again: {some}", stacklevel=3)
+            warnings.warn(f"{len(torn)} chunks of `{path}` are damaged and are computed again: {some}", stacklevel=users_level())
         missing = sorted({*range(shard[0] - 1, store.chunks, shard[1])}.difference(done))
         known = _lanes(store, done)
         bar = tqdm(total=known + _lanes(store, missing), initial=known, unit="lane", unit_scale=True, disable=not progress, smoothing=0.1)

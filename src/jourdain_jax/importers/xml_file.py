@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.scene.names import as_names
+from jourdain_jax.scene.tracebacks import users_level
 
 Element = ElementTree.Element
 
@@ -51,7 +52,7 @@ class XmlFile:
         """A warning that lists what was left out, apart from what `ignore` names."""
         listed = [f"`{what}`" if count == 1 else f"`{what}` ({count})" for what, count in sorted(self._left_out.items()) if what not in self.ignore]
         if listed:
-            warnings.warn(f"{self.source}: left out {', '.join(listed)}; `ignore` silences this", UserWarning, stacklevel=3)
+            warnings.warn(f"{self.source}: left out {', '.join(listed)}; `ignore` silences this", UserWarning, stacklevel=users_level())
 
     def fault(self, what: str) -> ValueError:
         """The error of this file."""

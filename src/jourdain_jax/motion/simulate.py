@@ -35,7 +35,7 @@ from jourdain_jax.motion.vector_fields.choice import Formulation, as_formulation
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.tracebacks import shown_from_users_lines
+from jourdain_jax.scene.tracebacks import shown_from_users_lines, users_level
 
 if TYPE_CHECKING:
     from jourdain_jax.motion import diffrax_steps
@@ -231,5 +231,5 @@ def warn_float32(dtype, rtol) -> None:
     if dtype == np.float32 and not isinstance(rtol, jax.core.Tracer) and rtol < 1e-5:
         warnings.warn(
             f"rtol = {rtol} asks for more digits than float32 has; set jax.config.update('jax_enable_x64', True), or loosen rtol and atol to 1e-5",
-            stacklevel=3,
+            stacklevel=users_level(),
         )

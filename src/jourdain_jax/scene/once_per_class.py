@@ -7,6 +7,7 @@ from threading import Lock
 import jax
 import numpy as np
 
+from jourdain_jax.scene.parameters import stacked_parameters
 from jourdain_jax.scene.scene import Scene
 
 MOST_CASES = 1024  # that are kept of one function
@@ -27,7 +28,7 @@ def once_per_class(describe: Callable, most: int = MOST_CASES) -> Callable:
         key = (treedef, tuple(np.shape(x) for x in leaves), jax.config.jax_enable_x64, case)
         found = known.get(key, _UNKNOWN)
         if found is _UNKNOWN:
-            found = describe(scene, *case)
+            found = _described(describe, scene, case)
             with keeping:
                 known[key] = found
                 if len(known) > most:
@@ -35,3 +36,12 @@ def once_per_class(describe: Callable, most: int = MOST_CASES) -> Callable:
         return found
 
     return of
+
+
+def _described(describe: Callable, scene: Scene, case: tuple):
+    try:
+        return describe(scene, *case)
+    except (TypeError, ValueError) as error:
+        if many := stacked_parameters(scene):
+            raise ValueError(f"{many} ({error})") from error
+        raise

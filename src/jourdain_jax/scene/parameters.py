@@ -1,6 +1,7 @@
 """Physical parameters of a scene: differentiable leaves, stated once, checked where their values are known."""
 
 from collections.abc import Iterator
+from dataclasses import MISSING
 
 import equinox as eqx
 import jax
@@ -65,6 +66,28 @@ def check_parameters(scene) -> None:
             raise ValueError(f"{where} is {numbers}, expected a positive number{_in(metadata)}; give a value above zero")
         if metadata["non_negative"] and not np.all(numbers >= 0):
             raise ValueError(f"{where} is {numbers}, expected a number >= 0{_in(metadata)}; give a value that is not negative")
+
+
+def stacked_parameters(scene) -> str:
+    """Which parameters of a scene have one axis more than their defaults, in words, as those of many scenes at once have; empty where none has."""
+    shapes = {name: np.shape(value) for name, value, _ in parameters_of(scene)}
+    usual = {name: np.shape(value) for name, value in _defaults(type(scene))}
+    many = [f"`{name}` has the shape {shape}" for name, shape in shapes.items() if name in usual and shape[1:] == usual[name] != shape]
+    if not many:
+        return ""
+    return (
+        f"`{type(scene).__name__}` cannot be evaluated: its {', '.join(many)}, one axis more than by default; "
+        "for many scenes at once use `jax.vmap` over them, or `rollout` with `parameters={name: values}`"
+    )
+
+
+def _defaults(kind) -> Iterator[tuple[str, object]]:
+    for name, field in kind.__dataclass_fields__.items():
+        if field.metadata.get("parameter"):
+            if field.default is not MISSING:
+                yield name, field.default
+            elif field.default_factory is not MISSING:
+                yield name, field.default_factory()
 
 
 def _in(metadata: dict) -> str:
