@@ -11,7 +11,7 @@ import pytest
 
 import jourdain_jax as jj
 from jourdain_jax.build import load_jumps
-from jourdain_jax.build.load_jumps import jump_of_loads, loads_may_jump
+from jourdain_jax.build.load_jumps import jump_of_loads, loads_may_jump, loads_without_slope
 from jourdain_jax.motion.simulate import set_up
 
 TS = jnp.linspace(0.0, 2.0, 9)
@@ -212,3 +212,39 @@ def test_a_derivative_along_which_no_time_moves_does_not_warn():
 
     assert len(warned(jax.jit(jax.grad(f, 0)), 0.4, 0.4)) == 1
     assert not warned(jax.jit(jax.grad(f, 1)), 0.4, 0.4)
+
+
+AT_REST = {
+    "friction": (True, JUMPS["friction"]),
+    "one-sided": (True, lambda m, p: jnp.maximum(m.q.x, 0.0)),
+    "a magnitude": (True, lambda m, p: -p * jnp.abs(m.q.x)),
+    "a root": (True, KINKS["a root"]),
+    "a jump on one side": (True, lambda m, p: jnp.where(m.q.x > 0.0, 1.0 + m.q.x, 0.0)),
+    "smooth": (False, lambda m, p: -p * jnp.sin(m.q.x) + 1e6 * (m.q.y + m.u.y_rate)),
+    "air": (False, lambda m, p: -1e3 * p * jnp.abs(m.u.y_rate) * m.u.y_rate),
+    "steep": (False, lambda m, p: -p * jnp.tanh(1e5 * m.u.y_rate) + 1e3 * jnp.abs(m.q.x - 0.1)),
+    "Hertz": (False, lambda m, p: 1e5 * jnp.maximum(-m.q.y, 0.0) ** 1.5),
+    "a spline": (False, lambda m, p: jj.Spline(TS, jnp.sin(3.0 * TS))(m.q.x + 0.5)),
+    "a table between its knots": (False, lambda m, p: jnp.interp(m.q.x + 0.3, TS, jnp.sin(TS))),
+    "a guarded quotient": (False, KINKS["a guarded quotient"]),
+    "large and far away": (False, lambda m, p: 1e9 + 1e3 * jnp.where(m.q.x > 1.0, 2.0, m.q.x)),
+}
+
+
+@pytest.mark.parametrize("name", AT_REST)
+def test_linearizing_where_a_load_has_no_slope_warns(name):
+    rough, push = AT_REST[name]
+    scene = Pushed(push=push)
+    rest = np.zeros(1), np.zeros(2), np.zeros(2), np.zeros(0)
+    assert loads_without_slope(scene, *rest) == ("the force along `y_rate`" if rough else "")
+
+
+def test_a_linearization_at_rest_on_dry_friction_says_so():
+    scene = Pushed(push=JUMPS["friction"])
+    with pytest.warns(jj.SensitivityWarning, match="the force along `y_rate` has no derivative at this state") as said:
+        jj.linearize(scene, {"y_rate": 0.0})
+    assert said[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jj.linearize(scene, {"y_rate": 0.1})
+        jax.jit(lambda u: jj.linearize(scene, jj.start(scene, y_rate=u)).A)(0.1)

@@ -8,6 +8,7 @@ coordinates: the first form with the privileged speeds changed to (pdot, the oth
 Source: Wang and Pao (2003), eqs. (25)-(31), (41); D. L. Peterson, G. Gede and M. Hubbard, Multibody System Dynamics 33 (2015) 143.
 """
 
+import warnings
 from collections.abc import Callable
 from functools import partial
 
@@ -19,15 +20,17 @@ from jaxtyping import Array, Complex, Float
 
 from jourdain_jax.analysis.table import linearization_text
 from jourdain_jax.analysis.tangent import Flow, carried_along, dependent_coordinates, eliminated, flow_of, others, perturbations, privileged_speeds
-from jourdain_jax.calculus.reals import Numbers
+from jourdain_jax.build.load_jumps import loads_without_slope
+from jourdain_jax.calculus.reals import Numbers, is_traced
 from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.quick_compilation import RUN_SELDOM, quickly_compiled
+from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.start import State
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
 from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.tracebacks import shown_from_users_lines
+from jourdain_jax.scene.tracebacks import shown_from_users_lines, users_level
 
 _compiled = partial(quickly_compiled, options=RUN_SELDOM)  # of a bicycle in 2.3 s of processor time, not in 11.4; run as quickly
 
@@ -115,15 +118,27 @@ def linearize(
     **Returns** a `Linearization`. Pure: runs under jit, vmap and differentiation, over scene parameters and the state.
 
     **Raises** ValueError: an unknown coordinate or speed, a coordinate that is both named and dependent, or whose rate is no privileged speed.
+    **Warns** (`SensitivityWarning`): a load has a kink or jumps at the state, as dry friction does at rest.
     """
     scene = as_scene(scene)
     f = as_input_vector(scene, inputs)
     state = as_state(scene, state, what="state", inputs=f)
     f = f.astype(state.q.dtype)
+    _warn_of_loads(scene, state, f)
     coordinates = None if coordinates is None else as_names(coordinates)
     y = privileged_speeds(scene, privileged)
     dependent_s = dependent_coordinates(scene, state, coordinates or (), None if dependent is None else as_names(dependent))
     return _linearize(scene, state, f, y, tuple(dependent_s.tolist()), coordinates)
+
+
+def _warn_of_loads(scene: Scene, state: State, f) -> None:
+    """A warning where loads have no derivative; what is traced is not looked at."""
+    if not is_traced((scene, state, f)) and (rough := loads_without_slope(scene, state.t, state.q, state.u, f)):
+        text = (
+            f"the linearization of `{type(scene).__name__}` leaves out that {rough} has no derivative at this state: it has a kink or jumps there, as dry "
+            "friction does at rest. Linearize at a state beside it, or let the load change within a short range, as by `jnp.tanh`"
+        )
+        warnings.warn(text, SensitivityWarning, stacklevel=users_level())
 
 
 @_compiled

@@ -4,6 +4,8 @@
 
 What is decided by a comparison or an index on the way to the loads is looked at along lines in t, and across coordinates, speeds and inputs. A branch that
 these lines do not meet, a jump without a branch (x / sqrt(x^2)), and loads by a callback that has no form for lanes, are not seen.
+
+At one state, as at rest with dry friction, loads may have no derivative at all; so has then no linearization.
 """
 
 import jax
@@ -27,6 +29,8 @@ from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 
 STATES = 64  # random ones, which the lines go through
+NEAR, NEARER = 1e-7, 1e-8  # steps off a state, relative to entries larger than one
+FLOOR = 1e-11  # what of a difference of loads may be round-off, relative to the largest of them
 POLE = 1e3  # times what an entry is elsewhere: what differs by more on both sides has a pole there
 
 
@@ -68,6 +72,32 @@ def _first_jump(scene: Scene, q: np.ndarray, in_parameters: bool, in_state: bool
             k, t = found
             return f"{_names(scene)[k]} jumps {where.format(t)}"
     return ""
+
+
+def loads_without_slope(scene: Scene, t, q, u, inputs) -> str:
+    """Which of the loads or masses has no derivative with respect to the state at a state, in words; empty where none is seen.
+
+    Differences on both sides, over steps h, agree to O(h) where there is a derivative; at a kink they do not, and where a load jumps they grow as 1/h.
+    """
+    if not loads_may_jump(scene)[1]:
+        return ""
+    at = np.concatenate([np.ravel(x).astype(float) for x in (t, q, u, inputs)])
+    step = np.diag(np.maximum(1.0, np.abs(at)))[1:]
+    with without_collecting(), np.errstate(all="ignore"):
+        try:
+            near, nearer = (_differences(scene, at, step, size) for size in (NEAR, NEARER))
+        except NotImplementedError:  # as of `jump_of_loads`
+            return ""
+        apart = nearer * NEARER > FLOOR * np.nanmax(np.abs(_loads(scene, at[None])), initial=1.0)
+    rough = np.any((nearer > 0.5 * near) & apart, axis=0)
+    return _names(scene)[int(np.argmax(rough))] if np.any(rough) else ""
+
+
+def _differences(scene: Scene, at: np.ndarray, step: np.ndarray, size: float) -> np.ndarray:
+    """How much slopes of every entry over steps of this size, and half of it, differ, (variables, entries)."""
+    here = _loads(scene, at[None])[0, 0]
+    ahead, halfway, back = ((_loads(scene, at + share * size * step)[:, 0] - here) / (share * size) for share in (1.0, 0.5, -1.0))
+    return np.maximum(np.abs(ahead - halfway), np.abs(ahead - back))
 
 
 def _jump_between(scene: Scene, a: np.ndarray, b: np.ndarray) -> tuple[int, float] | None:
