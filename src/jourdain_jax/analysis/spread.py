@@ -21,7 +21,7 @@ from jourdain_jax.analysis.losses import LEAST_SQUARES
 from jourdain_jax.analysis.noise_levels import NoiseLevels, noise_levels
 from jourdain_jax.analysis.problem import Problem
 
-_NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
+NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
 _FEWEST_DEGREES = 4  # of freedom, that an estimated correlation time leaves
 
 
@@ -77,7 +77,7 @@ def _normal_or_t(of_memory: np.ndarray, of_sigmas: np.ndarray) -> np.ndarray:
     """
     of_memory = np.minimum(of_memory, 2 / _FEWEST_DEGREES)
     doubt = of_memory + of_sigmas
-    return np.where(doubt > 0, students_t_95(2 / np.maximum(doubt, 1e-12)) * np.sqrt(1 - of_memory), _NORMAL_95)
+    return np.where(doubt > 0, students_t_95(2 / np.maximum(doubt, 1e-12)) * np.sqrt(1 - of_memory), NORMAL_95)
 
 
 def _of_rise(wider: np.ndarray, quantiles: np.ndarray, of_sigmas: np.ndarray) -> Float[np.ndarray, "members unknowns"]:
