@@ -139,7 +139,8 @@ def bootstrap(fit, data: Experiment | Sequence[Experiment], repeats: int, seed: 
     again, generator = taken_up(fit, data), np.random.default_rng(seed)
     samples, width = sum(r.size for run in fit.residuals for r in run.values()), sum(fit.layout.sizes) + 2
     most = max(1, _ROOM // (8 * samples * width))
-    places, limits, quantiles, pools = again.problem.unknowns.estimated, again.limits, fit.statistics.quantiles, {}
+    pools: dict[str, np.ndarray] = {}
+    places, limits, quantiles = again.problem.unknowns.estimated, again.limits, fit.statistics.quantiles
     if noise == "residuals":
         quantiles, pools = _of_residuals(fit, again)
     elif fit.asked.loss != LEAST_SQUARES:

@@ -233,7 +233,7 @@ class Fit(Printed):
         loss. `noise="residuals"` draws it from the whitened residuals of each channel, whatever their sigmas and distribution. What is missing, start values
         and inputs stay, means of priors are drawn anew. Repeats begin from the estimates, so that minima far away are not looked for.
 
-        **Returns** estimates with standard errors and 95 % intervals of the repeats (from their quantiles; wider where the size of the noise was estimated), their
+        **Returns** estimates with standard errors and 95 % intervals of the repeats (from their quantiles; wider where the size of noise was estimated), their
         bias, `converged` and `at_bound` of each, and `warnings`. 1000 repeats tell an end of an interval to a tenth of a standard error; the same `seed` gives
         the same ones.
 

@@ -73,7 +73,8 @@ def informed(fitted: TakenUp, most: int) -> Informed:
 
 def leverages(fitted: TakenUp) -> tuple[dict[str, Float[np.ndarray, "times *channel"]], ...]:
     """The leverage of each sample, of each run by channel; NaN where it is missing."""
-    known, found = fitted.information(), [{}] * len(fitted.problem.runs)
+    known = fitted.information()
+    found: list[dict[str, np.ndarray]] = [{}] * len(fitted.problem.runs)
     for run, own, shared in _derivatives(fitted):
         X = shared - own @ known.follow[run]
         found[run] = fitted.problem.lanes.by_channel(run, np.sum(X @ known.shared * X, axis=1) + np.sum(own @ known.own[run] * own, axis=1))
