@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from small_scenes import Oscillator
+from scipy.special import stdtrit
+from small_scenes import Bead, Oscillator
 
 import jourdain_jax as jj
 from jourdain_jax.analysis import bootstrap
@@ -80,7 +81,37 @@ def test_noise_of_residuals_has_their_spread_and_sigmas_that_are_estimated_allow
     assert by_residuals / by_sigmas == pytest.approx(np.sqrt(fit.reduced_chi_square), rel=0.12)
     data = run(0, TS[:16], stated=None)
     unknown = jj.fit(OSCILLATOR, data, ())  # its covariance has the factor samples / (samples - unknowns), here 1.33
-    assert unknown.bootstrap(data, 1500)["gauge.bias"].standard_error == pytest.approx(unknown["gauge.bias"].standard_error, rel=0.1)
+    found = unknown.bootstrap(data, 1500)["gauge.bias"]
+    assert found.standard_error == pytest.approx(unknown["gauge.bias"].standard_error, rel=0.1)
+    # and its interval is that of Student's t, 1.15 times as wide as a normal one
+    assert found.high - found.low == pytest.approx(unknown["gauge.bias"].high - unknown["gauge.bias"].low, rel=0.1)
+
+
+def test_noise_of_residuals_allows_for_the_unknowns_of_each_channel_and_the_degrees_of_freedom_of_each_interval():
+    # two straight lines, one with 20 samples, one with four
+    ts, noise, start = np.linspace(0.0, 1.0, 20), np.random.default_rng(3), {"x": 1.0, "x_rate": 2.0, "y": 0.5, "y_rate": 1.0}
+    x, y = 1 + 2 * ts + 0.1 * noise.normal(size=20), np.full(20, np.nan)
+    few = [0, 6, 13, 19]
+    y[few] = 0.5 + ts[few] + 0.3 * noise.normal(size=4)
+    data = jj.Experiment(ts, {"x": x, "y": y}, 1.0, start=start, unknown_start=tuple(start))
+    found = jj.fit(Bead(), data).bootstrap(data, 1500, noise="residuals")
+    for name, t, z in (("x", ts, x), ("y", ts[few], y[few])):
+        X = np.stack([np.ones(len(t)), t], axis=1)
+        _, (rss,), *_ = np.linalg.lstsq(X, z)
+        error, quantile = np.sqrt(rss / (len(t) - 2) * np.linalg.inv(X.T @ X)[1, 1]), stdtrit(len(t) - 2, 0.975)
+        slope = found[f"run 0: {name}_rate"]
+        assert slope.standard_error == pytest.approx(error, rel=0.1)
+        assert slope.high - slope.low == pytest.approx(2 * quantile * error, rel=0.1)  # t of 2 degrees of freedom is 4.3
+
+
+def test_intervals_stay_within_bounds_and_residuals_that_tell_no_noise_are_refused():
+    ts, start = np.linspace(0.0, 1.0, 4), {"x": 1.0, "x_rate": 2.0}
+    data = jj.Experiment(ts, {"x": [1.0, 1.8, 2.2, 3.1]}, None, start=start, unknown_start={"x": None, "x_rate": jj.bounds(1.9, 2.1)})
+    rate = jj.fit(Bead(), data).bootstrap(data, 40)["run 0: x_rate"]
+    assert 1.9 <= rate.low < rate.high <= 2.1
+    data = jj.Experiment(ts, {"x": [1.0, 1.8, 2.2, 3.1], "y": [np.nan, 0.1, np.nan, np.nan]}, 0.1, start=start, unknown_start=tuple(start))
+    with pytest.raises(ValueError, match="residuals of `y` tell nothing of its noise, with 1 samples"):
+        jj.fit(Bead(), data).bootstrap(data, 40, noise="residuals")
 
 
 def test_noise_is_students_t_under_that_loss_and_that_of_huber_comes_from_residuals():

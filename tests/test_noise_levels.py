@@ -163,3 +163,17 @@ def test_a_memory_needs_neighbours():
     runs = [run([0.5], {"x": [2.0 + 0.01 * k]}, 0.1, ("x",), t0=0.0, correlation_time=None) for k in range(3)]
     with pytest.raises(ValueError, match="each run has one sample"):
         jj.fit(Bead(), runs)
+
+
+def test_limits_at_a_bound_and_profiles_from_it_are_those_of_students_t_where_sigmas_are_estimated():
+    # of a straight line whose slope may not be less than it is found to be without a bound
+    ts, y = lines(6)
+    X = np.stack([np.ones(6), ts], axis=1)
+    (_, slope), (rss,), *_ = np.linalg.lstsq(X, y)
+    error = np.sqrt(rss / 4 * np.linalg.inv(X.T @ X)[1, 1])
+    for sigma, reach in ((None, stdtrit(4, 0.975) * error), (0.1, 1.959964 * error * 0.1 / np.sqrt(rss / 4))):
+        data = run(ts, {"x": y}, sigma, {"x": None, "x_rate": jj.bounds(slope + 1e-3 * error, 9.0)})
+        found = jj.fit(Bead(), data)
+        assert found.at_bound.tolist() == [False, True]
+        assert float(found["run 0: x_rate"].high) - slope == pytest.approx(reach, rel=0.02)  # found to 2 % of the rise
+        assert found.profiles(data)["run 0: x_rate"].high - slope == pytest.approx(reach, rel=0.02)

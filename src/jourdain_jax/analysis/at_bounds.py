@@ -1,9 +1,11 @@
 """Unknowns at a bound: how far from it each may be, a one-sided limit by profile likelihood; and intervals that bounds make too narrow.
 
-p(delta) = min over all other unknowns of (F - F_min), theta = bound + delta;      the limit is where 2 p = 2.706, the square of the normal 95 % quantile
+p(delta) = min over all other unknowns of (F - F_min), theta = bound + delta;      the limit is where 2 p = 3.84 f      f: see `spread`; 1 where noise is known
 p is close to g delta + h delta^2 / 2, g: slope of F there, 1 / h: variance of the unknown if it were free
 p < 0: F is lower away from the bound. So it is where another unknown does the same at the bound, as a delay does at a lag of zero: F is level there, a saddle
-Source: D. J. Venzon and S. H. Moolgavkar, Applied Statistics 37 (1988) 87.
+The rise is that at the ends of other intervals. With that of a one-sided limit, 2.71 f, data would choose between two kinds of interval, which together hold a
+truth that is 1.6 standard errors from its bound in 92.5 % of repeats.
+Source: D. J. Venzon and S. H. Moolgavkar, Applied Statistics 37 (1988) 87; G. J. Feldman and R. D. Cousins, Physical Review D 57 (1998) 3873, section IV.
 """
 
 from collections.abc import Callable, Iterable
@@ -16,10 +18,9 @@ from jaxtyping import Bool, Float
 from jourdain_jax.analysis.information import information
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum, minimum_beside
 
-ONE_SIDED = 2.7055434540954146 / 2  # of F
 RISE_95 = 3.841458820694124  # of 2 F
 FAR_BEYOND = 3.0  # standard errors: an estimate that is held at its bound by more is no chance
-CLOSE = 0.02  # of `ONE_SIDED`: error of p at the limit, and by how much F is to be lower elsewhere to count as lower
+CLOSE = 0.02  # of p at the limit: its error there, and by how much F is to be lower elsewhere to count as lower
 MOST = 16  # evaluations of p
 FURTHER = 4.0  # factor of delta where p does not rise
 NARROW = 0.5  # of the rise that a standard error foretells: with less, the interval is too narrow
@@ -33,6 +34,7 @@ class AtBounds:
 
     limit: Float[np.ndarray, "members unknowns"]  # infinite where the data give none
     beyond: Float[np.ndarray, "members unknowns"]  # by how many standard errors the data would put it beyond its bound
+    of_rise: Float[np.ndarray, "members unknowns"]  # f
     lower: dict[int, tuple[float, np.ndarray]] = field(default_factory=dict)  # by member: F and all unknowns where it is lower, one being off its bound
     at_limit: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)  # by member and unknown at a bound: all unknowns with that one at its limit
 
@@ -67,10 +69,10 @@ class Around:
         return error if np.isfinite(error) else np.inf, abs(float(arrow.gradient[0, place]))
 
 
-def limits_at_bounds(around: Around) -> AtBounds:
-    """Each unknown at a bound is moved away from it, all others following."""
+def limits_at_bounds(around: Around, of_rise: Float[np.ndarray, "members unknowns"]) -> AtBounds:
+    """Each unknown at a bound is moved away from it, all others following. `of_rise`: f."""
     theta = around.found.theta
-    told = AtBounds(np.full(theta.shape, np.nan), np.full(theta.shape, np.nan))
+    told = AtBounds(np.full(theta.shape, np.nan), np.full(theta.shape, np.nan), of_rise)
     for b, place in np.argwhere(around.at_bound & around.found.converged[:, None]).tolist():
         _look_inward(around, told, b, place)
     return told
@@ -80,14 +82,14 @@ def _look_inward(around: Around, told: AtBounds, b: int, place: int) -> None:
     """Tells what one unknown at its bound shows when it is moved away from it."""
     bound, limits = around.found.theta[b, place], around.limits
     inward = 1.0 if bound <= limits.low[place] else -1.0
-    error, slope = around.if_free(b, place)
+    (error, slope), end = around.if_free(b, place), RISE_95 / 2 * told.of_rise[b, place]
     told.beyond[b, place] = slope * error if np.isfinite(error) else np.nan
     if told.beyond[b, place] > FAR_BEYOND:  # the bound decides: the slope alone gives the limit
-        told.limit[b, place] = bound + inward * _root(slope, 1 / error**2)
+        told.limit[b, place] = bound + inward * _root(slope, 1 / error**2, end)
         return
     room = float(limits.high[place] - limits.low[place])
-    first = min(_root(slope, 1 / error**2) if np.isfinite(error) else float(limits.size(around.found.theta[b : b + 1])[0, place]), room)
-    delta, at = _limit(partial(around.rise, b, place), inward, first, room)
+    first = min(_root(slope, 1 / error**2, end) if np.isfinite(error) else float(limits.size(around.found.theta[b : b + 1])[0, place]), room)
+    delta, at = _limit(partial(around.rise, b, place), inward, first, room, end)
     if at is not None and np.isfinite(delta):
         told.at_limit[b, place] = at.theta[0]
     elif at is not None and (b not in told.lower or at.at.cost[0] < told.lower[b][0]):
@@ -139,19 +141,19 @@ def _too_narrow(names: list[str]) -> str:
     return f"the {'intervals' if len(names) > 1 else 'interval'} of {', '.join(names)} {'are' if len(names) > 1 else 'is'} too narrow"
 
 
-def _limit(profile: Callable[[float], tuple[float, Minimum]], inward: float, delta: float, room: float) -> tuple[float, Minimum | None]:
-    """How far `inward` (1 or -1) the profile reaches `ONE_SIDED`, looked for from `delta` on, and the minimum there; infinite and None where it does not.
+def _limit(profile: Callable[[float], tuple[float, Minimum]], inward: float, delta: float, room: float, end: float) -> tuple[float, Minimum | None]:
+    """How far `inward` (1 or -1) the profile reaches `end`, looked for from `delta` on, and the minimum there; infinite and None where it does not.
 
     Infinite with a minimum: that one is lower than at the bound.
     """
     inner, outer = (0.0, 0.0), (np.inf, np.inf)  # delta and rise on either side
     for _ in range(MOST):
         rise, at = profile(inward * delta)
-        if rise < -CLOSE * ONE_SIDED:
+        if rise < -CLOSE * end:
             return np.inf, at
-        if abs(rise / ONE_SIDED - 1) < CLOSE:
+        if abs(rise / end - 1) < CLOSE:
             return delta, at
-        if rise < ONE_SIDED:
+        if rise < end:
             inner = delta, max(rise, 0.0)
         else:
             outer = delta, rise
@@ -159,14 +161,14 @@ def _limit(profile: Callable[[float], tuple[float, Minimum]], inward: float, del
             return np.inf, None
         if np.isfinite(outer[1]):  # the root of p is nearly straight
             low, high = np.sqrt(inner[1]), np.sqrt(outer[1])
-            delta = inner[0] + (outer[0] - inner[0]) * (np.sqrt(ONE_SIDED) - low) / (high - low)
+            delta = inner[0] + (outer[0] - inner[0]) * (np.sqrt(end) - low) / (high - low)
         elif np.isfinite(outer[0]):  # the motion fails there
             delta = (inner[0] + outer[0]) / 2
         else:
-            delta = min(delta * min(np.sqrt(ONE_SIDED / inner[1]) * (1 + CLOSE) if inner[1] else FURTHER, FURTHER), room)
+            delta = min(delta * min(np.sqrt(end / inner[1]) * (1 + CLOSE) if inner[1] else FURTHER, FURTHER), room)
     return (delta, at) if np.isfinite(outer[0]) else (np.inf, None)
 
 
-def _root(slope: float, curvature: float) -> float:
-    """delta > 0 with slope delta + curvature delta^2 / 2 = ONE_SIDED."""
-    return float(2 * ONE_SIDED / (slope + np.sqrt(slope**2 + 2 * curvature * ONE_SIDED)))
+def _root(slope: float, curvature: float, end: float) -> float:
+    """delta > 0 with slope delta + curvature delta^2 / 2 = end."""
+    return float(2 * end / (slope + np.sqrt(slope**2 + 2 * curvature * end)))

@@ -3,9 +3,15 @@
     value* = prediction + sigma e       e: standard normal, or Student's t under that loss, with the memory that the noise was fitted with
     mean*  = theta + S M^-1 e           of priors: they were measured, too, and are drawn anew about the estimates; S, M: see `joint_prior`
 
-Each repeat is fitted as the data were, from the estimates on. Ends of the 95 % interval are the 2.5 and 97.5 % quantiles of what is found, bias is its mean
-less the estimate. Where e is drawn from residuals, sigma is sqrt(samples / (samples - unknowns)) times larger than these are.
-Source: B. Efron and R. J. Tibshirani, An Introduction to the Bootstrap (1993), chapters 9, 10 and 13; at a bound: D. W. K. Andrews, Econometrica 68 (2000) 399.
+Each repeat is fitted as the data were, from the estimates on; bias is the mean of what is found less the estimate.
+
+    ends of the 95 % interval     theta + (q / 1.96) (quantile - theta)           quantiles: 2.5 and 97.5 % of what is found
+    noise of residuals            e = (r - mean r) c,  of variance sum r^2 / (n - p)       of each channel: n samples, which determined p unknowns
+
+q is that of Student's t where the size of the noise was estimated: all repeats have the size that was found, so that they spread too little. Its degrees of
+freedom are 1 / sum share^2 / (n - p) over all channels, of whose share in the variance of an unknown `informed` tells. Where the noise is known, q is 1.96.
+Source: B. Efron and R. J. Tibshirani, An Introduction to the Bootstrap (1993), chapters 9, 10 and 13; T. C. Hesterberg, The American Statistician 69 (2015) 371
+(quantiles of t in place of normal ones); F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110; at a bound: D. W. K. Andrews, Econometrica 68 (2000) 399.
 """
 
 import math
@@ -23,11 +29,15 @@ from jourdain_jax.analysis.derived import derived
 from jourdain_jax.analysis.estimated import Estimated
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.held_out import Prediction, of_fitted
+from jourdain_jax.analysis.information import students_t_95
+from jourdain_jax.analysis.informed import informed, leverages
 from jourdain_jax.analysis.levenberg_marquardt import Minimum
 from jourdain_jax.analysis.losses import LEAST_SQUARES
+from jourdain_jax.analysis.noise_levels import LEFT
 from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.analysis.search import off_bounds, with_memory
+from jourdain_jax.analysis.spread import NORMAL_95
 from jourdain_jax.analysis.table import table
 from jourdain_jax.scene.printing import Printed
 
@@ -45,10 +55,12 @@ class Bootstrap(Printed):
     values: Float[np.ndarray, "repeats unknowns"]  # in the order of `fit.labels`
     converged: Bool[np.ndarray, "repeats"]  # the others count nowhere
     at_bound: Bool[np.ndarray, "repeats unknowns"]
+    quantiles: Float[np.ndarray, "unknowns"]  # q
+    bounds: tuple[Float[np.ndarray, "unknowns"], Float[np.ndarray, "unknowns"]]
 
     def __getitem__(self, name: str) -> Estimated:
-        e = self.fit[name]
-        return self._told(e.value, self.values[:, self.fit.labels.index(name)], ~np.isnan(e.low + e.high), e.unit)
+        e, i = self.fit[name], self.fit.labels.index(name)
+        return self._told(e.value, self.values[:, i], ~np.isnan(e.low + e.high), self.quantiles[i], e.unit, (self.bounds[0][i], self.bounds[1][i]))
 
     @property
     def estimates(self) -> dict[str, Estimated]:
@@ -64,18 +76,20 @@ class Bootstrap(Printed):
     def derived(self, function: Callable, unit: str = "") -> Estimated:
         """A number, or an array of them, that follows from the parameters, as `Fit.derived`, with standard error and interval of the bootstrap."""
         known, shared = self.fit.derived(function, unit), self.fit.layout.sizes[0]
-        drawn, _ = derived(self.fit.asked.scene, self.fit.layout, function, self.values[:, :shared])
-        return self._told(known.value, drawn, np.isfinite(known.standard_error), unit)
+        drawn, slopes = derived(self.fit.asked.scene, self.fit.layout, function, self.values[:, :shared])
+        q = np.max(np.where(np.any(slopes != 0, axis=0), self.quantiles[:shared], 0.0), axis=-1, initial=0.0)
+        return self._told(known.value, drawn, np.isfinite(known.standard_error), q, unit)
 
     @property
     def tied(self) -> dict[str, Estimated]:
         """The parameters that follow from unknowns, as in `Fit.tied`."""
         return {name: self.derived(lambda scene, name=name: getattr(scene, name), e.unit) for name, e in self.fit.tied.items()}
 
-    def _told(self, value, drawn: np.ndarray, is_told, unit: str) -> Estimated:
+    def _told(self, value, drawn: np.ndarray, is_told, q, unit: str, bounds=(-np.inf, np.inf)) -> Estimated:
         drawn, spread = drawn[self.converged], np.full((3, *np.shape(value)), np.nan)
         if len(drawn) > 1:
-            spread = np.where(is_told, [np.std(drawn, axis=0, ddof=1), *np.quantile(drawn, (_TAIL, 1 - _TAIL), axis=0)], np.nan)
+            ends = np.clip(value + q / NORMAL_95 * (np.quantile(drawn, (_TAIL, 1 - _TAIL), axis=0) - value), *bounds)
+            spread = np.where(is_told, [np.std(drawn, axis=0, ddof=1), *ends], np.nan)
         error, low, high = map(np.asarray, spread)
         return Estimated(value, error, low, high, unit)
 
@@ -125,17 +139,38 @@ def bootstrap(fit, data: Experiment | Sequence[Experiment], repeats: int, seed: 
     again, generator = taken_up(fit, data), np.random.default_rng(seed)
     samples, width = sum(r.size for run in fit.residuals for r in run.values()), sum(fit.layout.sizes) + 2
     most = max(1, _ROOM // (8 * samples * width))
-    parts = [_fitted(fit, again, generator, min(most, repeats - begun), noise) for begun in range(0, repeats, most)]
-    places, limits = again.problem.unknowns.estimated, again.limits
+    pools: dict[str, np.ndarray] = {}
+    places, limits, quantiles = again.problem.unknowns.estimated, again.limits, fit.statistics.quantiles
+    if noise == "residuals":
+        quantiles, pools = _of_residuals(fit, again)
+    elif fit.asked.loss != LEAST_SQUARES:
+        quantiles = np.full(quantiles.shape, NORMAL_95)
+    parts = [_fitted(fit, again, generator, min(most, repeats - begun), pools) for begun in range(0, repeats, most)]
     theta = np.concatenate([part.theta for part in parts])
     bound = (theta <= limits.low) | (theta >= limits.high)
-    return Bootstrap(fit, theta[:, places], np.concatenate([part.converged for part in parts]), bound[:, places])
+    converged = np.concatenate([part.converged for part in parts])
+    return Bootstrap(fit, theta[:, places], converged, bound[:, places], quantiles, (limits.low[places], limits.high[places]))
 
 
-def _fitted(fit, again: TakenUp, generator: np.random.Generator, count: int, noise: str) -> Minimum:
-    """So many repeats, fitted."""
+def _of_residuals(fit, again: TakenUp) -> tuple[Float[np.ndarray, "unknowns"], dict[str, Float[np.ndarray, "samples"]]]:
+    """q of each unknown, and by channel the noise that its residuals show, in units of sigma."""
+    shares, of_runs, pools, doubt = informed(again, len(fit.labels)), leverages(again), {}, 0.0
+    for name, share in shares.of_channels.items():
+        r, leverage = (np.concatenate([np.ravel(of[name]) for of in parts if name in of]) for parts in (fit.whitened, of_runs))
+        r, left = r[np.isfinite(r)], np.count_nonzero(np.isfinite(r)) - np.nansum(leverage)
+        if left < LEFT or (r.size == 1 and r[0]):
+            raise ValueError(f'residuals of `{name}` tell nothing of its noise, with {r.size} samples; use `noise="sigmas"`')
+        pools[name] = (r - np.mean(r)) * np.sqrt(np.sum(r**2) / left / max(np.var(r), np.finfo(float).tiny))
+        doubt = doubt + share**2 / left
+    quantiles = np.full(len(fit.labels), NORMAL_95)
+    quantiles[[fit.labels.index(name) for name in shares.labels]] = students_t_95(1 / np.maximum(doubt, 1e-12))
+    return quantiles, pools
+
+
+def _fitted(fit, again: TakenUp, generator: np.random.Generator, count: int, pools: dict) -> Minimum:
+    """So many repeats, fitted. `pools`: noise of channels to draw from; none: it is that of the sigmas."""
     problem, asked, limits = again.problem, fit.asked, again.limits
-    runs = _drawn(fit, problem, generator, count, noise)
+    runs = _drawn(fit, problem, generator, count, pools)
     lanes = Lanes(asked.scene, runs, problem.unknowns.layout, asked.simulation, count, asked.loss)
     of_repeats = Problem(asked.scene, runs, problem.unknowns, lanes, asked.loss)
     of_repeats.prior_mean = _drawn_priors(problem, again.theta[0], generator, count)
@@ -144,22 +179,19 @@ def _fitted(fit, again: TakenUp, generator: np.random.Generator, count: int, noi
     return off_bounds(of_repeats, with_memory(of_repeats, found, limits, asked.control), limits, asked.control, None)[0]
 
 
-def _drawn(fit, problem: Problem, generator: np.random.Generator, count: int, noise: str) -> tuple[Experiment, ...]:
+def _drawn(fit, problem: Problem, generator: np.random.Generator, count: int, pools: dict) -> tuple[Experiment, ...]:
     """The runs with so many repeats of their values; what is missing is so in each."""
-    runs, from_residuals = [], noise == "residuals"
-    larger = math.sqrt(fit.samples / max(float(fit.degrees_of_freedom), 1.0)) if from_residuals else 1.0
-    whitened = {name: np.concatenate([np.ravel(of[name]) for of in fit.whitened if name in of]) for of in fit.whitened for name in of}
-    pools = {name: w[np.isfinite(w)] - np.nanmean(w) for name, w in whitened.items()}
+    runs = []
     for run, of_run in zip(problem.runs, of_fitted(fit, problem.runs), strict=True):
         values = {}
         for name, predicted in of_run.items():
             shape = (count, *predicted.values.shape)
-            if from_residuals:
+            if pools:
                 e = generator.choice(pools[name], shape)
             else:
                 e = generator.standard_normal(shape) if fit.asked.loss == LEAST_SQUARES else generator.standard_t(fit.asked.loss.parameter, shape)
             tau = fit.correlation_time[name] if name in fit.correlation_time else run.correlation_time.get(name, 0.0)
-            values[name] = predicted.prediction + larger * predicted.sigma * _with_memory(e, predicted, float(tau))
+            values[name] = predicted.prediction + predicted.sigma * _with_memory(e, predicted, float(tau))
         runs.append(eqx.tree_at(lambda run: run.values, run, values))
     return tuple(runs)
 

@@ -164,7 +164,7 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
             pieces.keep(int(np.argmin(found.at.cost)))
         control = replace(control, cutoff=cutoff_of(pieces, control, np.arange(len(pieces.at.theta))))
         asked = replace(asked, control=control)
-    found, at_bounds = off_bounds(problem, with_memory(problem, found if members else found.lowest(), limits, control), limits, control, pieces)
+    found, at_bounds = off_bounds(problem, with_memory(problem, found if members else found.lowest(), limits, control), limits, control, pieces, errors)
     found.converged &= enough
     if pieces is not None:
         found.converged &= pieces.closed(np.arange(len(found.converged)))

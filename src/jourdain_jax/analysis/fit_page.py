@@ -109,7 +109,7 @@ def _estimates(fit, profiles: Mapping[str, Profile], bootstrap) -> str:
     more = ""
     if bootstrap is not None:
         good = int(np.sum(bootstrap.converged))
-        more = _note(f"Bootstrap: 2.5 and 97.5 % quantiles of {good} fits of repeats; {len(bootstrap.values) - good} did not converge.")
+        more = _note(f"Bootstrap: from 2.5 and 97.5 % quantiles of {good} fits of repeats; {len(bootstrap.values) - good} did not converge.")
         more += "".join(f'<p class="warning">{_words(sentence)}</p>' for sentence in bootstrap.warnings)
     return _table("estimates", tuple(heads), rows) + more
 

@@ -233,8 +233,9 @@ class Fit(Printed):
         loss. `noise="residuals"` draws it from the whitened residuals of each channel, whatever their sigmas and distribution. What is missing, start values
         and inputs stay, means of priors are drawn anew. Repeats begin from the estimates, so that minima far away are not looked for.
 
-        **Returns** estimates with standard errors and 95 % intervals (quantiles) of the repeats, their bias, `converged` and `at_bound` of each, and
-        `warnings`. 1000 repeats tell an end of an interval to a tenth of a standard error; the same `seed` gives the same ones.
+        **Returns** estimates with standard errors and 95 % intervals of the repeats (from their quantiles; wider where the size of noise was estimated), their
+        bias, `converged` and `at_bound` of each, and `warnings`. 1000 repeats tell an end of an interval to a tenth of a standard error; the same `seed` gives
+        the same ones.
 
         **Raises** ValueError for a fit of a batch, one that failed or has not converged, other data than the fit's, `errors="runs"`, and noise that `huber()`
         does not state.

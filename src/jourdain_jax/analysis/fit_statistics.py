@@ -1,31 +1,26 @@
 """What follows from the minimum that a fit found: standard errors and intervals, residuals by channel, the fitted scene.
 
-interval      estimate -+ q e,  within the bounds      e: standard error, q: 97.5 % quantile of the normal distribution, or Student's t where noise is estimated
+interval      estimate -+ q e,  within the bounds      e: standard error, q: quantile (see `spread`); at a bound: up to a limit by profile likelihood
 freedom       samples - rank + tr(C P)       what the samples determined is less than the rank by what priors tell; P: their information, C: covariance
 """
 
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jourdain_jax.analysis.arrow import Arrow
 from jourdain_jax.analysis.asked import Asked
-from jourdain_jax.analysis.at_bounds import RISE_95, Around, AtBounds, moved_from_bounds, too_narrow_near_bounds
+from jourdain_jax.analysis.at_bounds import Around, AtBounds, moved_from_bounds, too_narrow_near_bounds
 from jourdain_jax.analysis.events_met import events_met
-from jourdain_jax.analysis.information import Information, information, students_t_95, variances
-from jourdain_jax.analysis.levenberg_marquardt import LEAST, Limits, Minimum
-from jourdain_jax.analysis.noise_levels import noise_levels
+from jourdain_jax.analysis.information import Information, variances
+from jourdain_jax.analysis.levenberg_marquardt import Limits, Minimum
 from jourdain_jax.analysis.oddities import oddities
 from jourdain_jax.analysis.problem import Problem
+from jourdain_jax.analysis.spread import spread
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.scene.scene import Scene
-
-_NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
-_FEWEST_DEGREES = 4  # of freedom, that an estimated correlation time leaves
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,34 +60,18 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, e
     low, high = limits.low[places], limits.high[places]
     bound = (theta <= limits.low) | (theta >= limits.high)
     limit = one(at_bounds.limit[:, places])
-    told_by = partial(information, size=size, estimated=places, bound=bound, fails=fails, cutoff=control.cutoff)
-    levels = noise_levels(problem, theta, found.at, told_by, problem.loss.inflation)
+    about = spread(problem, found, bound, limits, control, errors)
+    levels, known, reach = about.levels, about.known.only() if single else about.known, one(about.quantiles * about.known.standard_errors)
     residuals = tuple(problem.by_channel(run, levels.at, one) for run in range(len(problem.runs)))
     white = tuple(problem.by_channel(run, levels.at, one, white=True) for run in range(len(problem.runs)))
     samples = sum(np.sum(np.isfinite(r), axis=tuple(range(0 if single else 1, r.ndim))) for run in residuals for r in run.values())
     determined = np.where(fails, 0.0, _determined(levels.known, unknowns))
 
-    def elsewhere(arrow: Arrow) -> tuple[np.ndarray, np.ndarray]:
-        norms = np.where(arrow.column_norms > 0, arrow.column_norms, 1.0)
-        moved = arrow.step(np.full(len(theta), LEAST), norms, limits.fixed | bound, np.zeros_like(theta), control.cutoff)
-        return told_by(arrow).standard_errors, moved[:, places]
-
-    known, plain = (x.only() if single else x for x in (levels.known, told_by(found.at.arrow)))
-    more, of_memory = (one(x) for x in problem.doubt(theta, elsewhere))
-    of_sigmas = one(levels.doubt)
-    quantiles = _normal_or_t(of_memory, of_sigmas) * np.sqrt(1 + more)
-    if errors == "runs":
-        of_runs = levels if problem.estimated else noise_levels(problem, theta, found.at, told_by, lambda r, _: problem.loss.bend(r))
-        scores = (levels if problem.estimated else found).at.arrow.scores
-        known = replace(of_runs.known.only() if single else of_runs.known, own=known.own).between_runs(one(scores))
-        quantiles, of_sigmas = students_t_95(len(problem.runs) - 1), np.zeros(1)
-    reach = quantiles * known.standard_errors
     too_narrow = []
     if single and found.converged[0]:
         too_narrow = moved_from_bounds(at_bounds, theta[0], reach, places, unknowns.labels)
         if errors == "sigmas":
-            around = Around(problem.linearised, found, limits, control)
-            too_narrow += too_narrow_near_bounds(around, at_bounds, plain.standard_errors, unknowns.labels)
+            too_narrow += too_narrow_near_bounds(Around(problem.linearised, found, limits, control), at_bounds, about.plain[0], unknowns.labels)
     values = one(theta[:, places])
     shared, local = unknowns.split(theta)
     scene = unknowns.layout.scene(problem.scene, one(shared))
@@ -106,7 +85,7 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, e
         low=np.where(values <= low, low, np.where(values >= high, limit, np.maximum(values - reach, low))),
         high=np.where(values >= high, high, np.where(values <= low, limit, np.minimum(values + reach, high))),
         at_bound=one(bound[:, places]),
-        quantiles=np.broadcast_to(quantiles, reach.shape),
+        quantiles=one(about.quantiles),
         information=known,
         residuals=residuals,
         whitened=white,
@@ -116,33 +95,12 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, e
         chi_square=np.where(one(fails), np.nan, sum(_sum_of_squares(r, single) for run in white for r in run.values())),
         samples=np.asarray(samples),
         degrees_of_freedom=np.asarray(samples - one(determined)),
-        of_rise=_of_rise(known.standard_errors / plain.standard_errors, quantiles, of_sigmas),
+        of_rise=one(np.where(bound[:, places], at_bounds.of_rise[:, places], about.of_rise)),
         from_prior=(values - unknowns.prior_mean[places]) / unknowns.prior_sigma[places],
         oddities=oddities(problem.scene, problem.runs, not single),
         events_met=events_met(problem, theta[0], asked.simulation) if single and asked.shooting is None else (),
         too_narrow=tuple(too_narrow),
     )
-
-
-def _normal_or_t(of_memory: np.ndarray, of_sigmas: np.ndarray) -> np.ndarray:
-    """97.5 % quantile by which a standard error is multiplied: normal where the noise is known, else Student's t.
-
-    Its degrees of freedom are 2 / var(log C): F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110. The variances are those that estimated correlation times
-    and sigmas leave. C is a mean over correlation times, so that t is to have that variance, without its n / (n - 2).
-    """
-    of_memory = np.minimum(of_memory, 2 / _FEWEST_DEGREES)
-    doubt = of_memory + of_sigmas
-    return np.where(doubt > 0, students_t_95(2 / np.maximum(doubt, 1e-12)) * np.sqrt(1 - of_memory), _NORMAL_95)
-
-
-def _of_rise(wider: np.ndarray, quantiles: np.ndarray, of_sigmas: np.ndarray) -> np.ndarray:
-    """What the rise of 2 F is to be divided by. With n degrees of freedom 2 F rises by n log(1 + t^2 / n) where an unknown is t standard errors away.
-
-    `wider`: standard errors over those that F alone foretells; where an unknown has none, the largest of others is taken.
-    """
-    n = 2 / np.maximum(of_sigmas, 1e-12)
-    found = wider**2 * n * np.log1p(quantiles**2 / n) / RISE_95
-    return np.where(np.isfinite(found), found, np.max(found, where=np.isfinite(found), initial=1.0))
 
 
 def _determined(known: Information, unknowns: Unknowns) -> Float[np.ndarray, "members"]:

@@ -2,11 +2,13 @@
 
     estimate_i = ... + sum_k a_ik r_k,     a_i = (C J')_i       C = (J'J)^-1: covariance of all unknowns; J: derivatives of residuals r, whitened and weighted
     share_ik = a_ik^2 / C_ii = - d log C_ii / d log w_k          w_k: weight of sample k, one over the square of its sigma
+    leverage_k = (J C J')_kk,    var(residual_k) = 1 - leverage_k
 
 It allows for all other unknowns being estimated, too. The shares of all samples add up to one; a prior takes what is missing.
 Source: R. D. Cook and S. Weisberg, Residuals and Influence in Regression (1982), section 2.2.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,27 +56,41 @@ class Informed:
 def informed(fitted: TakenUp, most: int) -> Informed:
     """Shares for the first `most` unknowns of a fit that have a standard error."""
     problem, known = fitted.problem, fitted.information()
-    unknowns, lanes = problem.unknowns, problem.lanes
+    unknowns = problem.unknowns
     some = np.flatnonzero(known.identifiable)[:most]
     places, labels = unknowns.estimated[some], tuple(unknowns.labels[i] for i in some)
-    runs, m, _ = known.follow.shape
     variance = variances(known.shared, known.own, known.follow)[places]
-    found: list[dict[str, np.ndarray]] = [{}] * runs
-    taus = problem.taus(np.array([0]))
-    for b, j, plain in lanes.evaluate(*unknowns.split(fitted.theta), np.array([0])):
+    found: list[dict[str, np.ndarray]] = [{}] * len(problem.runs)
+    for run, own, shared in _derivatives(fitted):
+        a_shared = known.shared @ (shared - own @ known.follow[run]).T  # own unknowns of a run follow the shared ones, x = - G s
+        a_own = -np.einsum("kij,js->kis", known.follow, a_shared)
+        a_own[run] += known.own[run] @ own.T
+        share = np.concatenate([a_shared, a_own.reshape(-1, len(own))])[places] ** 2 / variance[:, None]
+        by_channel = problem.lanes.by_channel(run, share)
+        found[run] = {name: np.nansum(x, axis=tuple(range(2, x.ndim))) for name, x in by_channel.items()}
+    return Informed(labels, tuple(found), tuple(np.asarray(run.ts) for run in problem.runs))
+
+
+def leverages(fitted: TakenUp) -> tuple[dict[str, Float[np.ndarray, "times *channel"]], ...]:
+    """The leverage of each sample, of each run by channel; NaN where it is missing."""
+    known = fitted.information()
+    found: list[dict[str, np.ndarray]] = [{}] * len(fitted.problem.runs)
+    for run, own, shared in _derivatives(fitted):
+        X = shared - own @ known.follow[run]
+        found[run] = fitted.problem.lanes.by_channel(run, np.sum(X @ known.shared * X, axis=1) + np.sum(own @ known.own[run] * own, axis=1))
+    return tuple(found)
+
+
+def _derivatives(fitted: TakenUp) -> Iterator[tuple[int, Float[np.ndarray, "samples own"], Float[np.ndarray, "samples shared"]]]:
+    """J of each run: with respect to its own unknowns, and to those that count as shared."""
+    problem, (_, m) = fitted.problem, fitted.problem.unknowns.layout.sizes
+    lanes, taus = problem.lanes, problem.taus(np.array([0]))
+    for b, j, plain in lanes.evaluate(*problem.unknowns.split(fitted.theta), np.array([0])):
         white = lanes.whitened(j, b, plain, {name: np.broadcast_to(tau, len(j)) for name, tau in taus.items()})
         for run, r_run, J_run in zip(j.tolist(), white[..., -1], white[..., :-1], strict=True):
             rows = np.sqrt(problem.loss.weight(r_run))[:, None] * J_run
-            if m < unknowns.layout.sizes[1]:  # those of a single run count as shared, and come last
-                rows = np.roll(rows, -unknowns.layout.sizes[1], axis=1)
             for k, name in enumerate(problem.estimated):
                 if name in problem.runs[run].values:
                     rows[lanes.channels(run)[name]] /= fitted.at.sigma[0, k]
-            own, shared = rows[:, :m], rows[:, m:]
-            a_shared = known.shared @ (shared - own @ known.follow[run]).T  # own unknowns of a run follow the shared ones, x = - G s
-            a_own = -np.einsum("kij,js->kis", known.follow, a_shared)
-            a_own[run] += known.own[run] @ own.T
-            share = np.concatenate([a_shared, a_own.reshape(runs * m, len(r_run))])[places] ** 2 / variance[:, None]
-            by_channel = lanes.by_channel(run, share)
-            found[run] = {name: np.nansum(x, axis=tuple(range(2, x.ndim))) for name, x in by_channel.items()}
-    return Informed(labels, tuple(found), tuple(np.asarray(run.ts) for run in problem.runs))
+            # those of a single run count as shared, and come last
+            yield run, *((rows[:, :0], np.roll(rows, -m, axis=1)) if len(problem.runs) == 1 else (rows[:, :m], rows[:, m:]))

@@ -20,7 +20,7 @@ from jourdain_jax.analysis.levenberg_marquardt import Linearised
 from jourdain_jax.analysis.losses import LEAST_SQUARES
 from jourdain_jax.analysis.problem import Problem
 
-_LEFT = 0.5  # degrees of freedom: with fewer, a channel does not tell its sigma
+LEFT = 0.5  # degrees of freedom: with fewer, a channel does not tell its sigma
 _TURNS, _SETTLED = 50, 1e-8  # of sigmas and covariance; relative change of sigmas that ends them
 
 
@@ -48,8 +48,8 @@ def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: C
     (determined, widths), unsure = np.zeros((2, len(theta), count)), problem.loss != LEAST_SQUARES
     for _ in range(_TURNS):
         left, before = samples - determined, widths.copy()
-        untold[:, 1:] |= left[:, 1:] < _LEFT
-        widths[:, 1:] = np.maximum(np.sqrt(squares[:, 1:] / np.maximum(left[:, 1:], _LEFT)), problem.least_sigma)
+        untold[:, 1:] |= left[:, 1:] < LEFT
+        widths[:, 1:] = np.maximum(np.sqrt(squares[:, 1:] / np.maximum(left[:, 1:], LEFT)), problem.least_sigma)
         widths[:, 0] = [np.sqrt(of_loss(r, p)) if r.size else 1.0 for r, p in zip(residuals, determined[:, 0].tolist(), strict=True)] if unsure else 1.0
         widths[untold] = np.inf
         if np.allclose(widths, before, rtol=_SETTLED, atol=0):
@@ -60,7 +60,7 @@ def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: C
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = added[..., places] / variances(known.shared, known.own, known.follow)[:, None, places]
     counts = np.s_[:, 0 if unsure else 1 :]
-    doubt = 2 * np.sum(np.nan_to_num(shares[counts]) ** 2 / np.maximum(left[counts], _LEFT)[..., None], axis=1)
+    doubt = 2 * np.sum(np.nan_to_num(shares[counts]) ** 2 / np.maximum(left[counts], LEFT)[..., None], axis=1)
     at = Linearised(at.cost, arrow, at.rows, np.where(untold[:, 1:], at.sigma, widths[:, 1:]))
     return NoiseLevels(at, known, doubt, untold[:, 1:])
 

@@ -9,6 +9,7 @@ from jourdain_jax.analysis.at_bounds import Around, AtBounds, limits_at_bounds
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum
 from jourdain_jax.analysis.piecewise import Piecewise
 from jourdain_jax.analysis.problem import Problem
+from jourdain_jax.analysis.spread import rises_if_free
 
 _POOR = 10.0  # times the sum of squares that noise alone leaves, one for each sample
 _SPANS = (1 / 32, 1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 3 / 4)  # shares of the span that a fit grows over
@@ -86,11 +87,14 @@ def with_memory(problem: Problem, found: Minimum, limits: Limits, control: Contr
     return found
 
 
-def off_bounds(problem: Problem, found: Minimum, limits: Limits, control: Control, pieces: Piecewise | None) -> tuple[Minimum, AtBounds]:
-    """The minimum, gone on from where unknowns at a bound let it be lower away from it; and what is known of those that stay."""
+def off_bounds(
+    problem: Problem, found: Minimum, limits: Limits, control: Control, pieces: Piecewise | None, errors: str = "sigmas"
+) -> tuple[Minimum, AtBounds]:
+    """The minimum, gone on from where unknowns at a bound let it be lower away from it; and what is known of those that stay. `errors`: as of `fit`."""
     for _ in range(_TURNS):
         with nullcontext() if pieces is None else pieces.unmoved():
-            told = limits_at_bounds(Around(problem.linearised, found, limits, control))
+            around = Around(problem.linearised, found, limits, control)
+            told = limits_at_bounds(around, rises_if_free(problem, found, around.at_bound, limits, control, errors))
         if not told.lower:
             break
         members = np.array(list(told.lower))
