@@ -94,3 +94,40 @@ def test_straight_lines_between_the_knots_that_are_kept_are_as_near_as_stated(sh
         off = np.max(np.abs(np.interp(ts, ts[kept], values[kept]) - values))
         assert off <= share * np.ptp(values) * (1 + 1e-9) + 1e-12 * np.max(np.abs(values))
     assert np.sum(bends(jj.Sampled(ts, 5.0 - 3.0 * ts), share)) == 2
+
+
+CLOCK, FORCE, PUSH = np.linspace(0.0, 2.0, 6), np.array([0.3, -1.0, 0.8, 0.5, -0.7, 0.2]), np.array([-0.4, 0.6, 0.1, -0.9, 0.7, 0.5])
+MODES = {
+    "reverse": ({}, jax.grad),
+    "forward": ({"adjoint": diffrax.ForwardMode()}, jax.jacfwd),
+    "diffrax": ({"solver": diffrax.Tsit5()}, jax.grad),
+}
+
+
+def rate_of_late(values, t0, t1):
+    """-int (t1 - t) dF/dt dt: what a delay of the force F on a mass of 1 kg does to its place at t1."""
+    knots, slopes = CLOCK, np.diff(values) / np.diff(CLOCK)
+    a, b = (np.clip(knots[:-1], *sorted((t0, t1))), np.clip(knots[1:], *sorted((t0, t1))))
+    return -np.sign(t1 - t0) * np.sum(slopes * (b - a) * (t1 - (a + b) / 2))
+
+
+@pytest.mark.parametrize(("options", "slope"), MODES.values(), ids=MODES)
+@pytest.mark.parametrize(("t0", "t1"), [(0.0, 2.0), (1.6, 0.0)])
+@pytest.mark.parametrize("times", [11, 2], ids=["saved at the knots", "two inputs by one clock"])
+def test_a_delay_of_one_input_has_its_derivative_where_knots_meet_each_other_and_saved_times(options, slope, t0, t1, times):
+    def end(late):
+        inputs = {"force": jj.Sampled(CLOCK + late, FORCE), "push": jj.Sampled(CLOCK, PUSH)}
+        motion = jj.simulate(Struck(mass=1.0), {}, t0=t0, ts=np.linspace(t0, t1, times), inputs=inputs, rtol=1e-5, atol=1e-5, work=False, **options)
+        return motion["x"][-1]
+
+    np.testing.assert_allclose(slope(end)(0.0), rate_of_late(FORCE, t0, t1), rtol=1e-9)
+
+
+@pytest.mark.parametrize("backend", ["auto", "xla"])
+def test_a_saved_time_at_a_knot_moves_its_own_state_alone(backend):
+    def states(ts):
+        inputs = {"force": jj.Sampled(CLOCK, FORCE)}
+        return jj.simulate(Struck(mass=1.0), {}, t0=0.0, ts=ts, inputs=inputs, rtol=1e-5, atol=1e-5, work=False, backend=backend)["x"]
+
+    speeds = np.concatenate([[0.0], np.cumsum(np.diff(CLOCK) * (FORCE[1:] + FORCE[:-1]) / 2)])
+    np.testing.assert_allclose(jax.jacrev(states)(jnp.asarray(CLOCK)), np.diag(speeds), atol=1e-9)

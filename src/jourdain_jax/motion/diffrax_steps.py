@@ -71,7 +71,9 @@ class Diffrax(Integrator):
         solver = for_adjoint(self.solver, self.adjoint)
         implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
         rates, project = (ZeroTangentIfNonfinite(f, t0, y0) if implicit else f for f in (integrands.rates, integrands.project))
-        solver = GuardedSolver(with_tolerances(solver, controller), project if field.projects else None, integrands.pivots if field.has_pivots else None)
+        args, within = (args, None) if knots is None else (integrands.within(jnp.inf, args), integrands.within)
+        pivots = integrands.pivots if field.has_pivots else None
+        solver = GuardedSolver(with_tolerances(solver, controller), project if field.projects else None, pivots, within)
         term = diffrax.ODETerm(rates)
         solution = diffrax.diffeqsolve(
             term,

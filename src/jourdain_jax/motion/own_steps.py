@@ -112,6 +112,7 @@ def _lanes_by_xla(mode: Mode, setups: Setup, begun: Begun) -> Solved:
 def _loop(mode: Mode, setup: Setup, y0, args, ts, knots) -> Solved:
     field, own = setup.field, _own(setup)
     goals = _goals(setup, ts)
+    args = args if knots is None else integrands.within(jnp.full_like(setup.t0, jnp.inf), args)
     problem = erk_loop.Problem(
         rates=integrands.rates,
         args=args,
@@ -124,6 +125,7 @@ def _loop(mode: Mode, setup: Setup, y0, args, ts, knots) -> Solved:
         max_steps=setup.most_steps(knots),
         knots=knots,
         rates_and_pivots=integrands.rates_and_pivots if field.has_pivots else None,
+        within=None if knots is None else integrands.within,
     )
     ys, reached, end = erk_loop.integrate(problem, own.solver, y0, jnp.zeros_like(setup.t0), goals, setup.dt0, mode)
     return _as_solved(goals, ys, reached, end)

@@ -63,6 +63,11 @@ class Problem(eqx.Module):
     knots: Float[Array, "knots *lanes"] | None = None  # times at which a step must end, in the order of the motion; the last are infinite, with its sign
     # as `rates`, and pivots (pivots, *lanes) that must keep their signs; None: the rates have none
     rates_and_pivots: Callable | None = None
+    within: Callable | None = None  # (t, args) -> args for the stages of a step with the middle t; None: the same in all steps
+
+    def in_step(self, t, h) -> "Problem":
+        """The problem for the stages of a step."""
+        return self if self.within is None else replace(self, args=self.within(t + 0.5 * h, self.args))
 
     def knot_ahead(self, p: "Progress", direction) -> Float[Array, "*lanes"]:
         """The time of the knot ahead, infinity with the sign of the motion where there is none."""
@@ -201,6 +206,7 @@ class Stages(NamedTuple):
 def stages(problem: Problem, method: Method, t, y: PyTree, h, monitored: bool = False) -> Stages:
     """y_1; the slopes of all stages, and the states at which they were taken; what the pivots were, where they are `monitored`."""
     leaves, treedef = jax.tree.flatten(y)
+    problem = problem.in_step(t, h)
     monitored = monitored and problem.rates_and_pivots is not None
 
     def stage(carried, row):

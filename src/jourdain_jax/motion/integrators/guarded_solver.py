@@ -35,11 +35,15 @@ class Seen(eqx.Module):
 
 
 class GuardedSolver(WrappingSolver):
-    """`solver`, followed by `project(t, y, args)` after every step, while `pivots(t, y, args)` must keep their signs; None: there is no such function."""
+    """`solver`, followed by `project(t, y, args)` after every step, while `pivots(t, y, args)` must keep their signs; None: there is no such function.
+
+    `within(t, args)`: the `args` for the stages of a step with the middle t, where they are not the same in all steps; then no slope is carried over, either.
+    """
 
     solver: diffrax.AbstractSolver
     project: Callable | None
     pivots: Callable | None
+    within: Callable | None
 
     def init(self, terms, t0, t1, y0, args):
         """The state of the wrapped solver, and what is seen at the start."""
@@ -49,7 +53,9 @@ class GuardedSolver(WrappingSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """One step of the wrapped solver, then the projection."""
         inner, seen = solver_state
-        y1, error, dense, inner, result = self.solver.step(terms, t0, t1, y0, args, inner, made_jump if self.project is None else True)
+        made_jump = made_jump if self.project is None and self.within is None else True
+        in_step = args if self.within is None else self.within(_time(terms, t0, t1, 0.5 * (t0 + t1)), args)
+        y1, error, dense, inner, result = self.solver.step(terms, t0, t1, y0, in_step, inner, made_jump)
         if self.project is not None:
             free, y1 = y1, self.project(_time(terms, t0, t1, t1), y1, args)
             moved = jax.tree.map(lambda a, b: jax.lax.stop_gradient(jnp.abs(a - b)), y1, free)

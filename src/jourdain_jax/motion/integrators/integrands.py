@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.motion.integrators.knots import seen_from_within
 from jourdain_jax.motion.vector_fields.field import Integrated
 
 
@@ -53,6 +54,12 @@ def events(tau, y, args) -> Float[Array, "events *lanes"]:
         return eqx.filter_vmap(events, in_axes=(0, -1, eqx.if_array(0)), out_axes=-1)(tau, y, args)
     t = origin + tau
     return field.events(scene, fixed, t, y, _at(_values, inputs, t))
+
+
+def within(middle, args):
+    """`args` for the stages of a step with this middle."""
+    field, scene, inputs, fixed, origin = args
+    return field, scene, seen_from_within(inputs, origin + middle), fixed, origin
 
 
 def _values(inputs, t) -> Float[Array, "inputs"]:

@@ -7,16 +7,21 @@ at which steps end are chosen so that the straight lines between them are nowher
     max(0.1 min(rtol, 1e-4) (max v - min v), round-off)
 
 at the knots in between. They are found one after the other: from the last one, lines to later knots must pass all knots in between within that distance.
+
+A step that ends at a knot has stages there, and so has the step that begins there. Their derivatives with respect to time, and to the times of knots, are
+those of the line within their own step (`SeenFromWithin`): the ends of steps need not move with the knots.
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jourdain_jax.motion.inputs import Sampled
+from jourdain_jax.motion.inputs import Inputs, Sampled
 
 _SHARE, _LOOSEST = 0.1, 1e-4
 _ONE_TIME = 1e-12  # of the span: times nearer to each other than this are one
+_INWARDS = 2.0**-10  # of the way to the middle of a step: so far inside a time at its end lies to see on which side of a knot it is
 
 
 def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> Float[Array, "knots"] | None:
@@ -62,3 +67,30 @@ def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
     _, bent = jax.lax.scan(next_knot, start, (t[1:], v[1:]))
     # `bent` tells at a knot that steps end at the one before
     return jnp.concatenate([(v[1] != v[0])[None], bent[1:], (v[-1] != v[-2])[None]])
+
+
+class SeenFromWithin(eqx.Module):
+    """An input by samples, at times of a step: at a knot it is on the line that belongs to the step."""
+
+    sampled: Sampled
+    middle: Float[Array, "*lanes"]  # s, of the step; infinite where there is none
+
+    def __call__(self, t):
+        """The value at time t, f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k)."""
+        ts, values = self.sampled.ts, self.sampled.values
+        at, middle, knots = jax.lax.stop_gradient((t, self.middle, ts))
+        at = jnp.where(jnp.isfinite(middle), at + _INWARDS * (middle - at), at)
+        k = jnp.clip(jnp.searchsorted(knots, at, side="right") - 1, 0, max(len(ts) - 2, 0))
+        after = jnp.minimum(k + 1, len(ts) - 1)
+        on_line = values[k] + (t - ts[k]) / jnp.where(after > k, ts[after] - ts[k], 1.0) * (values[after] - values[k])
+        return jnp.where(at < knots[0], values[0], jnp.where(at > knots[-1], values[-1], on_line))
+
+
+def seen_from_within(inputs: Inputs, middle: Float[Array, "*lanes"]) -> Inputs:
+    """`inputs` whose samples are looked at in a step with this middle (s); infinite where there is no step yet."""
+
+    def within(channel):
+        sampled = channel.sampled if isinstance(channel, SeenFromWithin) else channel
+        return SeenFromWithin(sampled, jax.lax.stop_gradient(middle)) if isinstance(sampled, Sampled) else channel
+
+    return Inputs(tuple(within(channel) for channel in inputs.channels))

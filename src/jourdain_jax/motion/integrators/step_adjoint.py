@@ -40,7 +40,7 @@ def step_vjp(problem_of: Callable[[PyTree], Problem], shared: PyTree, method: Me
         G, by_shared, by_t, by_h = carry
         c, b, column, Y, k, i = row
         v = jax.tree.map(lambda g, G: as_in(b, g) * g + weighted(column, G), g, G)
-        _, pull = jax.vjp(lambda t, y, shared: _rates(problem_of(shared), t, y), t_0 + c * h, Y, shared)
+        _, pull = jax.vjp(lambda t, y, shared: _rates(problem_of(shared).in_step(t_0, h), t, y), t_0 + c * h, Y, shared)
         tau, G_i, more = pull(jax.tree.map(lambda v: as_in(h, v) * v, v))
         G = jax.tree.map(lambda G, new: jax.lax.dynamic_update_index_in_dim(G, new, i, 0), G, G_i)
         by_h = by_h + product(v, k, t_0.ndim) + c * tau
