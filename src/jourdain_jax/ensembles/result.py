@@ -122,7 +122,7 @@ class StudyResult(Printed):
         """Means, covariances, histograms and extremes of the outputs over the lanes that have them."""
         grid = self.store.read_grid()
         if grid is None:
-            raise ValueError(f"no chunk of `{self.store.path}` is done yet; run the study first")
+            raise ValueError(f"no chunk of `{self.store.path}` is done yet, or `run/grid.json` is damaged; run the study first, which finds it again")
         found = self._gathered
         sums = [block for chunk in found["sums"] for block in chunk]
         return combined(self.outputs, Grid.from_dict(grid), sums, found["cells"], found["extremes"])
@@ -260,8 +260,11 @@ def merge_studies(path: str | os.PathLike, shares: Sequence[str | os.PathLike]) 
         for share in shares:
             other = Store(share)
             different = [name for name in ("identity", "chunk", "block", "samples") if other.study[name] != target.study[name]]
-            if different or other.read_grid() not in (None, target.read_grid()):
+            grid, own = other.read_grid(), target.read_grid()
+            if different or (grid and own and grid != own):
                 raise ValueError(f"`{share}` holds no share of the study in `{path}`: {' and '.join(different) or 'the grid of statistics'} differ")
+            if grid and not own:
+                target.write_grid(grid)
             for number in other.receipts():
                 if number not in held and other.is_whole(number):
                     target.take_chunk(other, number)
