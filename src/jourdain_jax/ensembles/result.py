@@ -160,6 +160,12 @@ class StudyResult(Printed):
         end = last if last == len(counts) else min(starts[-1] + step, len(counts) - 1)
         return np.add.reduceat(counts[:last], starts), np.append(edges[starts], edges[end])
 
+    def _bars(self, output: str, cells: int) -> tuple[np.ndarray, np.ndarray]:
+        """Heights of bars, so that areas are to each other as lanes, and their edges: a bar of lanes beyond the grid is as low as it is wider than others."""
+        (counts, edges), grid, i = self.histogram(output, cells), self.statistics.grid, self._place(output)
+        wide, within = np.diff(edges), (edges[:-1] >= grid.low[i]) & (edges[1:] <= grid.high[i])
+        return counts * np.minimum(1.0, np.max(wide[within], initial=0.0) / wide) if within.any() else counts, edges
+
     def sensitivity(self, output: str, confidence: float = 0.95) -> SobolIndices:
         """First-order and total Sobol' indices of an `output`, with intervals that hold each with the given `confidence`; needs sampler="saltelli"."""
         self._place(output)
@@ -195,8 +201,7 @@ class StudyResult(Printed):
         names = outputs or self.outputs
         figure, axes = plt.subplots(1, len(names), figsize=(3.6 * len(names), 3.0), squeeze=False, layout="constrained")
         for axis, name in zip(axes[0], names, strict=True):
-            counts, edges = self.histogram(name)
-            axis.stairs(counts, edges, fill=True, color="#1f5fa8", alpha=0.8)
+            axis.stairs(*self._bars(name, 64), fill=True, color="#1f5fa8", alpha=0.8)
             axis.axvline(self.mean(name), color="#b3470f", lw=1.2)
             unit = self._unit(name)
             axis.set_xlabel(f"{name} ({unit})" if unit else name)
@@ -209,7 +214,7 @@ class StudyResult(Printed):
     def _repr_html_(self) -> str:
         if not self._gathered["chunks"]:
             return super()._repr_html_()
-        drawn = [Histogram(name, self._unit(name), *self.histogram(name, cells=BARS), self.mean(name)) for name in self.outputs]
+        drawn = [Histogram(name, self._unit(name), *self._bars(name, BARS), self.mean(name)) for name in self.outputs]
         return super()._repr_html_() + pictures(drawn)
 
     def _unit(self, output: str) -> str:
