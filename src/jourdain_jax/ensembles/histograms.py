@@ -12,18 +12,19 @@ _WIDE, _HIGH, _FOOT = 220, 90, 16  # pixels of a picture, of them below the bars
 
 @dataclass(frozen=True)
 class Histogram:
-    """An output: heights of bars, the edges of their cells, and the mean."""
+    """Lanes per cell of an output, the edges of the cells, which are drawn pale since lanes lie anywhere in them, and the mean."""
 
     name: str
     unit: str
-    heights: np.ndarray  # (cells,)
+    counts: np.ndarray  # (cells,)
     edges: np.ndarray  # (cells + 1,)
+    pale: np.ndarray  # (cells,)
     mean: float
 
 
 def pictures(histograms: list[Histogram]) -> str:
     """One small picture for each output that any lane has: bars of lanes per cell, the mean as a line, the ends of the axis in numbers."""
-    drawn = [one for one in histograms if one.heights.sum() > 0]
+    drawn = [one for one in histograms if one.counts.sum() > 0]
     more = f"<div>and {len(drawn) - MOST} more</div>" if len(drawn) > MOST else ""
     parts = "".join(_picture(one) for one in drawn[:MOST])
     return f"<div style='display:flex;flex-wrap:wrap;gap:14px'>{parts}</div>{more}" if drawn else ""
@@ -33,9 +34,11 @@ def _picture(of: Histogram) -> str:
     low, high = float(of.edges[0]), float(of.edges[-1])
     x = _WIDE * (of.edges - low) / (high - low)
     height = _HIGH - _FOOT - 2
-    tall = height * of.heights / of.heights.max()
+    tall = height * of.counts / of.counts.max()
     bars = "".join(
-        f"<rect x='{a:.1f}' y='{height + 2 - h:.1f}' width='{b - a:.1f}' height='{h:.1f}'/>" for a, b, h in zip(x[:-1], x[1:], tall, strict=True) if h > 0
+        f"<rect x='{a:.1f}' y='{height + 2 - h:.1f}' width='{b - a:.1f}' height='{h:.1f}'{opacity}/>"
+        for a, b, h, opacity in zip(x[:-1], x[1:], tall, np.where(of.pale, " fill-opacity='0.3'", ""), strict=True)
+        if h > 0
     )
     mean = _WIDE * float(np.clip((of.mean - low) / (high - low), 0.0, 1.0))
     line = f"<line x1='{mean:.1f}' x2='{mean:.1f}' y1='0' y2='{height + 2}' stroke='#b3470f' stroke-width='1.5'/>"

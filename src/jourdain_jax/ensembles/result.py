@@ -160,11 +160,10 @@ class StudyResult(Printed):
         end = last if last == len(counts) else min(starts[-1] + step, len(counts) - 1)
         return np.add.reduceat(counts[:last], starts), np.append(edges[starts], edges[end])
 
-    def _bars(self, output: str, cells: int) -> tuple[np.ndarray, np.ndarray]:
-        """Heights of bars, so that areas are to each other as lanes, and their edges: a bar of lanes beyond the grid is as low as it is wider than others."""
+    def _bars(self, output: str, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The histogram, and which of its cells reach beyond the grid: lanes lie anywhere in them."""
         (counts, edges), grid, i = self.histogram(output, cells), self.statistics.grid, self._place(output)
-        wide, within = np.diff(edges), (edges[:-1] >= grid.low[i]) & (edges[1:] <= grid.high[i])
-        return counts * np.minimum(1.0, np.max(wide[within], initial=0.0) / wide) if within.any() else counts, edges
+        return counts, edges, (edges[:-1] < grid.low[i]) | (edges[1:] > grid.high[i])
 
     def sensitivity(self, output: str, confidence: float = 0.95) -> SobolIndices:
         """First-order and total Sobol' indices of an `output`, with intervals that hold each with the given `confidence`; needs sampler="saltelli"."""
@@ -201,7 +200,11 @@ class StudyResult(Printed):
         names = outputs or self.outputs
         figure, axes = plt.subplots(1, len(names), figsize=(3.6 * len(names), 3.0), squeeze=False, layout="constrained")
         for axis, name in zip(axes[0], names, strict=True):
-            axis.stairs(*self._bars(name, 64), fill=True, color="#1f5fa8", alpha=0.8)
+            counts, edges, beyond = self._bars(name, 64)
+            axis.stairs(np.where(beyond, 0, counts), edges, fill=True, color="#1f5fa8", alpha=0.8)
+            if beyond.any():
+                axis.stairs(np.where(beyond, counts, 0), edges, fill=True, color="#1f5fa8", alpha=0.25, label="anywhere in here")
+                axis.legend(fontsize="small")
             axis.axvline(self.mean(name), color="#b3470f", lw=1.2)
             unit = self._unit(name)
             axis.set_xlabel(f"{name} ({unit})" if unit else name)
