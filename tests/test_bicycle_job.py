@@ -12,6 +12,7 @@ from jourdain_jax.bicycle.job import Refused, run, table, write_results
 from jourdain_jax.bicycle.linear import linear_matrices
 from jourdain_jax.bicycle.parameter_files import shipped_bicycles
 from jourdain_jax.cli import main
+from jourdain_jax.cli.bicycle_verbs import prefixes
 
 
 @pytest.fixture(scope="module")
@@ -83,3 +84,8 @@ def test_the_command_writes_its_table_and_figures(tmp_path, capsys):
     assert main(["bicycle", "Rigid", "Tms", "--samples", "60", "--out", str(tmp_path / "out")]) == 1  # one file was refused
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", "eigenvalues.png", "ride.png", "ride.gif"}
     assert "5.0084" in capsys.readouterr().out
+
+
+def test_figures_of_two_bicycles_with_one_name_have_two_names():
+    assert prefixes(["Rigid"]) == [""]
+    assert prefixes(["Rigid", "my bike", "Rigid", "my_bike"]) == ["Rigid-", "my_bike-", "Rigid-2-", "my_bike-2-"]

@@ -97,6 +97,10 @@ def test_a_grid_crosses_its_levels_and_a_table_is_taken_as_it_is():
         (lambda: jj.Design(TWO, sampler="saltelli", samples=9), "a multiple of 4"),
         (lambda: jj.Design(TWO, samples=8, correlation={("mass", "lenght"): 0.5}), "`lenght`, which does not vary"),
         (lambda: jj.Design(TWO, samples=8, correlation={("mass", "radius"): 1.0}), "between -1 and 1"),
+        (lambda: jj.Design(TWO, samples=8, correlation={("mass", "radius"): "0.5"}), "expected real numbers"),
+        (lambda: jj.Design(TWO, samples=8, correlation={"mass": 0.5}), "expected pairs of names"),
+        (lambda: jj.Design({"a": [[1.0], [1.0, 2.0]]}), "`a` varies as"),
+        (lambda: jj.Design({f"a{i}": jj.Levels([0.0] * 10) for i in range(20)}), "cross to 100000000000000000000 samples"),
         (lambda: jj.Design(TWO, samples=8).values(0, 9), "not among 0 to 8"),
     ],
 )

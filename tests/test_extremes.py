@@ -72,5 +72,24 @@ def test_outputs_of_a_motion_find_its_turning_point_and_what_adds_up():
     height = landed + landed**2 - 1.5 * landed**3
     assert float(jj.Integral("z", "m s").of(motion)) == pytest.approx(height, rel=1e-9)
     assert float(jj.Integral(lambda motion: jnp.ones_like(motion.ts), "s").of(motion)) == pytest.approx(landed, rel=1e-9)
-    with pytest.raises(ValueError, match=r"the quantity of an output is .*, expected its values at all 9 times of the motion"):
+    with pytest.raises(ValueError, match=r"the quantity of an output is .*, expected its real values at all 9 times of the motion"):
         jj.Integral(lambda motion: motion.t_end).of(motion)
+
+
+def test_an_end_just_after_a_saved_time_is_no_node_of_its_own():
+    """A particle that falls from g T^2 / 2 lands at T: 1e-3 to 1e-15 s after a saved time, and at one. A polynomial through both times would swing."""
+    after = 1.0 + jnp.asarray([1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13, 1e-15, 0.0])
+    options = {"t1": 2.0, "ts": np.linspace(0.0, 2.0, 21), "rtol": 1e-8, "atol": 1e-8}
+    lanes = jj.rollout(Thrown(), {"z": 4.5 * after**2, "z_rate": 0.0}, **options).lanes
+    for output, exact in ((jj.Integral("z"), 3.0 * after**3), (jj.Integral(lambda m: m["z_rate"] ** 2), 27.0 * after**3), (jj.Largest("z"), 4.5 * after**2)):
+        np.testing.assert_allclose(jax.vmap(output.of)(lanes), exact, rtol=1e-9)
+
+
+def test_a_motion_that_runs_back_in_time_has_its_end_too():
+    """What is at rest at 0.5 m left the ground 1 / 3 s before."""
+    motion = jj.simulate(Thrown(), {"z": 0.5, "z_rate": 0.0}, ts=np.linspace(0.0, -1.0, 10), rtol=1e-10, atol=1e-10)
+    left = -1.0 / 3.0
+    assert float(motion.t_end) == pytest.approx(left, abs=1e-9)
+    assert float(jj.Smallest("z").of(motion)) == pytest.approx(0.0, abs=1e-9)
+    assert float(jj.LargestMagnitude("z_rate").of(motion)) == pytest.approx(3.0, rel=1e-9)
+    assert float(jj.Integral("z").of(motion)) == pytest.approx(0.5 * left - 1.5 * left**3, rel=1e-9)

@@ -62,6 +62,30 @@ def test_tables_have_one_row_for_each_time_of_each_lane(motion, lanes):
     np.testing.assert_array_equal(many.loc[2]["x1"], lanes.lane(2)["x1"])
 
 
+class _Timed(jj.Scene):
+    """A coordinate and a parameter with names that a dataset has for other things."""
+
+    steps: jnp.ndarray = jj.parameter(1.0, unit="m")
+    coordinates = jj.coordinates("time")
+
+    def bodies(self, t, q):
+        return {"ball": jj.Particle(1.0, jnp.stack([q.time, 0.0 * q.time, 0.0 * q.time]))}
+
+
+class _Stepped(_Timed):
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"ball": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+
+@pytest.mark.parametrize(("scene", "name"), [(_Timed(), "time"), (_Stepped(), "steps")])
+def test_a_name_of_two_arrays_is_refused(scene, name):
+    """The coordinate would take the place of the axis, the parameter would be left out."""
+    with pytest.raises(ValueError, match=f"`{name}` would name two arrays of the dataset"):
+        jj.simulate(scene, {}, ts=TIMES).to_xarray()
+
+
 @pytest.mark.parametrize(("package", "ask"), [("xarray", "to_xarray"), ("pandas", "to_pandas")])
 def test_a_missing_package_is_named_with_what_installs_it(motion, monkeypatch, package, ask):
     monkeypatch.setitem(sys.modules, package, None)

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from small_scenes import BeadOnTurningWire
 
 import jourdain_jax as jj
 
@@ -40,12 +41,23 @@ def overlap(figure, *artists) -> bool:
 )
 def test_values_are_drawn_in_the_units_that_are_asked_for(motions, name, unit, size):
     figure, axes = jj.plot(motions[0], name, units={name: unit, "t": "ms"})
-    expected = motions[0].energies().balance if name == "energy" else motions[0][name]
+    energies = motions[0].energies()
+    expected = energies.kinetic + energies.potential if name == "energy" else motions[0][name]
     (line,) = axes[0].lines
     np.testing.assert_allclose(line.get_xydata(), np.stack([1000 * TS, size * expected], axis=1), rtol=1e-12, atol=1e-12)
     assert axes[0].get_ylabel() == f"{name} in {unit}"
     assert axes[0].get_xlabel() == "t in ms"
     assert figure is axes[0].figure
+
+
+def test_the_energy_of_a_damped_motion_is_what_it_has_left():
+    """The sum of the two others, and not the balance, which the work of the damper keeps constant."""
+    motion = jj.simulate(BeadOnTurningWire(rate=0.0, damping=2.0), {"r": 1.0, "r_rate": 1.0}, ts=TS)
+    assert motion.work is not None
+    _, axes = jj.plot(motion, "energy", "kinetic energy")
+    total, kinetic = (axis.lines[0].get_ydata() for axis in axes)
+    np.testing.assert_array_equal(total, kinetic)
+    assert total[-1] < 0.2 * total[0]
 
 
 def test_several_motions_lie_in_one_figure_with_their_labels(motions):

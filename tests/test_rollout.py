@@ -45,6 +45,15 @@ def test_bad_lanes_are_counted_and_named_and_harm_no_other(sleighs):
     np.testing.assert_allclose(lanes.quantiles("heading", (0.5,))[0], np.median(np.asarray(lanes["heading"])[good], axis=0))
 
 
+def test_lanes_with_times_of_their_own_have_no_quantiles_in_common():
+    """The first saved time of the one is not that of the other."""
+    starts = [jj.start(ChaplyginSleigh(), t0=t0, x_rate=1.0) for t0 in (0.0, 1.0)]
+    lanes = jj.rollout(ChaplyginSleigh(), jax.tree.map(lambda *x: jnp.stack(x), *starts), t1=2.0, progress=False)
+    with pytest.raises(ValueError, match="lanes were saved at times of their own"):
+        lanes.quantiles("x")
+    assert "<svg" not in lanes._repr_html_()
+
+
 def test_lanes_with_parameters_of_the_wrong_sign_end_at_once_and_say_which():
     lanes = jj.rollout(ChaplyginSleigh(), parameters={"mass": np.array([1.0, -1.0, np.nan, 0.0])}, progress=False, **OPTIONS)
     assert lanes.result.tolist() == [results.SUCCESS, *[results.BAD_PARAMETER] * 3]

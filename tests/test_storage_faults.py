@@ -15,7 +15,7 @@ import jourdain_jax as jj
 
 TS = np.linspace(0.0, 0.2, 3)
 INPUTS = {"speed": 1.0, "push": 0.5}
-INFORMATIVE = ("units", "versions")  # read by people only
+INFORMATIVE = ("versions",)  # read by people only
 
 
 class Belt(OnBelt):
@@ -141,6 +141,13 @@ def test_a_parameter_that_the_file_lacks_is_not_the_default(saved, tmp_path):
         READ[kind](new, Belt)
     new = rewritten(path, tmp_path / "count.npz", header={"static": {}})
     with pytest.raises(ValueError, match="lacks the parameter `sides` of `Belt`"):
+        READ[kind](new, Belt)
+
+
+def test_a_parameter_whose_unit_changed_since_is_named(saved, tmp_path):
+    kind, _, path = saved
+    new = rewritten(path, tmp_path / "units.npz", header={"units": {"drag": "N s/mm"}})
+    with pytest.raises(ValueError, match="the parameter `drag` in N s/mm, but `Belt` takes it in N s/m; pass the class as it was"):
         READ[kind](new, Belt)
 
 

@@ -212,10 +212,16 @@ def test_a_study_shows_its_table_and_a_histogram_of_each_output_in_a_notebook(wh
         (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"x": jj.End("leen")}), "did you mean `lean`"),
         (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"x": jj.EventTime("fell")}), "did you mean `fallen`"),
         (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"a/b": jj.End("lean")}), "without `/`"),
+        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"a\\b": jj.End("lean")}), "without `/`"),
         (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"x": jj.End}), "expected an output"),
+        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"x": jj.Integral("lean")}, ts=[0.5, 1.0]), "`x` would leave out"),
+        (lambda d: jj.Study(d, vary={"radius": [0.5]}).run("x", outputs={"lane": jj.End("lean")}), "would name two arrays"),
+        (lambda d: jj.Study(d, vary={"radius": [0.5]}).run("x", outputs={"run": jj.End("lean")}), "would name two arrays"),
         (lambda d: jj.Study(d, vary={"radius": [0.5]}).run("x", outputs={"radius": jj.End("lean")}), "would name two arrays"),
         (lambda d: jj.Study(d, vary={"radius": [0.5] * 9}).run("x", chunk=7), "a multiple of 16"),
         (lambda d: jj.Study(d, vary={"radius": [0.5]}).run("x", shard=(3, 2)), "`shard` is"),
+        (lambda d: jj.Study(d, start={"lean": jj.Normal(0, 1)}, samples=2, correlation={3: 0.5}), "expected pairs of names"),
+        (lambda d: jj.Study(d, start={"lean": jj.Normal(0, 1)}, samples=2, correlation=np.eye(2)), "`correlation` is"),
     ],
 )
 def test_a_wrong_study_says_what_is_wrong(make, message, tmp_path, monkeypatch):
@@ -226,7 +232,9 @@ def test_a_wrong_study_says_what_is_wrong(make, message, tmp_path, monkeypatch):
 
 
 def test_an_output_that_is_no_number_or_unknown_is_named(whole, tmp_path):
-    with pytest.raises(ValueError, match="expected one number for one motion"):
+    with pytest.raises(ValueError, match="expected one real number for a motion"):
         discs().run(tmp_path / "discs.zarr", outputs={"all": lambda motion: motion.q_end}, **ASKED)
     with pytest.raises(ValueError, match="no output `lean`"):
         whole.mean("lean")
+    with pytest.raises(ValueError, match="`cells` is 0"):
+        whole.histogram("final lean", 0)

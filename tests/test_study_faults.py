@@ -7,11 +7,18 @@ import signal
 import subprocess
 import sys
 import time
+from collections import deque
+from fractions import Fraction
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import psutil
 import pytest
+from jax.flatten_util import ravel_pytree
+from scipy.interpolate import CubicSpline
 from test_studies import assert_same
 
 import jourdain_jax as jj
@@ -257,6 +264,56 @@ def test_a_function_counts_by_what_it_does():
     assert len({digest(made(2.0)), digest(made(3.0)), digest(made(2.0, "y")), digest(lambda motion: motion.q_end[0])}) == 4
     assert digest(jj.models.TiltingDisc()) != digest(jj.models.TiltingDisc(mass=2.0))
     assert digest(np.arange(3.0)) != digest(np.arange(3))
+
+
+class _Slots:
+    __slots__ = ("factor",)
+
+    def __init__(self, factor):
+        self.factor = factor
+
+
+OBJECTS = {
+    "a namespace": lambda x: SimpleNamespace(factor=x),
+    "a fraction": Fraction,
+    "a range": range,
+    "a deque": lambda x: deque([x]),
+    "slots": _Slots,
+    "a polynomial": lambda x: np.polynomial.Polynomial([0.0, x]),
+    "a spline": lambda x: CubicSpline(np.arange(4.0), x * np.arange(4.0) ** 2),
+    "a ufunc": lambda x: (np.sin, np.cos)[x - 2],
+    "objects in an array": lambda x: np.array([x, "text"], object),
+    "a key": jax.random.key,
+    "a gradient": lambda x: jax.grad(lambda q: x * q),
+    "lanes of lanes": lambda x: jax.vmap(jax.vmap(lambda q: x * q)),
+    "what ravel_pytree makes": lambda x: ravel_pytree({str(x): jnp.ones(2)})[1],
+    "lists in lists": lambda x: [[[[[[[[[[[[x]]]]]]]]]]]],
+}
+
+
+@pytest.mark.parametrize("made", OBJECTS.values(), ids=OBJECTS)
+def test_an_object_that_a_function_reads_counts_by_its_content(made):
+    """With the old numbers it would be taken for the study whose results are there."""
+
+    def output(x):
+        return lambda motion: x(motion)
+
+    assert digest(output(made(2))) == digest(output(made(2)))
+    assert digest(output(made(2))) != digest(output(made(3)))
+
+
+def test_what_a_function_reads_of_a_module_of_the_user_counts(monkeypatch):
+    module, inner = ModuleType("users_module"), ModuleType("users_module.inner")
+    module.inner, module.factor, module.unread, inner.helper = inner, 2.0, 1.0, lambda x: 2.0 * x
+    monkeypatch.setitem(globals(), "users_module", module)
+    exec("def output(motion): return users_module.inner.helper(users_module.factor * motion.q_end[0])", globals(), found := {})
+    before = digest(found["output"])
+    module.unread = 3.0
+    assert digest(found["output"]) == before
+    module.factor = 3.0
+    changed = digest(found["output"])
+    inner.helper = lambda x: 3.0 * x
+    assert len({before, changed, digest(found["output"])}) == 3
 
 
 def test_a_study_that_cannot_be_sent_to_other_processes_says_so(tmp_path):

@@ -173,3 +173,13 @@ def test_the_indices_of_a_pendulums_period_lie_within_their_limits(tmp_path):
     assert "length" in str(indices)
     with pytest.raises(ValueError, match="no output `period`"):
         result.sensitivity("period")
+
+
+def test_a_printed_quantile_beyond_the_grid_says_on_which_side_it_is(tmp_path):
+    """The grid spans twice the range of the first block; of what lies beyond, the middle between the grid's edge and the extreme says nothing."""
+    angles = np.r_[np.full(2048, 0.1), np.full(600, 0.3), np.linspace(1.0, 50.0, 1700)]
+    study = jj.Study(jj.models.TiltingDisc(), start={"yaw": angles, "lean": 0.1})
+    found = study.run(tmp_path / "discs.zarr", t1=1e-3, outputs={"yaw": jj.End("yaw", "rad")}, progress=False)
+    low, high = found.quantile("yaw", 0.975)
+    assert (low > 0.1, high) == (True, pytest.approx(50.0))
+    assert [word for word in str(found).split("deviation")[1].split()[-4:] if word not in (">", "0.1")] == []

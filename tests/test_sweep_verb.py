@@ -71,6 +71,10 @@ def test_a_study_runs_from_a_file_goes_on_and_is_exported(tmp_path, capsys, monk
         ({"outputs": {"x": {"ende": "lean"}}}, "output `x`"),
         ({"samples": 0}, "`samples` is 0"),
         ({"sampler": "sobol2"}, "did you mean `sobol`"),
+        ({"set": 3}, "`set` is an int, expected a table"),
+        ({"options": {"processes": 2}}, "`processes` is no entry of"),
+        ({"options": {"outputs": {}}}, "`outputs` is no entry of"),
+        ({"t1": 1.0, "options": {"t1": 2.0}}, "`t1` is no entry of"),
     ],
 )
 def test_a_wrong_file_says_what_is_wrong(change, message):
@@ -87,10 +91,24 @@ def test_a_wrong_file_says_what_is_wrong(change, message):
         (["exprot", "x.zarr"], "did you mean `export`"),
         (["status"], "takes one folder"),
         (["wrong.toml"], "the file is no TOML"),
+        (["latin.toml"], "`latin.toml` is no text in UTF-8"),
     ],
 )
 def test_a_wrong_command_says_what_is_wrong(words, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "wrong.toml").write_text("model = ")
+    (tmp_path / "latin.toml").write_bytes(b"model = 'd\xefsc'")
     assert main(["sweep", *words]) == 2
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("error", [RuntimeError("workers died 3 times on lanes 0 to 31"), MemoryError("a process holds 900 MB")])
+def test_a_study_that_stops_says_why_in_one_line(error, tmp_path, monkeypatch, capsys):
+    def stops(*_):
+        raise error
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(task.Task, "run_block", stops)
+    (tmp_path / "discs.toml").write_text(FILE)
+    assert main(["sweep", "discs.toml", "--quiet"]) == 1
+    assert capsys.readouterr().err == f"jourdain-jax: {error}\n"

@@ -50,16 +50,21 @@ def _job(options) -> bool:
     written = [out / "result.json"]
     good = [one for one in studies if isinstance(one, Study)]
     if not options.no_figures:
-        for one in good:
-            written += _figures(one, out, len(good) > 1)
+        for one, prefix in zip(good, prefixes([one.bicycle.name for one in good]), strict=True):
+            written += _figures(one, out, prefix)
     print(json.dumps([one.as_dict() for one in studies], indent=2) if options.json else table(studies))
     print("wrote " + ", ".join(str(path) for path in written), file=sys.stderr)
     return not any(isinstance(one, Refused) for one in studies)
 
 
-def _figures(study: Study, out: Path, several: bool) -> list[Path]:
-    """`eigenvalues.png`, `ride.png`, `ride.gif`; with the bicycle's name in front where there are several."""
-    prefix = re.sub(r"[^\w.-]", "_", study.bicycle.name) + "-" if several else ""
+def prefixes(names: list[str]) -> list[str]:
+    """What stands before the names of figures: nothing for one bicycle; otherwise the bicycle's name, with a number from the second of a name on."""
+    plain = [re.sub(r"[^\w.-]", "_", name) for name in names]
+    return [f"{name}-{number}-" if (number := plain[: k + 1].count(name)) > 1 else f"{name}-" for k, name in enumerate(plain)] if len(names) > 1 else [""]
+
+
+def _figures(study: Study, out: Path, prefix: str) -> list[Path]:
+    """`eigenvalues.png`, `ride.png`, `ride.gif`."""
     written = []
     for name, draw in (("eigenvalues.png", draw_eigenvalues), ("ride.png", draw_rides), ("ride.gif", animate_ride)):
         path = out / f"{prefix}{name}"

@@ -30,9 +30,10 @@ from pathlib import Path
 
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
+from jourdain_jax.ensembles.files import InUseError
 from jourdain_jax.ensembles.outputs import End, EventTime, Happened, Integral, Largest, LargestMagnitude, Smallest
 from jourdain_jax.ensembles.result import LEVELS, StudyResult, load_study, merge_studies
-from jourdain_jax.ensembles.study import Study
+from jourdain_jax.ensembles.study import OPTIONS, Study
 from jourdain_jax.models.registry import model
 from jourdain_jax.scene.names import nearest
 
@@ -47,7 +48,8 @@ OUTPUTS = {
     "event-time": EventTime,
     "happened": Happened,
 }
-KEYS = ("model", "t1", "samples", "sampler", "seed", "save", "every", "chunk", "set", "vary", "start", "outputs", "options", "correlation")
+TABLES = ("set", "vary", "start", "outputs", "options", "correlation")
+KEYS = ("model", "t1", "samples", "sampler", "seed", "save", "every", "chunk", *TABLES)
 
 
 def add(verbs) -> None:
@@ -88,6 +90,8 @@ def _text_of(path: str) -> str:
         return Path(path).read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ValueError(f"there is no file `{path}`; give a TOML file, or one of {', '.join(ACTIONS)}") from None
+    except UnicodeDecodeError as error:
+        raise ValueError(f"`{path}` is no text in UTF-8 ({error.reason}); give a TOML file") from None
 
 
 def _run(text: str, out: str, options) -> bool:
@@ -102,6 +106,11 @@ def _run(text: str, out: str, options) -> bool:
     except KeyboardInterrupt as stopped:
         print(f"jourdain-jax: {stopped or 'interrupted'}; or: jourdain-jax sweep resume {out}", file=sys.stderr)
         return False
+    except (RuntimeError, MemoryError) as error:
+        if isinstance(error, InUseError):
+            raise
+        print(f"jourdain-jax: {error}", file=sys.stderr)
+        return False
     _show(found, options)
     return not found.failed.size
 
@@ -111,6 +120,11 @@ def described_study(asked: Mapping) -> tuple[Study, dict]:
     for key in asked:
         if key not in KEYS:
             raise ValueError(f"the file has an entry `{key}`; {nearest(key, KEYS)}")
+        if key in TABLES and not isinstance(asked[key], Mapping):
+            raise ValueError(f"`{key}` is {described(asked[key])}, expected a table: a line [{key}] with entries below it")
+    for name in asked.get("options", {}):
+        if name not in OPTIONS or name in asked:
+            raise ValueError(f"`{name}` is no entry of [options]; {nearest(name, [option for option in OPTIONS if option not in asked])}")
     if "model" not in asked:
         raise ValueError("the file names no `model`; write, for example, model = 'tilting-disc'")
     scene = model(asked["model"], **asked.get("set", {}))

@@ -18,27 +18,30 @@ from jourdain_jax.motion.trajectories.trajectory import Trajectory
 
 FOR_EXTREMES, FOR_INTEGRALS = 5, 4  # values that a polynomial goes through
 FINE = 33  # places at which the polynomial is looked at
+NEAR = 1 / 16  # of the time between values: an end that follows the last of them sooner takes its place, since a polynomial through both swings
 
 
 def sampled(motion: Trajectory, quantity: str | Callable) -> tuple[Float[Array, "more"], Float[Array, "more"], Int[Array, ""]]:
     """Times and values of a quantity (a name, or a function of a trajectory that gives its values at all times), and how many of them count.
 
-    These are the saved times that were reached, and the end where it is later; all others repeat the end.
+    These are the saved times that were reached, and the end where it is none of them, in place of the last where it is near; all others repeat the end.
     """
-    reached = motion.valid
+    reached = jnp.sum(motion.valid)
+    before, last = (motion.ts[jnp.maximum(reached - k, 0)] for k in (2, 1))
+    beyond = jnp.abs(motion.t_end - last)
+    place = reached - ((beyond > 0) & (beyond <= NEAR * jnp.abs(last - before)))  # of the end
 
     def with_end(values, end):
-        kept = jnp.where(reached.reshape(-1, *[1] * end.ndim), values, end)
+        kept = jnp.where((jnp.arange(len(values)) < place).reshape(-1, *[1] * end.ndim), values, end)
         return jnp.concatenate([kept, end[None]])
 
     work = None if motion.work is None else with_end(motion.work, jnp.full_like(motion.t_end, jnp.nan))
     times = with_end(motion.ts, motion.t_end)
     whole = dataclasses.replace(motion, ts=times, q=with_end(motion.q, motion.q_end), u=with_end(motion.u, motion.u_end), work=work)
     values = whole[quantity] if isinstance(quantity, str) else quantity(whole)
-    if getattr(values, "shape", None) != times.shape:
-        raise ValueError(f"the quantity of an output is {described(values)}, expected its values at all {times.shape[0]} times of the motion")
-    count = jnp.sum(reached)
-    return times, values, count + (motion.t_end > times[jnp.maximum(count - 1, 0)])
+    if getattr(values, "shape", None) != times.shape or jnp.iscomplexobj(values):
+        raise ValueError(f"the quantity of an output is {described(values)}, expected its real values at all {times.shape[0]} times of the motion")
+    return times, values, jnp.where(beyond > 0, place + 1, jnp.maximum(reached, 1))
 
 
 def largest(times: Float[Array, "times"], values: Float[Array, "times"], count: Int[Array, ""]) -> Float[Array, ""]:

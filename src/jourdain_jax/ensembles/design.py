@@ -5,12 +5,13 @@ correlation; u of the varying quantity is Phi(L z), which its distribution maps 
 of normal ones is the one stated.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.reals import checked_known, described
 from jourdain_jax.ensembles.distributions import Distribution, Levels
 from jourdain_jax.ensembles.optional import special_functions
 from jourdain_jax.ensembles.samplers import MOST_SOBOL, SAMPLERS
@@ -18,6 +19,7 @@ from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.printing import Printed
 
 GRID, TABLE = "grid", "table"
+MOST_CROSSED = 2**62  # samples of a grid, which are counted in 64 bits
 
 
 @dataclass(frozen=True, repr=False)
@@ -62,7 +64,10 @@ class Design(Printed):
             return "distributions"
         if isinstance(what, Levels):
             return "levels"
-        column = np.asarray(what)
+        try:
+            column = np.asarray(what)
+        except ValueError:  # rows of unequal length
+            column = np.empty(0)
         if column.ndim != 1 or column.dtype.kind not in "fiu" or not column.size:
             raise ValueError(f"`{name}` varies as {described(what)}, expected a distribution such as jj.Normal(0, 1), jj.Levels([...]) or a list of numbers")
         if not np.all(np.isfinite(column)):
@@ -90,7 +95,9 @@ class Design(Printed):
         if self.sampler not in ("random", kind):
             raise ValueError(f"`sampler` is {self.sampler!r}, but the values form a {kind}, which draws nothing; leave it out")
         if kind == GRID:
-            count = int(np.prod([len(levels.levels) for levels in self.variables.values()]))
+            count = math.prod(len(levels.levels) for levels in self.variables.values())
+            if count > MOST_CROSSED:
+                raise ValueError(f"these levels cross to {count} samples, expected at most {MOST_CROSSED}; give fewer, or distributions")
         else:
             object.__setattr__(self, "variables", {name: np.asarray(column, float) for name, column in self.variables.items()})
             lengths = {name: len(column) for name, column in self.variables.items()}
@@ -108,6 +115,9 @@ class Design(Printed):
         names = self.names
         matrix = np.eye(len(names))
         for pair, value in self.correlation.items():
+            if not isinstance(pair, tuple) or len(pair) != 2:
+                raise ValueError(f"`correlation` has the entry {pair!r}, expected pairs of names, such as ({names[0]!r}, {names[-1]!r}): 0.5")
+            value = float(checked_known(value, f"the correlation of {pair}", (), advice="give a number between -1 and 1"))
             for name in pair:
                 if name not in names:
                     raise ValueError(f"`correlation` names `{name}`, which does not vary; {nearest(name, names)}")

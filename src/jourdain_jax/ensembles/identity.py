@@ -1,11 +1,13 @@
 """Digests that tell one study from another, the same in every process: of numbers, texts, containers, scenes, and of functions by what they do.
 
-A function counts by its code (byte code, constants, names), default arguments, what it closes over, and the globals that its code names; functions and
-classes of installed packages and of this one by their name alone, since their versions are kept beside. So a changed function makes another study.
+A function counts by its code (byte code, constants, names), default arguments, what it closes over, and the globals that its code names, also in modules of
+the user; functions and classes of installed packages and of this one by their name, since their versions are kept beside, and, where a function made them for
+the user (as `jax.grad` does), by what they close over. So a changed function makes another study. Other objects count by what `pickle` keeps of them.
 """
 
+import copyreg
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial
 from types import CodeType, FunctionType, MethodType, ModuleType
@@ -15,7 +17,7 @@ import numpy as np
 
 from jourdain_jax.scene.what_is_read import is_installed
 
-DEEPEST = 8  # functions that call functions
+DEEPEST = 8  # functions and classes that name others
 
 
 def digest(x: object) -> str:
@@ -26,7 +28,9 @@ def digest(x: object) -> str:
 def _content(x: object, depth: int, within: set[int]) -> object:
     if x is None or isinstance(x, bool | int | float | complex | str | bytes):
         return type(x).__name__, repr(x)
-    if isinstance(x, jax.Array | np.ndarray | np.generic):
+    if isinstance(x, jax.Array) and jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
+        return "key", str(x.dtype), _content(jax.random.key_data(x), depth, within)
+    if isinstance(x, jax.Array | np.ndarray | np.generic) and not x.dtype.hasobject:
         array = np.asarray(x)
         return "array", array.dtype.str, array.shape, hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
     if depth > DEEPEST or id(x) in within:
@@ -34,7 +38,7 @@ def _content(x: object, depth: int, within: set[int]) -> object:
     within = within | {id(x)}
 
     def of(y: object) -> object:
-        return _content(y, depth + 1, within)
+        return _content(y, depth + isinstance(x, FunctionType | type), within)
 
     if isinstance(x, tuple | list):
         return type(x).__name__, tuple(map(of, x))
@@ -64,14 +68,36 @@ def _content(x: object, depth: int, within: set[int]) -> object:
     if is_dataclass(x):
         return of(type(x)), tuple((field.name, of(getattr(x, field.name, None))) for field in fields(x))
     members = getattr(x, "__dict__", None)
-    return of(type(x)), of(members) if members and not is_installed(type(x).__module__) else None
+    return of(type(x)), of(members if members and not is_installed(type(x).__module__) else _pickled(x))
+
+
+def _pickled(x: object) -> object:
+    """What `pickle` keeps of an object; None of one that it refuses."""
+    if isinstance(x, np.ndarray):
+        return x.tolist()
+    try:
+        kept = copyreg.dispatch_table[type(x)](x) if type(x) in copyreg.dispatch_table else x.__reduce_ex__(4)
+    except Exception:  # an object's own methods may raise anything
+        return None
+    return kept if isinstance(kept, str) else tuple(list(part) if isinstance(part, Iterator) else part for part in kept)
 
 
 def _function(f: FunctionType, of) -> object:
-    if is_installed(f.__module__):
-        return "function", f.__module__, f.__qualname__
-    cells = tuple(of(_within(cell)) for cell in f.__closure__ or ())
-    named = tuple((name, of(f.__globals__[name])) for name in sorted(_names_in(f.__code__)) if name in f.__globals__)
+    installed, name = is_installed(f.__globals__.get("__name__")), (f.__module__, f.__qualname__, f.__code__.co_qualname)
+    if installed and is_installed(f.__module__) and "<locals>" not in f.__qualname__:
+        return "function", name
+    names = sorted(_names_in(f.__code__))
+
+    def read(y: object, *outer: ModuleType) -> object:
+        """What the code reads of what it names: of a module of the user, the attributes that the code names, too."""
+        if not isinstance(y, ModuleType) or is_installed(y.__name__) or y in outer:
+            return of(y)
+        return of(y), tuple((name, read(vars(y)[name], *outer, y)) for name in names if name in vars(y))
+
+    cells = tuple(read(_within(cell)) for cell in f.__closure__ or ())
+    if installed:
+        return "function", name, cells
+    named = tuple((name, read(f.__globals__[name])) for name in names if name in f.__globals__)
     return "function", of(f.__code__), of(f.__defaults__), of(f.__kwdefaults__), cells, named
 
 

@@ -162,8 +162,8 @@ class Quantity(Output):
     def of(self, motion: Trajectory) -> Float[Array, ""]:
         found = self.function(motion)
         shape = getattr(found, "shape", None if not isinstance(found, int | float) else ())
-        if shape != ():
-            raise ValueError(f"an output is {described(found)}, expected one number for one motion; take an entry or reduce it, or give one output for each")
+        if shape != () or jnp.iscomplexobj(found):
+            raise ValueError(f"an output is {described(found)}, expected one real number for a motion; take an entry or reduce it, or give one output for each")
         return jnp.asarray(found, motion.q_end.dtype)
 
 
@@ -175,8 +175,8 @@ def as_outputs(scene: Scene, outputs: Mapping | None) -> dict[str, Output]:
         raise ValueError(f'`outputs` is {described(outputs)}, expected a dictionary by name, such as {{"final lean": jj.End("lean", "rad")}}')
     found = {}
     for name, output in outputs.items():
-        if not isinstance(name, str) or not name or "/" in name or name.startswith(("_", ".")):
-            raise ValueError(f"an output is called {name!r}, expected a text without `/` that begins with neither `_` nor `.`")
+        if not isinstance(name, str) or not name or {"/", "\\"} & {*name} or name.startswith(("_", ".")):
+            raise ValueError(f"an output is called {name!r}, expected a text without `/` and `\\` that begins with neither `_` nor `.`")
         if isinstance(output, type) or not (isinstance(output, Output) or callable(output)):
             raise ValueError(f"output `{name}` is {described(output)}, expected an output such as jj.End('lean'), or a function of a trajectory")
         found[name] = output if isinstance(output, Output) else Quantity(output)

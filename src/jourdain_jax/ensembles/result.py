@@ -148,6 +148,8 @@ class StudyResult(Printed):
 
     def histogram(self, output: str, cells: int = 64) -> tuple[np.ndarray, np.ndarray]:
         """Lanes per cell of an `output` and the edges of the cells, some `cells` in number, each of several of the cells in which lanes are counted."""
+        if cells < 1:
+            raise ValueError(f"`cells` is {cells}, expected at least 1")
         self._place(output)
         counts, edges = self.statistics.histogram(output)
         inside = np.flatnonzero(counts)
@@ -213,6 +215,12 @@ class StudyResult(Printed):
     def _unit(self, output: str) -> str:
         return self.store.columns[output].attributes.get("units", "") if output in self.store.columns else ""
 
+    def _in_short(self, output: str, level: float) -> str:
+        """A quantile as one number, the middle of its cell; of one beyond the grid the side on which it is."""
+        (low, high), grid, i = self.quantile(output, level), self.statistics.grid, self._place(output)
+        beyond = (">", low) if low >= grid.high[i] else ("<", high) if high <= grid.low[i] else None
+        return f"{beyond[0]} {beyond[1]:.5g}" if beyond and low < high else f"{(low + high) / 2:.5g}"
+
     def _text(self) -> str:
         found = self._gathered
         done = int(found["codes"].sum())
@@ -227,7 +235,7 @@ class StudyResult(Printed):
             width = max(map(len, self.outputs))
             lines.append(f"  {'':<{width}} {'lanes':>9} {'mean':>12} {'deviation':>12} {'2.5 %':>12} {'median':>12} {'97.5 %':>12}")
             for i, name in enumerate(self.outputs):
-                middle = (f"{sum(self.quantile(name, level)) / 2:12.5g}" for level in LEVELS)
+                middle = (f"{self._in_short(name, level):>12}" for level in LEVELS)
                 numbers = f"{self.statistics.lanes[i, i]:>9} {self.statistics.mean[i]:12.5g} {self.statistics.deviation[i]:12.5g} {' '.join(middle)}"
                 lines.append(f"  {name:<{width}} {numbers}")
         return "\n".join(lines)

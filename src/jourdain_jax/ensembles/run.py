@@ -103,7 +103,7 @@ def opened(task: Task, path, chunk: int | None, command: str) -> Store:
     names = task.column_names()
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise ValueError(f"`{twice[0]}` would name two arrays of the study; arrays are {', '.join(map(repr, names))}: call the output otherwise")
+        raise ValueError(f"`{twice[0]}` would name two arrays of the study; its names are {', '.join(map(repr, names))}: call the output otherwise")
     if Store.is_taken(path):
         store = Store(path)
     else:

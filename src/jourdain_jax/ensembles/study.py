@@ -15,7 +15,7 @@ from jourdain_jax.ensembles.design import Design
 from jourdain_jax.ensembles.distributions import Distribution, Levels
 from jourdain_jax.ensembles.mean_gradients import MeanGradients, mean_gradients
 from jourdain_jax.ensembles.memory import of_each
-from jourdain_jax.ensembles.outputs import as_outputs
+from jourdain_jax.ensembles.outputs import Integral, as_outputs
 from jourdain_jax.ensembles.result import StudyResult
 from jourdain_jax.ensembles.run import bounded, in_this_process, run
 from jourdain_jax.ensembles.task import AT_START, SAVES, Task
@@ -50,12 +50,12 @@ class Study(Printed):
     """
 
     scene: Scene
-    vary: Any = None  # a dictionary by name, as is `start`
+    vary: Any = None  # a dictionary by name, as is `start`, and by pairs of names `correlation`
     start: Any = None
     sampler: str = "random"
     samples: int | None = None
     seed: int = 0
-    correlation: Mapping | None = None
+    correlation: Any = None
 
     def __post_init__(self):
         object.__setattr__(self, "scene", as_scene(self.scene))
@@ -64,9 +64,10 @@ class Study(Printed):
     @cached_property
     def _named(self) -> tuple[dict, dict]:
         """What varies, by the names of its columns, and the start values that do not."""
-        for what, given in (("vary", self.vary), ("start", self.start)):
-            if given is not None and not isinstance(given, Mapping):
-                raise ValueError(f'`{what}` is {described(given)}, expected a dictionary by name, such as {{"mass": jj.Normal(12.0, 0.3)}}')
+        examples = {"vary": '{"mass": jj.Normal(12.0, 0.3)}', "start": '{"lean": 0.3}', "correlation": '{("mass", "radius"): 0.5}'}
+        for what, example in examples.items():
+            if (given := getattr(self, what)) is not None and not isinstance(given, Mapping):
+                raise ValueError(f"`{what}` is {described(given)}, expected a dictionary by name, such as {example}")
         known = {name: np.ndim(value) for name, value, _ in parameters_of(self.scene)}
         varying = {}
         for name, how in (self.vary or {}).items():
@@ -96,7 +97,7 @@ class Study(Printed):
         """The samples: parameters by name, start values by name with `_at_start`."""
         varying, _ = self._named
         column = {name: name + AT_START for name in self.start or ()} | {name: name for name in self.vary or ()}
-        pairs = {tuple(column.get(name, name) for name in pair): value for pair, value in (self.correlation or {}).items()}
+        pairs = {tuple(column.get(x, x) for x in pair) if isinstance(pair, tuple) else pair: value for pair, value in (self.correlation or {}).items()}
         return Design(varying, self.sampler, self.samples, self.seed, pairs or None)
 
     def task(self, *, t1=None, ts=None, t0=None, outputs: Mapping | None = None, save: str = "outputs", every: int = 1, **options) -> Task:
@@ -114,6 +115,9 @@ class Study(Printed):
         first, times, last = span_and_times(self.scene, None, t0, t1, ts)
         if ts is None and save != "trajectories" and not any(output.over_times for output in known.values()):
             times = last[None]
+        if times[0] != first and (missed := [name for name, output in known.items() if isinstance(output, Integral)]):
+            text = f"`ts` begins at {times[0]:g} s, and the motion at {first:g} s: the integral `{missed[0]}` would leave out what is between"
+            raise ValueError(f"{text}; let `ts` begin where the motion does")
         settled = {"t0": float(first), "t1": float(last), "ts": np.asarray(times, float)} | options
         return Task(self.scene, self.design, self._named[1], known, settled, save, int(every))
 

@@ -35,6 +35,7 @@ LARGEST_BLOCK = 2048  # lanes: enough that few wait for the last one, few enough
 BLOCK_MEMORY = 2**26  # bytes of saved states of a block, at most
 AT_START = "_at_start"  # how columns of start values are called, after the coordinate or speed
 SKIPPED = {"result": results.PROCESS_DIED, "event": -1, "steps": 0, "rejected_steps": 0, "retries": 0}  # columns of a lane that is skipped; others are NaN
+RESERVED = ("lane", "saved_lane", "run", "zarr.json")  # axes, and names of files beside the arrays
 SAVES = ("statistics", "outputs", "trajectories")
 
 
@@ -182,8 +183,8 @@ class Task:
         return (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries) if self.save == "trajectories" else ()
 
     def column_names(self) -> list[str]:
-        """Names of all arrays, in order; a name may occur twice."""
-        return [*self.design.names, *OF_LANES, *self.outputs, *self._along, *(("time",) if self._along else ())]
+        """Names of all arrays, in order, and of what else the store holds; a name may occur twice."""
+        return [*self.design.names, *OF_LANES, *self.outputs, *self._along, *(("time",) if self._along else ()), *RESERVED]
 
     def identity(self) -> dict[str, str]:
         """Digests of all that decides the numbers, by what a user would call it."""

@@ -41,8 +41,8 @@ def plot(
     """Plot named quantities of a `motion` against time, one panel each.
 
     - `motion`: from `jj.simulate` or `jj.rollout`, or several of them in a list, each in its own colour; `labels`: what the legend calls each of them.
-    - `names`: coordinates, speeds, `"energy"`, `"kinetic energy"`, `"potential energy"` (default: all coordinates of the first motion). Of a rollout,
-      coordinates and speeds: the median of all lanes that are still under way, and a band for each number in `bands`, the part of them that it holds.
+    - `names`: coordinates, speeds, `"kinetic energy"`, `"potential energy"`, `"energy"`, their sum (default: all coordinates of the first motion). Of a
+      rollout, coordinates and speeds: the median of all lanes that are still under way, and a band for each number in `bands`, the part of them that it holds.
     - `units`: name -> unit, such as `{"lean": "deg", "spin_rate": "rpm", "t": "ms"}` (default: SI, radians). Coordinates: m, km, cm, mm, rad, mrad, deg,
       turn; speeds: m/s, km/h, cm/s, mm/s, rad/s, deg/s, turn/s, rpm; energies: J, kJ, mJ; `"t"`: s, ms, min, h.
     - `title`: default: of a rollout, how its lanes ended. `path`: where to write it (.png, .svg, .pdf); `axes`: existing axes, one per name.
@@ -166,5 +166,5 @@ def _values(motion: Trajectory | Rollout, name: str, bands: Sequence[float]) -> 
         return motion.quantiles(name, [level for part in bands for level in ((1 - part) / 2, (1 + part) / 2)] + [0.5])
     if name in ENERGIES:
         energies = motion.energies()
-        return np.asarray({"energy": energies.balance, "kinetic energy": energies.kinetic, "potential energy": energies.potential}[name])
+        return np.asarray({"energy": energies.kinetic + energies.potential, "kinetic energy": energies.kinetic, "potential energy": energies.potential}[name])
     return np.asarray(motion[name])

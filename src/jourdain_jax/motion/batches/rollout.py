@@ -86,8 +86,10 @@ class Rollout(Printed, eqx.Module):
     def quantiles(self, name: str, levels: Sequence[float] = (0.025, 0.5, 0.975)) -> np.ndarray:
         """Quantiles over lanes of the coordinate or speed `name` at all times, for the given `levels` (0 to 1), shape (levels, times).
 
-        Lanes that ended are left out from then on; NaN where none is left.
+        Lanes that ended are left out from then on; NaN where none is left. ValueError where lanes were saved at times of their own.
         """
+        if not np.all((ts := np.asarray(self.lanes.ts)) == ts[:1]):
+            raise ValueError("lanes were saved at times of their own, so that they have no quantiles in common; give all of them one start time, or one `ts`")
         values, quantiles = np.asarray(self[name]), np.asarray(checked_real(levels, "`levels`", advice="give numbers from 0 to 1"))
         if quantiles.ndim != 1 or not np.all((quantiles >= 0) & (quantiles <= 1)):
             raise ValueError(f"`levels` are {levels}, expected a list of numbers from 0 to 1")

@@ -38,16 +38,25 @@ def dataset(record: Record, units: Mapping[str, str] | None = None):
     found: dict[str, tuple] = {"time": ("time", ts[0] if lanes else ts, about_time) if shared else (along, ts, about_time)}
     if lanes:
         found["lane"] = ("lane", np.arange(len(ts)), {"long_name": "number of the motion"})
+
+    def add(name: str, axes: tuple, values, about: dict) -> None:
+        if name in found or name == "lane":
+            raise ValueError(
+                f"`{name}` would name two arrays of the dataset of a `{type(record.scene).__name__}`; coordinates, speeds and parameters need names of "
+                f"their own, other than {', '.join(('time', 'lane', *OF_LANES))}: call it otherwise in the scene, or take `to_pandas()`"
+            )
+        found[name] = (axes, values, about)
+
     for name, values in _columns(record).items():
-        found[name] = (along, values, {"long_name": name} | ({"units": units[name]} if name in units else {}))
+        add(name, along, values, {"long_name": name} | ({"units": units[name]} if name in units else {}))
     for name, (dtype, _, about) in OF_LANES.items():
         more = {"event_names": list(record.event_names)} if name == "event" else {}
-        found.setdefault(name, (lanes, np.asarray(getattr(record, _FIELDS[name])).astype(dtype), about | more))
+        add(name, lanes, np.asarray(getattr(record, _FIELDS[name])).astype(dtype), about | more)
     for name, value, about in parameters_of(record.scene):
         values = np.asarray(value)
         axes = tuple(f"{name}_{k}" for k in range(values.ndim - len(lanes)))
         unit = {"units": about["unit"]} if about["unit"] else {}
-        found.setdefault(name, ((*lanes, *axes), values, {"long_name": about["about"] or name, "role": "parameter"} | unit))
+        add(name, (*lanes, *axes), values, {"long_name": about["about"] or name, "role": "parameter"} | unit)
     held = xarray.Dataset({name: value for name, value in found.items() if name not in ("time", "lane")}, {n: found[n] for n in ("time", "lane") if n in found})
     return held.assign_attrs(scene=type(record.scene).__name__, conventions=record.scene.conventions, solver=record.solver)
 

@@ -168,6 +168,13 @@ def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajecto
             f"`{path}` lacks the parameter `{missing[0]}` of `{kind.__name__}`; it is damaged, or was written when the class had none: "
             "pass the class as it was when the file was written"
         )
+    then, now = header["units"], {name: about["unit"] for name, _, about in parameters_of(scene)}
+    for name in sorted({*then, *now}):
+        if then.get(name) != now.get(name):
+            was, takes = (f"in {units[name]}" if units.get(name) else "without a unit" for units in (then, now))
+            raise ValueError(
+                f"`{path}` holds the parameter `{name}` {was}, but `{kind.__name__}` takes it {takes}; pass the class as it was when the file was written"
+            )
     for name, now in (("coordinates", scene.coordinate_names), ("speeds", scene.speed_names), ("input_names", scene.inputs)):
         if tuple(header[name]) != now.entries:
             raise ValueError(

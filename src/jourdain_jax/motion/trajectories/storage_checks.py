@@ -24,7 +24,7 @@ AXES |= {"work": ("times",)}  # absent where it is not tracked
 HEADER: dict[str, tuple[type, str]] = dict.fromkeys(("scene", "state_form", "reduction", "solver", "kind"), (str, "a text"))
 _LISTS = ("coordinates", "speeds", "input_names", "event_names", "arrays")
 HEADER |= dict.fromkeys(_LISTS, (list, "a list of names"))
-HEADER |= {"static": (dict, "a dictionary"), "projected": (bool, "true or false"), "reruns": (list, "a list")}
+HEADER |= {"static": (dict, "a dictionary"), "units": (dict, "a dictionary"), "projected": (bool, "true or false"), "reruns": (list, "a list")}
 
 
 def refused(path, sentence: str) -> ValueError:
