@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -132,6 +133,24 @@ def test_a_damaged_chunk_is_found_and_computed_again(harm, whole, tmp_path, comp
         found = run(path)
     assert sorted(computed) == [0, 1]
     assert_same(found, whole)
+
+
+@pytest.mark.parametrize("harm", [Path.unlink, lambda file: file.write_text("{"), lambda file: file.write_text("{}")])
+def test_a_damaged_grid_of_a_whole_study_is_found_again(harm, whole, tmp_path, computed):
+    shutil.copytree(whole.store.path, tmp_path / "discs.zarr")
+    harm(tmp_path / "discs.zarr" / "run" / "grid.json")
+    with pytest.raises(ValueError, match=r"`run/grid.json` is damaged; run the study first"):
+        jj.load_study(tmp_path / "discs.zarr").mean("lean at the end")
+    assert_same(run(tmp_path / "discs.zarr"), whole)
+    assert computed == [0]
+
+
+def test_a_share_without_a_chunk_takes_those_of_others(whole, tmp_path):
+    paths = [tmp_path / f"{k}.zarr" for k in range(4)]
+    for k, path in enumerate(paths):
+        run(path, shard=(k + 1, 4))
+    assert jj.load_study(paths[3]).counts == {}
+    assert_same(jj.merge_studies(paths[3], paths[:3]), whole)
 
 
 def test_a_full_disk_is_named_and_the_study_goes_on_when_there_is_room(whole, tmp_path, monkeypatch):

@@ -121,6 +121,8 @@ def test_groups_without_a_value_are_left_out_and_counted():
         jj.sobol_indices(values[:-1], design.names)
     with pytest.raises(ValueError, match="that varies"):
         jj.sobol_indices(np.ones(20), design.names)
+    with pytest.raises(ValueError, match="that varies"):
+        jj.sobol_indices(np.tile([1.0, 2.0, 3.0, 4.0, 1.0], 4), design.names)
 
 
 class Pendulum(jj.Scene):
@@ -175,11 +177,17 @@ def test_the_indices_of_a_pendulums_period_lie_within_their_limits(tmp_path):
         result.sensitivity("period")
 
 
-def test_a_printed_quantile_beyond_the_grid_says_on_which_side_it_is(tmp_path):
-    """The grid spans twice the range of the first block; of what lies beyond, the middle between the grid's edge and the extreme says nothing."""
-    angles = np.r_[np.full(2048, 0.1), np.full(600, 0.3), np.linspace(1.0, 50.0, 1700)]
+def test_what_lies_beyond_the_grid_is_printed_and_drawn_as_that(tmp_path):
+    """The grid spans twice the range of the first block; the middle between its edge and the extreme says nothing."""
+    angles = np.r_[np.linspace(0.0, 1.0, 2048), np.linspace(2.0, 12.0, 2000)]
     study = jj.Study(jj.models.TiltingDisc(), start={"yaw": angles, "lean": 0.1})
-    found = study.run(tmp_path / "discs.zarr", t1=1e-3, outputs={"yaw": jj.End("yaw", "rad")}, progress=False)
-    low, high = found.quantile("yaw", 0.975)
-    assert (low > 0.1, high) == (True, pytest.approx(50.0))
-    assert [word for word in str(found).split("deviation")[1].split()[-4:] if word not in (">", "0.1")] == []
+    found = study.run(tmp_path / "discs.zarr", t1=1e-6, outputs={"yaw": jj.End("yaw", "rad")}, progress=False)
+    assert found.quantile("yaw", 0.975) == (pytest.approx(1.5), pytest.approx(12.0))
+    median, *beyond = str(found).split()[-3:]
+    assert float(median) == pytest.approx(0.9884, abs=1e-3)
+    assert beyond == [">", "1.5"]
+    assert found._repr_html_().count("fill-opacity='0.3'") == 1
+    (axis,) = found.plot().axes
+    assert [text.get_text() for text in axis.get_legend().get_texts()] == ["anywhere in here"]
+    counts, edges, _ = axis.patches[1].get_data()
+    assert (counts[-1], edges[-1]) == (2000, pytest.approx(12.0))

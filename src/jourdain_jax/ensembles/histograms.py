@@ -12,12 +12,13 @@ _WIDE, _HIGH, _FOOT = 220, 90, 16  # pixels of a picture, of them below the bars
 
 @dataclass(frozen=True)
 class Histogram:
-    """Lanes per cell of an output, the edges of the cells, and the mean."""
+    """Lanes per cell of an output, the edges of the cells, which are drawn pale since lanes lie anywhere in them, and the mean."""
 
     name: str
     unit: str
     counts: np.ndarray  # (cells,)
     edges: np.ndarray  # (cells + 1,)
+    pale: np.ndarray  # (cells,)
     mean: float
 
 
@@ -35,7 +36,9 @@ def _picture(of: Histogram) -> str:
     height = _HIGH - _FOOT - 2
     tall = height * of.counts / of.counts.max()
     bars = "".join(
-        f"<rect x='{a:.1f}' y='{height + 2 - h:.1f}' width='{b - a:.1f}' height='{h:.1f}'/>" for a, b, h in zip(x[:-1], x[1:], tall, strict=True) if h > 0
+        f"<rect x='{a:.1f}' y='{height + 2 - h:.1f}' width='{b - a:.1f}' height='{h:.1f}'{opacity}/>"
+        for a, b, h, opacity in zip(x[:-1], x[1:], tall, np.where(of.pale, " fill-opacity='0.3'", ""), strict=True)
+        if h > 0
     )
     mean = _WIDE * float(np.clip((of.mean - low) / (high - low), 0.0, 1.0))
     line = f"<line x1='{mean:.1f}' x2='{mean:.1f}' y1='0' y2='{height + 2}' stroke='#b3470f' stroke-width='1.5'/>"

@@ -122,7 +122,7 @@ class StudyResult(Printed):
         """Means, covariances, histograms and extremes of the outputs over the lanes that have them."""
         grid = self.store.read_grid()
         if grid is None:
-            raise ValueError(f"no chunk of `{self.store.path}` is done yet; run the study first")
+            raise ValueError(f"no chunk of `{self.store.path}` is done yet, or `run/grid.json` is damaged; run the study first, which finds it again")
         found = self._gathered
         sums = [block for chunk in found["sums"] for block in chunk]
         return combined(self.outputs, Grid.from_dict(grid), sums, found["cells"], found["extremes"])
@@ -160,6 +160,11 @@ class StudyResult(Printed):
         end = last if last == len(counts) else min(starts[-1] + step, len(counts) - 1)
         return np.add.reduceat(counts[:last], starts), np.append(edges[starts], edges[end])
 
+    def _bars(self, output: str, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The histogram, and which of its cells reach beyond the grid: lanes lie anywhere in them."""
+        (counts, edges), grid, i = self.histogram(output, cells), self.statistics.grid, self._place(output)
+        return counts, edges, (edges[:-1] < grid.low[i]) | (edges[1:] > grid.high[i])
+
     def sensitivity(self, output: str, confidence: float = 0.95) -> SobolIndices:
         """First-order and total Sobol' indices of an `output`, with intervals that hold each with the given `confidence`; needs sampler="saltelli"."""
         self._place(output)
@@ -195,8 +200,11 @@ class StudyResult(Printed):
         names = outputs or self.outputs
         figure, axes = plt.subplots(1, len(names), figsize=(3.6 * len(names), 3.0), squeeze=False, layout="constrained")
         for axis, name in zip(axes[0], names, strict=True):
-            counts, edges = self.histogram(name)
-            axis.stairs(counts, edges, fill=True, color="#1f5fa8", alpha=0.8)
+            counts, edges, beyond = self._bars(name, 64)
+            axis.stairs(np.where(beyond, 0, counts), edges, fill=True, color="#1f5fa8", alpha=0.8)
+            if beyond.any():
+                axis.stairs(np.where(beyond, counts, 0), edges, fill=True, color="#1f5fa8", alpha=0.25, label="anywhere in here")
+                axis.legend(fontsize="small")
             axis.axvline(self.mean(name), color="#b3470f", lw=1.2)
             unit = self._unit(name)
             axis.set_xlabel(f"{name} ({unit})" if unit else name)
@@ -209,7 +217,7 @@ class StudyResult(Printed):
     def _repr_html_(self) -> str:
         if not self._gathered["chunks"]:
             return super()._repr_html_()
-        drawn = [Histogram(name, self._unit(name), *self.histogram(name, cells=BARS), self.mean(name)) for name in self.outputs]
+        drawn = [Histogram(name, self._unit(name), *self._bars(name, BARS), self.mean(name)) for name in self.outputs]
         return super()._repr_html_() + pictures(drawn)
 
     def _unit(self, output: str) -> str:
@@ -260,8 +268,11 @@ def merge_studies(path: str | os.PathLike, shares: Sequence[str | os.PathLike]) 
         for share in shares:
             other = Store(share)
             different = [name for name in ("identity", "chunk", "block", "samples") if other.study[name] != target.study[name]]
-            if different or other.read_grid() not in (None, target.read_grid()):
+            grid, own = other.read_grid(), target.read_grid()
+            if different or (grid and own and grid != own):
                 raise ValueError(f"`{share}` holds no share of the study in `{path}`: {' and '.join(different) or 'the grid of statistics'} differ")
+            if grid and not own:
+                target.write_grid(grid)
             for number in other.receipts():
                 if number not in held and other.is_whole(number):
                     target.take_chunk(other, number)

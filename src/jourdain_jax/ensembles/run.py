@@ -233,6 +233,8 @@ def run(task: Task, path, *, chunk: int | None, progress: bool, shard: tuple[int
                 bar.update(lanes)
                 bar.set_postfix_str(f"{100 * failed / max(1, bar.n - known):.2g} % failed", refresh=False)
             stopped = interrupted() and finished < len(missing)
+        if not stopped and store.read_grid() is None:  # damaged, or that of a share without a chunk
+            Runner(task, store)
         if stopped:
             kept = f"{len(done) + finished} of {store.chunks} chunks are kept in `{path}`"
             raise KeyboardInterrupt(f"interrupted after {time.monotonic() - began:.0f} s: {kept}; the same call goes on from there")

@@ -62,7 +62,7 @@ def sobol_indices(values, names: Sequence[str], *, confidence: float = 0.95) -> 
     groups = values.reshape(-1, group)
     sound = np.isfinite(groups).all(axis=1)
     groups = groups[sound]
-    if len(groups) < 2 or np.ptp(groups) == 0:
+    if len(groups) < 2 or np.ptp(groups[:, [0, -1]]) == 0:  # those whose variance is divided by
         raise ValueError("fewer than two groups of samples have values, or all values are equal; Sobol' indices need a quantity that varies")
     generator = np.random.default_rng(0)
     drawn = np.stack([_indices(groups[generator.integers(0, len(groups), len(groups))]) for _ in range(RESAMPLES)])

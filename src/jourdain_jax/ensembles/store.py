@@ -121,6 +121,8 @@ class Store:
         file = self.path / "run" / "study.json"
         try:
             found = json.loads(file.read_bytes())
+            if not isinstance(found, dict):
+                raise ValueError("it is no dictionary")
         except FileNotFoundError:
             what = "is not a study: it holds no `run/study.json`" if self.path.exists() else "does not exist"
             raise ValueError(f"`{self.path}` {what}; give the folder of a study, or a new name") from None
@@ -225,7 +227,8 @@ class Store:
 
     def read_grid(self) -> dict | None:
         """What `write_grid` kept; None where nothing was, or it is damaged (it is then found again)."""
-        return self._read("grid.json", None)
+        found = self._read("grid.json", None)
+        return found if isinstance(found, dict) and {"low", "high", "centre"} <= found.keys() else None
 
     def write_grid(self, grid: dict) -> None:
         """Keep the grid of the statistics."""
