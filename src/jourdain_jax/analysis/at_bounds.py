@@ -96,7 +96,7 @@ def _look_inward(around: Around, told: AtBounds, b: int, place: int) -> None:
     (error, slope), end = around.if_free(b, place), RISE_95 / 2 * told.if_free.of_rise[b, place]
     if np.isfinite(error):
         left = told.if_free.wider[b, place] ** 2 - (slope * error) ** 2 / told.if_free.degrees[b, place]
-        told.beyond[b, place] = slope * error / np.sqrt(left) if left > 0 else np.inf
+        told.beyond[b, place] = np.inf if left <= 0 else slope * error / np.sqrt(left)
     if told.beyond[b, place] > FAR_BEYOND:  # the bound decides: the slope alone gives the limit
         told.limit[b, place] = bound + inward * _root(slope, 1 / error**2, end)
         return
