@@ -89,6 +89,33 @@ def test_the_derivative_of_the_first_event_is_its_own():
     np.testing.assert_allclose(jax.jacfwd(lambda wall: end(wall, diffrax.ForwardMode()))(2.0), expected, rtol=1e-10)
 
 
+# where a stone from z = 1 with the speeds 4.5 and 2 m/s meets a plane: its place, and the value a t^2 + b t + c
+MEETS = {
+    "floor": (0.6, lambda place: (-GRAVITY / 2, 2.0, 1.0 - place)),
+    "wall": (0.8, lambda place: (0.0, -4.5, place)),
+    "roof": (1.1, lambda place: (GRAVITY / 2, -2.0, place - 1.0)),
+    "slope": (1.9, lambda place: (GRAVITY / 2, -6.5, place - 1.0)),
+}
+
+
+@pytest.mark.parametrize("plane", MEETS)
+def test_the_second_derivative_of_one_of_several_events_is_its_own(plane):
+    place, value = MEETS[plane]
+
+    def end(place):
+        walls = {"floor": -9.0, "wall": 9.0} | {plane: place}
+        motion = jj.simulate(Thrown(**walls), {"z": 1.0, "x_rate": 4.5, "z_rate": 2.0}, t1=1.0)
+        return jnp.stack([motion.t_end, *motion.q_end])
+
+    def closed(place):
+        a, b, c = value(place)
+        t = 2 * c / (-b + jnp.sqrt(b**2 - 4 * a * c))
+        return jnp.stack([t, 4.5 * t, 1.0 + 2.0 * t - GRAVITY * t**2 / 2])
+
+    np.testing.assert_allclose(end(place), closed(place), rtol=1e-9)
+    np.testing.assert_allclose(jax.hessian(end)(place), jax.hessian(closed)(place), rtol=1e-6, atol=1e-9)
+
+
 class Bounded(jj.Scene):
     """A particle without forces; event values that are no numbers beyond edges of their own."""
 

@@ -315,6 +315,20 @@ def test_a_damping_of_zero_is_found_and_gets_a_one_sided_limit(damping):
         assert float(held.chi_square - found.chi_square) == pytest.approx(3.841, rel=0.05)
 
 
+def test_a_parameter_that_cannot_be_negative_ends_at_zero_whatever_its_range():
+    v = -0.3 * np.sqrt(5.0 / 2.0) * np.sin(np.sqrt(5.0 / 2.0) * TS)
+    run = cart_run(values={"x": 0.3 * np.cos(np.sqrt(5.0 / 2.0) * TS) * (1 + 0.002 * TS), "x_rate": v * (1 + 0.002 * TS)}, inputs=None)
+    usual = fit(Cart(mass=2.2, damping=0.6), run, ("mass", "damping"))
+    assert usual.at_bound.tolist() == [False, True]
+    for given in (unbounded(), unbounded(0.1), bounds(-1.0, 2.0)):
+        found = fit(Cart(mass=2.2, damping=0.6), run, {"mass": unbounded(), "damping": given})
+        assert found.converged
+        np.testing.assert_allclose(found.values, usual.values, rtol=1e-6)
+    assert fit(Cart(mass=2.2, damping=0.0), run, {"mass": None, "damping": unbounded(0.1)}).converged
+    with pytest.raises(ValueError, match=r"first guess of `damping` is -0\.5, but this parameter is declared as not negative"):
+        fit(Cart(), run, {"damping": jj.Estimate(-0.5, range=bounds(-1.0, 2.0))})
+
+
 def test_a_parameter_that_must_be_above_zero_ends_a_little_above_it():
     class Damped(Cart):
         damping: jnp.ndarray = jj.parameter(0.6, unit="N s/m", positive=True)  # with zero there is no motion
@@ -602,6 +616,8 @@ def test_noise_with_a_memory_is_warned_of_and_runs_tell_honest_errors():
     assert "are not white" in str(claimed[0])
     assert 0.75 < claimed[0].autocorrelation["x"][0] < 0.95
     assert found[0].warning == ""
+    own = fit(Cart(mass=1.9), [noisy(i, memory=0.9, ts=ts, unknown_start=("x",)) for i in range(8)], ("mass",), errors="runs")
+    assert "which makes intervals of what is a run's own too narrow (`run 0: x`)" in own.warning
     spread = np.std([float(f["mass"].value) for f in found])
     honest, naive = np.mean([float(f["mass"].standard_error) for f in found]), float(claimed[0]["mass"].standard_error)
     assert honest == pytest.approx(spread, rel=0.5)  # 14 % is the sampling error of a deviation from 25

@@ -73,7 +73,8 @@ def fit(
       more than about this fraction. `max_iterations`: steps tried at most, over each span.
     - `loss`: `huber()` or `student_t()` where some samples are far out (default: least squares).
     - `errors`: whence standard errors and intervals come. "sigmas": from the sigmas, which holds for noise that is white. "runs": from how much runs differ
-      (the sandwich of clusters, which needs five runs or more), which holds whatever the noise within a run, also where the scene is not quite right.
+      (the sandwich of clusters, which needs five runs or more), which holds whatever the noise within a run, also where the scene is not quite right; but for
+      what is a run's own, which takes noise within it as white.
     - `guesses`: how many first guesses are tried side by side: that of the scene and the runs, and others on a Latin hypercube over the bounds of all
       unknowns, or within a factor of five of a `positive()` one. The lowest minimum counts; `Fit.agreeing` says how many led to it.
     - `shooting`: `MultipleShooting(duration=...)` or `MultipleShooting(pieces=...)` for unstable and chaotic motions: the runs are fitted in pieces with

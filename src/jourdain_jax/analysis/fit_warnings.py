@@ -62,6 +62,11 @@ def warnings_of(fit) -> tuple[str, ...]:
         )
     wide = {name for size in small for name in size.channels}
     named = ", ".join(f"`{name}` ({rho:.2f})" for name, rho in coloured.items() if name not in wide)
+    if named and fit.errors == "runs" and (own := [name for name in fit.labels if name.startswith("run ")]):
+        found.append(
+            f"residuals of {named} are not white (in brackets: correlation of neighbouring ones), which makes intervals of what is a run's own too narrow "
+            f"(`{own[0]}`): how runs differ says nothing of it"
+        )
     if named and fit.errors == "sigmas":
         found.append(
             f"residuals of {named} are not white (in brackets: correlation of neighbouring ones), which makes intervals too narrow: the scene, a sensor or the "

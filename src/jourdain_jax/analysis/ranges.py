@@ -3,7 +3,7 @@
 Steps are taken in theta itself and end at a bound, so that an unknown can lie at its bound exactly.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -27,7 +27,7 @@ class Range:
         """What counts as a large change of an unknown that is near zero: the typical change, or a hundredth of the first guess or of the width."""
         if self.kind == "unbounded":
             return self.scale or abs(guess) or 1.0
-        return 0.01 * (self.high - self.low if self.kind == "bounds" else abs(guess))
+        return self.scale or 0.01 * (self.high - self.low if self.kind == "bounds" else abs(guess)) or 1.0
 
     def spread(self, guess, share) -> Float[np.ndarray, "*shape"]:
         """Other first guesses: for `share` from 0 to 1 all numbers between the bounds; without bounds a factor of five to either side, or a typical change."""
@@ -36,6 +36,10 @@ class Range:
         if self.kind == "positive":
             return guess * _FAR ** (2 * share - 1)
         return guess + (2 * share - 1) * max(abs(guess), self.least_size(guess))
+
+    def not_below(self, low: float) -> "Range":
+        """The part of the range that is not below this number, zero or a little more."""
+        return replace(self, kind="positive" if self.kind == "unbounded" else self.kind, low=max(self.low, low))
 
     def refusal(self, guess: np.ndarray) -> str:
         """Why a first guess cannot be taken; empty where it can."""
@@ -64,7 +68,8 @@ def bounds(low: Number, high: Number) -> Range:
 
 
 def unbounded(scale: Number | None = None) -> Range:
-    """The unknown may be any number; `scale`, in its unit, is a typical change: state it where the first guess is zero.
+    """The unknown may be any number, but for a parameter that is declared positive or non-negative, which stays so. `scale`, in its unit, is a typical change:
+    state it where the first guess is zero.
 
     Raises ValueError unless the scale is positive and finite.
     """

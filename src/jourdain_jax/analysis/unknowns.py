@@ -130,7 +130,7 @@ def unknowns_of(
         about = parameters[name]
         default = positive() if about["positive"] or about["non_negative"] else unbounded()
         entry = _entry(name, about["unit"], given, default, np.asarray(getattr(scene, name)))
-        entries.append(_above_zero(entry) if about["positive"] else entry)
+        entries.append(_not_negative(entry, about["positive"]) if about["positive"] or about["non_negative"] else entry)
         shared.add(name, entries[-1].guess.shape)
     for label, estimate in _of_all_runs(runs).items():
         if not estimate.per_run:
@@ -174,9 +174,12 @@ def _parameters(kind: type[Scene]) -> dict[str, Mapping]:
     return {name: field.metadata for name, field in kind.__dataclass_fields__.items() if field.metadata.get("parameter")}
 
 
-def _above_zero(entry: "_Entry") -> "_Entry":
-    """The range with a bound a little above zero in place of one at zero, where the scene has no motion."""
-    return replace(entry, range=replace(entry.range, low=_LEAST * float(entry.guess.min()))) if entry.range.low == 0 else entry
+def _not_negative(entry: "_Entry", positive: bool) -> "_Entry":
+    """The range cut at zero, below which the scene has no motion; a little above it where it has none at zero either. ValueError for a guess below zero."""
+    if np.any(entry.guess < 0):
+        raise ValueError(f"first guess of `{entry.label}` is {entry.guess}, but this parameter is declared as not negative; give one that is not below zero")
+    cut = entry.range.not_below(_LEAST * float(entry.guess.min()) if positive else 0.0)
+    return replace(entry, range=cut)
 
 
 class _Places:

@@ -124,12 +124,13 @@ class Lowered:
             if n in place:
                 leaf, i = place[n]
                 known[n] = leaves[leaf][i]
-        return tuple(jnp.asarray(x) for x in run(self.graph, self.fixed, known | self._usual_values(known)))
+        return tuple(jnp.asarray(x) for x in run(self.graph, self.fixed, known | self.usual_values(known)))
 
-    def _usual_values(self, parameters: dict) -> dict[int, Float[Array, ""]]:
-        """What stands for usual magnitudes: those over `states`, for these parameters; 1 for what vanishes at all of them."""
+    def usual_values(self, parameters: dict) -> dict[int, Float[Array, ""]]:
+        """What stands for usual magnitudes: those over `states`, for these parameters; 1 for what vanishes at all of them. Numbers to differentiation."""
         if not self.usual:
             return {}
+        parameters = jax.lax.stop_gradient(parameters)
         found = run(self.graph, list(self.usual.values()), parameters | {n: jnp.asarray(x) for n, x in self.states.items()})
         sizes = [usual(jnp.abs(jnp.atleast_1d(jnp.asarray(x)))) for x in found]
         return {n: jnp.where(size == 0, 1.0, size) for n, size in zip(self.usual, sizes, strict=True)}

@@ -103,7 +103,7 @@ def _moved(form: Form, asked: Sequence[int]) -> Pulled:
         total = graph.add(total, graph.mul(g, x))
     for i in range(1, layout.events):
         happens = graph.call("eq", which, graph.const(float(i)))
-        rate, slope = graph.call("select", happens, dc[i], rate), graph.call("select", happens, slopes[i], slope)
+        rate, slope = graph.call("select", happens, rate, dc[i]), graph.call("select", happens, slope, slopes[i])
     by_dt = graph.neg(graph.div(graph.mul(total, rate), slope))
     times = [own.variables[first], *(own.variables[len(own.variables) - len(program.inputs) + i] for i in form.sampled)]
     found = cotangents(graph, [by_dt], [graph.one], [*_varying(form, own, asked), *times])

@@ -4,7 +4,7 @@ Each is a function of JAX on one state or scene; under `vmap` all lanes go to on
 rows of numbers are put together, takes twice as long there. Derivatives are those of the same by XLA (`lowering/lowered.py`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 
 import jax
@@ -18,10 +18,11 @@ from jourdain_jax.calculus.elsewhere import or_elsewhere
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.native.called import called, nodes_called, unless_batched
+from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
 from jourdain_jax.native import host
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.math_functions import FUNCTIONS
-from jourdain_jax.native.scalar_program import as_real, unsupported, written, written_in_turn
+from jourdain_jax.native.scalar_program import as_real, unsupported, written
 from jourdain_jax.native.threads import write_rows
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.scene.scene import Scene
@@ -56,14 +57,30 @@ def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:
 
 def fixed_values(program: Lowered, scene: Scene) -> tuple[Float[Array, ""], ...]:
     """As `Lowered.fixed_values`."""
-    if not program.fixed or not entries(scene, _needed(program)):  # nothing to hand over, or nothing asked for
+    parameters = entries(scene, _needed(program))
+    if not program.fixed or not parameters:  # nothing to hand over, or nothing asked for
         return program.fixed_values(scene)
+    x = jnp.concatenate(parameters)
+    usual = [_usual(program)(jax.lax.stop_gradient(x))] if program.usual else []
+    found = _of_parameters(program)(jnp.concatenate([x, *usual]))
+    return tuple(jnp.squeeze(x, 0) for x in jnp.split(found, len(program.fixed)))
 
-    def by_machine_code(scene: Scene) -> tuple:
-        found = _kernel_of_fixed(program)(jnp.concatenate(entries(scene, _needed(program))))[0]
-        return tuple(jnp.squeeze(x, 0) for x in jnp.split(found, len(program.fixed)))
 
-    return differentiated_as(program.fixed_values, or_elsewhere(by_machine_code, program.fixed_values), "forward")(scene)
+@lru_cache(maxsize=MOST_KERNELS)
+def _of_parameters(program: Lowered) -> Callable[[Array], Array]:
+    """What is fixed, as a function of those parameters that are needed and of what is usual."""
+    return values_of_nodes(program.graph, dict(enumerate(program.fixed)), len(program.fixed), [*_places_of(program), *program.usual])
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def _usual(program: Lowered) -> Callable[[Array], Array]:
+    """What is usual at the states that were probed, as a function of those parameters that are needed; JAX does not differentiate it."""
+    kernel = called(lambda lanes, threads: _text_of_usual(program, lanes, threads), lambda *_: ((len(program.usual),),), effort=1)
+
+    def by_xla(x):
+        return jnp.stack(list(program.usual_values(dict(zip(_places_of(program), x, strict=True))).values()))
+
+    return or_elsewhere(lambda x: kernel(x)[0], by_xla)
 
 
 def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
@@ -145,35 +162,17 @@ def _needed(program: Lowered) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(n if n in needed else -1 for n in np.ravel(leaf).tolist()) for leaf in program.traced.parameters)
 
 
-@lru_cache(maxsize=MOST_KERNELS)
-def _kernel_of_fixed(program: Lowered):
-    return called(lambda lanes, threads: _text_of_fixed(program, lanes, threads), lambda *_: ((len(program.fixed),),), effort=1)
+def _places_of(program: Lowered) -> list[int]:
+    """Nodes of the parameters that are needed."""
+    return [n for leaf in _needed(program) for n in leaf if n >= 0]
 
 
-def _text_of_fixed(program: Lowered, lanes: int, threads: int) -> str:
-    """`row(state, found)`: what depends on parameters alone, after what is usual at the states that were probed."""
-    w, given = Writer(lanes, host.fuses()), [n for leaf in _needed(program) for n in leaf if n >= 0]
-    usual, probes = list(program.usual), len(next(iter(program.states.values()), (None,)))
-    if usual:
-        _write_usual(w, program, given, probes)
-    with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
-        known = {n: w.load(w.real, state, k) for k, n in enumerate(given)}
-        if usual:
-            sizes = w.room(w.real, len(usual))
-            w.call("usual", "void", state, sizes)
-            known |= {n: w.load(w.real, sizes, k) for k, n in enumerate(usual)}
-        for i, value in written_in_turn(w, program.graph, program.fixed, known):
-            w.store(as_real(w, value), found, i)
-        w.give()
-    write_rows(w, len(given), len(program.fixed), threads)
-    return w.text
-
-
-def _write_usual(w: Writer, program: Lowered, given: list[int], probes: int) -> None:
-    """`usual(state, sizes)`: as `build/usual_lengths.py: usual` of the magnitudes at the probed states; 1 for what vanishes at all of them."""
-    nodes, states = list(program.usual.values()), list(program.states)
+def _text_of_usual(program: Lowered, lanes: int, threads: int) -> str:
+    """`row(state, found)`: as `build/usual_lengths.py: usual` of the magnitudes at the probed states; 1 for what vanishes at all of them."""
+    w, given, nodes, states = Writer(lanes, host.fuses()), _places_of(program), list(program.usual.values()), list(program.states)
+    probes = len(next(iter(program.states.values()), (None,)))
     table = w.constants("probed", (x[p] for p in range(probes) for x in program.states.values())) if states else Value(w, "ptr", "null")
-    with w.function("usual", "void", {"state": "ptr", "sizes": "ptr"}, attributes="noinline") as (state, sizes):
+    with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
         seen = w.room(w.real, len(nodes) * probes)
         known = {n: w.load(w.real, state, k) for k, n in enumerate(given)}
         with w.counted(0, probes) as p:
@@ -181,8 +180,10 @@ def _write_usual(w: Writer, program: Lowered, given: list[int], probes: int) -> 
             for k, value in enumerate(written(w, program.graph, nodes, known | at)):
                 w.store(w.magnitude(as_real(w, value)), seen, p + k * probes)
         with w.counted(0, len(nodes)) as k:
-            w.store(_median_or_largest(w, w.at(seen, k * probes, w.real), probes), sizes, k)
+            w.store(_median_or_largest(w, w.at(seen, k * probes, w.real), probes), found, k)
         w.give()
+    write_rows(w, len(given), len(nodes), threads)
+    return w.text
 
 
 def _median_or_largest(w: Writer, seen: Value, count: int) -> Value:

@@ -1,0 +1,120 @@
+"""Values of nodes of a graph by machine code, as a function that JAX can differentiate.
+
+    o = f(x),    f'(x) v,    g f'(x),    f''(x) w v,    g f''(x) v         o: values of the nodes, x: of the variables
+
+Each is machine code of its own, made when it is asked for: derivatives are taken on the graph. Those of an order above the second, and those of programs that
+are too large, are JAX's derivatives of the program as XLA runs it.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as
+from jourdain_jax.lowering.jacobian import on_its_own
+from jourdain_jax.motion.native.called import nodes_called
+from jourdain_jax.native.scalar_program import unsupported
+from jourdain_jax.program.derivative import cotangents, derivatives
+from jourdain_jax.program.emit import run
+from jourdain_jax.program.graph import Graph, Unsupported
+
+LARGEST_PROGRAM = 20_000  # operations of a derivative; machine code of so many takes 0.7 MB of the stack, and 0.15 s to make
+
+
+def values_of_nodes(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array]:
+    """Values of nodes, at their places among so many numbers that are zero otherwise, as a function of the values of the variables."""
+    places = dict(sorted(places.items()))
+    graph, nodes, variables = on_its_own(graph, list(places.values()), variables)
+    places = dict(zip(places, nodes, strict=True))
+    program = _Program(graph, places, size, variables)
+    along, back = program.derivative(back=False), program.derivative(back=True)
+
+    def serve(order: int, *_) -> bool:
+        return order <= 2 and program.machine_code(back=False, order=1) is not None and program.machine_code(back=True, order=1) is not None
+
+    def push(arguments, tangents):
+        return values(*arguments), along(*arguments, *tangents)
+
+    def pull(perturbed, arguments, found, g):
+        return (back(*arguments, g),)
+
+    by_xla, quick = _by_xla_and_machine_code(graph, places, size, variables)
+    values = differentiated_as(by_xla, quick, "both", Rules(serve, push, pull), by_xla)
+    return values
+
+
+class _Program:
+    """The nodes, and machine code of their derivatives."""
+
+    def __init__(self, graph: Graph, places: dict[int, int], size: int, variables: list[int]) -> None:
+        self.graph, self.places, self.size, self.variables = graph, places, size, variables
+        self.machine_code = cache(self._machine_code)
+
+    def derivative(self, back: bool) -> Callable[[Array, Array], Array]:
+        """f'(x) v as a function of x and v, or (`back`) g f'(x) of x and g; the derivative of either along x is machine code where it serves."""
+
+        def taken(v):
+            return v[np.array(list(self.places), int)] if back else v
+
+        def first(x, v):
+            function = self.machine_code(back, 1)
+            assert function is not None
+            return function(jnp.concatenate([x, taken(v)]))
+
+        linear = jax.custom_jvp(first)
+
+        @linear.defjvp
+        def rule(at, tangents):
+            second = self.machine_code(back, 2)
+            if second is None:
+                return jax.jvp(first, at, tangents)
+            return linear(*at), linear(at[0], tangents[1]) + second(jnp.concatenate([at[0], taken(at[1]), tangents[0]]))
+
+        return linear
+
+    def _machine_code(self, back: bool, order: int) -> Callable[[Array], Array] | None:
+        """The derivative as a function of x, v or g, and w in a row; None where it is too large, or no machine code."""
+        graph, variables, size = self.graph, self.variables, len(self.places if back else self.variables)
+        weights, w = ([graph.input(f"{name} {i}", True) for i in range(count)] for name, count in (("v", size), ("w", len(variables))))
+
+        def along(nodes, direction: list[int]) -> list[int]:
+            return derivatives(graph, nodes, dict(zip(variables, direction, strict=True)))
+
+        try:
+            nodes = along(self.places.values(), w) if order == 2 else list(self.places.values())
+            if back:
+                found = dict(enumerate(cotangents(graph, nodes, weights, variables)))
+            else:
+                found = dict(zip(self.places, along(nodes, weights), strict=True))
+        except Unsupported:
+            return None
+        found = {place: node for place, node in found.items() if node != graph.zero}
+        if unsupported(graph, found.values()) or graph.operations(found.values()) > LARGEST_PROGRAM:
+            return None
+        given = [*variables, *weights, *(w if order == 2 else ())]
+        return differentiated_as(*_by_xla_and_machine_code(graph, found, len(variables) if back else self.size, given), "forward")
+
+
+def _by_xla_and_machine_code(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> tuple[Callable, Callable]:
+    """Values of nodes at their places, as a function of the values of the variables: by XLA, and by machine code.
+
+    Machine code returns the numbers that are not zero: a whole matrix of 32 trailers lay beyond the end of its stack.
+    """
+    nodes = list(dict.fromkeys(places.values()))
+    number = {n: k for k, n in enumerate(nodes)}
+    which = np.full(size, len(nodes))
+    which[list(places)] = [number[n] for n in places.values()]
+    in_order = bool(nodes) and np.array_equal(which, np.arange(len(nodes)))
+    kernel = nodes_called(graph, nodes, variables, effort=0)
+
+    def placed(found, x):
+        return jnp.concatenate(found) if in_order else jnp.concatenate([*found, jnp.zeros(1, x.dtype)])[which]
+
+    def by_xla(x):
+        return placed([jnp.asarray(value, x.dtype)[None] for value in run(graph, nodes, dict(zip(variables, x, strict=True)))], x)
+
+    return by_xla, lambda x: placed([kernel(x)], x)
