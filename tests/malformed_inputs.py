@@ -580,6 +580,7 @@ MEASURED: dict[str, Case] = {
     "jj.Experiment([0.0, 0.1], {'x': [0.0, 0.1]}, 'small', start={})": ("ValueError", "sigma of channel `x` is the text 'small', expected real numbers"),
     "jj.Experiment([0.0, 0.1], {'x': [0.0, 0.1]}, {'y': 0.1}, start={})": ("ValueError", "`sigma` names channel `y`, which has no values; Valid names: `x`."),
     "jj.Experiment([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start=None)": ("ValueError", "`start` of `Experiment` is `None`, expected a dictionary by name"),
+    "jj.Experiment([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, t0='a')": ("ValueError", "`t0` is the text 'a', expected real numbers; give a time in s"),
     "jj.Experiment([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, t0=0.5)": ("ValueError", "the start at t0 = 0.5 s comes after the first sample (0.0 s)"),
     "jj.Experiment([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, unknown_start=('x',))": ("ValueError", "unknown start value `x` has no first guess"),
     "jj.Experiment([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, sensors={'nose': len})": ("ValueError", "sensor `nose` has no measured values"),

@@ -177,3 +177,15 @@ def test_limits_at_a_bound_and_profiles_from_it_are_those_of_students_t_where_si
         assert found.at_bound.tolist() == [False, True]
         assert float(found["run 0: x_rate"].high) - slope == pytest.approx(reach, rel=0.02)  # found to 2 % of the rise
         assert found.profiles(data)["run 0: x_rate"].high - slope == pytest.approx(reach, rel=0.02)
+
+
+def test_a_bound_that_decides_is_named_where_its_misfit_counts_as_noise():
+    ts, y = lines(8)
+    X = np.stack([np.ones(8), ts], axis=1)
+    (_, slope), (rss,), *_ = np.linalg.lstsq(X, y)
+    for sigma, error in ((None, np.sqrt(rss / 6 * np.linalg.inv(X.T @ X)[1, 1])), (0.1, 0.1 * np.sqrt(np.linalg.inv(X.T @ X)[1, 1]))):
+        for far in (2.0, 8.0):
+            bounded = jj.Estimate(slope + 10 * error, range=jj.bounds(slope + far * error, 90.0))
+            found = jj.fit(Bead(), run(ts, {"x": y}, sigma, {"x": None, "x_rate": bounded}))
+            assert float(found.beyond[1]) == pytest.approx(far, rel=1e-4)
+            assert any("decides its value" in sentence for sentence in found.warnings) == (far > 3)

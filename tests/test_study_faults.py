@@ -321,6 +321,21 @@ def test_an_object_that_a_function_reads_counts_by_its_content(made):
     assert digest(output(made(2))) != digest(output(made(3)))
 
 
+def test_what_a_function_does_not_read_does_not_count(monkeypatch):
+    """A global with the name of an attribute, as a loop leaves one behind, and a list that counts calls."""
+    calls = []
+    monkeypatch.setitem(globals(), "q_end", 1)
+
+    def output(motion):
+        calls.append(1)
+        return motion.q_end[0]
+
+    before = digest(output)
+    globals()["q_end"] = 2
+    calls.append(1)
+    assert digest(output) == before
+
+
 def test_what_a_function_reads_of_a_module_of_the_user_counts(monkeypatch):
     module, inner = ModuleType("users_module"), ModuleType("users_module.inner")
     module.inner, module.factor, module.unread, inner.helper = inner, 2.0, 1.0, lambda x: 2.0 * x

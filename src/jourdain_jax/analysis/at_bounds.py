@@ -2,6 +2,8 @@
 
 p(delta) = min over all other unknowns of (F - F_min), theta = bound + delta;      the limit is where 2 p = 3.84 f      f: see `spread`; 1 where noise is known
 p is close to g delta + h delta^2 / 2, g: slope of F there, 1 / h: variance of the unknown if it were free
+beyond      d = b / sqrt(w^2 - b^2 / n), b = g e, standard errors that the data would put it beyond the bound      e: as F foretells; w, n: see `spread`
+            With b alone, what the bound adds to the residuals counts as noise where sigmas are estimated: of N samples, b is less than sqrt(N), however far.
 p < 0: F is lower away from the bound. So it is where another unknown does the same at the bound, as a delay does at a lag of zero: F is level there, a saddle
 The rise is that at the ends of other intervals. With that of a one-sided limit, 2.71 f, data would choose between two kinds of interval, which together hold a
 truth that is 1.6 standard errors from its bound in 92.5 % of repeats.
@@ -28,13 +30,22 @@ MOST_LOOKED_AT = 8  # unknowns whose intervals are compared with the rise at the
 ADVICE = "`Fit.profiles` gives intervals that hold"
 
 
+@dataclass(frozen=True)
+class IfFree:
+    """What is known of unknowns at a bound, as if they were free."""
+
+    of_rise: Float[np.ndarray, "members unknowns"]  # f
+    wider: Float[np.ndarray, "members unknowns"]  # w
+    degrees: Float[np.ndarray, "members unknowns"]  # n
+
+
 @dataclass
 class AtBounds:
     """What is known of unknowns at a bound, of fits that have converged; NaN for all others."""
 
     limit: Float[np.ndarray, "members unknowns"]  # infinite where the data give none
     beyond: Float[np.ndarray, "members unknowns"]  # by how many standard errors the data would put it beyond its bound
-    of_rise: Float[np.ndarray, "members unknowns"]  # f
+    if_free: IfFree
     lower: dict[int, tuple[float, np.ndarray]] = field(default_factory=dict)  # by member: F and all unknowns where it is lower, one being off its bound
     at_limit: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)  # by member and unknown at a bound: all unknowns with that one at its limit
 
@@ -69,10 +80,10 @@ class Around:
         return error if np.isfinite(error) else np.inf, abs(float(arrow.gradient[0, place]))
 
 
-def limits_at_bounds(around: Around, of_rise: Float[np.ndarray, "members unknowns"]) -> AtBounds:
-    """Each unknown at a bound is moved away from it, all others following. `of_rise`: f."""
+def limits_at_bounds(around: Around, if_free: IfFree) -> AtBounds:
+    """Each unknown at a bound is moved away from it, all others following."""
     theta = around.found.theta
-    told = AtBounds(np.full(theta.shape, np.nan), np.full(theta.shape, np.nan), of_rise)
+    told = AtBounds(np.full(theta.shape, np.nan), np.full(theta.shape, np.nan), if_free)
     for b, place in np.argwhere(around.at_bound & around.found.converged[:, None]).tolist():
         _look_inward(around, told, b, place)
     return told
@@ -82,8 +93,10 @@ def _look_inward(around: Around, told: AtBounds, b: int, place: int) -> None:
     """Tells what one unknown at its bound shows when it is moved away from it."""
     bound, limits = around.found.theta[b, place], around.limits
     inward = 1.0 if bound <= limits.low[place] else -1.0
-    (error, slope), end = around.if_free(b, place), RISE_95 / 2 * told.of_rise[b, place]
-    told.beyond[b, place] = slope * error if np.isfinite(error) else np.nan
+    (error, slope), end = around.if_free(b, place), RISE_95 / 2 * told.if_free.of_rise[b, place]
+    if np.isfinite(error):
+        left = told.if_free.wider[b, place] ** 2 - (slope * error) ** 2 / told.if_free.degrees[b, place]
+        told.beyond[b, place] = np.inf if left <= 0 else slope * error / np.sqrt(left)
     if told.beyond[b, place] > FAR_BEYOND:  # the bound decides: the slope alone gives the limit
         told.limit[b, place] = bound + inward * _root(slope, 1 / error**2, end)
         return

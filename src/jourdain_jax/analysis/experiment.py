@@ -98,7 +98,7 @@ class Experiment(eqx.Module):
         self.inputs = inputs
         self.sensors = {name: one if isinstance(one, Sensor) else Sensor(one) for name, one in (sensors or {}).items()}
         self.readings, self.drives, self.estimates = {}, {}, {}
-        self.t0 = _array(self.ts[0] if t0 is None else t0)
+        self.t0 = _array(self.ts[0] if t0 is None else checked_unless_traced(t0, "`t0`", (), advice="give a time in s"))
         self.ended_by = next(iter(events or {}), "")
         if events:
             self.ts, self.values, self.sigma = cut(events, self.t0, self.ts, self.values, self.sigma)

@@ -95,7 +95,7 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, e
         chi_square=np.where(one(fails), np.nan, sum(_sum_of_squares(r, single) for run in white for r in run.values())),
         samples=np.asarray(samples),
         degrees_of_freedom=np.asarray(samples - one(determined)),
-        of_rise=one(np.where(bound[:, places], at_bounds.of_rise[:, places], about.of_rise)),
+        of_rise=one(np.where(bound[:, places], at_bounds.if_free.of_rise[:, places], about.of_rise)),
         from_prior=(values - unknowns.prior_mean[places]) / unknowns.prior_sigma[places],
         oddities=oddities(problem.scene, problem.runs, not single),
         events_met=events_met(problem, theta[0], asked.simulation) if single and asked.shooting is None else (),

@@ -9,7 +9,7 @@ from jourdain_jax.analysis.at_bounds import Around, AtBounds, limits_at_bounds
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum
 from jourdain_jax.analysis.piecewise import Piecewise
 from jourdain_jax.analysis.problem import Problem
-from jourdain_jax.analysis.spread import rises_if_free
+from jourdain_jax.analysis.spread import if_free
 
 _POOR = 10.0  # times the sum of squares that noise alone leaves, one for each sample
 _SPANS = (1 / 32, 1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 3 / 4)  # shares of the span that a fit grows over
@@ -94,7 +94,7 @@ def off_bounds(
     for _ in range(_TURNS):
         with nullcontext() if pieces is None else pieces.unmoved():
             around = Around(problem.linearised, found, limits, control)
-            told = limits_at_bounds(around, rises_if_free(problem, found, around.at_bound, limits, control, errors))
+            told = limits_at_bounds(around, if_free(problem, found, around.at_bound, limits, control, errors))
         if not told.lower:
             break
         members = np.array(list(told.lower))

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jourdain_jax.analysis.arrow import Arrow
-from jourdain_jax.analysis.at_bounds import RISE_95
+from jourdain_jax.analysis.at_bounds import RISE_95, IfFree
 from jourdain_jax.analysis.information import Information, information, students_t_95
 from jourdain_jax.analysis.levenberg_marquardt import LEAST, Control, Limits, Minimum
 from jourdain_jax.analysis.losses import LEAST_SQUARES
@@ -33,6 +33,8 @@ class Spread:
     known: Information  # the same, or from how much runs differ
     plain: Float[np.ndarray, "members unknowns"]  # standard errors that F alone foretells
     quantiles: Float[np.ndarray, "members unknowns"]  # q
+    wider: Float[np.ndarray, "members unknowns"]  # w
+    degrees: Float[np.ndarray, "members unknowns"]  # n
     of_rise: Float[np.ndarray, "members unknowns"]  # f
 
 
@@ -55,18 +57,20 @@ def spread(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members pl
         of_runs = levels if problem.estimated else noise_levels(problem, theta, found.at, told_by, lambda r, _: problem.loss.bend(r))
         known = replace(of_runs.known, own=known.own).between_runs(levels.at.arrow.scores if problem.estimated else scores)
         quantiles, of_sigmas = students_t_95(len(problem.runs) - 1), np.zeros(1)
-    return Spread(levels, known, plain, np.broadcast_to(quantiles, plain.shape), _of_rise(known.standard_errors / plain, quantiles, of_sigmas))
+    quantiles, degrees = (np.broadcast_to(x, plain.shape) for x in (quantiles, 2 / np.maximum(of_sigmas, 1e-12)))
+    wider = known.standard_errors / plain
+    return Spread(levels, known, plain, quantiles, wider, degrees, _of_rise(wider, quantiles, degrees))
 
 
-def rises_if_free(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members places"], limits: Limits, control: Control, errors: str):
-    """f of each unknown at a `bound`, as if it were free (members, places); one for those that are at none."""
-    f = np.ones(bound.shape)
+def if_free(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members places"], limits: Limits, control: Control, errors: str) -> IfFree:
+    """f, w and n of each unknown at a `bound`, as if it were free."""
+    told = IfFree(np.ones(bound.shape), np.ones(bound.shape), np.full(bound.shape, np.inf))
     if problem.estimated or problem.with_memory or problem.loss != LEAST_SQUARES or errors == "runs":
         for place in np.flatnonzero(bound.any(axis=0)).tolist():
             others = np.where(np.arange(bound.shape[1]) == place, False, bound)
-            here = spread(problem, found, others, limits, control, errors).of_rise[:, np.searchsorted(problem.unknowns.estimated, place)]
-            f[:, place] = np.where(bound[:, place], here, 1.0)
-    return f
+            here, k = spread(problem, found, others, limits, control, errors), np.searchsorted(problem.unknowns.estimated, place)
+            told.of_rise[:, place], told.wider[:, place], told.degrees[:, place] = here.of_rise[:, k], here.wider[:, k], here.degrees[:, k]
+    return told
 
 
 def _normal_or_t(of_memory: np.ndarray, of_sigmas: np.ndarray) -> np.ndarray:
@@ -80,8 +84,7 @@ def _normal_or_t(of_memory: np.ndarray, of_sigmas: np.ndarray) -> np.ndarray:
     return np.where(doubt > 0, students_t_95(2 / np.maximum(doubt, 1e-12)) * np.sqrt(1 - of_memory), NORMAL_95)
 
 
-def _of_rise(wider: np.ndarray, quantiles: np.ndarray, of_sigmas: np.ndarray) -> Float[np.ndarray, "members unknowns"]:
+def _of_rise(wider: np.ndarray, quantiles: np.ndarray, n: np.ndarray) -> Float[np.ndarray, "members unknowns"]:
     """f; where an unknown has no standard error, the largest of others is taken."""
-    n = 2 / np.maximum(of_sigmas, 1e-12)
     f = wider**2 * n * np.log1p(quantiles**2 / n) / RISE_95
     return np.where(np.isfinite(f), f, np.max(f, axis=-1, keepdims=True, where=np.isfinite(f), initial=1.0))

@@ -15,7 +15,7 @@ from types import CodeType, FunctionType, MethodType, ModuleType
 import jax
 import numpy as np
 
-from jourdain_jax.scene.what_is_read import is_installed
+from jourdain_jax.scene.what_is_read import is_installed, read_in
 
 DEEPEST = 8  # functions and classes that name others
 
@@ -86,18 +86,19 @@ def _function(f: FunctionType, of) -> object:
     installed, name = is_installed(f.__globals__.get("__name__")), (f.__module__, f.__qualname__, f.__code__.co_qualname)
     if installed and is_installed(f.__module__) and "<locals>" not in f.__qualname__:
         return "function", name
-    names = sorted(_names_in(f.__code__))
+    names = read_in(f.__code__)
 
     def read(y: object, *outer: ModuleType) -> object:
         """What the code reads of what it names: of a module of the user, the attributes that the code names, too."""
         if not isinstance(y, ModuleType) or is_installed(y.__name__) or y in outer:
             return of(y)
-        return of(y), tuple((name, read(vars(y)[name], *outer, y)) for name in names if name in vars(y))
+        return of(y), tuple((name, read(vars(y)[name], *outer, y)) for name in names.attributes if name in vars(y))
 
-    cells = tuple(read(_within(cell)) for cell in f.__closure__ or ())
+    around = zip(f.__code__.co_freevars, f.__closure__ or (), strict=True)
+    cells = tuple((name, read(_within(cell))) for name, cell in around if name in names.enclosing)
     if installed:
         return "function", name, cells
-    named = tuple((name, read(f.__globals__[name])) for name in names if name in f.__globals__)
+    named = tuple((name, read(f.__globals__[name])) for name in names.globals if name in f.__globals__)
     return "function", of(f.__code__), of(f.__defaults__), of(f.__kwdefaults__), cells, named
 
 
@@ -106,10 +107,6 @@ def _within(cell) -> object:
         return cell.cell_contents
     except ValueError:  # not yet set
         return None
-
-
-def _names_in(code: CodeType) -> set[str]:
-    return set(code.co_names).union(*(_names_in(inner) for inner in code.co_consts if isinstance(inner, CodeType)))
 
 
 def _class(kind: type, of) -> object:

@@ -133,7 +133,8 @@ def animate(
 
     count = len(drawn.ts)
     seconds = float(np.clip(abs(drawn.ts[-1] - drawn.ts[0]), 2.0, 12.0))
-    FuncAnimation(figure, draw, frames=count, blit=False).save(path, writer=PillowWriter(fps=max(1, round(count / seconds))), dpi=80)
+    with np.errstate(over="ignore", invalid="ignore"):  # Matplotlib projects corners that it never set, of faces with fewer than others, and draws none of them
+        FuncAnimation(figure, draw, frames=count, blit=False).save(path, writer=PillowWriter(fps=max(1, round(count / seconds))), dpi=80)
     plt.close(figure)
 
 

@@ -71,7 +71,7 @@ def names_of_what_is_traced(tree) -> list[str]:
 
 def _named_in(f: FunctionType) -> Iterable[tuple[str, Any]]:
     yield from zip(f.__code__.co_freevars, map(_content_of, f.__closure__ or ()), strict=True)
-    yield from ((name, f.__globals__.get(name)) for name in _read_in(f.__code__).globals)
+    yield from ((name, f.__globals__.get(name)) for name in read_in(f.__code__).globals)
 
 
 def is_function(x) -> bool:
@@ -224,7 +224,7 @@ class _Reader:
         if f.__dict__:
             self.members.append(f.__dict__)
             own += [(name, self.key(y, depth + 1)) for name, y in f.__dict__.items()]
-        read = _read_in(f.__code__)
+        read = read_in(f.__code__)
         for name in read.globals:
             own.append((name, self._named(f.__globals__, name, depth)))
             own += self._attributes(f.__globals__.get(name), read.attributes, depth)
@@ -283,7 +283,7 @@ def _entry(y) -> Hashable:
 
 
 @dataclass(frozen=True)
-class _Read:
+class Read:
     """Names that code reads, those of functions inside it included."""
 
     globals: tuple[str, ...]
@@ -292,7 +292,7 @@ class _Read:
 
 
 @functools.lru_cache(maxsize=4096)
-def _read_in(code: CodeType) -> _Read:
+def read_in(code: CodeType) -> Read:
     """What code reads; what it only adds to or writes into (a list that counts its calls) is not among it."""
     instructions = [i for i in dis.get_instructions(code) if i.opname not in ("CACHE", "NOP", "PRECALL", "EXTENDED_ARG")]
     written = {i.argval for i in instructions if i.opname in ("STORE_GLOBAL", "STORE_DEREF")}
@@ -304,11 +304,11 @@ def _read_in(code: CodeType) -> _Read:
             found[_LOADS[i.opname]].append(i.argval)
     for inner in code.co_consts:
         if isinstance(inner, CodeType):
-            read = _read_in(inner)
+            read = read_in(inner)
             found["globals"] += read.globals
             found["enclosing"] += read.enclosing
             found["attributes"] += read.attributes
-    return _Read(**{kind: tuple(dict.fromkeys(names)) for kind, names in found.items()})
+    return Read(**{kind: tuple(dict.fromkeys(names)) for kind, names in found.items()})
 
 
 _LOADS = {"LOAD_GLOBAL": "globals", "LOAD_NAME": "globals", "LOAD_DEREF": "enclosing", "LOAD_CLASSDEREF": "enclosing"}
