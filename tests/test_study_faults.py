@@ -334,6 +334,38 @@ def test_an_object_that_a_function_reads_counts_by_its_content(made):
     assert digest(output(made(2))) != digest(output(made(3)))
 
 
+def test_an_object_that_is_met_in_very_many_places_is_looked_at_once():
+    def nested(number):
+        made = deque([number])
+        for _ in range(40):
+            made = deque([made, made])
+        return made
+
+    assert digest(nested(1)) == digest(nested(1)) != digest(nested(2))
+
+
+PENDULUM = """<robot name="arm"><link name="base"/><link name="arm"><inertial><origin xyz="0 0 -0.5"/><mass value="1"/>
+<inertia ixx="0.1" iyy="0.1" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="pivot" type="continuous">
+<parent link="base"/><child link="arm"/><axis xyz="{}"/></joint></robot>"""
+
+
+def test_scenes_of_other_tools_count_by_what_they_were_made_from(tmp_path):
+    """Their classes bear a name of this package, and hold the axis of a joint, or SymPy's expressions."""
+
+    def of_urdf(axis):
+        (tmp_path / "arm.urdf").write_text(PENDULUM.format(axis))
+        return jj.from_urdf(tmp_path / "arm.urdf")()
+
+    def counted(scene):
+        return digest((type(scene), scene))
+
+    assert counted(of_urdf("0 1 0")) == counted(of_urdf("0 1 0")) != counted(of_urdf("1 0 0"))
+    systems = pytest.importorskip("sympy_systems")
+    rolling, slipping = (lambda make=make: jj.from_sympy(*make())() for make in (systems.rolling_disc, systems.slipping_disc))
+    assert counted(rolling()) == counted(rolling()) != counted(slipping())
+    assert counted(slipping()) == counted(slipping())
+
+
 def test_what_a_function_does_not_read_does_not_count(monkeypatch):
     """A global with the name of an attribute, as a loop leaves one behind, and a list that counts calls."""
     calls = []
