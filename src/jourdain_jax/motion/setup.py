@@ -125,7 +125,7 @@ class Begun(eqx.Module):
     """The start of the integration, marked for the adjoint."""
 
     right: Bool[Array, ""]  # whether all parameters are, and the masses and inertias that they make
-    timely: Bool[Array, ""]  # whether the times go together
+    timely: Bool[Array, ""] | np.bool_  # whether the times go together
     start: State
     args: tuple  # vector field, scene, inputs, what the rates need of the scene, the time from which times count
     y0: Integrated
