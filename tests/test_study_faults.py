@@ -20,6 +20,7 @@ import psutil
 import pytest
 from jax.flatten_util import ravel_pytree
 from scipy.interpolate import CubicSpline
+from test_inputs import OnBelt
 from test_studies import assert_same
 
 import jourdain_jax as jj
@@ -150,7 +151,9 @@ def test_a_share_without_a_chunk_takes_those_of_others(whole, tmp_path):
     for k, path in enumerate(paths):
         run(path, shard=(k + 1, 4))
     assert jj.load_study(paths[3]).counts == {}
+    Store(paths[1]).skip(40)  # noted, so that what is still missing is not computed with it
     assert_same(jj.merge_studies(paths[3], paths[:3]), whole)
+    assert Store(paths[3]).skipped() == (40,)
 
 
 def test_a_full_disk_is_named_and_the_study_goes_on_when_there_is_room(whole, tmp_path, monkeypatch):
@@ -213,6 +216,16 @@ def test_a_folder_that_holds_another_study_is_refused_and_left_alone(change, nam
         change(whole.store.path)
     assert named in str(caught.value)
     assert content() == before
+
+
+def test_an_option_is_not_named_for_the_place_of_a_function_in_memory(tmp_path):
+    def study(**options):
+        inputs = {"speed": lambda t: 1.0 + t, "push": 0.5}
+        return jj.Study(OnBelt(), start={"y": [0.1]}).run(tmp_path / "belt.zarr", t1=0.1, inputs=inputs, progress=False, **options)
+
+    study()
+    with pytest.raises(ValueError, match=r"what differs: options \(`rtol`\); give"):
+        study(rtol=1e-6)
 
 
 def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path):
@@ -319,6 +332,38 @@ def test_an_object_that_a_function_reads_counts_by_its_content(made):
 
     assert digest(output(made(2))) == digest(output(made(2)))
     assert digest(output(made(2))) != digest(output(made(3)))
+
+
+def test_an_object_that_is_met_in_very_many_places_is_looked_at_once():
+    def nested(number):
+        made = deque([number])
+        for _ in range(40):
+            made = deque([made, made])
+        return made
+
+    assert digest(nested(1)) == digest(nested(1)) != digest(nested(2))
+
+
+PENDULUM = """<robot name="arm"><link name="base"/><link name="arm"><inertial><origin xyz="0 0 -0.5"/><mass value="1"/>
+<inertia ixx="0.1" iyy="0.1" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="pivot" type="continuous">
+<parent link="base"/><child link="arm"/><axis xyz="{}"/></joint></robot>"""
+
+
+def test_scenes_of_other_tools_count_by_what_they_were_made_from(tmp_path):
+    """Their classes bear a name of this package, and hold the axis of a joint, or SymPy's expressions."""
+
+    def of_urdf(axis):
+        (tmp_path / "arm.urdf").write_text(PENDULUM.format(axis))
+        return jj.from_urdf(tmp_path / "arm.urdf")()
+
+    def counted(scene):
+        return digest((type(scene), scene))
+
+    assert counted(of_urdf("0 1 0")) == counted(of_urdf("0 1 0")) != counted(of_urdf("1 0 0"))
+    systems = pytest.importorskip("sympy_systems")
+    rolling, slipping = (lambda make=make: jj.from_sympy(*make())() for make in (systems.rolling_disc, systems.slipping_disc))
+    assert counted(rolling()) == counted(rolling()) != counted(slipping())
+    assert counted(slipping()) == counted(slipping())
 
 
 def test_what_a_function_does_not_read_does_not_count(monkeypatch):

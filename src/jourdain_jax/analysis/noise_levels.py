@@ -2,10 +2,12 @@
 
     sigma_c^2 = sum w^2 / (n_c - p_c),    p_c = tr(C A_c),   A_c = J_c' J_c / sigma_c^2       n_c samples of channel c; C: covariance of all unknowns
     degrees of freedom of the variance C_ii:   1 / sum_c v_ic^2 / (n_c - p_c),    v_ic = (C A_c C)_ii / C_ii: what channel c adds to it
+    variance of the estimate:   C_ii - sum_c 2 / (n_c - p_c) sigma_c^4 d^2 C_ii / d (sigma_c^2)^2,    as the weights of channels and priors are estimated, too
 
 With one channel and no prior n - p is left, and intervals are those of Student's t. Under a robust loss the same holds of all samples together, and the factor
 by which their variance is to be multiplied takes the place of sigma^2. Priors and channels whose sigma is given are taken as they are.
-Source: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545; F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110.
+Source: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545; F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110; M. G. Kenward and J. H. Roger,
+Biometrics 53 (1997) 983.
 """
 
 from collections.abc import Callable
@@ -21,6 +23,7 @@ from jourdain_jax.analysis.losses import LEAST_SQUARES
 from jourdain_jax.analysis.problem import Problem
 
 LEFT = 0.5  # degrees of freedom: with fewer, a channel does not tell its sigma
+_STEP = 0.03  # of sigma^2, for the second derivative of C
 _TURNS, _SETTLED = 50, 1e-8  # of sigmas and covariance; relative change of sigmas that ends them
 
 
@@ -31,6 +34,7 @@ class NoiseLevels:
     at: Linearised
     known: Information
     doubt: Float[np.ndarray, "members unknowns"]  # variance of log C_ii, 2 over its degrees of freedom
+    more: Float[np.ndarray, "members unknowns"]  # what weights that are estimated add to C_ii, relative to it
     untold: Bool[np.ndarray, "members channels"]  # which channels do not tell their sigma: nothing is taken from them
 
 
@@ -42,7 +46,7 @@ def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: C
     known = told_by(at.arrow)
     doubt, untold = np.zeros((len(theta), len(places))), np.zeros((len(theta), count), bool)
     if count == 1 and problem.loss == LEAST_SQUARES:
-        return NoiseLevels(at, known, doubt, untold[:, 1:])
+        return NoiseLevels(at, known, doubt, 0 * doubt, untold[:, 1:])
     good = np.flatnonzero(np.isfinite(at.cost))
     triangles, squares, samples, residuals = _by_kind(problem, at, good)
     (determined, widths), unsure = np.zeros((2, len(theta), count)), problem.loss != LEAST_SQUARES
@@ -62,7 +66,12 @@ def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: C
     counts = np.s_[:, 0 if unsure else 1 :]
     doubt = 2 * np.sum(np.nan_to_num(shares[counts]) ** 2 / np.maximum(left[counts], LEFT)[..., None], axis=1)
     at = Linearised(at.cost, arrow, at.rows, np.where(untold[:, 1:], at.sigma, widths[:, 1:]))
-    return NoiseLevels(at, known, doubt, untold[:, 1:])
+    more = 0 * doubt
+    for k in range(1, count):
+        other = [widths * np.sqrt(1 + step * (np.arange(count) == k)) for step in (-_STEP, _STEP)]
+        ends = [(told_by(problem.joined(theta, members, triangles, some)[0]).standard_errors / known.standard_errors) ** 2 for some in other]
+        more -= 2 / np.maximum(left[:, k : k + 1], 1.0) * (sum(ends) - 2) / _STEP**2
+    return NoiseLevels(at, known, doubt, np.maximum(np.nan_to_num(more), 0.0), untold[:, 1:])
 
 
 def _by_kind(problem: Problem, at: Linearised, good: np.ndarray):

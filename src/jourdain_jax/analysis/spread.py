@@ -1,6 +1,7 @@
 """How far estimates are spread about a minimum: from sigmas, given or estimated, from correlation times that are not known, or from how much runs differ.
 
-interval     estimate -+ q e      e: standard error; q: 97.5 % quantile of the normal distribution, or of Student's t where noise is estimated
+interval     estimate -+ q e      e: standard error; q: 97.5 % quantile of the normal distribution, or of Student's t where noise is estimated, times the root
+                                  of what correlation times and weights of channels that are estimated add to the variance
 by profile   2 (F - F_min) <= 3.84 f,   3.84 f = w^2 n log(1 + q^2 / n)      n: degrees of freedom; w: e over what F alone foretells, as sigma is estimated in F
                                                                              from all samples, without allowing for the unknowns
 With one channel of unknown sigma, no prior and a linear motion both are the interval of Student's t of regression.
@@ -52,7 +53,7 @@ def spread(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members pl
     levels = noise_levels(problem, theta, found.at, told_by, problem.loss.inflation)
     known, plain, of_sigmas = levels.known, told_by(found.at.arrow).standard_errors, levels.doubt
     more, of_memory = problem.doubt(theta, elsewhere)
-    quantiles = _normal_or_t(of_memory, of_sigmas) * np.sqrt(1 + more)
+    quantiles = _normal_or_t(of_memory, of_sigmas) * np.sqrt(1 + more + levels.more)
     if errors == "runs":
         of_runs = levels if problem.estimated else noise_levels(problem, theta, found.at, told_by, lambda r, _: problem.loss.bend(r))
         known = replace(of_runs.known, own=known.own).between_runs(levels.at.arrow.scores if problem.estimated else scores)

@@ -7,6 +7,7 @@ the user (as `jax.grad` does), by what they close over. So a changed function ma
 
 import copyreg
 import hashlib
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial
@@ -15,6 +16,7 @@ from types import CodeType, FunctionType, MethodType, ModuleType
 import jax
 import numpy as np
 
+from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.what_is_read import is_installed, read_in
 
 DEEPEST = 8  # functions and classes that name others
@@ -22,23 +24,30 @@ DEEPEST = 8  # functions and classes that name others
 
 def digest(x: object) -> str:
     """A short text that changes with the content of `x`."""
-    return hashlib.sha256(repr(_content(x, 0, set())).encode()).hexdigest()[:16]
+    return _hashed(_content(x, 0, set(), {}))[:16]
 
 
-def _content(x: object, depth: int, within: set[int]) -> object:
+def _hashed(content: object) -> str:
+    return hashlib.sha256(repr(content).encode()).hexdigest()
+
+
+def _content(x: object, depth: int, within: set[int], known: dict[int, tuple[object, str]]) -> object:
+    """`within`: the objects around it; `known`: objects that were met before, and their contents in short."""
     if x is None or isinstance(x, bool | int | float | complex | str | bytes):
         return type(x).__name__, repr(x)
     if isinstance(x, jax.Array) and jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
-        return "key", str(x.dtype), _content(jax.random.key_data(x), depth, within)
+        return "key", str(x.dtype), _content(jax.random.key_data(x), depth, within, known)
     if isinstance(x, jax.Array | np.ndarray | np.generic) and not x.dtype.hasobject:
         array = np.asarray(x)
         return "array", array.dtype.str, array.shape, hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
+    if _is_formula(x):
+        return "formula", type(x).__qualname__, str(x)
     if depth > DEEPEST or id(x) in within:
         return "deeper", type(x).__qualname__
     within = within | {id(x)}
 
     def of(y: object) -> object:
-        return _content(y, depth + isinstance(x, FunctionType | type), within)
+        return _content(y, depth + isinstance(x, FunctionType | type), within, known)
 
     if isinstance(x, tuple | list):
         return type(x).__name__, tuple(map(of, x))
@@ -68,7 +77,17 @@ def _content(x: object, depth: int, within: set[int]) -> object:
     if is_dataclass(x):
         return of(type(x)), tuple((field.name, of(getattr(x, field.name, None))) for field in fields(x))
     members = getattr(x, "__dict__", None)
-    return of(type(x)), of(members if members and not is_installed(type(x).__module__) else _pickled(x))
+    if members and not is_installed(type(x).__module__):
+        return of(type(x)), of(members)
+    if id(x) not in known:  # a part of an expression of SymPy may be met in very many places
+        known[id(x)] = x, _hashed(of(_pickled(x)))
+    return of(type(x)), known[id(x)][1]
+
+
+def _is_formula(x: object) -> bool:
+    """Whether it is an expression of SymPy, whose symbols and functions have numbers of their own in every process, and show themselves by their names."""
+    sympy = sys.modules.get("sympy")
+    return sympy is not None and isinstance(x, sympy.Basic | sympy.MatrixBase | sympy.core.function.UndefinedFunction)
 
 
 def _pickled(x: object) -> object:
@@ -110,7 +129,7 @@ def _within(cell) -> object:
 
 
 def _class(kind: type, of) -> object:
-    if is_installed(kind.__module__):
+    if is_installed(kind.__module__) and (not issubclass(kind, Scene) or getattr(sys.modules[kind.__module__], kind.__name__, None) is kind):
         return "class", kind.__module__, kind.__qualname__
     own = tuple((name, of(member)) for name, member in sorted(vars(kind).items()) if name == "__call__" or not name.startswith(("__", "_abc_")))
     return "class", kind.__qualname__, own, tuple(of(base) for base in kind.__bases__)

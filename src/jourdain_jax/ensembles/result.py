@@ -273,6 +273,8 @@ def merge_studies(path: str | os.PathLike, shares: Sequence[str | os.PathLike]) 
                 raise ValueError(f"`{share}` holds no share of the study in `{path}`: {' and '.join(different) or 'the grid of statistics'} differ")
             if grid and not own:
                 target.write_grid(grid)
+            for lane in {*other.skipped()}.difference(target.skipped()):
+                target.skip(lane)
             for number in other.receipts():
                 if number not in held and other.is_whole(number):
                     target.take_chunk(other, number)

@@ -5,6 +5,7 @@ The first Ctrl-C lets the chunk under way end; a second one ends at once. Both l
 
 import functools
 import json
+import re
 import signal
 import sys
 import threading
@@ -154,13 +155,18 @@ def attributes(task: Task) -> dict:
         "sampler": task.design.sampler,
         "seed": int(task.design.seed),
         "samples": len(task.design),
-        "options": {name: np.asarray(x).tolist() if isinstance(x, int | float | np.ndarray | jax.Array) else repr(x) for name, x in task.options.items()},
+        "options": {name: _as_text(x) for name, x in task.options.items()},
         "precision": str(jnp.result_type(float)),
         "versions": versions(),
         "command": " ".join(sys.argv),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "coordinates": " ".join(task.design.names) if task.save != "statistics" else "",
     }
+
+
+def _as_text(x) -> object:
+    """Numbers as they are, other options as they show themselves, without the places in memory of functions, which are others in every process."""
+    return np.asarray(x).tolist() if isinstance(x, int | float | np.ndarray | jax.Array) else re.sub(r" at 0x[0-9a-f]+", "", repr(x))
 
 
 def _check_same(store: Store, task: Task, chunk: int | None) -> None:
