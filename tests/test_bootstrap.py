@@ -110,7 +110,7 @@ def test_intervals_stay_within_bounds_and_residuals_that_tell_no_noise_are_refus
     rate = jj.fit(Bead(), data).bootstrap(data, 40)["run 0: x_rate"]
     assert 1.9 <= rate.low < rate.high <= 2.1
     data = jj.Experiment(ts, {"x": [1.0, 1.8, 2.2, 3.1], "y": [np.nan, 0.1, np.nan, np.nan]}, 0.1, start=start, unknown_start=tuple(start))
-    with pytest.raises(ValueError, match="residuals of `y` tell nothing of its noise, with 1 samples"):
+    with pytest.raises(ValueError, match="residuals of `y` tell nothing of its noise, with samples: 1"):
         jj.fit(Bead(), data).bootstrap(data, 40, noise="residuals")
 
 

@@ -161,6 +161,13 @@ def test_a_repeat_without_samples_has_not_converged(sigma):
     np.testing.assert_allclose(found.standard_errors[0], jj.fit(Bead(), run(ts, {"x": y}, sigma)).standard_errors, rtol=1e-6)
 
 
+@pytest.mark.parametrize(("value", "sigma"), [(np.finfo(float).max, 0.1), (1.0, 1e-300)], ids=["value", "sigma"])
+def test_residuals_beyond_all_measure_are_not_called_a_motion_that_fails(value, sigma):
+    ts, y = lines(5)
+    y[2] = value
+    assert jj.fit(Bead(), run(ts, {"x": y}, sigma)).warning.startswith("residuals at the first guess are beyond all measure")
+
+
 def test_a_memory_needs_neighbours():
     runs = [run([0.5], {"x": [2.0 + 0.01 * k]}, 0.1, ("x",), t0=0.0, correlation_time=None) for k in range(3)]
     with pytest.raises(ValueError, match="each run has one sample"):

@@ -2,9 +2,10 @@
 
 p(delta) = min over all other unknowns of (F - F_min), theta = bound + delta;      the limit is where 2 p = 3.84 f      f: see `spread`; 1 where noise is known
 p is close to g delta + h delta^2 / 2, g: slope of F there, 1 / h: variance of the unknown if it were free
-beyond      d = b / sqrt(w^2 - b^2 / n), b = g e, standard errors that the data would put it beyond the bound      e: as F foretells; w, n: see `spread`
-            With b alone, what the bound adds to the residuals counts as noise where sigmas are estimated: of N samples, b is less than sqrt(N), however far.
 p < 0: F is lower away from the bound. So it is where another unknown does the same at the bound, as a delay does at a lag of zero: F is level there, a saddle
+beyond      d = b / sqrt(w^2 - b^2 / n),  b = g e:   standard errors that the data would put it beyond its bound      e: as F foretells; w, n: see `spread`
+
+What a bound adds to the residuals counts as noise where sigmas are estimated: with N samples, b stays below sqrt(N) however far the bound is; d does not.
 The rise is that at the ends of other intervals. With that of a one-sided limit, 2.71 f, data would choose between two kinds of interval, which together hold a
 truth that is 1.6 standard errors from its bound in 92.5 % of repeats.
 Source: D. J. Venzon and S. H. Moolgavkar, Applied Statistics 37 (1988) 87; G. J. Feldman and R. D. Cousins, Physical Review D 57 (1998) 3873, section IV.

@@ -158,8 +158,8 @@ def _of_residuals(fit, again: TakenUp) -> tuple[Float[np.ndarray, "unknowns"], d
     for name, share in shares.of_channels.items():
         r, leverage = (np.concatenate([np.ravel(of[name]) for of in parts if name in of]) for parts in (fit.whitened, of_runs))
         r, left = r[np.isfinite(r)], np.count_nonzero(np.isfinite(r)) - np.nansum(leverage)
-        if left < LEFT or (r.size == 1 and r[0]):
-            raise ValueError(f'residuals of `{name}` tell nothing of its noise, with {r.size} samples; use `noise="sigmas"`')
+        if left < LEFT or (r.any() and np.ptp(r) == 0):
+            raise ValueError(f'residuals of `{name}` tell nothing of its noise, with samples: {r.size}; use `noise="sigmas"`')
         pools[name] = (r - np.mean(r)) * np.sqrt(np.sum(r**2) / left / max(np.var(r), np.finfo(float).tiny))
         doubt = doubt + share**2 / left
     quantiles = np.full(len(fit.labels), NORMAL_95)

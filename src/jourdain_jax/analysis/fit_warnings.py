@@ -8,6 +8,7 @@ import numpy as np
 from jourdain_jax.analysis.at_bounds import FAR_BEYOND
 from jourdain_jax.analysis.losses import LEAST_SQUARES
 
+_BEYOND_ALL = 1e150  # sigmas: the square is no number any more
 _COINCIDING = 3  # different residuals that two channels may share by chance
 _FROM_PRIOR = 4.0  # standard deviations: an estimate that lies further from its prior is no chance
 _SURE = 5.0  # standard deviations: a mean square that is further from 1 is no chance
@@ -16,6 +17,8 @@ _SURE = 5.0  # standard deviations: a mean square that is further from 1 is no c
 def warnings_of(fit) -> tuple[str, ...]:
     """Warnings of a fit of one experiment, the most serious reason first, one sentence each."""
     if not np.isfinite(fit.chi_square):
+        if any(np.any(np.abs(r) > _BEYOND_ALL) for run in fit.residuals for r in run.values()):
+            return ("residuals at the first guess are beyond all measure: a value that stands for a missing one (give NaN), or a sigma that is far too small",)
         return ("the motion fails at the first guess, so that there is nothing to fit; look at it with `simulate`", *fit.statistics.events_met)
     found = []
     if fit.stuck:

@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.row_program import RowProgram
-from jourdain_jax.calculus.differentiated_as import differentiated_as
+from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as
 from jourdain_jax.calculus.elsewhere import or_elsewhere
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.native.called import called, nodes_called, unless_batched
-from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
+from jourdain_jax.motion.native.values_of_nodes import Derivatives, values_of_nodes
 from jourdain_jax.native import host
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.math_functions import FUNCTIONS
@@ -29,6 +29,9 @@ from jourdain_jax.scene.scene import Scene
 
 MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the process
 LARGEST_PROGRAM = 60_000  # operations
+# Operations of the dependent speeds from which on their derivatives are machine code. Measured, gradients of batches over all saved states, by XLA and here:
+# 5 operations, 28 and 42 ms; 66, 98 and 69; 228, 405 and 108. One motion of 16 trailers compiles in 16 to 19 s and 4.5 s.
+FEWEST = 60
 _TRUTHS = frozenset(("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite"))
 
 
@@ -85,6 +88,7 @@ def _usual(program: Lowered) -> Callable[[Array], Array]:
 
 def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
     """As `Lowered.speeds_and_pivot`."""
+    count = len(program.independent) + len(program.dependent)
 
     def by_xla(fixed, t, q, y, inputs):
         return program.speeds_and_pivot(fixed, t, tuple(q), tuple(y), inputs)
@@ -93,7 +97,37 @@ def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Ar
         found = _seen(program, *state)
         return found[:-3], found[-3]
 
-    return differentiated_as(by_xla, or_elsewhere(unless_batched(1, by_machine_code, by_xla), by_xla), "forward")(fixed, t, q, y, inputs)
+    def push(arguments, tangents):
+        given, treedef = jax.tree.flatten(arguments)
+        along = [jnp.zeros_like(x) if dx is None else dx for x, dx in zip(given, jax.tree.leaves(tangents, is_leaf=lambda dx: dx is None), strict=True)]
+        found = _derivatives_of_speeds(program).along(_in_a_row(*arguments), _in_a_row(*jax.tree.unflatten(treedef, along)))
+        return values(*arguments), (found[:count], found[count])
+
+    def pull(perturbed, arguments, found, g):
+        leaves, treedef = jax.tree.flatten(arguments)
+        x = _in_a_row(*arguments)
+        found = _derivatives_of_speeds(program).back(x, jnp.concatenate([g[0], jnp.zeros_like(x, shape=(1,))]))
+        parts = jnp.split(found, np.cumsum([jnp.size(x) for x in leaves])[:-1])
+        return jax.tree.unflatten(treedef, [jnp.reshape(part, jnp.shape(x)) for x, part in zip(leaves, parts, strict=True)])
+
+    quick = or_elsewhere(unless_batched(1, by_machine_code, by_xla), by_xla)
+    if not _has_many_operations(program):
+        return differentiated_as(by_xla, quick, "forward")(fixed, t, q, y, inputs)
+    values = differentiated_as(by_xla, quick, "both", Rules(lambda order, *_: _derivatives_of_speeds(program).serve(order), push, pull), by_xla)
+    return values(fixed, jnp.asarray(t, real_type()), q, y, inputs)
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def _has_many_operations(program: Lowered) -> bool:
+    return program.graph.operations(program.z) >= FEWEST
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def _derivatives_of_speeds(program: Lowered) -> Derivatives:
+    """Those of all speeds; the pivot after them is a number to differentiation."""
+    every = [*(int(program.traced.u[k]) for k in program.independent), *program.z]
+    speeds = dict(zip([*program.independent, *program.dependent], every, strict=True))
+    return Derivatives(program.graph, speeds, len(every) + 1, program.variables)
 
 
 def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
@@ -119,8 +153,12 @@ def _kernel_of_right(program: RowProgram):
 
 
 def _seen(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "seen"]:
+    return _kernel_of_seen(program)(_in_a_row(fixed, t, q, y, inputs))[0]
+
+
+def _in_a_row(fixed, t, q, y, inputs) -> Float[Array, "given"]:
     parts = [jnp.stack(fixed)] if fixed else []
-    return _kernel_of_seen(program)(jnp.concatenate([jnp.asarray(x, real_type()) for x in (*parts, jnp.asarray(t)[None], q, y, inputs)]))[0]
+    return jnp.concatenate([jnp.asarray(x, real_type()) for x in (*parts, jnp.asarray(t)[None], q, y, inputs)])
 
 
 def _seen_nodes(program: Lowered) -> list[int]:

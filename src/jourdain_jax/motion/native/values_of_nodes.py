@@ -27,41 +27,44 @@ LARGEST_PROGRAM = 20_000  # operations of a derivative; machine code of so many 
 
 def values_of_nodes(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array]:
     """Values of nodes, at their places among so many numbers that are zero otherwise, as a function of the values of the variables."""
-    places = dict(sorted(places.items()))
-    graph, nodes, variables = on_its_own(graph, list(places.values()), variables)
-    places = dict(zip(places, nodes, strict=True))
-    program = _Program(graph, places, size, variables)
-    along, back = program.derivative(back=False), program.derivative(back=True)
-
-    def serve(order: int, *_) -> bool:
-        return order <= 2 and program.machine_code(back=False, order=1) is not None and program.machine_code(back=True, order=1) is not None
+    program = Derivatives(graph, places, size, variables)
+    by_xla, quick = _by_xla_and_machine_code(program.graph, program.places, size, program.variables)
 
     def push(arguments, tangents):
-        return values(*arguments), along(*arguments, *tangents)
+        return values(*arguments), program.along(*arguments, *tangents)
 
     def pull(perturbed, arguments, found, g):
-        return (back(*arguments, g),)
+        return (program.back(*arguments, g),)
 
-    by_xla, quick = _by_xla_and_machine_code(graph, places, size, variables)
-    values = differentiated_as(by_xla, quick, "both", Rules(serve, push, pull), by_xla)
+    values = differentiated_as(by_xla, quick, "both", Rules(program.serve, push, pull), by_xla)
     return values
 
 
-class _Program:
-    """The nodes, and machine code of their derivatives."""
+class Derivatives:
+    """Machine code of derivatives of values of nodes, as of `values_of_nodes`."""
 
-    def __init__(self, graph: Graph, places: dict[int, int], size: int, variables: list[int]) -> None:
-        self.graph, self.places, self.size, self.variables = graph, places, size, variables
-        self.machine_code = cache(self._machine_code)
+    along: Callable[[Array, Array], Array]  # f'(x) v as a function of x and v
+    back: Callable[[Array, Array], Array]  # g f'(x) as a function of x and g
 
-    def derivative(self, back: bool) -> Callable[[Array, Array], Array]:
-        """f'(x) v as a function of x and v, or (`back`) g f'(x) of x and g; the derivative of either along x is machine code where it serves."""
+    def __init__(self, graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> None:
+        places = dict(sorted(places.items()))
+        self.graph, nodes, self.variables = on_its_own(graph, list(places.values()), variables)
+        self.places, self.size = dict(zip(places, nodes, strict=True)), size
+        self._function = cache(self._made)
+        self.along, self.back = self._linear(back=False), self._linear(back=True)
+
+    def serve(self, order: int, *_) -> bool:
+        """Whether there is machine code of this order."""
+        return order <= 2 and self._function(False, 1) is not None and self._function(True, 1) is not None
+
+    def _linear(self, back: bool) -> Callable[[Array, Array], Array]:
+        """A function of x and v, or (`back`) g; its derivative along x is machine code where that serves."""
 
         def taken(v):
             return v[np.array(list(self.places), int)] if back else v
 
         def first(x, v):
-            function = self.machine_code(back, 1)
+            function = self._function(back, 1)
             assert function is not None
             return function(jnp.concatenate([x, taken(v)]))
 
@@ -69,14 +72,14 @@ class _Program:
 
         @linear.defjvp
         def rule(at, tangents):
-            second = self.machine_code(back, 2)
+            second = self._function(back, 2)
             if second is None:
                 return jax.jvp(first, at, tangents)
             return linear(*at), linear(at[0], tangents[1]) + second(jnp.concatenate([at[0], taken(at[1]), tangents[0]]))
 
         return linear
 
-    def _machine_code(self, back: bool, order: int) -> Callable[[Array], Array] | None:
+    def _made(self, back: bool, order: int) -> Callable[[Array], Array] | None:
         """The derivative as a function of x, v or g, and w in a row; None where it is too large, or no machine code."""
         graph, variables, size = self.graph, self.variables, len(self.places if back else self.variables)
         weights, w = ([graph.input(f"{name} {i}", True) for i in range(count)] for name, count in (("v", size), ("w", len(variables))))
