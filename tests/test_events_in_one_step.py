@@ -179,6 +179,26 @@ def test_a_value_that_falls_below_zero_and_rises_again_within_a_step_is_an_event
     np.testing.assert_allclose(lanes.t_end[seen], expected[seen], rtol=1e-9)
 
 
+@pytest.mark.parametrize("backend", ["auto", "xla"])
+def test_a_value_that_ends_a_step_just_below_zero_was_zero_where_it_fell_not_there(backend):
+    """A roof that a stone passes by some nm, and a value that decays to next to nothing; both are flat where the first step of the search ends."""
+
+    class Decaying(Bounded):
+        def events(self, motion):
+            return {"decayed": jnp.exp(-50.0 * motion.t) - 1e-10}
+
+    found = jj.simulate(Decaying(), {"x_rate": 1.0}, ts=[5.0], backend=backend)
+    np.testing.assert_allclose(found.t_end, np.log(1e10) / 50, rtol=1e-9)
+    by, top = 3e-9, 1.0 + 5.0**2 / (2 * GRAVITY)
+
+    def end(roof):
+        motion = jj.simulate(Thrown(floor=-100.0, wall=100.0, roof=roof, slope=100.0), {"z": 1.0, "x_rate": 0.0, "z_rate": 5.0}, ts=[2.0], backend=backend)
+        return motion.t_end
+
+    np.testing.assert_allclose(end(top - by), 5.0 / GRAVITY - np.sqrt(2 * by / GRAVITY), rtol=1e-9)
+    np.testing.assert_allclose(jax.grad(end)(top - by), 1 / np.sqrt(2 * GRAVITY * by), rtol=1e-4)
+
+
 def test_an_event_is_no_mistake_to_a_search_for_nan_and_a_mistake_still_is():
     class Wrong(Thrown):
         def loads(self, motion):

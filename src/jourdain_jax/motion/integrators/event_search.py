@@ -88,11 +88,12 @@ def next_trial(known: Bracket, step: Float[Array, "*lanes"], last: Bool[Array, "
     share = jnp.where(jnp.isinf(t_3), c_1 / (c_1 - c_2), jnp.where(safe, inverse, 0.5))
     share = jnp.where(jnp.isfinite(share), share, 0.5)
     least = jnp.minimum(tiny / jnp.abs(width), 0.5)
-    # near in time by the slope, and small beside the value at the other end: neither says enough of a value that is flat, or that jumps
-    slope = (c_1 - c_3) / (t_1 - t_3)
-    slope = jnp.where(jnp.isfinite(slope) & jnp.isfinite(t_3), slope, (c_1 - c_2) / (t_1 - t_2))
+    # near in time by the slope, and small beside the value at the other end: neither says enough of a value that is flat, or that jumps; nor does the mean
+    # slope over the whole step, before anything was tried
+    slope, tried = (c_1 - c_3) / (t_1 - t_3), jnp.isfinite(t_3)
+    slope = jnp.where(jnp.isfinite(slope), slope, (c_1 - c_2) / (t_1 - t_2))
     small = jnp.sqrt(jnp.finfo(t_1.dtype).eps)
-    near = (c_1 == 0) | ((jnp.abs(c_1) <= small * step * jnp.abs(slope)) & (jnp.abs(c_1) <= 1e-3 * jnp.abs(c_2)))
+    near = (c_1 == 0) | (tried & (jnp.abs(c_1) <= small * step * jnp.abs(slope)) & (jnp.abs(c_1) <= 1e-3 * jnp.abs(c_2)))
     closed = (jnp.abs(width) <= 2 * tiny) | last
     known_there = jnp.isfinite(c_1)
     t = jnp.where(closed, t_2, t_1 + jnp.clip(share, least, 1 - least) * width)

@@ -113,10 +113,10 @@ def _next_trial(w: Writer, t: Values, c: Values, step: Value, last: Value) -> tu
     share = w.where(w.magnitude(t_3).equals(math.inf), c_1 / (c_1 - c_2), w.where(safe, inverse, 0.5))
     share = w.where(w.magnitude(share) < math.inf, share, 0.5)
     least = w.smaller(tiny / w.magnitude(width), 0.5)
-    slope = (c_1 - c_3) / (t_1 - t_3)
-    slope = w.where((w.magnitude(slope) < math.inf) & (w.magnitude(t_3) < math.inf), slope, (c_1 - c_2) / (t_1 - t_2))
+    slope, tried = (c_1 - c_3) / (t_1 - t_3), w.magnitude(t_3) < math.inf
+    slope = w.where(w.magnitude(slope) < math.inf, slope, (c_1 - c_2) / (t_1 - t_2))
     small = (w.magnitude(c_1) <= _SMALL * step * w.magnitude(slope)) & (w.magnitude(c_1) <= 1e-3 * w.magnitude(c_2))
-    near = c_1.equals(0.0) | small
+    near = c_1.equals(0.0) | (tried & small)
     closed = (w.magnitude(width) <= 2.0 * tiny) | last
     clipped = w.smaller(w.larger(share, least), 1.0 - least)
     return w.where(closed, t_2, t_1 + clipped * width), near | (closed & (w.magnitude(c_1) < math.inf))
