@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as
 from jourdain_jax.calculus.elsewhere import or_elsewhere
+from jourdain_jax.calculus.entries import entries_of
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.native.called import called, nodes_called, unless_batched
@@ -65,8 +66,7 @@ def fixed_values(program: Lowered, scene: Scene) -> tuple[Float[Array, ""], ...]
         return program.fixed_values(scene)
     x = jnp.concatenate(parameters)
     usual = [_usual(program)(jax.lax.stop_gradient(x))] if program.usual else []
-    found = _of_parameters(program)(jnp.concatenate([x, *usual]))
-    return tuple(jnp.squeeze(x, 0) for x in jnp.split(found, len(program.fixed)))
+    return entries_of(_of_parameters(program)(jnp.concatenate([x, *usual])))
 
 
 @lru_cache(maxsize=MOST_KERNELS)
@@ -91,30 +91,30 @@ def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Ar
     count = len(program.independent) + len(program.dependent)
 
     def by_xla(fixed, t, q, y, inputs):
-        return program.speeds_and_pivot(fixed, t, tuple(q), tuple(y), inputs)
+        return program.speeds_and_pivot(entries_of(fixed), t, tuple(q), tuple(y), inputs)
 
     def by_machine_code(*state):
-        found = _seen(program, *state)
+        found = _kernel_of_seen(program)(_in_a_row(*state))[0]
         return found[:-3], found[-3]
 
     def push(arguments, tangents):
-        given, treedef = jax.tree.flatten(arguments)
-        along = [jnp.zeros_like(x) if dx is None else dx for x, dx in zip(given, jax.tree.leaves(tangents, is_leaf=lambda dx: dx is None), strict=True)]
-        found = _derivatives_of_speeds(program).along(_in_a_row(*arguments), _in_a_row(*jax.tree.unflatten(treedef, along)))
+        along = [jnp.zeros_like(x) if dx is None else dx for x, dx in zip(arguments, tangents, strict=True)]
+        found = _derivatives_of_speeds(program).along(_in_a_row(*arguments), _in_a_row(*along))
         return values(*arguments), (found[:count], found[count])
 
     def pull(perturbed, arguments, found, g):
-        leaves, treedef = jax.tree.flatten(arguments)
         x = _in_a_row(*arguments)
         found = _derivatives_of_speeds(program).back(x, jnp.concatenate([g[0], jnp.zeros_like(x, shape=(1,))]))
-        parts = jnp.split(found, np.cumsum([jnp.size(x) for x in leaves])[:-1])
-        return jax.tree.unflatten(treedef, [jnp.reshape(part, jnp.shape(x)) for x, part in zip(leaves, parts, strict=True)])
+        parts = jnp.split(found, np.cumsum([jnp.size(x) for x in arguments])[:-1])
+        return tuple(jnp.reshape(part, jnp.shape(x)) for x, part in zip(arguments, parts, strict=True))
 
     quick = or_elsewhere(unless_batched(1, by_machine_code, by_xla), by_xla)
-    if not _has_many_operations(program):
-        return differentiated_as(by_xla, quick, "forward")(fixed, t, q, y, inputs)
-    values = differentiated_as(by_xla, quick, "both", Rules(lambda order, *_: _derivatives_of_speeds(program).serve(order), push, pull), by_xla)
-    return values(fixed, jnp.asarray(t, real_type()), q, y, inputs)
+    if _has_many_operations(program):
+        rules = Rules(lambda order, *_: _derivatives_of_speeds(program).serve(order), push, pull)
+        values = differentiated_as(by_xla, quick, "both", rules, by_xla)
+    else:
+        values = differentiated_as(by_xla, quick, "forward")
+    return values(_stacked(fixed), jnp.asarray(t, real_type()), q, y, inputs)
 
 
 @lru_cache(maxsize=MOST_KERNELS)
@@ -134,10 +134,10 @@ def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
     """As `Lowered.energy_values`."""
 
     def by_xla(fixed, t, q, y, inputs):
-        return program.energy_values(fixed, t, tuple(q), tuple(y), inputs)
+        return program.energy_values(entries_of(fixed), t, tuple(q), tuple(y), inputs)
 
-    by_machine_code = or_elsewhere(unless_batched(1, lambda *state: _seen(program, *state)[-2:], by_xla), by_xla)
-    return differentiated_as(by_xla, by_machine_code, "forward")(*jax.lax.stop_gradient((fixed, t, q, y, inputs)))
+    by_machine_code = or_elsewhere(unless_batched(1, lambda *state: _kernel_of_seen(program)(_in_a_row(*state))[0][-2:], by_xla), by_xla)
+    return differentiated_as(by_xla, by_machine_code, "forward")(*jax.lax.stop_gradient((_stacked(fixed), t, q, y, inputs)))
 
 
 def is_right(program: RowProgram, scene: Scene, t, q) -> Bool[Array, ""]:
@@ -152,13 +152,12 @@ def _kernel_of_right(program: RowProgram):
     return nodes_called(program.graph, [program.right], given)
 
 
-def _seen(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "seen"]:
-    return _kernel_of_seen(program)(_in_a_row(fixed, t, q, y, inputs))[0]
+def _stacked(fixed) -> Float[Array, "fixed"]:
+    return jnp.stack(fixed) if fixed else jnp.zeros(0, real_type())
 
 
 def _in_a_row(fixed, t, q, y, inputs) -> Float[Array, "given"]:
-    parts = [jnp.stack(fixed)] if fixed else []
-    return jnp.concatenate([jnp.asarray(x, real_type()) for x in (*parts, jnp.asarray(t)[None], q, y, inputs)])
+    return jnp.concatenate([jnp.asarray(x, real_type()) for x in (fixed, jnp.asarray(t)[None], q, y, inputs)])
 
 
 def _seen_nodes(program: Lowered) -> list[int]:

@@ -7,11 +7,12 @@ are too large, are JAX's derivatives of the program as XLA runs it.
 """
 
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
 from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as
@@ -70,12 +71,16 @@ class Derivatives:
 
         linear = jax.custom_jvp(first)
 
-        @linear.defjvp
+        @partial(linear.defjvp, symbolic_zeros=True)
         def rule(at, tangents):
-            second = self._function(back, 2)
-            if second is None:
-                return jax.jvp(first, at, tangents)
-            return linear(*at), linear(at[0], tangents[1]) + second(jnp.concatenate([at[0], taken(at[1]), tangents[0]]))
+            found, (dx, dv) = linear(*at), tangents
+            moves, turns = (not isinstance(d, SymbolicZero) for d in tangents)
+            second = self._function(back, 2) if moves else None
+            if moves and second is None:
+                return jax.jvp(first, at, (dx, dv if turns else jnp.zeros_like(at[1])))
+            rates = [linear(at[0], dv)] if turns else []
+            rates += [second(jnp.concatenate([at[0], taken(at[1]), dx]))] if second else []
+            return found, sum(rates[1:], rates[0]) if rates else jnp.zeros_like(found)
 
         return linear
 
