@@ -337,7 +337,7 @@ def test_an_object_that_a_function_reads_counts_by_its_content(made):
 @pytest.mark.parametrize("pair", [lambda x: [x, x], lambda x: deque([x, x]), lambda x: SimpleNamespace(a=x, b=x)])
 def test_an_object_that_is_met_in_very_many_places_is_looked_at_once(pair):
     def nested(number):
-        for _ in range(40):
+        for _ in range(16):
             number = pair(number)
         return number
 
