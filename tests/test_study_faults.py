@@ -334,12 +334,12 @@ def test_an_object_that_a_function_reads_counts_by_its_content(made):
     assert digest(output(made(2))) != digest(output(made(3)))
 
 
-def test_an_object_that_is_met_in_very_many_places_is_looked_at_once():
+@pytest.mark.parametrize("pair", [lambda x: [x, x], lambda x: deque([x, x]), lambda x: SimpleNamespace(a=x, b=x)])
+def test_an_object_that_is_met_in_very_many_places_is_looked_at_once(pair):
     def nested(number):
-        made = deque([number])
-        for _ in range(40):
-            made = deque([made, made])
-        return made
+        for _ in range(16):
+            number = pair(number)
+        return number
 
     assert digest(nested(1)) == digest(nested(1)) != digest(nested(2))
 

@@ -19,7 +19,7 @@ import numpy as np
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.what_is_read import is_installed, read_in
 
-DEEPEST = 8  # functions and classes that name others
+DEEPEST = 20  # functions and classes that name others
 
 
 def digest(x: object) -> str:
@@ -31,8 +31,8 @@ def _hashed(content: object) -> str:
     return hashlib.sha256(repr(content).encode()).hexdigest()
 
 
-def _content(x: object, depth: int, within: set[int], known: dict[int, tuple[object, str]]) -> object:
-    """`within`: the objects around it; `known`: objects that were met before, and their contents in short."""
+def _content(x: object, depth: int, within: set[int], known: dict[tuple[int, int], tuple[object, str]]) -> object:
+    """`within`: the objects around it; `known`: what was met before, maybe in very many places, and its content in short."""
     if x is None or isinstance(x, bool | int | float | complex | str | bytes):
         return type(x).__name__, repr(x)
     if isinstance(x, jax.Array) and jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
@@ -44,7 +44,13 @@ def _content(x: object, depth: int, within: set[int], known: dict[int, tuple[obj
         return "formula", type(x).__qualname__, str(x)
     if depth > DEEPEST or id(x) in within:
         return "deeper", type(x).__qualname__
-    within = within | {id(x)}
+    if (id(x), depth) not in known:
+        known[id(x), depth] = x, _hashed(_parts(x, depth, within | {id(x)}, known))
+    return known[id(x), depth][1]
+
+
+def _parts(x: object, depth: int, within: set[int], known: dict) -> object:
+    """The content of what has parts."""
 
     def of(y: object) -> object:
         return _content(y, depth + isinstance(x, FunctionType | type), within, known)
@@ -77,11 +83,7 @@ def _content(x: object, depth: int, within: set[int], known: dict[int, tuple[obj
     if is_dataclass(x):
         return of(type(x)), tuple((field.name, of(getattr(x, field.name, None))) for field in fields(x))
     members = getattr(x, "__dict__", None)
-    if members and not is_installed(type(x).__module__):
-        return of(type(x)), of(members)
-    if id(x) not in known:  # a part of an expression of SymPy may be met in very many places
-        known[id(x)] = x, _hashed(of(_pickled(x)))
-    return of(type(x)), known[id(x)][1]
+    return of(type(x)), of(members if members and not is_installed(type(x).__module__) else _pickled(x))
 
 
 def _is_formula(x: object) -> bool:
