@@ -275,6 +275,28 @@ def named_starts(quick: bool) -> Iterator[Figure]:
         np.testing.assert_allclose(found["forward"], found["reverse"], rtol=1e-5, atol=1e-5 * np.max(np.abs(found["reverse"])))
 
 
+def all_parameters(quick: bool) -> Iterator[Figure]:
+    """Derivative of all speeds at the saved times of 1 s with respect to every parameter of a scene: what each mode takes to compile."""
+    chain, ts = jj.models.TrailerChain(trailers=16), jnp.linspace(0.0, 1.0, 101)
+    for name, scene in {"trailer-chain, n = 16": chain} if quick else {"trailer-chain, n = 16": chain, "whipple-bicycle": jj.models.WhippleBicycle()}.items():
+        start = jj.start(scene, **scene.example)
+
+        def loss(scene, adjoint, start=start):
+            return jnp.sum(jj.simulate(scene, start, ts=ts, adjoint=adjoint, work=False).u ** 2)
+
+        jax.block_until_ready(loss(scene, None))  # what is found of the scene is not counted
+        found = {}
+        for way, derivative, adjoint in (("forward", jax.jacfwd, diffrax.ForwardMode()), ("reverse", jax.grad, None)):
+            begin = time.process_time()
+            run = jax.jit(derivative(lambda scene, loss=loss, adjoint=adjoint: loss(scene, adjoint))).lower(scene).compile()
+            seconds = time.process_time() - begin
+            found[way] = np.concatenate([np.ravel(x) for x in jax.tree.leaves(run(scene))])
+            warm = least_processor_time({way: lambda run=run, scene=scene: jax.block_until_ready(run(scene))}, 7)[way]
+            print(f"  {name}, {way} mode by all {found[way].size} parameters: compiled in {seconds:.1f} s, {1e3 * warm:.3f} ms", flush=True)
+            yield figure(f"trace and compile a derivative by all parameters, {way} mode, s", name, seconds, *((8, 4) if way == "forward" else (10, 5)))
+        np.testing.assert_allclose(found["forward"], found["reverse"], rtol=1e-5, atol=1e-5 * np.max(np.abs(found["reverse"])))
+
+
 def cold_seconds(name: str, way: str) -> float:
     """From a fresh process to the first trajectory: import, build, probe, compile, run."""
     done = subprocess.run([sys.executable, "-c", COLD, name, way], capture_output=True, text=True, check=True)
@@ -464,7 +486,19 @@ def limit(quick: bool) -> Iterator[Figure]:
 
 FIGURES = {
     f.__name__: f
-    for f in (operation_ratios, evaluation_ratios, disc_motions, gradients, second_derivatives, named_starts, cold_starts, growth, opaque_calls, limit)
+    for f in (
+        operation_ratios,
+        evaluation_ratios,
+        disc_motions,
+        gradients,
+        second_derivatives,
+        all_parameters,
+        named_starts,
+        cold_starts,
+        growth,
+        opaque_calls,
+        limit,
+    )
 }
 
 

@@ -78,6 +78,7 @@ def test_comments_blank_lines_spaces_and_plus_minus_signs_are_read(tmp_path):
         ("w = 1.121+/-0.002\n", "", ["missing `w`", "Add a line"]),
         ("w = 1.121", "w = 1,121", ["line 22", "`w`", "decimal point"]),
         ("w = 1.121", "w = long", ["line 22", "`w`", "`long`", "expected a number"]),
+        ("w = 1.121", "w = 1_121", ["line 22", "`w`", "`1_121`", "expected a number"]),
         ("w = 1.121", "w = nan", ["line 22", "`w`", "finite"]),
         ("w = 1.121+/-0.002", "w = 1.121+/-inf", ["line 22", "sigma of `w`", "finite"]),
         ("w = 1.121+/-0.002", "w = 1.121+/-", ["line 22", "sigma of `w`"]),

@@ -220,7 +220,7 @@ def _read_line(line: str, where: str) -> tuple[str, float, float | None]:
 
 def read_number(text: str, what: str, where: str) -> float:
     try:
-        number = float(text)
+        number = float("" if "_" in text else text)  # by which Python alone groups digits
     except ValueError:
         hint = " Write the decimal point as `.`, not `,`." if "," in text else ""
         raise ValueError(f"{where}: {what} is {_clipped(text.strip())}, expected a number; form: {_FORMAT}.{hint}") from None

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jourdain_jax.calculus.entries import entries_of
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.input_programs import FunctionOfTime
@@ -171,7 +172,7 @@ def cotangents(motion: Motion, asked: Sequence[bool], found: Stopped, ys: Integr
     form, start = _form_of(motion), _start(motion)
     ends = jnp.concatenate([_packed(y_end), t_end[None]])
     found = flow_back(form, motion.method, which)(start, found, jax.vmap(_packed)(ys), ends)
-    known = dict(zip(which, found[form.layout.y :], strict=True))
+    known = dict(zip(which, entries_of(found[form.layout.y :]), strict=True))
     return _state(form.layout, found[: form.layout.y]), [known.get(i) for i in range(len(asked))]
 
 
