@@ -1,8 +1,7 @@
 """Rows and mass matrix of a scene by machine code, as functions that JAX can differentiate: a derivative has two calls in it, in place of the scene itself.
 
 g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M(t, q)
-d o_i = sum_j J_ij d x_j     o: any of these numbers, x: parameters, time, coordinates, speeds, inputs;   J: derived on the graph
-
+d o_i = sum_j J_ij d x_j     o: any of these numbers, x: parameters, time, coordinates, speeds, inputs;   J: derived on the graph (`values_of_nodes.py`)
 """
 
 from collections.abc import Sequence

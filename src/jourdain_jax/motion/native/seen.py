@@ -1,7 +1,8 @@
 """Numbers beside the steps of a motion, as machine code: those that depend on parameters alone, and all speeds, pivots and energies at saved states.
 
 Each is a function of JAX on one state or scene; under `vmap` all lanes go to one call. In batches of motions XLA sees the states: machine code, for which
-rows of numbers are put together, takes twice as long there. Derivatives are those of the same by XLA (`lowering/lowered.py`).
+rows of numbers are put together, takes twice as long there. Derivatives of what parameters fix, and of speeds that take many operations, are machine code
+too (`values_of_nodes.py`); those of other speeds are derivatives of the same by XLA (`lowering/lowered.py`).
 """
 
 from collections.abc import Callable, Sequence
