@@ -7,7 +7,6 @@ files carry no covariance: sigmas are those of independent errors.
 
 import dataclasses
 import difflib
-import math
 import re
 from collections.abc import Iterator
 from importlib import resources
@@ -18,6 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.analysis.joint_prior import Correlated, joint_normal
+from jourdain_jax.calculus import reading
+from jourdain_jax.calculus.reading import read_text, shortened
 from jourdain_jax.ensembles.distributions import Normal
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 from jourdain_jax.scene.names import nearest
@@ -109,7 +110,7 @@ def read_bicycle(path: str | Path) -> MeasuredBicycle:
     values: dict[str, float] = {}
     sigmas: dict[str, float] = {}
     lines: dict[str, int] = {}
-    text = read_text(path)
+    text = read_lines(path)
     for number, line in _yaml_lines(text, path) if path.suffix.lower() in (".yml", ".yaml") else text_lines(text):
         where = f"{path}, line {number}"
         name, value, sigma = _read_line(line, where)
@@ -146,25 +147,9 @@ def _bicycle_name(path: Path) -> str:
     return path.stem.removesuffix("Benchmark") or path.stem
 
 
-def read_text(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            content = file.read(_LARGEST_FILE + 1)
-    except FileNotFoundError:
-        near = difflib.get_close_matches(path.name, [p.name for p in path.parent.glob("*")] + list(shipped_bicycles()), 1)
-        hint = f" Did you mean `{near[0]}`?" if near else ""
-        raise ValueError(f"{path}: no such file. Give the path of a bicycle parameter file.{hint}") from None
-    except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise ValueError(f"{path}: cannot be read ({reason}). Give the path of a readable parameter file.") from None
-    if len(content) > _LARGEST_FILE:
-        raise ValueError(f"{path}: larger than {_LARGEST_FILE} bytes, so not a bicycle parameter file; expected {_FORMAT}")
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: not UTF-8 text (byte {error.start} is {content[error.start]:#04x}). Expected lines {_FORMAT}.") from None
-    if "\0" in text:
-        raise ValueError(f"{path}: a binary file (it contains zero bytes). Expected text lines {_FORMAT}.")
+def read_lines(path: Path) -> str:
+    """The text of a file of parameters or readings, which is not empty."""
+    text = read_text(path, _LARGEST_FILE, f"a bicycle parameter file with lines {_FORMAT}")
     if not text.strip():
         raise ValueError(f"{path}: the file is empty. Expected lines {_FORMAT}.")
     return text
@@ -191,9 +176,9 @@ def _yaml_lines(text: str, path: Path) -> Iterator[tuple[int, str]]:
         if has_section and not is_indented:
             inside = name == "values"
             if name == "parameterization" and value.strip("\"'") not in _PARAMETERIZATIONS:
-                raise ValueError(f"{path}, line {number}: parameterization {_clipped(value)}, expected that of the benchmark: {' '.join(PARAMETER_NAMES)}")
+                raise ValueError(f"{path}, line {number}: parameterization `{shortened(value)}`, expected that of the benchmark: {' '.join(PARAMETER_NAMES)}")
         elif inside and not value:
-            raise ValueError(f"{path}, line {number}: got {_clipped(line.strip())}, expected `name: value`, for example `rF: 0.35`")
+            raise ValueError(f"{path}, line {number}: got `{shortened(line.strip())}`, expected `name: value`, for example `rF: 0.35`")
         elif inside:
             yield number, f"{name} = {value}"
 
@@ -202,12 +187,12 @@ def _read_line(line: str, where: str) -> tuple[str, float, float | None]:
     """Name, value and sigma (None where not given) of one line without comment."""
     name, equals, right = (part.strip() for part in line.partition("="))
     if not equals or not name or not right:
-        raise ValueError(f"{where}: got {_clipped(line)}, expected {_FORMAT}")
+        raise ValueError(f"{where}: got `{shortened(line)}`, expected {_FORMAT}")
     if not _is_known(name):
         lower_case = {known.lower(): known for known in reversed(PARAMETER_NAMES)}
         near = difflib.get_close_matches(name.lower(), lower_case, 1, cutoff=0.0)
         nearest = lower_case[near[0]] if near else PARAMETER_NAMES[0]
-        raise ValueError(f"{where}: unknown parameter {_clipped(name)}; the nearest valid name is `{nearest}`. Valid names: {' '.join(PARAMETER_NAMES)}.")
+        raise ValueError(f"{where}: unknown parameter `{shortened(name)}`; the nearest valid name is `{nearest}`. Valid names: {' '.join(PARAMETER_NAMES)}.")
     value_text, separator, sigma_text = right.replace("±", "+/-").partition("+/-")
     value = read_number(value_text, f"value of `{name}`", where)
     if not separator:
@@ -219,14 +204,8 @@ def _read_line(line: str, where: str) -> tuple[str, float, float | None]:
 
 
 def read_number(text: str, what: str, where: str) -> float:
-    try:
-        number = float("" if "_" in text else text)  # by which Python alone groups digits
-    except ValueError:
-        hint = " Write the decimal point as `.`, not `,`." if "," in text else ""
-        raise ValueError(f"{where}: {what} is {_clipped(text.strip())}, expected a number; form: {_FORMAT}.{hint}") from None
-    if not math.isfinite(number):
-        raise ValueError(f"{where}: {what} is {number}, expected a finite number. Measure it, or leave this bicycle out.")
-    return number
+    """The finite number that `text` is."""
+    return reading.number(text, f"{where}: {what}", advice=f"; form: {_FORMAT}. Measure it, or leave this bicycle out.")
 
 
 def _is_known(name: str) -> bool:
@@ -243,10 +222,6 @@ def _ignored_but_telling(values: dict[str, float]) -> tuple[str, ...]:
         if values.get(name, values[twin]) != values[twin]:
             found.append(f"`{name}` = {values[name]:g} is ignored: a wheel is symmetric, so `{twin}` is used instead")
     return tuple(found)
-
-
-def _clipped(text: str) -> str:
-    return f"`{text}`" if len(text) <= 60 else f"`{text[:57]}...`"
 
 
 def listed(names: list[str]) -> str:

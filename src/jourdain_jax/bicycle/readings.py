@@ -22,7 +22,7 @@ from pathlib import Path
 
 import equinox as eqx
 
-from jourdain_jax.bicycle.parameter_files import listed, read_number, read_text, text_lines
+from jourdain_jax.bicycle.parameter_files import listed, read_lines, read_number, text_lines
 
 _FORM = "`name = reading+/-sigma`, or several readings with commas between, for example `TcB1 = 1.7173+/-0.0001`"
 _FRAME, _TABLE = ("w", "gamma", "f"), ("h1", "h2", "h3", "h4", "h5", "d1", "d2", "d3", "d4", "d")
@@ -63,7 +63,7 @@ def read_readings(path: str | Path) -> Readings:
     sigmas: dict[str, float] = {}
     lines: dict[str, int] = {}
     without: list[str] = []
-    for number, line in text_lines(read_text(path)):
+    for number, line in text_lines(read_lines(path)):
         where = f"{path}, line {number}"
         name, _, right = (part.strip() for part in line.partition("="))
         if not right or not re.fullmatch(r"\w+", name):

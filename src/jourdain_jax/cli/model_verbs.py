@@ -7,6 +7,7 @@ import numpy as np
 
 from jourdain_jax.analysis.report import report
 from jourdain_jax.analysis.verify import verify
+from jourdain_jax.calculus.reading import number
 from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.models.registry import MODELS, counts_of, known_model, model
 from jourdain_jax.motion.simulate import simulate
@@ -66,13 +67,9 @@ def _start_options(parser) -> None:
 def _pairs(words: list[str], what: str) -> dict[str, float]:
     values = {}
     for word in words:
-        name, equals, text = word.partition("=")
-        try:
-            values[name] = float(text)
-        except ValueError:
-            equals = ""
-        if not equals:
-            raise ValueError(f"{what} `{word}` is not NAME=VALUE with a number; write, for example, {what} mass=2.5")
+        name, _, text = word.partition("=")
+        advice = f"; it takes NAME=VALUE with a number, for example {what} mass=2.5"
+        values[name] = number(text, f"{what} `{word}`: the value", finite=False, advice=advice)
     return values
 
 

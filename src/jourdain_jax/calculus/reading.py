@@ -1,0 +1,100 @@
+"""Reading what others wrote: files of a limited size, numbers as text, things within things. Every fault is a ValueError that names its source.
+
+A source is the path of a file, with a line or an element where that is known.
+"""
+
+import contextlib
+import difflib
+import math
+import os
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+DEEPEST = 250  # levels of what is nested: a chain of so many bodies, as elements of MJCF
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(inf(inity)?|nan)", re.ASCII | re.IGNORECASE)
+
+
+def read_bytes(path: str | os.PathLike, limit: int, what: str = "a file") -> bytes:
+    """Return the content of the file `path`, of at most `limit` bytes; `what` it should be, for the error, such as "a URDF file"."""
+    try:
+        with open(path, "rb") as file:
+            content = file.read(limit + 1)
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in the path
+        said = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        raise ValueError(f"{shortened(path, 300)}: cannot be read ({said}); give the path of {what}{_near(Path(path), error)}") from None
+    if len(content) > limit:
+        raise ValueError(f"{path}: larger than {limit} bytes, expected {what}")
+    return content
+
+
+def read_text(path: str | os.PathLike, limit: int, what: str = "a text file") -> str:
+    """Return the text of the file `path`, which is UTF-8 without zero bytes; arguments as of `read_bytes`."""
+    content = read_bytes(path, limit, what)
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: not UTF-8 text (byte {error.start} is {content[error.start]:#04x}), expected {what}") from None
+    if "\0" in text:
+        raise ValueError(f"{path}: a binary file (it contains zero bytes), expected {what}")
+    return text
+
+
+def number(text: str, what: str, *, finite: bool = True, advice: str = "") -> float:
+    """Return the number that `text` is: ASCII digits, a point, an exponent; with `finite=False` also inf and nan.
+
+    `what`: source and name of the number, for the error; `advice`: what to do, at its end. Digits in groups (`1_0`) and those of other scripts are refused.
+    """
+    plain = text.strip(" \t\r\n")
+    value = float(plain) if _NUMBER.fullmatch(plain) else None
+    if value is None or (finite and not math.isfinite(value)):
+        hint = ", with `.` as the decimal point" if "," in plain else ""
+        raise ValueError(f"{what} is `{shortened(plain)}`, expected a {'finite ' if value is not None else ''}number{hint}{advice}")
+    return value
+
+
+def whole_number(text: str, what: str, low: int, high: int) -> int:
+    """Return the whole number from `low` to `high` that `text` is; `what` as of `number`."""
+    plain = text.strip(" \t\r\n")
+    if not re.fullmatch(r"[+-]?\d{1,30}", plain, re.ASCII) or not low <= int(plain) <= high:
+        raise ValueError(f"{what} is `{shortened(plain)}`, expected a whole number from {low} to {high}")
+    return int(plain)
+
+
+def parsed(parse: Callable, content, source: str, what: str):
+    """Return what `parse` makes of the content of `source`; a ValueError of its own, or nesting without end, names the source and `what` was expected."""
+    try:
+        return parse(content)
+    except RecursionError:
+        raise _too_deep(source) from None
+    except ValueError as error:
+        raise ValueError(f"{source}: is no {what} ({shortened(error, 200)})") from None
+
+
+def check_depth(root, inner: Callable[[object], Iterable], source: str) -> None:
+    """Raise a ValueError where things are nested deeper than `DEEPEST`. `inner`: thing -> those in it."""
+    level = [root]
+    for _ in range(DEEPEST):
+        level = [thing for holder in level for thing in inner(holder)]
+        if not level:
+            return
+    raise _too_deep(source)
+
+
+def shortened(text: object, length: int = 60) -> str:
+    """Return a text of others for an error, of at most `length` letters."""
+    text = str(text)
+    return text if len(text) <= length else f"{text[: length - 3]}..."
+
+
+def _too_deep(source: str) -> ValueError:
+    return ValueError(f"{source}: nested more than {DEEPEST} levels deep; give a flatter file")
+
+
+def _near(path: Path, error: Exception) -> str:
+    """The nearest name in the folder, where the file is missing."""
+    found: list[str] = []
+    with contextlib.suppress(OSError):
+        if isinstance(error, FileNotFoundError):
+            found = difflib.get_close_matches(path.name, os.listdir(path.parent), 1)
+    return f". Did you mean `{found[0]}`?" if found else ""
