@@ -369,6 +369,8 @@ MOTIONS: dict[str, Case] = {
     "jj.simulate(b, {}, t1=1.0, atol=[1e-8, 1e-8])": ("ValueError", "`atol` has shape (2,), expected one number"),
     "jj.simulate(b, {}, t1=1.0, max_steps=0)": ("ValueError", "`max_steps` is 0, expected a whole number of at least 1"),
     "jj.simulate(b, {}, t1=1.0, max_steps=True)": ("ValueError", "`max_steps` is True, expected a whole number of at least 1"),
+    "jj.simulate(b, {}, t1=1.0, max_step=0.0)": ("ValueError", "`max_step` is 0, expected a positive time in s"),
+    "jj.simulate(b, {}, t1=1.0, max_step=nan)": ("ValueError", "`max_step` is nan, expected a positive time in s"),
     "jj.simulate(b, {}, t1=1.0, dt0='small')": ("ValueError", "`dt0` is the text 'small', expected real numbers; give the first step in s"),
     "jj.simulate(b, {}, t1=1.0, dt0=0.0)": ("ValueError", "`dt0` is 0, expected a finite first step in s that is not zero"),
     "jj.simulate(b, {}, t1=1.0, dt0=nan)": ("ValueError", "`dt0` is nan, expected a finite first step in s"),

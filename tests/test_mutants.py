@@ -115,7 +115,7 @@ def a_program_knows_where_rows_are_parallel():
 # Steps
 
 
-def loop(kind: str, rates: Callable, *, rtol: float, project=None, events=None, knots=None, solver=None, dt0: float = 1.0) -> Callable:
+def loop(kind: str, rates: Callable, *, rtol: float, project=None, events=None, knots=None, solver=None, dt0: float = 1.0, longest=np.inf) -> Callable:
     """`(y0, t0, goals, args)` -> saved states and the loop's own account."""
 
     def run(y0, t0, goals, args):
@@ -129,6 +129,7 @@ def loop(kind: str, rates: Callable, *, rtol: float, project=None, events=None, 
             rtol=rtol * one,
             atol=rtol * one,
             shortest=1e-14 * one,
+            longest=longest * one,
             max_steps=2000,
             knots=None if knots is None else jnp.asarray(knots),
         )
@@ -166,6 +167,12 @@ def an_event_within_a_step_ends_the_motion():
     _, end = jax.jit(run)(jnp.zeros(1), jnp.array(0.0), jnp.array([2.0]), None)
     assert int(end.code) == results.EVENT, "an event was passed over"
     np.testing.assert_allclose(end.t, 0.51, atol=1e-10, err_msg="event")
+
+
+def steps_are_no_longer_than_allowed():
+    run = loop("forward", lambda t, y, args: jnp.ones(1), rtol=1e-3, longest=0.25)
+    _, end = jax.jit(run)(jnp.zeros(1), jnp.array(0.0), jnp.array([2.0]), None)
+    assert int(end.accepted) == 8, "the longest step"
 
 
 # Their derivatives in reverse mode
@@ -254,6 +261,7 @@ class Mutant:
 DENSE = "differs from the dense path"
 BUILD, KINEMATICS, VJP = appell.AppellOnGraph, appell._Kinematics, recorded_adjoint._motion
 DISC, BOARD = a_tilting_disc_accelerates_as_by_dense_matrices, a_snakeboard_accelerates_as_by_dense_matrices
+LONGEST = steps_are_no_longer_than_allowed
 STEPS, TIMES, EVENT = steps_follow_a_closed_form, reverse_mode_through_saved_times, reverse_mode_to_an_event
 MUTANTS = [
     Mutant("no gyroscopic torque", BUILD, "_inertia_resultants", "g.add(g.dot(row, alpha), w)", "g.dot(row, alpha)", DISC, DENSE),
@@ -320,6 +328,8 @@ MUTANTS = [
         "knot",
     ),
     Mutant("no dips", erk_step, "_monitored", "dips = accept & dip.happens", "dips = accept & False", an_event_within_a_step_ends_the_motion, "passed over"),
+    Mutant("the first step without a bound", erk_loop, "begun", "jnp.minimum(jnp.abs(dt0), problem.longest)", "jnp.abs(dt0)", LONGEST, "the longest step"),
+    Mutant("no bound of steps", erk_step, "_tried", "jnp.minimum(size * factor, problem.longest)", "size * factor", LONGEST, "the longest step"),
     Mutant("no cotangents of later stages", step_adjoint, "step_vjp", "as_in(b, g) * g + weighted(column, G)", "as_in(b, g) * g", TIMES, "derivative"),
     Mutant(
         "one stage without parameters",

@@ -104,7 +104,7 @@ def disc_kernel(request):
     starts = np.zeros((100, layout.given))
     starts[:, 3], starts[:, 5:8] = lean, np.stack([0.5 + lean, 0.2 + np.zeros(100), -3 + 2 * lean], axis=1)
     progress = {"h": 1e-4, "code": -1, "event": -1, "pivot": np.inf, "direction": 1, "last_goal": 1.0, "rtol": 1e-6, "atol": 1e-6}
-    for name, value in (progress | {"shortest": 1e-14, "max_steps": 1000}).items():
+    for name, value in (progress | {"shortest": 1e-14, "longest": 0.1, "max_steps": 1000}).items():
         starts[:, layout.rows[name].start] = value
     starts[:, layout.rows["known"].start : layout.rows["known"].stop] = fixed
     return kernel, request.param, jnp.asarray(starts), jnp.broadcast_to(jnp.linspace(0.0, 1.0, 5), (100, 5))

@@ -84,7 +84,7 @@ def motion(scene: jj.Scene, values: dict, **options):
 
 
 def pushed(x, v, k, level=-0.1, events=False, **options):
-    options = {"ts": TIMES, "rtol": 1e-10, "atol": 1e-10, "dt0": 1.0} | options
+    options = {"ts": TIMES, "rtol": 1e-10, "atol": 1e-10, "dt0": 1.0, "max_step": jnp.inf} | options
     return motion(Pushed(k, level), {"x": x, "x_rate": v}, events=events, **options)
 
 
@@ -111,9 +111,19 @@ def an_event_is_found():
 
 
 def an_event_within_a_step_is_found():
-    found = jax.jit(lambda: motion(Dips(), {"x": 0.0, "x_rate": 1.0}, ts=[2.0], dt0=1.0))()
+    found = jax.jit(lambda: motion(Dips(), {"x": 0.0, "x_rate": 1.0}, ts=[2.0], dt0=1.0, max_step=jnp.inf))()
     assert int(found.code) == results.EVENT, "the event was passed over"
     assert abs(found.t_end - 0.51) < 1e-9, "time of the event"
+
+
+def steps_are_no_longer_than_allowed():
+    found = jax.jit(lambda: motion(Dips(), {"x": 0.0, "x_rate": -1.0}, ts=[2.0], dt0=1.0, max_step=0.25))()
+    assert int(found.accepted) == 8, "the longest step"
+
+
+def series_are_no_longer_than_allowed():
+    found = jax.jit(lambda: motion(Dips(), {"x": 0.0, "x_rate": -1.0}, ts=[2.0], solver=jj.Taylor(), max_step=0.25))()
+    assert int(found.accepted) == 8, "the longest step"
 
 
 def a_bead_stays_on_its_circle():
@@ -238,7 +248,7 @@ def reverse_mode_back_over_projections():
     @jax.jit
     @functools.partial(jax.value_and_grad, has_aux=True)
     def weighed(rate):
-        found = motion(Round(), {"x": 1.0, "y": 0.0, "y_rate": rate}, ts=[2.0, 4.0], rtol=1e3, atol=1e3, dt0=100.0)
+        found = motion(Round(), {"x": 1.0, "y": 0.0, "y_rate": rate}, ts=[2.0, 4.0], rtol=1e3, atol=1e3, dt0=100.0, max_step=jnp.inf)
         return jnp.sum(found.ys.q @ jnp.array([0.4, 0.9])) + found.y_end.v[0], found.accepted
 
     h = 1e-3
@@ -254,6 +264,7 @@ EVENT, DIP, ROWS = an_event_is_found, an_event_within_a_step_is_found, a_start_i
 BACK, ALONG, TIME = reverse_mode_through_saved_times, forward_mode_through_saved_times, reverse_mode_with_respect_to_times
 EVENT_BACK, EVENT_ALONG, EVENT_TWICE = reverse_mode_to_an_event, forward_mode_to_an_event, forward_mode_to_an_event_twice
 BENT, TIMES_BENT = a_hessian_to_an_event, a_hessian_with_respect_to_times
+LONGEST, SERIES_LONGEST = steps_are_no_longer_than_allowed, series_are_no_longer_than_allowed
 PROJECTED_BACK = reverse_mode_back_over_projections
 TRIED, WRONG = "_tried_by_stages", "derivative with respect to"
 MUTANTS = [
@@ -268,6 +279,8 @@ MUTANTS = [
     Mutant("starts of another lane", loop, "_write_begin", "number * given + row), lanes", "0 * given + row), lanes", LANES, "lanes"),
     Mutant("goals of another lane", loop, "_write_begin", "number * w.load", "0 * w.load", LANES, "lanes"),
     Mutant("states of another lane", loop, "_save", "(number * times + k)", "(0 * number + k)", LANES, "lanes"),
+    Mutant("no bound of steps", step, TRIED, ', p["longest"])', ', w.number(math.inf))', LONGEST, "the longest step"),
+    Mutant("no bound of series", step, "_tried_by_series", 'rows), p["longest"])', "rows), math.inf)", SERIES_LONGEST, "the longest step"),
     Mutant("no projection", step, "_project", 'w.call("project", "void", p.pointer, t1, y1)', "None", CIRCLE, "circle"),
     Mutant("no events", step, "_monitored", "~search.no_event(w, c_1)", "~search.no_event(w, c_0)", EVENT, "event"),
     Mutant("no dips", step, "_monitored", "dips = accept & dips", "dips = accept & ~accept", DIP, "passed over"),

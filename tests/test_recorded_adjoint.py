@@ -36,6 +36,7 @@ def pendulum(kind, *, rtol, solver=None, events=False, max_steps=100_000):
             rtol=rtol * same,
             atol=rtol * same,
             shortest=1e-14 * same,
+            longest=jnp.inf * same,
             max_steps=max_steps,
         )
         method = method_of(diffrax.Dopri8() if solver is None else solver)

@@ -79,7 +79,7 @@ def fit(
       unknowns, or within a factor of five of a `positive()` one. The lowest minimum counts; `Fit.agreeing` says how many led to it.
     - `shooting`: `MultipleShooting(duration=...)` or `MultipleShooting(pieces=...)` for unstable and chaotic motions: the runs are fitted in pieces with
       starts of their own, and continuity between them is an equation. What is minimised stays the same.
-    - `simulation`: options of `simulate` such as `rtol`, `atol`, `solver`, `max_steps`. Stop events cut no run: what is given counts, and `Fit.warnings`
+    - `simulation`: options of `simulate` such as `rtol`, `solver`, `max_step`, `max_steps`. Stop events cut no run: what is given counts, and `Fit.warnings`
       names those that the fitted motion meets before a sample. Give samples up to where the real motion met one; were runs cut where the fitted one does,
       estimates whose motion ends early would have fewer residuals.
 

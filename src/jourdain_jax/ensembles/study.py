@@ -159,7 +159,7 @@ class Study(Printed):
           it included; with `client`, what each worker may hold. Blocks and chunks are made small enough. It is held on Linux. Means and covariances of
           studies with other blocks differ in their last digits.
         - `shard`: (k, n): only the k-th of n shares of the chunks, for a folder of its own on one of n machines; `jj.merge_studies` puts them together.
-        - `progress`: a bar; `command`: text that is kept with the study; `options`: further ones as in `rollout` (`rtol`, `atol`, `solver`, ...).
+        - `progress`: a bar; `command`: text that is kept with the study; `options`: further ones as in `rollout` (`rtol`, `atol`, `solver`, `max_step`, ...).
 
         Raises ValueError where the folder holds another study or `memory` is too little, MemoryError where it turned out to be, `InUseError` where another
         process runs it, OSError where it cannot be written.

@@ -49,7 +49,7 @@ def named_values(scene: Scene, given, what: str = "start") -> Mapping:
     return scene.example if given is None else given
 
 
-def check_options(*, rtol=1e-8, atol=1e-8, max_steps=1, dt0=None, switches: dict | None = None, **objects) -> None:
+def check_options(*, rtol=1e-8, atol=1e-8, max_steps=1, dt0=None, max_step=None, switches: dict | None = None, **objects) -> None:
     """ValueError for tolerances that are no positive numbers, and for `solver`, `adjoint`, ... that are no objects of their kind (None is let pass)."""
     for name, value in (("rtol", rtol), ("atol", atol)):
         if type(value) is float and 0 < value < np.inf:
@@ -64,6 +64,10 @@ def check_options(*, rtol=1e-8, atol=1e-8, max_steps=1, dt0=None, switches: dict
         first = checked_unless_traced(dt0, "`dt0`", (), advice="give the first step in s, or None for 1e-4 of the span")
         if not is_traced(first) and not 0 < abs(float(first)) < np.inf:
             raise ValueError(f"`dt0` is {float(first):g}, expected a finite first step in s that is not zero; or None for 1e-4 of the span")
+    if max_step is not None:
+        longest = checked_unless_traced(max_step, "`max_step`", (), advice="give the longest step in s, None for a part of the span, or inf for no bound")
+        if not is_traced(longest) and not float(longest) > 0:
+            raise ValueError(f"`max_step` is {float(longest):g}, expected a positive time in s; None bounds steps by the span, inf does not bound them")
     if max_steps is not None and (not isinstance(max_steps, int | np.integer) or isinstance(max_steps, bool) or max_steps < 1):
         raise ValueError(f"`max_steps` is {max_steps!r}, expected a whole number of at least 1; give the number of steps after which to stop")
     for name, value in objects.items():
@@ -131,12 +135,12 @@ def times_fit(ts, t0, t1) -> "Bool[Array, ''] | np.bool_":
     return (direction != 0) & xp.isfinite(t1 - t0) & xp.all((ts[1:] - ts[:-1]) * direction > 0) & (from_start >= -slack) & (to_end >= -slack)
 
 
-def fitting_times(ts, t0, t1, dt0):
-    """`ts`, `t0`, `t1` and the first step where they go together, none beyond an end by round-off; otherwise those of a short span."""
+def fitting_times(ts, t0, t1, dt0, longest):
+    """`ts`, `t0`, `t1`, the first step and the longest one where they go together, none beyond an end by round-off; otherwise those of a short span."""
     fits, direction = times_fit(ts, t0, t1), jnp.sign(t1 - t0)
     inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
-    short = _SHORT * jnp.linspace(0.0, 1.0, ts.shape[-1], dtype=ts.dtype), jnp.zeros_like(t0), _SHORT * jnp.ones_like(t1), 0.1 * _SHORT * jnp.ones_like(dt0)
-    return tuple(jnp.where(fits, own, other) for own, other in zip((inside, t0, t1, dt0), short, strict=True))
+    short = _SHORT * jnp.linspace(0.0, 1.0, ts.shape[-1], dtype=ts.dtype), jnp.zeros_like(t0), _SHORT * jnp.ones_like(t1), 0.1 * _SHORT * jnp.ones_like(dt0), _SHORT * jnp.ones_like(longest)
+    return tuple(jnp.where(fits, own, other) for own, other in zip((inside, t0, t1, dt0, longest), short, strict=True))
 
 
 def saved_times(ts) -> "Float[Array, 'times'] | Float[np.ndarray, 'times']":

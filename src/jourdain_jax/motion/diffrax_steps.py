@@ -62,7 +62,7 @@ class Diffrax(Integrator):
         if takes_even_steps(self.solver) and (self.controller is None or type(self.controller) is diffrax.ConstantStepSize):
             controller = to_times = EvenSteps(landings)
         else:
-            by_tolerance = diffrax.PIDController(rtol=rtol, atol=atol, norm=integrands.state_norm, dtmin=setup.shortest, force_dtmin=False)
+            by_tolerance = diffrax.PIDController(rtol=rtol, atol=atol, norm=integrands.state_norm, dtmin=setup.shortest, dtmax=setup.longest, force_dtmin=False)
             controller = by_tolerance if self.controller is None else self.controller
             to_times = step_to_times(landings, controller) if self.saveat is None or knots is not None else controller
         saveat = diffrax.SaveAt(ts=ts) if self.saveat is None else self.saveat

@@ -122,6 +122,7 @@ def _loop(mode: Mode, setup: Setup, y0, args, ts, knots) -> Solved:
         rtol=jnp.broadcast_to(setup.tolerances[0], setup.t0.shape),
         atol=jnp.broadcast_to(setup.tolerances[1], setup.t0.shape),
         shortest=setup.shortest,
+        longest=jnp.broadcast_to(setup.longest, setup.t0.shape),
         max_steps=setup.most_steps(knots),
         knots=knots,
         rates_and_pivots=integrands.rates_and_pivots if field.has_pivots else None,
@@ -139,7 +140,7 @@ def _by_machine_code(setup: Setup, begun: Begun) -> Solved:
 def _motion(setup: Setup, begun: Begun) -> native_motion.Motion:
     own, knots = _own(setup), setup.knots
     rtol, atol = setup.tolerances
-    control = native_motion.Control(rtol, atol, setup.shortest, setup.dt0, setup.most_steps(knots))
+    control = native_motion.Control(rtol, atol, setup.shortest, setup.longest, setup.dt0, setup.most_steps(knots))
     return native_motion.Motion(begun.args, own.solver, own.order, bool(own.event_names), begun.y0, _goals(setup, setup.ts), knots, control)
 
 

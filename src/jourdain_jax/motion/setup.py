@@ -23,7 +23,7 @@ from jourdain_jax.motion.start import State, Unmoved
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
-TOLERANCE, MOST_STEPS = 1e-8, 100_000  # of `simulate`, where nothing else is asked for
+TOLERANCE, MOST_STEPS, LONGEST = 1e-8, 100_000, 1 / 16  # of `simulate`, where nothing else is asked for; the last: of the span, a step
 
 
 class Solved(eqx.Module):
@@ -92,11 +92,12 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     field: VectorField
     tolerances: tuple  # rtol, atol
     dt0: Float[Array | np.ndarray, "*lanes"] | float
+    longest: Float[Array | np.ndarray, "*lanes"] | float  # step, s
     integrator: Integrator
 
     def fitting(self) -> "Setup":
         """The setup with times that serve any loop, also where its own do not go together."""
-        of = attrgetter("ts", "t0", "t1", "dt0")
+        of = attrgetter("ts", "t0", "t1", "dt0", "longest")
         return eqx.tree_at(of, self, fitting_times(*of(self)))
 
     @property

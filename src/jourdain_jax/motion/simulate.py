@@ -27,7 +27,7 @@ from jourdain_jax.motion.moving_jumps import warns_of_jumps
 from jourdain_jax.motion.own_steps import own_steps, reason_against_series
 from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
-from jourdain_jax.motion.setup import MOST_STEPS, TOLERANCE, Setup
+from jourdain_jax.motion.setup import LONGEST, MOST_STEPS, TOLERANCE, Setup
 from jourdain_jax.motion.start import State, Unmoved, named_unmoved, put_on_rows, unmoved
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -57,6 +57,7 @@ def simulate(
     solver: "diffrax.AbstractSolver | Taylor | None" = None,
     stepsize_controller: "diffrax.AbstractStepSizeController | None" = None,
     dt0: Number | None = None,
+    max_step: Number | None = None,
     adjoint: "diffrax.AbstractAdjoint | None" = None,
     max_steps: int = MOST_STEPS,
     formulation: Formulation | None = None,
@@ -81,6 +82,8 @@ def simulate(
       Default adjoint: forward and reverse mode, to the second order (`jax.hessian`), where machine code integrates; otherwise
       `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order, by recorded steps; with `checkpoints=`, that of diffrax);
       `diffrax.ForwardMode()` for forward mode of any order; `diffrax.DirectAdjoint()` for all.
+    - `max_step`: the longest step (s); None: 1/16 of the span, so that a load that acts on a part of the way, or a dip of an event, is not
+      stepped over where nothing else keeps steps short; inf: no bound. For one of your own `stepsize_controller`, give that its `dtmax`.
     - `formulation`: which equations are integrated, a `jj.Formulation(state, reduction, stabilisation)` (default: what serves the scene).
     - `backend`: "native", the scene's scalar program (`jj.lower`) as machine code made for it, on CPUs, where llvmlite is installed and the solver is a
       default one; "xla", that program compiled by XLA, as third derivatives, those with respect to samples, and programs that are exported (`jax.export`)
@@ -152,16 +155,16 @@ def set_up(scene: Scene | BuiltFor, start=None, **options) -> Setup:
 
 
 def _set_up(
-    *, scene, start, t0, t1, ts, saveat, rtol, atol, solver, stepsize_controller, dt0, adjoint, max_steps, formulation, backend, inputs, events, work,
+    *, scene, start, t0, t1, ts, saveat, rtol, atol, solver, stepsize_controller, dt0, max_step, adjoint, max_steps, formulation, backend, inputs, events, work,
     searches: bool = False,
 ) -> Setup:  # fmt: skip
     scene, formulation = as_scene(scene), as_formulation(formulation)
     switches = {"events": events, "work": work}
     order, solver = (solver.order or order_for(rtol), None) if isinstance(solver, Taylor) else (None, solver)
     objects = {"solver": solver, "adjoint": adjoint, "stepsize_controller": stepsize_controller, "saveat": saveat}
-    check_options(rtol=rtol, atol=atol, max_steps=max_steps, dt0=dt0, switches=switches, **objects)
+    check_options(rtol=rtol, atol=atol, max_steps=max_steps, dt0=dt0, max_step=max_step, switches=switches, **objects)
     _check_adjoint(adjoint)
-    check_solver(solver, stepsize_controller, dt0, saveat)
+    check_solver(solver, stepsize_controller, dt0, saveat, max_step)
     native = backend in ("auto", "native")
     inputs = as_inputs(scene, inputs)
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
@@ -180,7 +183,8 @@ def _set_up(
         integrator = diffrax_steps.Diffrax(as_solver(solver), stepsize_controller, adjoint, saveat, **static)
     tolerances = tuple(as_array(x, start.q.dtype) for x in (rtol, atol))  # arrays: another tolerance is no other program
     first_step = _first_step(dt0, t0, t1)  # diffrax's own guess costs two more copies of the vector field to compile
-    setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, integrator)
+    longest = as_array(LONGEST * abs(t1 - t0) if max_step is None else max_step, start.q.dtype)
+    setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, longest, integrator)
     if backend == "native" and (reason := setup.reason_against_machine_code):
         raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
     if order is not None and (reason := reason_against_series(setup, order)):

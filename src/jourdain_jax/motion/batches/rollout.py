@@ -275,8 +275,8 @@ _compiled_dense, _compiled_lowered = for_programs(_lanes_in_lockstep), for_progr
 def _with_arrays(options: dict) -> dict:
     """Options with their numbers as arrays: another tolerance, first step or end is no other program."""
     options = {"rtol": TOLERANCE, "atol": TOLERANCE} | options
-    numbers = {name: options[name] for name in ("rtol", "atol", "dt0", "t0", "t1", "ts") if options.get(name) is not None}
-    check_options(**{name: value for name, value in numbers.items() if name in ("rtol", "atol", "dt0")})
+    numbers = {name: options[name] for name in ("rtol", "atol", "dt0", "max_step", "t0", "t1", "ts") if options.get(name) is not None}
+    check_options(**{name: value for name, value in numbers.items() if name in ("rtol", "atol", "dt0", "max_step")})
     if options.get("solver") is None:
         options["solver"] = default_solver(options["rtol"])
     if isinstance(options["solver"], Taylor):

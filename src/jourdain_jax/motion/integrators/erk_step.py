@@ -1,7 +1,7 @@
 """One step of our explicit Runge-Kutta loop: an explicit Runge-Kutta method with an embedded error estimate, or a step of the search for a stop event.
 
     k_i = f(t + c_i h, y + h sum_j a_ij k_j),   y_1 = y + h sum b_i k_i,   e = h sum b^err_i k_i
-    |e| = rms(e / (atol + rtol max(|y|, |y_1|))) <= 1 accepts;   h <- h clip(0.9 |e|^(-1/order), 0.2, 10)
+    |e| = rms(e / (atol + rtol max(|y|, |y_1|))) <= 1 accepts;   h <- min(h clip(0.9 |e|^(-1/order), 0.2, 10), longest)
 
 The state is any tree of arrays; in a batch all arrays, times and step sizes among them, have a last axis of lanes, which keeps neighbours in memory
 neighbours. A step ends at every time asked for and at every knot of the inputs; the step size found before such a shortened step is remembered. The state
@@ -59,6 +59,7 @@ class Problem(eqx.Module):
     rtol: Float[Array, "*lanes"]
     atol: Float[Array, "*lanes"]
     shortest: Float[Array, "*lanes"]
+    longest: Float[Array, "*lanes"]
     max_steps: int = eqx.field(static=True)
     knots: Float[Array, "knots *lanes"] | None = None  # times at which a step must end, in the order of the motion; the last are infinite, with its sign
     # as `rates`, and pivots (pivots, *lanes) that must keep their signs; None: the rates have none
@@ -83,7 +84,7 @@ class Problem(eqx.Module):
 
 def begun(problem: Problem, y0: PyTree, t0: Float[Array, "*lanes"], dt0, direction) -> Progress:
     """The start of a motion; one that starts beyond an event has no motion at all."""
-    start = standing(problem, y0, t0, jnp.broadcast_to(jnp.abs(dt0), jnp.shape(t0)), direction)
+    start = standing(problem, y0, t0, jnp.minimum(jnp.abs(dt0), problem.longest), direction)
     if problem.events is None:
         return start
     values = problem.events(t0, y0, problem.args)
@@ -149,7 +150,7 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
     accept = locating | (size_of_error <= 1)
     factor = SAFETY * jnp.where(size_of_error > 0, size_of_error, 1e-30) ** (-1 / method.order)
     factor = jnp.clip(jnp.where(jnp.isfinite(size_of_error), factor, 0.0), LEAST_FACTOR, jnp.where(accept, LARGEST_FACTOR, 1.0))
-    proposed = size * factor
+    proposed = jnp.minimum(size * factor, problem.longest)
     next_h = jnp.where(accept & shortened, jnp.maximum(proposed, p.h), proposed)
     accepted, rejected = p.accepted + (accept & ~locating).astype(jnp.int32), p.rejected + (~accept).astype(jnp.int32)
     too_short = (next_h < problem.shortest) | (t1 + direction * next_h == t1)  # the second: no time would pass

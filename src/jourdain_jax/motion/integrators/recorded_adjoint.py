@@ -87,15 +87,15 @@ def motion(forward: Callable, problem: Problem, method: Method, y0: PyTree, t0, 
     """`forward` of the other arguments; in reverse mode it has derivatives with respect to `y0`, `t0`, `goals` and all that the functions of `problem` read."""
     like = (t0, y0, problem.args)
     rates, project, events = (f if f is None else eqx.filter_closure_convert(f, *like) for f in (problem.rates, problem.project, problem.events))
-    control = problem.norm, *jax.lax.stop_gradient((problem.rtol, problem.atol, problem.shortest)), problem.max_steps
+    control = problem.norm, *jax.lax.stop_gradient((problem.rtol, problem.atol, problem.shortest, problem.longest)), problem.max_steps
     control += (problem.rates_and_pivots, problem.within)
     return _motion(((rates, project, problem.args), events, problem.knots, y0, t0, goals), (control, jax.lax.stop_gradient(jnp.asarray(dt0))), forward, method)
 
 
 def _problem(moving, control) -> Problem:
     (rates, project, args), events, knots, *_ = moving
-    norm, rtol, atol, shortest, max_steps, *monitored = control[0]
-    return Problem(rates, args, project, events, norm, rtol, atol, shortest, max_steps, knots, *monitored)
+    norm, rtol, atol, shortest, longest, max_steps, *monitored = control[0]
+    return Problem(rates, args, project, events, norm, rtol, atol, shortest, longest, max_steps, knots, *monitored)
 
 
 @eqx.filter_custom_vjp

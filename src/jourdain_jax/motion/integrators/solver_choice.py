@@ -27,8 +27,10 @@ def may_be_full(solver) -> bool:
     return isinstance(solver, Method | None) or not isinstance(solver, discrete_gradient.DiscreteGradient)
 
 
-def check_solver(solver, controller, dt0, saveat) -> None:
-    """ValueError for options that do not go with a structure-preserving solver; others pass."""
+def check_solver(solver, controller, dt0, saveat, max_step) -> None:
+    """ValueError for options that do not go with a structure-preserving solver, or with a control of steps of the user's; others pass."""
+    if max_step is not None and (controller is not None or takes_even_steps(solver)):
+        raise ValueError(f"`max_step` bounds the steps of the default control: give {'`dtmax` to `stepsize_controller`' if controller else '`dt0`, the step'}")
     if not takes_even_steps(solver) and not _moves_along_rotations(solver):
         return
     name = type(solver).__name__

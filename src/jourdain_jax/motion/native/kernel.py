@@ -36,10 +36,10 @@ class Start(NamedTuple):
 
     def rows(self, t, dt: Sequence) -> Float[Array, "given"]:
         """The rows of a lane at the time t since the start, which has tangents."""
-        rtol, atol, shortest, first, most = self.control
+        rtol, atol, shortest, longest, first, most = self.control
         zero, one = jnp.zeros(()), jnp.ones(())
-        progress = [t, jnp.abs(first), RUNNING * one, zero, zero, -one, jnp.inf * one, *dt]
-        limits = [jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, most, self.origin]
+        progress = [t, jnp.minimum(jnp.abs(first), longest), RUNNING * one, zero, zero, -one, jnp.inf * one, *dt]
+        limits = [jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, longest, most, self.origin]
         known = [jnp.stack(part) for part in self.known if part]  # each tangent by itself: values may have no lanes where tangents have
         return jnp.concatenate([*self.y, jnp.stack(progress), jnp.stack(limits), *known])
 

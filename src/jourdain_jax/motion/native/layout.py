@@ -16,7 +16,7 @@ from jourdain_jax.native.ir import Value, Writer
 
 PROGRESS = ("t", "h", "code", "accepted", "rejected", "event", "pivot")
 SAMPLES = ("table", "samples", "knot")
-CONTROL = ("direction", "last_goal", "rtol", "atol", "shortest", "max_steps", "origin")
+CONTROL = ("direction", "last_goal", "rtol", "atol", "shortest", "longest", "max_steps", "origin")
 
 
 @dataclass(frozen=True)

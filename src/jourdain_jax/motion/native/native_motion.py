@@ -46,6 +46,7 @@ class Control(NamedTuple):
     rtol: Float[Array, ""]
     atol: Float[Array, ""]
     shortest: Float[Array, ""]
+    longest: Float[Array, ""]
     dt0: Float[Array, ""]
     max_steps: int
 

@@ -68,7 +68,8 @@ def _tried_by_stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value) 
     accept = locating | (size_of_error <= 1.0)
     factor = SAFETY * power(w, w.where(size_of_error > 0.0, size_of_error, 1e-30), -1 / method.order)
     factor = w.larger(w.where(size_of_error < math.inf, factor, 0.0), LEAST_FACTOR)
-    proposed = size * w.smaller(factor, w.where(accept, LARGEST_FACTOR, w.number(1.0)))
+    factor = w.smaller(factor, w.where(accept, LARGEST_FACTOR, w.number(1.0)))
+    proposed = w.smaller(size * factor, p["longest"])
     next_h = w.where(accept & shortened, w.larger(proposed, h), proposed)
     return Trial(t1, step, y1, accept, next_h, smallest if form.pivots else None)
 
@@ -82,7 +83,7 @@ def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Va
     for row, series in enumerate(rows):
         for j, x in enumerate(series):
             w.store(w.number(0.0) if x is None else x, k, j * count + row)
-    length = radius(w, layout, p, rows)
+    length = w.smaller(radius(w, layout, p, rows), p["longest"])
     size = w.smaller(length, p["bound"])
     rest = w.magnitude(last_goal - t)
     lands = ~locating & (size >= 0.999 * rest)
