@@ -10,7 +10,6 @@ import jourdain_jax as jj
 from jourdain_jax.motion.setup import LONGEST
 
 
-
 class Bead(jj.Scene):
     """m x'' = -k x"""
 

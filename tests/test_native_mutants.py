@@ -279,7 +279,7 @@ MUTANTS = [
     Mutant("starts of another lane", loop, "_write_begin", "number * given + row), lanes", "0 * given + row), lanes", LANES, "lanes"),
     Mutant("goals of another lane", loop, "_write_begin", "number * w.load", "0 * w.load", LANES, "lanes"),
     Mutant("states of another lane", loop, "_save", "(number * times + k)", "(0 * number + k)", LANES, "lanes"),
-    Mutant("no bound of steps", step, TRIED, ', p["longest"])', ', w.number(math.inf))', LONGEST, "the longest step"),
+    Mutant("no bound of steps", step, TRIED, ', p["longest"])', ", w.number(math.inf))", LONGEST, "the longest step"),
     Mutant("no bound of series", step, "_tried_by_series", 'rows), p["longest"])', "rows), math.inf)", SERIES_LONGEST, "the longest step"),
     Mutant("no projection", step, "_project", 'w.call("project", "void", p.pointer, t1, y1)', "None", CIRCLE, "circle"),
     Mutant("no events", step, "_monitored", "~search.no_event(w, c_1)", "~search.no_event(w, c_0)", EVENT, "event"),

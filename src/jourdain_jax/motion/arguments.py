@@ -139,7 +139,8 @@ def fitting_times(ts, t0, t1, dt0, longest):
     """`ts`, `t0`, `t1`, the first step and the longest one where they go together, none beyond an end by round-off; otherwise those of a short span."""
     fits, direction = times_fit(ts, t0, t1), jnp.sign(t1 - t0)
     inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
-    short = _SHORT * jnp.linspace(0.0, 1.0, ts.shape[-1], dtype=ts.dtype), jnp.zeros_like(t0), _SHORT * jnp.ones_like(t1), 0.1 * _SHORT * jnp.ones_like(dt0), _SHORT * jnp.ones_like(longest)
+    short = _SHORT * jnp.linspace(0.0, 1.0, ts.shape[-1], dtype=ts.dtype), jnp.zeros_like(t0)
+    short += tuple(share * _SHORT * jnp.ones_like(x) for share, x in ((1.0, t1), (0.1, dt0), (1.0, longest)))
     return tuple(jnp.where(fits, own, other) for own, other in zip((inside, t0, t1, dt0, longest), short, strict=True))
 
 
