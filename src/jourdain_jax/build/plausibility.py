@@ -25,6 +25,7 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import contacts_of, loads_of
 
 TOLERANCE = 1e-4  # relative: constants may be typed with a few digits, mistakes are larger
+_POINT = 1e-10**2  # m^2: of bodies whose radius of gyration is smaller, moments are round-off
 _ROUNDED = 1e-2  # relative: of thin wheels the last moment is the sum of the others, and published moments have three digits
 _ROWS_INSTEAD = "write its rows in `velocity_constraints`: tangents @ (rolling.velocity_at(point) - ground.velocity_at(point))"
 
@@ -122,7 +123,7 @@ def impossible_bodies(scene: Scene, q) -> tuple[str, ...]:
         what = f"body `{name}` of `{type(scene).__name__}`"
         found.append(_of_mass(what, np.atleast_1d(mass)))
         if inertia is not None:
-            found.append(_of_inertia(what, inertia[None]))
+            found.append(_of_inertia(what, np.atleast_1d(mass), inertia[None]))
             least, middle, largest = np.linalg.eigvalsh(inertia)
             if least > TOLERANCE * largest and largest > (1 + _ROUNDED) * (least + middle):
                 found.append(
@@ -139,9 +140,9 @@ def _masses_and_inertias(scene: Scene, q) -> dict:
 
 
 def are_negative(mass: Float[Array, "bodies"], inertia: Float[Array, "bodies 3 3"]) -> Bool[Array, "bodies"]:
-    """Whether a mass is below zero, or an eigenvalue of a symmetric inertia: by its principal minors, relative to its largest entry."""
+    """Whether a mass is below zero, or an eigenvalue of a symmetric inertia: by its principal minors, relative to its largest entry, or that of a point."""
     I = jnp.moveaxis(inertia, 0, 2)
-    size = reduce(jnp.maximum, (jnp.abs(x) for row in I for x in row))
+    size = reduce(jnp.maximum, (jnp.abs(x) for row in I for x in row), _POINT * mass)
     I = I / jnp.where(size > 0, size, 1.0) + TOLERANCE * jnp.eye(3, dtype=I.dtype)[..., None]
 
     def minor(i: int, j: int, k: int, m: int):
@@ -157,7 +158,7 @@ def implausible(scene: Scene, numbers: PoseNumbers) -> tuple[str, ...]:
     pieces = {"mass": numbers.mass, "inertia": numbers.inertia, "position": numbers.position, "orientation": numbers.orientation}
     sentences = [_of_nothing(f"body `{name}` of `{who}`", what, x) for what, part in pieces.items() for name, x in part.items()]
     sentences += [_of_mass(f"body `{name}` of `{who}`", mass) for name, mass in numbers.mass.items()]
-    sentences += [_of_inertia(f"body `{name}` of `{who}`", I) for name, I in numbers.inertia.items()]
+    sentences += [_of_inertia(f"body `{name}` of `{who}`", numbers.mass[name], I) for name, I in numbers.inertia.items()]
     sentences += [_of_orientation(f"body `{name}` of `{who}`", R) for name, R in numbers.orientation.items()]
     sentences += [_of_carried(f"the ground of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.carried.items()]
     sentences += [_of_plane(f"the plane of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.planes.items()]
@@ -184,9 +185,9 @@ def _of_mass(what: str, mass: np.ndarray) -> str:
     return f"{what} has a mass of {lowest:.4g} kg, expected a number that is not negative; check what its mass is computed from" if lowest < 0 else ""
 
 
-def _of_inertia(what: str, I: np.ndarray) -> str:
-    I = _finite(I)
-    size = np.max(np.abs(I), axis=(1, 2), initial=np.finfo(float).tiny)
+def _of_inertia(what: str, mass: np.ndarray, I: np.ndarray) -> str:
+    I, heaviest = _finite(I), np.max(_finite(mass), initial=0.0)
+    size = np.max(np.abs(I), axis=(1, 2), initial=max(_POINT * heaviest, np.finfo(float).tiny))
     if np.any(np.max(np.abs(I - np.swapaxes(I, 1, 2)), axis=(1, 2), initial=0.0) > TOLERANCE * size):
         return f"{what} has an inertia that is not symmetric; give the same products of inertia above and below the diagonal"
     least = np.linalg.eigvalsh(I)[:, 0]

@@ -7,13 +7,14 @@ by evaluating the scene at a few states, which takes numbers for its parameters.
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from functools import lru_cache, wraps
 from operator import is_
 from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from jourdain_jax.calculus.reals import is_traced_type
 from jourdain_jax.scene.scene import Scene
@@ -113,9 +114,10 @@ def defaults(scene: Scene) -> list[tuple[str, Any]]:
         if field.metadata.get("static", False):
             continue
         leaves = jax.tree.leaves(getattr(scene, field.name))
-        default = jax.tree.leaves(field.default)
+        stated = field.default if field.default_factory is MISSING else field.default_factory()
+        default = jax.tree.leaves(stated)
         if len(default) != len(leaves):
-            default = [field.default if len(leaves) == 1 else None] * len(leaves)
+            default = [stated if len(leaves) == 1 else None] * len(leaves)
         found += [(field.name, x) for x in default]
     return found
 
@@ -132,4 +134,30 @@ def _generic(x, near, place: int) -> np.ndarray:
     if near.ndim == 1 and near.size > 1 and np.all(np.diff(near) > 0):
         steps = np.diff(near, append=2 * near[-1] - near[-2])
         return np.asarray(near + 0.01 * draws * steps, x.dtype)
-    return np.asarray(np.where(near == 0, 0.1, near) * (1.0 + 0.01 * draws), x.dtype)
+    return np.asarray(varied(near, 0.01 * draws, 0.1), x.dtype)
+
+
+def varied(given: np.ndarray, change: Float[np.ndarray, "*more"], zero: float) -> np.ndarray:
+    """Numbers that differ from those given by fractions, `change` (of the same shape, after any leading axes), with `zero` in place of each zero.
+
+    A tensor of inertia becomes that of the body stretched, sheared and turned, since tensors whose entries are changed one by one may be those of no body:
+
+    S = tr(I)/2 1 - I,      S' = (1 + E) S (1 + E)',      I' = tr(S') 1 - S'
+    """
+    given = np.asarray(given)
+    if not _is_inertia(given):
+        return np.where(given == 0, zero, given) * (1 + change)
+    F = np.eye(3) + change / 2
+    S = F @ _second_moments(given) @ np.swapaxes(F, -1, -2)
+    return np.trace(S, axis1=-2, axis2=-1)[..., None, None] * np.eye(3) - S
+
+
+def _second_moments(I: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    return np.trace(I) / 2 * np.eye(3) - I
+
+
+def _is_inertia(x: np.ndarray) -> bool:
+    """Whether numbers can be a tensor of inertia, and are no rotation; within a hundredth, as published moments are."""
+    if x.shape != (3, 3) or not np.any(x) or np.any(np.abs(x - x.T) > 1e-9 * np.max(np.abs(x))) or np.allclose(x @ x.T, np.eye(3)):
+        return False
+    return bool(np.linalg.eigvalsh(_second_moments(x))[0] >= -0.01 * np.trace(x))

@@ -20,6 +20,9 @@ from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 
+ROUNDED = 0.01  # of the largest moment of inertia: published ones have three digits
+POINT = 1e-10**2  # m^2: of bodies whose radius of gyration is smaller, moments are round-off
+
 Frame = tuple[Float[Array, "3 3"], Float[Array, "3"]]  # orientation and origin in the inertial frame
 
 
@@ -212,7 +215,7 @@ def tree_scene(tree: Tree, source: str) -> type[Scene]:
 
 def _mass_parameters(link: Link, name: str) -> dict[str, Any]:
     assert link.mass is not None
-    inertia = link.mass.inertia
+    inertia = np.where(np.abs(link.mass.inertia) > POINT * link.mass.mass, link.mass.inertia, 0.0)
     is_diagonal = not np.any(inertia - np.diag(np.diag(inertia)))
     found = {
         f"{name}_mass": parameter(link.mass.mass, unit="kg", positive=True),
@@ -224,9 +227,15 @@ def _mass_parameters(link: Link, name: str) -> dict[str, Any]:
 
 
 def _check_masses(tree: Tree, source: str) -> None:
-    """A ValueError for a joint beyond which nothing has a mass."""
+    """A ValueError for a joint beyond which nothing has a mass, and for moments of inertia that no body has: 0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2."""
     heavy: set[str] = set()
     for link in reversed(tree.links):
+        least, middle, largest = np.linalg.eigvalsh(link.mass.inertia) if link.mass else np.zeros(3)
+        if link.mass and max(-least, largest - least - middle) > max(ROUNDED * largest, POINT * link.mass.mass):
+            raise ValueError(
+                f"{source}: link `{link.name}` has principal moments of inertia {least:.4g}, {middle:.4g} and {largest:.4g} kg m^2, which no body has: expected "
+                f"none below zero, and the largest at most the sum of the others (within {ROUNDED:.0%}); check signs, units and products of inertia"
+            )
         if (link.mass is not None or link.name in heavy) and link.parent is not None:
             heavy.add(link.parent)
         if link.joints and link.mass is None and link.name not in heavy:

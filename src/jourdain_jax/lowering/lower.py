@@ -11,9 +11,10 @@ from itertools import islice
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jourdain_jax.build.kept_findings import kept_of_scene
-from jourdain_jax.build.reference_parameters import with_reference_parameters
+from jourdain_jax.build.reference_parameters import varied, with_reference_parameters
 from jourdain_jax.build.sampling import random_states
 from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
@@ -35,6 +36,7 @@ from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
 PROBES = 56  # at most
+SHARES = (1.0, -1.0, *(0.1**k for k in range(1, 9)))  # of the usual differences from the values of parameters: the first with which these can be
 USUAL_STATES = 16  # at which a motion finds out what is usual for its parameters
 # Of the program before simplification; beyond, the dense path is taken. There XLA needs a minute more for the program than for dense matrices (24 joint angles,
 # 20,762 operations: 71 and 7.5 s), though an evaluation takes 0.15 of the time (in a batch 0.22). Below, the dense path lost everywhere (bench/README.md).
@@ -149,26 +151,40 @@ def _check_calls(traced: TracedScene) -> None:
 
 def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
     """Configurations on the geometric rows, random and symmetric ones, as the structure was found at, with any speeds, and parameters off their values,
-    so that what is zero or equal by chance does not count: larger by up to a tenth, or smaller where the scene has no numbers there.
+    so that what is zero or equal by chance does not count: larger by up to a tenth; smaller, or by less, where the scene has no numbers there, or moments of
+    inertia that no body has.
     """
     generator = np.random.default_rng(1)
     t, q = structure.times[:PROBES], np.array(structure.coordinates[:PROBES], np.float64)
     for first, _ in scene.coordinates.quaternions:  # in single precision they are unit ones to seven digits
         q[:, first : first + 4] /= np.linalg.norm(q[:, first : first + 4], axis=1, keepdims=True)
     u = random_states(scene, len(t), generator)[2]
-    given = [np.where(np.asarray(x) == 0, 0.05, np.asarray(x)) for x in jax.tree.leaves(scene)]
-    off = [0.1 * generator.uniform(size=(len(t), *np.shape(x))) for x in given]
+    given = [np.asarray(x) for x in jax.tree.leaves(scene)]
+    away = [varied(x, 0.1 * generator.uniform(size=(len(t), *x.shape)), 0.05) - x for x in given]
     inputs = generator.normal(size=(len(t), len(scene.inputs)))
     values = named_values(scene, t, q, u, inputs)
 
-    def probes(sign) -> Probes:
-        columns = [np.reshape(x * (1 + np.reshape(sign, (-1, *[1] * x.ndim)) * dx), (len(t), -1)).T for x, dx in zip(given, off, strict=True)]
-        varied = {f"p{k}_{i}": column for k, of_leaf in enumerate(columns) for i, column in enumerate(of_leaf)}
-        return Probes(traced.graph, {name: np.asarray(value, np.float64) for name, value in (values | varied).items()})  # whatever precision motions have
+    def probes(share) -> Probes:
+        columns = [np.reshape(x + np.reshape(share, (-1, *[1] * x.ndim)) * dx, (len(t), -1)).T for x, dx in zip(given, away, strict=True)]
+        parameters = {f"p{k}_{i}": column for k, of_leaf in enumerate(columns) for i, column in enumerate(of_leaf)}
+        return Probes(traced.graph, {name: np.asarray(value, np.float64) for name, value in (values | parameters).items()})  # whatever precision motions have
 
-    larger = probes(np.ones(len(t)))
-    finite = np.all(np.isfinite(larger([n for part in traced.motion for n in part.ravel().tolist()])), axis=0)
-    return larger if finite.all() else probes(np.where(finite, 1.0, -1.0))
+    share, possible, least = np.zeros(len(t)), False, _least_moments(traced, probes(np.zeros(len(t)))) / 2
+    for tried in SHARES:
+        share = np.where(possible, share, tried)
+        here = probes(share)
+        finite = np.all(np.isfinite(here([n for part in traced.motion for n in part.ravel().tolist()])), axis=0)
+        possible = finite & ~np.any(_least_moments(traced, here) < least, axis=1)
+        if possible.all():
+            break
+    return here
+
+
+def _least_moments(traced: TracedScene, probes: Probes) -> Float[np.ndarray, "probes bodies"]:
+    """The smallest principal moment of each body at each probe; NaN where it is none."""
+    I = np.moveaxis(probes(traced.at.inertia.ravel().tolist()).reshape(-1, 3, 3, probes.count), -1, 0)
+    known = np.all(np.isfinite(I), axis=(2, 3))
+    return np.where(known, np.linalg.eigvalsh(np.where(known[..., None, None], I, 0.0))[..., 0], np.nan)
 
 
 def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered:

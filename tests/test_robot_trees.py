@@ -1,0 +1,147 @@
+"""Trees of links with the tensors of inertia of real robots: thin shells, long bones, products of inertia beside small moments. All are lowered."""
+
+import itertools
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+
+BONE = np.array([[3e-5, 5e-5, 0.0], [5e-5, 4e-4, 0.0], [0.0, 0.0, 4.1e-4]])  # kg m^2
+START, SPAN = {"j00": 0.3, "j01_rate": 0.7}, {"t1": 0.2, "ts": [0.0, 0.2]}
+
+
+def inertial(mass: float, centre, I) -> str:
+    moments = " ".join(f'i{"xyz"[i]}{"xyz"[j]}="{I[i, j]}"' for i in range(3) for j in range(i, 3))
+    return f'<inertial><origin xyz="{centre[0]} {centre[1]} {centre[2]}"/><mass value="{mass}"/><inertia {moments}/></inertial>'
+
+
+def possible_tensor(draw: np.random.Generator, thin: float) -> np.ndarray:
+    """I = tr(S) 1 - S of a body turned at random, whose second moment S about one axis is `thin` beside the largest."""
+    turn, size = np.linalg.qr(draw.normal(size=(3, 3)))[0], 10.0 ** draw.uniform(-6, -2)
+    S = turn @ np.diag(size * np.array([1.0, draw.uniform(0.01, 1.0), thin])) @ turn.T
+    return np.trace(S) * np.eye(3) - S
+
+
+def tree(seed: int, legs: int, joints: int, tensor) -> str:
+    """A trunk with legs, each a chain of revolute joints, its links with what `tensor` draws."""
+    draw = np.random.default_rng(seed)
+    parts = [f'<link name="trunk">{inertial(4.0, (0.01, 0.0, 0.0), np.array([[0.01, 1e-4, 2e-4], [1e-4, 0.03, 1e-5], [2e-4, 1e-5, 0.035]]))}</link>']
+    for leg in range(legs):
+        names = ["trunk", *(f"l{leg}{k}" for k in range(joints))]
+        for k, (parent, name) in enumerate(itertools.pairwise(names)):
+            at, axis = draw.normal(size=3) * 0.1, "1 0 0" if k == 0 else "0 1 0"
+            parts.append(f'<link name="{name}">{inertial(draw.uniform(0.05, 0.5), 0.03 * draw.normal(size=3), tensor(draw))}</link>')
+            parts.append(f'<joint name="j{leg}{k}" type="revolute"><parent link="{parent}"/><child link="{name}"/>')
+            parts.append(f'<origin xyz="{at[0]} {at[1]} {at[2]}"/><axis xyz="{axis}"/></joint>')
+    return f'<robot name="walker">{"".join(parts)}</robot>'
+
+
+def drawn(seed: int):
+    """A tree by its number: thin links down to flat ones, and bones as a quadruped has them."""
+    draw = np.random.default_rng([7, seed])
+    thin = [1e-2, 1e-4, 1e-8, 0.0][seed % 4]
+    tensor = (lambda _: BONE) if seed % 5 == 4 else lambda draw: possible_tensor(draw, thin)
+    legs, joints = int(draw.integers(1, 3)), int(draw.integers(2, 4))
+    return jj.from_urdf(tree(seed, legs, joints, tensor), base="planar" if seed % 3 == 2 else "fixed")
+
+
+@pytest.mark.parametrize("seed", [2, 4, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(5, 40))])
+def test_every_tree_is_lowered(seed):
+    assert jj.lower(drawn(seed)()).operations > 0
+
+
+@pytest.mark.slow
+def test_a_quadruped_on_a_free_base_is_lowered():
+    built = str(jj.build(jj.from_urdf(tree(0, 4, 3, lambda draw: BONE), base="free")()))
+    assert "operations" in built
+    assert "dense" not in built
+
+
+@pytest.mark.slow
+def test_motions_of_a_bone_and_their_derivatives_by_its_tensor_are_those_of_dense_matrices():
+    scene = jj.from_urdf(tree(1, 1, 2, lambda draw: BONE))()
+
+    def end(I, backend="auto"):
+        return jj.simulate(scene.replace(l01_inertia=I), START, **SPAN, backend=backend).q_end
+
+    program, dense = (jax.jacrev(partial(end, backend=backend))(jnp.asarray(BONE)) for backend in ("auto", "dense"))
+    np.testing.assert_allclose(end(jnp.asarray(BONE)), end(jnp.asarray(BONE), "dense"), rtol=1e-5)
+    np.testing.assert_allclose(program + np.swapaxes(program, 1, 2), dense + np.swapaxes(dense, 1, 2), rtol=1e-3, atol=1e-3 * np.max(np.abs(dense)))
+
+
+def test_a_tree_whose_tensors_are_traced_first_is_lowered_too():
+    scene = jj.from_urdf(tree(2, 1, 2, lambda draw: BONE))()
+    jax.jit(lambda I: jj.simulate(scene.replace(l01_inertia=I), START, **SPAN).q_end)(jnp.asarray(BONE))
+    assert jj.lower(scene).operations > 0
+    lanes = jj.rollout(scene, START, **SPAN, parameters={"l01_inertia": jnp.stack([BONE, 1.2 * BONE])}, progress=False)
+    for k, scale in enumerate((1.0, 1.2)):
+        np.testing.assert_allclose(lanes["j01"][k], jj.simulate(scene.replace(l01_inertia=scale * BONE), START, **SPAN)["j01"], rtol=1e-9)
+
+
+class Spinning(jj.Scene):
+    """A small body whose products of inertia are numbers of their own, one of them zero."""
+
+    across: object = jj.parameter(5e-5, unit="kg m^2")
+    beside: object = jj.parameter(0.0, unit="kg m^2")
+    coordinates = jj.coordinates("yaw lean spin")
+    domain = {"lean": (-1.0, 1.0), "spin": (-1.0, 1.0)}
+
+    def bodies(self, t, q):
+        I = jnp.asarray(BONE).at[0, 1].set(self.across).at[1, 0].set(self.across).at[0, 2].set(self.beside).at[2, 0].set(self.beside)
+        return {"body": jj.RigidBody(1.0, I, jnp.zeros(3), jj.rot_z(q.yaw) @ jj.rot_x(q.lean) @ jj.rot_y(q.spin))}
+
+
+def test_products_of_inertia_that_are_parameters_of_their_own_are_varied_within_what_bodies_have():
+    assert jj.lower(Spinning()).operations > 0
+
+
+JOINT = '<joint name="j" type="continuous"><parent link="base"/><child link="arm"/></joint>'
+PENDULUM = '<robot name="p"><link name="base"/><link name="arm">{}</link>' + JOINT + "</robot>"
+
+
+@pytest.mark.parametrize("noise", [2e-35, *(pytest.param(noise, marks=pytest.mark.slow) for noise in (-1e-33, 1e-22))])
+def test_round_off_in_a_tensor_of_zeros_is_no_moment(noise):
+    arm = jj.from_urdf(PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), np.array([[0.0, noise, 0.0], [noise, 0.0, noise], [0.0, noise, 0.0]]))))()
+    point = jj.from_urdf(PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), np.zeros((3, 3)))))()
+    np.testing.assert_array_equal(jj.simulate(arm, {"j": 0.3}, **SPAN).q_end, jj.simulate(point, {"j": 0.3}, **SPAN).q_end)
+
+
+class Point(jj.Scene):
+    coordinates = jj.coordinates("q")
+    noise: object = jj.parameter(2e-35, unit="kg m^2")
+
+    def bodies(self, t, q):
+        I = self.noise * jnp.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+        return {"bob": jj.RigidBody(1.0, I, jj.rot_x(q.q) @ jnp.array([0.0, 1.0, 0.0]), jj.rot_x(q.q))}
+
+
+def test_round_off_in_a_tensor_of_a_scene_is_no_negative_moment():
+    motion = jj.simulate(Point(), {"q_rate": 1.0}, **SPAN)
+    assert int(motion.result) == 0
+    np.testing.assert_allclose(motion.q_end, [0.2], rtol=1e-9)
+    lanes = jj.rollout(Point(), {"q_rate": 1.0}, **SPAN, parameters={"noise": jnp.array([2e-35, -1e-33])}, progress=False)
+    assert not np.any(np.asarray(lanes.result))
+
+
+@pytest.mark.parametrize("moments", [(1.0, 1.0, 2.1), (3.0, 1.0, 1.0), (0.0, 0.0, 1.0), (1.0, -0.5, 1.2), (-1e-3, 0.0, 0.0)])
+@pytest.mark.parametrize("form", ["urdf", "mjcf"])
+def test_moments_that_no_body_has_are_refused_when_they_are_read(moments, form):
+    with pytest.raises(ValueError, match=r"link `arm` has principal moments of inertia .* which no body has"):
+        _pendulum(form, moments)
+
+
+@pytest.mark.parametrize("moments", [(1.0, 1.0, 2.0), (1.0, 1.0, 2.01), (0.0, 1.0, 1.0), (0.0, 0.0, 0.0), (1e-3, 2e-3, 2.5e-3)])
+@pytest.mark.parametrize("form", ["urdf", "mjcf"])
+def test_moments_of_discs_rods_and_points_are_read(moments, form):
+    assert _pendulum(form, moments)().arm_mass == 1.0
+
+
+def _pendulum(form: str, moments):
+    if form == "urdf":
+        return jj.from_urdf(PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), np.diag(moments))))
+    stated = f'<inertial pos="0 0.3 0" mass="1" diaginertia="{moments[0]} {moments[1]} {moments[2]}"/>'
+    return jj.from_mjcf(f'<mujoco><worldbody><body name="arm"><joint name="j" axis="1 0 0"/>{stated}</body></worldbody></mujoco>')
