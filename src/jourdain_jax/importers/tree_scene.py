@@ -233,8 +233,8 @@ def _check_masses(tree: Tree, source: str) -> None:
         least, middle, largest = np.linalg.eigvalsh(link.mass.inertia) if link.mass else np.zeros(3)
         if link.mass and max(-least, largest - least - middle) > max(ROUNDED * largest, POINT * link.mass.mass):
             raise ValueError(
-                f"{source}: link `{link.name}` has principal moments of inertia {least:.4g}, {middle:.4g} and {largest:.4g} kg m^2, which no body has: expected "
-                f"none below zero, and the largest at most the sum of the others (within {ROUNDED:.0%}); check signs, units and products of inertia"
+                f"{source}: link `{link.name}` has principal moments of inertia {least:.4g}, {middle:.4g} and {largest:.4g} kg m^2, which no body has; "
+                f"expected none below zero, and the largest at most the sum of the others (within {ROUNDED:.0%}): check signs, units and products of inertia"
             )
         if (link.mass is not None or link.name in heavy) and link.parent is not None:
             heavy.add(link.parent)
