@@ -235,7 +235,7 @@ BAD = {
     "no-inertia": ({"path": _robot(_joint(child="c"), NO_INERTIA, links="a")}, r"link `c` has an `inertial` without `inertia`"),
     "no-mass-moves": ({"path": _robot(_joint(child="c"), '<link name="c"/>', links="a")}, r"link `c`, which `j` moves, has no mass"),
     "negative-mass": ({"path": _robot(_joint(child="c"), WEIGHT.format(-1), links="a")}, r"mass of link `c` is -1"),
-    "mass-is-no-number": ({"path": _robot(_joint(child="c"), WEIGHT.format("heavy"), links="a")}, r"mass of link `c` is `heavy`, expected numbers"),
+    "mass-is-no-number": ({"path": _robot(_joint(child="c"), WEIGHT.format("heavy"), links="a")}, r"mass of link `c` is `heavy`, expected a number"),
     "axis-of-two": ({"path": _robot(_joint(inside='<axis xyz="1 0"/>'))}, r"axis of joint `j` is `1 0`, expected 3 numbers"),
     "axis-zero": ({"path": _robot(_joint(inside='<axis xyz="0 0 0"/>'))}, r"axis of joint `j` is zero"),
     "friction": ({"path": _robot(_joint(inside='<dynamics friction="0.1"/>'))}, r'the friction of joint `j` is not read.*ignore=\("friction",\)'),
@@ -244,7 +244,7 @@ BAD = {
     "unknown-free-link": ({"path": _robot(_joint()), "free": "bb"}, r"`free` names `bb`, which is no link; did you mean `b`"),
     "unknown-leader": ({"path": _robot(_joint(inside='<mimic joint="x"/>'))}, r"`mimic` of joint `j`: `x` is no joint"),
     "leader-of-itself": ({"path": _robot(_joint(inside='<mimic joint="j" multiplier="2"/>'))}, r"joint `j` mimics itself"),
-    "quaternion": ({"path": _robot(_joint(inside='<origin quat_xyzw="0 0 0 1"/>'))}, r"`quat_xyzw` of the origin of joint `j` is not read"),
+    "quaternion": ({"path": _robot(_joint(inside='<origin quat_xyzw="0 0 0 1"/>'))}, r'`quat_xyzw="0 0 0 1"` of `origin` of joint `j` is not read'),
     "nothing-moves": ({"path": _robot(_joint("fixed"))}, r"no joint moves anything"),
     "no-name": ({"path": "<robot><link/></robot>"}, r"a link has no `name`"),
     "two-names-become-one": (

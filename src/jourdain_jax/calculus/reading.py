@@ -62,16 +62,18 @@ def whole_number(text: str, what: str, low: int, high: int) -> int:
 
 
 def parsed(parse: Callable, content, source: str, what: str):
-    """Return what `parse` makes of the content of `source`; a ValueError of its own, or nesting without end, names the source and `what` was expected."""
+    """Return what `parse` makes of the content of `source`; an error of its own (ValueError, SyntaxError, LookupError: unknown encodings), or nesting without
+    end, becomes a ValueError that names the source and `what` was expected.
+    """
     try:
         return parse(content)
     except RecursionError:
         raise _too_deep(source) from None
-    except ValueError as error:
+    except (ValueError, SyntaxError, LookupError) as error:
         raise ValueError(f"{source}: is no {what} ({shortened(error, 200)})") from None
 
 
-def check_depth(root, inner: Callable[[object], Iterable], source: str) -> None:
+def check_depth(root, inner: Callable[..., Iterable], source: str) -> None:
     """Raise a ValueError where things are nested deeper than `DEEPEST`. `inner`: thing -> those in it."""
     level = [root]
     for _ in range(DEEPEST):

@@ -15,13 +15,15 @@ def identifier(name: str) -> str:
 
 
 def identifiers(names: Iterable[str], kind: str, taken: Iterable[str] = ()) -> dict[str, str]:
-    """Name -> its identifier, with an underscore at its end where that is among the `taken` ones; ValueError where two names become one."""
+    """Name -> its identifier, with an underscore at its end where that is among the `taken` ones; ValueError where two are equal, or become so."""
     found: dict[str, str] = {}
     taken = set(taken)
     for name in names:
         new = identifier(name)
         new = f"{new}_" if new in taken else new
-        twin = next((other for other, known in found.items() if known == new and other != name), None)
+        twin = next((other for other, known in found.items() if known == new), None)
+        if twin == name:
+            raise ValueError(f"two {kind}s are called `{name}`; give each a name of its own")
         if twin is not None:
             raise ValueError(f"{kind}s `{twin}` and `{name}` would both be called `{new}`; rename one of them")
         found[name] = new

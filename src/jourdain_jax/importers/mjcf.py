@@ -4,13 +4,14 @@ Source: the XML reference of MuJoCo's documentation, version 3.
 """
 
 import math
+import os
 from collections.abc import Iterable
 
 import numpy as np
 
 from jourdain_jax.calculus.rotations import matrices_to_quaternions
 from jourdain_jax.importers.identifiers import identifier
-from jourdain_jax.importers.mjcf_elements import IDLE_ELEMENTS, Defaults, attributes_of, check_attributes
+from jourdain_jax.importers.mjcf_elements import TABLE, Defaults, attributes_of
 from jourdain_jax.importers.placing import about, by_euler_angles, by_quaternion, combined, onto_axis
 from jourdain_jax.importers.solids import SIZES, moments, volume
 from jourdain_jax.importers.tree import Joint, Link, Look, Mass, Matrix, Motor, Tree, Vector
@@ -21,7 +22,6 @@ from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.scene import Scene
 
 _TYPES = ("free", "ball", "slide", "hinge")
-_SECTIONS = ("compiler", "option", "default", "worldbody", "asset", "actuator")
 _LOOKS = {"sphere": "ball", "capsule": "capsule", "cylinder": "cylinder", "box": "box", "ellipsoid": "ellipsoid"}
 _WATER = 1000.0  # kg/m^3, of geoms that state neither mass nor density
 
@@ -38,21 +38,18 @@ def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> 
 
     **Returns** a class. Hinges and slides are coordinates of their own names, a ball joint is a quaternion of its name, a free one `<joint>_x`, `_y`, `_z` and
     the quaternion `<joint>_attitude`; joints without a name are called `<body>_joint`, with a number from the second on. Speeds are those of MuJoCo. Motors
-    are inputs. Fields, as far as they are not zero: `<body>_mass` (kg), `<body>_mass_centre` (m, in the body's frame), `<body>_inertia` (kg m^2, about the
-    mass centre), `<joint>_damping`, `<joint>_stiffness` and `gravity` (m/s^2); and of bodies that `free` names `<body>_origin` (m). Inertias of geoms come from
-    their mass or density. The pose that the file states is the `example`.
+    are inputs, held within `ctrlrange` and their force within `forcerange` where these are limits, as MuJoCo holds them. Fields, as far as they are not
+    zero: `<body>_mass` (kg), `<body>_mass_centre` (m, in the body's frame), `<body>_inertia` (kg m^2, about the mass centre), `<joint>_damping`,
+    `<joint>_stiffness` and `gravity` (m/s^2); and of bodies that `free` names `<body>_origin` (m). Inertias of geoms come from their mass or density. The pose
+    that the file states is the `example`.
 
     Geoms are drawn; what they touch is not read: rolling is stated in `contacts` of a subclass. Limits stop nothing; those of joints become the `domain`.
 
-    **Raises** ValueError, by name: a file that cannot be read, a body that moves and has no mass, and whatever changes the motion and is not read, such as
-    `equality`, `tendon`, `armature` or `frictionloss`, unless `ignore` names it. A warning lists what else is left out.
+    **Raises** ValueError, by name: a file that cannot be read, a body that moves and has no mass, moments of inertia that no body has, what is said twice, and
+    whatever changes the motion, or is no part of the format, and is not read, such as `equality`, `tendon`, `armature`, `frictionloss` or a misspelt attribute,
+    unless `ignore` names it. A warning lists what else is left out.
     """
-    file = XmlFile(path, "mujoco", "MJCF", ignore)
-    for section in file.root:
-        if section.tag in IDLE_ELEMENTS:
-            file.leave_out(section.tag)
-        elif section.tag not in _SECTIONS:
-            file.refuse(section.tag, f"the section `{section.tag}`")
+    file = XmlFile(path, TABLE, "MJCF", ignore)
     tree = _Reader(file).tree(as_names(free))
     file.warn()
     return tree_scene(tree, file.source)
@@ -71,8 +68,6 @@ class _Reader:
         self.meshes = {mesh.get("name") or (mesh.get("file") or "").rpartition("/")[2].partition(".")[0]: mesh for mesh in file.root.findall("asset/mesh")}
         self.links: list[Link] = []
         self.start: dict[str, float] = {}
-        for flag in file.root.findall("option/flag"):
-            check_attributes(file, "flag", dict(flag.attrib), "`flag`")
 
     def tree(self, free: tuple[str, ...]) -> Tree:
         """The whole mechanism."""
@@ -85,19 +80,11 @@ class _Reader:
         return Tree(name, tuple(self.links), gravity, tuple(self._motors()), free=free, start=self.start)
 
     def _children(self, holder: Element, parent: str | None, childclass: str | None) -> None:
-        for element in holder:
-            if element.tag == "body":
-                self._body(element, parent, childclass)
-            elif element.tag in IDLE_ELEMENTS:
-                self.file.leave_out(element.tag)
-            elif element.tag not in ("inertial", "joint", "freejoint", "geom"):
-                self.file.refuse(element.tag, f"`{element.tag}` in body `{parent or 'world'}`")
+        for element in holder.findall("body"):
+            self._body(element, parent, childclass)
 
     def _body(self, body: Element, parent: str | None, childclass: str | None) -> None:
         name = body.get("name") or f"body{len(self.links)}"
-        if name in {link.name for link in self.links}:
-            raise self.file.fault(f"two bodies are called `{name}`; give each a name of its own")
-        check_attributes(self.file, "body", dict(body.attrib), f"body `{name}`")
         childclass = body.get("childclass") or childclass
         position, turn = self._place(dict(body.attrib), f"body `{name}`")
         given = [element for element in body if element.tag in ("joint", "freejoint")]
@@ -120,7 +107,6 @@ class _Reader:
         name = element.get("name") or (f"{body}_joint" if number == 0 else f"{body}_joint{number + 1}")
         what = f"joint `{name}`"
         given = dict(element.attrib) if element.tag == "freejoint" else self.defaults.of(element, childclass, what)
-        check_attributes(self.file, element.tag, given, what)
         kind = "free" if element.tag == "freejoint" else given.get("type", "hinge")
         if kind not in _TYPES:
             raise self.file.fault(f"{what} is of the type `{kind}`; {nearest(kind, _TYPES)}")
@@ -153,7 +139,6 @@ class _Reader:
         rule = self.compiler.get("inertiafromgeom", "auto")
         inertial = body.find("inertial")
         if inertial is not None and rule != "true":
-            check_attributes(self.file, "inertial", dict(inertial.attrib), f"`inertial` of body `{name}`")
             return self._stated_mass(inertial, f"`inertial` of body `{name}`")
         if rule == "false":
             return None
@@ -182,7 +167,6 @@ class _Reader:
         """Attributes and type of a geom, and what to call it."""
         what = f"geom `{geom.get('name')}` of {where}" if geom.get("name") else f"a geom of {where}"
         given = self.defaults.of(geom, childclass, what)
-        check_attributes(self.file, "geom", given, what)
         return given, given.get("type", "mesh" if "mesh" in given else "sphere"), what
 
     def _mass_of_geom(self, geom: Element, childclass: str | None, body: str) -> Mass | None:
@@ -235,7 +219,7 @@ class _Reader:
         if kind == "mesh" and given.get("mesh") in self.meshes:
             mesh = self.meshes[given["mesh"]]
             path = self.file.folder / self.compiler.get("meshdir", self.compiler.get("assetdir", "")) / (mesh.get("file") or "")
-            if path.is_file():
+            if os.path.isfile(path):
                 factors = self.file.numbers(mesh.get("scale"), 3, f"scale of the mesh of {what}", [1.0] * 3)
                 return Look("mesh", tuple(factors), *self._place(given, what), colour, opacity, str(path))
         self.file.leave_out(f"geom of type {kind}")
@@ -274,13 +258,19 @@ class _Reader:
 
     def _motors(self) -> Iterable[Motor]:
         names = [joint.name for link in self.links for joint in link.joints if joint.kind in ("hinge", "slide")]
-        for k, element in enumerate(self.file.root.findall("actuator/*")):
-            if element.tag != "motor":
-                self.file.refuse(element.tag, f"the actuator `{element.tag}` `{element.get('name') or k + 1}`", "state its force in `loads` of a subclass")
-                continue
-            given = self.defaults.of(element, None, f"motor {k + 1}")
+        for k, element in enumerate(self.file.root.findall("actuator/motor")):
+            given = self.defaults.of(element, None, f"motor `{element.get('name') or k + 1}`")
             name = given.get("name") or f"{given.get('joint')}_motor"
-            check_attributes(self.file, "motor", given, f"motor `{name}`")
             if given.get("joint") not in names:
                 raise self.file.fault(f"motor `{name}` pushes `{given.get('joint')}`, which is no hinge or slide; {nearest(str(given.get('joint')), names)}")
-            yield Motor(name, given["joint"], float(self.file.numbers(given.get("gear"), None, f"gear of motor `{name}`", [1.0])[0]))
+            gear = self.file.numbers(given.get("gear"), None, f"gear of motor `{name}`", [1.0])[0]
+            yield Motor(name, given["joint"], float(gear), self._limits(given, "ctrl", name), self._limits(given, "force", name))
+
+    def _limits(self, given: dict[str, str], what: str, motor: str) -> tuple[float, float] | None:
+        """The range of a motor's control or force, where it has one: stated, and not switched off."""
+        low, high = self.file.numbers(given.get(f"{what}range"), 2, f"{what}range of motor `{motor}`", [0.0, 0.0])
+        limited = given.get(f"{what}limited", "auto")
+        inferred = self.compiler.get("autolimits", "true") == "true"
+        if (limited == "true" and low >= high) or (limited == "auto" and not inferred and (low, high) != (0.0, 0.0)):
+            raise self.file.fault(f'`{what}range` of motor `{motor}` and `{what}limited` contradict each other; state low < high and `{what}limited="true"`')
+        return (float(low), float(high)) if limited == "true" or (limited == "auto" and low < high) else None

@@ -1,93 +1,81 @@
-"""What MJCF's elements and attributes mean here: read, without effect on the motion, or refused; and the defaults of its classes.
+"""What MJCF's elements may hold here, and the defaults of its classes.
 
 Source: the XML reference of MuJoCo's documentation, version 3.
 """
 
-from typing import Any
-
-from jourdain_jax.importers.xml_file import Element, XmlFile
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.importers.xml_file import Element, Holds, XmlFile
 
 _PLACE = "pos quat axisangle xyaxes zaxis euler"
 _CONTACT = "contype conaffinity condim group priority friction solmix solref solimp margin gap user fitscale fluidcoef"
-# attributes that are read
-READ = {
-    "body": f"name childclass {_PLACE}",
-    "inertial": f"mass diaginertia fullinertia {_PLACE}",
-    "joint": "name class type pos axis damping stiffness springref ref range",
-    "freejoint": "name",
-    "geom": f"name class type size fromto mass density rgba mesh {_PLACE}",
-    "motor": "name class joint gear",
-    "compiler": "angle eulerseq inertiafromgeom meshdir assetdir",
-    "option": "gravity",
-}
-# attributes that move nothing here: contacts, limits, drawing, how the other engine computes
-IDLE = {
-    "body": "user sleep",
-    "inertial": "",
-    "joint": "group user margin limited solreflimit solimplimit solreffriction solimpfriction",
-    "freejoint": "group",
-    "geom": f"material hfield {_CONTACT}",
-    "motor": "group user ctrllimited ctrlrange forcelimited forcerange",
-    "compiler": "autolimits texturedir strippath fusestatic discardvisual usethread saveinertial convexhull exactmeshinertia fitaabb conflict",
-    "option": "timestep apirate impratio tolerance ls_tolerance noslip_tolerance ccd_tolerance mpr_tolerance o_margin o_solref o_solimp o_friction "
-    "magnetic wind integrator cone jacobian solver iterations ls_iterations noslip_iterations ccd_iterations mpr_iterations sdf_iterations "
-    "sdf_initpoints actuatorgroupdisable sleep_tolerance",
-}
-# attributes that would move something, and the values with which they do not
-OFF = {
-    "body": {"mocap": "false", "gravcomp": "0"},
-    "joint": {
-        "armature": "0",
-        "frictionloss": "0",
-        "springdamper": "0 0",
-        "actuatorgravcomp": "false",
-        "actuatorfrclimited": "false auto",
-        "actuatorfrcrange": "0 0",
-    },
-    "freejoint": {"align": "false auto"},
-    "geom": {"shellinertia": "false", "fluidshape": "none"},
-    "compiler": {
-        "coordinate": "local",
-        "boundmass": "0",
-        "boundinertia": "0",
-        "settotalmass": "-1",
-        "balanceinertia": "false",
-        "inertiagrouprange": "0 5",
-        "alignfree": "false",
-    },
-    "option": {"density": "0", "viscosity": "0"},
-    "flag": dict.fromkeys(("spring", "damper", "passive", "gravity", "actuation"), "enable") | {"fwdinv": "disable enable", "override": "disable"},
-}
-# values that an attribute may have
-WORDS = {"compiler": {"angle": ("degree", "radian"), "inertiafromgeom": ("true", "false", "auto")}}
 # actuators that share their defaults with `motor`, as far as it has the attribute
 _ACTUATORS = {"general", "position", "velocity", "intvelocity", "damper", "cylinder", "muscle"}
-# elements that move nothing, beside those that are read
-IDLE_ELEMENTS = {"camera", "light", "site", "visual", "statistic", "size", "sensor", "keyframe", "custom", "contact", "texture", "material", "hfield", "skin"}
-
-
-def check_attributes(file: XmlFile, kind: str, attributes: dict[str, str], what: str) -> None:
-    """A ValueError for an attribute that would move something and is not read, unless it is to be ignored; or for one with an unknown value."""
-    for name, words in WORDS.get(kind, {}).items():
-        if attributes.get(name, words[0]) not in words:
-            raise file.fault(f"`{name}` of {what} is `{attributes[name]}`; {nearest(attributes[name], words)}")
-    off = OFF.get(kind, {})
-    for name, value in attributes.items():
-        if name in READ.get(kind, "").split() or name in IDLE.get(kind, "").split():
-            continue
-        if kind == "flag" and name not in off:
-            continue  # of the other engine's solver
-        if name in off and _is_off(value, off[name]):
-            continue
-        file.refuse(name, f'`{name}="{value}"` of {what}')
-
-
-def _is_off(value: str, off: str) -> bool:
-    try:
-        return [float(x) for x in value.split()] == [float(x) for x in off.split()]
-    except ValueError:
-        return value in off.split()
+_IDLE = "camera light site visual statistic size sensor keyframe custom contact texture material hfield skin"
+_SWITCH, _RANGED = ("true", "false"), ("true", "false", "auto")
+# What elements may hold, the attributes of their classes included; all else is refused by name. Idle is what has to do with contacts, limits, drawing, and how
+# the other engine computes.
+TABLE = {
+    "mujoco": Holds("model", many="compiler option default worldbody asset actuator", listed=_IDLE),
+    "compiler": Holds(
+        "angle eulerseq inertiafromgeom meshdir assetdir autolimits",
+        idle="texturedir strippath fusestatic discardvisual usethread saveinertial convexhull exactmeshinertia fitaabb conflict lengthrange",
+        off={
+            "coordinate": "local",
+            "boundmass": "0",
+            "boundinertia": "0",
+            "settotalmass": "-1",
+            "balanceinertia": "false",
+            "inertiagrouprange": "0 5",
+            "alignfree": "false",
+        },
+        words={"angle": ("degree", "radian"), "inertiafromgeom": _RANGED, "autolimits": _SWITCH},
+    ),
+    "option": Holds(
+        "gravity",
+        one="flag",
+        idle="timestep apirate impratio tolerance ls_tolerance noslip_tolerance ccd_tolerance mpr_tolerance o_margin o_solref o_solimp o_friction magnetic "
+        "wind integrator cone jacobian solver iterations ls_iterations noslip_iterations ccd_iterations mpr_iterations sdf_iterations sdf_initpoints "
+        "sleep_tolerance",
+        off={"density": "0", "viscosity": "0", "actuatorgroupdisable": ""},
+    ),
+    "flag": Holds(
+        idle="constraint equality frictionloss limit contact warmstart filterparent refsafe sensor midphase eulerdamp autoreset nativeccd island multiccd "
+        "energy invdiscrete sleep",
+        off=dict.fromkeys(("spring", "damper", "passive", "gravity", "actuation", "clampctrl"), "enable") | {"fwdinv": "disable enable", "override": "disable"},
+    ),
+    "default": Holds("class", many="default", idle=f"{' '.join(_ACTUATORS)} motor adhesion mesh material joint geom site camera light pair equality tendon"),
+    "worldbody": Holds(many="geom body", listed=_IDLE),
+    "asset": Holds(many="mesh", idle="texture material hfield skin model"),
+    "mesh": Holds("name class file scale", idle="content_type vertex normal texcoord face refpos refquat smoothnormal maxhullvert inertia builtin params"),
+    "body": Holds(
+        f"name childclass {_PLACE}",
+        one="inertial",
+        many="joint freejoint geom body",
+        idle="user sleep",
+        listed=_IDLE,
+        off={"mocap": "false", "gravcomp": "0"},
+    ),
+    "inertial": Holds(f"mass diaginertia fullinertia {_PLACE}"),
+    "joint": Holds(
+        "name class type pos axis damping stiffness springref ref range",
+        idle="group user margin limited solreflimit solimplimit solreffriction solimpfriction",
+        off={
+            "armature": "0",
+            "frictionloss": "0",
+            "springdamper": "0 0",
+            "actuatorgravcomp": "false",
+            "actuatorfrclimited": "false auto",
+            "actuatorfrcrange": "0 0",
+        },
+    ),
+    "freejoint": Holds("name", idle="group", off={"align": "false auto"}),
+    "geom": Holds(
+        f"name class type size fromto mass density rgba mesh {_PLACE}", idle=f"material hfield {_CONTACT}", off={"shellinertia": "false", "fluidshape": "none"}
+    ),
+    "actuator": Holds(many="motor"),
+    "motor": Holds(
+        "name class joint gear ctrllimited ctrlrange forcelimited forcerange", idle="group user", words={"ctrllimited": _RANGED, "forcelimited": _RANGED}
+    ),
+}
 
 
 class Defaults:
@@ -103,32 +91,36 @@ class Defaults:
             self._read(section, "main", {})
 
     def _read(self, section: Element, name: str, inherited: dict[str, dict[str, str]]) -> None:
-        known = {kind: dict(attributes) for kind, attributes in inherited.items()}
+        known, motor = {kind: dict(attributes) for kind, attributes in inherited.items()}, TABLE["motor"]
+        kinds = [element.tag for element in section if element.tag != "default"]
+        if twice := next((kind for kind in kinds if kinds.count(kind) > 1), None):
+            raise self._file.fault(f"the class `{name}` states `{twice}` twice, expected once")
         for element in section:
             if element.tag != "default":
+                self._file.check_text(element, f"`{element.tag}` of the class `{name}`")
                 known[element.tag] = known.get(element.tag, {}) | dict(element.attrib)
             if element.tag in _ACTUATORS:
-                shared = {name: value for name, value in element.attrib.items() if name in f"{READ['motor']} {IDLE['motor']}".split()}
+                shared = {name: value for name, value in element.attrib.items() if name in f"{motor.read} {motor.idle}".split()}
                 known["motor"] = known.get("motor", {}) | shared
         self._classes[name] = self._classes.get(name, {}) | known
         for element in section.findall("default"):
             inner = element.get("class")
             if not inner:
                 raise self._file.fault(f"a `default` inside the class `{name}` has no `class`; give it one")
+            if inner in self._classes:
+                raise self._file.fault(f"two `default` are of the class `{inner}`; give each a class of its own")
             self._read(element, inner, known)
 
     def of(self, element: Element, childclass: str | None, what: str) -> dict[str, str]:
-        """The attributes of an element, completed by its class, or else by that of the bodies around it."""
+        """The attributes of an element, completed by its class, or else by that of the bodies around it; checked."""
         name = element.get("class") or childclass or "main"
         if name not in self._classes:
             raise self._file.fault(f"{what} is of the class `{name}`, which no `default` states")
-        return self._classes[name].get(element.tag, {}) | dict(element.attrib)
+        found = self._classes[name].get(element.tag, {}) | dict(element.attrib)
+        self._file.check_attributes(element.tag, found, what)
+        return found
 
 
-def attributes_of(file: XmlFile, tag: str) -> dict[str, Any]:
-    """The attributes of all sections of a kind, the last counts; checked."""
-    found: dict[str, str] = {}
-    for section in file.root.findall(tag):
-        found |= dict(section.attrib)
-    check_attributes(file, tag, found, f"`{tag}`")
-    return found
+def attributes_of(file: XmlFile, tag: str) -> dict[str, str]:
+    """The attributes of all sections of a kind, the last counts."""
+    return {name: value for section in file.root.findall(tag) for name, value in section.attrib.items()}

@@ -74,11 +74,13 @@ class Follower:
 
 @dataclass(frozen=True)
 class Motor:
-    """An input that pushes a hinge or slide with `gear` times its value."""
+    """An input that pushes a hinge or slide with `gear` times its value, which is held between limits: those of the input first, then those of the force."""
 
     name: str
     joint: str
     gear: float = 1.0
+    control: tuple[float, float] | None = None
+    force: tuple[float, float] | None = None  # before the gear
 
 
 @dataclass(frozen=True)

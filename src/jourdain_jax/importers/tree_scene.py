@@ -52,8 +52,10 @@ class TreeScene(Scene):
             for joint in link.joints:
                 found += self._of_joint(motion, joint)
         for motor in self._tree.motors:
-            push = motor.gear * motion.inputs[self._names[motor.name]]
-            found.append(generalized_force(motion, **{f"{self._names[motor.joint]}_rate": push}))
+            push = motion.inputs[self._names[motor.name]]
+            for limits in (motor.control, motor.force):
+                push = push if limits is None else jnp.clip(push, *limits)
+            found.append(generalized_force(motion, **{f"{self._names[motor.joint]}_rate": motor.gear * push}))
         return tuple(found)
 
     def geometric_constraints(self, pose):

@@ -3,6 +3,7 @@
 Source: the format as the ROS wiki describes it, wiki.ros.org/urdf/XML.
 """
 
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -11,14 +12,37 @@ import numpy as np
 from jourdain_jax.importers.placing import by_roll_pitch_yaw
 from jourdain_jax.importers.tree import Follower, Joint, Link, Look, Mass, Matrix, Motor, Tree, Vector
 from jourdain_jax.importers.tree_scene import tree_scene
-from jourdain_jax.importers.xml_file import Element, XmlFile
+from jourdain_jax.importers.xml_file import Element, Holds, XmlFile
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.scene import Scene
 
 _KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free", "planar": "planar", "fixed": ""}
 _BASES = ("fixed", "planar", "free")
-_READ = ("link", "joint", "material")
-_READ_IN_JOINT = ("parent", "child", "origin", "axis", "limit", "dynamics", "mimic")
+# What elements may hold; all else is refused by name. Elements that are read are idle, or listed, where they move nothing.
+_TABLE = {
+    "robot": Holds("name", many="link joint material", idle="version", listed="transmission gazebo sensor ros2_control mujoco"),
+    "link": Holds("name", one="inertial", many="visual", idle="type collision", listed="contact sensor self_collision_checking"),
+    "inertial": Holds(one="origin mass inertia"),
+    "mass": Holds("value"),
+    "inertia": Holds("ixx ixy ixz iyy iyz izz"),
+    "visual": Holds(one="origin geometry material", idle="name"),
+    "geometry": Holds(one="box sphere cylinder capsule mesh", listed="plane cone ellipsoid"),
+    "box": Holds("size"),
+    "sphere": Holds("radius"),
+    "cylinder": Holds("radius length"),
+    "capsule": Holds("radius length"),
+    "mesh": Holds("filename scale"),
+    "material": Holds("name", one="color", idle="texture"),
+    "color": Holds("rgba"),
+    "joint": Holds("name type", one="parent child origin axis limit dynamics mimic", listed="calibration safety_controller"),
+    "parent": Holds("link"),
+    "child": Holds("link"),
+    "origin": Holds("xyz rpy"),
+    "axis": Holds("xyz"),
+    "limit": Holds("lower upper", idle="effort velocity acceleration deceleration jerk"),
+    "dynamics": Holds("damping friction"),
+    "mimic": Holds("joint multiplier offset"),
+}
 
 
 def from_urdf(
@@ -35,7 +59,7 @@ def from_urdf(
     - `motors`: names of revolute, continuous or prismatic joints that an input pushes, `<joint>_motor` in N m or N.
     - `free`: names of links whose place in the frame of their parent is a parameter.
     - `packages`: name -> folder, for meshes at `package://name/...` (default: folders of that name above the file).
-    - `ignore`: what may be left out without a word: names of elements, or "friction".
+    - `ignore`: what may be left out without a word: names of elements and attributes, "friction", or "text" between elements.
 
     **Returns** a class. A joint is a coordinate of its own name; a floating one is `<joint>_x`, `_y`, `_z` and the quaternion `<joint>_attitude`, a planar
     one `<joint>_x`, `_y`, `_heading`. Fields, as far as they are not zero in the file: `<link>_mass` (kg), `<link>_mass_centre` (m, in the link's frame),
@@ -44,18 +68,15 @@ def from_urdf(
     `contacts` of a subclass.
 
     **Raises** ValueError with the name of the link or joint: a file that cannot be read, an unknown type of joint, a parent or child that does not exist, a
-    loop, a mass without inertia, a joint that moves no mass, a joint with friction. A warning lists other elements that are left out.
+    loop, a mass without inertia, moments of inertia that no body has (the largest above the sum of the others by more than 1 %), a joint that moves no mass, a
+    joint with friction, what is said twice; and by its name all that an element of a URDF does not hold: a misspelt attribute, `spring` of `dynamics`,
+    `loop_joint`, text in place of an attribute. A warning lists elements that move nothing and are left out, such as `gazebo` and `transmission`.
     """
-    file = XmlFile(path, "robot", "URDF", ignore)
+    file = XmlFile(path, _TABLE, "URDF", ignore)
     if base not in _BASES:
         raise ValueError(f"`base` is {base!r}, expected one of {', '.join(map(repr, _BASES))}")
-    if any("xacro" in str(element.tag) for element in file.root.iter()):
-        raise file.fault("it has elements of xacro; let `xacro FILE > robot.urdf` write the URDF first")
-    for element in file.root:
-        if element.tag not in _READ:
-            file.leave_out(element.tag)
-    links = {file.name(element, "link"): element for element in file.root.findall("link")}
-    joints = file.root.findall("joint")
+    links = file.named(file.root.findall("link"), "link")
+    joints = list(file.named(file.root.findall("joint"), "joint").values())
     if not links:
         raise file.fault("it has no links")
     tree = _Reader(file, links, packages or {}).tree(joints, base, as_names(motors), as_names(free))
@@ -117,9 +138,6 @@ class _Reader:
         kind = joint.get("type")
         if kind not in _KINDS:
             raise self.file.fault(f"joint `{label}` is of the type `{kind}`; {nearest(str(kind), _KINDS)}")
-        for element in joint:
-            if element.tag not in _READ_IN_JOINT:
-                self.file.leave_out(element.tag)
         position, turn = self._origin(joint, f"joint `{label}`")
         moved = (self._joint(joint, label, _KINDS[kind], kind),) if _KINDS[kind] else ()
         parent = self._end(joint, "parent", label)
@@ -155,8 +173,6 @@ class _Reader:
     def _origin(self, element: Element, what: str) -> tuple[Vector, Matrix]:
         origin = element.find("origin")
         xyz, rpy = (None, None) if origin is None else (origin.get("xyz"), origin.get("rpy"))
-        for word in () if origin is None else set(origin.attrib) - {"xyz", "rpy"}:
-            self.file.refuse(word, f"`{word}` of the origin of {what}", "state the rotation by `rpy`")
         zero = np.zeros(3)
         return self.file.numbers(xyz, 3, f"xyz of {what}", zero), by_roll_pitch_yaw(self.file.numbers(rpy, 3, f"rpy of {what}", zero))
 
@@ -185,9 +201,9 @@ class _Reader:
 
     def _look(self, visual: Element, what: str) -> Look | None:
         geometry = visual.find("geometry")
-        shape = None if geometry is None or len(geometry) == 0 else geometry[0]
-        if shape is None:
-            raise self.file.fault(f"{what} has no shape in its `geometry`")
+        if geometry is None or len(geometry) != 1:
+            raise self.file.fault(f"{what} has {'no shape' if not geometry else 'several shapes'} in its `geometry`, expected one")
+        (shape,) = geometry
         position, turn = self._origin(visual, what)
         colour, opacity = self._colour(visual)
         if opacity == 0:
@@ -199,9 +215,10 @@ class _Reader:
         if shape.tag in ("cylinder", "capsule"):
             size = tuple(self.file.number(shape.get(word), f"{word} of {what}") for word in ("radius", "length"))
             return Look(shape.tag, size, position, turn, colour, opacity)
-        path = self._mesh_path(shape.get("filename")) if shape.tag == "mesh" else None
+        path = self._mesh_path(shape.get("filename"))
         if path is None:
-            self.file.leave_out(f"mesh {shape.get('filename')}" if shape.tag == "mesh" else shape.tag)
+            if shape.tag == "mesh":
+                self.file.leave_out(f"mesh {shape.get('filename')}")
             return None
         return Look("mesh", tuple(self.file.numbers(shape.get("scale"), 3, f"scale of {what}", [1.0] * 3)), position, turn, colour, opacity, str(path))
 
@@ -209,16 +226,15 @@ class _Reader:
         """The file of a mesh, if it is there."""
         if not name:
             return None
-        plain = name.removeprefix("file://")
         if name.startswith("package://"):
             package, _, rest = name.removeprefix("package://").partition("/")
             folders = (
                 [Path(self.packages[package])] if package in self.packages else [above / package for above in (self.file.folder, *self.file.folder.parents)]
             )
             folders += [above for above in self.file.folder.parents if above.name == package]
-            return next((folder / rest for folder in folders if (folder / rest).is_file()), None)
-        path = self.file.folder / plain
-        return path if path.is_file() else None
+        else:
+            folders, rest = [self.file.folder], name.removeprefix("file://")
+        return next((folder / rest for folder in folders if os.path.isfile(folder / rest)), None)
 
     def _colour(self, visual: Element) -> tuple[str | None, float]:
         material = visual.find("material")

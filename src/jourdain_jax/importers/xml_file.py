@@ -1,56 +1,108 @@
-"""Reading XML: files, numbers in attributes, and what is left out: refused or listed, never passed over without a word."""
+"""Reading XML: files, what each element may hold, numbers in attributes. What is left out is refused or listed, never passed over without a word."""
 
+import difflib
 import os
+import re
 import warnings
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 from jaxtyping import Float
 
+from jourdain_jax.calculus.reading import check_depth, number, parsed, read_bytes, shortened
 from jourdain_jax.calculus.reals import described
-from jourdain_jax.scene.names import as_names
+from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.tracebacks import users_level
 
 Element = ElementTree.Element
+LARGEST = 100_000_000  # bytes of a file
+
+
+@dataclass(frozen=True)
+class Holds:
+    """What an element may hold, by name: names are separated by blanks."""
+
+    read: str = ""  # attributes
+    one: str = ""  # children, each at most once
+    many: str = ""  # children, any number of each
+    idle: str = ""  # attributes and children that move nothing here, and are passed over
+    listed: str = ""  # children that move nothing here, and are listed in a warning
+    off: Mapping[str, str] = field(default_factory=dict)  # attributes that would move something -> values with which they do not
+    words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # attributes -> the values that they may have
 
 
 class XmlFile:
     """A file of a robot while it is read: its root, where it lies, and what of it is left out."""
 
-    def __init__(self, path, root_tag: str, format_name: str, ignore: Iterable[str]):
-        """The file at `path`, or the text itself, whose root is `root_tag`. ValueError where it cannot be read or is another kind of file."""
+    def __init__(self, path, table: Mapping[str, Holds], format_name: str, ignore: Iterable[str]):
+        """The file at `path`, or the text itself; `table`: what elements may hold, the root first. ValueError where it cannot be read or holds more."""
         if not isinstance(path, str | os.PathLike):
             raise ValueError(f"`path` is {described(path)}, expected the path of a {format_name} file, or its text")
-        self.ignore = as_names(ignore)
+        self.ignore, self.table = as_names(ignore), table
         text = str(path) if isinstance(path, str) and path.lstrip().startswith("<") else None
-        self.folder = Path.cwd() if text is not None else Path(path).resolve().parent
         self.source = f"the {format_name} text" if text is not None else str(path)
-        try:
-            content = Path(path).read_bytes() if text is None else text
-            self.root = ElementTree.fromstring(content)
-        except OSError as error:
-            raise ValueError(f"{self.source}: cannot be read ({error.strerror or type(error).__name__}); give the path of a {format_name} file") from None
-        except ElementTree.ParseError as error:
-            raise ValueError(f"{self.source}: is no XML ({error}); give a {format_name} file") from None
+        content = read_bytes(path, LARGEST, f"a {format_name} file") if text is None else text
+        self.folder = Path.cwd() if text is not None else Path(path).resolve().parent
+        self.root: Element = parsed(ElementTree.fromstring, content, self.source, "XML")
+        check_depth(self.root, list, self.source)
+        root_tag = next(iter(table))
         if self.root.tag != root_tag:
-            raise ValueError(f"{self.source}: its root is `{self.root.tag}`, expected `{root_tag}` of a {format_name} file")
+            raise self.fault(f"its root is `{self.root.tag}`, expected `{root_tag}` of a {format_name} file")
+        if any("xacro" in str(element.tag) for element in self.root.iter()):
+            raise self.fault("it has elements of xacro; let `xacro FILE > robot.urdf` write the URDF first")
         self._left_out: Counter[str] = Counter()
+        self._check(self.root, f"`{root_tag}`")
+
+    def _check(self, element: Element, what: str) -> None:
+        """A ValueError for anything in an element that the table does not have, unless it is to be ignored; `what`: the element, in words."""
+        holds = self.table[element.tag]
+        self.check_attributes(element.tag, element.attrib, what)
+        self.check_text(element, what)
+        counts = Counter(child.tag for child in element)
+        if twice := next((tag for tag in holds.one.split() if counts[tag] > 1), None):
+            raise self.fault(f"{what} has {counts[twice]} elements `{twice}`, expected one")
+        where = "" if element is self.root else f" of {what}"
+        for child in element:
+            tag, name = str(child.tag).rpartition("}")[2], child.get("name")
+            if child.tag in holds.one.split() + holds.many.split():
+                self._check(child, f"{tag} `{name}`" if name and tag in holds.many.split() else f"`{tag}`{where}")
+            elif child.tag in holds.listed.split():
+                self.leave_out(child.tag)
+            elif child.tag not in holds.idle.split():
+                self.refuse(tag, f"`{tag}`{f' `{name}`' if name else ''} in {what}", valid=f"{holds.one} {holds.many}")
+
+    def check_text(self, element: Element, what: str) -> None:
+        """A ValueError for text in an element, unless `text` is to be ignored."""
+        if text := "".join([element.text or "", *(child.tail or "" for child in element)]).strip():
+            self.refuse("text", f"the text `{shortened(text)}` in {what}", "state numbers in attributes")
+
+    def check_attributes(self, kind: str, attributes: Mapping[str, str], what: str) -> None:
+        """A ValueError for an attribute that elements of a kind do not have here, unless it is to be ignored, or one with an unknown value."""
+        holds = self.table[kind]
+        for name, value in attributes.items():
+            if value not in holds.words.get(name, (value,)):
+                raise self.fault(f"`{name}` of {what} is `{shortened(value)}`; {nearest(value, holds.words[name])}")
+            if name not in f"{holds.read} {holds.idle}".split() and not (name in holds.off and _is_off(value, holds.off[name])):
+                self.refuse(name.rpartition("}")[2], f'`{name.rpartition("}")[2]}="{shortened(value)}"` of {what}', valid=holds.read)
 
     def leave_out(self, what: str) -> None:
         """Note that something is left out that moves nothing, or that the user wants to be left out."""
         self._left_out[what] += 1
 
-    def refuse(self, key: str, what: str, advice: str = "state it in a subclass") -> None:
-        """A ValueError for something that is not read and would change the motion, unless `ignore` has its `key`."""
+    def refuse(self, key: str, what: str, advice: str = "state it in a subclass", valid: str = "") -> None:
+        """A ValueError for something that is not read, unless `ignore` has its `key`; `valid`: names that may be meant."""
         if key not in self.ignore:
-            raise ValueError(f'{self.source}: {what} is not read; {advice}, and give ignore=("{key}",) to read the file without')
+            meant = "".join(f"did you mean `{name}`? Otherwise " for name in difflib.get_close_matches(key, valid.split(), 1, 0.7))
+            raise ValueError(f'{self.source}: {what} is not read; {meant}{advice}, and give ignore=("{shortened(key)}",) to read the file without')
 
     def warn(self) -> None:
         """A warning that lists what was left out, apart from what `ignore` names."""
-        listed = [f"`{what}`" if count == 1 else f"`{what}` ({count})" for what, count in sorted(self._left_out.items()) if what not in self.ignore]
+        counted = {what: count for what, count in sorted(self._left_out.items()) if what not in self.ignore}
+        listed = [f"`{shortened(what)}`{f' ({count})' if count > 1 else ''}" for what, count in counted.items()]
         if listed:
             warnings.warn(f"{self.source}: left out {', '.join(listed)}; `ignore` silences this", UserWarning, stacklevel=users_level())
 
@@ -71,14 +123,26 @@ class XmlFile:
             if default is None:
                 raise self.fault(f"{what} is missing")
             return np.asarray(default, float)
-        try:
-            found = np.array([float(word) for word in text.split()], float)
-        except ValueError:
-            raise self.fault(f"{what} is `{text}`, expected numbers") from None
-        if len(found) != (count or len(found)) or not np.all(np.isfinite(found)):
-            raise self.fault(f"{what} is `{text}`, expected {count or 'finite'} number{'' if count == 1 else 's'}")
+        found = np.array([number(word, f"{self.source}: {what}") for word in re.findall(r"[^ \t\r\n]+", text)], float)
+        if len(found) != (count or max(1, len(found))):
+            raise self.fault(f"{what} is `{shortened(text)}`, expected {count or 'finite'} number{'' if count == 1 else 's'}")
         return found
 
     def number(self, text: str | None, what: str, default: float | None = None) -> float:
         """The one number in an attribute."""
         return float(self.numbers(text, 1, what, None if default is None else [default])[0])
+
+    def named(self, elements: Iterable[Element], what: str) -> dict[str, Element]:
+        """Elements by their names; ValueError where two have one name."""
+        found: dict[str, Element] = {}
+        for element in elements:
+            if found.setdefault(self.name(element, what), element) is not element:
+                raise self.fault(f"two {what}s are called `{element.get('name')}`; give each a name of its own")
+        return found
+
+
+def _is_off(value: str, off: str) -> bool:
+    try:
+        return [number(x, "") for x in value.split()] == [number(x, "") for x in off.split()]
+    except ValueError:
+        return value in off.split()
