@@ -55,13 +55,11 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _findings_are_not_kept():
-    """What tests look at is found now, not read from a disk; machine code of our own is made with less effort, which changes no bit of a number."""
-    from jourdain_jax.build import kept_findings
+def _less_effort():
+    """Machine code of our own is made with less effort, which changes no bit of a number."""
     from jourdain_jax.native import host
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kept_findings, "name_of", lambda *_: None)
         patch.setattr(host, "EFFORT", 0)
         yield
 

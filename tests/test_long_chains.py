@@ -175,7 +175,6 @@ def test_what_acts_by_less_than_round_off_is_not_left_out():
 def test_a_motion_finds_the_structure_of_its_scene_once(monkeypatch):
     looked, probed = [], structure._probed_structure
     monkeypatch.setattr(structure, "_probed_structure", lambda scene: looked.append(scene) or probed(scene))
-    monkeypatch.setenv("JOURDAIN_JAX_CACHE", "0")
     motion = jj.simulate(TrailerChain(trailers=2, car_mass=1.2345), t1=0.1)
     motion.raise_if_failed()
     assert len(looked) == 1

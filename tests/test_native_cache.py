@@ -1,16 +1,25 @@
 """Machine code that is kept on disk."""
 
 import multiprocessing
+import os
+import stat
+import subprocess
+import sys
+import warnings
+from itertools import permutations
 from types import SimpleNamespace
 
 import pytest
 
 from jourdain_jax.native import disk, ffi, host
 
+OTHER = 12345  # the number of another user
+
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("JOURDAIN_JAX_CACHE", str(tmp_path / "kept"))
+    disk._warn.cache_clear()
     return tmp_path / "kept"
 
 
@@ -18,14 +27,19 @@ def _never():
     raise AssertionError("made again")
 
 
+def _all_kept(*names):
+    """The code of each name, made of it where it is not kept."""
+    return [disk.kept(name, "llvm 20", lambda name=name: f"code of {name}".encode()) for name in names]
+
+
 def test_code_is_made_once_and_again_where_its_file_is_torn(folder):
-    assert disk.kept("a", lambda: b"code") == b"code"
-    assert disk.kept("a", _never) == b"code"
+    assert disk.kept("a", "llvm 20", lambda: b"code") == b"code"
+    assert disk.kept("a", "llvm 20", _never) == b"code"
     file = folder / "a.o"
     whole = file.read_bytes()
     for torn in (whole[:-1], b"", whole[:10], whole[:-1] + b"?"):
         file.write_bytes(torn)
-        assert disk.kept("a", lambda: b"code") == b"code"
+        assert disk.kept("a", "llvm 20", lambda: b"code") == b"code"
         assert file.read_bytes() == whole
     assert [f.name for f in folder.iterdir()] == ["a.o"]
 
@@ -33,16 +47,143 @@ def test_code_is_made_once_and_again_where_its_file_is_torn(folder):
 def test_a_folder_that_cannot_be_used_or_is_switched_off_is_no_error(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("JOURDAIN_JAX_CACHE", str(tmp_path / "file"))
-    assert disk.kept("a", lambda: b"code") == b"code"
+    assert disk.kept("a", "llvm 20", lambda: b"code") == b"code"
     monkeypatch.setenv("JOURDAIN_JAX_CACHE", "0")
     assert disk.folder() is None
-    assert disk.kept("a", lambda: b"code") == b"code"
+    assert disk.kept("a", "llvm 20", lambda: b"code") == b"code"
+
+
+def test_files_that_are_exchanged_are_made_again(folder):
+    """Also those of another kind, or what another version made: the digest at the beginning is that of name, maker and code."""
+    names = "abc"
+    right = _all_kept(*names)
+    whole = {name: (folder / f"{name}.o").read_bytes() for name in names}
+    for order in permutations(names):
+        for name, other in zip(names, order, strict=True):
+            (folder / f"{name}.o").write_bytes(whole[other])
+        assert _all_kept(*names) == right
+    assert disk.kept("a", "llvm 21", lambda: b"newer") == b"newer"
+    assert disk.kept("a", "llvm 20", lambda: b"older") == b"older"
+
+
+def test_every_byte_of_a_file_counts(folder):
+    (code,) = _all_kept("a")
+    file = folder / "a.o"
+    whole = file.read_bytes()
+    for place in range(len(whole)):
+        for flipped in (whole[place] ^ 1, whole[place] ^ 128, 0, 255):
+            file.write_bytes(whole[:place] + bytes([flipped]) + whole[place + 1 :])
+            assert _all_kept("a") == [code]
+    assert file.read_bytes() == whole
+
+
+def test_only_the_user_may_read_and_write_what_is_kept(folder, monkeypatch):
+    before = os.umask(0)
+    try:
+        _all_kept("a", "b")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert {stat.S_IMODE(file.stat().st_mode) for file in folder.iterdir()} == {0o600}
+
+
+def _unused(folder, words):
+    """Code is made each time, nothing of the folder is read or written, and one warning says why."""
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    with pytest.warns(UserWarning, match=f"{folder}.*{words}") as said:
+        assert [disk.kept(name, "llvm 20", lambda: b"new") for name in "az"] == [b"new", b"new"]
+    assert len(said) == 1
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o770, 0o720, 0o702, 0o1777])
+def test_a_folder_that_others_may_write_is_not_used(folder, mode):
+    right = _all_kept("a")
+    folder.chmod(mode)
+    _unused(folder, "others may write to it.*chmod go-w.*JOURDAIN_JAX_CACHE")
+    folder.chmod(0o755)
+    assert disk.kept("a", "llvm 20", _never) == right[0]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can hand a folder to another user")
+def test_a_folder_that_belongs_to_another_user_is_not_used(folder):
+    _all_kept("a")
+    os.chown(folder, OTHER, OTHER)
+    _unused(folder, f"belongs to user {OTHER}")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can hand a file to another user")
+def test_a_file_that_another_user_put_there_is_made_again(folder):
+    right = _all_kept("a")
+    file = folder / "a.o"
+    os.chown(file, OTHER, OTHER)
+    assert _all_kept("a") == right
+    assert file.stat().st_uid == os.geteuid()
+    file.chmod(0o666)
+    assert disk.kept("a", "llvm 20", lambda: b"made again") == b"made again"
+
+
+def test_a_link_or_a_pipe_in_place_of_a_file_is_not_read(folder, tmp_path):
+    right = _all_kept("a")
+    file = folder / "a.o"
+    file.rename(tmp_path / "moved")
+    file.symlink_to(tmp_path / "moved")
+    assert disk.kept("a", "llvm 20", lambda: b"other") == b"other"
+    file.unlink()
+    os.mkfifo(file)
+    assert _all_kept("a") == right
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can hand a folder to another user")
+@pytest.mark.parametrize("place", ["JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME"])
+def test_the_owner_is_asked_of_every_folder(tmp_path, monkeypatch, place):
+    """Of JAX's shared cache and of the user's too."""
+    monkeypatch.delenv("JOURDAIN_JAX_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    config = SimpleNamespace(jax_compilation_cache_dir=str(tmp_path) if place == "JAX_COMPILATION_CACHE_DIR" else None)
+    monkeypatch.setattr(disk, "jax", SimpleNamespace(config=config))
+    disk._warn.cache_clear()
+    (code,) = _all_kept("a")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert disk.kept("a", "llvm 20", _never) == code
+    os.chown(tmp_path / "jourdain_jax", OTHER, -1)
+    _unused(tmp_path / "jourdain_jax", f"belongs to user {OTHER}")
+
+
+PROGRAM = """
+import sys
+import jax
+import jax.numpy as jnp
+import jourdain_jax as jj
+from jourdain_jax.native import host
+host.EFFORT = 0
+for name in sys.argv[1:]:
+    scene = jj.models.MODELS[name]()
+    jax.grad(lambda scene: jnp.sum(jj.simulate(scene, scene.example, t1=0.2).q_end))(scene)
+"""
+
+
+def _kept_by_a_process(folder, seed, names) -> set[str]:
+    environment = os.environ | {"PYTHONHASHSEED": str(seed), "JOURDAIN_JAX_CACHE": str(folder)}
+    subprocess.run([sys.executable, "-W", "ignore", "-c", PROGRAM, *names], env=environment, check=True)
+    return {file.name for file in folder.iterdir()}
+
+
+@pytest.mark.skipif(bool(host.reason_against()), reason=host.reason_against())
+@pytest.mark.parametrize("names", [("tilting-disc",), pytest.param(("whipple-bicycle", "snakeboard", "trailer-chain", "rattleback"), marks=pytest.mark.slow)])
+def test_every_process_writes_the_same_programs(tmp_path, names):
+    """Files are named by their programs' text: an order of sets of texts, which differs from process to process, would give others."""
+    first = _kept_by_a_process(tmp_path / "kept", 1, names)
+    assert len(first) >= 3 * len(names)
+    assert all(name.startswith("jourdain_jax_") for name in first)
+    assert _kept_by_a_process(tmp_path / "kept", 2, names) == first
 
 
 def test_the_oldest_go_where_there_is_no_room(folder, monkeypatch):
     monkeypatch.setattr(disk, "MOST_BYTES", 100)
     for name in "abc":
-        disk.kept(name, lambda: b"x" * 40)
+        disk.kept(name, "llvm 20", lambda: b"x" * 40)
     assert not (folder / "a.o").exists()
     assert (folder / "c.o").exists()
 
@@ -52,8 +193,8 @@ def test_code_for_another_program_effort_machine_or_compiler_has_another_name(mo
     class Asked(Exception):
         """With the name of a file."""
 
-    def asked(name, make):
-        raise Asked(name)
+    def asked(name, made_by, make):
+        raise Asked(f"{name} {made_by}")
 
     def name(text="a program", effort=2) -> str:
         with pytest.raises(Asked) as found:
@@ -73,7 +214,7 @@ def test_code_for_another_program_effort_machine_or_compiler_has_another_name(mo
 
 
 def _write(name):
-    return disk.kept(name, lambda: b"y" * 1_000_000)
+    return disk.kept(name, "llvm 20", lambda: b"y" * 1_000_000)
 
 
 def test_many_processes_may_write_the_same_code(folder):

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
+from jourdain_jax.calculus import writing
 from jourdain_jax.ensembles import files, memory, workers
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.motion.native import called
@@ -169,7 +170,7 @@ def test_what_is_kept_has_no_place_where_a_user_has_no_home(monkeypatch):
     monkeypatch.setattr(disk, "jax", SimpleNamespace(config=SimpleNamespace(jax_compilation_cache_dir=None)))
     monkeypatch.setattr(disk.Path, "home", nowhere)
     assert disk.folder() is None
-    assert disk.kept("a", lambda: b"code") == b"code"
+    assert disk.kept("a", "", lambda: b"code") == b"code"
 
 
 def test_a_file_that_another_process_reads_need_not_be_replaced(tmp_path, monkeypatch):
@@ -177,8 +178,8 @@ def test_a_file_that_another_process_reads_need_not_be_replaced(tmp_path, monkey
         raise PermissionError(13, "The process cannot access the file because it is being used by another process")
 
     monkeypatch.setenv("JOURDAIN_JAX_CACHE", str(tmp_path))
-    monkeypatch.setattr(disk.os, "replace", refused)
-    assert disk.kept("a", lambda: b"code") == b"code"
+    monkeypatch.setattr(os, "replace", refused)
+    assert disk.kept("a", "", lambda: b"code") == b"code"
     assert not list(tmp_path.iterdir())
 
 
@@ -187,12 +188,11 @@ def test_files_of_studies_are_bytes_and_need_no_locks(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "O_BINARY", 0x8000, raising=False)
     monkeypatch.setitem(sys.modules, "fcntl", None)
     monkeypatch.setattr(os, "open", lambda path, flags, *mode, open=os.open: asked.append(flags) or open(path, flags & ~0x8000, *mode))
-    module = runpy.run_path(files.__file__)
-    module["write_whole"](tmp_path / "a", b"1\n2")
+    runpy.run_path(writing.__file__)["write_whole"](tmp_path / "a", b"1\n2")
     assert (tmp_path / "a").read_bytes() == b"1\n2"
     assert all(flags & 0x8000 for flags in asked)
     assert len(asked) == 1
-    with module["locked"](tmp_path / "lock"):
+    with runpy.run_path(files.__file__)["locked"](tmp_path / "lock"):
         pass
 
 
@@ -215,7 +215,7 @@ def _read_as_text(tree: ast.AST) -> Iterator[ast.Call]:
         name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
         of_os = isinstance(call.func, ast.Attribute) and getattr(call.func.value, "id", "") == "os"
         modes = [x.value for x in call.args if isinstance(x, ast.Constant) and isinstance(x.value, str)]
-        own = isinstance(call.func, ast.Name) and name != "open"  # `read_text` of parameter files, which tries several encodings
+        own = isinstance(call.func, ast.Name) and name != "open"  # `read_text` of `calculus/reading.py`
         if (name in ("read_text", "write_text") and not own) or (name == "open" and not of_os and not any("b" in mode for mode in modes)):
             yield call
 
@@ -239,10 +239,12 @@ def test_workers_share_threads_also_where_a_process_cannot_choose_its_cores(monk
     assert environ == {"JOURDAIN_JAX_THREADS": "1"}
 
 
-def test_a_number_of_threads_that_is_none_is_named(monkeypatch):
-    monkeypatch.setenv("JOURDAIN_JAX_THREADS", "all")
-    with pytest.raises(ValueError, match="JOURDAIN_JAX_THREADS is 'all', expected a number of threads"):
+@pytest.mark.parametrize("text", ["all", "0", "-1", "2.0", "1_0", "\u0662", "1025", "100000", "9" * 5000, ""])
+def test_a_number_of_threads_that_is_none_is_named(monkeypatch, text):
+    monkeypatch.setenv("JOURDAIN_JAX_THREADS", text)
+    with pytest.raises(ValueError, match=r"JOURDAIN_JAX_THREADS is `.*`, expected a whole number from 1 to 1024") as error:
         host.threads.__wrapped__()
+    assert len(str(error.value)) < 200
 
 
 def test_a_bound_on_memory_is_refused_where_there_is_no_library_of_c_to_ask(monkeypatch):

@@ -2,7 +2,7 @@
 
     g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M = sum m beta' beta + gamma' I gamma
 
-Unit norms of quaternions count as geometric rows. The program is kept on disk between processes, as text.
+Unit norms of quaternions count as geometric rows.
 """
 
 from dataclasses import dataclass
@@ -11,21 +11,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.build.kept_findings import kept_of_scene
 from jourdain_jax.build.plausibility import are_negative
 from jourdain_jax.build.probed_on_graph import LookedAt, looked_at
 from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.build.trace import TracedScene
-from jourdain_jax.calculus.plain_text import as_text, from_text
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
-from jourdain_jax.program.part import part
+from jourdain_jax.program.part import part_of
 from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.scene import Scene
 
 MOST_PRODUCTS = 20_000  # of entries of velocities in a mass matrix that is written out
-_TEXTLESS = b"none"
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,19 +47,11 @@ class RowProgram:
 def row_program(scene: Scene) -> RowProgram | None:
     """The program of a class of scenes; None where a part of it is no scalar program."""
     scene = with_reference_parameters(scene)
-    found = kept_of_scene("rows", scene, lambda: _as_text(scene))
-    if found == _TEXTLESS:
-        return None
-    rows, *others = from_text(found)
-    return RowProgram(Graph.of_rows(rows), *others)
-
-
-def _as_text(scene: Scene) -> bytes:
     try:
         nodes = looked_at(scene)
         right = _right(scene, nodes.traced)
     except Unsupported:
-        return _TEXTLESS
+        return None
     graph, traced = nodes.graph, nodes.traced
     q, u = traced.q.tolist(), traced.u.tolist()
     g, phi = [int(n) for n in nodes.closures], traced.at.phi.tolist()
@@ -70,18 +59,30 @@ def _as_text(scene: Scene) -> bytes:
     M = _mass_matrix(nodes, u)
     needed = [right, *g, *G.values(), *phi, *A.values(), *({} if M is None else M).values()]
     if graph.calls(needed):
-        return _TEXTLESS
+        return None
     inputs = [traced.t, *q, *u, *traced.inputs.tolist()]
-    rows, place = part(graph, [*needed, *inputs])
+    own, place = part_of(graph, [*needed, *inputs])
 
     def places(entries: dict) -> dict:
         return {key: int(place[n]) for key, n in entries.items()}
 
-    def every(nodes) -> list[int]:
-        return [int(place[n]) for n in np.ravel(np.asarray(nodes, int))]
+    def every(nodes) -> tuple[int, ...]:
+        return tuple(int(place[n]) for n in np.ravel(np.asarray(nodes, int)))
 
-    variables = [every(x) for x in traced.parameters], int(place[traced.t]), *map(every, (traced.q, traced.u, traced.inputs))
-    return as_text([rows, *variables, every(g), places(G), every(phi), places(A), None if M is None else places(M), int(place[right])])
+    return RowProgram(
+        graph=own,
+        parameters=tuple(map(every, traced.parameters)),
+        t=int(place[traced.t]),
+        q=every(traced.q),
+        u=every(traced.u),
+        inputs=every(traced.inputs),
+        g=every(g),
+        G=places(G),
+        phi=every(phi),
+        A=places(A),
+        M=None if M is None else places(M),
+        right=int(place[right]),
+    )
 
 
 def _right(scene: Scene, traced: TracedScene) -> int:

@@ -11,7 +11,6 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.build.kept_findings import kept_of_scene
 from jourdain_jax.build.plausibility import implausible, odd_gravity
 from jourdain_jax.build.privileged import best_privileged, pivots_at, privileged_by_user, worst_pivot
 from jourdain_jax.build.probed import TIMED, Probed
@@ -22,7 +21,6 @@ from jourdain_jax.build.row_lengths import speed_scales, typical_row_lengths
 from jourdain_jax.build.sampling import no_numbers, random_states, states_near_what_was_seen, symmetric_configurations, usable_states
 from jourdain_jax.build.smoothness import check_smoothness
 from jourdain_jax.calculus.collecting import without_collecting
-from jourdain_jax.calculus.plain_text import as_text, from_text
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.rows import UsualRows
@@ -214,7 +212,7 @@ def usual_rows(scene: Scene) -> UsualRows:
 @once_per_values
 def _structure(scene: Scene) -> Structure:
     with without_collecting(), np.errstate(all="ignore"):  # what is no number at a probe does not count there
-        return Structure(**from_text(kept_of_scene("structure", scene, lambda: as_text(vars(_probed_structure(scene))))))
+        return _probed_structure(scene)
 
 
 def _probed_structure(scene: Scene) -> Structure:

@@ -1,14 +1,8 @@
-"""Files that are whole or absent: written beside their place and moved there in one step, with checksums; and the lock of a folder.
-
-A process that is killed leaves files whole. A machine that loses power may leave torn ones, which their checksums show. Small files that are written once
-are waited for until they are on the disk.
-"""
+"""The lock of a study's folder."""
 
 import contextlib
-import itertools
 import json
 import os
-import secrets
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,29 +11,6 @@ try:
     import fcntl
 except ImportError:  # not on this system: no lock is held there
     fcntl = None  # type: ignore[assignment]
-
-_BINARY = getattr(os, "O_BINARY", 0)  # without it, Windows writes two bytes for every one that is a line feed
-_OURS, _count = secrets.token_hex(4), itertools.count()  # in names of files, other than those of all processes
-
-
-def write_whole(path: Path, content: bytes, *, wait: bool = False) -> None:
-    """Put a file in its place; `wait`: until it is on the disk."""
-    beside = f"{path.parent}/.{path.name}.{os.getpid()}.{_OURS}.{next(_count)}"
-    try:
-        file = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BINARY, 0o666)
-        try:
-            written = 0
-            while written < len(content):
-                written += os.write(file, content[written:] if written else content)
-            if wait:
-                os.fsync(file)
-        finally:
-            os.close(file)
-        os.replace(beside, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(beside)
-        raise
 
 
 class InUseError(RuntimeError):

@@ -25,8 +25,9 @@ from pathlib import Path
 import numpy as np
 
 from jourdain_jax.calculus.on_first_use import needed
+from jourdain_jax.calculus.writing import write_whole
 from jourdain_jax.ensembles import optional
-from jourdain_jax.ensembles.files import locked, write_whole
+from jourdain_jax.ensembles.files import locked
 
 FORMAT = 1
 _BEGIN = b"jourdain-jax chunk 1\n"

@@ -7,30 +7,29 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import islice
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.build.kept_findings import kept_of_scene
 from jourdain_jax.build.reference_parameters import varied, with_reference_parameters
 from jourdain_jax.build.sampling import random_states
 from jourdain_jax.build.structure import Structure, structure_of
-from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
+from jourdain_jax.build.trace import TracedScene, Variables, named_values, traced_scene
 from jourdain_jax.calculus.collecting import without_collecting
-from jourdain_jax.calculus.plain_text import as_text
 from jourdain_jax.lowering.appell import AppellOnGraph, Strategy
 from jourdain_jax.lowering.comparison import agree, check_against_dense, rates_of, values_at
 from jourdain_jax.lowering.far import full_turns, on_velocity_rows
 from jourdain_jax.lowering.ignorable import ignorable
-from jourdain_jax.lowering.kept_programs import program_as_text, program_from_text
 from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.lowered import Lowered, NotLowered, Stage
 from jourdain_jax.lowering.massless import may_be_massless
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.identity_test import IdentityProbes, equal
+from jourdain_jax.program.part import part_of
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
@@ -44,6 +43,7 @@ MOST_OPERATIONS = 20_000
 MOST_TERMS = 200  # of one normal form
 SMALL = 1000  # operations: below, further ways are tried
 LARGE = 5000  # operations: above, the explicit way is not tried
+_NODES = ("qdot", "ydot", "z", "pivots", "sizes", "guards", "events", "energies", "projected_q", "projected_u", "fixed")  # fields that are tuples of nodes
 NOT_SMALL = 4000  # operations: holding ignorable coordinates leaves no small program of so many
 
 
@@ -99,21 +99,33 @@ class _Key:
 def _lowered(key: _Key) -> Lowered | NotLowered:
     try:
         with without_collecting(), np.errstate(all="ignore"):  # what is no number at a probe does not count there
-            return _built_or_kept(key)
+            return _timed(key)
     except NotLowered as reason:
         return NotLowered(str(reason))  # kept without its traceback
 
 
-def _built_or_kept(key: _Key) -> Lowered:
-    """The program from the disk, or built and kept there; always put together from its text, so that both are the same."""
-    begin, built = time.perf_counter(), []
+def _timed(key: _Key) -> Lowered:
+    begin = time.perf_counter()
+    found = _alone(_built(key))
+    return replace(found, seconds=time.perf_counter() - begin)
 
-    def text() -> bytes:
-        built.append(_built(key))
-        return program_as_text(built[0])
 
-    found = kept_of_scene("program", key.scene, text, key.structure.potentials_of_inputs, as_text(vars(key.structure)), key.every_speed, key.massless)
-    return replace(program_from_text(found) if found else built[0], seconds=time.perf_counter() - begin)
+def _alone(found: Lowered) -> Lowered:
+    """The program in a graph of its own, without what was tried for it."""
+    of, power = found.traced, [] if found.power is None else [found.power]
+    variables = [of.t, *of.q.tolist(), *of.u.tolist(), *of.inputs.tolist(), *(n for x in of.parameters for n in x.ravel().tolist())]
+    outputs = [n for name in _NODES for n in getattr(found, name)]
+    graph, nodes = part_of(found.graph, [*variables, *outputs, *power, *found.usual, *found.usual.values(), *found.states])
+    place = nodes.tolist()
+    moved: dict[str, Any] = {name: tuple(place[n] for n in getattr(found, name)) for name in _NODES}
+    return replace(
+        found,
+        traced=Variables(graph, place[of.t], nodes[of.q], nodes[of.u], nodes[of.inputs], [np.asarray(nodes[x]) for x in of.parameters]),
+        power=None if found.power is None else place[found.power],
+        usual={place[a]: place[b] for a, b in found.usual.items()},
+        states={place[n]: x for n, x in found.states.items()},
+        **moved,
+    )
 
 
 def _built(key: _Key) -> Lowered:

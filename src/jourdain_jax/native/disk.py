@@ -1,17 +1,21 @@
-"""Machine code, and what was found of scenes, kept on disk between processes: in the folder of JAX's compilation cache where one is set, otherwise in
-the user's cache.
+"""Machine code kept on disk between processes: in the folder of JAX's compilation cache where one is set, otherwise in the user's cache.
 
-A file is named by what its content was made from; it begins with a digest of the content, so that one that is torn or changed is made again. It is
-written beside and moved to its place, so that many processes may write the same one.
+A file is named by what its code was made from. It begins with a digest of that name, of what made it and of the code, so that one that is torn, changed or
+exchanged for another is made again. Code from others would run in this process: a folder or a file that somebody else owns or may write is not used.
 """
 
+import contextlib
+import functools
 import hashlib
 import os
-import tempfile
+import stat
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 import jax
+
+from jourdain_jax.calculus.writing import write_whole
 
 MOST_BYTES = 200e6  # of all files; beyond, the oldest go
 _DIGEST = 32  # bytes
@@ -32,41 +36,68 @@ def folder() -> Path | None:
         return None
 
 
-def kept(name: str, make: Callable[[], bytes]) -> bytes:
+def kept(name: str, made_by: str, make: Callable[[], bytes]) -> bytes:
     """What `make` returns, from the file of this name where it is whole, otherwise made and kept there; a disk that refuses is no error.
 
-    What is empty is not kept.
+    `made_by`: what else must be the same, versions of what makes it, as text.
     """
     place = folder()
-    if place is None:
+    if place is None or not _is_ours(place):
         return make()
     file = place / f"{name}.o"
-    try:
-        text = file.read_bytes()
-    except OSError:
-        text = b""
-    digest, code = text[:_DIGEST], text[_DIGEST:]
-    if code and hashlib.sha256(code).digest() == digest:
-        return code
+
+    def digest(code: bytes) -> bytes:
+        return hashlib.sha256(f"machine code\0{name}\0{made_by}\0".encode() + code).digest()
+
+    text = _read(file)
+    if digest(text[_DIGEST:]) == text[:_DIGEST]:
+        return text[_DIGEST:]
     code = make()
-    if not code:
-        return code
-    try:
-        place.mkdir(parents=True, exist_ok=True)
+    with contextlib.suppress(OSError):
         _make_room(place)
-        with tempfile.NamedTemporaryFile(dir=place, delete=False) as beside:
-            beside.write(hashlib.sha256(code).digest() + code)
-        try:
-            os.replace(beside.name, file)
-        except OSError:  # under Windows, while another process reads it
-            os.unlink(beside.name)
-    except OSError:
-        pass
+        write_whole(file, digest(code) + code, mode=0o600)
     return code
 
 
+def _is_ours(place: Path) -> bool:
+    """Whether the folder, made where there is none, can be used; a warning where others may put code into it."""
+    try:
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        against = _against(os.stat(place))
+    except OSError:
+        return False
+    if against:
+        _warn(place, against)
+    return not against
+
+
+def _against(found: os.stat_result) -> str:
+    """Why a folder or a file is not believed; empty where it is."""
+    if found.st_uid != os.geteuid():
+        return f"it belongs to user {found.st_uid}, and this process runs as {os.geteuid()}"
+    return "others may write to it" if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH) else ""
+
+
+@functools.cache
+def _warn(place: Path, against: str) -> None:
+    warnings.warn(
+        f"the folder `{place}` is not used for machine code, which is compiled anew in each process: {against}, and what lies there runs in your process; "
+        "take away that right (chmod go-w), or name a folder of your own in JOURDAIN_JAX_CACHE (0: none)",
+        stacklevel=2,
+    )
+
+
+def _read(file: Path) -> bytes:
+    """The content; nothing where there is none of our own."""
+    try:
+        with open(os.open(file, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as opened:
+            return b"" if _against(os.fstat(opened.fileno())) else opened.read()
+    except OSError:
+        return b""
+
+
 def _make_room(place: Path) -> None:
-    """Removes the oldest files where all take more than `MOST_BYTES`."""
+    """Remove the oldest files where all take more than `MOST_BYTES`."""
     found = sorted((file.stat().st_mtime, file.stat().st_size, file) for file in place.glob("*.o"))
     excess = sum(size for _, size, _ in found) - MOST_BYTES
     for _, size, file in found:

@@ -182,7 +182,7 @@ def registered(text: str, effort: int = 2) -> str:
     name = f"jourdain_jax_{hashlib.sha256(f'{host.description()} {effort} {text}'.encode()).hexdigest()[:24]}"
     capsule = ctypes.pythonapi.PyCapsule_New
     capsule.restype, capsule.argtypes = ctypes.py_object, (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
-    code = disk.kept(name, lambda: host.object_code(text, effort))
+    code = disk.kept(name, host.description(), lambda: host.object_code(text, effort))
     with _REGISTERING:
         if name not in _REGISTERED:  # by another thread meanwhile
             jax.ffi.register_ffi_target(name, capsule(host.address(code, HANDLER), b"xla._CUSTOM_CALL_TARGET", None), platform="cpu")

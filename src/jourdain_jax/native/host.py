@@ -7,6 +7,7 @@ import os
 import threading
 from typing import Any
 
+from jourdain_jax.calculus.reading import whole_number
 from jourdain_jax.native.libm import PREFIX
 from jourdain_jax.native.math_functions import LIBM
 
@@ -27,6 +28,7 @@ _LANES = (("avx512f", 8), ("avx", 4))  # doubles of a register; else 2, as every
 # 1: few passes; speeds of a bicycle put onto its rows take 0.51 s to compile in place of 0.84, and 2.4 us per lane in place of 1.6.
 # 0: registers are assigned without a search; 12,000 operations in a row take 0.07 s to compile in place of 0.72 (1) and 1.33 (2), and run at half the speed.
 EFFORT = 2
+MOST_THREADS = 1024  # each takes 8 MB of addresses for its stack
 _lock = threading.Lock()
 _engines: list = []  # what machine code lives in: as long as the process, which may call it
 
@@ -81,10 +83,8 @@ def registers() -> int:
 def threads() -> int:
     """How many threads share a batch: one for every core that this process may use, or as many as `JOURDAIN_JAX_THREADS` says."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    stated = os.environ.get("JOURDAIN_JAX_THREADS", str(cores))
-    if not stated.isdecimal():
-        raise ValueError(f"the environment variable JOURDAIN_JAX_THREADS is {stated!r}, expected a number of threads, such as 2")
-    return max(1, int(stated))
+    stated = os.environ.get("JOURDAIN_JAX_THREADS", str(min(cores, MOST_THREADS)))
+    return whole_number(stated, "the environment variable JOURDAIN_JAX_THREADS", 1, MOST_THREADS)
 
 
 def fuses() -> bool:

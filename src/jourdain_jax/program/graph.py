@@ -41,13 +41,9 @@ class Graph:
         self._known: dict = {}
         self.zero, self.one = self.const(0.0), self.const(1.0)
 
-    @staticmethod
-    def of_rows(rows: Iterable[tuple]) -> "Graph":
-        """The graph of nodes given as (operation, arguments, value, whether it varies); the first two are the numbers zero and one."""
-        graph = Graph()
-        for op, args, value, varies in rows:
-            graph._node(op, args, math.nan if op == "const" and value != value else value, varies)
-        return graph
+    def like(self, other: "Graph", node: int, args: tuple[int, ...]) -> int:
+        """The node that is here with `args` what `node` is in another graph."""
+        return self._node(other.op[node], args, other.value[node], other.varies[node])
 
     def _node(self, op: str, args: tuple[int, ...] = (), value=None, varies: bool | None = None) -> int:
         key = (op, args, value)
