@@ -25,7 +25,7 @@ from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.lowering import appell, kept_rows, lower
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.models import MODELS
-from jourdain_jax.motion.integrators import erk_loop, erk_step, recorded_adjoint, step_adjoint
+from jourdain_jax.motion.integrators import crossings, erk_loop, erk_step, recorded_adjoint, step_adjoint
 from jourdain_jax.motion.integrators.tableaus import method_of
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.program.evaluate import Probes
@@ -115,7 +115,9 @@ def a_program_knows_where_rows_are_parallel():
 # Steps
 
 
-def loop(kind: str, rates: Callable, *, rtol: float, project=None, events=None, knots=None, solver=None, dt0: float = 1.0, longest=np.inf) -> Callable:
+def loop(
+    kind: str, rates: Callable, *, rtol: float, project=None, events=None, knots=None, solver=None, dt0: float = 1.0, longest=np.inf, relations=None
+) -> Callable:
     """`(y0, t0, goals, args)` -> saved states and the loop's own account."""
 
     def run(y0, t0, goals, args):
@@ -132,6 +134,9 @@ def loop(kind: str, rates: Callable, *, rtol: float, project=None, events=None, 
             longest=longest * one,
             max_steps=2000,
             knots=None if knots is None else jnp.asarray(knots),
+            relations=relations,
+            relation_count=0 if relations is None else 2,
+            resolved=2e-3 * one,
         )
         ys, _, end = erk_loop.integrate(problem, method_of(solver or diffrax.Dopri8()), y0, t0, goals, dt0, kind)
         return ys, end
@@ -173,6 +178,27 @@ def steps_are_no_longer_than_allowed():
     run = loop("forward", lambda t, y, args: jnp.ones(1), rtol=1e-3, longest=0.25)
     _, end = jax.jit(run)(jnp.zeros(1), jnp.array(0.0), jnp.array([2.0]), None)
     assert int(end.accepted) == 8, "the longest step"
+
+
+def a_pulse_is_met():
+    def within(t):
+        return (jnp.abs(t - 0.7) < 0.01) * 1.0
+
+    def watched(args, t, y):
+        return jnp.stack([t - 0.7, 0.01 - jnp.abs(t - 0.7)])
+
+    run = loop("forward", lambda t, y, args: within(t)[None], rtol=1e-6, longest=0.5, relations=watched)
+    _, end = jax.jit(run)(jnp.zeros(1), jnp.array(0.0), jnp.array([2.0]), None)
+    assert int(end.crossings.count) == 3, "crossings"
+    np.testing.assert_allclose(end.y, 0.02, atol=1e-4, err_msg="pulse")
+    assert int(end.rejected) < 80, f"too many refused steps, {end.rejected}"
+    assert int(end.accepted) < 100, "too many steps"
+
+
+def a_pulse_within_a_step_is_named():
+    run = loop("forward", lambda t, y, args: 0 * y, rtol=1e-6, longest=0.5, relations=lambda args, t, y: jnp.stack([t - 0.7, 1e-5 - jnp.abs(t - 0.7)]))
+    _, end = jax.jit(run)(jnp.zeros(1), jnp.array(0.0), jnp.array([2.0]), None)
+    assert abs(end.crossings.together - 0.7) < 3e-3, "not named"
 
 
 # Their derivatives in reverse mode
@@ -330,6 +356,11 @@ MUTANTS = [
     Mutant("no dips", erk_step, "_monitored", "dips = accept & dip.happens", "dips = accept & False", an_event_within_a_step_ends_the_motion, "passed over"),
     Mutant("the first step without a bound", erk_loop, "begun", "jnp.minimum(jnp.abs(dt0), problem.longest)", "jnp.abs(dt0)", LONGEST, "the longest step"),
     Mutant("no bound of steps", erk_step, "_tried", "jnp.minimum(size * factor, problem.longest)", "size * factor", LONGEST, "the longest step"),
+    Mutant("no step refused", crossings.Crossings, "watched", "(fits & (count > 0) & (", "(fits & (count < 0) & (", a_pulse_is_met, "pulse"),
+    Mutant("steps as long as the way that is left", crossings.Crossings, "reach", "0.5 * (self.by", "1.0 * (self.by", a_pulse_is_met, "too many|crossings"),
+    Mutant("signs of the first state", crossings.Watched, "noted", "jnp.where(counts, self.last, before.last)", "before.last", a_pulse_is_met, "crossings"),
+    Mutant("a change never behind", crossings.Watched, "noted", "passed = counts & (", "passed = ~counts & counts & (", a_pulse_is_met, "too many|crossings"),
+    Mutant("only the ends of a step", crossings.Crossings, "watched", "+ 2 * jnp.any(", "+ 0 * jnp.any(", a_pulse_within_a_step_is_named, "not named"),
     Mutant("no cotangents of later stages", step_adjoint, "step_vjp", "as_in(b, g) * g + weighted(column, G)", "as_in(b, g) * g", TIMES, "derivative"),
     Mutant(
         "one stage without parameters",

@@ -15,7 +15,7 @@ from test_mutants import Mutant
 
 import jourdain_jax as jj
 from jourdain_jax.motion import integration, put_on_rows
-from jourdain_jax.motion.native import back, functions, kernel, loop, native_motion, onto_rows, search, step
+from jourdain_jax.motion.native import back, crossings, functions, kernel, loop, native_motion, onto_rows, search, step
 from jourdain_jax.motion.simulate import set_up
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native import ffi
@@ -64,6 +64,22 @@ class Dips(jj.Scene):
 
     def events(self, motion):
         return {"dip": (motion.q.x - 0.52) ** 2 - 1e-4}
+
+
+class Strip(jj.Scene):
+    """A bead that is braked within `width` of 0.7 m."""
+
+    width: float = jj.parameter(0.02)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(1.0, jnp.stack([q.x, 0 * q.x, 0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=jnp.where(jnp.abs(motion.q.x - 0.7) < self.width, -3.0, 0.0)),)
+
+    def events(self, motion):
+        return {"window": jnp.abs(motion.q.x - 1.2) - self.width + 0.02}
 
 
 def pushed_position(t, x, v, k):
@@ -124,6 +140,29 @@ def steps_are_no_longer_than_allowed():
 def series_are_no_longer_than_allowed():
     found = jax.jit(lambda: motion(Dips(), {"x": 0.0, "x_rate": -1.0}, ts=[2.0], solver=jj.Taylor(), max_step=0.25))()
     assert int(found.accepted) == 8, "the longest step"
+
+
+def strip(width, **options):
+    options = {"ts": [2.0], "rtol": 1e-6, "atol": 1e-6, "max_steps": 400} | options
+    return jax.jit(lambda: motion(Strip(width), {"x": 0.0, "x_rate": 1.0}, **options))()
+
+
+def a_strip_is_met():
+    found, v = strip(0.004, events=False), np.sqrt(1 - 6 * 0.008)
+    assert int(found.crossings) == 3, "crossings"
+    np.testing.assert_allclose(found.y_end.q, 0.704 + v * (2 - 0.696 - (1 - v) / 3), atol=1e-3, err_msg="strip")
+    assert int(found.rejected) < 80, f"too many refused steps, {found.rejected}"
+    assert int(found.accepted) < 100, "too many steps"
+
+
+def a_strip_within_a_step_is_named():
+    assert abs(strip(1e-5, events=False, rtol=1e-2, atol=1e-2).together - 0.7) < 3e-3, "not named"
+
+
+def an_event_where_a_relation_changes_is_found():
+    found = strip(0.02 + 1e-5)
+    assert int(found.code) == results.EVENT, "the event was passed over"
+    assert abs(found.y_end.q[0] - 1.2 + 1e-5) < 1e-9, "place of the event"
 
 
 def a_bead_stays_on_its_circle():
@@ -265,6 +304,7 @@ BACK, ALONG, TIME = reverse_mode_through_saved_times, forward_mode_through_saved
 EVENT_BACK, EVENT_ALONG, EVENT_TWICE = reverse_mode_to_an_event, forward_mode_to_an_event, forward_mode_to_an_event_twice
 BENT, TIMES_BENT = a_hessian_to_an_event, a_hessian_with_respect_to_times
 LONGEST, SERIES_LONGEST = steps_are_no_longer_than_allowed, series_are_no_longer_than_allowed
+STRIP, NAMED, WINDOW = a_strip_is_met, a_strip_within_a_step_is_named, an_event_where_a_relation_changes_is_found
 PROJECTED_BACK = reverse_mode_back_over_projections
 TRIED, WRONG = "_tried_by_stages", "derivative with respect to"
 MUTANTS = [
@@ -281,6 +321,14 @@ MUTANTS = [
     Mutant("states of another lane", loop, "_save", "(number * times + k)", "(0 * number + k)", LANES, "lanes"),
     Mutant("no bound of steps", step, TRIED, ', p["longest"])', ", w.number(math.inf))", LONGEST, "the longest step"),
     Mutant("no bound of series", step, "_tried_by_series", 'rows), p["longest"])', "rows), math.inf)", SERIES_LONGEST, "the longest step"),
+    Mutant("no step refused", crossings, "watched", "(fits & (count > 0.0) & (", "(fits & (count < 0.0) & (", STRIP, "strip"),
+    Mutant("steps as long as the way that is left", crossings, "reach", "w.larger(0.5 * (", "w.larger(1.0 * (", STRIP, "too many|crossings"),
+    Mutant("signs of the first state", crossings, "note", "[w.where(counts, new, old)", "[w.where(counts, old, old)", STRIP, "crossings"),
+    Mutant("a change that is never behind", crossings, "note", "passed = counts & (", "passed = counts & ~counts & (", STRIP, "too many|crossings|strip"),
+    Mutant("only the ends of a step", crossings, "watched", "w.load(w.real, hidden, 0), 2.0", "w.load(w.real, hidden, 0), 0.0", NAMED, "not named"),
+    Mutant(
+        "no event between the ends of a step", crossings, "watched", "w.load(w.real, hidden, 1) > 0.0", "w.load(w.real, hidden, 1) > 9.0", WINDOW, "passed over"
+    ),
     Mutant("no projection", step, "_project", 'w.call("project", "void", p.pointer, t1, y1)', "None", CIRCLE, "circle"),
     Mutant("no events", step, "_monitored", "~search.no_event(w, c_1)", "~search.no_event(w, c_0)", EVENT, "event"),
     Mutant("no dips", step, "_monitored", "dips = accept & dips", "dips = accept & ~accept", DIP, "passed over"),

@@ -26,6 +26,7 @@ from jourdain_jax.lowering.ignorable import ignorable
 from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.lowered import Lowered, NotLowered, Stage
 from jourdain_jax.lowering.massless import may_be_massless
+from jourdain_jax.lowering.relations import relations
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.identity_test import IdentityProbes, equal
@@ -43,7 +44,21 @@ MOST_OPERATIONS = 20_000
 MOST_TERMS = 200  # of one normal form
 SMALL = 1000  # operations: below, further ways are tried
 LARGE = 5000  # operations: above, the explicit way is not tried
-_NODES = ("qdot", "ydot", "z", "pivots", "sizes", "guards", "events", "energies", "projected_q", "projected_u", "fixed")  # fields that are tuples of nodes
+_NODES = (
+    "qdot",
+    "ydot",
+    "z",
+    "pivots",
+    "sizes",
+    "guards",
+    "events",
+    "energies",
+    "relations",
+    "event_relations",
+    "projected_q",
+    "projected_u",
+    "fixed",
+)  # fields that are tuples of nodes
 NOT_SMALL = 4000  # operations: holding ignorable coordinates leaves no small program of so many
 
 
@@ -227,6 +242,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
     rest = iter(outputs)
     nodes = {name: tuple(islice(rest, len(group))) for name, group in groups.items()}
     (power,) = nodes.pop("power")
+    nodes["relations"], nodes["event_relations"] = watched = relations(graph, [*nodes["qdot"], *nodes["ydot"]], nodes["events"], probes)
     sizes = {graph.input(f"usual_pivot_{k}", False): n for k, n in enumerate(nodes["pivots"])}
     stands_for = best.usual | sizes
     names = scene.coordinate_names.entries
@@ -251,7 +267,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
         stages=tuple(stages),
         way=builder.kept.description if builder.kept else way.description,
         seconds=0.0,  # not known yet
-        fixed=graph.fixed([*outputs, *sizes]),
+        fixed=graph.fixed([*outputs, *sizes, *(n for part in watched for n in part)]),
         usual=stands_for,
         states=_some_states(graph, probes, stands_for.values()),
         **nodes,

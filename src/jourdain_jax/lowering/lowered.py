@@ -59,6 +59,8 @@ class Lowered:
     power: int | None  # `rate_of_work` (d(T + V)/dt at constant inputs, or that part of it that is integrated); None where poses are driven
     events: tuple[int, ...]  # values of the stop events, sorted by name; none where they have no scalar form
     energies: tuple[int, ...]  # kinetic and potential
+    relations: tuple[int, ...]  # numbers whose signs decide between branches of the rates (`lowering/relations.py`)
+    event_relations: tuple[int, ...]  # and those that do so in stop events besides
     projected_q: tuple[int, ...]  # coordinates put back onto norms and geometric rows, one step of Gauss-Newton
     projected_u: tuple[int, ...]  # all speeds put back onto the rows; none where dependent speeds are eliminated
     by_partition: bool  # all speeds are in the state, but the accelerations come from privileged ones
@@ -218,6 +220,14 @@ class Lowered:
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
         """
         return self._stacked(self.events, fixed, t, q, y, inputs)
+
+    def watched(self, has_events: bool) -> tuple[int, ...]:
+        """The numbers whose signs are watched over every step, in the rates and, where it `has_events`, in those."""
+        return (*self.relations, *(self.event_relations if has_events else ()))
+
+    def values(self, nodes: Sequence[int], fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "nodes *lanes"]:
+        """Values of `nodes`; `fixed`, `t`, `q`, `y`, `inputs`: as in `rates`."""
+        return self._stacked(nodes, fixed, t, q, y, inputs)
 
     def _stacked(self, nodes: Sequence[int], fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "nodes *lanes"]:
         out, like = run(self.graph, nodes, self._known(fixed, t, q, y, inputs)), q[0]

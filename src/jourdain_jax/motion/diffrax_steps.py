@@ -38,6 +38,7 @@ class Diffrax(Integrator):
     max_steps: int = eqx.field(static=True)
     event_names: tuple[str, ...] = eqx.field(static=True)
     projects_saved: ClassVar[bool] = False
+    watches: ClassVar[bool] = False
 
     @property
     def name(self) -> str:
@@ -118,6 +119,8 @@ class Diffrax(Integrator):
             rejected=solution.stats["num_rejected_steps"],
             last_step=jnp.full_like(t_end, jnp.nan),
             pivot=seen.pivot,
+            crossings=jnp.zeros_like(event),
+            together=jnp.full_like(t_end, jnp.inf),
         )
 
 

@@ -33,6 +33,7 @@ from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
 from jourdain_jax.motion.vector_fields.field import Integrated
+from jourdain_jax.motion.watched import reason_against_watching
 from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.scene.parameters import parameter_faults
 
@@ -134,6 +135,7 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
     violated = rows_violated(setup, states[0], q, u) if field.rows_may_contradict else False
     code = jnp.where(results.is_success(solved.code) & lost, results.ENERGY_LOST, solved.code)
     code = jnp.where(results.is_success(code) & violated, results.CONTRADICTORY_ROWS, code)
+    unwatched = reason_against_watching(setup)
     return Trajectory(
         scene=setup.scene,
         ts=given.ts if integrator.saveat is None else origin + solved.ts,
@@ -154,6 +156,8 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
         accepted=solved.accepted,
         rejected=solved.rejected,
         last_step=solved.last_step,
+        crossings=jnp.full_like(solved.crossings, -1) if unwatched else solved.crossings,
+        together=solved.together,
         fallback=jnp.zeros((), jnp.int32) + results.AS_ASKED,
         moved_q=start.moved_q,
         moved_u=start.moved_u,
@@ -163,6 +167,7 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
         reduction=field.reduction_name if setup.reason_against_machine_code else f"{field.reduction_name} to machine code",
         solver=integrator.name,
         projected=moving,
+        unwatched=unwatched,
         event_names=integrator.event_names,
     )
 

@@ -18,11 +18,13 @@ from jourdain_jax.calculus.guards import reverse_only
 from jourdain_jax.motion.batches.lockstep import in_blocks, width
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators import erk_loop, integrands
+from jourdain_jax.motion.integrators.crossings import RESOLVED
 from jourdain_jax.motion.integrators.of_diffrax import alongside, diffrax
 from jourdain_jax.motion.integrators.tableaus import Method, method_of
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
+from jourdain_jax.motion.watched import watched
 
 Mode = Literal["forward", "reverse"]
 
@@ -40,6 +42,7 @@ class OwnSteps(Integrator):
     controller: ClassVar[None] = None
     saveat: ClassVar[None] = None
     projects_saved: ClassVar[bool] = True
+    watches: ClassVar[bool] = True
 
     @property
     def name(self) -> str:
@@ -113,6 +116,7 @@ def _loop(mode: Mode, setup: Setup, y0, args, ts, knots) -> Solved:
     field, own = setup.field, _own(setup)
     goals = _goals(setup, ts)
     args = args if knots is None else integrands.within(jnp.full_like(setup.t0, jnp.inf), args)
+    relations, relation_count = watched(field, setup.inputs, bool(own.event_names))
     problem = erk_loop.Problem(
         rates=integrands.rates,
         args=args,
@@ -126,6 +130,9 @@ def _loop(mode: Mode, setup: Setup, y0, args, ts, knots) -> Solved:
         max_steps=setup.most_steps(knots),
         knots=knots,
         rates_and_pivots=integrands.rates_and_pivots if field.has_pivots else None,
+        relations=relations,
+        relation_count=relation_count,
+        resolved=RESOLVED * jnp.abs(goals[-1]),
         within=None if knots is None else integrands.within,
     )
     ys, reached, end = erk_loop.integrate(problem, own.solver, y0, jnp.zeros_like(setup.t0), goals, setup.dt0, mode)
@@ -193,4 +200,5 @@ def _goals(setup: Setup, ts) -> Float[Array, "times *lanes"]:
 
 def _as_solved(goals, ys: PyTree, reached, end: erk_loop.Progress) -> Solved:
     ys = jax.tree.map(lambda x: x[:-1], ys)
-    return Solved(goals[:-1], ys, reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, end.pivot)
+    counted = (jnp.zeros_like(end.accepted), jnp.full_like(end.t, jnp.inf)) if end.crossings is None else (end.crossings.count, end.crossings.together)
+    return Solved(goals[:-1], ys, reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, end.pivot, *counted)

@@ -40,6 +40,8 @@ class Solved(eqx.Module):
     rejected: Int[Array, "*lanes"]
     last_step: Float[Array, "*lanes"]  # s, that the step-size control would take next; NaN where it keeps that to itself
     pivot: Float[Array, "*lanes"]  # smallest magnitude of a pivot in any step, negative where one changed its sign; infinite: none was monitored
+    crossings: Int[Array, "*lanes"]  # as in `Trajectory`
+    together: Float[Array, "*lanes"]
 
 
 class Integrator(eqx.Module):
@@ -53,6 +55,7 @@ class Integrator(eqx.Module):
     solver: eqx.AbstractVar["diffrax.AbstractSolver | Method"]
     controller: eqx.AbstractVar["diffrax.AbstractStepSizeController | None"]  # None: the default one
     saveat: eqx.AbstractVar["diffrax.SaveAt | None"]  # None: at the times asked for, at each of which a step ends
+    watches: eqx.AbstractClassVar[bool]  # whether steps watch relations (`crossings.py`)
     projects_saved: eqx.AbstractClassVar[bool]  # whether the states that it returns are on the rows
 
     @property

@@ -132,8 +132,9 @@ class Scene(eqx.Module, metaclass=_SceneClass):
         """Named stop events at a `motion`: positive while it may go on; it stops where a value falls through zero, or is no number beyond.
 
         Of several events in one step the first in time counts. A value that falls through zero and rises again within one step is found where the cubic
-        through values and rates at the ends of the step shows it (default solvers), or the dense output at three times in the step (other adaptive ones);
-        a dip that is shorter than that shows may be passed over: choose values that fall once.
+        through values and rates at the ends of the step shows it (default solvers), or the dense output at three times in the step (other adaptive ones),
+        and where a relation in it (`<`, `where`, `abs`, ...) changes. A smooth dip of a stop event that is narrower than the longest step may be passed over:
+        choose values that fall once, or give a smaller `max_step`.
         """
         return {}
 

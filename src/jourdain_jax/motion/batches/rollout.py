@@ -40,7 +40,7 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 CHUNK = 512  # lanes whose stages fit the cache of a core
-RERUN_FIELDS = ("state_form", "reduction", "solver", "projected")  # of a trajectory, static: they say how a lane was run again
+RERUN_FIELDS = ("state_form", "reduction", "solver", "projected", "unwatched")  # of a trajectory, static: they say how a lane was run again
 MEMORY = 2**30  # bytes of saved states per chunk, at most
 
 
@@ -82,6 +82,11 @@ class Rollout(Printed, eqx.Module):
     def continued(self) -> np.ndarray:
         """Numbers of the lanes that lost their privileged speeds and were run again with the full state."""
         return np.flatnonzero(np.asarray(self.lanes.fallback) & results.FULL_STATE)
+
+    @property
+    def crossed_together(self) -> np.ndarray:
+        """Numbers of the lanes of which a step crossed two or more relations at once: what acts between them may be missed."""
+        return np.flatnonzero(np.isfinite(self.lanes.together))
 
     def quantiles(self, name: str, levels: Sequence[float] = (0.025, 0.5, 0.975)) -> np.ndarray:
         """Quantiles over lanes of the coordinate or speed `name` at all times, for the given `levels` (0 to 1), shape (levels, times).
@@ -131,6 +136,8 @@ class Rollout(Printed, eqx.Module):
         stiff = int(np.count_nonzero(np.asarray(self.lanes.fallback) & results.IMPLICIT))
         if stiff:
             lines.append(f"  {stiff} are stiff and were run with an implicit solver")
+        if self.crossed_together.size:
+            lines.append(f"  {len(self.crossed_together)} crossed two or more relations in one step, which may miss what acts between them: give `max_step`")
         steps = np.asarray(self.lanes.accepted)
         lines.append(f"  steps accepted: {steps.min()} to {steps.max()}, median {int(np.median(steps))}")
         return "\n".join(lines)

@@ -13,6 +13,7 @@ increments are smaller than its last digit stands still while time passes, and n
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -22,7 +23,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
-from jourdain_jax.motion.integrators import event_search
+from jourdain_jax.motion.integrators import crossings, event_search
+from jourdain_jax.motion.integrators.crossings import Crossings
 from jourdain_jax.motion.integrators.event_search import Search
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.trajectories import results
@@ -46,6 +48,7 @@ class Progress(eqx.Module):
     search: Search | None  # for that event
     pivot: Float[Array, "*lanes"]  # smallest magnitude so far of a pivot, at any stage of an accepted step
     rest: PyTree  # what rounding has left off `y`, to be added by the next step; None where that cannot add up to much
+    crossings: Crossings | None  # of relations, where there are any
 
 
 class Problem(eqx.Module):
@@ -64,6 +67,9 @@ class Problem(eqx.Module):
     knots: Float[Array, "knots *lanes"] | None = None  # times at which a step must end, in the order of the motion; the last are infinite, with its sign
     # as `rates`, and pivots (pivots, *lanes) that must keep their signs; None: the rates have none
     rates_and_pivots: Callable | None = None
+    relations: Callable | None = None  # (args, t, y) -> numbers whose signs are watched, (numbers, *lanes): first so many relations, then stop events
+    relation_count: int = eqx.field(static=True, default=0)
+    resolved: Float[Array, "*lanes"] | None = None  # the length of a step in which they may change
     within: Callable | None = None  # (t, args) -> args for the stages of a step with the middle t; None: the same in all steps
 
     def in_step(self, t, h) -> "Problem":
@@ -101,7 +107,8 @@ def standing(problem: Problem, y: PyTree, t: Float[Array, "*lanes"], h: Float[Ar
     zero = jnp.zeros(jnp.shape(t), jnp.int32)
     rest = jax.lax.stop_gradient(jax.tree.map(jnp.zeros_like, y)) if _rounding_adds_up(problem, y) else None
     no_pivot = jax.lax.stop_gradient(jnp.full_like(t, jnp.inf))
-    return Progress(t, y, h, zero + RUNNING, problem.knots_passed(t, direction), zero, zero, zero - 1, None, no_pivot, rest)
+    watched = None if problem.relations is None else crossings.begun(problem.relations(problem.args, t, y), direction)
+    return Progress(t, y, h, zero + RUNNING, problem.knots_passed(t, direction), zero, zero, zero - 1, None, no_pivot, rest, watched)
 
 
 def _rounding_adds_up(problem: Problem, y: PyTree) -> bool:
@@ -126,8 +133,9 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
     knot = problem.knot_ahead(p, direction)
     target = jnp.where((knot - goal) * direction < 0, knot, goal)
     rest = jnp.abs(target - p.t)
-    lands = ~locating & (p.h >= 0.999 * rest)
-    size = jnp.where(lands, rest, jnp.where(2 * p.h > rest, 0.5 * rest, p.h))
+    reach = p.h if p.crossings is None else jnp.minimum(p.h, p.crossings.reach(p.t, direction, problem.resolved))
+    lands = ~locating & (reach >= 0.999 * rest)
+    size = jnp.where(lands, rest, jnp.where(2 * reach > rest, 0.5 * rest, reach))
     shortened = size < p.h
     h = direction * size if p.search is None else jnp.where(locating, p.search.shift, direction * size)
     t1 = jnp.where(lands, target, p.t + h)
@@ -152,6 +160,12 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
     factor = jnp.clip(jnp.where(jnp.isfinite(size_of_error), factor, 0.0), LEAST_FACTOR, jnp.where(accept, LARGEST_FACTOR, 1.0))
     proposed = jnp.minimum(size * factor, problem.longest)
     next_h = jnp.where(accept & shortened, jnp.maximum(proposed, p.h), proposed)
+    watched = None
+    if p.crossings is not None and problem.relations is not None:
+        watched = p.crossings.watched(
+            partial(problem.relations, problem.args), problem.relation_count, (p.t, p.y), (t1, y1), accept & ~locating, h, problem.resolved
+        )
+        accept, next_h = accept & ~watched.refused, jnp.where(watched.refused, jnp.where(watched.falls, watched.to_event, p.h), next_h)
     accepted, rejected = p.accepted + (accept & ~locating).astype(jnp.int32), p.rejected + (~accept).astype(jnp.int32)
     too_short = (next_h < problem.shortest) | (t1 + direction * next_h == t1)  # the second: no time would pass
     code = jnp.where(too_short, results.STEP_TOO_SMALL, RUNNING)
@@ -159,14 +173,18 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
     y = jax.tree.map(lambda new, old: jnp.where(accept, as_in(new, old), old), y1, p.y)
     rest = jax.tree.map(lambda new, old: jnp.where(accept & ~locating, new, old), rest, p.rest)
     passed = p.knot + (accept & ~locating & (t1 == knot)).astype(jnp.int32)
-    moved = Progress(jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, passed, accepted, rejected, p.event, p.search, p.pivot, rest)
+    moved = Progress(
+        jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, passed, accepted, rejected, p.event, p.search, p.pivot, rest, p.crossings
+    )
     if problem.events is not None:
         slopes = [jax.tree.map(lambda k, i=i: k[i], slopes) for i in (0, method.at_the_end)]  # first and last
         moved = _monitored(problem, p, moved, h, slopes, accept & ~locating & (code == RUNNING))
-    if pivots is None:
-        return moved
     # what lies beyond an event does not count
     counts = accept & ~locating & (moved.code == RUNNING) & (moved.t == t1)
+    if watched is not None and p.crossings is not None:
+        moved = replace(moved, crossings=watched.noted(p.crossings, t1, direction, counts | (locating & (moved.code == results.EVENT))))
+    if pivots is None:
+        return moved
     pivot = jnp.where(counts, jnp.minimum(p.pivot, pivots.smallest), p.pivot)
     return replace(moved, pivot=pivot, code=jnp.where(counts & (pivot < SMALLEST_PIVOT), results.SINGULAR_PARTITION, moved.code).astype(jnp.int32))
 
@@ -286,4 +304,6 @@ def _monitored(problem: Problem, p: Progress, moved: Progress, h, slopes, accept
     tried = dips.astype(jnp.int32)
     knot = jnp.where(dips, p.knot, moved.knot)
     rest = jax.tree.map(lambda new, old: jnp.where(dips, old, new), moved.rest, p.rest)
-    return Progress(t, y, jax.lax.stop_gradient(next_h), code, knot, moved.accepted - tried, moved.rejected + tried, event, search, moved.pivot, rest)
+    return Progress(
+        t, y, jax.lax.stop_gradient(next_h), code, knot, moved.accepted - tried, moved.rejected + tried, event, search, moved.pivot, rest, moved.crossings
+    )

@@ -13,10 +13,11 @@ from typing import NamedTuple
 
 from jourdain_jax.lowering.jacobian import on_its_own
 from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.lowering.relations import MOST_WATCHED
 from jourdain_jax.motion.native.layout import Lanes, Layout
 from jourdain_jax.motion.native.samples import looked_up
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.scalar_program import as_real, written
+from jourdain_jax.native.scalar_program import as_real, written, written_in_turn
 from jourdain_jax.program.derivative import directional_derivative
 from jourdain_jax.program.graph import Graph
 
@@ -50,12 +51,24 @@ class Form:
             len(program.events) if self.has_events else 0,
             tuple(map(len, self.moving)),
             len(self.sampled),
+            len(self.watched),
         )
 
     @property
     def pivots(self) -> int:
         """How many are monitored."""
         return len(self.program.pivots) if self.has_pivots else 0
+
+    @property
+    def relations(self) -> tuple[int, ...]:
+        """The numbers whose signs are watched; none where there are too many."""
+        found = self.program.watched(self.has_events)
+        return found if len(found) <= MOST_WATCHED else ()
+
+    @property
+    def watched(self) -> tuple[int, ...]:
+        """These, and the values of stop events that relations decide."""
+        return (*self.relations, *(self.program.events if self.relations and self.has_events and self.program.event_relations else ()))
 
     @property
     def moves(self) -> list[int]:
@@ -69,7 +82,7 @@ class Form:
         projected = [*program.projected_q, *program.projected_u] if self.projects else []
         events = program.events if self.has_events else ()
         power = [program.power] if self.with_work and program.power is not None else []
-        return [*program.qdot, *program.ydot, *power, *program.guards, *program.pivots, *projected, *events]
+        return [*program.qdot, *program.ydot, *power, *program.guards, *program.pivots, *projected, *events, *self.watched]
 
 
 class Outputs(NamedTuple):
@@ -178,6 +191,14 @@ def write_projection(w: Writer, form: Form) -> None:
     with w.function("project", "void", {"state": "ptr", "tau": w.real, "y": "ptr"}) as (state, tau, y):
         for q_moves in form.moves:
             w.call("projected_once", "void", state, tau, y, w.literal(q_moves, "i1"))
+        w.give()
+
+
+def write_relations(w: Writer, form: Form) -> None:
+    """`relations(state, tau, y, values)`: the numbers whose signs are watched, of the state `y`."""
+    with w.function("relations", "void", {"state": "ptr", "tau": w.real, "y": "ptr", "values": "ptr"}, attributes="noinline") as (state, tau, y, values):
+        for i, x in written_in_turn(w, form.program.graph, form.watched, known_values(w, form, state, tau, y)):
+            w.store(as_real(w, x), values, i)
         w.give()
 
 

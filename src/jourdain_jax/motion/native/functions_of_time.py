@@ -14,6 +14,7 @@ import numpy as np
 
 from jourdain_jax.build.trace import Variables
 from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.lowering.relations import switches
 from jourdain_jax.motion.input_programs import FunctionOfTime, TimeProgram
 from jourdain_jax.program.graph import ARRAYS, Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
@@ -44,6 +45,8 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
         return f"an input is a function of time without scalar form ({error})"
     power = [] if program.power is None else [program.power]
     outputs = [*program.qdot, *program.ydot, *power, *program.pivots, *program.guards, *program.events, *program.projected_q, *program.projected_u]
+    outputs += [*program.relations, *program.event_relations]
+    of_functions = [new[n] for n in program.traced.inputs.tolist() if n in new]
     new = graph.copied(outputs, program.graph, new)
 
     def on_it(nodes: Iterable[int]) -> tuple[int, ...]:
@@ -64,6 +67,8 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
         pivots=on_it(program.pivots),
         guards=on_it(program.guards),
         events=on_it(program.events),
+        relations=tuple(dict.fromkeys([*on_it(program.relations), *switches(graph, of_functions)])),
+        event_relations=on_it(program.event_relations),
         projected_q=on_it(program.projected_q),
         projected_u=on_it(program.projected_u),
         z=(),  # what is seen of a motion is evaluated with the values of inputs

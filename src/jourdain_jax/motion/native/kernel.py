@@ -38,7 +38,7 @@ class Start(NamedTuple):
         """The rows of a lane at the time t since the start, which has tangents."""
         rtol, atol, shortest, longest, first, most = self.control
         zero, one = jnp.zeros(()), jnp.ones(())
-        progress = [t, jnp.minimum(jnp.abs(first), longest), RUNNING * one, zero, zero, -one, jnp.inf * one, *dt]
+        progress = [t, jnp.minimum(jnp.abs(first), longest), RUNNING * one, zero, zero, -one, jnp.inf * one, zero, jnp.inf * one, *dt]
         limits = [jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, longest, most, self.origin]
         known = [jnp.stack(part) for part in self.known if part]  # each tangent by itself: values may have no lanes where tangents have
         return jnp.concatenate([*self.y, jnp.stack(progress), jnp.stack(limits), *known])

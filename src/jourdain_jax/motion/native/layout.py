@@ -5,7 +5,8 @@ pushed along, the state is followed by its own, and so are the numbers that the 
 derivatives of order n in directions e_1 to e_n the tangents are 2^n - 1, in the order of the binary numbers that say which e_i are taken together: of the
 second order those along e_1, e_2, and both. Where inputs are given by samples, rows of pointers and whole numbers say where the samples of a lane are
 (`table`), how many each input has (`samples`), and where the next knot is at which a step must end (`knot`). `taken` is by how far the last step has gone; of
-a step by Taylor series, `before` is the time at which it began, and `bound` how long the next one may be after one that was rejected.
+a step by Taylor series, `before` is the time at which it began, and `bound` how long the next one may be after one that was rejected. `last` are the numbers
+whose signs are watched, and by the time `crossing_by` one of them is known to change (`motion/integrators/crossings.py`).
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from itertools import pairwise
 
 from jourdain_jax.native.ir import Value, Writer
 
-PROGRESS = ("t", "h", "code", "accepted", "rejected", "event", "pivot")
+PROGRESS = ("t", "h", "code", "accepted", "rejected", "event", "pivot", "crossings", "together")
 SAMPLES = ("table", "samples", "knot")
 CONTROL = ("direction", "last_goal", "rtol", "atol", "shortest", "longest", "max_steps", "origin")
 
@@ -30,6 +31,7 @@ class Layout:
     events: int
     moving: tuple[int, ...] = ()  # of every tangent, how many of those known have it
     sampled: int = 0  # how many of the inputs are given by samples
+    watched: int = 0  # numbers whose signs are watched
 
     @property
     def y(self) -> int:
@@ -59,6 +61,7 @@ class Layout:
         counts = {"y": self.integrated, **dict.fromkeys(PROGRESS, 1), "dt": len(self.moving), **dict.fromkeys(CONTROL, 1)}
         counts |= {"known": self.known, "dknown": sum(self.moving)}
         counts |= {"goal": 1, "taken": 1, "before": 1, "bound": 1, **(search if self.events else {}), **dict.fromkeys(SAMPLES if self.sampled else (), 1)}
+        counts |= {"last": self.watched, "crossing_by": 1} if self.watched else {}
         found, first = {}, 0
         for name, count in counts.items():
             found[name] = range(first, first + count)

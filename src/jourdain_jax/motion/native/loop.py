@@ -9,7 +9,7 @@ import math
 
 from jourdain_jax.motion.integrators.erk_step import LOCATING, RUNNING, Method
 from jourdain_jax.motion.native import samples
-from jourdain_jax.motion.native.functions import Form, write_events, write_projection, write_rates
+from jourdain_jax.motion.native.functions import Form, write_events, write_projection, write_rates, write_relations
 from jourdain_jax.motion.native.layout import Lanes
 from jourdain_jax.motion.native.step import IDLE, write_step
 from jourdain_jax.motion.native.taylor import TaylorSteps
@@ -45,6 +45,8 @@ def write_functions(w: Writer, form: Form, method: Method | TaylorSteps) -> None
         write_projection(w, form)
     if form.has_events:
         write_events(w, form)
+    if form.relations:
+        write_relations(w, form)
     write_step(w, form, method)
 
 

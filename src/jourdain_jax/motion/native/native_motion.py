@@ -15,6 +15,7 @@ from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.input_programs import FunctionOfTime
 from jourdain_jax.motion.inputs import Constant, Inputs, Sampled
+from jourdain_jax.motion.integrators.crossings import Crossings
 from jourdain_jax.motion.integrators.erk_loop import ended
 from jourdain_jax.motion.integrators.erk_step import Progress
 from jourdain_jax.motion.integrators.tableaus import Method
@@ -74,7 +75,7 @@ def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events
         return "the scene itself holds samples"
     if not all(isinstance(channel, Constant | Sampled | FunctionOfTime) for channel in inputs.channels):
         return "an input is a function of time that holds arrays of its own"
-    if isinstance(reason := _driven(field.program, inputs), str):
+    if isinstance(reason := driven(field.program, inputs), str):
         return reason
     if has_events and not field.lowers_events:
         return "a stop event is no part of the scalar program"
@@ -133,7 +134,7 @@ def reason_against_derivatives(form: Form, order: int) -> str:
     return ""
 
 
-def _driven(program: Lowered, inputs: Inputs) -> Lowered | str:
+def driven(program: Lowered, inputs: Inputs) -> Lowered | str:
     """The program that takes numbers and samples alone, or why there is none."""
     if not inputs.programs:
         return program
@@ -144,7 +145,7 @@ def form_of(field: VectorField, inputs: Inputs, has_events: bool) -> Form:
     """What machine code integrates."""
     assert isinstance(field, ByProgram)
     sampled = tuple(i for i, channel in enumerate(_others(inputs)) if isinstance(channel, Sampled))
-    program = _driven(field.program, inputs)
+    program = driven(field.program, inputs)
     assert not isinstance(program, str), program
     return Form(program, field.with_work, field.projects, field.affine, has_events, field.has_pivots, sampled=sampled)
 
@@ -250,12 +251,12 @@ def _packed(y: Integrated) -> Float[Array, "y"]:
 
 
 def _unpacked(layout: Layout, goals, found: Found) -> tuple[Integrated, Bool[Array, "times"], Progress]:
-    h, code, accepted, rejected, event, pivot, count = found.rest
+    h, code, accepted, rejected, event, pivot, crossings, together, count = found.rest
     (states,), (end,), (t,) = found[:3]
     reached = (jnp.arange(len(goals)) < count) | (goals == t)
-    numbers = [x.astype(jnp.int32) for x in (code, accepted, rejected, event)]
-    code, accepted, rejected, event = numbers
-    last = Progress(t, _state(layout, end), h, code, jnp.zeros((), jnp.int32), accepted, rejected, event, None, pivot, None)
+    code, accepted, rejected, event, crossings = (x.astype(jnp.int32) for x in (code, accepted, rejected, event, crossings))
+    seen = Crossings(None, None, crossings, together) if layout.watched else None
+    last = Progress(t, _state(layout, end), h, code, jnp.zeros((), jnp.int32), accepted, rejected, event, None, pivot, None, seen)
     return jax.vmap(lambda y: _state(layout, y))(states), reached, ended(last, 0.0)
 
 

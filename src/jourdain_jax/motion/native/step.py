@@ -10,7 +10,7 @@ import numpy as np
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.integrators.erk_step import LARGEST_FACTOR, LEAST_FACTOR, LOCATING, NOISE, RUNNING, SAFETY, Method
 from jourdain_jax.motion.integrators.event_search import DIFFERENTIABLE
-from jourdain_jax.motion.native import search
+from jourdain_jax.motion.native import crossings, search
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.layout import Lanes, Layout
 from jourdain_jax.motion.native.taylor import TaylorSteps, at_time, jet, monitored_at, radius, slope
@@ -37,6 +37,8 @@ def write_step(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
     """`step(state, k)`: one step, tried by all lanes that are on their way; `k`: room for the slopes of its stages, or for Taylor coefficients."""
     with w.function("step", "void", {"state": "ptr noalias", "k": "ptr noalias"}, attributes="noinline") as (state, k):
         lanes = Lanes(w, form.layout, state)
+        if form.relations:
+            crossings.write_begin(w, form, lanes)
         if isinstance(method, TaylorSteps):
             _take(w, form, method, lanes, w.at(k, form.layout.integrated, w.real), _tried_by_series(w, form, method, lanes, k))
         else:
@@ -50,8 +52,9 @@ def _tried_by_stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value) 
     t, h, goal, direction = p["t"], p["h"], p["goal"], p["direction"]
     locating = p["code"].equals(float(LOCATING))
     rest = w.magnitude(goal - t)
-    lands = ~locating & (h >= 0.999 * rest)
-    size = w.where(lands, rest, w.where(2.0 * h > rest, 0.5 * rest, h))
+    reach = crossings.reach(w, form, p, h)
+    lands = ~locating & (reach >= 0.999 * rest)
+    size = w.where(lands, rest, w.where(2.0 * reach > rest, 0.5 * rest, reach))
     shortened = size < h
     step = w.where(locating, p["search_shift"], direction * size) if form.has_events else direction * size
     t1 = w.where(lands, goal, t + step)
@@ -84,7 +87,7 @@ def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Va
         for j, x in enumerate(series):
             w.store(w.number(0.0) if x is None else x, k, j * count + row)
     length = w.smaller(radius(w, layout, p, rows), p["longest"])
-    size = w.smaller(length, p["bound"])
+    size = crossings.reach(w, form, p, w.smaller(length, p["bound"]))
     rest = w.magnitude(last_goal - t)
     lands = ~locating & (size >= 0.999 * rest)
     size = w.where(lands, rest, size)
@@ -121,6 +124,11 @@ def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Valu
     rows = range(layout.integrated)
     t, code, direction = p["t"], p["code"], p["direction"]
     locating = code.equals(float(LOCATING))
+    watched = crossings.watched(w, form, p, trial.t1, trial.step, trial.y1, trial.accept & ~locating) if form.relations else None
+    if watched is not None:
+        trial = trial._replace(
+            accept=trial.accept & ~watched.refused, next_h=w.where(watched.refused, w.where(watched.falls, watched.to_event, p["h"]), trial.next_h)
+        )
     t1, step, y1, accept, next_h, _ = trial
     accepted = p["accepted"] + _count(w, accept & ~locating)
     rejected = p["rejected"] + _count(w, ~accept)
@@ -138,6 +146,9 @@ def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Valu
         pivot = w.where(counts, w.smaller(p["pivot"], trial.pivot), p["pivot"])
         new |= {"pivot": pivot, "code": w.where(counts & (pivot < SMALLEST_PIVOT), float(results.SINGULAR_PARTITION), new["code"])}
     moving = locating | code.equals(float(RUNNING))
+    if watched is not None:
+        stays = accept & ~locating & new["code"].equals(float(RUNNING)) & new["t"].equals(t1)
+        crossings.note(w, p, watched, t1, moving, stays | (locating & new["code"].equals(float(results.EVENT))))
     each_row(w, rows, y, lambda i: w.where(moving, w.load(w.real, y1, i), w.load(w.real, y, i)))
     for name, value in new.items():
         p[name] = w.where(moving, value, w.number(0.0) if name == "taken" else p[name])

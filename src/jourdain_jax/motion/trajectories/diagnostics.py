@@ -158,6 +158,11 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
             f"the clock resolves {resolved:.0e} s at these times, and steps are of {step:.0e} s: loads, poses and inputs that depend on time are given "
             "rounded times; count time from zero, or take float64"
         )
+    if np.isfinite(float(trajectory.together)):
+        warned.append(
+            "two or more relations (`<`, `where`, `sign`, `abs`, `floor`, ...) changed in the one step that ends at "
+            f"t = {float(trajectory.together):.6g} s: what acts between them may be missed; give a smaller `max_step`, or a shorter span"
+        )
     pulled = [name for name, contact in found.contacts.items() if not contact.honest]
     return (*warned, *(f"contact `{name}` would have to pull: a real one lifts off" for name in pulled))
 
@@ -179,6 +184,8 @@ def summary_rows(trajectory: Record, message: str) -> list[tuple[str, str]]:
         *([("run again", FALLBACKS[int(trajectory.fallback)].removeprefix("run again ") + _left_domain(trajectory))] if int(trajectory.fallback) else []),
         ("state", f"{trajectory.state_form}, reduction: {trajectory.reduction}" + (", projected after each step" if trajectory.projected else "") + pivot),
         *([("dense", dense)] if dense else []),
+        *([("relations", f"{int(trajectory.crossings)} crossings")] if int(trajectory.crossings) > 0 else []),
+        *([("relations", f"not watched: {trajectory.unwatched}")] if trajectory.unwatched else []),
         ("energy", f"drift {float(found.energy_drift):.2e} J of {found.energy_kind}" if several else "drift is not seen: one time was saved"),
         ("residuals", f"position {float(found.position_residual):.1e}, velocity {float(found.velocity_residual):.1e}"),
         ("rows", f"rank {low if low == high else f'{low} to {high}'}, smallest singular value {float(found.smallest_singular_value):.2e}"),

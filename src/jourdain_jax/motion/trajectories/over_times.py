@@ -46,6 +46,8 @@ class Record(eqx.Module):
     accepted: Int[Array, ""]  # steps
     rejected: Int[Array, ""]
     last_step: Float[Array, ""]  # s, that the step-size control would take next; NaN where it keeps that to itself
+    crossings: Int[Array, ""]  # how often relations of loads, poses and rows (`<`, `abs`, `floor`, ...) changed their sides; -1: not watched
+    together: Float[Array, ""]  # s, the end of the first step in which two or more of them did; infinite: none
     fallback: Int[Array, ""]  # in what other way the motion was run again, see `results.FALLBACKS`; 0: as asked
     moved_q: Float[Array, ""]  # how far the start was moved onto the constraints
     moved_u: Float[Array, ""]
@@ -57,6 +59,7 @@ class Record(eqx.Module):
     reduction: str = eqx.field(static=True)
     solver: str = eqx.field(static=True)
     projected: bool = eqx.field(static=True)
+    unwatched: str = eqx.field(static=True)  # why steps do not watch relations, in words; empty where they do, or there are none
     event_names: tuple[str, ...] = eqx.field(static=True)
 
 

@@ -1,10 +1,10 @@
 """Saving and loading motions: NumPy's `.npz`, readable by anything that reads `.npz`.
 
 Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `work` (times; absent where not tracked), `t_end`, `q_end`, `u_end`,
-`result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `last_step`, `fallback`, `inputs` (times, inputs;
+`result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `last_step`, `crossings`, `together`, `fallback`, `inputs` (times, inputs;
 sampled at `ts`), and `parameter:NAME` for every field that is an array. `header` is JSON text: `format`, `kind`, `scene` (class name), `coordinates`,
 `speeds`, `input_names`, `units` of the parameters, `static` (fields that are plain numbers or texts),
-`state_form`, `reduction`, `solver`, `projected`, `event_names`, `arrays` (names of all arrays), `versions`.
+`state_form`, `reduction`, `solver`, `projected`, `unwatched`, `event_names`, `arrays` (names of all arrays), `versions`.
 `kind` is "trajectory" or "rollout"; in a rollout every array has a leading axis of lanes (so `result` is one code per lane), and `reruns` in its header
 says how lanes with a `fallback` were run.
 

@@ -15,13 +15,15 @@ from jourdain_jax.motion.trajectories.results import BAD_PARAMETER, EVENT, FALLB
 from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.scene import Scene
 
-COUNTS = ("result", "event", "accepted", "rejected", "fallback")
+COUNTS = ("result", "event", "accepted", "rejected", "fallback", "crossings")
 # arrays and their axes, after that of the lanes of a rollout
 AXES: dict[str, tuple[str, ...]] = {"ts": ("times",), "q": ("times", "coordinates"), "u": ("times", "speeds"), "inputs": ("times", "input_names")}
-AXES |= {"q_end": ("coordinates",), "u_end": ("speeds",)} | dict.fromkeys(("t_end", "last_step", "moved_q", "moved_u", "smallest_pivot", *COUNTS), ())
+AXES |= {"q_end": ("coordinates",), "u_end": ("speeds",)} | dict.fromkeys(
+    ("t_end", "last_step", "moved_q", "moved_u", "smallest_pivot", "together", *COUNTS), ()
+)
 AXES |= {"work": ("times",)}  # absent where it is not tracked
 # entries of the header: their type, in words too
-HEADER: dict[str, tuple[type, str]] = dict.fromkeys(("scene", "state_form", "reduction", "solver", "kind"), (str, "a text"))
+HEADER: dict[str, tuple[type, str]] = dict.fromkeys(("scene", "state_form", "reduction", "solver", "unwatched", "kind"), (str, "a text"))
 _LISTS = ("coordinates", "speeds", "input_names", "event_names", "arrays")
 HEADER |= dict.fromkeys(_LISTS, (list, "a list of names"))
 HEADER |= {"static": (dict, "a dictionary"), "units": (dict, "a dictionary"), "projected": (bool, "true or false"), "reruns": (list, "a list")}
@@ -70,7 +72,7 @@ def _check_codes(path, header: dict, arrays: dict) -> None:
     events = np.where(arrays["result"] == EVENT, np.arange(len(header["event_names"]) + 1).max() - 1, -1)
     ranges = {"result": np.isin(arrays["result"], list(MESSAGES)), "fallback": np.isin(arrays["fallback"], list(FALLBACKS))}
     ranges["event"] = (arrays["event"] <= events) & (arrays["event"] >= np.where(arrays["result"] == EVENT, 0, -1))
-    ranges |= {name: arrays[name] >= 0 for name in ("accepted", "rejected")}
+    ranges |= {name: arrays[name] >= 0 for name in ("accepted", "rejected")} | {"crossings": arrays["crossings"] >= -1}
     for name, right in ranges.items():
         if not np.all(right):
             raise refused(path, f"has {arrays.get(name, header.get(name))} as `{name}`, which no motion has")
@@ -83,8 +85,9 @@ def _check_finite(path, arrays: dict) -> None:
         good = np.isfinite(arrays[name])
         if not np.all(good.reshape(*whole.shape, -1)[whole]):
             raise refused(path, f"has numbers in `{name}` that are not finite, in a motion that did not fail")
-    if np.any(np.isnan(arrays["ts"])):
-        raise refused(path, "has times in `ts` that are no numbers")
+    for name in ("ts", "together"):
+        if np.any(np.isnan(arrays[name])):
+            raise refused(path, f"has times in `{name}` that are no numbers")
     reached = np.all(np.isfinite(arrays["q"]), axis=-1)
     due = np.isfinite(arrays["ts"]) & (np.asarray(arrays["result"]) == SUCCESS)[..., None]
     for name in ("q", "u", "inputs", *(["work"] if "work" in arrays else [])):

@@ -1,0 +1,111 @@
+"""Relations that decide between branches of rates and stop events, as numbers whose signs decide: what steps watch (`motion/integrators/erk_step.py`).
+
+    a < b, max(a, b), ...    a - b          sign(x), |x|    x          floor(x)    sin(pi x)          round(x)    cos(pi x)
+
+A relation counts where a rate, or its slope, is another one on either side of where that number vanishes, or where a stop event may have a dip there;
+with it count the relations that its number is made of. Where its branches agree, as those of a guard do, it does not. Both branches are evaluated on
+either side of such places, which are found between the states that are probed; a relation that vanishes between none of these counts.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.graph import Graph
+
+MOST_WATCHED = 32  # of a scene
+COMPARED = {"lt": (False, True), "le": (False, True), "gt": (True, False), "ge": (True, False)}  # the truth where a > b, and where a < b
+PLACES, HALVINGS = 6, 40  # for each relation, between probes
+ASIDE, AGREE = 1e-5, 1e-7  # of the way between two probes; of the size of a rate
+_WHOLE = {"floor": "sin", "ceil": "sin", "round": "cos", "rem": "sin"}
+
+
+def switches(graph: Graph, nodes: Iterable[int]) -> dict[int, list[tuple[int, int]]]:
+    """Number whose sign decides -> the relations that it decides, each with 1, or -1 where it is the negative of their own number."""
+    found: dict[int, list[tuple[int, int]]] = {}
+    for n in graph.reachable(list(nodes)):
+        if graph.varies[n] and (own := _own(graph, n)) is not None and graph.varies[own]:
+            number, turned = (graph.args[own][0], -1) if graph.op[own] == "neg" else (own, 1)
+            if _is_never_negative(graph, number, {}):  # as in a guard, `where(x x + y y > 0, ...)`
+                continue
+            if graph.op[number] == "sub" and graph.args[number][0] > graph.args[number][1]:
+                number, turned = graph.neg(number), -turned
+            found.setdefault(number, []).append((n, turned))
+    return found
+
+
+def _own(graph: Graph, node: int) -> int | None:
+    op, args = graph.op[node], graph.args[node]
+    if op in COMPARED or op in ("max", "min"):
+        return graph.sub(*args)
+    if op in ("abs", "sign"):
+        return args[0]
+    if op not in _WHOLE:
+        return None
+    return graph.call(_WHOLE[op], graph.mul(graph.const(np.pi), graph.div(*args) if op == "rem" else args[0]))
+
+
+def _is_never_negative(graph: Graph, node: int, known: dict[int, bool]) -> bool:
+    if node not in known:
+        op, args = graph.op[node], graph.args[node]
+        squared = op in ("sqrt", "abs", "exp", "cosh") or (op == "mul" and args[0] == args[1]) or (op == "const" and graph.value[node] >= 0)
+        known[node] = squared or (op in ("add", "mul", "div") and all(_is_never_negative(graph, a, known) for a in args))
+    return known[node]
+
+
+def _branch(graph: Graph, node: int, above: bool) -> int:
+    """What takes the place of a relation where its own number is positive (`above`), or negative."""
+    op, args = graph.op[node], graph.args[node]
+    if op in COMPARED:
+        return graph.const(COMPARED[op][0 if above else 1])
+    if op == "sign":
+        return graph.const(1.0 if above else -1.0)
+    return args[0] if above == (op in ("abs", "max")) else graph.neg(args[0]) if op == "abs" else args[1]
+
+
+def relations(graph: Graph, rates: Sequence[int], events: Sequence[int], probes: Probes) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Numbers whose signs are to be watched: of the rates, and those of stop events besides."""
+    found: list[list[int]] = []
+    for outputs, counts in ((rates, _differ), (events, _may_dip)):
+        of_outputs = switches(graph, outputs)
+        kept = [n for n, nodes in of_outputs.items() if any(graph.op[k] in _WHOLE for k, _ in nodes) or _counts(graph, n, nodes, outputs, counts, probes)]
+        needed = set(graph.reachable(kept))
+        found.append([n for n in of_outputs if n in kept or any(k in needed for k, _ in of_outputs[n])])
+    return tuple(found[0]), tuple(n for n in found[1] if n not in found[0])
+
+
+def _counts(graph: Graph, number: int, nodes: list[tuple[int, int]], outputs: Sequence[int], counts, probes: Probes) -> bool:
+    """Whether the branches of relations matter on either side of where their number vanishes."""
+    beside = [here for place in _places(number, probes) for here in place]
+    if not beside:
+        return True
+    above, below = (graph.substituted(outputs, {n: _branch(graph, n, side == turned) for n, turned in nodes}) for side in (1, -1))
+    size = np.nanmax(np.abs(probes(outputs)), axis=1, initial=0.0)
+    return any(counts(here(outputs)[:, 0], here(above)[:, 0], here(below)[:, 0], AGREE * size) for here in beside)
+
+
+def _differ(values, above, below, least) -> bool:
+    return not np.all(np.abs(above - below) <= least)
+
+
+def _may_dip(values, above, below, least) -> bool:
+    """A value that is the lower one of its two branches on either side has a peak there, or goes on."""
+    return not np.all(values <= np.minimum(above, below) + least)
+
+
+def _places(number: int, probes: Probes) -> Iterator[tuple[Probes, Probes]]:
+    """Pairs of states on either side of a place where a number vanishes."""
+    values = probes([number])[0]
+    positive, negative = np.flatnonzero(values > 0), np.flatnonzero(values < 0)
+    for i, j in list(zip(positive, negative, strict=False))[:PLACES]:
+        a, b = ({name: np.atleast_1d(np.broadcast_to(x, probes.count)[k]) for name, x in probes.inputs.items()} for k in (i, j))
+
+        def at(share: float, a=a, b=b) -> Probes:
+            return probes.with_inputs({name: a[name] + share * (b[name] - a[name]) for name in a})
+
+        low, high = 0.0, 1.0
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if at(middle)([number])[0, 0] > 0 else (low, middle)
+        yield at(low - ASIDE), at(high + ASIDE)

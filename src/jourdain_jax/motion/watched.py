@@ -1,0 +1,63 @@
+"""The relations of a scene that XLA's loop watches, and why some are not watched (`motion/integrators/crossings.py`)."""
+
+from collections.abc import Callable
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.build.load_jumps import loads_may_jump
+from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.lowering.relations import MOST_WATCHED
+from jourdain_jax.motion.input_programs import FunctionOfTime
+from jourdain_jax.motion.inputs import Inputs
+from jourdain_jax.motion.native.functions_of_time import numbers_of
+from jourdain_jax.motion.native.native_motion import driven
+from jourdain_jax.motion.setup import Setup
+from jourdain_jax.motion.vector_fields.field import VectorField
+
+
+def watched(field: VectorField, inputs: Inputs, has_events: bool) -> tuple[Callable | None, int]:
+    """The numbers whose signs are watched, as a function (args, tau, y) -> (numbers, *lanes), and how many are relations; None where none are, or too many."""
+    if field.lowered is None:
+        return None, 0
+    program, nodes = _relations(field.lowered, inputs, has_events)
+    events = program.events if has_events and program.event_relations else ()
+    return (partial(_values, program, (*nodes, *events)), len(nodes)) if 0 < len(nodes) <= MOST_WATCHED else (None, 0)
+
+
+def reason_against_watching(setup: Setup) -> str:
+    """Why no step watches the relations that the loads of a scene, or its stop events, have; empty where one does, or they have none."""
+    if setup.field.lowered is None:
+        return "the scene has no scalar program" if any(loads_may_jump(setup.scene)) else ""
+    count = len(_relations(setup.field.lowered, setup.inputs, bool(setup.integrator.event_names))[1])
+    if not setup.integrator.watches:
+        return "solvers of diffrax do not" if count else ""
+    return f"they are {count}, more than {MOST_WATCHED}" if count > MOST_WATCHED else ""
+
+
+def _relations(program: Lowered, inputs: Inputs, has_events: bool) -> tuple[Lowered, tuple[int, ...]]:
+    """The program with the functions of time among the inputs, where it takes these, and the relations in it."""
+    found = driven(program, inputs)
+    program = program if isinstance(found, str) else found
+    return program, program.watched(has_events)
+
+
+@eqx.filter_jit
+def _values(program: Lowered, nodes: tuple[int, ...], args, tau, y) -> Float[Array, "numbers *lanes"]:
+    _, _, inputs, fixed, origin = args
+    t, given = origin + tau, partial(_given, len(program.inputs))
+    values = eqx.filter_vmap(given, out_axes=-1)(inputs, t) if jnp.ndim(tau) else given(inputs, t)
+    numbers = len(values) - len(program.inputs)
+    state = jax.lax.stop_gradient(((*fixed, *values[:numbers]), t, tuple(y.q), tuple(y.v), values[numbers:]))
+    return program.values(nodes, *state)
+
+
+def _given(count: int, inputs: Inputs, t) -> Float[Array, "given"]:
+    """Numbers of the functions of time, and values of the `count` inputs that are left to the program."""
+    functions = [channel for channel in inputs.channels if isinstance(channel, FunctionOfTime)] if count < len(inputs.channels) else []
+    numbers = [x for channel in functions for x in numbers_of(channel)]
+    values = [channel(t) for channel in inputs.channels if not (functions and isinstance(channel, FunctionOfTime))]
+    return jnp.stack([jnp.asarray(x, jnp.result_type(float)) for x in (*numbers, *values)]) if numbers or values else jnp.zeros(0)

@@ -1,0 +1,192 @@
+"""Relations of loads, poses, inputs and rows are watched over each step: what acts in a part of the way is not stepped over.
+
+Motions are compared with such of steps of 1/2,000 of the span, which miss nothing; both loops take the same steps.
+"""
+
+import dataclasses
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.lowering.lower import lowered
+from jourdain_jax.native import ffi
+
+BACKENDS = ("xla", *(() if ffi.reason_against() else ("native",)))
+
+
+class Sliding(jj.Scene):
+    """A bead that slides freely but for what acts between `a` and `a + width` of its way, or of time."""
+
+    a: float = jj.parameter(0.7)
+    width: float = jj.parameter(0.03)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(1.0, jnp.stack([q.x, 0 * q.x, self.height(q.x)]))}
+
+    def height(self, x):
+        return 0 * x
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=self.force(motion.t, motion.q.x, motion.u.x_rate)), jj.gravity(motion, 9.81))
+
+    def force(self, t, x, v):
+        return 0 * x
+
+
+class Strip(Sliding):
+    def force(self, t, x, v):
+        return jnp.where((x > self.a) & (x < self.a + self.width), -3.0, 0.0)
+
+
+class StripByDistance(Sliding):
+    def force(self, t, x, v):
+        return jnp.where(jnp.abs(x - self.a - 0.5 * self.width) < 0.5 * self.width, -3.0 * v, 0.0)
+
+
+class Pulse(Sliding):
+    def force(self, t, x, v):
+        return jnp.where((t > self.a) & (t < self.a + self.width), 20.0, 0.0)
+
+
+class Hat(Sliding):
+    def force(self, t, x, v):
+        return -40.0 * jnp.maximum(0.0, 1.0 - jnp.abs((x - self.a) / self.width - 0.5) * 2)
+
+
+class Signs(Sliding):
+    def force(self, t, x, v):
+        return -3.0 * (jnp.sign(x - self.a) - jnp.sign(x - self.a - self.width))
+
+
+class Floors(Sliding):
+    def force(self, t, x, v):
+        return -3.0 * (jnp.floor(x - self.a + 7.0) - jnp.floor(x - self.a - self.width + 7.0))
+
+
+class Bump(Sliding):
+    """A speed bump in the way of the bead, with slopes of zero at its ends."""
+
+    def height(self, x):
+        s = (x - self.a) / self.width
+        return jnp.where((s > 0) & (s < 1), 0.3 * self.width * (1 - jnp.cos(2 * jnp.pi * s)), 0.0)
+
+
+KINDS = (Strip, StripByDistance, Pulse, Hat, Signs, Floors, Bump)
+START, SPAN = {"x": 0.0, "x_rate": 1.0}, 2.0
+
+
+def motion(scene, start=START, **options):
+    return jj.simulate(scene, start, **{"ts": [SPAN], "rtol": 1e-9, "atol": 1e-9} | options)
+
+
+@pytest.mark.parametrize("kind", [kind if kind in (StripByDistance, Pulse, Bump) else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS])
+def test_what_acts_in_a_part_of_the_way_is_met_by_the_same_steps_of_both_loops(kind):
+    scene, loose = kind(), {"rtol": 1e-6, "atol": 1e-6}  # at tight ones round-off alone sets the length of steps of a free bead
+    exact = motion(scene, max_step=SPAN / 2000, **loose)
+    found = [motion(scene, backend=backend, **loose) for backend in BACKENDS]
+    assert abs(float(exact.q_end[0]) - SPAN) > 5e-3, "nothing acted"
+    for one in found:
+        np.testing.assert_allclose(one.q_end, exact.q_end, atol=2e-3)
+        assert int(one.crossings) == int(exact.crossings) >= 2
+        assert not np.isfinite(one.together)
+        assert (int(one.accepted), int(one.rejected)) == (int(found[0].accepted), int(found[0].rejected))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_neighbours_in_lanes_are_right_or_flagged(kind):
+    generator = np.random.default_rng(5)
+    a, width = generator.uniform(0.2, 1.4, 200), 10 ** generator.uniform(-4, -0.5, 200)
+    options = {"parameters": {"a": a, "width": width}, "ts": [SPAN], "rtol": 1e-8, "atol": 1e-8, "progress": False}
+    starts = {"x": np.zeros(200), "x_rate": 1.0}
+    found = jj.rollout(kind(), starts, **options)
+    exact = jj.rollout(kind(), starts, **options | {"max_step": 1e-4, "rtol": 1e-10, "atol": 1e-10})
+    assert not exact.failed.size
+    wrong = np.abs(found.lanes.q_end - exact.lanes.q_end)[:, 0] > 1e-5
+    assert not np.any(np.delete(wrong, found.crossed_together)), "wrong in silence"
+    assert len(found.crossed_together) < 100
+
+
+def test_a_load_that_is_passed_in_one_step_is_named():
+    scene = Strip(width=1e-5)
+    assert np.isfinite(motion(scene).together)
+    assert "changed in the one step" in " ".join(motion(scene).warnings)
+    lanes = jj.rollout(scene, {"x": np.zeros(3), "x_rate": np.array([1.0, 0.1, -1.0])}, ts=[SPAN], rtol=1e-3, atol=1e-3, progress=False)
+    np.testing.assert_array_equal(lanes.crossed_together, [0])
+    assert "1 crossed two or more relations in one step" in str(lanes)
+
+
+def test_crossings_are_counted_under_jit_back_in_time_and_by_both_modes_of_derivatives():
+    scene = Strip()
+    assert int(jax.jit(lambda: motion(scene).crossings)()) == 2
+    assert int(motion(scene, {"x": 2.0, "x_rate": 1.0}, ts=[-SPAN]).crossings) == 2
+    assert int(motion(scene, {"x": 0.71, "x_rate": 1.0}).crossings) == 1
+
+    def end(x, **options):
+        found = motion(scene, {"x": x, "x_rate": 1.0}, **options)
+        return found.q_end[0], found.crossings
+
+    def counted(backend):
+        _, by_reverse_mode = jax.grad(end, has_aux=True)(0.0, backend=backend)
+        options = {"backend": backend, "adjoint": diffrax.ForwardMode()}
+        return int(by_reverse_mode), int(jax.jvp(lambda x: end(x, **options), (0.0,), (1.0,), has_aux=True)[2])
+
+    for backend in BACKENDS:
+        with pytest.warns(jj.SensitivityWarning, match="leave out how the time of the jump moves"):
+            assert counted(backend) == (2, 2)
+
+
+def test_inputs_that_are_functions_of_time_are_watched():
+    @dataclasses.dataclass(frozen=True)
+    class Pushed:
+        start: float
+
+        def __call__(self, t):
+            return jnp.where((t > self.start) & (t < self.start + 0.03), 20.0, 0.0)
+
+    class Cart(Sliding):
+        inputs = jj.inputs("push")
+
+        def force(self, t, x, v):
+            return 0 * x
+
+        def loads(self, motion):
+            return (jj.generalized_force(motion, x_rate=motion.inputs.push),)
+
+    found = [motion(Cart(), inputs={"push": Pushed(0.9)}, backend=backend) for backend in BACKENDS]
+    for one in found:
+        np.testing.assert_allclose(one.q_end[0], 2.0 + 0.6 * (2.0 - 0.915), atol=1e-6)
+        assert int(one.crossings) == 2
+
+
+class Guarded(Sliding):
+    """Guards whose branches agree, and smooth functions of relations."""
+
+    def force(self, t, x, v):
+        squared = x * x + v * v
+        length = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
+        return -length * v - v * jnp.abs(v) + jnp.maximum(x, 0.0) - jnp.maximum(-x, 0.0)
+
+
+def test_guards_and_smooth_functions_do_not_count():
+    assert lowered(Guarded()).relations == ()
+    assert int(motion(Guarded(), {"x": -1.0, "x_rate": 1.5}).crossings) == 0
+
+
+class Many(Sliding):
+    def force(self, t, x, v):
+        return sum(jnp.sign(x - 0.01 * k) for k in range(40))
+
+
+def test_what_is_not_watched_is_said():
+    assert "not watched: they are 40, more than 32" in str(motion(Many()))
+    dense, by_diffrax = motion(Strip(), backend="dense"), motion(Strip(), solver=diffrax.Heun(), rtol=1e-4, atol=1e-4)
+    assert int(dense.crossings) == int(by_diffrax.crossings) == -1
+    assert "not watched: the scene has no scalar program" in str(dense)
+    assert "solvers of diffrax do not" in by_diffrax.unwatched
+    assert not motion(Guarded()).unwatched
