@@ -6,7 +6,7 @@ import numpy as np
 
 import jourdain_jax as jj
 
-HULL = np.array([0.1, 0.0, 0.0])
+HULL = (0.1, 0.0, 0.0)
 
 
 class PlanarRobot(jj.Scene):
@@ -38,7 +38,7 @@ class PlanarRobot(jj.Scene):
     def bodies(self, t, q):
         o, R = 0 * q.x, jj.rot_z(q.heading)
         at = jnp.stack([q.x, q.y, o + 0.1])
-        made = {"hull": jj.RigidBody(3.0, 0.2 * jnp.ones(3), at + R @ HULL, R)}
+        made = {"hull": jj.RigidBody(3.0, 0.2 * jnp.ones(3), at + R @ jnp.array(HULL), R)}
         for name, side in (("left", 1.0), ("right", -1.0)):
             centre = at + R @ jnp.stack([o, o + side * self.track, o])
             made[name] = jj.RigidBody.thin_disc(0.3, 0.1, axis="y", position=centre, orientation=R @ jj.rot_y(q[name]))
@@ -69,7 +69,7 @@ class PlanarRobot(jj.Scene):
             v = m[name].velocity + jnp.cross(m[name].angular_velocity, jnp.array([0.0, 0.0, -0.1]))
             rows[name] = jnp.stack([c * v[0] + s * v[1], c * v[1] - s * v[0]])
         hull = m["hull"]
-        ahead = hull.velocity + jnp.cross(hull.angular_velocity, hull.orientation @ (jnp.stack([-self.hitch, 0.0, 0.0]) - HULL))
+        ahead = hull.velocity + jnp.cross(hull.angular_velocity, hull.orientation @ (jnp.stack([-self.hitch, 0.0, 0.0]) - jnp.array(HULL)))
         for i in range(self.trailers):
             body = m[f"trailer{i}"]
             rows[f"trailer{i}"] = jj.knife_edge(body, body.position, body.orientation[:, 1])

@@ -84,6 +84,11 @@ GEOMETRIC = {"rod", "pin", "flat pin", "curve"}
 LENGTHS = {"x", "y", "z"}
 
 
+def coordinates_of(kind: str):
+    """Stems and middles of the coordinates of a body of this kind."""
+    return KINDS[kind]
+
+
 def coordinate_list(recipe: Recipe) -> list[tuple[int, str, float]]:
     """Body, stem and middle of every coordinate; a quaternion counts once."""
     return [(i, stem, middle + (1.1 * i if stem == "x" else 0.0)) for i, kind in enumerate(recipe.bodies) for stem, middle in KINDS[kind]]
@@ -147,7 +152,7 @@ class Generated(jj.Scene):
 
     def _body(self, i: int, kind: str, t, q, parent):
         m, size, o = self.masses[i], self.sizes[i], 0.0 * t
-        value = {stem: q[f"{stem}{i}"] for stem, _ in KINDS[kind] if stem != "*"}
+        value = {stem: q[f"{stem}{i}"] for stem, _ in coordinates_of(kind) if stem != "*"}
         if kind == "swing":
             pivot = jnp.stack([0.3 * jnp.sin(2.0 * t), o, o])
             return jj.Particle(m, pivot + size * jnp.stack([jnp.sin(value["turn"]), o, -jnp.cos(value["turn"])]))
@@ -163,7 +168,7 @@ class Generated(jj.Scene):
             return jj.Particle(m, position)
         if kind == "plate":
             return jj.RigidBody(m, self._moments(i), position, jj.rot_z(value["yaw"]))
-        if ("*", 0.0) in KINDS[kind]:
+        if ("*", 0.0) in coordinates_of(kind):
             frame = jj.quaternion_to_matrix(q[f"q{i}"])
             if kind == "top":
                 return jj.RigidBody(m, self._moments(i), position, frame)

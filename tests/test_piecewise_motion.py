@@ -130,6 +130,10 @@ def test_a_table_among_the_parameters_is_refused_also_while_it_is_traced():
         jj.report(TableOfScene(ts=TS + 1.7e9))
 
 
+def drive(x):
+    return jnp.interp(x, jnp.asarray(TS), jnp.asarray(DRIVE))
+
+
 class Road(jj.Scene):
     """A mass on a bumpy road."""
 
@@ -137,7 +141,7 @@ class Road(jj.Scene):
     domain = {"x": (0.0, 2.0)}
 
     def bodies(self, t, q):
-        return {"mass": jj.Particle(1.0, jnp.stack([q.x, q.y, jnp.interp(q.x, jnp.asarray(TS), jnp.asarray(DRIVE))]))}
+        return {"mass": jj.Particle(1.0, jnp.stack([q.x, q.y, drive(q.x)]))}
 
 
 def test_a_road_by_linear_interpolation_is_refused():
@@ -152,7 +156,7 @@ class Pushed(Driven):
         return {"bob": bob(0.0 * t, q.angle)}
 
     def loads(self, motion):
-        push = jnp.interp(motion.t, jnp.asarray(TS), jnp.asarray(DRIVE)) + jnp.floor(motion.q.angle)
+        push = drive(motion.t) + jnp.floor(motion.q.angle)
         return jj.gravity(motion, GRAVITY), jj.Load(generalized={"angle_rate": push})
 
 

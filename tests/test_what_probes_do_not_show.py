@@ -15,6 +15,10 @@ from jourdain_jax.models import ChaplyginSleigh
 KNOTS = jnp.linspace(-3.0, 3.0, 7)
 
 
+def looked_up(x, table=None):
+    return jnp.interp(x, KNOTS, jnp.sin(KNOTS) if table is None else table)
+
+
 class Plane(jj.Scene):
     """A particle in a plane."""
 
@@ -35,7 +39,7 @@ class Limited(Plane):
     limit: object = jj.parameter(5.0)
 
     def loads(self, motion):
-        force = lambda x: -jnp.interp(x, KNOTS, jnp.sin(KNOTS))  # noqa: E731
+        force = lambda x: -looked_up(x)  # noqa: E731
         x = motion.q.x
         return (jj.generalized_force(motion, x_rate=force(x), y_rate=force(jnp.clip(x, -self.limit, self.limit))),)
 
@@ -50,7 +54,7 @@ class Fading(Plane):
     """Two look-ups, one of whose operands leaves the other long after all probes."""
 
     def loads(self, motion):
-        force = lambda x: -jnp.interp(x, KNOTS, jnp.sin(KNOTS))  # noqa: E731
+        force = lambda x: -looked_up(x)  # noqa: E731
         x = motion.q.x
         return (jj.generalized_force(motion, x_rate=force(x), y_rate=force(x * jax.nn.sigmoid((20.0 - motion.t) / 0.1))),)
 
@@ -137,7 +141,7 @@ class Small(Plane):
     scale: object = jj.parameter(1e11)
 
     def loads(self, motion):
-        force = lambda table: self.scale * jnp.interp(motion.q.x, KNOTS, table)  # noqa: E731
+        force = lambda table: self.scale * looked_up(motion.q.x, table)  # noqa: E731
         return (jj.generalized_force(motion, x_rate=force(self.table), y_rate=force(-self.table)),)
 
 

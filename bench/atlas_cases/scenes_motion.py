@@ -8,7 +8,11 @@ from jaxtyping import Array, Float
 import jourdain_jax as jj
 
 _OMEGA = (-3.0, 3.0)
-_DOMAIN = {f"attitude_omega_{axis}": _OMEGA for axis in "xyz"}
+
+
+def _turning() -> dict:
+    """The domain of an angular velocity."""
+    return {f"attitude_omega_{axis}": _OMEGA for axis in "xyz"}
 
 
 class CeltInQuaternion(jj.Scene):
@@ -21,7 +25,7 @@ class CeltInQuaternion(jj.Scene):
     @property
     def domain(self):
         """Heights in the unit of length."""
-        return {"z": (0.01 * self.scale, 0.2 * self.scale), **_DOMAIN}
+        return {"z": (0.01 * self.scale, 0.2 * self.scale), **_turning()}
 
     def bodies(self, t, q):
         k = self.scale**2
@@ -52,7 +56,7 @@ class EccentricBall(jj.Scene):
     axial: Float[Array, ""] = jj.parameter(0.5, unit="kg m^2", positive=True)
     transverse: Float[Array, ""] = jj.parameter(0.4, unit="kg m^2", positive=True)
     coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
-    domain = {"z": (0.7, 1.3), **_DOMAIN}
+    domain = {"z": (0.7, 1.3), **_turning()}
 
     def bodies(self, t, q):
         inertia = jnp.stack([self.transverse, self.transverse, self.axial])
@@ -78,7 +82,7 @@ class DragDisc(jj.Scene):
 
     drag: Float[Array, ""] = jj.parameter(1.7e-4, unit="N m s", non_negative=True)
     coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
-    domain = {"z": (0.05, 0.3), **_DOMAIN}
+    domain = {"z": (0.05, 0.3), **_turning()}
 
     def bodies(self, t, q):
         centre, turned = jnp.stack([q.x, q.y, q.z]), jj.quaternion_to_matrix(q.attitude)

@@ -70,6 +70,7 @@ with _without_collecting(all_stays=True):  # what a motion needs
     from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere, Surface
     from jourdain_jax.scene.loads import Load, damper, generalized_force, gravity, point_force, spring, torque
     from jourdain_jax.scene.motion_state import fixed_point
+    from jourdain_jax.scene.names_read import clear_caches
     from jourdain_jax.scene.parameters import parameter
     from jourdain_jax.scene.possible_inertia import inertia_from_log_cholesky, log_cholesky
     from jourdain_jax.scene.printing import show_scenes_with as _show_scenes_with
@@ -255,6 +256,7 @@ __all__ = [
     "ball_contact",
     "bounds",
     "build",
+    "clear_caches",
     "consistent",
     "constraint_rows",
     "coordinate_rates",

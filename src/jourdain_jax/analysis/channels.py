@@ -17,8 +17,8 @@ from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.program.calls import description
 from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.names_read import is_function, now_read_by
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.what_is_read import is_function, is_read_by
 
 MOST = 256  # functions whose trace is kept
 
@@ -57,10 +57,10 @@ class Channel(eqx.Module):
 
 def channel(function: Callable, scene: Scene) -> Channel:
     """A function of a motion of this scene as a channel; it is traced again where it is new, or what it reads has changed."""
-    if not is_function(function):
+    now = now_read_by(function) if is_function(function) else None
+    if now is None:
         return _traced(function, scene)
-    kept = _kept(function)
-    key = is_read_by(function).now(), _kind(scene)
+    kept, key = _kept(function), (now, _kind(scene))
     if kept.get("key") == key:
         return kept["channel"]
     found = _traced(function, scene)

@@ -32,7 +32,6 @@ from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import events_of, loads_of
-from jourdain_jax.scene.what_is_read import names_of_what_is_traced
 
 
 class VelocityQuantities(eqx.Module):
@@ -180,11 +179,9 @@ def jaxpr_of_scene(scene: Scene, of_inputs: tuple[int, ...]):
 
     closed, shape = jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
     if is_traced(closed.consts):
-        name = next(iter(names_of_what_is_traced(scene)), "")
-        what = f"`{name}`" if name else "a number"
         raise ValueError(
-            f"a method of `{type(scene).__name__}` reads {what}, which JAX is tracing (jit, grad, vmap) and which is no field of it; "
-            f"make it one, `{name or 'name'}: float = jj.parameter(unit=...)`, and pass it to the scene"
+            f"a method of `{type(scene).__name__}`, or what it calls, reads a number that JAX is tracing (jit, grad, vmap) and that is no field of it; "
+            "make it one, `name: float = jj.parameter(unit=...)`, and pass it to the scene"
         )
     return closed, shape
 

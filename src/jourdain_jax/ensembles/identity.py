@@ -6,6 +6,7 @@ the user (as `jax.grad` does), by what they close over. So a changed function ma
 """
 
 import copyreg
+import functools
 import hashlib
 import sys
 from collections.abc import Iterator, Mapping
@@ -16,8 +17,8 @@ from types import CodeType, FunctionType, MethodType, ModuleType
 import jax
 import numpy as np
 
+from jourdain_jax.scene.names_read import spaces
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.what_is_read import is_installed, read_in
 
 DEEPEST = 20  # functions and classes that name others
 
@@ -107,27 +108,34 @@ def _function(f: FunctionType, of) -> object:
     installed, name = is_installed(f.__globals__.get("__name__")), (f.__module__, f.__qualname__, f.__code__.co_qualname)
     if installed and is_installed(f.__module__) and "<locals>" not in f.__qualname__:
         return "function", name
-    names = read_in(f.__code__)
+    attributes = _names_in(f.__code__)
 
     def read(y: object, *outer: ModuleType) -> object:
         """What the code reads of what it names: of a module of the user, the attributes that the code names, too."""
         if not isinstance(y, ModuleType) or is_installed(y.__name__) or y in outer:
             return of(y)
-        return of(y), tuple((name, read(vars(y)[name], *outer, y)) for name in names.attributes if name in vars(y))
+        return of(y), tuple((name, read(vars(y)[name], *outer, y)) for name in attributes if name in vars(y))
 
-    around = zip(f.__code__.co_freevars, f.__closure__ or (), strict=True)
-    cells = tuple((name, read(_within(cell))) for name, cell in around if name in names.enclosing)
+    named, around = (tuple((name, read(space.get(name))) for name in names) for space, names in spaces(f))
     if installed:
-        return "function", name, cells
-    named = tuple((name, read(f.__globals__[name])) for name in names.globals if name in f.__globals__)
-    return "function", of(f.__code__), of(f.__defaults__), of(f.__kwdefaults__), cells, named
+        return "function", name, around
+    return "function", of(f.__code__), of(f.__defaults__), of(f.__kwdefaults__), around, named
 
 
-def _within(cell) -> object:
-    try:
-        return cell.cell_contents
-    except ValueError:  # not yet set
-        return None
+def _names_in(code: CodeType) -> tuple[str, ...]:
+    return tuple(sorted(set(code.co_names).union(*(_names_in(inner) for inner in code.co_consts if isinstance(inner, CodeType)))))
+
+
+@functools.lru_cache(maxsize=4096)
+def is_installed(name: str | None) -> bool:
+    """Whether a module belongs to Python, to an installed package, or to this one."""
+    top = (name or "").partition(".")[0]
+    if top == "__main__":
+        return False
+    if top == __name__.partition(".")[0] or top in sys.builtin_module_names or top in sys.stdlib_module_names:
+        return True
+    file = getattr(sys.modules.get(name or ""), "__file__", None) or ""
+    return "site-packages" in file or "dist-packages" in file
 
 
 def _class(kind: type, of) -> object:

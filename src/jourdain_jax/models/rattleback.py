@@ -26,7 +26,7 @@ from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 
-_HALF_TURN = np.diag([1.0, -1.0, -1.0])  # from axes with n3 down to the engine's, z up
+_HALF_TURN = (1.0, -1.0, -1.0)  # from axes with n3 down to the engine's, z up
 
 
 class Rattleback(Scene):
@@ -66,7 +66,7 @@ class Rattleback(Scene):
 
     def bodies(self, t, q):
         level = jnp.stack([q.x, q.y])
-        turned = _HALF_TURN @ rot_z(q.gamma) @ rot_x(q.alpha) @ rot_y(q.beta)
+        turned = jnp.diag(jnp.array(_HALF_TURN)) @ rot_z(q.gamma) @ rot_x(q.alpha) @ rot_y(q.beta)
         down = -turned[2]  # mu
         height = self.contact_arm(down) @ down
         return {"stone": RigidBody(self.mass, self._inertia(), jnp.append(level, height), turned)}

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.quick_compilation import compiled
 from jourdain_jax.program.calls import description
-from jourdain_jax.scene.what_is_read import WhatIsRead, is_function, is_read_by
+from jourdain_jax.scene.names_read import is_function, now_read_by
 
 MOST_PROGRAMS = 64  # kept, so that equal ones are one object
 MOST_COMPILED = 16  # sets of them for which compiled motions are kept
@@ -95,17 +95,17 @@ class FunctionOfTime(eqx.Module):
 def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
     """A function of one time as it is now, and the shape of what it returns; no `FunctionOfTime` where that is not one number.
 
-    It is traced again where it is another function, or what it reads (`scene/what_is_read.py`) has changed.
+    It is traced again where it is another function, or what it reads (`scene/names_read.py`) has changed or has state.
     """
     if not is_function(function):
         return _traced_now(function, real)
     kept = _trace(function)
-    if kept.read is not None and kept.now == (kept.read.now(), real):
+    now = (now_read_by(function), real) if kept.again else None
+    if now is not None and now[0] is not None and kept.now == now:
         return kept.found
     found = _traced_now(function, real)
     if kept.again and found[0] is not None and not is_traced(found[0]):
-        kept.read, kept.found = is_read_by(function), found
-        kept.now = kept.read.now(), real
+        kept.now, kept.found = now, found
     kept.again = True
     return found
 
@@ -115,7 +115,6 @@ class _Trace:
 
     def __init__(self) -> None:
         self.again = False
-        self.read: WhatIsRead | None = None
         self.now: Hashable = None
         self.found: tuple[FunctionOfTime | None, object] = (None, None)
 

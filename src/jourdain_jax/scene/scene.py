@@ -4,7 +4,6 @@ them and what holds them. Everything else (velocities, partial velocities, mass 
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
-from threading import RLock
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -21,34 +20,13 @@ from jourdain_jax.scene.description import check_description, checked_arguments
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.names import Named, nearest
+from jourdain_jax.scene.names_read import NamesRead, is_function, names_read
 from jourdain_jax.scene.parameters import check_parameters, parameters_of
 from jourdain_jax.scene.printing import scene_html, scene_text
 from jourdain_jax.scene.visuals import Visual
-from jourdain_jax.scene.what_is_read import WhatIsRead, is_function, is_read_by
 
 
-class _SceneClass(type(eqx.Module)):  # type: ignore[misc]
-    """Every scene carries what its methods read as a part of its structure; the fields that `dataclasses.fields` lists are those that its author wrote."""
-
-    hidden: ClassVar[dict] = {}
-    building: ClassVar = RLock()  # one class at a time: the fields of its bases change meanwhile
-
-    def __new__(mcs, name, bases, namespace, **options):
-        """The class, built with that field and shown without it."""
-        scenes = {kind for base in bases for kind in base.__mro__ if isinstance(kind, mcs)}
-        with mcs.building:
-            for kind in scenes:
-                kind.__dataclass_fields__.update(mcs.hidden)
-            try:
-                new = super().__new__(mcs, name, bases, namespace, **options)
-            finally:
-                for kind in scenes:
-                    kind.__dataclass_fields__.pop("_read", None)
-            mcs.hidden["_read"] = new.__dataclass_fields__.pop("_read")
-        return new
-
-
-class Scene(eqx.Module, metaclass=_SceneClass):
+class Scene(eqx.Module):
     """Base class of all scenes. Subclass it, state `coordinates` and `bodies`, and what else the scene needs.
 
     Class attributes (or properties, where they depend on a static field such as a number of bodies)
@@ -61,8 +39,10 @@ class Scene(eqx.Module, metaclass=_SceneClass):
     - `conventions`: one text: axes, signs, frames.
     - `example`: coordinate or speed name -> value, a typical start; `example_span`: its duration in s.
 
-    Methods may read globals, variables of enclosing functions and attributes of classes: a change of these is noticed at the next call, as is a method that is
-    replaced. Not noticed is what only shows while a method runs (`globals()[name]`, a file), and what a `jax.jit` of your own inside a method has traced.
+    Methods are traced once, as everywhere in JAX: what they read besides the fields of the scene is a constant. Numbers, texts, tuples of them and functions
+    that a method itself reads as global names, or as variables of a function around it, may be bound anew: the next call notices that, as it does a method
+    that is replaced. Arrays, lists, dictionaries and objects with state are refused by name: make them parameters or static fields. Not noticed is a change
+    of what helpers read, of attributes of modules and classes, and of files: `jj.clear_caches()` starts anew.
     """
 
     coordinates: ClassVar[Coordinates]
@@ -73,13 +53,18 @@ class Scene(eqx.Module, metaclass=_SceneClass):
     conventions: ClassVar[str] = "SI units, radians; right-handed inertial frame, z up."
     example: ClassVar[dict[str, float]] = {}
     example_span: ClassVar[float] = 5.0
-    _read: WhatIsRead = eqx.field(init=False, repr=False)  # globals, closures, attributes of the class: a change of them makes another scene
+    _read: NamesRead = eqx.field(init=False, repr=False)  # a change of what they stand for makes another scene
+
+    def __init_subclass__(cls, **options):
+        """Look at the names that the methods read; ValueError where one stands for an object with state."""
+        super().__init_subclass__(**options)
+        names_read(cls)
 
     def __new__(cls, *args, **kwargs):
         """Before any field is set: the arguments are parameters of the scene."""
         checked_arguments(cls, kwargs)
         scene = super().__new__(cls)
-        object.__setattr__(scene, "_read", is_read_by(cls))  # functions in fields come to it when they are known
+        object.__setattr__(scene, "_read", names_read(cls))  # functions in fields come to it when they are known
         return scene
 
     def __check_init__(self):
@@ -235,11 +220,11 @@ class HeldFunction(eqx.Module):
     """A function that JAX takes for part of the structure of the scene, as it takes a static field."""
 
     function: Callable[..., Any] = eqx.field(static=True)
-    read: WhatIsRead
+    read: NamesRead
 
     def __init__(self, function: Callable[..., Any]):
         self.function = function
-        self.read = is_read_by(function) if is_function(function) else is_read_by()
+        self.read = names_read(function) if is_function(function) else names_read()
 
     def __call__(self, *args, **kwargs):
         """What the function returns."""
@@ -256,7 +241,7 @@ def hold_leaves(scene) -> None:
         return HeldFunction(leaf) if callable(leaf) else jnp.asarray(leaf) if type(leaf) is float else leaf
 
     static = tuple(value for field in fields(scene) if field.metadata.get("static") and is_function(value := getattr(scene, field.name)))
-    object.__setattr__(scene, "_read", is_read_by(type(scene), *static))
+    object.__setattr__(scene, "_read", names_read(type(scene), *static))
     for field in fields(scene):
         if field.metadata.get("static") or field.metadata.get("parameter"):
             continue

@@ -1,0 +1,251 @@
+"""Names that methods read besides their arguments.
+
+As everywhere in JAX, a method is traced once, and what it reads that is no field of the scene is a constant of the trace. Looked at are the global names and
+the variables of enclosing functions that a method loads itself, when its class is made and again at each call:
+
+- numbers, texts and tuples of them are compared by type and value, functions by identity, so that `g = 1.62` in the next cell of a notebook is noticed;
+- modules and classes are constants, as are their attributes;
+- arrays, containers and objects with state are refused by name: what changes in them could not be seen.
+
+What helpers read is not followed. `clear_caches` makes every scene be traced anew.
+"""
+
+import dis
+import enum
+import functools
+import re
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import fields, is_dataclass
+from decimal import Decimal
+from fractions import Fraction
+from itertools import repeat
+from operator import is_
+from pathlib import PurePath
+from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
+from typing import Any
+
+import jax
+import numpy as np
+
+from jourdain_jax.calculus.reals import is_traced
+
+_UNSET = object()
+_BASE = f"{__name__.rpartition('.')[0]}.scene"  # the module of the base class, below which nothing of a user's stands
+_VALUES = (bool, int, float, complex, str, bytes, type(None), type(...), range, Fraction, Decimal, re.Pattern, np.dtype, *PurePath.__subclasses__())
+_epoch = 0  # of `clear_caches`
+
+
+class StatefulError(ValueError):
+    """A name stands for something whose changes cannot be seen."""
+
+
+def clear_caches() -> None:
+    """Trace, probe and compile every scene anew when it is next used, after a change of what helpers, modules or classes hold. Clears JAX's caches, too."""
+    global _epoch
+    _epoch += 1
+    jax.clear_caches()
+
+
+class NamesRead:
+    """Names that methods or functions read; a pytree without leaves, whose structure changes with what they stand for."""
+
+    def __init__(self, watch: "_Watch"):
+        self._watch = watch
+
+    def now(self) -> tuple["_Watch", int]:
+        """Return the watch and a version: equal contents have equal versions. ValueError where a name has come to stand for an object with state."""
+        return self._watch, self._watch.version()
+
+    def __reduce__(self):
+        return names_read, self._watch.roots
+
+
+jax.tree_util.register_pytree_node(NamesRead, lambda read: ((), read.now()), lambda now, _: NamesRead(now[0]))
+
+
+def names_read(*roots: type | Callable) -> NamesRead:
+    """Return the names that the methods of classes, and functions, read. ValueError where one stands for an array, a container or an object with state."""
+    return NamesRead(_watch(*roots))
+
+
+def now_read_by(function: Callable) -> Hashable | None:
+    """What the names that a function reads stand for now; None where one has state, so that a trace of the function cannot be kept."""
+    try:
+        return names_read(function).now()
+    except (StatefulError, TypeError):  # the second: it cannot be hashed
+        return None
+
+
+def is_function(x) -> bool:
+    """Whether it is a function that may read something, and not a module that holds numbers."""
+    return isinstance(x, FunctionType | MethodType | functools.partial) or callable(_attribute(x, "__wrapped__"))
+
+
+class _Same:
+    """An object that is compared by identity, and kept."""
+
+    __slots__ = ("x",)
+
+    def __init__(self, x):
+        self.x = x
+
+    def __eq__(self, other):
+        return isinstance(other, _Same) and self.x is other.x
+
+    def __hash__(self):
+        return id(self.x)
+
+
+class _Watch:
+    """Compares what names stand for with what they stood for when they were last looked up."""
+
+    def __init__(self, roots: tuple):
+        self.roots = roots
+        self._numbers: dict[Hashable, int] = {}
+        self._look()
+
+    def __reduce__(self):
+        return _watch, self.roots
+
+    def version(self) -> int:
+        """The number of the present content."""
+        same = self._epoch == _epoch and all(len(members) == size for members, size in self._sizes)
+        if not same or not all(all(map(is_, map(get, names, repeat(_UNSET)), before)) for get, names, before in self._before):
+            self._look()
+        return self._number
+
+    def _look(self) -> None:
+        self._epoch, content = _epoch, []
+        self._before: list[tuple] = []
+        self._sizes: list[tuple] = []
+        for root in self.roots:
+            members = {name: x for kind in own_classes(root) for name, x in vars(kind).items()} if isinstance(root, type) else {"": root}
+            for kind in own_classes(root) if isinstance(root, type) else ():
+                self._note(vars(kind).get, tuple(vars(kind)))
+                self._sizes.append((vars(kind), len(vars(kind))))
+            for name, member in members.items():
+                content.append((name, _member_key(member)))
+                for f in () if name.startswith("__") and name != "__call__" else functions_in(member):
+                    where = f"`{root.__name__}.{name}`" if name else f"the function `{f.__qualname__}`"
+                    for space, names in spaces(f):
+                        found = self._note(space.get, names)
+                        content += [(n, _key_or_refusal(x, n, where)) for n, x in zip(names, found, strict=True)]
+        self._number = self._numbers.setdefault((_epoch, *content), len(self._numbers))
+
+    def _note(self, get: Callable, names: tuple[str, ...]) -> tuple:
+        found = tuple(map(get, names, repeat(_UNSET)))
+        self._before.append((get, names, found))
+        return found
+
+
+@functools.lru_cache(maxsize=1024)
+def _watch(*roots) -> _Watch:
+    return _Watch(roots)
+
+
+def own_classes(kind: type) -> tuple[type, ...]:
+    """The class and those that it is derived from, up to the base class of all scenes."""
+    order = kind.__mro__
+    return order[: next((k for k, owner in enumerate(order) if owner.__module__ == _BASE), len(order) - 1)]
+
+
+def functions_in(member) -> list[FunctionType]:
+    """The functions of Python's in a member of a class, without wrappers that other modules put around them."""
+    found, member = [], member.fget if isinstance(member, property) else member
+    while member is not None and not isinstance(member, type):
+        if isinstance(member, FunctionType) and (member.__globals__.get("__name__") == member.__module__ or not hasattr(member, "__wrapped__")):
+            found.append(member)
+        names = ("__wrapped__", "__func__", "func", "method")  # the last: as Equinox holds methods
+        member = next((inner for name in names if callable(inner := _attribute(member, name))), None)
+    return found
+
+
+def _attribute(x, name: str):
+    """An attribute, or None; an object's own `__getattr__` may raise anything."""
+    try:
+        return getattr(x, name, None)
+    except Exception:
+        return None
+
+
+class _Cells(Mapping):
+    """Variables of the functions around a function, as a mapping."""
+
+    def __init__(self, f: FunctionType):
+        self._cells = dict(zip(f.__code__.co_freevars, f.__closure__ or (), strict=True))
+
+    def __getitem__(self, name: str):
+        try:
+            return self._cells[name].cell_contents
+        except ValueError:  # not yet set
+            raise KeyError(name) from None
+
+    def __iter__(self):
+        return iter(self._cells)
+
+    def __len__(self) -> int:
+        return len(self._cells)
+
+
+def spaces(f: FunctionType) -> tuple[tuple[Mapping, tuple[str, ...]], ...]:
+    """Where the names that a function loads itself are looked up: its globals, and the variables of the functions around it."""
+    written = {"__class__"} | _names(f.__code__, ("STORE_GLOBAL", "STORE_DEREF"))  # a counter of calls, say
+    own, around = _names(f.__code__, ("LOAD_GLOBAL", "LOAD_NAME")) - written, set(f.__code__.co_freevars) - written
+    return (f.__globals__, tuple(sorted(own))), (_Cells(f), tuple(sorted(around)))
+
+
+@functools.lru_cache(maxsize=4096)
+def _names(code: CodeType, operations: tuple[str, ...]) -> frozenset[str]:
+    """Names on which code works by some operations of Python's machine, functions inside it included."""
+    own = frozenset(i.argval for i in dis.get_instructions(code) if i.opname in operations)
+    return own.union(*(_names(inner, operations) for inner in code.co_consts if isinstance(inner, CodeType)))
+
+
+def _member_key(member) -> Hashable:
+    """The key of a member of a class: by value where it has no state, otherwise by identity."""
+    try:
+        return key(member)
+    except StatefulError:
+        return _Same(member)
+
+
+def _key_or_refusal(x: Any, name: str, where: str) -> Hashable:
+    try:
+        return key(x)
+    except StatefulError:
+        pass
+    if is_traced(x):
+        raise StatefulError(f"{where} reads `{name}`, which JAX is tracing (jit, grad, vmap) and which is no field of the scene; {_advice(name)}")
+    kind = type(x).__name__ if "ArrayImpl" not in type(x).__name__ else "array"
+    raise StatefulError(f"{where} reads `{name}`, an object ({kind}) that may change without being noticed; {_advice(name)}")
+
+
+def _advice(name: str) -> str:
+    return f"make it a field, `{name}: ... = jj.parameter(...)`, or, where it holds no numbers, `eqx.field(static=True)`; or a tuple of numbers"
+
+
+def key(x: Any) -> Hashable:
+    """What tells a value without state from another: its type and value, of functions, modules and classes their identity.
+
+    **Raises** StatefulError for what may change: arrays, containers, objects.
+    """
+    if type(x) in _VALUES or (isinstance(x, np.generic) and not x.dtype.hasobject) or isinstance(x, enum.Enum):
+        return type(x), repr(x)
+    if isinstance(x, tuple | frozenset):
+        return type(x), tuple(map(key, x)) if isinstance(x, tuple) else frozenset(map(key, x))
+    if isinstance(x, functools.partial):
+        return type(x), key(x.func), key(x.args), tuple((name, key(value)) for name, value in x.keywords.items())
+    if is_dataclass(x) and not isinstance(x, type) and vars(type(x))["__dataclass_params__"].frozen:
+        return type(x), tuple(key(getattr(x, field.name, None)) for field in fields(x))
+    if _is_constant(x):
+        return _Same(x)
+    raise StatefulError
+
+
+def _is_constant(x: Any) -> bool:
+    """Whether it is a module, a class, a function, or something else that has no state of its own."""
+    if isinstance(x, BuiltinFunctionType | MethodType):
+        return x.__self__ is None or isinstance(x.__self__, ModuleType | type)
+    if isinstance(x, ModuleType | type | FunctionType | staticmethod | classmethod | property | np.ufunc | functools.cached_property):
+        return True
+    return type(x) is object or type(x).__module__ == "typing" or callable(_attribute(x, "__wrapped__"))

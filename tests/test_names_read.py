@@ -1,0 +1,281 @@
+"""Methods are traced once: what they read is refused where it has state, noticed where it is bound anew, and a constant where it is a class or a module."""
+
+import copy
+import importlib
+import pickle
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+
+GAIN = 1.0
+SPRING = """
+class Spring(jj.Scene):
+    coordinates = jj.coordinates("x")
+    mass: object = jj.parameter(1.0)
+
+    def bodies(self, t, q):
+        return {{"mass": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}}
+
+    def loads(self, motion):
+        {before}
+        return (jj.generalized_force(motion, x_rate=-({read}) * motion.q.x),)
+"""
+TWO_FIELDS = "@dataclasses.dataclass(frozen=True)\nclass Two:\n    a: float = 1.0\n    b: tuple = (1.0,)\n"
+
+
+def cell(text: str, read: str, before: str = "pass") -> dict:
+    """What a cell of a notebook defines, and a spring below it whose stiffness in N/m is what it reads; `before`: a line of the method before that."""
+    names = {"jj": jj, "jnp": jnp, "np": np, "__name__": "__main__"}
+    modules = ("argparse", "array", "collections", "contextvars", "dataclasses", "enum", "fractions", "functools", "itertools", "logging", "random", "types")
+    names |= {name: importlib.import_module(name) for name in modules}
+    exec(text, names)
+    exec(SPRING.format(read=read, before=before), names)
+    return names
+
+
+def stiffness(scene, way: str) -> float:
+    """By the acceleration at x = 1 m, or the motion to 1 s, in N/m."""
+    if way == "accelerations":
+        return -float(jj.accelerations(scene, 0.0, jnp.ones(1), jnp.zeros(1)).udot[0])
+    if way == "rollout":
+        end = jj.rollout(scene, {"x": jnp.ones(2)}, t1=1.0, progress=False).lanes.q_end[0, 0]
+    elif way == "gradient":
+        end = jax.grad(lambda x: jj.simulate(scene, {"x": x}, t1=1.0).q_end[0])(1.0)
+    elif way == "jit":
+        end = compiled_by_the_user(scene)
+    else:
+        end = jj.simulate(scene, {"x": 1.0}, t1=1.0).q_end[0]
+    return float(np.arccos(float(end))) ** 2
+
+
+@eqx.filter_jit
+def compiled_by_the_user(scene):
+    return jj.simulate(scene, {"x": 1.0}, t1=1.0).q_end[0]
+
+
+NOTICED = {
+    "a number": ("k = 1.0", "k", "k = 4.0"),
+    "a whole number": ("k = 1", "k", "k = 4"),
+    "a number of another type": ("k = True", "jnp.where(isinstance(k, bool), 1.0, 4.0)", "k = 1"),
+    "a number of NumPy": ("k = np.float32(1)", "k", "k = np.float32(4)"),
+    "a tuple": ("k = (1.0, (2.0, 'a'))", "k[0]", "k = (4.0, (2.0, 'a'))"),
+    "a named tuple": ("Two = collections.namedtuple('Two', 'a b')\nk = Two(1.0, 2.0)", "k.a", "k = Two(4.0, 2.0)"),
+    "a text": ("k = 'soft'", "{'soft': 1.0, 'stiff': 4.0}[k]", "k = 'stiff'"),
+    "a fraction": ("k = fractions.Fraction(1)", "float(k)", "k = fractions.Fraction(4)"),
+    "an enumeration": ("Kind = enum.Enum('Kind', 'soft stiff')\nk = Kind.soft", "1.0 if k is Kind.soft else 4.0", "k = Kind.stiff"),
+    "a frozen dataclass": (TWO_FIELDS + "k = Two()", "k.a", "k = Two(a=4.0)"),
+    "a function": ("def law(): return 1.0", "law()", "def law(): return 4.0"),
+    "a compiled function": ("import jax\nlaw = jax.jit(lambda x: 1.0 * x)", "law(1.0)", "law = jax.jit(lambda x: 4.0 * x)"),
+    "a partial function": ("law = functools.partial(pow, 1.0)", "law(2)", "law = functools.partial(pow, 2.0)"),
+    "a class": ("class Law:\n    k = 1.0", "Law.k", "class Law:\n    k = 4.0"),
+    "a module": ("law = types.ModuleType('law')\nlaw.k = 1.0", "law.k", "law = types.ModuleType('law')\nlaw.k = 4.0"),
+    "a function inside the method": ("k = 1.0", "(lambda: k)()", "k = 4.0"),
+    "a name defined below": ("", "k", "k = 4.0"),
+    "a replaced method": ("", "1.0", "Spring.loads = lambda self, motion: (jj.generalized_force(motion, x_rate=-4.0 * motion.q.x),)"),
+    "an attribute of the scene's class": ("", "Spring.k if hasattr(Spring, 'k') else 1.0", "Spring.k = 4.0"),
+}
+
+
+@pytest.mark.parametrize("kind", NOTICED)
+def test_what_is_bound_anew_is_noticed(kind):
+    before, read, after = NOTICED[kind]
+    names = cell(before or "k = 1.0", read)
+    scene = names["Spring"]()
+    assert stiffness(scene, "accelerations") == pytest.approx(1.0)
+    exec(after, names)
+    assert stiffness(scene, "accelerations") == pytest.approx(4.0)
+    if before and not before.startswith(("class", "import", "law")):
+        exec(before, names)
+        assert stiffness(scene, "accelerations") == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("way", ["simulate", "rollout", "gradient", "jit"])
+def test_every_use_notices_a_number_that_is_bound_anew(way):
+    names = cell("k = 1.0", "k")
+    scene = names["Spring"]()
+    assert stiffness(scene, way) == pytest.approx(1.0, abs=1e-6)
+    exec("k = 4.0", names)
+    assert stiffness(scene, way) == pytest.approx(4.0, abs=1e-6)
+
+
+HAS_STATE = {
+    "list": "k = [1.0]",
+    "list in a tuple": "k = ([1.0],)",
+    "a subclass of list": "class Own(list): pass\nk = Own([1.0])",
+    "a subclass of float": "class Own(float): pass\nk = Own(1.0)",
+    "dictionary": "k = {'a': 1.0}",
+    "set": "k = {1.0}",
+    "deque": "k = collections.deque([1.0])",
+    "UserDict": "k = collections.UserDict(a=1.0)",
+    "array.array": "k = array.array('d', [1.0])",
+    "bytearray": "k = bytearray(3)",
+    "array of NumPy": "k = np.ones(3)",
+    "large array": "k = np.ones(5000)",
+    "array of one number": "k = np.array(1.0)",
+    "array of objects": "k = np.array([1.0, None])",
+    "array of JAX": "k = jnp.ones(3)",
+    "Namespace of argparse": "k = argparse.Namespace(a=1.0)",
+    "SimpleNamespace": "k = types.SimpleNamespace(a=1.0)",
+    "ContextVar": "k = contextvars.ContextVar('k', default=1.0)",
+    "dataclass": "@dataclasses.dataclass\nclass Two:\n    a: float = 1.0\nk = Two()",
+    "frozen dataclass with a list": TWO_FIELDS + "k = Two(b=[1.0])",
+    "object": "class Own: pass\nk = Own()",
+    "object with slots": "class Own:\n    __slots__ = ('a',)\nk = Own()",
+    "object that can be called": "class Own:\n    def __call__(self): return 1.0\nk = Own()",
+    "method of an object": "class Own:\n    def law(self): return 1.0\nk = Own().law",
+    "partial function of a list": "k = functools.partial(sum, [1.0])",
+    "generator": "k = itertools.count()",
+    "random numbers": "k = random.Random(1)",
+    "scene": "k = jj.models.VerticalDisc()",
+}
+
+
+@pytest.mark.parametrize("kind", HAS_STATE)
+def test_what_has_state_is_refused_by_name_when_the_class_is_made(kind):
+    with pytest.raises(ValueError, match=r"`Spring.loads` reads `k`, .*make it a field"):
+        cell(HAS_STATE[kind], "1.0 if k is None else 1.0")
+
+
+def test_a_controller_whose_method_is_called_update_is_refused():
+    with pytest.raises(ValueError, match=r"`Spring\.loads` reads `controller`"):
+        cell("class Law:\n    def update(self, x): return x\ncontroller = Law()", "controller.update(1.0)")
+
+
+def test_a_table_of_pandas_is_refused():
+    pandas = pytest.importorskip("pandas")
+    with pytest.raises(ValueError, match=r"`Spring\.loads` reads `table`"):
+        exec(SPRING.format(read="table['k'][0]", before="pass"), {"jj": jj, "jnp": jnp, "table": pandas.DataFrame({"k": [1.0]})})
+
+
+def test_an_object_that_takes_the_place_of_a_number_is_refused_at_the_next_call():
+    names = cell("k = 1.0", "k")
+    scene = names["Spring"]()
+    assert stiffness(scene, "accelerations") == 1.0
+    names["k"] = [1.0]
+    with pytest.raises(ValueError, match=r"`Spring.loads` reads `k`, an object \(list\)"):
+        stiffness(scene, "accelerations")
+
+
+OWN_MODULE = "import sys\nsys.modules['own_constants'] = own = types.ModuleType('own')\nown.k = 1.0"
+CONSTANTS = {
+    "an attribute of a module": ("pkg = types.ModuleType('pkg')\npkg.k = 1.0", "pkg.k", "pass", "pkg.k = 4.0"),
+    "an attribute of a class": ("class Law:\n    k = 1.0", "Law.k", "pass", "Law.k = 4.0"),
+    "what a helper reads": ("k = 1.0\ndef law(): return k", "law()", "pass", "k = 4.0"),
+    "a name imported in the method": (OWN_MODULE, "k", "from own_constants import k", "own.k = 4.0"),
+}
+
+
+@pytest.mark.parametrize("kind", CONSTANTS)
+def test_what_is_a_constant_is_read_anew_after_the_caches_are_cleared(kind):
+    before, read, line, after = CONSTANTS[kind]
+    names = cell(before, read, line)
+    scene = names["Spring"]()
+    assert stiffness(scene, "accelerations") == 1.0
+    exec(after, names)
+    assert stiffness(scene, "accelerations") == 1.0
+    jj.clear_caches()
+    assert stiffness(scene, "accelerations") == 4.0
+    assert stiffness(scene, "simulate") == pytest.approx(4.0, abs=1e-6)
+
+
+def spring_around(gain):
+    """A spring whose stiffness is a variable of this function, and what sets it."""
+
+    class Around(jj.Scene):
+        coordinates = jj.coordinates("x")
+
+        def bodies(self, t, q):
+            return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+        def loads(self, motion):
+            return (jj.generalized_force(motion, x_rate=-gain * motion.q.x),)
+
+    def put(value):
+        nonlocal gain
+        gain = value
+
+    return Around, put
+
+
+def test_a_variable_of_an_enclosing_function_counts():
+    kind, put = spring_around(1.0)
+    scene = kind()
+    assert stiffness(scene, "simulate") == pytest.approx(1.0, abs=1e-6)
+    put(4.0)
+    assert stiffness(scene, "simulate") == pytest.approx(4.0, abs=1e-6)
+    with pytest.raises(ValueError, match=r"`Around\.loads` reads `gain`"):
+        spring_around(np.ones(1))
+
+
+@pytest.mark.parametrize("transformed", [jax.grad, jax.jit])
+def test_a_method_that_reads_what_jax_is_tracing_is_refused_with_its_name(transformed):
+    def end(stiffness):
+        return jj.simulate(spring_around(stiffness)[0](), {"x": 1.0}, t1=0.1).q_end[0]
+
+    with pytest.raises(ValueError, match=r"`Around\.loads` reads `gain`, which JAX is tracing"):
+        transformed(end)(2.0)
+
+
+def law(x):
+    return GAIN * x
+
+
+class Pushed(jj.Scene):
+    """Functions in fields and inputs read names as well."""
+
+    coordinates = jj.coordinates("x")
+    inputs = jj.inputs("push")
+    static: object = eqx.field(static=True, default=law)
+    held: object = law
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=motion.inputs.push + self.static(motion.q.x) - self.held(motion.q.x)),)
+
+
+def test_functions_in_fields_and_inputs_count(monkeypatch):
+    scene, table = Pushed(), np.array([1.0, 1.0])
+
+    def end(push):
+        return float(jj.simulate(scene, {"x": 0.0}, t1=1.0, inputs={"push": push}).q_end[0])
+
+    by_name, by_table = (lambda t: GAIN * jnp.cos(t)), (lambda t: table[0] * jnp.cos(t))
+    for gain in (1.0, 4.0, 1.0):  # what an input reads may have state: it is traced in each call
+        monkeypatch.setitem(globals(), "GAIN", gain)
+        table[0] = gain
+        for push in (by_name, by_table, by_name, by_table):
+            assert end(push) == pytest.approx(gain * (1.0 - np.cos(1.0)), abs=1e-6)
+    structure = jax.tree.structure(scene)
+    monkeypatch.setitem(globals(), "GAIN", 4.0)
+    assert jax.tree.structure(scene) != structure
+    with pytest.raises(ValueError, match=r"the function .*reads `table`"):
+        Pushed(held=lambda x: table[0] * x)
+
+
+def test_nothing_is_traced_anew_where_nothing_has_changed():
+    names = cell("k, calls = 1.0, 0\nseen = []\ndef note(): seen.append(1)", "k", "global calls; calls += 1; note()")
+    scene = names["Spring"]()
+    for way in ("accelerations", "simulate"):
+        stiffness(scene, way)
+    count, structure = len(names["seen"]), jax.tree.structure(scene)
+    names["k"] = float("1.0")  # another object of one value
+    names["mass"] = 4.0  # a global that is named like an attribute
+    for way in ("accelerations", "simulate"):
+        stiffness(scene, way)
+    assert len(names["seen"]) == count > 0
+    assert jax.tree.structure(names["Spring"]()) == structure
+
+
+def test_scenes_are_copied_and_stored():
+    scene = Pushed()
+    for other in (copy.deepcopy(scene), pickle.loads(pickle.dumps(scene))):
+        assert jax.tree.structure(other) == jax.tree.structure(scene)
+    disc = jj.models.VerticalDisc()
+    assert jax.tree.structure(disc.replace(mass=2.0)) == jax.tree.structure(disc)
