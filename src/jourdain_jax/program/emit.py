@@ -6,8 +6,7 @@ Sines and cosines of one argument are computed together, in double precision by 
 (error about 2e-16; XLA on a CPU would call libm once per element, and again in every fusion).
 """
 
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -17,60 +16,70 @@ from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.calls import EMITTED
 from jourdain_jax.program.fused import fused
 from jourdain_jax.program.graph import ARRAYS, Graph
-from jourdain_jax.program.loop_rerolling import Before, Given, Here, Loop, deepest_first, sources, with_loops
 
 DEEP = 120  # operations one after the other; measured: chains of links and trailers gain from 100 to 250 on, the bicycle (102) loses a quarter
 PIECE = 128  # operations
 
 
 def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) -> list:
-    """Values of the outputs as JAX scalars (or numbers), given those of inputs and of nodes computed before."""
-    outputs = list(outputs)
-    values = Values(known)
+    """Return values of the outputs as JAX scalars (or numbers), given those of inputs and of nodes computed before."""
+    outputs, values = list(outputs), dict(known)
     needed = graph.needed(outputs, values)
     if _depth(graph, needed) <= DEEP:
         _run_in_a_row(graph, needed, values)
         return [values[n] for n in outputs]
     values |= {n: graph.value[n] for n in needed if graph.is_const(n)}
-    parts = list(_pieces(with_loops(graph, deepest_first(graph, outputs, values))))
-    last_use = {a: k for k, part in enumerate(parts) for a in _arguments(graph, part)} | dict.fromkeys(outputs, len(parts))
+    order = _deepest_first(graph, outputs, values)
+    parts = [order[k : k + PIECE] for k in range(0, len(order), PIECE)]
+    last_use = {a: k for k, part in enumerate(parts) for n in part for a in graph.args[n]} | dict.fromkeys(outputs, len(parts))
     for k, part in enumerate(parts):
-        if isinstance(part, Loop):
-            run_loop(part, values, {n for n in part.nodes.ravel().tolist() if last_use.get(n, -1) > k}, _operation)
-        else:
-            _run_in_a_row(graph, part, values)
-            values |= _fused_by_shape([n for n in part if last_use.get(n, -1) > k and graph.op[n] not in ARRAYS], values)
+        _run_in_a_row(graph, part, values)
+        values |= _fused_by_shape([n for n in part if last_use.get(n, -1) > k and graph.op[n] not in ARRAYS], values)
     return [values[n] for n in outputs]
 
 
-def _pieces(parts: Iterable[list[int] | Loop]) -> Iterator[list[int] | Loop]:
-    for part in parts:
-        yield from [part] if isinstance(part, Loop) else (part[k : k + PIECE] for k in range(0, len(part), PIECE))
+def _deepest_first(graph: Graph, outputs: Sequence[int], known: Iterable[int]) -> list[int]:
+    """Return the needed nodes, each soon after its arguments, of which the one that ends the longest chain of operations comes first.
 
+    So chains are followed from their beginning, sums grow term by term, and little is carried from piece to piece.
+    """
+    seen = set(known)
+    depth: dict[int, int] = {}
+    for node in graph.needed(outputs, seen):
+        depth[node] = 1 + max((depth.get(a, 0) for a in graph.args[node]), default=0)
+    order = []
 
-def _arguments(graph: Graph, part: list[int] | Loop) -> Iterable[int]:
-    return sources(part) if isinstance(part, Loop) else (a for node in part for a in graph.args[node])
+    def arguments(node):
+        return iter(sorted(graph.args[node], key=lambda a: -depth.get(a, 0)))
+
+    for output in outputs:
+        waiting = [] if output in seen else [(output, arguments(output))]
+        seen.add(output)
+        while waiting:
+            arg = next((a for a in waiting[-1][1] if a not in seen), None)
+            if arg is None:
+                order.append(waiting.pop()[0])
+            else:
+                seen.add(arg)
+                waiting.append((arg, arguments(arg)))
+    return order
 
 
 def _run_in_a_row(graph: Graph, nodes: list[int], values: dict[int, jax.Array]) -> None:
     waves: dict = {}
     for node in nodes:
         op, args = graph.op[node], graph.args[node]
+        given = [values[a] for a in args]
         if op == "const":
             values[node] = graph.value[node]
         elif op in EMITTED:
-            values[node] = EMITTED[op](graph.value[node], *(values[a] for a in args))
+            values[node] = EMITTED[op](graph.value[node], *given)
+        elif op in ("sin", "cos"):
+            if args not in waves:
+                waves[args] = sine_and_cosine(*given)
+            values[node] = waves[args][op == "cos"]
         else:
-            values[node] = _operation(op, args, [values[a] for a in args], waves)
-
-
-def _operation(op: str, key: Hashable, args: list, waves: dict) -> jax.Array:
-    """One operation; `waves` keeps sines and cosines by the `key` of their argument."""
-    if op not in ("sin", "cos"):
-        return FUNCTIONS[op](*args)
-    if key not in waves:
-        waves[key] = sine_and_cosine(args[0])
-    return waves[key][op == "cos"]
+            values[node] = FUNCTIONS[op](*given)
 
 
 def _depth(graph: Graph, nodes: list[int]) -> int:
@@ -143,61 +152,3 @@ def _polynomial(coefficients, x):
     for c in coefficients[1:]:
         total = total * x + c
     return total
-
-
-UNROLLED = 2  # iterations that follow one another without a jump; measured: one is slower, four compile to more functions
-
-
-class Values(dict):
-    """Values of nodes; those of a loop are kept in one array per operation, and taken out when they are asked for."""
-
-    def __init__(self, known) -> None:
-        super().__init__(known)
-        self._in_arrays: dict[int, tuple[jax.Array, int]] = {}
-
-    def __missing__(self, node: int) -> jax.Array:
-        array, k = self._in_arrays[node]
-        self[node] = value = array[k]
-        return value
-
-    def keep(self, nodes: Sequence[int], array: jax.Array) -> None:
-        """The values of the nodes, along the first axis of an array."""
-        self._in_arrays |= {node: (array, k) for k, node in enumerate(nodes)}
-
-    def stacked(self, nodes: Sequence[int], shape: tuple[int, ...], real) -> jax.Array:
-        """The values of the nodes along a new first axis: part of an array that is kept, where they follow one another in it."""
-        places = [self._in_arrays[n] for n in nodes if n in self._in_arrays]
-        steps = {b[1] - a[1] for a, b in pairwise(places)}
-        if len(places) == len(nodes) and steps in ({1}, {-1}) and all(array is places[0][0] for array, _ in places):
-            low, high = sorted((places[0][1], places[-1][1]))
-            part = jnp.broadcast_to(jnp.moveaxis(places[0][0][low : high + 1], 0, -1), (*shape, len(nodes)))
-            return jnp.moveaxis(part, -1, 0)[:: steps.pop()].astype(real)
-        return jnp.stack([jnp.broadcast_to(jnp.asarray(self[n], real), shape) for n in nodes])
-
-
-def run_loop(loop: Loop, values: Values, wanted: set[int], operation: Callable) -> None:
-    """Add the wanted nodes of a loop to the values; `operation(op, key, arguments, waves)` computes one of them."""
-    outside = sources(loop)
-    shape = jnp.broadcast_shapes(*(jnp.shape(values[n]) for n in outside))
-    real = jnp.result_type(*([values[n] for n in outside if isinstance(values[n], jax.Array)] or [float]))
-    slots = {slot: None for slots in loop.arguments for slot in slots}
-    carried = [s for s in slots if isinstance(s, Before)]
-    stacked = [s for s in slots if isinstance(s, Given) and len(set(s.nodes)) > 1]
-    fixed = {s: values[s.nodes[0]] for s in slots if isinstance(s, Given) and len(set(s.nodes)) == 1}
-    kept = [k for k, nodes in enumerate(loop.nodes.T.tolist()) if not wanted.isdisjoint(nodes)]
-
-    def body(carry, given):
-        at = fixed | dict(zip(carried, carry, strict=True)) | dict(zip(stacked, given, strict=True))
-        waves = {}
-        for k, (op, arguments) in enumerate(zip(loop.ops, loop.arguments, strict=True)):
-            at[Here(k)] = operation(op, arguments, [at[a] for a in arguments], waves)
-        places = list(dict.fromkeys([*(s.place for s in carried), *kept]))
-        found = fused(tuple(jnp.broadcast_to(jnp.asarray(at[Here(k)], real), shape) for k in places))
-        here = dict(zip(places, found, strict=True))
-        return tuple(here[s.place] for s in carried), tuple(here[k] for k in kept)
-
-    first = tuple(jnp.broadcast_to(jnp.asarray(values[s.first], real), shape) for s in carried)
-    given = tuple(values.stacked(s.nodes, shape, real) for s in stacked)
-    _, found = lax.scan(body, first, given, length=len(loop.nodes), unroll=UNROLLED)
-    for k, array in zip(kept, found, strict=True):
-        values.keep(loop.nodes[:, k].tolist(), array)
