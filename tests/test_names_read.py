@@ -141,6 +141,17 @@ def test_what_has_state_is_refused_by_name_when_the_class_is_made(kind):
         cell(HAS_STATE[kind], "1.0 if k is None else 1.0")
 
 
+def test_methods_of_the_class_and_of_those_it_is_derived_from_count():
+    names = cell("k = 1.0", "k")
+    exec("class Stiffer(Spring):\n    def loads(self, motion): return (*super().loads(motion), jj.generalized_force(motion, x_rate=-more * motion.q.x))", names)
+    scene, names["more"] = names["Stiffer"](), 2.0
+    assert stiffness(scene, "accelerations") == pytest.approx(3.0)
+    names["more"] = 4.0
+    assert stiffness(scene, "accelerations") == pytest.approx(5.0)
+    names["k"] = 2.0
+    assert stiffness(scene, "accelerations") == pytest.approx(6.0)
+
+
 def test_a_controller_whose_method_is_called_update_is_refused():
     with pytest.raises(ValueError, match=r"`Spring\.loads` reads `controller`"):
         cell("class Law:\n    def update(self, x): return x\ncontroller = Law()", "controller.update(1.0)")

@@ -119,11 +119,12 @@ class _Watch:
         self._before: list[tuple] = []
         self._sizes: list[tuple] = []
         for root in self.roots:
-            members = {name: x for kind in own_classes(root) for name, x in vars(kind).items()} if isinstance(root, type) else {"": root}
-            for kind in own_classes(root) if isinstance(root, type) else ():
+            classes = own_classes(root) if isinstance(root, type) else ()
+            members = [(name, x) for kind in classes for name, x in vars(kind).items()] or [("", root)]
+            for kind in classes:
                 self._note(vars(kind).get, tuple(vars(kind)))
                 self._sizes.append((vars(kind), len(vars(kind))))
-            for name, member in members.items():
+            for name, member in members:
                 content.append((name, _member_key(member)))
                 for f in () if name.startswith("__") and name != "__call__" else functions_in(member):
                     where = f"`{root.__name__}.{name}`" if name else f"the function `{f.__qualname__}`"
