@@ -37,8 +37,8 @@ class _Search(eqx.Module):
     going: Bool[Array, ""]
 
 
-def damped_root(rows: Callable, guess: Float[Array, "unknowns"], size: Float[Array, "unknowns"], tolerance: float) -> Nearest:
-    """x near `guess` at which no row exceeds the `tolerance`, or where they are smallest.
+def damped_root(rows: Callable, guess: Float[Array, "unknowns"], size: Float[Array, "unknowns"], tolerance: float, low=-np.inf, high=np.inf) -> Nearest:
+    """x near `guess` from `low` to `high` at which no row exceeds the `tolerance`, or where they are smallest.
 
     `rows`: x -> f and J. `size`: of each unknown, by which steps are measured; zero for one that is held. Rows should be of order one where unknowns change
     by their size.
@@ -56,7 +56,7 @@ def damped_root(rows: Callable, guess: Float[Array, "unknowns"], size: Float[Arr
         step = -J.T @ jnp.linalg.solve(J @ J.T + damping * jnp.eye(f.shape[0], dtype=f.dtype), f)
         step = step * jnp.minimum(1.0, _FARTHEST / jnp.maximum(jnp.max(jnp.abs(step), initial=0.0), jnp.finfo(f.dtype).tiny))
         going = (jnp.max(jnp.abs(f), initial=0.0) > tolerance) & (damping < _GIVEN_UP) & (search.steps < MOST_STEPS) & jnp.all(jnp.isfinite(f))
-        return _Search(best + size * step, best, f, J, damping, search.steps + 1, going)
+        return _Search(jnp.clip(best + size * step, low, high), best, f, J, damping, search.steps + 1, going)
 
     f, J = jax.eval_shape(look, guess)
     unknown = jnp.full(f.shape, jnp.inf, f.dtype), jnp.zeros(J.shape, J.dtype)
@@ -66,10 +66,10 @@ def damped_root(rows: Callable, guess: Float[Array, "unknowns"], size: Float[Arr
     return Nearest(found.best, jnp.where(jnp.isfinite(left), left, jnp.inf))
 
 
-def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, tolerance: float, good: float) -> tuple[Nearest, Int[Array, ""]]:
+def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, tolerance: float, good: float, *bounds) -> tuple[Nearest, Int[Array, ""]]:
     """The root that is found from the first of the `guesses` that leads to one, and its number; where none does, what comes nearest.
 
-    A root leaves at most `good`; all else is as for `damped_root`.
+    A root leaves at most `good`; all else, also the `bounds`, is as for `damped_root`.
     """
     count = guesses.shape[0]
     block = max(1, min(count, MOST_ENTRIES // max(1, jax.eval_shape(rows, guesses[0])[1].size)))
@@ -78,7 +78,7 @@ def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, 
 
     def next_block(carried):
         k, best, number = carried
-        found = jax.vmap(lambda guess: damped_root(rows, guess, size, tolerance))(guesses[jnp.asarray(places)[k]])
+        found = jax.vmap(lambda guess: damped_root(rows, guess, size, tolerance, *bounds))(guesses[jnp.asarray(places)[k]])
         which = jnp.where(jnp.any(found.left <= good), jnp.argmax(found.left <= good), jnp.argmin(found.left)).astype(jnp.int32)
         better = (k == 0) | (found.left[which] < best.left)
         chosen = (Nearest(found.x[which], found.left[which]), jnp.asarray(places, jnp.int32)[k, which])

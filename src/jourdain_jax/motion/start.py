@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import lru_cache
+from types import MappingProxyType
 from typing import NamedTuple
 
 import equinox as eqx
@@ -39,8 +40,10 @@ from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 FAR = 10.0  # widths of the domain: a coordinate that Newton's method moves by more has run away
 GUESSES = 8  # of each kind
+_NOTHING: Mapping = MappingProxyType({})
 _TYPED = 1.5e-5  # of numbers that were typed with a few digits
 _OFF = 1e4  # units of round-off: a residual that is more
+_HARDLY = 1e-6  # of the width of the domain
 NEAR = 0.1  # of the domain: how far the first guesses are from what was given
 
 
@@ -102,7 +105,14 @@ class Unmoved(NamedTuple):
     u: Float[Array | np.ndarray, "speeds"]
     free_q: Bool[np.ndarray, "coordinates"]  # what may move
     free_u: Bool[np.ndarray, "speeds"]
+    bounded: Bool[np.ndarray, "coordinates"]  # what may not be found outside of the domain that the scene states
     usual: Usual
+
+    def inside(self, q) -> Bool[Array, "coordinates"]:
+        """Which coordinates are where they may be found, those that hardly moved among them."""
+        q, begin = jax.lax.stop_gradient((q, jnp.asarray(self.q)))
+        usual = self.usual
+        return ~self.bounded | ((q >= usual.low) & (q <= usual.high)) | (jnp.abs(q - begin) <= _HARDLY * usual.width)
 
 
 def unmoved(scene: Scene, q, u, native: bool, held: tuple[str, ...] = ()) -> Unmoved:
@@ -112,7 +122,7 @@ def unmoved(scene: Scene, q, u, native: bool, held: tuple[str, ...] = ()) -> Unm
     for name in held:
         if name not in coordinates + speeds:
             raise ValueError(f"`held` names `{name}`, which is no coordinate or speed; {nearest(name, coordinates + speeds)}")
-    return Unmoved(q, u, _free(coordinates, tuple(held)), _free(speeds, tuple(held)), usual_sizes(scene, False, native))
+    return Unmoved(q, u, _free(coordinates, tuple(held)), _free(speeds, tuple(held)), _free(coordinates, coordinates), usual_sizes(scene, False, native))
 
 
 @lru_cache(maxsize=1024)
@@ -161,17 +171,17 @@ def is_off(state: State) -> Bool[Array | np.ndarray, ""]:
 
 
 def _put_onto_constraints(scene: Scene, t, start: Unmoved, inputs, guesses) -> tuple[State, Bool[Array, ""]]:
-    """The start on the constraints, and whether its coordinates arrived, within reach of the domain; no search where `guesses` is None.
+    """The start on the constraints, and whether its coordinates arrived, where they may be found; no search where `guesses` is None.
 
-    The residual is infinite where a number is not finite.
+    The residual is infinite where a number is not finite, or a coordinate was found where it may not be.
     """
     given_q, u, free, usual = jnp.asarray(start.q), jnp.asarray(start.u), jnp.asarray(start.free_q), start.usual
     q = given_q
     here, at, begin = jax.lax.stop_gradient((scene, t, q))
     near_q, g = put_positions(here, at, begin, free, usual)
-    arrived, found = _arrived(begin, near_q, g, usual), _Put(near_q, g, jnp.zeros((), jnp.int32), begin, jnp.array(True))
+    arrived, found = _arrived(begin, near_q, g, start), _Put(near_q, g, jnp.zeros((), jnp.int32), begin, jnp.array(True))
     if guesses is not None and len(usual.closures):
-        other = jax.lax.cond(eqxi.unvmap_any(~arrived), lambda: _searched(here, at, begin, free, usual, jax.lax.stop_gradient(guesses)), lambda: found)
+        other = jax.lax.cond(eqxi.unvmap_any(~arrived), lambda: _searched(here, at, begin, start, jax.lax.stop_gradient(guesses)), lambda: found)
         better = ~arrived & (_left(other.g) <= _left(g))
         found = jax.tree.map(lambda x, y: jnp.where(better, x, y), other, found)
         q = jnp.where(better & free, found.begin, q)
@@ -180,10 +190,10 @@ def _put_onto_constraints(scene: Scene, t, start: Unmoved, inputs, guesses) -> t
     near_q, guess = jnp.where(found.met, near_q, q), found.guess
     near_u, phi = put_speeds(scene, t, near_q, u, jnp.asarray(inputs), jnp.asarray(start.free_u), usual)
     left = jnp.concatenate([g, phi])
-    finite = jnp.all(jnp.isfinite(jnp.concatenate([near_q, near_u, left])))
+    right = jnp.all(jnp.isfinite(jnp.concatenate([near_q, near_u, left]))) & jnp.all(start.inside(near_q))
     moved_q, moved_u, residual = (jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - given_q, near_u - u, left))
     names = scene.coordinate_names, scene.speed_names
-    state = State(jnp.asarray(t), near_q, near_u, moved_q, moved_u, jnp.where(finite, residual, jnp.inf), names, guess.astype(q.dtype))
+    state = State(jnp.asarray(t), near_q, near_u, moved_q, moved_u, jnp.where(right, residual, jnp.inf), names, guess.astype(q.dtype))
     return state, arrived
 
 
@@ -193,10 +203,10 @@ def _left(g: Float[Array, "closures"]) -> Float[Array, ""]:
     return jnp.where(left < _tolerance(g.dtype), 0.0, jnp.where(jnp.isfinite(left), left, jnp.inf))
 
 
-def _arrived(q, near_q, g, usual: Usual) -> Bool[Array, ""]:
-    """Whether the rows are met, without running far away."""
-    close = jnp.all(jnp.abs(near_q - q) <= FAR * usual.width)  # never where it is not a number
-    return jax.lax.stop_gradient(close & (_left(g) == 0))
+def _arrived(q, near_q, g, start: Unmoved) -> Bool[Array, ""]:
+    """Whether the rows are met, where coordinates may be found and without running far away."""
+    close = jnp.all(jnp.abs(near_q - q) <= FAR * start.usual.width)  # never where it is not a number
+    return jax.lax.stop_gradient(close & (_left(g) == 0)) & jnp.all(start.inside(near_q))
 
 
 class _Put(NamedTuple):
@@ -209,19 +219,22 @@ class _Put(NamedTuple):
     met: Bool[Array, ""]  # whether it was worth while
 
 
-def _searched(scene: Scene, t, q, free, usual: Usual, guesses) -> _Put:
+def _searched(scene: Scene, t, q, start: Unmoved, guesses) -> _Put:
     """Coordinates from the first guess that leads to the rows, q itself counting as the first."""
+    free, usual = jnp.asarray(start.free_q), start.usual
     size = jnp.where(free, jnp.asarray(usual.width, q.dtype), 0.0)
     every = jnp.where(free, jnp.concatenate([q[None], guesses]), q)
     by = functions_of_rows(usual)
     given = by.given(scene)
     G = jax.vmap(lambda q: by.closures(given, t, q)[1])(every)
-    every = jnp.where(jnp.any(G != 0, axis=(0, 1)), every, q)  # coordinates that no row depends on stay
+    on_rows = jnp.any(G != 0, axis=(0, 1))  # coordinates that no row depends on stay
+    low, high = (jnp.where(on_rows & start.bounded, x, side * jnp.inf) for x, side in ((usual.low, -1), (usual.high, 1)))
+    every = jnp.clip(jnp.where(on_rows, every, q), low, high)
     d = row_scale(jnp.max(jnp.abs(G), axis=0) * size, usual.closures * jnp.mean(usual.width))
     tolerance = 16 * float(jnp.finfo(q.dtype).eps)
     scaled = lambda q: jax.tree.map(lambda x: (x.T * d).T, by.closures(given, t, q))  # noqa: E731
     good = float(jnp.finfo(q.dtype).eps) ** 0.5
-    found, guess = first_root(scaled, every, size, tolerance, good)
+    found, guess = first_root(scaled, every, size, tolerance, good, low, high)
     begin, met = jnp.where(free, found.x, q), found.left <= good
     near_q = jnp.where(met, put_positions(scene, t, begin, free, usual)[0], begin)
     return _Put(near_q, by.closures(given, t, near_q)[0], guess, begin, met)
@@ -237,33 +250,38 @@ _uncompiled_projection = eval_numpy(_put_onto_constraints)
 
 
 @shown_from_users_lines
-def start(scene: Scene | BuiltFor, given=None, *, t0: Number = 0.0, inputs=None, **values) -> State:
+def start(scene: Scene | BuiltFor, given=None, *, near: Mapping | None = None, t0: Number = 0.0, inputs=None, **values) -> State:
     """A consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`, or `start(disc, {"lean": 0.3, "spin_rate": -3.0})`.
 
     `values`, by keyword or in a dictionary `given` (where both name one, the keyword counts), are kept, at time `t0` (s).
-    Coordinates that are not given begin at zero (a quaternion at the identity) and follow from the rows;
-    where that leads nowhere, they begin at those of states of the domain, nearest first, and the state says so (`guess`).
+    Coordinates that are not given begin at zero (a quaternion at the identity) and follow from the rows; where that leads nowhere, or out of the `domain`
+    that the scene states, they begin at those of states of the domain, nearest first, and the state says so (`guess`). `near`: coordinates by name, with
+    values from which they begin but at which they are not held; those may be found outside of the domain.
+    Of a quaternion that is given in part, `attitude_w=cos(a / 2), attitude_x=sin(a / 2)`, the other parts are zero.
     Privileged speeds that are not given stay zero and the dependent speeds follow from the rows;
     where dependent speeds are given, all others are solved for: the smallest change that meets the constraints, in the metric of the mass matrix.
     `inputs`: as in `simulate`, name -> number, function of time, or `Sampled`; what they are at `t0` counts where velocity rows depend on them.
-    ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints.
+    ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints or that no state of the
+    domain has; where they are not, `residual` is infinite, and a motion from there ends with a code.
     """
     scene = as_scene(scene)
     if given is not None and not isinstance(given, Mapping):
         raise ValueError(f"`start` was given {described(given)}, expected named values: `jj.start(scene, lean=0.3)`, or a dictionary of them")
-    return named_start(scene, {**(given or {}), **values}, t0, inputs_at(as_inputs(scene, inputs), _as_time(t0)))
+    if near is not None and not isinstance(near, Mapping):
+        raise ValueError(f'`near` is {described(near)}, expected a dictionary of coordinates: near={{"z": -0.4}}')
+    return named_start(scene, {**(given or {}), **values}, t0, inputs_at(as_inputs(scene, inputs), _as_time(t0)), near=near or {})
 
 
-def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, native: bool = True, onto_rows: bool = False) -> State:
+def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, native: bool = True, onto_rows: bool = False, near: Mapping = _NOTHING) -> State:
     """A start from a dictionary of `values`, as of `start`, and the `inputs` at time `t0`: a vector, or by name (None: zero).
 
     `native`: as in `put_on_rows`. `onto_rows`: where given values contradict each other by so little that it passes for round-off of what was typed, they
     move, too.
     """
     scene = as_scene(scene)
-    t, start, inputs, known, given = named_unmoved(scene, values, t0, inputs, native)
+    t, start, inputs, known, given = named_unmoved(scene, values, t0, inputs, native, near)
     state = _consistent(scene, t, start, inputs, lambda: _guesses(scene, known, start.q, start.free_q))
-    _check_residual(scene, state, inputs, given)
+    _check_residual(scene, start, state, inputs, given)
     return _moved_if_near(scene, state, inputs, native) if onto_rows and may_contradict(scene, known, start.free_q, start.free_u) else state
 
 
@@ -292,17 +310,24 @@ class _Named(NamedTuple):
     given: tuple[str, ...]
 
 
-def named_unmoved(scene: Scene, values: Mapping, t0, inputs, native: bool) -> _Named:
+def named_unmoved(scene: Scene, values: Mapping, t0, inputs, native: bool, near: Mapping = _NOTHING) -> _Named:
     """Named values as vectors, and what of them may move; arguments as of `named_start`."""
-    q, u, given = vectors_named(scene, values)
+    q, u, given = vectors_named(scene, {**near, **values})
+    about = given if near else ()
+    if near:
+        given = vectors_named(scene, values)[2]
+        for name in near:
+            if name not in scene.coordinate_names:
+                raise ValueError(f"`near` names `{name}`, which is no coordinate; {nearest(name, scene.coordinate_names.entries)}")
     inputs = _as_input_vector(scene, inputs, q.dtype)
     t, free_q = _as_time(t0), _free(scene.coordinate_names.entries, given)
     if is_traced(q, u, t) or not (np.isfinite(q).all() and np.isfinite(u).all() and np.isfinite(t)):
-        _check_finite({**values, "t0": t0})
+        _check_finite({**near, **values, "t0": t0})
     known = _structure(scene, t, q, free_q)
     free_u = _free(scene.speed_names.entries, (*given, *_resting(scene, known, given)))
     determined = known.affine and not any(free_u[i] for i in known.independent)  # rows determine the speeds that are free
-    return _Named(t, Unmoved(q, u, free_q, free_u, usual_sizes(scene, determined, native)), inputs, known, given)
+    bounded = _free(scene.coordinate_names.entries, about) if near else free_q
+    return _Named(t, Unmoved(q, u, free_q, free_u, bounded, usual_sizes(scene, determined, native)), inputs, known, given)
 
 
 def _structure(scene: Scene, t, q, free_q) -> Structure:
@@ -347,16 +372,25 @@ def _check_finite(values: Mapping) -> None:
             raise ValueError(f"start value `{name}` is {value}, expected a finite number; check where it was computed")
 
 
-def _check_residual(scene: Scene, state: State, inputs, given: tuple[str, ...]) -> None:
+def _check_residual(scene: Scene, start: Unmoved, state: State, inputs, given: tuple[str, ...]) -> None:
     if is_traced(state.residual) or np.asarray(state.residual) < _tolerance(state.q.dtype):
         return
+    who, held = type(scene).__name__, ", ".join(f"`{name}`" for name in given) or "none"
     g = np.abs(np.asarray(closure_residual(scene, state.t, state.q)))
+    outside = np.flatnonzero(~np.asarray(start.inside(state.q)))
+    for k in outside[:1] if float(_left(jnp.asarray(g))) == 0 else ():
+        name, found = scene.coordinate_names.entries[k], float(state.q[k])
+        raise ValueError(
+            f"no start of `{who}` was found with `{name}` in its `domain`, {scene.domain[name]}, while the given values are held ({held}): the nearest one has "
+            f'{found:.6g}; give other values, a wider `domain`, or near={{"{name}": {found:.2g}}}, from where it is looked for, outside of the domain as well'
+        )
     phi = np.abs(np.asarray(velocity_residual(scene, state.t, state.q, state.u, inputs)))
     names = list(names_of_position_rows(scene))
     names += [f"norm of quaternion {k + 1}" for k in range(len(g) - len(names))] + list(names_of_rows(scene))
     worst = int(np.argmax(np.concatenate([g, phi])))
-    held = ", ".join(f"`{name}`" for name in given) or "none"
+    within = any(bounded and name in scene.domain for name, bounded in zip(scene.coordinate_names.entries, start.bounded, strict=True))
+    elsewhere = ", give some as guesses by `near=`, which are looked for outside of the `domain` as well" if within else ""
     raise ValueError(
-        f"the start of `{type(scene).__name__}` contradicts row `{names[worst]}`: residual {np.concatenate([g, phi])[worst]:.3g} is left with the given values "
-        f"held ({held}); give fewer values and let the constraints decide the rest, or use `jj.consistent(scene, t, q, u)` to move all of them"
+        f"the start of `{who}` contradicts row `{names[worst]}`: residual {np.concatenate([g, phi])[worst]:.3g} is left with the given values "
+        f"held ({held}); give fewer values and let the constraints decide the rest{elsewhere}, or use `jj.consistent(scene, t, q, u)` to move all of them"
     )

@@ -25,6 +25,8 @@ from jourdain_jax.scene.parameters import check_parameters, parameters_of
 from jourdain_jax.scene.printing import scene_html, scene_text
 from jourdain_jax.scene.visuals import Visual
 
+_TYPED = 1e-4  # of the square of a quaternion whose parts were typed with a few digits
+
 
 class Scene(eqx.Module):
     """Base class of all scenes. Subclass it, state `coordinates` and `bodies`, and what else the scene needs.
@@ -165,7 +167,8 @@ class Scene(eqx.Module):
     def named(self, **values) -> tuple[Float[Array, "coordinates"], Float[Array, "speeds"], tuple[str, ...]]:
         """q and u with the named `values`, the rest at the reference (zero; the identity for quaternions); and the names that were given.
 
-        A quaternion or its angular velocity may be given whole, by its own name. ValueError for an unknown name or a wrong shape.
+        A quaternion or its angular velocity may be given whole, by its own name; of a quaternion that is named in part, the other parts are zero.
+        ValueError for an unknown name or a wrong shape, and for parts of a quaternion that are no attitude without the others.
         """
         q, u, given = vectors_named(self, values)
         return jnp.asarray(q), jnp.asarray(u), given
@@ -188,7 +191,25 @@ def entries_named(scene: Scene, values: Mapping) -> tuple[list, list, tuple[str,
             valid = coordinates.entries + speeds.entries
             raise ValueError(f"scene `{type(scene).__name__}` has no coordinate or speed `{name}`; {nearest(name, valid)}")
         given += hits
+    for first, _ in scene.coordinates.quaternions:
+        given += _completed(coordinates.entries[first : first + 4], q, first, given)
     return q, u, tuple(given)
+
+
+def _completed(parts: tuple[str, ...], q: list, first: int, given: list[str]) -> list[str]:
+    """The other parts of a quaternion that is named in part, put to zero: otherwise its attitude would be any one that has these parts."""
+    named = [name for name in parts if name in given]
+    if len(named) in (0, 4):
+        return []
+    q[first : first + 4] = [value if name in named else 0.0 for name, value in zip(parts, q[first : first + 4], strict=True)]
+    square = sum(value * value for value in q[first : first + 4])
+    if not is_traced(square) and abs(float(square) - 1) > _TYPED:
+        group, told = parts[0].removesuffix("_w"), ", ".join(f"`{name}`" for name in named)
+        raise ValueError(
+            f"of the quaternion `{group}` only {told} is given, the squares of which sum up to {float(square):.4g}: many attitudes have that; give all four "
+            f"parts, {group}=(w, x, y, z), or those whose squares sum up to 1, the others being zero"
+        )
+    return [name for name in parts if name not in named]
 
 
 def _put(names: Names, entries: list, name: str, value) -> list[str]:
