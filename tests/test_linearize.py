@@ -216,3 +216,34 @@ def test_wrong_names_are_answered_with_valid_ones():
 
 
 # Minutes of compilation, and not yet run together with the rest: kept out of the short run until it has been.
+
+
+class TwoSkates(jj.Scene):
+    """Two bodies on skates, one turned against the other about a pin at the rear one's front."""
+
+    coordinates = jj.coordinates("x y heading steer")
+
+    def bodies(self, t, q):
+        o, moments = 0.0 * q.x, (0.1, 0.2, 0.3)
+        ahead = jnp.stack([jnp.cos(q.heading), jnp.sin(q.heading), o])
+        at = jnp.stack([q.x, q.y, o])
+        front = jj.RigidBody(1.0, moments, at + ahead, jj.rot_z(q.heading + q.steer))
+        return {"rear": jj.RigidBody(2.0, moments, at, jj.rot_z(q.heading)), "front": front}
+
+    def velocity_constraints(self, motion):
+        return {name: body.orientation[:, 1] @ body.velocity for name, body in motion.bodies.items()}
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.7, np.pi / 2])
+def test_speeds_are_chosen_at_the_state_where_those_of_the_domain_do_not_serve(heading):
+    scene = TwoSkates()
+    state = jj.start(scene, heading=heading, x_rate=np.cos(heading), y_rate=np.sin(heading))
+    small = linearize(scene, state, ())
+    assert small.pivot > 0.02
+    # straight ahead at 1 m/s with both skates in line: a heading stays, a steer of the front one falls as exp(-t), an offset and the speed stay
+    np.testing.assert_allclose(small.state_eigenvalues().real, [-1.0, 0.0, 0.0, 0.0, 0.0, 0.0], atol=1e-6)
+    in_jit = jax.jit(lambda u: linearize(scene, jj.consistent(scene, 0.0, state.q, u), ()))(state.u)
+    assert in_jit.pivot < 1e-12
+    assert np.isnan(in_jit.A).all()
+    with pytest.raises(ValueError, match="do not follow from its rows at this state"):
+        linearize(scene, state, (), privileged=("heading_rate", "steer_rate"))

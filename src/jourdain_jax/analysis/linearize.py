@@ -19,9 +19,21 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from jourdain_jax.analysis.table import linearization_text
-from jourdain_jax.analysis.tangent import Flow, carried_along, dependent_coordinates, eliminated, flow_of, others, perturbations, privileged_speeds
+from jourdain_jax.analysis.tangent import (
+    Flow,
+    carried_along,
+    dependent_coordinates,
+    eliminated,
+    flow_of,
+    others,
+    perturbations,
+    privileged_at,
+    privileged_speeds,
+)
 from jourdain_jax.build.load_jumps import loads_without_slope
+from jourdain_jax.build.structure import WELL_CONDITIONED
 from jourdain_jax.calculus.reals import Numbers, is_traced
+from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.quick_compilation import RUN_SELDOM, quickly_compiled
 from jourdain_jax.motion.sensitivity import SensitivityWarning
@@ -115,9 +127,11 @@ def linearize(
     - `dependent`: names of the coordinates that follow from the geometric rows; `privileged`: names of the independent speeds. The default
       is well conditioned at the state (over the scene's domain, while state or parameters are traced).
 
-    **Returns** a `Linearization`. Pure: runs under jit, vmap and differentiation, over scene parameters and the state.
+    **Returns** a `Linearization`. Pure: runs under jit, vmap and differentiation, over scene parameters and the state. Where the privileged speeds do not
+    determine the others, all is NaN there and `pivot` is zero, or nearly: name others.
 
-    **Raises** ValueError: an unknown coordinate or speed, a coordinate that is both named and dependent, or whose rate is no privileged speed.
+    **Raises** ValueError: an unknown coordinate or speed, a coordinate that is both named and dependent, or whose rate is no privileged speed; at a known
+    state, speeds or coordinates that do not determine the others there.
     **Warns** (`SensitivityWarning`): a load has a kink or jumps at the state, as dry friction does at rest.
     """
     scene = as_scene(scene)
@@ -128,7 +142,18 @@ def linearize(
     coordinates = None if coordinates is None else as_names(coordinates)
     y = privileged_speeds(scene, privileged)
     dependent_s = dependent_coordinates(scene, state, coordinates or (), None if dependent is None else as_names(dependent))
-    return _linearize(scene, state, f, y, tuple(dependent_s.tolist()), coordinates)
+    found = _linearize(scene, state, f, y, tuple(dependent_s.tolist()), coordinates)
+    if is_traced(found) or not found.pivot < WELL_CONDITIONED:
+        return found
+    if privileged is None and scene.privileged is None:
+        chosen = privileged_at(scene, state, f, y)
+        found = found if chosen == y else _linearize(scene, state, f, chosen, tuple(dependent_s.tolist()), coordinates)
+    if found.pivot < SMALLEST_PIVOT:
+        raise ValueError(
+            f"the dependent speeds or coordinates of `{type(scene).__name__}` do not follow from its rows at this state (pivot {float(found.pivot):.1e}): "
+            "name others by `privileged` or `dependent`, or linearize at a state beside it"
+        )
+    return found
 
 
 def _warn_of_loads(scene: Scene, state: State, f) -> None:

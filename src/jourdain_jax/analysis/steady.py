@@ -17,15 +17,13 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.analysis.tangent import flow_of, privileged_speeds
 from jourdain_jax.build.domain import coordinate_bounds
-from jourdain_jax.build.trace import traced_scene
+from jourdain_jax.build.probed_on_graph import coordinates_on_rows
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
 from jourdain_jax.calculus.reals import Number, Numbers, described
 from jourdain_jax.dynamics.reduced import ignorable_coordinates
-from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.motion.quick_compilation import RUN_SELDOM, quickly_compiled
 from jourdain_jax.motion.start import State
-from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.printing import Printed
@@ -99,21 +97,11 @@ def steady(
     _check_names(scene, moving, (*scene.coordinate_names.entries, *groups))
     carried = {entry for name in moving for entry in groups.get(name, (name,))}
     resting = tuple(i for i, name in enumerate(scene.coordinate_names.entries) if name not in carried)
+    on_rows = set(np.array(scene.coordinate_names.entries)[coordinates_on_rows(scene)])
     # nothing that vanishes changes with them: they keep the guess's value, and no step runs away along them
-    idle = {entry for name in ignorable for entry in groups.get(name, (name,))} - _on_geometric_rows(scene)
+    idle = {entry for name in ignorable for entry in groups.get(name, (name,))} - on_rows
     free = jnp.array([name not in held and name not in idle for name in names], bool)
     return _solve(_Problem(scene, t, f, privileged_speeds(scene, privileged), resting), q, u, free, max_steps)
-
-
-def _on_geometric_rows(scene: Scene) -> set[str]:
-    """Coordinates on which geometric rows or unit norms may depend."""
-    names = scene.coordinate_names.entries
-    in_quaternions = {names[first + k] for first, _ in scene.coordinates.quaternions for k in range(4)}
-    if not names_of_position_rows(scene):
-        return in_quaternions
-    traced = traced_scene(scene)
-    found = {n for row in jacobian(traced.graph, traced.at.closure.tolist(), traced.q.tolist()) for n in row}
-    return in_quaternions | {name for name, n in zip(names, traced.q.tolist(), strict=True) if n in found}
 
 
 def _guessed(scene: Scene, guess, t0) -> tuple[Array, Array, Array]:

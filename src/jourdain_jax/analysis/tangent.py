@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jourdain_jax.build.privileged import best_privileged, pivots_at
 from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.build.sampling import sample_states
-from jourdain_jax.build.structure import structure_of, usual_rows
+from jourdain_jax.build.structure import WELL_CONDITIONED, structure_of, usual_rows
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff, singular_values
 from jourdain_jax.calculus.rotations import quaternion_product
 from jourdain_jax.eager.eager import eval_numpy
@@ -125,6 +126,20 @@ def privileged_speeds(scene: Scene, names: str | tuple[str, ...] | None = None) 
             f"freedom; name {freedoms} independent speeds"
         )
     return chosen
+
+
+def privileged_at(scene: Scene, state: State, f, usual: tuple[int, ...]) -> tuple[int, ...]:
+    """Indices of independent speeds at a known state: the `usual` ones, or others where these do not determine the rest well."""
+    A, count = _scaled_rows(scene, state.t, state.q, state.u, f)[None], len(scene.speed_names)
+    rank = count - len(usual)
+    pivot = lambda y: pivots_at(A, others(y, count).tolist(), rank)[0]  # noqa: E731
+    return usual if pivot(usual) >= WELL_CONDITIONED else best_privileged(A, count, rank)
+
+
+@eval_numpy
+def _scaled_rows(scene: Scene, t, q, u, f):
+    equations, rows = equations_and_rows(scene, t, q, u, f)
+    return scaled(equations, rows.judged_by(usual_rows(scene))).A
 
 
 def dependent_coordinates(scene: Scene, state: State, named: tuple[str, ...], dependent: tuple[str, ...] | None) -> Int[np.ndarray, "dependent"]:

@@ -97,6 +97,12 @@ def looked_at(scene: Scene) -> LookedAt:
     )
 
 
+def coordinates_on_rows(scene: Scene) -> np.ndarray:
+    """Which coordinates geometric rows or unit norms depend on, (coordinates,)."""
+    nodes = looked_at(scene)
+    return np.isin(nodes.traced.q, [n for row in nodes.of_closures for n in row])
+
+
 def _passing(kinds, traced: TracedScene, vanishing: dict, rows: list[dict[int, int]]) -> frozenset[str]:
     """What passes an operation of these kinds; "nonlinear" where the rows do so with the speeds."""
     g, u = traced.graph, traced.u.tolist()

@@ -4,12 +4,16 @@ at random states are singular.
 
 import itertools
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jourdain_jax.build.assembling import Assembled
 from jourdain_jax.build.domain import coordinate_bounds, speed_bounds
 from jourdain_jax.build.probed import Probed
 from jourdain_jax.build.probed_on_graph import sampled_on_graph
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.scene.arguments import as_scene, of_known_numbers
 from jourdain_jax.scene.scene import Scene
 
@@ -17,6 +21,8 @@ SYMMETRIC_PROBES = 200
 SYMMETRIC_NUMBERS = 12_000  # in their coordinates together, at most: chains of hundreds of bodies are looked at in fewer symmetric configurations,
 FEWEST_SYMMETRIC = 24  # but in so many
 FEW_INSIDE = 8  # random states inside the domain: with fewer, those nearest to it are used as well
+GUESSES = 8  # of a start, of each kind
+NEAR = 0.1  # of the domain: how far the first guesses are from what was given
 NEARLY_INSIDE = 0.05  # of the width of the domain
 
 
@@ -98,6 +104,19 @@ def random_states(scene: Scene, count: int, generator: np.random.Generator) -> t
         wxyz = generator.normal(size=(count, 4))
         q[:, first : first + 4] = wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)
     return generator.uniform(0, 1, count), q, generator.uniform(u_low, u_high, (count, len(u_low)))
+
+
+def guesses_of(scene: Scene, states: np.ndarray, q, free) -> Float[Array | np.ndarray, "guesses coordinates"]:
+    """Configurations near q, those of the `states` on the rows (first those whose coordinates that are not `free` are nearest), and elsewhere in the domain."""
+    on = jnp if is_traced(q) else np
+    q = jax.lax.stop_gradient(q) if is_traced(q) else np.asarray(q)
+    low, high = coordinate_bounds(scene)
+    on_rows = on.asarray(states, q.dtype)
+    apart = on.where(free, 0.0, (on_rows - q) / np.where(high > low, high - low, 1.0))
+    nearest_first = on.argsort(on.sum(apart**2, axis=1))[:GUESSES]
+    elsewhere = np.random.default_rng(3).uniform(low, high, (2 * GUESSES, len(low)))
+    near = q + NEAR * (elsewhere[:GUESSES] - (low + high) / 2)
+    return on.concatenate([near, on_rows[nearest_first], elsewhere[GUESSES:]]).astype(q.dtype)
 
 
 def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.domain import coordinate_bounds
+from jourdain_jax.build.probed_on_graph import coordinates_on_rows
 from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.row_program import RowProgram, row_program
 from jourdain_jax.build.sampling import NEARLY_INSIDE
@@ -38,7 +39,7 @@ class Usual(eqx.Module):
     closures: Float[Array | np.ndarray, "closures"]
     rows: Float[Array | np.ndarray, "rows"]  # in scaled speeds; where rows determine the speeds that are free, in the speeds as they are
     width: Float[Array | np.ndarray, "coordinates"]  # of the domain
-    low: Float[Array | np.ndarray, "coordinates"]  # of what the scene states as its domain, and a little less; infinite where it states none
+    low: Float[Array | np.ndarray, "coordinates"]  # where a coordinate is found by the rows; infinite where it may be anywhere
     high: Float[Array | np.ndarray, "coordinates"]
     affine: bool = eqx.field(static=True)  # rows are, in the speeds
     determined: bool = eqx.field(static=True)  # rows determine the speeds that are free
@@ -48,15 +49,21 @@ class Usual(eqx.Module):
 def _worked_out(scene: Scene, determined: bool, native: bool) -> Usual:
     low, high = (x.astype(real_type()) for x in coordinate_bounds(scene))
     width = np.where(high > low, high - low, 1.0).astype(real_type())
-    stated = [name in scene.domain for name in scene.coordinate_names.entries]
-    of_domain = width, *(np.where(stated, x + side * NEARLY_INSIDE * width, side * np.inf) for x, side in ((low, -1), (high, 1)))
     program = row_program(scene) if native and not ffi.reason_against() else None
     try:
         rows = plain_row_lengths(scene) if determined else usual_rows(scene).lengths
-        return Usual(closure_lengths(scene), rows, *of_domain, rows_are_affine(scene), determined, program)
+        within = _found_within(scene, low, high)
+        return Usual(closure_lengths(scene), rows, width, within[0], within[1], rows_are_affine(scene), determined, program)
     except ValueError:  # of a scene that is wrong in itself; said where its structure is asked for
         norms, geometric = len(scene.coordinates.quaternions), len(names_of_position_rows(scene))
-        return Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), *of_domain, False, False, None)
+        return Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), width, -np.inf * width, np.inf * width, False, False, None)
+
+
+def _found_within(scene: Scene, low, high) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of what rows may find: the domain, and a little more, of the coordinates for which a scene states it and on which rows depend."""
+    bounded = coordinates_on_rows(scene) & [name in scene.domain for name in scene.coordinate_names.entries]
+    more = NEARLY_INSIDE * (high - low)
+    return np.where(bounded, low - more, -np.inf).astype(low.dtype), np.where(bounded, high + more, np.inf).astype(low.dtype)
 
 
 def _as_arrays(scene: Scene, determined: bool, native: bool) -> Usual:

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jourdain_jax.build.domain import coordinate_bounds
 from jourdain_jax.build.held_values import may_contradict
-from jourdain_jax.build.sampling import NoStateFoundError, seen_on_rows
+from jourdain_jax.build.row_program import RowProgram
+from jourdain_jax.build.sampling import NoStateFoundError, guesses_of, seen_on_rows
 from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.calculus.damped import first_root
 from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, described, is_traced, nothing_is_traced, real_type
@@ -31,6 +31,7 @@ from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.motion.inputs import as_inputs, inputs_at
 from jourdain_jax.motion.put_on_rows import Usual, functions_of_rows, put_positions, put_speeds, usual_sizes
 from jourdain_jax.motion.quick_compilation import RUN_SELDOM, quickly_compiled
+from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import nearest
@@ -39,12 +40,9 @@ from jourdain_jax.scene.scene import Scene, vectors_named
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 FAR = 10.0  # widths of the domain: a coordinate that Newton's method moves by more has run away
-GUESSES = 8  # of each kind
 _NOTHING: Mapping = MappingProxyType({})
 _TYPED = 1.5e-5  # of numbers that were typed with a few digits
 _OFF = 1e4  # units of round-off: a residual that is more
-_HARDLY = 1e-6  # of the width of the domain
-NEAR = 0.1  # of the domain: how far the first guesses are from what was given
 
 
 class State(Printed, eqx.Module):
@@ -109,10 +107,9 @@ class Unmoved(NamedTuple):
     usual: Usual
 
     def inside(self, q) -> Bool[Array, "coordinates"]:
-        """Which coordinates are where they may be found, those that hardly moved among them."""
-        q, begin = jax.lax.stop_gradient((q, jnp.asarray(self.q)))
-        usual = self.usual
-        return ~self.bounded | ((q >= usual.low) & (q <= usual.high)) | (jnp.abs(q - begin) <= _HARDLY * usual.width)
+        """Which coordinates are where they may be found."""
+        q = jax.lax.stop_gradient(q)
+        return ~self.bounded | ((q >= self.usual.low) & (q <= self.usual.high))
 
 
 def unmoved(scene: Scene, q, u, native: bool, held: tuple[str, ...] = ()) -> Unmoved:
@@ -227,9 +224,8 @@ def _searched(scene: Scene, t, q, start: Unmoved, guesses) -> _Put:
     by = functions_of_rows(usual)
     given = by.given(scene)
     G = jax.vmap(lambda q: by.closures(given, t, q)[1])(every)
-    on_rows = jnp.any(G != 0, axis=(0, 1))  # coordinates that no row depends on stay
-    low, high = (jnp.where(on_rows & start.bounded, x, side * jnp.inf) for x, side in ((usual.low, -1), (usual.high, 1)))
-    every = jnp.clip(jnp.where(on_rows, every, q), low, high)
+    low, high = (jnp.where(start.bounded, x, side * jnp.inf) for x, side in ((usual.low, -1), (usual.high, 1)))
+    every = jnp.clip(jnp.where(jnp.any(G != 0, axis=(0, 1)), every, q), low, high)  # coordinates that no row depends on stay
     d = row_scale(jnp.max(jnp.abs(G), axis=0) * size, usual.closures * jnp.mean(usual.width))
     tolerance = 16 * float(jnp.finfo(q.dtype).eps)
     scaled = lambda q: jax.tree.map(lambda x: (x.T * d).T, by.closures(given, t, q))  # noqa: E731
@@ -250,13 +246,13 @@ _uncompiled_projection = eval_numpy(_put_onto_constraints)
 
 
 @shown_from_users_lines
-def start(scene: Scene | BuiltFor, given=None, *, near: Mapping | None = None, t0: Number = 0.0, inputs=None, **values) -> State:
+def start(scene: Scene | BuiltFor, given=None, *, near=None, t0: Number = 0.0, inputs=None, **values) -> State:
     """A consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`, or `start(disc, {"lean": 0.3, "spin_rate": -3.0})`.
 
     `values`, by keyword or in a dictionary `given` (where both name one, the keyword counts), are kept, at time `t0` (s).
     Coordinates that are not given begin at zero (a quaternion at the identity) and follow from the rows; where that leads nowhere, or out of the `domain`
     that the scene states, they begin at those of states of the domain, nearest first, and the state says so (`guess`). `near`: coordinates by name, with
-    values from which they begin but at which they are not held; those may be found outside of the domain.
+    values from which they begin but at which they are not held; those may be found outside of the domain, as may coordinates of which the rows leave no choice.
     Of a quaternion that is given in part, `attitude_w=cos(a / 2), attitude_x=sin(a / 2)`, the other parts are zero.
     Privileged speeds that are not given stay zero and the dependent speeds follow from the rows;
     where dependent speeds are given, all others are solved for: the smallest change that meets the constraints, in the metric of the mass matrix.
@@ -280,7 +276,7 @@ def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, native: bo
     """
     scene = as_scene(scene)
     t, start, inputs, known, given = named_unmoved(scene, values, t0, inputs, native, near)
-    state = _consistent(scene, t, start, inputs, lambda: _guesses(scene, known, start.q, start.free_q))
+    state = _consistent(scene, t, start, inputs, lambda: guesses_of(scene, known.coordinates[: known.random], start.q, start.free_q))
     _check_residual(scene, start, state, inputs, given)
     return _moved_if_near(scene, state, inputs, native) if onto_rows and may_contradict(scene, known, start.free_q, start.free_u) else state
 
@@ -326,8 +322,20 @@ def named_unmoved(scene: Scene, values: Mapping, t0, inputs, native: bool, near:
     known = _structure(scene, t, q, free_q)
     free_u = _free(scene.speed_names.entries, (*given, *_resting(scene, known, given)))
     determined = known.affine and not any(free_u[i] for i in known.independent)  # rows determine the speeds that are free
-    bounded = _free(scene.coordinate_names.entries, about) if near else free_q
-    return _Named(t, Unmoved(q, u, free_q, free_u, bounded, usual_sizes(scene, determined, native)), inputs, known, given)
+    usual = usual_sizes(scene, determined, native)
+    bounded = _bounded(usual.program, scene.coordinate_names.entries, given, about)
+    return _Named(t, Unmoved(q, u, free_q, free_u, bounded, usual), inputs, known, given)
+
+
+@lru_cache(maxsize=1024)
+def _bounded(program: RowProgram | None, names: tuple[str, ...], given: tuple[str, ...], about: tuple[str, ...]) -> Bool[np.ndarray, "coordinates"]:
+    """Which coordinates rows may not find outside of the domain: those neither given nor guessed; none where the rows, affine in them, leave one place."""
+    free = _free(names, given)
+    if program is not None:
+        slopes = [n for (_, k), n in program.G.items() if free[k]]
+        if not any(depend_on(program.graph, slopes, np.array(program.q)[free].tolist())):
+            return np.zeros(len(names), bool)
+    return free & _free(names, about)
 
 
 def _structure(scene: Scene, t, q, free_q) -> Structure:
@@ -342,19 +350,6 @@ def _structure(scene: Scene, t, q, free_q) -> Structure:
             raise
         seen_on_rows(scene, near)
         return structure_of(scene)
-
-
-def _guesses(scene: Scene, known: Structure, q, free_q) -> Float[Array | np.ndarray, "guesses coordinates"]:
-    """Configurations near q, on the rows (those first whose given coordinates are nearest), and elsewhere in the domain."""
-    on = jnp if is_traced(q) else np
-    q = jax.lax.stop_gradient(q) if is_traced(q) else np.asarray(q)
-    low, high = coordinate_bounds(scene)
-    on_rows = on.asarray(known.coordinates[: known.random], q.dtype)
-    apart = on.where(free_q, 0.0, (on_rows - q) / np.where(high > low, high - low, 1.0))
-    nearest_first = on.argsort(on.sum(apart**2, axis=1))[:GUESSES]
-    elsewhere = np.random.default_rng(3).uniform(low, high, (2 * GUESSES, len(low)))
-    near = q + NEAR * (elsewhere[:GUESSES] - (low + high) / 2)
-    return on.concatenate([near, on_rows[nearest_first], elsewhere[GUESSES:]]).astype(q.dtype)
 
 
 def _resting(scene: Scene, known: Structure, given: tuple[str, ...]) -> tuple[str, ...]:
