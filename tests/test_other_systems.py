@@ -204,7 +204,7 @@ def test_a_study_takes_an_empty_folder_also_where_a_folder_cannot_take_the_place
 
     monkeypatch.setattr(os, "rename", rename)
     (tmp_path / "empty").mkdir()
-    assert Store.make(tmp_path / "empty", {"samples": 4, "chunk": 2}, {}, {}, {}).lanes == 4
+    assert Store.make(tmp_path / "empty", {"samples": 4, "chunk": 2, "block": 2}, {}, {}, {}).lanes == 4
     assert [file.name for file in tmp_path.iterdir()] == ["empty"]
 
 
@@ -256,7 +256,7 @@ def test_a_bound_on_memory_is_refused_where_there_is_no_library_of_c_to_ask(monk
 
 def test_a_study_whose_workers_cannot_begin_says_so(tmp_path):
     sent = b"\x80\x04\x8c\x08__main__\x8c\x04Mine\x93."  # a class of the program that was started, which a worker does not have
-    store = Store.make(tmp_path / "study", {"samples": 4, "chunk": 2}, {}, {}, {})
+    store = Store.make(tmp_path / "study", {"samples": 4, "chunk": 2, "block": 2}, {}, {}, {})
     found = workers._until_a_worker_dies(sent, store, [0, 1], 1, lambda: False)
     with pytest.raises(RuntimeError, match=r"no worker of this study could begin.*__main__"):
         next(found)

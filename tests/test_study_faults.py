@@ -2,14 +2,19 @@
 
 import errno
 import json
+import math
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections import deque
+import warnings
+from collections import Counter, deque
+from collections.abc import Iterator
+from dataclasses import replace
 from fractions import Fraction
+from itertools import combinations
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -24,9 +29,10 @@ from test_inputs import OnBelt
 from test_studies import assert_same
 
 import jourdain_jax as jj
-from jourdain_jax.ensembles import files, store, task
-from jourdain_jax.ensembles.files import write_whole
+from jourdain_jax.calculus.writing import write_whole
+from jourdain_jax.ensembles import files, optional, store, task, workers
 from jourdain_jax.ensembles.identity import digest
+from jourdain_jax.ensembles.run import Runner, opened
 from jourdain_jax.ensembles.store import Store
 
 COUNT = 90  # lanes, in three chunks
@@ -57,7 +63,7 @@ def whole(tmp_path_factory):
 def computed(monkeypatch):
     """Numbers of the blocks that are computed, in order."""
     numbers, before = [], task.Task.run_block
-    monkeypatch.setattr(task.Task, "run_block", lambda self, number, skipped=(): numbers.append(number) or before(self, number, skipped))
+    monkeypatch.setattr(task.Task, "run_block", lambda self, number: numbers.append(number) or before(self, number))
     return numbers
 
 
@@ -89,8 +95,8 @@ def _files_written(monkeypatch, path):
 
 def test_a_run_killed_at_any_file_goes_on_to_the_same_bits(whole, tmp_path, monkeypatch, computed):
     count = _files_written(monkeypatch, tmp_path / "all")
-    assert count == 2 + 3 * (len(whole.store.columns) + 1)  # study, grid; per chunk its arrays and its receipt
-    for number in (0, 1, 2, 3, count // 2, count - 1):
+    assert count == 4 + 3 * (len(whole.store.columns) + 1)  # study, grid, the manifest of each; per chunk its arrays and its receipt
+    for number in (0, 1, 2, 3, 4, 5, count // 2, count - 1):
         path = tmp_path / f"killed{number}"
         with monkeypatch.context() as patch:
             _after(patch, number, Killed())
@@ -98,7 +104,7 @@ def test_a_run_killed_at_any_file_goes_on_to_the_same_bits(whole, tmp_path, monk
                 run(path)
         computed.clear()
         assert_same(run(path), whole)
-        begun = max(0, number - 2) // (len(whole.store.columns) + 1)  # whole chunks
+        begun = max(0, number - 4) // (len(whole.store.columns) + 1)  # whole chunks
         assert sorted(set(computed)) == sorted({0, *range(begun, 3)})  # the first block is the yardstick of every process
     assert not [entry for entry in tmp_path.iterdir() if entry.name.startswith(".")]
 
@@ -151,15 +157,13 @@ def test_a_share_without_a_chunk_takes_those_of_others(whole, tmp_path):
     for k, path in enumerate(paths):
         run(path, shard=(k + 1, 4))
     assert jj.load_study(paths[3]).counts == {}
-    Store(paths[1]).skip(40)  # noted, so that what is still missing is not computed with it
     assert_same(jj.merge_studies(paths[3], paths[:3]), whole)
-    assert Store(paths[3]).skipped() == (40,)
 
 
 def test_a_full_disk_is_named_and_the_study_goes_on_when_there_is_room(whole, tmp_path, monkeypatch):
     path = tmp_path / "discs.zarr"
     with monkeypatch.context() as patch:
-        _after(patch, 2 + (len(whole.store.columns) + 1) + 3, OSError(errno.ENOSPC, "No space left on device"))
+        _after(patch, 4 + (len(whole.store.columns) + 1) + 3, OSError(errno.ENOSPC, "No space left on device"))
         with pytest.raises(OSError, match="No space left on device; 1 of 3 chunks are kept") as caught:
             run(path)
     assert caught.value.errno == errno.ENOSPC
@@ -253,26 +257,238 @@ def test_a_second_run_into_one_folder_is_refused_while_the_first_lives(whole):
     assert run(whole.store.path).complete
 
 
-def test_a_newer_format_is_refused(whole, tmp_path):
+def _changed(path, name, **entries):
+    """The JSON of a file with other entries, and a manifest that knows them: as a hostile hand, or another version, would write it."""
+    file, manifest = path / "run" / name, path / "run" / "manifest.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | entries))
+    digests = json.loads(manifest.read_text())["digests"] | {f"run/{name}": store._digest(file.read_bytes())}
+    store._write_manifest(path, digests)
+
+
+def test_another_format_is_refused(whole, tmp_path):
     path = tmp_path / "discs.zarr"
-    run(path)
-    about = json.loads((path / "run" / "study.json").read_text())
-    (path / "run" / "study.json").write_text(json.dumps(about | {"format": 2}))
-    with pytest.raises(ValueError, match="has format 2, this version of jourdain-jax reads 1"):
-        run(path)
-    (path / "run" / "study.json").write_text("{")
-    with pytest.raises(ValueError, match="is damaged"):
-        run(path)
+    shutil.copytree(whole.store.path, path)
+    _changed(path, "study.json", format=3)
+    for read in (run, jj.load_study):
+        with pytest.raises(ValueError, match="has format 3, this version of jourdain-jax reads 2; use the version that wrote it"):
+            read(path)
+    (path / "run" / "manifest.json").unlink()  # as the first format, which had none
+    (path / "run" / "study.json").write_text(json.dumps({"format": 1}))
+    with pytest.raises(ValueError, match="has format 1, this version of jourdain-jax reads 2"):
+        jj.load_study(path)
+
+
+@pytest.mark.parametrize("entry", ["samples", "chunk", "block"])
+@pytest.mark.parametrize("value", [10**18, 10**30, 1e18, 0, -1, 90.0, True, "90", None, [90]])
+def test_numbers_of_a_study_are_within_their_ranges(entry, value, whole, tmp_path):
+    path = tmp_path / "discs.zarr"
+    shutil.copytree(whole.store.path, path)
+    _changed(path, "study.json", **{entry: value})
+    with pytest.raises(ValueError, match=rf"study.json` is damaged \(`{entry}` is .*, expected a whole number from 1 to"):
+        jj.load_study(path)
+
+
+def test_a_study_has_not_more_chunks_than_can_be_counted(whole, tmp_path):
+    shutil.copytree(whole.store.path, tmp_path / "discs.zarr")
+    _changed(tmp_path / "discs.zarr", "study.json", samples=2**52)
+    with pytest.raises(ValueError, match="samples are more than 16777216 chunks of 32"):
+        jj.load_study(tmp_path / "discs.zarr")
+
+
+@pytest.mark.parametrize("grid", [{"centre": [math.nan]}, {"low": [1.0], "high": [-1.0]}, {"centre": [math.inf]}, {"low": []}, {"centre": [[0.0]]}])
+def test_numbers_of_a_grid_are_within_their_ranges(grid, whole, tmp_path):
+    path, count = tmp_path / "discs.zarr", len(whole.outputs)
+    shutil.copytree(whole.store.path, path)
+    _changed(path, "grid.json", **{name: values * count for name, values in grid.items()})
+    _with_receipts_of(path)
+    with pytest.raises(ValueError, match=r"grid of the statistics is .*, expected finite numbers in order"):
+        jj.load_study(path).mean(whole.outputs[0])
+
+
+def _with_receipts_of(path):
+    """Receipts that belong to the grid that is there, as a hostile hand would write them."""
+    opened = Store(path)
+    crc32c = optional.crc32c()
+    for number in opened.receipts():
+        file = path / "run" / "chunks" / str(number)
+        found = store._unpacked(file.read_bytes(), crc32c)
+        file.write_bytes(store._packed(replace(found, of=(opened.identity, opened._digests["run/grid.json"])), crc32c))
+
+
+def test_chunks_of_another_grid_do_not_count(whole, tmp_path, computed):
+    """As where two machines whose numbers differ found the grid at the same time: sums about another centre would give another mean."""
+    path = tmp_path / "discs.zarr"
+    shutil.copytree(whole.store.path, path)
+    _changed(path, "grid.json", centre=whole.store.read_grid()["high"])
+    with pytest.warns(UserWarning, match=r"lanes 0 to 31, 32 to 63, 64 to 89 of .* are left out"):
+        found = jj.load_study(path)
+    assert (found.complete, found.counts) == (False, {})
+    with pytest.warns(UserWarning, match="3 chunks of .* are damaged and are computed again"), pytest.warns(UserWarning, match="come out with other bits"):
+        assert run(path).complete
+    assert sorted(set(computed)) == [0, 1, 2]
 
 
 def test_other_versions_are_said(whole, tmp_path):
     path = tmp_path / "discs.zarr"
-    run(path)
-    about = json.loads((path / "run" / "study.json").read_text())
-    about["versions"]["jax"] = "0.1.2"
-    (path / "run" / "study.json").write_text(json.dumps(about))
+    shutil.copytree(whole.store.path, path)
+    _changed(path, "study.json", versions=whole.store.study["versions"] | {"jax": "0.1.2"})
     with pytest.warns(UserWarning, match=r"other versions: jax 0.1.2 \(now "):
         run(path)
+
+
+def test_a_folder_that_is_moved_while_a_study_runs_is_named(tmp_path, monkeypatch, whole):
+    path, before = tmp_path / "discs.zarr", Store.write
+
+    def write(self, number, *what):
+        if number == 1:
+            path.rename(tmp_path / "moved.zarr")
+        before(self, number, *what)
+
+    for options in ({}, {"save": "trajectories"}):
+        with monkeypatch.context() as patch:
+            patch.setattr(Store, "write", write)
+            with pytest.raises(OSError, match=r"the folder is gone: it was moved or removed while the study ran.*discs.zarr"):
+                run(path, **options)
+        assert not path.exists()
+        assert run(tmp_path / "moved.zarr", **options).complete
+        shutil.rmtree(tmp_path / "moved.zarr")
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "write_grid", lambda self, grid: path.rename(tmp_path / "moved.zarr") and Store(path))
+        with pytest.raises(ValueError, match="does not exist"):
+            run(path)
+
+
+# Every file of a folder, changed in every way that is tried: the right answer, or a named error or warning. --------------------------
+
+
+def _harms(content: bytes, generator, count) -> Iterator[tuple[str, bytes]]:
+    """Changed contents of a file: `count` bits, twice as many digits; cut short, made longer, emptied."""
+    places = generator.integers(len(content), size=count).tolist() if content else []
+    for place in places:
+        yield f"a bit of byte {place}", content[:place] + bytes([content[place] ^ 1 << int(generator.integers(8))]) + content[place + 1 :]
+    digits = [place for place, byte in enumerate(content) if 48 <= byte <= 57]
+    for place in generator.choice(digits, size=min(2 * count, len(digits)), replace=False).tolist() if digits else []:
+        yield f"the digit at {place}", content[:place] + bytes([48 + (content[place] - 48 + int(generator.integers(1, 10))) % 10]) + content[place + 1 :]
+    yield "the end", content[: int(generator.integers(len(content) or 1))]
+    yield "nothing left", b""
+    yield "more", content + content[-7:] + b" "
+
+
+def _answers(path) -> dict:
+    """All that a folder says, read without its scene."""
+    found = jj.load_study(path)
+    numbers = {name: (found.mean(name), found.deviation(name), found.quantile(name, 0.5)) for name in found.outputs}
+    arrays = {name: array.values.tobytes() for name, array in found.to_xarray().load().variables.items()}
+    return {"complete": found.complete, "counts": found.counts, "failed": found.failed.tolist(), "numbers": repr(numbers), "arrays": arrays}
+
+
+def _is_right_or_said(path, right) -> bool:
+    """Whether the answers are right (True), or an error or a warning names the folder (False); an AssertionError otherwise."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        try:
+            found = _answers(path)
+        except ValueError as error:
+            words = str(error)
+        else:
+            if found == right:
+                return True
+            words = " ".join(str(warning.message) for warning in said)
+    assert path.name in words or "checksum" in words, words or found
+    return False
+
+
+TRAJECTORIES = pytest.param("trajectories", {"every": 2, "ts": np.linspace(0.0, 1.0, 3)}, 6, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(("save", "options", "count"), [("outputs", {}, 2), ("statistics", {}, 6), TRAJECTORIES])
+def test_whatever_happens_to_a_file_of_a_study_no_other_number_comes_out(tmp_path, save, options, count):
+    generator = np.random.default_rng(1)
+    path = tmp_path / "discs.zarr"
+    run(path, save=save, outputs={"lean": jj.End("lean")}, **options)
+    right = _answers(path)
+    seen = []
+    for file in sorted(file for file in path.rglob("*") if file.is_file()):
+        content = file.read_bytes()
+        for what, harmed in _harms(content, generator, count):
+            if harmed == content:
+                continue
+            file.write_bytes(harmed)
+            try:
+                seen.append(_is_right_or_said(path, right))
+            except AssertionError as error:
+                raise AssertionError(f"{what} of {file.relative_to(path)} changed: {error}") from error
+        file.unlink()
+        if file.parent.name == "chunks":  # as if the chunk had not been computed yet
+            assert not _answers(path)["complete"]
+        else:
+            _is_right_or_said(path, right)
+        file.write_bytes(content)
+    assert len(seen) > 50
+    assert np.mean(seen) < 0.1  # the lock holds no number; most else is noticed
+    assert _answers(path) == right
+
+
+def test_whatever_files_of_a_study_are_exchanged_no_other_number_comes_out(tmp_path):
+    path, other = tmp_path / "discs.zarr", tmp_path / "other.zarr"
+    for folder, seed in ((path, 3), (other, 4)):
+        run(folder, seed=seed, outputs={"lean": jj.End("lean")})
+    right = _answers(path)
+    names = [file.relative_to(path) for file in sorted(path.rglob("*")) if file.is_file() and file.name != "lock"]
+    contents = {name: (path / name).read_bytes() for name in names}
+    alike = [(a, b) for a, b in combinations(names, 2) if len(contents[a]) == len(contents[b]) and contents[a] != contents[b]]  # chunks, columns, receipts
+    assert len(alike) > 60
+    for first, second in np.random.default_rng(0).permutation(alike)[:60]:
+        (path / first).write_bytes(contents[second])
+        (path / second).write_bytes(contents[first])
+        _is_right_or_said(path, right)
+        for name in (first, second):
+            (path / name).write_bytes(contents[name])
+    for name in names:  # from another study of the same kind
+        (path / name).write_bytes((other / name).read_bytes())
+        _is_right_or_said(path, right)
+        (path / name).write_bytes(contents[name])
+    assert _answers(path) == right
+
+
+# Processes that die. ----------------------------------------------------------------------------------------------------
+
+
+def _with_deaths(path, deadly, first_block=False):
+    """The study, as processes compute it that die on the chunks `deadly`, whose numbers are asked for; with the number of deaths."""
+    owned = study().task(t1=1.0, rtol=1e-6, atol=1e-6)
+    opened_store, deaths, runners = opened(owned, path, None, ""), Counter(), []
+
+    def compute(numbers, alone):
+        for number in numbers:
+            if number in deadly or (first_block and not runners):
+                deaths[number] += 1
+                return [number]
+            runners.append(runners[0] if runners else Runner(owned, opened_store))
+            yield runners[0].run(number)
+        return []
+
+    list(workers.whatever_dies(opened_store, range(opened_store.chunks), lambda: False, compute, workers.MOST_DEATHS - 1))
+    return deaths
+
+
+@pytest.mark.parametrize("deadly", [(1,), (2,), (1, 2)])
+def test_a_chunk_on_which_processes_died_three_times_is_named_and_the_study_goes_on(deadly, whole, tmp_path):
+    path = tmp_path / "discs.zarr"
+    lanes = ", ".join({1: "32 to 63", 2: "64 to 89"}[number] for number in deadly)
+    with pytest.warns(UserWarning, match=rf"processes died 3 times on lanes {lanes} of .*left out; all others are kept.*`memory=`") as said:
+        assert _with_deaths(path, deadly) == dict.fromkeys(deadly, 3)
+    assert len(said) == 1
+    found = jj.load_study(path)
+    assert not found.complete
+    assert sum(found.counts.values()) == COUNT - sum({1: 32, 2: 26}[number] for number in deadly)
+    assert_same(run(path), whole)  # the same call tries again
+
+
+def test_a_first_block_on_which_processes_die_ends_the_study(tmp_path):
+    """Every process begins with it: all others would die, too."""
+    with pytest.raises(RuntimeError, match=r"processes died 3 times on lanes 0 to 31 of .*with which every process begins"):
+        _with_deaths(tmp_path / "discs.zarr", (), first_block=True)
 
 
 def test_clocks_do_not_matter(whole, tmp_path, monkeypatch):
@@ -367,17 +583,14 @@ def test_scenes_of_other_tools_count_by_what_they_were_made_from(tmp_path):
 
 
 def test_what_a_function_does_not_read_does_not_count(monkeypatch):
-    """A global with the name of an attribute, as a loop leaves one behind, and a list that counts calls."""
-    calls = []
+    """A global with the name of an attribute, as a loop leaves one behind."""
     monkeypatch.setitem(globals(), "q_end", 1)
 
     def output(motion):
-        calls.append(1)
         return motion.q_end[0]
 
     before = digest(output)
     globals()["q_end"] = 2
-    calls.append(1)
     assert digest(output) == before
 
 

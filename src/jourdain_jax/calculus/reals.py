@@ -45,7 +45,10 @@ def _of_jax(x) -> Array:
     """`x` as an array of JAX, which has no extended precision."""
     if isinstance(x, jax.Array):
         return x
-    return jnp.asarray(np.asarray(x, real_type()) if type(x) in (int, float) or getattr(x, "dtype", None) == np.longdouble else x)
+    try:
+        return jnp.asarray(np.asarray(x, real_type()) if type(x) in (int, float) or getattr(x, "dtype", None) == np.longdouble else x)
+    except OverflowError:
+        raise ValueError("an integer is larger than all floating-point numbers, expected real numbers") from None
 
 
 def checked_real(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str = "check how it is put together") -> Array:

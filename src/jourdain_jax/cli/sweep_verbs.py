@@ -28,6 +28,7 @@ import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from jourdain_jax.calculus.reading import check_depth, parsed, read_text, whole_number
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
 from jourdain_jax.ensembles.files import InUseError
@@ -37,6 +38,7 @@ from jourdain_jax.ensembles.study import OPTIONS, Study
 from jourdain_jax.models.registry import model
 from jourdain_jax.scene.names import nearest
 
+_LARGEST = 100_000_000  # bytes of a file, whose tables may have a row for each sample
 ACTIONS = ("status", "resume", "export", "merge")
 VARYING: dict[str, Callable] = {"normal": Normal, "uniform": Uniform, "log-normal": LogNormal, "log-uniform": LogUniform}
 OUTPUTS = {
@@ -70,14 +72,15 @@ def _sweep(options) -> bool:
     if action not in ACTIONS:
         if paths:
             raise ValueError(f"`{action}` is not known to `sweep`; {nearest(action, ACTIONS)} To run a study: jourdain-jax sweep FILE.toml --out FOLDER")
-        return _run(_text_of(action), options.out or str(Path(action).with_suffix(".zarr")), options)
+        text = read_text(action, _LARGEST, f"a TOML file of a study, or one of {', '.join(ACTIONS)}")
+        return _run(text, action, options.out or str(Path(action).with_suffix(".zarr")), options)
     if not paths or (action != "merge" and len(paths) > 1):
         raise ValueError(f"`sweep {action}` takes {'folders' if action == 'merge' else 'one folder'} of a study")
     if action == "resume":
         text = load_study(paths[0]).store.study["command"]
         if not text:
             raise ValueError(f"`{paths[0]}` was begun from Python; run the same program again to go on")
-        return _run(text, paths[0], options)
+        return _run(text, f"{paths[0]}/run/study.json", paths[0], options)
     found = merge_studies(paths[0], paths[1:]) if action == "merge" else load_study(paths[0])
     if action == "export":
         return _export(found, options)
@@ -85,20 +88,9 @@ def _sweep(options) -> bool:
     return found.complete
 
 
-def _text_of(path: str) -> str:
-    try:
-        return Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ValueError(f"there is no file `{path}`; give a TOML file, or one of {', '.join(ACTIONS)}") from None
-    except UnicodeDecodeError as error:
-        raise ValueError(f"`{path}` is no text in UTF-8 ({error.reason}); give a TOML file") from None
-
-
-def _run(text: str, out: str, options) -> bool:
-    try:
-        asked = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"the file is no TOML: {error}") from None
+def _run(text: str, source: str, out: str, options) -> bool:
+    asked = parsed(tomllib.loads, text, source, "TOML")
+    check_depth(asked, lambda x: x.values() if isinstance(x, dict) else x if isinstance(x, list) else (), source)
     study, how = described_study(asked)
     try:
         asked_here = {"processes": options.workers, "memory": options.memory, "shard": _shard(options.shard), "progress": not options.quiet}
@@ -112,7 +104,8 @@ def _run(text: str, out: str, options) -> bool:
         print(f"jourdain-jax: {error}", file=sys.stderr)
         return False
     _show(found, options)
-    return not found.failed.size
+    first, every = asked_here["shard"]
+    return not found.failed.size and not {*range(first - 1, found.store.chunks, every)}.difference(found.store.receipts())
 
 
 def described_study(asked: Mapping) -> tuple[Study, dict]:
@@ -159,11 +152,11 @@ def _output(name: str, how):
 
 
 def _shard(text: str) -> tuple[int, int]:
-    try:
-        k, n = map(int, text.split("/"))
-    except ValueError:
-        raise ValueError(f"--shard is `{text}`, expected K/N, such as 1/4") from None
-    return k, n
+    k, slash, n = text.partition("/")
+    if not slash:
+        raise ValueError(f"--shard is `{text}`, expected K/N, such as 1/4")
+    count = whole_number(n, "N of --shard K/N", 1, 2**24)
+    return whole_number(k, "K of --shard K/N", 1, count), count
 
 
 def _export(found: StudyResult, options) -> bool:

@@ -1,7 +1,6 @@
 """Workers of a Dask cluster that compute the chunks of one study. Its folder must be where all of them, and the process that asks, can reach it.
 
-Dask starts a chunk again where its worker died. A chunk on which workers died again and again is tried once more alone, then searched for the lane that is the
-cause.
+Dask starts a chunk again where its worker died. A chunk on which workers died again and again is tried once more alone, then left out with a warning.
 """
 
 import os
@@ -12,11 +11,10 @@ from pathlib import Path
 
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.ensembles import optional
-from jourdain_jax.ensembles.deadly_lanes import without_deadly_lanes
 from jourdain_jax.ensembles.run import Runner
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
-from jourdain_jax.ensembles.workers import keep_to_share, sent_to_others
+from jourdain_jax.ensembles.workers import keep_to_share, sent_to_others, whatever_dies
 
 AHEAD = 2  # chunks per thread of a worker: one under way, one that waits for it
 
@@ -40,14 +38,7 @@ def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
         def compute(numbers: list[int], alone: bool):
             return _computed(distributed, client, asked, numbers, interrupted, 1 if alone else most)
 
-        def survives(first: int, last: int) -> bool:
-            try:
-                client.submit(_try, study, first, last, pure=False).result()
-            except distributed.KilledWorker:
-                return False
-            return True
-
-        return without_deadly_lanes(store, numbers, interrupted, compute, survives, 1)
+        return whatever_dies(store, numbers, interrupted, compute, 1)
 
     return workers
 
@@ -87,11 +78,6 @@ def _computed(distributed, client, asked: tuple, numbers, interrupted, most: int
     return suspects
 
 
-def _try(sent: bytes, first: int, last: int) -> None:
-    with _one_at_a_time:
-        pickle.loads(sent).run_lanes(first, last)
-
-
 def _chunk(number: int, sent: bytes, path: str, asking: int, places: dict | None) -> tuple[int, int]:
     """Compute and keep a chunk in this worker, one at a time; what a worker kept before it died is not computed again.
 
@@ -103,7 +89,7 @@ def _chunk(number: int, sent: bytes, path: str, asking: int, places: dict | None
             os.environ["JOURDAIN_JAX_THREADS"] = str(worker.state.nthreads)
             if places and worker.name in places:
                 keep_to_share(places[worker.name], len(places))
-        which = sent, path, (Path(path) / "run" / "study.json").stat().st_mtime_ns
+        which = sent, path, (Path(path) / "zarr.json").stat().st_mtime_ns
         if which not in _runners:
             _runners.clear()
             _runners[which] = Runner(pickle.loads(sent), Store(path))

@@ -19,6 +19,7 @@ from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.printing import Printed
 
 GRID, TABLE = "grid", "table"
+MOST_SAMPLES = 2**53  # whole numbers that are floats
 MOST_CROSSED = 2**62  # samples of a grid, which are counted in 64 bits
 
 
@@ -78,10 +79,10 @@ class Design(Printed):
         if self.sampler in (GRID, TABLE):
             name, what = next(iter(self.variables.items()))
             raise ValueError(f"a {self.sampler} takes {'`jj.Levels`' if self.sampler == GRID else 'columns of numbers'}, but `{name}` varies as {what!r}")
-        if self.sampler not in SAMPLERS:
+        if not isinstance(self.sampler, str) or self.sampler not in SAMPLERS:
             raise ValueError(f"unknown sampler `{self.sampler}`; {nearest(str(self.sampler), SAMPLERS)} Grids take `jj.Levels`, tables columns.")
-        if isinstance(self.samples, bool) or not isinstance(self.samples, int | np.integer) or self.samples < 1:
-            raise ValueError(f"`samples` is {self.samples!r}, expected a whole number of at least 1")
+        if isinstance(self.samples, bool) or not isinstance(self.samples, int | np.integer) or not 1 <= self.samples <= MOST_SAMPLES:
+            raise ValueError(f"`samples` is {self.samples!r}, expected a whole number of at least 1 and at most {MOST_SAMPLES}")
         if self.sampler in ("sobol", "saltelli") and self.samples > MOST_SOBOL:
             raise ValueError(f"`samples` is {self.samples}, expected at most {MOST_SOBOL} for a Sobol sequence; take sampler='random'")
         group = len(self.variables) + 2

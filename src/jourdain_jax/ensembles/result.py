@@ -2,6 +2,7 @@
 
 import math
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,6 +20,7 @@ from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.printing import Printed
+from jourdain_jax.scene.tracebacks import users_level
 
 LEVELS = (0.025, 0.5, 0.975)
 
@@ -61,7 +63,8 @@ class StudyResult(Printed):
     @cached_property
     def _gathered(self) -> dict:
         """What the receipts hold, together."""
-        receipts = [receipt for receipt in map(self.store.receipt, self.store.receipts()) if receipt is not None]
+        known = {number: self.store.receipt(number) for number in self.store.receipts()}
+        receipts = [receipt for receipt in known.values() if receipt is not None]
         count = len(self.outputs)
         cells = np.zeros(count * (CELLS + 2), np.int64)
         for receipt in receipts:
@@ -70,7 +73,8 @@ class StudyResult(Printed):
         extremes = np.stack([[np.full(count, np.inf), np.full(count, -np.inf)], *(r.arrays["extremes"] for r in receipts)])
         return {
             "chunks": len(receipts),
-            "codes": sum((r.arrays["codes"] for r in receipts), np.zeros(len(CODES), np.int64)),
+            "left_out": tuple(number for number, receipt in known.items() if receipt is None),
+            "codes": sum((np.pad(codes := r.arrays["codes"], (0, len(CODES) - codes.size)) for r in receipts), np.zeros(len(CODES), np.int64)),
             "again": sum(int(r.arrays["again"][0]) for r in receipts),
             "steps": sum((r.arrays["steps"] for r in receipts), np.zeros(2, np.int64)),
             "failed": np.concatenate([np.zeros(0, np.int64), *(r.arrays["failed"] for r in receipts)]),
@@ -95,6 +99,11 @@ class StudyResult(Printed):
         return self._gathered["chunks"] == self.store.chunks
 
     @property
+    def left_out(self) -> tuple[int, ...]:
+        """Numbers of chunks of which there is a receipt that is damaged or of another study, so that they do not count; `study.run` computes them again."""
+        return self._gathered["left_out"]
+
+    @property
     def counts(self) -> dict[str, int]:
         """Lanes per result code, by its name; those that no lane has are left out."""
         return {name: int(count) for name, count in zip(CODES, self._gathered["codes"], strict=True) if count}
@@ -114,7 +123,8 @@ class StudyResult(Printed):
         first = {name: value if name in self.task.constants else float(value[0]) for name, value in starts.items()}
         kept = {}
         if self.store.columns:
-            kept = {name: float(array[number]) for name, array in self.to_xarray().items() if array.dims == ("lane",)}
+            self.store.check_arrays({number // self.store.chunk}.intersection(self.store.receipts()))
+            kept = {name: float(array[number]) for name, array in self._opened().items() if array.dims == ("lane",)}
         return Lane(self.task, number, first, {name: float(value[0]) for name, value in parameters.items()}, kept)
 
     @cached_property
@@ -125,7 +135,7 @@ class StudyResult(Printed):
             raise ValueError(f"no chunk of `{self.store.path}` is done yet, or `run/grid.json` is damaged; run the study first, which finds it again")
         found = self._gathered
         sums = [block for chunk in found["sums"] for block in chunk]
-        return combined(self.outputs, Grid.from_dict(grid), sums, found["cells"], found["extremes"])
+        return combined(self.outputs, Grid.from_dict(grid, len(self.outputs)), sums, found["cells"], found["extremes"])
 
     def mean(self, output: str) -> float:
         """Mean of an `output` over the lanes that have it."""
@@ -180,7 +190,14 @@ class StudyResult(Printed):
         return self.outputs.index(output)
 
     def to_xarray(self):
-        """All arrays as an `xarray.Dataset` with names and units, read where they are used; lanes that are not done are NaN, their result is -1."""
+        """All arrays as an `xarray.Dataset` with names and units, read where they are used; lanes that are not done are NaN, their result is -1.
+
+        Raises ValueError where arrays are not those that were written, here or, where their values are damaged, when they are read.
+        """
+        self.store.check_arrays(self.store.receipts())
+        return self._opened()
+
+    def _opened(self):
         return needed("xarray", "a study as labelled arrays", "ensembles").open_zarr(self.store.path, chunks=None, consolidated=True)
 
     def to_netcdf(self, path: str | os.PathLike) -> None:
@@ -252,9 +269,14 @@ class StudyResult(Printed):
 def load_study(path: str | os.PathLike) -> StudyResult:
     """What is in the folder `path` of a study, finished or not, without its scene: `study.run` with the same arguments gives `.lane(k).simulate()` too.
 
-    Raises ValueError where the folder holds no study, or one of a format that this version does not know.
+    A warning names chunks that are damaged: their lanes do not count (`left_out`). Raises ValueError where the folder holds no study, one of a format that this
+    version does not know, or one whose description is damaged.
     """
-    return StudyResult(Store(path))
+    found = StudyResult(Store(path))
+    if found.left_out:
+        text = "are left out: the receipts of their chunks are damaged, or of another study; run the study again, which computes them anew"
+        warnings.warn(f"{found.store.lanes_of(found.left_out)} {text}", stacklevel=users_level())
+    return found
 
 
 def merge_studies(path: str | os.PathLike, shares: Sequence[str | os.PathLike]) -> StudyResult:
@@ -273,8 +295,6 @@ def merge_studies(path: str | os.PathLike, shares: Sequence[str | os.PathLike]) 
                 raise ValueError(f"`{share}` holds no share of the study in `{path}`: {' and '.join(different) or 'the grid of statistics'} differ")
             if grid and not own:
                 target.write_grid(grid)
-            for lane in {*other.skipped()}.difference(target.skipped()):
-                target.skip(lane)
             for number in other.receipts():
                 if number not in held and other.is_whole(number):
                     target.take_chunk(other, number)

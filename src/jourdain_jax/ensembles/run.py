@@ -30,7 +30,7 @@ from jourdain_jax.motion.trajectories.versions import version_of
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.tracebacks import users_level
 
-MOST_CHUNKS = 1000
+MOST_CHUNKS, LARGEST_CHUNK = 1000, 2**20  # by default: number, and lanes of one
 PACKAGES = ("jourdain-jax", "jax", "jaxlib", "diffrax", "numpy", "scipy", "zarr", "llvmlite")
 
 
@@ -45,16 +45,15 @@ class Runner:
         if task.memory:
             memory.give_back_at_once()
         self._first = self._run_block(0)
-        found, kept = Grid.of(self._first.outputs).as_dict(), store.read_grid()
-        if kept is None:
-            store.write_grid(kept := found)
-        elif kept != found:
+        found = Grid.of(self._first.outputs).as_dict()
+        kept = store.read_grid() or store.write_grid(found)
+        if kept != found:
             warnings.warn(
                 f"the first {task.block} lanes of `{store.path}` come out with other bits here than where the study was begun (another machine, or other "
                 "versions); results are right, but not bit-equal to those of one machine",
                 stacklevel=users_level(),
             )
-        self.grid = Grid.from_dict(kept)
+        self.grid = Grid.from_dict(kept, len(task.outputs))
 
     def run(self, number: int) -> tuple[int, int]:
         """Compute and keep a chunk; how many lanes it has, and how many of them failed."""
@@ -68,7 +67,7 @@ class Runner:
         return last - first, receipt["failed"].size
 
     def _run_block(self, number: int) -> Lanes:
-        found = self.task.run_block(number, self.store.skipped())
+        found = self.task.run_block(number)
         if self.task.memory:
             memory.check(self.task.memory)
         return found
@@ -126,7 +125,7 @@ def _chunk(task: Task, chunk: int | None) -> int:
     """Lanes of a chunk: whole blocks, whole strides of saved lanes; by default about a thousandth of all."""
     unit = np.lcm(task.block, task.every)
     if chunk is None:
-        return int(unit * max(1, len(task.design) // (MOST_CHUNKS * unit)))
+        return int(unit * max(1, min(len(task.design), MOST_CHUNKS * LARGEST_CHUNK) // (MOST_CHUNKS * unit)))
     if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or chunk < 1 or chunk % unit:
         raise ValueError(f"`chunk` is {chunk!r}, expected a multiple of {unit} lanes, such as {4 * unit}: so many are computed together in this study")
     return int(chunk)

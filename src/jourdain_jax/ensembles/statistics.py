@@ -51,9 +51,12 @@ class Grid:
         return {name: values.tolist() for name, values in vars(self).items()}
 
     @classmethod
-    def from_dict(cls, found: dict) -> "Grid":
-        """The grid that `as_dict` wrote."""
-        return cls(**{name: np.array(values, float) for name, values in found.items()})
+    def from_dict(cls, found: dict, outputs: int) -> "Grid":
+        """The grid that `as_dict` wrote, of so many outputs; ValueError where its numbers are not finite, or not in order."""
+        low, high, centre = numbers = [np.array(found[name], float) for name in ("low", "high", "centre")]
+        if any(x.shape != (outputs,) or not np.isfinite(x).all() for x in numbers) or np.any((centre < low) | (centre > high)):
+            raise ValueError(f"the grid of the statistics is {found}, expected finite numbers in order, one each for {outputs} outputs")
+        return cls(low, high, centre)
 
 
 def sums_of_block(grid: Grid, values: np.ndarray) -> np.ndarray:

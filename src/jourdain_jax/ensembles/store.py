@@ -2,35 +2,46 @@
 
     NAME/zarr.json, NAME/c/0, ...    arrays, cut into chunks of lanes; every chunk ends in its CRC-32C, as Zarr's codec `crc32c` has it
     run/study.json                   what study this is: format, digests, settings, versions; written once
-    run/grid.json                    the grid of the statistics
+    run/grid.json                    the grid of the statistics, written by whichever process computes the first block first
+    run/manifest.json                digests of these two and of all other files that are written once, and of itself; replaced in one step
     run/chunks/K                     receipt of chunk K: written when all its arrays are, with their checksums, its counts and its sums
-    run/skipped.json                 lanes that are not computed, since processes died on them
     run/lock                         held by the process that runs the study
 
-A chunk counts as done if its receipt is whole and its arrays are there with the checksums of the receipt; otherwise it is computed again.
+A chunk counts as done if its receipt is whole, belongs to this study and this grid, and its arrays are there with the checksums of the receipt; otherwise it
+is computed again. A file that the manifest does not know is not there; the grid comes before the manifest that knows it. Processes that find the grid at the
+same time write the same one; on machines whose numbers differ, the chunks of the grid that was replaced do not count. Chunks need no manifest.
 """
 
 import contextlib
 import errno
+import hashlib
 import json
 import math
 import os
 import secrets
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from jourdain_jax.calculus.on_first_use import needed
+from jourdain_jax.calculus.reading import parsed, read_bytes, shortened
 from jourdain_jax.calculus.writing import write_whole
 from jourdain_jax.ensembles import optional
+from jourdain_jax.ensembles.design import MOST_SAMPLES
 from jourdain_jax.ensembles.files import locked
+from jourdain_jax.ensembles.statistics import CELLS
+from jourdain_jax.motion.trajectories.results import CODES
 
-FORMAT = 1
-_BEGIN = b"jourdain-jax chunk 1\n"
+FORMAT = 2
+_BEGIN = b"jourdain-jax chunk 2\n"
+MOST_CHUNKS, MOST_LANES = 2**24, 2**40  # of a study, of a chunk
+_LARGEST = 100_000_000  # bytes of one of the files that are written once
+_MANIFEST = "run/manifest.json"
+RECEIPT = ("codes", "again", "steps", "failed", "sums", "cells", "extremes")  # arrays of a receipt
 
 
 @dataclass(frozen=True)
@@ -56,6 +67,7 @@ class Receipt:
     last: int
     arrays: Mapping[str, np.ndarray]  # result codes and their counts, failed lanes, sums per block, cells and their counts, extremes
     checksums: Mapping[str, int]
+    of: tuple[str, str]  # digests of the study and of its grid
 
     @property
     def lanes(self) -> tuple[int, int]:
@@ -68,9 +80,12 @@ class Store:
 
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
+        self._digests = self._read_manifest()
         self.study = self._read_study()
-        self.lanes, self.chunk = int(self.study["samples"]), int(self.study["chunk"])
-        self.columns = {name: Column(**{**entry, "more": tuple(map(tuple, entry["more"]))}) for name, entry in self.study["columns"].items()}
+        self.lanes, self.chunk = self.study["samples"], self.study["chunk"]
+        self.columns = {name: Column(**entry | {"more": tuple(map(tuple, entry["more"]))}) for name, entry in self.study["columns"].items()}
+        decides = [self.study.get(name) for name in ("identity", "samples", "chunk", "block", "outputs")]  # the same in all shares
+        self.identity = hashlib.sha256(json.dumps(decides).encode()).hexdigest()
 
     @staticmethod
     def make(path: str | os.PathLike, study: Mapping, columns: Mapping[str, Column], constants: Mapping[str, tuple], attributes: Mapping) -> "Store":
@@ -79,6 +94,8 @@ class Store:
         path = Path(path)
         if path.is_file():
             raise ValueError(f"`{path}` is a file, expected a folder for the study; give another name")
+        if fault := _beyond(study):
+            raise ValueError(f"the study is too large: {fault}; take fewer samples, or a larger `chunk`")
         beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
         lanes, chunk = study["samples"], study["chunk"]
         try:
@@ -104,6 +121,8 @@ class Store:
                 (beside / name / "c").mkdir(exist_ok=True)
             entries = {name: vars(column) | {"attributes": dict(column.attributes)} for name, column in columns.items()}
             write_whole(beside / "run" / "study.json", json.dumps({"format": FORMAT, **study, "columns": entries}, indent=1).encode(), wait=True)
+            files = [file for file in beside.rglob("*") if file.is_file()]
+            _write_manifest(beside, {file.relative_to(beside).as_posix(): _digest(file.read_bytes()) for file in files})
             with contextlib.suppress(OSError):  # an empty folder, whose place Windows does not give to another one
                 path.rmdir()
             try:
@@ -118,27 +137,54 @@ class Store:
             shutil.rmtree(beside, ignore_errors=True)
         return Store(path)
 
-    def _read_study(self) -> dict:
-        file = self.path / "run" / "study.json"
-        try:
-            found = json.loads(file.read_bytes())
-            if not isinstance(found, dict):
-                raise ValueError("it is no dictionary")
-        except FileNotFoundError:
+    def _read_manifest(self) -> dict[str, str]:
+        """The digests of files that are written once, by name; every file but the grid, which can be found again, is there and has its digest."""
+        if not (self.path / "run" / "study.json").exists():
+            if self.path.is_file():
+                raise ValueError(f"`{self.path}` is a file, expected the folder of a study")
             what = "is not a study: it holds no `run/study.json`" if self.path.exists() else "does not exist"
-            raise ValueError(f"`{self.path}` {what}; give the folder of a study, or a new name") from None
-        except NotADirectoryError:
-            raise ValueError(f"`{self.path}` is a file, expected the folder of a study") from None
-        except ValueError as error:
-            raise ValueError(f"`{file}` is damaged ({error}); the study cannot be continued: move the folder away and run it anew") from None
-        if found.get("format") != FORMAT:
-            raise ValueError(f"`{self.path}` has format {found.get('format')}, this version of jourdain-jax reads {FORMAT}; use the version that wrote it")
+            raise ValueError(f"`{self.path}` {what}; give the folder of a study, or a new name")
+        if not (self.path / _MANIFEST).exists():
+            found = parsed(json.loads, self._read("run/study.json"), f"{self.path}/run/study.json", "JSON")
+            if isinstance(found, dict) and found.get("format") != FORMAT:
+                raise self._of_another_format(found.get("format"))
+        found = parsed(json.loads, self._read(_MANIFEST), f"{self.path}/{_MANIFEST}", "JSON")
+        digests = found.get("digests") if isinstance(found, dict) else None
+        if not isinstance(digests, dict) or found.get("digest") != _digest_of(digests):
+            raise self._damaged(_MANIFEST)
+        for name in digests:
+            if name != "run/grid.json" and _digest(self._read(name)) != digests[name]:
+                raise self._damaged(name)
+        return digests
+
+    def _read(self, name: str) -> bytes:
+        return read_bytes(self.path / name, _LARGEST, "the folder of a study with all its files")
+
+    def _damaged(self, name: str, what: str = "it is not what was written") -> ValueError:
+        return ValueError(f"`{self.path / name}` is damaged ({what}); the study cannot be continued: move the folder away and run it anew")
+
+    def _of_another_format(self, found) -> ValueError:
+        text = f"has format {found}, this version of jourdain-jax reads {FORMAT}; use the version that wrote it, or run the study anew in another folder"
+        return ValueError(f"`{self.path}` {text}")
+
+    def _read_study(self) -> dict:
+        """What study this is, its numbers within their ranges."""
+        found = parsed(json.loads, self._read("run/study.json"), f"{self.path}/run/study.json", "JSON")
+        if not isinstance(found, dict) or found.get("format") != FORMAT:
+            raise self._of_another_format(found.get("format") if isinstance(found, dict) else None)
+        if fault := _beyond(found):
+            raise self._damaged("run/study.json", fault)
         return found
 
     @property
     def attributes(self) -> dict:
         """Attributes of the whole store, by name."""
-        return json.loads((self.path / "zarr.json").read_bytes())["attributes"]
+        return json.loads(self._read("zarr.json"))["attributes"]
+
+    def lanes_of(self, numbers: Sequence[int]) -> str:
+        """The lanes of chunks, in words."""
+        spans = (f"{first} to {last - 1}" for first, last in map(self.span, numbers[:5]))
+        return f"lanes {', '.join(spans)}{' ...' if len(numbers) > 5 else ''} of `{self.path}`"
 
     @staticmethod
     def is_taken(path: str | os.PathLike) -> bool:
@@ -167,55 +213,83 @@ class Store:
         """Put the file of a chunk in its place."""
         file = self._file(name, number)
         if self.columns[name].more:
-            file.parent.mkdir(parents=True, exist_ok=True)
+            file.parent.mkdir(exist_ok=True)  # in a folder that is there: one that was moved away is not made again
         write_whole(file, content)
 
     def _receipt_file(self, number: int) -> Path:
         return self.path / "run" / "chunks" / str(number)
 
+    @contextlib.contextmanager
+    def _named(self) -> Iterator[None]:
+        """Errors of the system say what became of the study."""
+        try:
+            yield
+        except OSError as error:
+            if not (self.path / "run").is_dir():
+                text = f"the folder is gone: it was moved or removed while the study ran; put it back, or run it again under its new name ({error.strerror})"
+            else:
+                kept = f"{len(self.receipts())} of {self.chunks} chunks are kept"
+                text = f"{error.strerror or type(error).__name__}; {kept}: make room or mend the folder, and run the study again to go on"
+            raise OSError(error.errno, text, str(self.path)) from error
+
     def write(self, number: int, values: Mapping[str, np.ndarray], arrays: Mapping[str, np.ndarray]) -> None:
         """Keep a chunk: the values of all columns, then its receipt with `arrays`."""
         crc32c = optional.crc32c()
         checksums = {}
-        try:
+        with self._named():
             for name, column in self.columns.items():
                 full = np.full((self.chunk // column.every, *(length for _, length in column.more)), column.fill, np.dtype(column.dtype).newbyteorder("<"))
                 full[: len(values[name])] = values[name]
                 content = full.tobytes()
                 checksums[name] = crc32c.value(content)
                 self._write(name, number, content + checksums[name].to_bytes(4, "little"))
-            write_whole(self._receipt_file(number), _packed(Receipt(*self.span(number), arrays, checksums), crc32c))
-        except OSError as error:
-            done = len(self.receipts())
-            text = f"{os.strerror(error.errno or 0)}; {done} of {self.chunks} chunks are kept: make room or mend the folder, and run the study again to go on"
-            raise OSError(error.errno, text, str(self.path)) from error
+            of = self.identity, self._digests.get("run/grid.json", "")
+            write_whole(self._receipt_file(number), _packed(Receipt(*self.span(number), arrays, checksums, of), crc32c))
 
     def receipt(self, number: int) -> Receipt | None:
-        """The receipt of a chunk; None where there is none or it is torn."""
+        """The receipt of a chunk; None where there is none, or it is torn, or of another chunk, study or grid."""
         try:
-            return _unpacked(self._receipt_file(number).read_bytes(), optional.crc32c())
-        except (FileNotFoundError, ValueError):
+            found = _unpacked(self._receipt_file(number).read_bytes(), optional.crc32c())
+            sound = (found.first, found.last) == self.span(number) and set(found.checksums) == set(self.columns)
+            grid = self._digests.get("run/grid.json", found.of[1])
+            return found if sound and found.of == (self.identity, grid) and _fits(found, len(self.study["outputs"])) else None
+        except (OSError, ValueError, KeyError, TypeError, IndexError):
             return None
 
     def receipts(self) -> list[int]:
         """Numbers of chunks that have a receipt, whole or not, in order."""
-        return sorted(int(entry.name) for entry in os.scandir(self.path / "run" / "chunks") if entry.name.isdigit() and int(entry.name) < self.chunks)
+        try:
+            names = os.listdir(self.path / "run" / "chunks")
+        except OSError as error:
+            raise ValueError(f"`{self.path}` holds no chunks of a study any more ({error.strerror}); it was moved or removed") from None
+        return sorted(int(name) for name in names if name.isdecimal() and name == str(int(name)) and int(name) < self.chunks)
 
     def is_whole(self, number: int) -> bool:
         """Whether a chunk has its receipt and all its arrays, and all of them are as they were written."""
-        crc32c = optional.crc32c()
         receipt = self.receipt(number)
-        if receipt is None or (receipt.first, receipt.last) != self.span(number) or set(receipt.checksums) != set(self.columns):
+        return receipt is not None and all(self._is_kept(name, number, receipt, optional.crc32c().value) for name in self.columns)
+
+    def _is_kept(self, name: str, number: int, receipt: Receipt, computed=None) -> bool:
+        """Whether the file of a chunk ends in the checksum of its receipt, has its length and, where one is `computed`, that checksum."""
+        column = self.columns[name]
+        size = np.dtype(column.dtype).itemsize * (self.chunk // column.every) * math.prod(length for _, length in column.more)
+        try:
+            with open(self._file(name, number), "rb") as file:
+                content = file.read(size) if computed else file.seek(size)
+                stated, rest = file.read(4), file.read(1)
+        except OSError:
             return False
-        for name, column in self.columns.items():
-            try:
-                content = self._file(name, number).read_bytes()
-            except FileNotFoundError:
-                return False
-            size = np.dtype(column.dtype).itemsize * (self.chunk // column.every) * math.prod(length for _, length in column.more)
-            if len(content) != size + 4 or not int.from_bytes(content[-4:], "little") == receipt.checksums[name] == crc32c.value(content[:-4]):
-                return False
-        return True
+        right = int.from_bytes(stated, "little") == receipt.checksums[name] and len(stated) == 4 and not rest
+        return right and (computed is None or computed(content) == receipt.checksums[name])
+
+    def check_arrays(self, numbers: Iterable[int]) -> None:
+        """ValueError where arrays of chunks are not those of their receipts; whether values go with their checksums is seen when Zarr reads them."""
+        for number in numbers:
+            receipt = self.receipt(number)
+            wrong = list(self.columns) if receipt is None else [name for name in self.columns if not self._is_kept(name, number, receipt)]
+            if wrong:
+                text = f"`{wrong[0]}` is damaged in {self.lanes_of([number])}: its file, or the receipt of the chunk, is not what was written"
+                raise ValueError(f"{text}; run the study again, which computes them anew")
 
     def done(self) -> tuple[list[int], list[int]]:
         """Numbers of the chunks that are whole, and of those that have a receipt and are not; the receipts of the latter are removed."""
@@ -228,26 +302,21 @@ class Store:
 
     def read_grid(self) -> dict | None:
         """What `write_grid` kept; None where nothing was, or it is damaged (it is then found again)."""
-        found = self._read("grid.json", None)
-        return found if isinstance(found, dict) and {"low", "high", "centre"} <= found.keys() else None
+        self._digests = self._read_manifest()
+        with contextlib.suppress(ValueError, OSError):
+            content = self._read("run/grid.json")
+            if _digest(content) == self._digests.get("run/grid.json"):
+                return json.loads(content)
+        return None
 
-    def write_grid(self, grid: dict) -> None:
-        """Keep the grid of the statistics."""
-        write_whole(self.path / "run" / "grid.json", json.dumps(grid).encode(), wait=True)
-
-    def skipped(self) -> tuple[int, ...]:
-        """Numbers of the lanes that `skip` noted, since processes died on them."""
-        return tuple(self._read("skipped.json", ()))
-
-    def skip(self, lane: int) -> None:
-        """Note that a lane is not to be computed."""
-        write_whole(self.path / "run" / "skipped.json", json.dumps(sorted({*self.skipped(), lane})).encode(), wait=True)
-
-    def _read(self, name: str, otherwise):
-        try:
-            return json.loads((self.path / "run" / name).read_bytes())
-        except (FileNotFoundError, ValueError):
-            return otherwise
+    def write_grid(self, grid: dict) -> dict:
+        """Keep the grid of the statistics, and return it as it is kept."""
+        content = json.dumps(grid).encode()
+        with self._named():
+            write_whole(self.path / "run" / "grid.json", content, wait=True)
+            self._digests = self._read_manifest() | {"run/grid.json": _digest(content)}
+            _write_manifest(self.path, self._digests)
+        return grid
 
     def take_chunk(self, other: "Store", number: int) -> None:
         """Copy a chunk that another folder of the same study holds."""
@@ -256,11 +325,34 @@ class Store:
         write_whole(self._receipt_file(number), other._receipt_file(number).read_bytes())
 
 
+def _beyond(study: Mapping) -> str:
+    """Which number of a study is out of its range, and the range; nothing where none is."""
+    for name, most in {"samples": MOST_SAMPLES, "chunk": MOST_LANES, "block": MOST_LANES}.items():
+        value = study.get(name)
+        if type(value) is not int or not 1 <= value <= most:
+            return f"`{name}` is {shortened(value)}, expected a whole number from 1 to {most}"
+    if study["samples"] > MOST_CHUNKS * study["chunk"]:
+        return f"{study['samples']} samples are more than {MOST_CHUNKS} chunks of {study['chunk']}"
+    return ""
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _digest_of(digests: Mapping[str, str]) -> str:
+    return _digest(json.dumps(digests, sort_keys=True).encode())
+
+
+def _write_manifest(path: Path, digests: Mapping[str, str]) -> None:
+    write_whole(path / _MANIFEST, json.dumps({"digests": dict(digests), "digest": _digest_of(digests)}, indent=1).encode(), wait=True)
+
+
 def _packed(receipt: Receipt, crc32c) -> bytes:
     """A receipt as bytes: a first line, a line of JSON that says what follows, the arrays, and the CRC-32C of all that."""
     arrays = {name: np.ascontiguousarray(array) for name, array in receipt.arrays.items()}
     listed = [(name, array.dtype.str, array.shape) for name, array in arrays.items()]
-    head = {"first": receipt.first, "last": receipt.last, "checksums": dict(receipt.checksums), "arrays": listed}
+    head = {"first": receipt.first, "last": receipt.last, "of": receipt.of, "checksums": dict(receipt.checksums), "arrays": listed}
     content = _BEGIN + json.dumps(head).encode() + b"\n" + b"".join(array.tobytes() for array in arrays.values())
     return content + crc32c.value(content).to_bytes(4, "little")
 
@@ -272,6 +364,18 @@ def _unpacked(content: bytes, crc32c) -> Receipt:
     head, at, arrays = json.loads(content[len(_BEGIN) : end]), end + 1, {}
     for name, dtype, shape in head["arrays"]:
         count = math.prod(shape)
+        if min(shape, default=0) < 0 or np.dtype(dtype).hasobject:
+            raise ValueError("the receipt of a chunk holds no numbers")
         arrays[name] = np.frombuffer(content, dtype, count, at).reshape(shape)
         at += count * np.dtype(dtype).itemsize
-    return Receipt(head["first"], head["last"], arrays, head["checksums"])
+    return Receipt(head["first"], head["last"], arrays, head["checksums"], tuple(head["of"]))
+
+
+def _fits(receipt: Receipt, outputs: int) -> bool:
+    """Whether the numbers of a receipt are within their ranges."""
+    codes, again, steps, failed, sums, (place, counts), extremes = (receipt.arrays[name] for name in RECEIPT)
+    lanes, _ = receipt.lanes
+    shapes = again.shape == (1,) and steps.shape == (2,) and sums.shape[1:] == (3, outputs, outputs) and extremes.shape == (2, outputs)
+    numbers = codes.sum() == lanes and codes.size <= len(CODES) and min(codes.min(), again.min(), steps.min()) >= 0
+    within = np.all((failed >= receipt.first) & (failed < receipt.last)) and np.all((place >= 0) & (place < outputs * (CELLS + 2)) & (counts > 0))
+    return bool(shapes and numbers and within)

@@ -5,7 +5,7 @@ run the same compiled programs on arrays of the same shapes, so a lane's numbers
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -34,7 +34,6 @@ from jourdain_jax.scene.scene import Scene
 LARGEST_BLOCK = 2048  # lanes: enough that few wait for the last one, few enough that a chunk is a fraction of a second
 BLOCK_MEMORY = 2**26  # bytes of saved states of a block, at most
 AT_START = "_at_start"  # how columns of start values are called, after the coordinate or speed
-SKIPPED = {"result": results.PROCESS_DIED, "event": -1, "steps": 0, "rejected_steps": 0, "retries": 0}  # columns of a lane that is skipped; others are NaN
 RESERVED = ("lane", "saved_lane", "run", "zarr.json")  # axes, and names of files beside the arrays
 SAVES = ("statistics", "outputs", "trajectories")
 
@@ -101,34 +100,11 @@ class Task:
         first = {name: value if name in self.constants else value[0] for name, value in starts.items()}
         return simulate(own, first, **(dict(self.options) | options))
 
-    def run_block(self, number: int, skipped: Sequence[int] = ()) -> Lanes:
-        """All lanes of a block; lanes that are `skipped` have no values."""
+    def run_block(self, number: int) -> Lanes:
+        """All lanes of a block."""
         first = number * self.block
         last = min(first + self.block, len(self.design))
-        places = np.minimum(np.arange(self.block), last - first - 1)
-        here = np.array([lane - first for lane in skipped if first <= lane < last], int)
-        if not here.size:
-            return self._computed(first, last, places)
-        places[np.isin(places, here)] = np.setdiff1d(places, here)[0]
-        found = self._computed(first, last, places)
-        found.outputs[here] = math.nan
-        first_saved = -first % self.every
-        saved = (here[(first + here) % self.every == 0] - first_saved) // self.every
-        columns = {name: np.array(column) for name, column in found.columns.items()}
-        for name in columns.keys() - set(self.design.names):
-            columns[name][saved if name in self._along else here] = SKIPPED.get(name, math.nan)
-        return Lanes(columns, found.outputs)
-
-    def run_lanes(self, first: int, last: int) -> None:
-        """Compute lanes `first` to `last` - 1 and no others, for nothing but to see whether this process survives it."""
-        for number in range(first // self.block, -(-last // self.block)):
-            begin = number * self.block
-            places = np.clip(np.arange(self.block), max(first - begin, 0), min(last - begin, self.block) - 1)
-            self._computed(begin, min(begin + self.block, len(self.design)), places)
-
-    def _computed(self, first: int, last: int, places: np.ndarray) -> Lanes:
-        """Lanes `first` to `last` - 1; in place of each the one at `places`, counted from `first`, is computed."""
-        starts, parameters = self.arguments(first, last, places)
+        starts, parameters = self.arguments(first, last, np.minimum(np.arange(self.block), last - first - 1))
         rolled = rollout(self.scene, starts, parameters=parameters or None, chunk=self.block, progress=False, **self.options).lanes
         with nan_is_a_mark():
             outputs = np.array(self._outputs_of(rolled))[: last - first]

@@ -1,7 +1,7 @@
 """Several processes that compute the chunks of one study; each is started afresh (never forked from one in which JAX runs) and has its share of the cores.
 
 A worker that dies takes nothing with it: chunks that were under way are given to a new worker, one at a time. A chunk on which workers died three times is
-searched for the lane that is the cause.
+left out, with a warning that names its lanes.
 """
 
 import contextlib
@@ -9,16 +9,18 @@ import os
 import pickle
 import signal
 import threading
+import warnings
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection, get_context, parent_process
 
-from jourdain_jax.ensembles.deadly_lanes import MOST_DEATHS, without_deadly_lanes
 from jourdain_jax.ensembles.run import Runner
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
+from jourdain_jax.scene.tracebacks import users_level
 
+MOST_DEATHS = 3  # of processes on one chunk, before it is left out
 _NONE_BEGAN = (
     "no worker of this study could begin, as what it printed says. Each imports the program that was started: run studies in it under "
     '`if __name__ == "__main__":`, and define scenes and outputs in a module; or take processes=1'
@@ -35,27 +37,43 @@ def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, in
         def compute(numbers: list[int], alone: bool):
             return _until_a_worker_dies(sent, store, numbers, 1 if alone else count, interrupted)
 
-        with contextlib.ExitStack() as stack:
-            yield from without_deadly_lanes(store, numbers, interrupted, compute, _Survives(sent, store, stack), MOST_DEATHS - 1)
+        return whatever_dies(store, numbers, interrupted, compute, MOST_DEATHS - 1)
 
     return workers
 
 
-class _Survives:
-    """Whether a worker survives lanes `first` to `last` - 1; one that did is asked again."""
+def whatever_dies(store: Store, numbers, interrupted, compute: Callable, attempts: int) -> Iterator[tuple[int, int]]:
+    """Compute the chunks `numbers`, whatever becomes of the processes that do; chunks on which they die again and again are left out, with a warning.
 
-    def __init__(self, sent: bytes, store: Store, stack: contextlib.ExitStack):
-        self.sent, self.store, self.stack = sent, store, stack
-        self.pool: ProcessPoolExecutor | None = None
+    - `compute(numbers, alone)`: a generator that yields lanes and failed lanes of each chunk, and returns the numbers of those under way when a process died.
+    - `attempts`: how often such a chunk is tried alone, so that no other is suspected.
 
-    def __call__(self, first: int, last: int) -> bool:
-        self.pool = self.pool or self.stack.enter_context(_pool(self.sent, self.store, 1, get_context("spawn").Event()))
-        try:
-            self.pool.submit(_try, first, last).result()
-        except BrokenProcessPool:
-            self.pool = None
-            return False
-        return True
+    A process may die within a motion where a user's function calls other code, or where memory runs out. RuntimeError where it is the first block, which
+    every process computes.
+    """
+    waiting, left_out = list(numbers), []
+    while waiting and not interrupted():
+        for number in (yield from compute(waiting, False)):
+            deaths = 0
+            while deaths < attempts and not interrupted() and (yield from compute([number], True)):
+                deaths += 1
+            if deaths == attempts:
+                left_out.append(number)
+                if store.read_grid() is None:
+                    raise RuntimeError(f"{_died(store, [0])}, with which every process begins. {_ADVICE}")
+        waiting = [number for number in waiting if number not in left_out and store.receipt(number) is None]
+    if left_out:
+        said = f"{_died(store, sorted(left_out))}, which are left out; all others are kept, and the same call tries these again. {_ADVICE}"
+        warnings.warn(said, stacklevel=users_level())
+
+
+_ADVICE = (
+    "Is there enough memory? Take fewer processes, `memory=`, or a smaller `chunk`; or simulate these lanes one by one, in a process of their own, to see why"
+)
+
+
+def _died(store: Store, numbers: list[int]) -> str:
+    return f"processes died {MOST_DEATHS} times on {store.lanes_of(numbers)}"
 
 
 def sent_to_others(task: Task) -> bytes:
@@ -128,7 +146,3 @@ def _chunk(number: int) -> tuple[int, int]:
     if not _runner:
         _runner.append(Runner(*_asked[0]))
     return _runner[0].run(number)
-
-
-def _try(first: int, last: int) -> None:
-    _asked[0][0].run_lanes(first, last)

@@ -63,7 +63,7 @@ def model(name: str, **parameters) -> Scene:
 
 def known_model(name: str) -> type[Scene]:
     """The class of a model; a ValueError with the nearest name where there is none."""
-    if name not in MODELS:
+    if not isinstance(name, str) or name not in MODELS:
         raise ValueError(f"unknown model `{name}`; {nearest(name, MODELS)}")
     return MODELS[name]
 

@@ -31,7 +31,7 @@ MESSAGES = {
     "missed a short feature of a load, or a load's potential is not that of its force (`verify`)",
     CONTRADICTORY_ROWS: "velocity rows that depend on each other are not met together at some saved time: they contradict each other there; leave one out, "
     "or mend the inputs and times that they follow",
-    PROCESS_DIED: "processes died on it again and again, and the study skipped it; simulate it alone, in a process of its own, to see why",
+    PROCESS_DIED: "processes died on it again and again, and an earlier version's study skipped it",
     UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; take a shorter step (`dt0`), or look for a singularity there",
 }
 
