@@ -28,6 +28,7 @@ def stopped(y0, value, *, rates, longest=2.0, solver=None, kind="forward", lanes
         atol=real(1e-9),
         shortest=real(1e-14),
         longest=real(jnp.inf),
+        span=real(longest),
         max_steps=max_steps,
     )
     goals = jnp.stack([real(0.5 * longest), real(longest)])

@@ -25,7 +25,7 @@ from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.lowering import appell, kept_rows, lower
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.models import MODELS
-from jourdain_jax.motion.integrators import crossings, erk_loop, erk_step, recorded_adjoint, step_adjoint
+from jourdain_jax.motion.integrators import crossings, erk_loop, erk_step, event_search, recorded_adjoint, step_adjoint
 from jourdain_jax.motion.integrators.tableaus import method_of
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.program.evaluate import Probes
@@ -136,7 +136,7 @@ def loop(
             knots=None if knots is None else jnp.asarray(knots),
             relations=relations,
             relation_count=0 if relations is None else 2,
-            resolved=2e-3 * one,
+            span=2.0 * one,
         )
         ys, _, end = erk_loop.integrate(problem, method_of(solver or diffrax.Dopri8()), y0, t0, goals, dt0, kind)
         return ys, end
@@ -178,6 +178,13 @@ def steps_are_no_longer_than_allowed():
     run = loop("forward", lambda t, y, args: jnp.ones(1), rtol=1e-3, longest=0.25)
     _, end = jax.jit(run)(jnp.zeros(1), jnp.array(0.0), jnp.array([2.0]), None)
     assert int(end.accepted) == 8, "the longest step"
+
+
+def a_motion_leaves_an_event_at_which_it_starts():
+    run = jax.jit(loop("forward", lambda t, y, args: jnp.array([1.0 - t]), rtol=1e-8, dt0=1e-3, events=lambda t, y, args: y))
+    for start, expected in ((0.0, 2.0), (-1e-5, 0.0)):
+        _, end = run(jnp.full(1, start), jnp.array(0.0), jnp.array([4.0]), None)
+        np.testing.assert_allclose(end.t, expected, atol=1e-8, err_msg="leaves")
 
 
 def a_pulse_is_met():
@@ -287,7 +294,7 @@ class Mutant:
 DENSE = "differs from the dense path"
 BUILD, KINEMATICS, VJP = appell.AppellOnGraph, appell._Kinematics, recorded_adjoint._motion
 DISC, BOARD = a_tilting_disc_accelerates_as_by_dense_matrices, a_snakeboard_accelerates_as_by_dense_matrices
-LONGEST = steps_are_no_longer_than_allowed
+LONGEST, LEAVES = steps_are_no_longer_than_allowed, a_motion_leaves_an_event_at_which_it_starts
 STEPS, TIMES, EVENT = steps_follow_a_closed_form, reverse_mode_through_saved_times, reverse_mode_to_an_event
 MUTANTS = [
     Mutant("no gyroscopic torque", BUILD, "_inertia_resultants", "g.add(g.dot(row, alpha), w)", "g.dot(row, alpha)", DISC, DENSE),
@@ -356,6 +363,8 @@ MUTANTS = [
     Mutant("no dips", erk_step, "_monitored", "dips = accept & dip.happens", "dips = accept & False", an_event_within_a_step_ends_the_motion, "passed over"),
     Mutant("the first step without a bound", erk_loop, "begun", "jnp.minimum(jnp.abs(dt0), problem.longest)", "jnp.abs(dt0)", LONGEST, "the longest step"),
     Mutant("no bound of steps", erk_step, "_tried", "jnp.minimum(size * factor, problem.longest)", "size * factor", LONGEST, "the longest step"),
+    Mutant("no start at an event", event_search, "at_start", "rises = (c_dot_0 > 0)", "rises = (c_dot_0 > 1e9)", LEAVES, "leaves"),
+    Mutant("every start at an event", event_search, "at_start", "reach_of_noise(span) * c_dot_0", "c_dot_0", LEAVES, "leaves"),
     Mutant("no step refused", crossings.Crossings, "watched", "(fits & (count > 0) & (", "(fits & (count < 0) & (", a_pulse_is_met, "pulse"),
     Mutant("steps as long as the way that is left", crossings.Crossings, "reach", "0.5 * (self.by", "1.0 * (self.by", a_pulse_is_met, "too many|crossings"),
     Mutant("signs of the first state", crossings.Watched, "noted", "jnp.where(counts, self.last, before.last)", "before.last", a_pulse_is_met, "crossings"),

@@ -147,12 +147,24 @@ def strip(width, **options):
     return jax.jit(lambda: motion(Strip(width), {"x": 0.0, "x_rate": 1.0}, **options))()
 
 
+def a_motion_leaves_an_event_at_which_it_starts():
+    rising = jax.jit(lambda: motion(Pushed(4.0, 0.7), {"x": 0.7, "x_rate": 5.0}, ts=TIMES))()
+    assert int(rising.code) == results.EVENT, "leaves"
+    assert 0.5 < rising.t_end < 1.5, "leaves"
+    assert float(jax.jit(lambda: motion(Pushed(4.0, 0.7), {"x": 0.7, "x_rate": -5.0}, ts=TIMES))().t_end) == 0.0, "leaves"
+
+
 def a_strip_is_met():
     found, v = strip(0.004, events=False), np.sqrt(1 - 6 * 0.008)
     assert int(found.crossings) == 3, "crossings"
     np.testing.assert_allclose(found.y_end.q, 0.704 + v * (2 - 0.696 - (1 - v) / 3), atol=1e-3, err_msg="strip")
     assert int(found.rejected) < 80, f"too many refused steps, {found.rejected}"
     assert int(found.accepted) < 100, "too many steps"
+
+
+def a_motion_below_an_event_has_none():
+    below = jax.jit(lambda: motion(Pushed(4.0, 0.7), {"x": 0.699, "x_rate": 5.0}, ts=TIMES, dt0=0.01))()
+    assert float(below.t_end) == 0.0, "starts below"
 
 
 def a_strip_within_a_step_is_named():
@@ -304,6 +316,7 @@ BACK, ALONG, TIME = reverse_mode_through_saved_times, forward_mode_through_saved
 EVENT_BACK, EVENT_ALONG, EVENT_TWICE = reverse_mode_to_an_event, forward_mode_to_an_event, forward_mode_to_an_event_twice
 BENT, TIMES_BENT = a_hessian_to_an_event, a_hessian_with_respect_to_times
 LONGEST, SERIES_LONGEST = steps_are_no_longer_than_allowed, series_are_no_longer_than_allowed
+LEAVES, LEAVES_BELOW = a_motion_leaves_an_event_at_which_it_starts, a_motion_below_an_event_has_none
 STRIP, NAMED, WINDOW = a_strip_is_met, a_strip_within_a_step_is_named, an_event_where_a_relation_changes_is_found
 PROJECTED_BACK = reverse_mode_back_over_projections
 TRIED, WRONG = "_tried_by_stages", "derivative with respect to"
@@ -321,6 +334,8 @@ MUTANTS = [
     Mutant("states of another lane", loop, "_save", "(number * times + k)", "(0 * number + k)", LANES, "lanes"),
     Mutant("no bound of steps", step, TRIED, ', p["longest"])', ", w.number(math.inf))", LONGEST, "the longest step"),
     Mutant("no bound of series", step, "_tried_by_series", 'rows), p["longest"])', "rows), math.inf)", SERIES_LONGEST, "the longest step"),
+    Mutant("no start at an event", search, "at_start", "rises = (rate > 0.0)", "rises = (rate > 1e9)", LEAVES, "leaves"),
+    Mutant("every start at an event", search, "at_start", "& (w.magnitude(a) <= reach_of_noise(w, p) * rate)", "", LEAVES_BELOW, "below"),
     Mutant("no step refused", crossings, "watched", "(fits & (count > 0.0) & (", "(fits & (count < 0.0) & (", STRIP, "strip"),
     Mutant("steps as long as the way that is left", crossings, "reach", "w.larger(0.5 * (", "w.larger(1.0 * (", STRIP, "too many|crossings"),
     Mutant("signs of the first state", crossings, "note", "[w.where(counts, new, old)", "[w.where(counts, old, old)", STRIP, "crossings"),

@@ -37,6 +37,7 @@ def pendulum(kind, *, rtol, solver=None, events=False, max_steps=100_000):
             atol=rtol * same,
             shortest=1e-14 * same,
             longest=jnp.inf * same,
+            span=same,
             max_steps=max_steps,
         )
         method = method_of(diffrax.Dopri8() if solver is None else solver)

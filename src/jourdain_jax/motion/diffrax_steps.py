@@ -17,9 +17,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jourdain_jax.motion.integrators import integrands
+from jourdain_jax.motion.integrators import event_search, integrands
 from jourdain_jax.motion.integrators.event_location import Remembering, locate, with_tolerances
-from jourdain_jax.motion.integrators.event_search import no_event
 from jourdain_jax.motion.integrators.guarded_solver import GuardedSolver
 from jourdain_jax.motion.integrators.solver_choice import takes_even_steps
 from jourdain_jax.motion.integrators.step_to_times import EvenSteps, merged, step_to_times
@@ -124,11 +123,17 @@ class Diffrax(Integrator):
         )
 
 
-def _an_event(t, y, args, *, terms, **kwargs) -> Bool[Array, ""]:
-    """Whether any event has happened, in the signature of diffrax; a state that is lost is none."""
+def _an_event(t, y, args, *, terms, t0, t1, **kwargs) -> Bool[Array, ""]:
+    """Whether any event has happened, in the signature of diffrax; a state that is lost is none, nor is at the start a value that rises from zero."""
     direction = terms.contr(0.0, 1.0)  # diffrax counts time along the direction of the motion
     known = jnp.all(jnp.stack([jnp.all(jnp.isfinite(part)) for part in jax.tree.leaves((y.q, y.v))]))
-    return known & ~no_event(integrands.events(t * direction, y, args))
+
+    def at_start():
+        along = direction, jax.tree.map(lambda f: direction * f, integrands.rates(t * direction, y, args))
+        values, rates = jax.jvp(lambda t, y: integrands.events(t, y, args), (t * direction, y), along)
+        return jnp.any(event_search.at_start(values, rates, values, jnp.abs(t1 - t0))[0])
+
+    return known & jax.lax.cond(t == t0, at_start, lambda: ~event_search.no_event(integrands.events(t * direction, y, args)))
 
 
 class ZeroTangentIfNonfinite(eqx.Module):

@@ -18,7 +18,6 @@ from jourdain_jax.calculus.guards import reverse_only
 from jourdain_jax.motion.batches.lockstep import in_blocks, width
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators import erk_loop, integrands
-from jourdain_jax.motion.integrators.crossings import RESOLVED
 from jourdain_jax.motion.integrators.of_diffrax import alongside, diffrax
 from jourdain_jax.motion.integrators.tableaus import Method, method_of
 from jourdain_jax.motion.native import native_motion
@@ -132,7 +131,7 @@ def _loop(mode: Mode, setup: Setup, y0, args, ts, knots) -> Solved:
         rates_and_pivots=integrands.rates_and_pivots if field.has_pivots else None,
         relations=relations,
         relation_count=relation_count,
-        resolved=RESOLVED * jnp.abs(goals[-1]),
+        span=jnp.abs(goals[-1]),
         within=None if knots is None else integrands.within,
     )
     ys, reached, end = erk_loop.integrate(problem, own.solver, y0, jnp.zeros_like(setup.t0), goals, setup.dt0, mode)

@@ -116,7 +116,8 @@ class Scene(eqx.Module):
         return {}
 
     def events(self, motion: Motion) -> dict[str, Float[Array, ""]]:
-        """Named stop events at a `motion`: positive while it may go on; it stops where a value falls through zero, or is no number beyond.
+        """Named stop events at a `motion`: positive while it may go on; it stops where a value falls through zero, or is no number beyond. At a
+        start a value of zero that rises has not happened.
 
         Of several events in one step the first in time counts. A value that falls through zero and rises again within one step is found where the cubic
         through values and rates at the ends of the step shows it (default solvers), or the dense output at three times in the step (other adaptive ones),

@@ -37,12 +37,12 @@ class Crossings(eqx.Module):
     count: Int[Array, "*lanes"]
     together: Float[Array, "*lanes"]  # the end of the first step in which two or more have changed; infinite: none
 
-    def reach(self, t, direction, resolved) -> Float[Array, "*lanes"]:
+    def reach(self, t, direction, span) -> Float[Array, "*lanes"]:
         """How long a step from t may be."""
-        return jnp.maximum(0.5 * (self.by - t) * direction, resolved)
+        return jnp.maximum(0.5 * (self.by - t) * direction, RESOLVED * span)
 
     def watched(
-        self, values: Callable, relations: int, start: tuple[Array, PyTree], end: tuple[Array, PyTree], fits: Bool[Array, "*lanes"], h, resolved
+        self, values: Callable, relations: int, start: tuple[Array, PyTree], end: tuple[Array, PyTree], fits: Bool[Array, "*lanes"], h, span
     ) -> "Watched":
         """What a step h crosses from its `start` to its `end`, (t, y); `values`: (t, y) -> numbers, first `relations`; `fits`: it would be accepted."""
         now = _unless_zero(values(*end), self.last)
@@ -54,7 +54,7 @@ class Crossings(eqx.Module):
         hidden = (count == 1) & _apart(between, now) & _apart(between, self.last)
         falls = fits & jnp.any(hidden[relations:], axis=0)
         count = count + 2 * jnp.any(hidden[:relations], axis=0)
-        refused = falls | (fits & (count > 0) & (jnp.abs(h) > LONGER * resolved))
+        refused = falls | (fits & (count > 0) & (jnp.abs(h) > LONGER * RESOLVED * span))
         return jax.lax.stop_gradient(Watched(now, count, refused, falls, share * jnp.abs(h)))
 
 

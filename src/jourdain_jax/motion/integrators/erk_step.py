@@ -69,7 +69,7 @@ class Problem(eqx.Module):
     rates_and_pivots: Callable | None = None
     relations: Callable | None = None  # (args, t, y) -> numbers whose signs are watched, (numbers, *lanes): first so many relations, then stop events
     relation_count: int = eqx.field(static=True, default=0)
-    resolved: Float[Array, "*lanes"] | None = None  # the length of a step in which they may change
+    span: Float[Array, "*lanes"] | None = None  # of the motion, s
     within: Callable | None = None  # (t, args) -> args for the stages of a step with the middle t; None: the same in all steps
 
     def in_step(self, t, h) -> "Problem":
@@ -89,17 +89,11 @@ class Problem(eqx.Module):
 
 
 def begun(problem: Problem, y0: PyTree, t0: Float[Array, "*lanes"], dt0, direction) -> Progress:
-    """The start of a motion; one that starts beyond an event has no motion at all."""
+    """The start of a motion."""
     start = standing(problem, y0, t0, jnp.minimum(jnp.abs(dt0), problem.longest), direction)
     if problem.events is None:
         return start
-    values = problem.events(t0, y0, problem.args)
-    beyond = ~(values > 0)
-    known = [jnp.all(jnp.isfinite(x), axis=tuple(range(x.ndim - jnp.ndim(t0)))) for x in jax.tree.leaves(y0)]  # a state that is lost is no event
-    happened = jnp.any(beyond, axis=0) & jnp.all(jnp.stack(known), axis=0)
-    code = jnp.where(happened, results.EVENT, start.code).astype(jnp.int32)
-    event = jnp.where(happened, jnp.argmax(beyond, axis=0), start.event).astype(jnp.int32)
-    return replace(start, code=code, event=event, search=event_search.none(t0, values))
+    return replace(start, search=event_search.none(t0, problem.events(t0, y0, problem.args)))
 
 
 def standing(problem: Problem, y: PyTree, t: Float[Array, "*lanes"], h: Float[Array, "*lanes"], direction) -> Progress:
@@ -133,7 +127,7 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
     knot = problem.knot_ahead(p, direction)
     target = jnp.where((knot - goal) * direction < 0, knot, goal)
     rest = jnp.abs(target - p.t)
-    reach = p.h if p.crossings is None else jnp.minimum(p.h, p.crossings.reach(p.t, direction, problem.resolved))
+    reach = p.h if p.crossings is None else jnp.minimum(p.h, p.crossings.reach(p.t, direction, problem.span))
     lands = ~locating & (reach >= 0.999 * rest)
     size = jnp.where(lands, rest, jnp.where(2 * reach > rest, 0.5 * rest, reach))
     shortened = size < p.h
@@ -163,7 +157,7 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
     watched = None
     if p.crossings is not None and problem.relations is not None:
         watched = p.crossings.watched(
-            partial(problem.relations, problem.args), problem.relation_count, (p.t, p.y), (t1, y1), accept & ~locating, h, problem.resolved
+            partial(problem.relations, problem.args), problem.relation_count, (p.t, p.y), (t1, y1), accept & ~locating, h, problem.span
         )
         accept, next_h = accept & ~watched.refused, jnp.where(watched.refused, jnp.where(watched.falls, watched.to_event, p.h), next_h)
     accepted, rejected = p.accepted + (accept & ~locating).astype(jnp.int32), p.rejected + (~accept).astype(jnp.int32)
@@ -283,6 +277,12 @@ def _monitored(problem: Problem, p: Progress, moved: Progress, h, slopes, accept
     first_values, first_rates = jax.jvp(events, (p.t, p.y), (one, first_slope))
     values, last_rates = jax.jvp(events, (moved.t, moved.y), (one, jax.lax.stop_gradient(last_slope)))
     dip = event_search.dip(h, first_values, first_rates, values, last_rates)
+    sunk, sinks = event_search.at_start(first_values, jnp.sign(h) * first_rates, values, problem.span)
+    again = jnp.any(sinks, axis=0) & (jnp.abs(h) > event_search.reach_of_noise(problem.span))
+    dip = event_search.Dip(dip.happens | again, jnp.where(again, 0.5, dip.share))
+    known = [jnp.all(jnp.isfinite(x), axis=tuple(range(x.ndim - p.t.ndim))) for x in jax.tree.leaves(p.y)]  # a state that is lost is no event
+    fresh = (p.accepted + p.rejected == 0) & jnp.all(jnp.stack(known), axis=0)
+    over = jnp.any((fresh & sunk) | (accept & ~again & sinks), axis=0)  # at the start
     dips = accept & dip.happens
     happened = accept & ~dips & ~event_search.no_event(values)
     search = jax.lax.cond(
@@ -304,6 +304,8 @@ def _monitored(problem: Problem, p: Progress, moved: Progress, h, slopes, accept
     tried = dips.astype(jnp.int32)
     knot = jnp.where(dips, p.knot, moved.knot)
     rest = jax.tree.map(lambda new, old: jnp.where(dips, old, new), moved.rest, p.rest)
-    return Progress(
-        t, y, jax.lax.stop_gradient(next_h), code, knot, moved.accepted - tried, moved.rejected + tried, event, search, moved.pivot, rest, moved.crossings
-    )
+    accepted, rejected = moved.accepted - tried, moved.rejected + tried
+    after = Progress(t, y, jax.lax.stop_gradient(next_h), code, knot, accepted, rejected, event, search, moved.pivot, rest, moved.crossings)
+    first = jnp.argmax(sunk | sinks, axis=0).astype(jnp.int32)
+    none = replace(p, code=jnp.full_like(code, results.EVENT), event=first, search=search)
+    return jax.tree.map(lambda a, b: jnp.where(over, a, b), none, after)

@@ -1,8 +1,15 @@
 """Which stop event of a step came first, and when: trials of shorter steps from the last state before it.
 
-All event values are positive at t_b, and one of them is not at t_a. What is not a number is not positive: such a value lies beyond its boundary. Of
-the values that are not positive at t_a, the one whose secant from t_b falls to zero first is followed; the next trial, between t_b and t_a, is by
-Chandrupatla's method (inverse quadratic interpolation where it is safe, otherwise the middle). Where a trial finds another event, all that
+An event happens where its value falls through zero. A motion that starts with a value of zero, as round-off has it, and a rate that raises it goes on
+
+    |c_0| <= noise c_0',   noise = eps^0.6 span
+
+if the value is positive after a first step, which is tried again at half its length where it is not, down to that noise; then the event has happened at
+the start, as it has where the value is lower, or does not rise.
+
+All event values are positive at t_b, or rise from zero there, and one of them is not at t_a. What is not a number is not positive: such a value lies
+beyond its boundary. Of the values that are not positive at t_a, the one whose secant from t_b falls to zero first is followed; the next trial, between t_b
+and t_a, is by Chandrupatla's method (inverse quadratic interpolation where it is safe, otherwise the middle). Where a trial finds another event, all that
 is after it no longer counts: so the event that is found has no other before it, as far as values were seen.
 
 The times tried are numbers to differentiation. Near the event, shifts of Newton's method follow,
@@ -24,7 +31,21 @@ from jaxtyping import Array, Bool, Float, Int
 MOST_STEPS = 72
 DIFFERENTIABLE = 2
 FLAT = 1e-8  # of its mean rate over a step: a value that falls through zero so slowly has a root of several fold, or as good as that
+LEAVES = 0.6  # exponent of round-off
 LATE = 0.98  # of a step: a dip that is later is left to the next one
+
+
+def reach_of_noise(span) -> Float[Array, "*lanes"]:
+    """The time in which a value rises by no more than it may be below zero at a start."""
+    return jnp.finfo(span.dtype).eps ** LEAVES * span
+
+
+def at_start(c_0, c_dot_0, c_1, span) -> tuple[Bool[Array, "events *lanes"], Bool[Array, "events *lanes"]]:
+    """Which events have happened at a state, of a start; and which values, though they rise from zero there, are not positive after a step."""
+    c_0, c_dot_0, c_1 = jax.lax.stop_gradient((c_0, c_dot_0, c_1))
+    rises = (c_dot_0 > 0) & (jnp.abs(c_0) <= reach_of_noise(span) * c_dot_0)
+    beyond = ~(c_0 > 0)
+    return beyond & ~rises, beyond & rises & ~(c_1 > 0)
 
 
 class Bracket(eqx.Module):

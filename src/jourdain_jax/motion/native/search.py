@@ -2,7 +2,7 @@
 
 import math
 
-from jourdain_jax.motion.integrators.event_search import DIFFERENTIABLE, FLAT, LATE, MOST_STEPS
+from jourdain_jax.motion.integrators.event_search import DIFFERENTIABLE, FLAT, LATE, LEAVES, MOST_STEPS
 from jourdain_jax.motion.native.layout import Lanes
 from jourdain_jax.native.ir import Value, Writer
 
@@ -17,6 +17,22 @@ def no_event(w: Writer, values: Values) -> Value:
     for c in values[1:]:
         found = found & (c > 0.0)
     return found
+
+
+def reach_of_noise(w: Writer, p: Lanes) -> Value:
+    """As in `event_search`."""
+    return EPS**LEAVES * w.magnitude(p["last_goal"])
+
+
+def at_start(w: Writer, p: Lanes, c_0: Values, rate_0: Values, c_1: Values) -> tuple[Values, Values]:
+    """As in `event_search`."""
+    sunk, sinks = [], []
+    for a, slope, b in zip(c_0, rate_0, c_1, strict=True):
+        rate = slope * p["direction"]
+        rises = (rate > 0.0) & (w.magnitude(a) <= reach_of_noise(w, p) * rate)
+        sunk.append(~(a > 0.0) & ~rises)
+        sinks.append(~(a > 0.0) & rises & ~(b > 0.0))
+    return sunk, sinks
 
 
 def first_event(w: Writer, before: Values, after: Values) -> Value:

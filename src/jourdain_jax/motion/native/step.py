@@ -1,8 +1,9 @@
 """One step of lanes side by side, as in `motion/integrators/erk_step.py`, which says what it does and why."""
 
 import math
+import operator
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -258,7 +259,9 @@ def _monitored(
     c_0, rate_0 = events(t, y, 0)
     c_1, rate_1 = events(new["t"], y1, method.at_the_end)
     dips, share = search.dip(w, step, c_0, rate_0, c_1, rate_1)
-    dips = accept & dips
+    sunk, sinks = search.at_start(w, p, c_0, rate_0, c_1)
+    again = any_of(sinks) & (w.magnitude(step) > search.reach_of_noise(w, p))
+    dips, share = accept & (dips | again), w.where(again, 0.5, share)
     happened = accept & ~dips & ~search.no_event(w, c_1)
     was_trying = p["search_left"] > DIFFERENTIABLE + 1.0
     changes, first = happened | locating, w.room(w.real)
@@ -269,10 +272,10 @@ def _monitored(
     found, back = locating & left.equals(0.0), changes & (left > DIFFERENTIABLE + 1.0)
     # a motion that starts beyond an event has no motion at all
     finite = over_rows(w, range(layout.y), 0.0, lambda total, i: total + 0.0 * w.load(w.real, y, i)).equals(0.0)
-    over = fresh & finite & ~search.no_event(w, c_0)
+    over = (fresh & finite & any_of(sunk)) | (accept & ~again & any_of(sinks))
     which = w.number(float(count - 1))
     for i in reversed(range(count - 1)):
-        which = w.where(c_0[i] > 0.0, which, float(i))
+        which = w.where(sunk[i] | sinks[i], float(i), which)
     stays = back | dips | over
 
     def state(i: int | Value) -> Value:
@@ -295,6 +298,11 @@ def _monitored(
     }
     begun = {"h": p["h"], "code": w.number(float(results.EVENT)), "accepted": p["accepted"], "rejected": p["rejected"], "event": which}
     return new | {name: w.where(over, value, new[name]) for name, value in begun.items()}
+
+
+def any_of(found: list[Value]) -> Value:
+    """Whether any holds."""
+    return reduce(operator.or_, found)
 
 
 def _put_tangents_at_event(w: Writer, form: Form, p: Lanes, k: Value, found: Value, t: Value, rate: list[Value], y1: Value) -> None:
