@@ -131,17 +131,32 @@ def test_round_off_in_a_tensor_of_a_scene_is_no_negative_moment():
     assert not np.any(np.asarray(lanes.result))
 
 
-@pytest.mark.parametrize("moments", [(1.0, 1.0, 2.1), (3.0, 1.0, 1.0), (0.0, 0.0, 1.0), (1.0, -0.5, 1.2), (-1e-3, 0.0, 0.0)])
+@pytest.mark.parametrize("moments", [(1.0, 1.0, 2.2), (3.0, 1.0, 1.0), (0.0, 0.0, 1.0), (1.0, -0.5, 1.2), (-1e-3, 0.0, 0.0)])
 @pytest.mark.parametrize("form", ["urdf", "mjcf"])
 def test_moments_that_no_body_has_are_refused_when_they_are_read(moments, form):
     with pytest.raises(ValueError, match=r"link `arm` has principal moments of inertia .* which no body has"):
         _pendulum(form, moments)
 
 
-@pytest.mark.parametrize("moments", [(1.0, 1.0, 2.0), (1.0, 1.0, 2.01), (0.0, 1.0, 1.0), (0.0, 0.0, 0.0), (1e-3, 2e-3, 2.5e-3)])
+@pytest.mark.parametrize("moments", [(1.0, 1.0, 2.0), (1.0, 1.0, 2.05), (0.0, 1.0, 1.0), (0.0, 0.0, 0.0), (1e-3, 2e-3, 2.5e-3)])
 @pytest.mark.parametrize("form", ["urdf", "mjcf"])
 def test_moments_of_discs_rods_and_points_are_read(moments, form):
     assert _pendulum(form, moments)().arm_mass == 1.0
+
+
+@pytest.mark.parametrize("moments", [(0.0, 0.0, 3e-6), (1e-4, -1e-4, 1e-4)])
+def test_moments_of_links_that_are_fixed_to_each_other_are_judged_together(moments):
+    plate = f'<link name="plate">{inertial(0.1, (0.0, 0.0, 0.0), np.diag(moments))}</link>'
+    joint = '<joint name="f" type="fixed"><parent link="arm"/><child link="plate"/><origin xyz="0 0 0.1" rpy="0.3 0.2 0.1"/></joint></robot>'
+    arm = PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), 0.01 * np.eye(3)))
+    assert jj.from_urdf(arm.replace("</robot>", plate + joint))().plate_mass == 0.1
+    with pytest.raises(ValueError, match=r"link `arm`, with what is fixed to it, has principal moments"):
+        jj.from_urdf(arm.replace("0.01", "1e-8").replace('xyz="0.0 0.3 0.0"', "").replace("</robot>", (plate + joint).replace("0 0 0.1", "0 0 0")))
+
+
+def test_moments_that_no_body_has_are_taken_on_purpose():
+    text = PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), np.diag((1.0, 1.0, 3.0))))
+    np.testing.assert_array_equal(jj.from_urdf(text, ignore="inertia")().arm_inertia, (1.0, 1.0, 3.0))
 
 
 def _pendulum(form: str, moments):

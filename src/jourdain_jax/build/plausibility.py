@@ -25,7 +25,7 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import contacts_of, loads_of
 
 TOLERANCE = 1e-4  # relative: constants may be typed with a few digits, mistakes are larger
-_POINT = 1e-10**2  # m^2: of bodies whose radius of gyration is smaller, moments are round-off
+_POINT = 1e-9**2  # m^2: of bodies whose radius of gyration is smaller, moments are round-off
 _ROUNDED = 1e-2  # relative: of thin wheels the last moment is the sum of the others, and published moments have three digits
 _ROWS_INSTEAD = "write its rows in `velocity_constraints`: tangents @ (rolling.velocity_at(point) - ground.velocity_at(point))"
 

@@ -34,7 +34,8 @@ def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> 
 
     - `path`: of the file, or its text.
     - `free`: names of bodies whose place in the frame of their parent is a parameter.
-    - `ignore`: names of elements and attributes that may be left out although they change the motion, such as "armature" or "equality".
+    - `ignore`: names of elements and attributes that may be left out although they change the motion, such as "armature" or "equality". With
+      "inertia", moments of inertia that no body has are taken as they are.
 
     **Returns** a class. Hinges and slides are coordinates of their own names, a ball joint is a quaternion of its name, a free one `<joint>_x`, `_y`, `_z` and
     the quaternion `<joint>_attitude`; joints without a name are called `<body>_joint`, with a number from the second on. Speeds are those of MuJoCo. Motors
@@ -52,7 +53,7 @@ def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> 
     file = XmlFile(path, TABLE, "MJCF", ignore)
     tree = _Reader(file).tree(as_names(free))
     file.warn()
-    return tree_scene(tree, file.source)
+    return tree_scene(tree, file.source, file.ignore)
 
 
 class _Reader:

@@ -9,9 +9,9 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import quaternion_to_matrix
 from jourdain_jax.importers.identifiers import class_name, identifiers
-from jourdain_jax.importers.placing import cross_matrix, onto_axis
+from jourdain_jax.importers.placing import combined, cross_matrix, onto_axis
 from jourdain_jax.importers.scene_class import scene_class
-from jourdain_jax.importers.tree import Joint, Link, Look, Tree
+from jourdain_jax.importers.tree import Joint, Link, Look, Mass, Tree
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.coordinates import Quaternion, coordinates, inputs, quaternion
 from jourdain_jax.scene.loads import Load, generalized_force
@@ -20,8 +20,8 @@ from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 
-ROUNDED = 0.01  # of the largest moment of inertia: published ones have three digits
-POINT = 1e-10**2  # m^2: of bodies whose radius of gyration is smaller, moments are round-off
+ROUNDED = 0.05  # of the largest moment of inertia: some are published with two digits
+POINT = 1e-6**2  # m^2: of bodies whose radius of gyration is smaller, moments are round-off
 
 Frame = tuple[Float[Array, "3 3"], Float[Array, "3"]]  # orientation and origin in the inertial frame
 
@@ -173,12 +173,15 @@ def _mesh(path: str) -> Any:
     return Visual.from_file(path)
 
 
-def tree_scene(tree: Tree, source: str) -> type[Scene]:
-    """The class of scenes of a mechanism. ValueError, which names the `source`, where nothing moves or what moves weighs nothing."""
+def tree_scene(tree: Tree, source: str, ignore: tuple[str, ...] = ()) -> type[Scene]:
+    """The class of scenes of a mechanism. ValueError, which names the `source`, where nothing moves, what moves weighs nothing, or moments are impossible.
+
+    `ignore`: with "inertia" in it, such moments are taken as they are.
+    """
     moving = tree.moving()
     if not moving:
         raise ValueError(f'{source}: no joint moves anything; expected at least one that does, or a base that moves, such as base="free"')
-    _check_masses(tree, source)
+    _check_masses(tree, source, ignore)
     known = [link.name for link in tree.links]
     for name in tree.free:
         if name not in known:
@@ -228,18 +231,29 @@ def _mass_parameters(link: Link, name: str) -> dict[str, Any]:
     return found
 
 
-def _check_masses(tree: Tree, source: str) -> None:
-    """A ValueError for a joint beyond which nothing has a mass, and for moments of inertia that no body has: 0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2."""
+def _check_masses(tree: Tree, source: str, ignore: tuple[str, ...]) -> None:
+    """A ValueError for a joint beyond which nothing has a mass, and for moments of inertia that no body has; those of links fixed to each other together."""
     heavy: set[str] = set()
+    fixed: dict[str | None, list[Mass]] = {link.name: [] if link.mass is None else [link.mass] for link in tree.links} | {None: []}
     for link in reversed(tree.links):
-        least, middle, largest = np.linalg.eigvalsh(link.mass.inertia) if link.mass else np.zeros(3)
-        if link.mass and max(-least, largest - least - middle) > max(ROUNDED * largest, POINT * link.mass.mass):
-            raise ValueError(
-                f"{source}: link `{link.name}` has principal moments of inertia {least:.4g}, {middle:.4g} and {largest:.4g} kg m^2, which no body has; "
-                f"expected none below zero, and the largest at most the sum of the others (within {ROUNDED:.0%}): check signs, units and products of inertia"
-            )
+        if link.joints or link.parent is None:
+            if fixed[link.name] and "inertia" not in ignore:
+                _check_moments(combined(fixed[link.name]), f"{source}: link `{link.name}`{', with what is fixed to it,' if len(fixed[link.name]) > 1 else ''}")
+        else:
+            fixed[link.parent] += [Mass(m.mass, link.position + link.turn @ m.centre, link.turn @ m.inertia @ link.turn.T) for m in fixed[link.name]]
         if (link.mass is not None or link.name in heavy) and link.parent is not None:
             heavy.add(link.parent)
         if link.joints and link.mass is None and link.name not in heavy:
             joint = link.joints[0].name or "the base"
             raise ValueError(f"{source}: link `{link.name}`, which `{joint}` moves, has no mass, nor has any that it carries; give it an `inertial`")
+
+
+def _check_moments(mass: Mass, what: str) -> None:
+    """0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2."""
+    least, middle, largest = np.linalg.eigvalsh(mass.inertia)
+    if max(-least, largest - least - middle) > max(ROUNDED * largest, POINT * mass.mass):
+        raise ValueError(
+            f"{what} has principal moments of inertia {least:.4g}, {middle:.4g} and {largest:.4g} kg m^2, which no body has; expected none below zero, and the "
+            f"largest at most the sum of the others (within {ROUNDED:.0%}): check signs, units and products of inertia, or give "
+            'ignore=("inertia",) to take them as they are'
+        )

@@ -21,7 +21,13 @@ _BASES = ("fixed", "planar", "free")
 # What elements may hold; all else is refused by name. Elements that are read are idle, or listed, where they move nothing.
 _TABLE = {
     "robot": Holds("name", many="link joint material", idle="version", listed="transmission gazebo sensor ros2_control mujoco"),
-    "link": Holds("name", one="inertial", many="visual", idle="type collision", listed="contact sensor self_collision_checking"),
+    "link": Holds(
+        "name",
+        one="inertial",
+        many="visual",
+        idle="type collision",
+        listed="contact sensor self_collision_checking collision_checking self_filter surface",
+    ),
     "inertial": Holds(one="origin mass inertia"),
     "mass": Holds("value"),
     "inertia": Holds("ixx ixy ixz iyy iyz izz"),
@@ -34,12 +40,12 @@ _TABLE = {
     "mesh": Holds("filename scale"),
     "material": Holds("name", one="color", idle="texture"),
     "color": Holds("rgba"),
-    "joint": Holds("name type", one="parent child origin axis limit dynamics mimic", listed="calibration safety_controller"),
+    "joint": Holds("name type", one="parent child origin axis limit dynamics mimic", idle="dont_collapse", listed="calibration safety_controller"),
     "parent": Holds("link"),
     "child": Holds("link"),
     "origin": Holds("xyz rpy"),
     "axis": Holds("xyz"),
-    "limit": Holds("lower upper", idle="effort velocity acceleration deceleration jerk"),
+    "limit": Holds("lower upper", idle="effort velocity acceleration deceleration jerk command_effort current gear_velocity"),
     "dynamics": Holds("damping friction"),
     "mimic": Holds("joint multiplier offset"),
 }
@@ -59,7 +65,8 @@ def from_urdf(
     - `motors`: names of revolute, continuous or prismatic joints that an input pushes, `<joint>_motor` in N m or N.
     - `free`: names of links whose place in the frame of their parent is a parameter.
     - `packages`: name -> folder, for meshes at `package://name/...` (default: folders of that name above the file).
-    - `ignore`: what may be left out without a word: names of elements and attributes, "friction", or "text" between elements.
+    - `ignore`: what may be left out without a word: names of elements and attributes, "friction", or "text" between elements. With
+      "inertia", moments of inertia that no body has are taken as they are.
 
     **Returns** a class. A joint is a coordinate of its own name; a floating one is `<joint>_x`, `_y`, `_z` and the quaternion `<joint>_attitude`, a planar
     one `<joint>_x`, `_y`, `_heading`. Fields, as far as they are not zero in the file: `<link>_mass` (kg), `<link>_mass_centre` (m, in the link's frame),
@@ -68,7 +75,7 @@ def from_urdf(
     `contacts` of a subclass.
 
     **Raises** ValueError with the name of the link or joint: a file that cannot be read, an unknown type of joint, a parent or child that does not exist, a
-    loop, a mass without inertia, moments of inertia that no body has (the largest above the sum of the others by more than 1 %), a joint that moves no mass, a
+    loop, a mass without inertia, moments of inertia that no body has (the largest above the sum of the others by more than 5 %), a joint that moves no mass, a
     joint with friction, what is said twice; and by its name all that an element of a URDF does not hold: a misspelt attribute, `spring` of `dynamics`,
     `loop_joint`, text in place of an attribute. A warning lists elements that move nothing and are left out, such as `gazebo` and `transmission`.
     """
@@ -81,7 +88,7 @@ def from_urdf(
         raise file.fault("it has no links")
     tree = _Reader(file, links, packages or {}).tree(joints, base, as_names(motors), as_names(free))
     file.warn()
-    return tree_scene(tree, file.source)
+    return tree_scene(tree, file.source, file.ignore)
 
 
 class _Reader:
@@ -116,7 +123,7 @@ class _Reader:
         for name in motors:
             if name not in names:
                 raise ValueError(f"`motors` names `{name}`, which is no joint of one coordinate; {nearest(name, names)}")
-        followers = tuple(self._follower(joint, names) for joint in joints if joint.find("mimic") is not None)
+        followers = tuple(self._follower(joint, names) for joint in joints if joint.find("mimic") is not None and joint.get("type") != "fixed")
         pushed = tuple(Motor(f"{name}_motor", name) for name in motors)
         return Tree(self.file.root.get("name") or "Robot", tuple(links), np.array([0.0, 0.0, -9.81]), pushed, followers, free)
 
