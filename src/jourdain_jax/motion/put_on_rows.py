@@ -24,10 +24,10 @@ from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions, project_positions, project_speeds
 from jourdain_jax.motion.native.called import called
-from jourdain_jax.motion.native.onto_rows import Rows, written
+from jourdain_jax.motion.native.onto_rows import Rows, write
 from jourdain_jax.motion.native.seen import entries
 from jourdain_jax.motion.row_functions import row_functions
-from jourdain_jax.native import ffi, host
+from jourdain_jax.native import ffi
 from jourdain_jax.scene.scene import Scene
 
 MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the process
@@ -128,7 +128,7 @@ def _reason_against(rows: Rows) -> str:
 @lru_cache(maxsize=MOST_KERNELS)
 def _kernel(rows: Rows, given_in: np.dtype):
     count, cutoff = len(rows.moving) + len(rows.residuals), rank_cutoff(given_in)
-    return called(lambda lanes, threads: written(rows, lanes, host.fuses(), threads, cutoff), lambda *_: ((count,),), effort=1)
+    return called(lambda w: write(w, rows, cutoff), lambda *_: ((count,),), effort=1)
 
 
 def _put(rows: Rows, scene: Scene, t, *vectors) -> tuple[Array, Array]:

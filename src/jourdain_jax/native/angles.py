@@ -1,7 +1,8 @@
 """Sine, cosine and tangent of vectors of doubles, and their inverses, by polynomials.
 
 Angles lose whole quarter turns: pi/2 has the three parts of `program/emit.py`, and the angle that is left a second part, by which it is over. That serves
-while the multiple of pi/2 has 20 bits; lanes beyond go through libm. Sine and cosine have the minimax polynomials of `program/emit.py`, arcs those of Chebyshev
+while the multiple of pi/2 has 20 bits; angles beyond are multiplied by as many bits of 2/pi as matter (M. Payne and R. Hanek, ACM SIGNUM Newsletter 18
+(1983) 19). Sine and cosine have the minimax polynomials of `program/emit.py`, arcs those of Chebyshev
 (mpmath's `chebyfit` of 12 and 13 terms; a test finds them again):
 
     atan q = q + q^3 P(q^2) for |q| < tan(pi/8),   otherwise   atan(a/b) = pi/4 + atan((a - b)/(a + b))
@@ -13,12 +14,18 @@ Errors are below 0.9 ulp.
 import math
 
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.libm import by_libm_where
 from jourdain_jax.native.two_parts import polynomial, product_less, quotient, two_sum
 from jourdain_jax.program.emit import COSINE, HALF_PI, SINE
 
 WHOLE = 1.5 * 2.0**52  # a number to which this is added is rounded to a whole one, whose last bits are the last of the sum
 LARGEST_ANGLE = 5e5  # rad; multiples of pi/2 below 2^20 times a part of 33 bits are exact
+TWO_OVER_PI = (  # its first 1,216 bits, 64 in each
+    0xA2F9836E4E441529, 0xFC2757D1F534DDC0, 0xDB6295993C439041, 0xFE5163ABDEBBC561, 0xB7246E3A424DD2E0,
+    0x06492EEA09D1921C, 0xFE1DEB1CB129A73E, 0xE88235F52EBB4484, 0xE99C7026B45F7E41, 0x3991D639835339F4,
+    0x9C845F8BBDF9283B, 0x1FF897FFDE05980F, 0xEF2F118B5A0A6D1F, 0x6D367ECF27CB09B7, 0x4F463F669E5FEA2D,
+    0x7527BAC7EBE5F17B, 0x3D0739F78A5292EA, 0x6BFB5FB11F8D5D08, 0x56033046FC7B6BAB,
+)
+_HALF_PI = (1.5707963267948966, 6.123233995736766e-17)
 _LESS_SINE = tuple(-c for c in SINE)
 _PI = (3.1415926535897896, 3.675178358715236e-15)  # the first has 50 bits: 1/4, 1/2 and 3/4 of it are exact
 ATAN = (
@@ -56,9 +63,7 @@ def sine_and_cosine(w: Writer, x: Value) -> tuple[Value, Value]:
     """(sin x, cos x)"""
     (r, less), (most, more), quadrant = _waves(w, x)
     sine, cosine, odd = r - less, most + more, (quadrant & 1).differs(0)
-    quick = _turned(w, w.where(odd, cosine, sine), quadrant), _turned(w, w.where(odd, sine, cosine), quadrant + 1)
-    s, c = by_libm_where(w, ~(w.magnitude(x) <= LARGEST_ANGLE), [x], quick, ("sin", "cos"))
-    return s, c
+    return _turned(w, w.where(odd, cosine, sine), quadrant), _turned(w, w.where(odd, sine, cosine), quadrant + 1)
 
 
 def tangent(w: Writer, x: Value) -> Value:
@@ -69,7 +74,7 @@ def tangent(w: Writer, x: Value) -> Value:
     odd = (quadrant & 1).differs(0)
     across = w.where(odd, -cosine, sine), w.where(odd, -cosine_rest, sine_rest)
     head, over = quotient(w, across, (w.where(odd, sine, cosine), w.where(odd, sine_rest, cosine_rest)))
-    return by_libm_where(w, ~(w.magnitude(x) <= LARGEST_ANGLE), [x], [head - over], ["tan"])[0]
+    return head - over
 
 
 def _waves(w: Writer, x: Value) -> tuple[tuple[Value, Value], tuple[Value, Value], Value]:
@@ -79,12 +84,70 @@ def _waves(w: Writer, x: Value) -> tuple[tuple[Value, Value], tuple[Value, Value
     near = w.fma(-turns, HALF_PI[0], x)  # exact
     r = w.fma(-turns, HALF_PI[1], near)
     over = w.fma(turns, HALF_PI[2], w.fma(turns, HALF_PI[1], r - near))
+    places = [w.room(a.type) for a in (r, over, quadrant)]
+    for value, place in zip((r, over, quadrant), places, strict=True):
+        w.store(value, place)
+    far = (w.magnitude(x) > LARGEST_ANGLE) & (w.magnitude(x) < math.inf)
+    with w.when(w.any(far)):
+        _reduce_far(w, x, far, places)
+    r, over, quadrant = (w.load(place_of.type, place) for place_of, place in zip((r, over, quadrant), places, strict=True))
     square = r * r
     half = 0.5 * square
     most = 1.0 - half
     less = w.fma(r, square * polynomial(w, _LESS_SINE, square), over * most)
     more = ((1.0 - most) - half) + w.fma(square * square, polynomial(w, COSINE, square), (r - less) * over)
     return (r, less), (most, more), quadrant
+
+
+def _reduce_far(w: Writer, x: Value, far: Value, places: list[Value]) -> None:
+    """What a large angle leaves, that by which it is over, and its quarter turns, into these places in the lanes that are far.
+
+    x = m 2^e with a whole number m of 53 bits; of 2/pi those 192 bits count whose products with m are no multiples of whole turns, and not far below 2^-126.
+    """
+    w.whole_numbers("two_over_pi", (0, *(word - 2**64 * (word >> 63) for word in TWO_OVER_PI)))
+    given, flags = w.room(w.real), w.room(w.real)
+    w.store(x, given)
+    w.store(w.where(far, 1.0, w.number(0.0)), flags)
+    with w.counted(0, w.lanes) as lane, w.when(w.load("double", flags, lane) > 0.0):
+        arguments = [w.at(place, lane, "double") for place in (given, *places)]
+        w.once("far_angle", "void", dict.fromkeys(("x", "r", "over", "quadrant"), "ptr"), _write_far_angle)
+        w.call("far_angle", "void", *arguments)
+
+
+def _write_far_angle(w: Writer, x: Value, r: Value, over: Value, quadrant: Value) -> None:
+    bits = w.load("i64", x)
+    m = w.converted("zext", (bits & (2**52 - 1)) | 2**52, "i128")
+    start = (w.bitwise("lshr", bits, 52) & 2047) - (1077 - 64)  # of the bits of 2/pi, after a word of zeros
+    word, shift = w.bitwise("ashr", start, 6), start & 63
+
+    def digits(k: int) -> Value:
+        """64 bits of 2/pi."""
+        table = Value(w, "ptr", "@two_over_pi")
+        both = w.bitwise("shl", w.converted("zext", w.load("i64", table, word + k), "i128"), 64) | w.converted("zext", w.load("i64", table, word + (k + 1)), "i128")
+        return w.bitwise("lshr", w.bitwise("shl", both, w.converted("zext", shift, "i128")), 64)
+
+    # in units of 2^-126 quarter turns, without whole turns
+    product = w.bitwise("shl", m * digits(0), 64) + m * digits(1) + w.bitwise("lshr", m * digits(2), 64)
+    turns = w.bitwise("lshr", product + 2**125, 126)
+    left = product - w.bitwise("shl", turns, 126)
+    # three parts of 43 bits, each exact
+    parts = []
+    for low in (86, 43, 0):
+        part = w.bitwise("ashr", left, low)
+        parts.append(w.converted("sitofp", w.converted("trunc", part, "i64"), "double") * 2.0 ** (low - 126))
+        left = left - w.bitwise("shl", part, low)
+    head, rest = two_sum(parts[0], parts[1])
+    head, more = two_sum(head, parts[2] + rest)
+    angle = head * _HALF_PI[0]
+    less = w.intrinsic("fma", head, _HALF_PI[0], -angle) + (head * _HALF_PI[1] + more * _HALF_PI[0])
+    near = angle + less
+    negative = bits < 0
+    w.store(w.where(negative, -near, near), r)
+    beyond = (near - angle) - less
+    w.store(w.where(negative, -beyond, beyond), over)
+    count = w.converted("trunc", turns, "i64")
+    w.store(w.where(negative, w.literal(0, "i64") - count, count), quadrant)
+    w.give()
 
 
 def _turned(w: Writer, x: Value, quadrant: Value) -> Value:
@@ -100,10 +163,18 @@ def arctangent(w: Writer, x: Value) -> Value:
 
 
 def arctangent_of_two(w: Writer, y: Value, x: Value) -> Value:
-    """atan2(y, x); lanes with a tiny or a huge number go through libm."""
+    """atan2(y, x); tiny and huge numbers are scaled."""
     a, b = w.magnitude(y), w.magnitude(x)
-    far = ~(a + b < 2.0**60) | _tiny(a) | _tiny(b)
-    return by_libm_where(w, far, [y, x], [w.intrinsic("copysign", _direction(w, a, x), y)], ["atan2"])[0]
+    huge, place = ~(a + b < 2.0**60), w.room(w.real)
+    w.store(_direction(w, a, x), place)
+    far = huge | _tiny(a) | _tiny(b)
+    with w.when(w.any(far)):
+        endless, scale = a.equals(math.inf) | b.equals(math.inf), w.where(huge, 2.0**-600, w.number(2.0**600))
+        near_a, near_b = (w.where(c.equals(math.inf), 1.0, w.where(endless, c - c, c * scale)) for c in (a, b))
+        found = _direction(w, near_a, w.intrinsic("copysign", near_b, x))
+        flat = ~(w.converted("bitcast", x, w.whole) < 0) & (near_a < 2.0**-900) & (near_b > 2.0**-600)
+        w.store(w.where(far, w.where(flat, a / b, found), w.load(w.real, place)), place)
+    return w.intrinsic("copysign", w.load(w.real, place), y)
 
 
 def _tiny(a: Value) -> Value:

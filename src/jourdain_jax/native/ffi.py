@@ -19,15 +19,17 @@ from typing import NamedTuple
 
 import jax
 
-from jourdain_jax.native import disk, host
+from jourdain_jax.native import disk, host, nvidia
 from jourdain_jax.native.ir import Value, Writer
 
-HANDLER = "handler"
+HANDLER, KERNEL = "handler", "kernel"
+WORDS, MOST_BUFFERS = 4, 16  # what a kernel of a GPU is told of each array (`gpu.py`), and of how many arrays at most
+FIRST_OF_SCRATCH = 8  # double of a kernel's own memory that is not the counter
 _FRAME = "struct_size extension_start api ctx stage args rets attrs future"
 _BUFFER = "struct_size extension_start dtype data rank dims"
 _LISTS = "struct_size extension_start size types"
 # places, in words of 8 bytes
-_EXTENSION, _ARGS, _RETS = 1, 9, 14  # of a frame: its extension, its lists of pointers to arguments and results
+_EXTENSION, ARGS, RETS = 1, 9, 14  # of a frame: its extension, its lists of pointers to arguments and results
 _TYPE, _DATA, _RANK, _DIMS = 2, 3, 4, 5  # of a buffer
 _SINGLE = 11  # the type of arrays in single precision
 _KIND, _METADATA = 1, 3  # of an extension
@@ -48,10 +50,10 @@ def version() -> tuple[int, int] | None:
 
 def reason_against() -> str:
     """Why no machine code of our own can be called here; empty where it can."""
-    if jax.default_backend() != "cpu":
-        return "it is made for CPUs alone"
-    if host.reason_against():
-        return host.reason_against()
+    if (backend := jax.default_backend()) not in ("cpu", "gpu"):
+        return f"it is made for CPUs and NVIDIA GPUs, not for JAX's backend {backend}"
+    if reason := host.reason_against() if backend == "cpu" else nvidia.reason_against():
+        return reason
     if version() is None:
         return "the foreign function interface of this jaxlib is not known"
     return ""
@@ -85,8 +87,15 @@ class Given(NamedTuple):
     rank: Value
 
 
+def last_size(w: Writer, x: Given) -> Value:
+    """The size of the last axis."""
+    return w.load("i64", x.sizes, 0 if w.device else x.rank - 1)
+
+
 def product(w: Writer, x: Given, but: int) -> Value:
-    """The product of the sizes of all axes but the last ones."""
+    """The product of the sizes of all axes but the last ones, 1 or 3 of them on a GPU, where the host has found it."""
+    if w.device:
+        return w.load("i64", x.sizes, (1, 3).index(but) + 1)
     total = w.room("i64")
     w.store(w.literal(1, "i64"), total)
     with w.counted(0, x.rank - but) as axis:
@@ -95,43 +104,61 @@ def product(w: Writer, x: Given, but: int) -> Value:
 
 
 def write_handler(w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Value]], None]) -> None:
-    """A handler that calls `body` with all arguments, and pointers to the data of all results."""
-    known = version()
-    assert known is not None
+    """A handler that calls `body` with all arguments, and pointers to the data of all results; on a GPU the kernel that does so."""
+    if w.device:
+        return _write_kernel(w, arguments, results, body)
     _write_doubles(w)
     _write_rounded(w)
     with w.function(HANDLER, "ptr", {"frame": "ptr"}, how="") as (frame,):
         nothing = Value(w, "ptr", "null")
-        extension = w.load("ptr", frame, _EXTENSION)
-        asked, called = w.label(), w.label()
-        is_asked = w.label()
-        none = w.compared("eq", w.converted("ptrtoint", extension, "i64"), 0)
-        w.go(called, none, is_asked)
-        w.place(is_asked)
-        w.go(asked, w.load("i32", extension, 2 * _KIND).equals(1), called)
-        w.place(asked)
-        metadata = w.load("ptr", extension, _METADATA)
-        w.store(w.literal(known[0], "i32"), metadata, 2 * _MAJOR)
-        w.store(w.literal(known[1], "i32"), metadata, 2 * _MAJOR + 1)
-        w.store(w.literal(0, "i32"), metadata, 2 * _MAJOR + 2)
-        w.give(nothing)
-        w.place(called)
-        given, returned = w.load("ptr", frame, _ARGS), w.load("ptr", frame, _RETS)
-        inputs = [w.load("ptr", given, k) for k in range(arguments)]
+        answer_metadata(w, frame)
+        arrays, returned = w.load("ptr", frame, ARGS), w.load("ptr", frame, RETS)
+        inputs = [w.load("ptr", arrays, k) for k in range(arguments)]
         outputs = [w.load("ptr", returned, k) for k in range(results)]
         failed = w.room("i64")
         w.store(w.literal(0, "i64"), failed)
         taken = [w.call("doubles", "ptr", x, w.literal(1, "i1"), failed) for x in inputs]
         found = [w.call("doubles", "ptr", x, w.literal(0, "i1"), failed) for x in outputs]
         with w.when(w.load("i64", failed).equals(0)):
-            body([_given(w, x)._replace(data=data) for x, data in zip(inputs, taken, strict=True)], found)
+            body([given(w, x)._replace(data=data) for x, data in zip(inputs, taken, strict=True)], found)
         for buffers, pointers, are_results in ((inputs, taken, 0), (outputs, found, 1)):
             for x, data in zip(buffers, pointers, strict=True):
                 w.call("rounded", "void", x, data, w.literal(are_results, "i1"), failed)
         w.give(nothing)
 
 
-def _given(w: Writer, buffer: Value) -> Given:
+def answer_metadata(w: Writer, frame: Value) -> None:
+    """Where the frame asks for the version of the interface, says it and returns."""
+    known = version()
+    assert known is not None
+    extension = w.load("ptr", frame, _EXTENSION)
+    asked, called = w.label(), w.label()
+    is_asked = w.label()
+    none = w.compared("eq", w.converted("ptrtoint", extension, "i64"), 0)
+    w.go(called, none, is_asked)
+    w.place(is_asked)
+    w.go(asked, w.load("i32", extension, 2 * _KIND).equals(1), called)
+    w.place(asked)
+    metadata = w.load("ptr", extension, _METADATA)
+    w.store(w.literal(known[0], "i32"), metadata, 2 * _MAJOR)
+    w.store(w.literal(known[1], "i32"), metadata, 2 * _MAJOR + 1)
+    w.store(w.literal(0, "i32"), metadata, 2 * _MAJOR + 2)
+    w.give(Value(w, "ptr", "null"))
+    w.place(called)
+
+
+def _write_kernel(w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Value]], None]) -> None:
+    """`kernel(words)`, which every thread of a GPU runs; the last result is memory of the call's own."""
+    with w.function(KERNEL, "void", {"words": f"ptr byval([{WORDS * MOST_BUFFERS} x i64]) align 8"}, how="ptx_kernel"):
+        words = Value(w, "ptr", "%words")
+        each = [Given(w.load("ptr", words, WORDS * k), w.at(words, WORDS * k + 1, "i64"), words) for k in range(arguments + results + 1)]
+        w.own = each[-1].data, last_size(w, each[-1])
+        body(each[:arguments], [x.data for x in each[arguments:-1]])
+        w.give()
+
+
+def given(w: Writer, buffer: Value) -> Given:
+    """What a handler is given of an array."""
     return Given(w.load("ptr", buffer, _DATA), w.load("ptr", buffer, _DIMS), w.load("i64", buffer, _RANK))
 
 
@@ -145,7 +172,7 @@ def _write_doubles(w: Writer) -> None:
     As `rounded`, it is not optimised: that takes LLVM 20 ms for each kernel, and makes no motion faster by more than noise.
     """
     with w.function("doubles", "ptr", {"buffer": "ptr", "filled": "i1", "failed": "ptr"}, attributes="noinline optnone") as (buffer, filled, failed):
-        x, data = _given(w, buffer), w.room("ptr")
+        x, data = given(w, buffer), w.room("ptr")
         w.store(x.data, data)
         with w.when(_is_single(w, buffer)):
             count = product(w, x, 0)
@@ -163,7 +190,7 @@ def _write_rounded(w: Writer) -> None:
     """`rounded(buffer, doubles, is_result, failed)`: puts a result into an array in single precision, NaN where memory failed, and frees its doubles."""
     arguments = {"buffer": "ptr", "doubles": "ptr", "is_result": "i1", "failed": "ptr"}
     with w.function("rounded", "void", arguments, attributes="noinline optnone") as (buffer, doubles, is_result, failed):
-        x = _given(w, buffer)
+        x = given(w, buffer)
         with w.when(_is_single(w, buffer)):
             there = w.load("i64", failed).equals(0)
             with w.when(is_result), w.counted(0, product(w, x, 0)) as k:
@@ -179,12 +206,21 @@ def _write_rounded(w: Writer) -> None:
 @functools.cache
 def registered(text: str, effort: int = 2) -> str:
     """The name under which JAX calls the handler of a module of LLVM IR; `effort`: as of `host.object_code`."""
-    name = f"jourdain_jax_{hashlib.sha256(f'{host.description()} {effort} {text}'.encode()).hexdigest()[:24]}"
+    name = _name(text, effort)
+    register(name, text, "cpu", effort)
+    return name
+
+
+def _name(text: str, effort: int) -> str:
+    return f"jourdain_jax_{hashlib.sha256(f'{host.description()} {effort} {text}'.encode()).hexdigest()[:24]}"
+
+
+def register(name: str, text: str, platform: str, effort: int = 2) -> None:
+    """Registers the handler of a module of LLVM IR under a name."""
     capsule = ctypes.pythonapi.PyCapsule_New
     capsule.restype, capsule.argtypes = ctypes.py_object, (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
-    code = disk.kept(name, host.description(), lambda: host.object_code(text, effort))
+    code = disk.kept(_name(text, effort), host.description(), lambda: host.object_code(text, effort))
     with _REGISTERING:
         if name not in _REGISTERED:  # by another thread meanwhile
-            jax.ffi.register_ffi_target(name, capsule(host.address(code, HANDLER), b"xla._CUSTOM_CALL_TARGET", None), platform="cpu")
+            jax.ffi.register_ffi_target(name, capsule(host.address(code, HANDLER), b"xla._CUSTOM_CALL_TARGET", None), platform=platform)
             _REGISTERED.add(name)
-    return name

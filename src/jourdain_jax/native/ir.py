@@ -2,13 +2,19 @@
 
 `a + b`, `a < b`, `where(c, a, b)` each append an instruction to the function that is being written. Numbers of Python become literals. There are no
 flags that let LLVM change results: every lane is rounded as it is written here, whatever the width.
+
+On a GPU (`device`) every thread runs the same with a lane of its own; the threads of a warp come `together` where the loop over steps goes on. What is local
+to a thread is in registers only where functions are written out at their calls: those that are called once, and small ones.
 """
 
+import re
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
+MOST_INLINED = 6_000  # lines of a function times its calls, up to which it is written out at these on a GPU
 _COMPARED = {"lt": ("olt", "slt"), "le": ("ole", "sle"), "gt": ("ogt", "sgt"), "ge": ("oge", "sge"), "eq": ("oeq", "eq"), "ne": ("une", "ne")}
 
 
@@ -79,10 +85,16 @@ class Value:
 
 
 class Writer:
-    """A module of functions on vectors of `lanes` doubles; `fused`: products and sums are rounded once where `fma` asks for it."""
+    """A module of functions on vectors of `lanes` doubles; `fused`: products and sums are rounded once where `fma` asks for it.
 
-    def __init__(self, lanes: int, fused: bool) -> None:
-        self.lanes, self.fused = lanes, fused
+    `threads`: among which many lanes are shared on a CPU; `device`: whether the module is for a GPU. There `scratch` says how many doubles of memory outside
+    a thread each thread needs, and how many times as many it can use.
+    """
+
+    def __init__(self, lanes: int, fused: bool, threads: int = 1, device: bool = False) -> None:
+        self.lanes, self.fused, self.threads, self.device = lanes, fused, threads, device
+        self.scratch = (0, 1)
+        self.own: tuple[Value, Value]  # a kernel's own memory, the counter of lanes first, and how many doubles it has
         self.real, self.truth, self.whole = f"<{lanes} x double>", f"<{lanes} x i1>", f"<{lanes} x i64>"
         self._lines: list[str] = []
         self._declared: dict[str, str] = {}
@@ -91,7 +103,8 @@ class Writer:
     @property
     def text(self) -> str:
         """The module."""
-        return "\n".join([*self._lines, *self._declared.values(), ""])
+        whole = "\n".join([*self._lines, *self._declared.values(), ""])
+        return _inlined(whole) if self.device else whole
 
     # functions and control
 
@@ -216,16 +229,28 @@ class Writer:
         self._declared[function] = f"declare {result} @{function}({', '.join(a.type for a in arguments)})"
         return self.call(function, result, *arguments)
 
+    def declare(self, name: str, text: str) -> None:
+        """A declaration at the end of the module."""
+        self._declared[name] = text
+
+    def through(self, pointer: Value, result: str, *arguments: Value) -> Value:
+        """The result of a function that a pointer points to."""
+        return self.instruction(result, f"call {result} {pointer.name}({', '.join(f'{a.type} {a.name}' for a in arguments)})")
+
     def shared(self, name: str, body: Callable[..., Value], *arguments: Value) -> Value:
         """The result of a function of vectors that stands in the module once, so that each use takes one call to compile; `body(w, *arguments)` writes it."""
         function = f"shared_{name}"
+        self.once(function, self.real, {f"a{i}": a.type for i, a in enumerate(arguments)}, lambda w, *given: w.give(body(w, *given)))
+        return self.call(function, self.real, *arguments)
+
+    def once(self, function: str, result: str, arguments: dict[str, str], body: Callable) -> None:
+        """A function that stands in the module once, however often it is asked for; `body(w, *arguments)` writes it."""
         if function not in self._declared:
             around, self._lines = (self._lines, self._entry), []
-            with self.function(function, self.real, {f"a{i}": a.type for i, a in enumerate(arguments)}, attributes="noinline") as given:
-                self.give(body(self, *given))
+            with self.function(function, result, arguments, attributes="noinline") as given:
+                body(self, *given)
             self._declared[function] = "\n".join(self._lines)
             self._lines, self._entry = around
-        return self.call(function, self.real, *arguments)
 
     def intrinsic(self, name: str, a: Value, *more) -> Value:
         """A function of LLVM of one or more numbers of a type."""
@@ -256,6 +281,17 @@ class Writer:
         """A number in all lanes, given one that is no vector."""
         first = self.instruction(self.real, f"insertelement {self.real} poison, double {a.name}, i64 0")
         return self.instruction(self.real, f"shufflevector {self.real} {first.name}, {self.real} poison, <{self.lanes} x i32> zeroinitializer")
+
+    def together(self, a: Value) -> Value:
+        """Whether a truth value holds in any thread of a warp, which come together here; on a CPU, the value."""
+        return self.external("llvm.nvvm.vote.any.sync", "i1", self.literal(-1, "i32"), a) if self.device else a
+
+    def thread(self) -> tuple[Value, Value]:
+        """The number of a thread of a GPU, and how many there are."""
+        block, size, own, blocks = (
+            self.converted("zext", self.external(f"llvm.nvvm.read.ptx.sreg.{name}.x", "i32"), "i64") for name in ("ctaid", "ntid", "tid", "nctaid")
+        )
+        return block * size + own, blocks * size
 
     def any(self, a: Value) -> Value:
         """Whether a truth value holds in any lane."""
@@ -291,11 +327,14 @@ class Writer:
         return replace(self.instruction(type, f"load {type}, ptr {place}"), place=place)
 
     def again(self, value: Value) -> Value:
-        """A value that was put into memory, read from there, even where LLVM would rather keep it in a register; others as they are."""
+        """A value that was put into memory, read from there, even where LLVM would rather keep it in a register; others, and on a GPU all, as they are."""
+        if self.device:
+            return value
         return self.instruction(value.type, f"load volatile {value.type}, ptr {value.place}") if value.place else value
 
     def opaque(self, pointer: Value, rows: Iterable[int]) -> list[Value]:
         """Pointers to some rows of memory, each in a register of its own, unknown to LLVM as related: rows nearby are reached by short offsets."""
+        assert not self.device
         found, place = [], self.room("ptr")
         for row in rows:
             self.store(self.at(pointer, row, self.real), place)
@@ -311,3 +350,28 @@ class Writer:
         place = self.at(pointer, index, value.type).name
         self._lines.append(f"  store {value.type} {value.name}, ptr {place}")
         return replace(value, place=place)
+
+
+def _inlined(text: str) -> str:
+    """A module in which functions are written out where they are called once, or small; `noinline` is said of the others alone."""
+    parts = {found[1]: found[0] for found in re.finditer(r"^define [^@]*@(\w+)\(.*?^\}$", text, re.DOTALL | re.MULTILINE)}
+    calls = {name: Counter(re.findall(r"call [^@]*@(\w+)\(", part)) for name, part in parts.items()}
+    sizes: dict[str, int] = {}
+
+    def sites(name: str) -> int:
+        return sum(counts[name] for counts in calls.values())
+
+    def size(name: str) -> int:
+        if name not in sizes:
+            written_out = {inner: count for inner, count in calls[name].items() if inner in parts and is_small(inner)}
+            sizes[name] = parts[name].count("\n") + sum(count * size(inner) for inner, count in written_out.items())
+        return sizes[name]
+
+    def is_small(name: str) -> bool:
+        return sites(name) == 1 or sites(name) * size(name) <= MOST_INLINED
+
+    for name, part in parts.items():
+        if " internal " in (head := part.split("\n", 1)[0]):
+            plain = head.replace(" noinline", "").replace(" alwaysinline", "").removesuffix(" {")
+            text = text.replace(head, f"{plain} {'alwaysinline' if is_small(name) else 'noinline'} {{")
+    return text

@@ -71,7 +71,7 @@ class _AtHand:
     def __init__(self, w: Writer, values: dict[int, Value], steps: list[tuple[int, list[int]]]) -> None:
         self.w, self.values, self.places = w, values, dict(values)
         self.turns: list[Turn] = []
-        if len(steps) > LONG:
+        if len(steps) > LONG and not w.device:
             self.turns, rows = turns(steps, values, host.registers())
             self.rooms = w.opaque(w.room(w.real, max(rows, 1)), range(REACH, rows + REACH, 2 * REACH))
 

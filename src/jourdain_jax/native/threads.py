@@ -8,8 +8,24 @@ STACK = 2**23  # bytes for each thread, as the first one has in most systems; ma
 NEXT, COUNT, IN, OUT = range(4)  # words of a job of rows: the number of the next row, how many there are, pointers to those given and to those returned
 
 
-def share(w: Writer, job: Value, count: Value, threads: int) -> None:
-    """Calls the module's `loop(job)` in so many threads, in fewer where lanes are few."""
+def start_counting(w: Writer, job: Value, word: int) -> None:
+    """No lane is taken: a word of a job counts them, or on a GPU points to what does."""
+    w.store(w.own[0] if w.device else w.literal(0, "i64"), job, word)
+
+
+def next_lane(w: Writer, job: Value, word: int) -> Value:
+    """The number of the next lane, which is taken."""
+    return w.counted_up(w.load("ptr", job, word), 0) if w.device else w.counted_up(job, word)
+
+
+def lanes_taken(w: Writer, job: Value, word: int) -> Value:
+    """How many lanes are taken; there may be fewer."""
+    return w.load("i64", w.load("ptr", job, word)) if w.device else w.load("i64", job, word)
+
+
+def share(w: Writer, job: Value, count: Value) -> None:
+    """Calls the module's `loop(job)` in as many threads as the writer says, in fewer where lanes are few."""
+    threads = w.threads
     loop, nothing, others, started = Value(w, "ptr", "@loop"), Value(w, "ptr", "null"), w.room("i64", threads), w.room("i64")
     w.store(w.literal(0, "i64"), started)
     how = w.room("i64", 16)  # a `pthread_attr_t`, which takes up to 64 bytes
@@ -27,7 +43,7 @@ def share(w: Writer, job: Value, count: Value, threads: int) -> None:
             w.external("pthread_join", "i32", w.load("i64", others, number), nothing)
 
 
-def write_rows(w: Writer, given: int, returned: int, threads: int) -> None:
+def write_rows(w: Writer, given: int, returned: int) -> None:
     """A handler that takes rows of `given` numbers to rows of `returned` ones, lanes side by side, by the module's `row(given, returned)`.
 
     Places for which no row is left work out the last one once more.
@@ -36,9 +52,9 @@ def write_rows(w: Writer, given: int, returned: int, threads: int) -> None:
         state, found, who = w.room(w.real, given), w.room(w.real, returned), w.room("i64", w.lanes)
         rows, results, count = w.load("ptr", job, IN), w.load("ptr", job, OUT), w.load("i64", job, COUNT)
         with w.repeated() as leave:
-            leave(w.load("i64", job, NEXT) >= count)
+            leave(~w.together(lanes_taken(w, job, NEXT) < count))
             with w.counted(0, w.lanes) as lane:
-                number = w.counted_up(job, NEXT)
+                number = next_lane(w, job, NEXT)
                 w.store(number, who, lane)
                 last = w.where(number < count, number, count - 1)
                 with w.counted(0, given) as row:
@@ -53,10 +69,10 @@ def write_rows(w: Writer, given: int, returned: int, threads: int) -> None:
     def body(arguments: list[Given], results: list[Value]) -> None:
         job, count = w.room("i64", 4), w.room("i64")
         w.store(product(w, arguments[0], 1), count)
-        w.store(w.literal(0, "i64"), job, NEXT)
+        start_counting(w, job, NEXT)
         w.store(w.load("i64", count), job, COUNT)
         w.store(arguments[0].data, job, IN)
         w.store(results[0], job, OUT)
-        share(w, job, w.load("i64", count), threads)
+        share(w, job, w.load("i64", count))
 
     write_handler(w, 1, 1, body)

@@ -5,7 +5,7 @@ not depend on the width.
 """
 
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +13,9 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
-from jourdain_jax.calculus.elsewhere import or_elsewhere
+from jourdain_jax.calculus.elsewhere import PLATFORMS, or_elsewhere
 from jourdain_jax.calculus.lanes_first import with_lanes_first
-from jourdain_jax.native import ffi, host
+from jourdain_jax.native import ffi, gpu, host, nvidia
 from jourdain_jax.native.ir import Writer
 from jourdain_jax.native.scalar_program import as_real, written_in_turn
 from jourdain_jax.native.threads import write_rows
@@ -25,18 +25,26 @@ from jourdain_jax.program.graph import Graph
 ALONE = 2  # places for the lanes of one motion; measured: 64 us with 2, 66 with 1 or 4, 99 with 8 (10 s of a disc at 1e-8)
 
 
-def called(text: Callable[[int, int], str], shapes: Callable, of_samples: int = 0, effort: int = 2) -> Callable:
-    """A module of LLVM IR, written for so many lanes and threads, as a function of arrays without lanes; `shapes`: of its results, given the arguments.
+def called(write: Callable[[Writer], None], shapes: Callable, of_samples: int = 0, effort: int = 2) -> Callable:
+    """A module of LLVM IR as a function of arrays without lanes; `shapes`: of its results, given the arguments.
 
     The first arguments are samples, which lanes may share; `effort`: as of `host.object_code`.
     """
 
     @cache
     def handler(lanes: int, threads: int) -> str:
-        return ffi.registered(text(lanes, threads), effort)
+        w = Writer(lanes, host.fuses(), threads)
+        write(w)
+        return ffi.registered(w.text, effort)
+
+    @cache
+    def kernel() -> gpu.Kernel:
+        w = Writer(1, True, device=True)
+        write(w)
+        return gpu.registered(w.text, w.scratch)
 
     def call(lanes: int, threads: int, *arguments):
-        return tuple(_call_p.bind(*arguments, handler=handler, lanes=lanes, threads=threads, shapes=shapes))
+        return tuple(_call_p.bind(*arguments, handler=handler, kernel=kernel, lanes=lanes, threads=threads, shapes=shapes))
 
     @jax.custom_batching.custom_vmap
     def run(*arguments):
@@ -56,36 +64,39 @@ def _results(*arguments, shapes: Callable, **_) -> list:
     return [arguments[-1].update(shape=(*arguments[-1].shape[:-1], *shape), weak_type=False) for shape in shapes(*arguments)]
 
 
-def _at_once(*arguments, handler: Callable, lanes: int, threads: int, shapes: Callable) -> list:
-    results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in _results(*map(jax.typeof, arguments), shapes=shapes)]
-    return jax.ffi.ffi_call(handler(lanes, threads), results)(*arguments)
+@lru_cache(maxsize=64)
+def _compiled(**how) -> Callable:
+    return jax.jit(lambda *arguments: _call_p.bind(*arguments, **how))
+
+
+def on_cpu(ctx: mlir.LoweringRuleContext, *arguments, handler: Callable, lanes: int, threads: int, **_):
+    """The call in a program for the CPU."""
+    return jax.ffi.ffi_lowering(handler(lanes, threads))(ctx, *arguments)
 
 
 # The call itself: machine code is made where a program is lowered that holds it, not for what is only traced.
 _call_p = Primitive("jourdain_machine_code")
 _call_p.multiple_results = True
-_call_p.def_impl(_at_once)
+_call_p.def_impl(lambda *arguments, **how: _compiled(**how)(*arguments))
 _call_p.def_abstract_eval(_results)
-mlir.register_lowering(
-    _call_p, lambda ctx, *arguments, handler, lanes, threads, shapes: jax.ffi.ffi_lowering(handler(lanes, threads))(ctx, *arguments), platform="cpu"
-)
+mlir.register_lowering(_call_p, on_cpu, platform="cpu")
+mlir.register_lowering(_call_p, lambda ctx, *arguments, kernel, **_: gpu.lowered(ctx, arguments, kernel()), platform="cuda")
+PLATFORMS["cuda"] = lambda: not nvidia.reason_against()
 batching.primitive_batchers[_call_p] = lambda values, axes, **how: (found := _call_p.bind(*with_lanes_first(values, axes), **how), [0] * len(found))
 
 
 def nodes_called(graph: Graph, nodes: Sequence[int], variables: Sequence[int], effort: int = 1) -> Callable[[Array], Array]:
     """Values of nodes of a graph as a function of the values of the variables."""
 
-    def text(lanes: int, threads: int) -> str:
-        w = Writer(lanes, host.fuses())
+    def write(w: Writer) -> None:
         with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
             known = {n: w.load(w.real, state, k) for k, n in enumerate(variables)}
             for k, value in written_in_turn(w, graph, nodes, known):
                 w.store(as_real(w, value), found, k)
             w.give()
-        write_rows(w, len(variables), len(nodes), threads)
-        return w.text
+        write_rows(w, len(variables), len(nodes))
 
-    kernel = called(text, lambda *_: ((len(nodes),),), effort=effort)
+    kernel = called(write, lambda *_: ((len(nodes),),), effort=effort)
 
     def by_xla(x):
         return jnp.stack([jnp.asarray(value, x.dtype) for value in emit.run(graph, nodes, dict(zip(variables, x, strict=True)))])

@@ -19,7 +19,7 @@ from jourdain_jax.motion.native.called import called
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.layout import Layout
 from jourdain_jax.motion.native.taylor import TaylorSteps
-from jourdain_jax.native import host
+from jourdain_jax.native.ir import Writer
 
 MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the process
 
@@ -77,7 +77,7 @@ def kernel(form: Form, method: Method, order: int | None = None) -> Kernel:
     def run(*arguments: Float[Array, "..."]) -> tuple[Float[Array, "times y"], Float[Array, "ends"]]:
         return tuple(run_rows(*arguments))
 
-    run_rows = called(lambda lanes, threads: loop.written(form, steps, lanes, host.fuses(), threads), shapes, samples.arguments(layout))
+    run_rows = called(lambda w: loop.write(w, form, steps), shapes, samples.arguments(layout))
     return Kernel(form, run, _motion(layout, run))
 
 
@@ -116,22 +116,22 @@ def kernel_back(form: Form, method: Method, asked: tuple[int, ...]) -> Callable:
 
     It returns cotangents of the state at the start, and of the numbers `asked` for of those that the rates are given. A state has its tangent after it.
     """
-    return _one_row(lambda *how: back.written(form, method, asked, *how), form, form.layout.integrated + len(asked))
+    return _one_row(lambda w: back.write(w, form, method, asked), form, form.layout.integrated + len(asked))
 
 
 @lru_cache(maxsize=MOST_KERNELS)
 def kernel_of_rates(form: Form) -> Callable:
     """A function of samples, rows as those of a start, and their times as an array of one: the rates of the states in these rows, and of their tangents."""
-    return _one_row(lambda *how: slopes.written(form, *how), form, form.layout.integrated)
+    return _one_row(lambda w: slopes.write(w, form), form, form.layout.integrated)
 
 
 @lru_cache(maxsize=MOST_KERNELS)
 def kernel_of_pulled_rates(form: Form, asked: tuple[int, ...]) -> Callable:
     """As `kernel_of_rates`, of cotangents of the rates in place of the times: those of the state, and of the numbers `asked` for."""
-    return _one_row(lambda *how: slopes.written_back(form, asked, *how), form, form.layout.y + len(asked))
+    return _one_row(lambda w: slopes.write_back(w, form, asked), form, form.layout.y + len(asked))
 
 
-def _one_row(text: Callable[[int, bool, int], str], form: Form, count: int) -> Callable:
-    """Machine code that returns a row of so many numbers for each lane; `text`: for so many lanes, with or without fused operations, in so many threads."""
-    run_rows = called(lambda lanes, threads: text(lanes, host.fuses(), threads), lambda *_: ((count,),), samples.arguments(form.layout))
+def _one_row(write: Callable[[Writer], None], form: Form, count: int) -> Callable:
+    """Machine code that returns a row of so many numbers for each lane."""
+    run_rows = called(write, lambda *_: ((count,),), samples.arguments(form.layout))
     return lambda *arguments: run_rows(*arguments)[0]

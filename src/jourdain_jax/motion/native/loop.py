@@ -13,27 +13,26 @@ from jourdain_jax.motion.native.functions import Form, write_events, write_proje
 from jourdain_jax.motion.native.layout import Lanes
 from jourdain_jax.motion.native.step import IDLE, write_step
 from jourdain_jax.motion.native.taylor import TaylorSteps
-from jourdain_jax.native.ffi import Given, product, write_handler
+from jourdain_jax.native.ffi import Given, last_size, product, write_handler
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.threads import share
+from jourdain_jax.native.threads import next_lane, share, start_counting
 
-# words of a job, shared by all threads: the number of lanes, of times, and of the next lane, those of samples, then pointers to the arrays
-COUNT, TIMES, NEXT, FIRST_OF_SAMPLES = range(4)
+# words of a job, shared by all threads: the number of lanes, of times, and of the next lane, of doubles of a kernel's own memory (`ffi.py`), those of
+# samples, then pointers to the arrays
+COUNT, TIMES, NEXT, OWN, FIRST_OF_SAMPLES = range(5)
 FIRST_ARRAY = FIRST_OF_SAMPLES + samples.WORDS
 _STARTS, _GOALS, _STATES, _ENDS = range(FIRST_ARRAY, FIRST_ARRAY + 4)
 
 
-def written(form: Form, method: Method | TaylorSteps, lanes: int, fused: bool, threads: int) -> str:
-    """The module of LLVM IR; `threads`: among which many lanes are shared."""
-    w = Writer(lanes, fused)
+def write(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
+    """The module."""
     write_functions(w, form, method)
     _write_begin(w, form)
     _write_serve(w, form)
     if isinstance(method, TaylorSteps):
         _write_save_within(w, form, method)
     _write_loop(w, form, method)
-    write_handler(w, 2 + samples.arguments(form.layout), 2, lambda arguments, results: write_job(w, form, arguments, results, threads))
-    return w.text
+    write_handler(w, 2 + samples.arguments(form.layout), 2, lambda arguments, results: write_job(w, form, arguments, results))
 
 
 def write_functions(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
@@ -50,7 +49,7 @@ def write_functions(w: Writer, form: Form, method: Method | TaylorSteps) -> None
     write_step(w, form, method)
 
 
-def write_job(w: Writer, form: Form, arguments: list[Given], results: list[Value], threads: int) -> None:
+def write_job(w: Writer, form: Form, arguments: list[Given], results: list[Value]) -> None:
     """All lanes, by this thread and by others that it starts and waits for; the last of the arguments is an array of lanes and times."""
     of_samples, arguments, times = arguments[: samples.arguments(form.layout)], arguments[samples.arguments(form.layout) :], arguments[-1]
     arrays = [*(x.data for x in arguments), *results]
@@ -60,11 +59,13 @@ def write_job(w: Writer, form: Form, arguments: list[Given], results: list[Value
     count = w.room("i64")
     w.store(product(w, times, 1), count)
     w.store(w.load("i64", count), job, COUNT)
-    w.store(w.load("i64", times.sizes, times.rank - 1), job, TIMES)
-    w.store(w.literal(0, "i64"), job, NEXT)
+    w.store(last_size(w, times), job, TIMES)
+    start_counting(w, job, NEXT)
+    if w.device:
+        w.store(w.own[1], job, OWN)
     if form.sampled:
         samples.store_words(w, w.at(job, FIRST_OF_SAMPLES, "i64"), of_samples)
-    share(w, job, w.load("i64", count), threads)
+    share(w, job, w.load("i64", count))
 
 
 def _write_loop(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
@@ -85,7 +86,7 @@ def _write_lanes(w: Writer, form: Form, method: Method | TaylorSteps, job: Value
         w.call("begin", "void", job, state, who, lane)
         w.call("serve", "void", job, state, who, lane)
     with w.repeated() as leave:
-        leave(w.load("i64", who, 2 * w.lanes).equals(0))
+        leave(~w.together(w.load("i64", who, 2 * w.lanes).differs(0)))
         w.call("step", "void", state, k)
         if isinstance(method, TaylorSteps):
             w.call("save_within", "void", job, state, who, k)
@@ -99,7 +100,7 @@ def _write_begin(w: Writer, form: Form) -> None:
     """`begin(job, state, who, lane)`: the next lane of the batch takes this place; where there is none, it is idle."""
     with w.function("begin", "void", {"job": "ptr", "state": "ptr", "who": "ptr", "lane": "i64"}, attributes="noinline") as (job, state, who, lane):
         lanes, given = Lanes(w, form.layout, state), form.layout.given
-        number = w.counted_up(job, NEXT)
+        number = next_lane(w, job, NEXT)
         there = number < w.load("i64", job, COUNT)
         with w.when(there):
             w.store(number, who, lane)

@@ -90,12 +90,12 @@ class Rows:
         return unsupported(self.program.graph, nodes)
 
 
-def written(of: Rows, lanes: int, fused: bool, threads: int, cutoff: float) -> str:
-    """The module of LLVM IR: a lane is given `of.given`, what is free, and lengths, and returns what moved, and what is left of the rows.
+def write(w: Writer, of: Rows, cutoff: float) -> None:
+    """The module: a lane is given `of.given`, what is free, and lengths, and returns what moved, and what is left of the rows.
 
     `cutoff`: singular values of rows below this share of the largest one count as zero.
     """
-    w, rows, columns = Writer(lanes, fused), len(of.residuals), len(of.moving)
+    rows, columns = len(of.residuals), len(of.moving)
     _write_values(w, of, "residuals", dict(enumerate(of.residuals)))
     write_rotated(w, rows, columns)
     write_inverted(w, rows, columns, cutoff)
@@ -112,8 +112,7 @@ def written(of: Rows, lanes: int, fused: bool, threads: int, cutoff: float) -> s
     else:
         _write_in_band(w, of, of.in_band, min(REGULAR, CLEARLY / cutoff**2))
     _write_row(w, of)
-    write_rows(w, len(of.given) + columns + rows, columns + rows, threads)
-    return w.text
+    write_rows(w, len(of.given) + columns + rows, columns + rows)
 
 
 def _write_values(w: Writer, of: Rows, name: str, nodes: dict[int, int]) -> None:

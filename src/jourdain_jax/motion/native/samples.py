@@ -8,7 +8,7 @@ times. Knots (`integrators/knots.py`) have the shape (rows, knots). Lanes that s
 """
 
 from jourdain_jax.motion.native.layout import Lanes, Layout
-from jourdain_jax.native.ffi import Given, product
+from jourdain_jax.native.ffi import Given, last_size, product
 from jourdain_jax.native.ir import Value, Writer
 
 WORDS = 6  # of a job: pointers to the tables and the knots, how many there are of each, samples of a table, knots of a row
@@ -28,8 +28,8 @@ def store_words(w: Writer, words: Value, given: list[Given]) -> None:
         (_KNOTS, knots.data),
         (_TABLE_COUNT, product(w, tables, 3)),
         (_KNOT_COUNT, product(w, knots, 1)),
-        (_SAMPLES, w.load("i64", tables.sizes, tables.rank - 1)),
-        (_KNOTS_EACH, w.load("i64", knots.sizes, knots.rank - 1)),
+        (_SAMPLES, last_size(w, tables)),
+        (_KNOTS_EACH, last_size(w, knots)),
     ):
         w.store(value, words, word)
 

@@ -6,7 +6,7 @@ too (`values_of_nodes.py`); those of other speeds are derivatives of the same by
 """
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,6 @@ from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.native.called import called, nodes_called, unless_batched
 from jourdain_jax.motion.native.values_of_nodes import Derivatives, values_of_nodes
-from jourdain_jax.native import host
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.math_functions import FUNCTIONS
 from jourdain_jax.native.scalar_program import as_real, unsupported, written
@@ -79,7 +78,7 @@ def _of_parameters(program: Lowered) -> Callable[[Array], Array]:
 @lru_cache(maxsize=MOST_KERNELS)
 def _usual(program: Lowered) -> Callable[[Array], Array]:
     """What is usual at the states that were probed, as a function of those parameters that are needed; JAX does not differentiate it."""
-    kernel = called(lambda lanes, threads: _text_of_usual(program, lanes, threads), lambda *_: ((len(program.usual),),), effort=1)
+    kernel = called(partial(_write_usual, program), lambda *_: ((len(program.usual),),), effort=1)
 
     def by_xla(x):
         return jnp.stack(list(program.usual_values(dict(zip(_places_of(program), x, strict=True))).values()))
@@ -168,12 +167,12 @@ def _seen_nodes(program: Lowered) -> list[int]:
 @lru_cache(maxsize=MOST_KERNELS)
 def _kernel_of_seen(program: Lowered):
     count = len(program.independent) + len(program.dependent) + 3
-    return called(lambda lanes, threads: _text_of_seen(program, lanes, threads, count), lambda *_: ((count,),), effort=1)
+    return called(partial(_write_seen, program, count), lambda *_: ((count,),), effort=1)
 
 
-def _text_of_seen(program: Lowered, lanes: int, threads: int, count: int) -> str:
+def _write_seen(program: Lowered, count: int, w: Writer) -> None:
     """`row(state, found)`: all speeds, the smallest pivot relative to its usual size, kinetic and potential energy."""
-    w, given = Writer(lanes, host.fuses()), program.variables
+    given = program.variables
     with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
         known = {n: w.load(w.real, state, k) for k, n in enumerate(given)}
         values = [as_real(w, x) for x in written(w, program.graph, _seen_nodes(program), known)]
@@ -189,8 +188,7 @@ def _text_of_seen(program: Lowered, lanes: int, threads: int, count: int) -> str
         for i, value in enumerate([pivot, *values[len(values) - of_energy :]]):
             w.store(value, found, count - 3 + i)
         w.give()
-    write_rows(w, len(given), count, threads)
-    return w.text
+    write_rows(w, len(given), count)
 
 
 @lru_cache(maxsize=MOST_KERNELS)
@@ -205,9 +203,9 @@ def _places_of(program: Lowered) -> list[int]:
     return [n for leaf in _needed(program) for n in leaf if n >= 0]
 
 
-def _text_of_usual(program: Lowered, lanes: int, threads: int) -> str:
+def _write_usual(program: Lowered, w: Writer) -> None:
     """`row(state, found)`: as `build/usual_lengths.py: usual` of the magnitudes at the probed states; 1 for what vanishes at all of them."""
-    w, given, nodes, states = Writer(lanes, host.fuses()), _places_of(program), list(program.usual.values()), list(program.states)
+    given, nodes, states = _places_of(program), list(program.usual.values()), list(program.states)
     probes = len(next(iter(program.states.values()), (None,)))
     table = w.constants("probed", (x[p] for p in range(probes) for x in program.states.values())) if states else Value(w, "ptr", "null")
     with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
@@ -220,8 +218,7 @@ def _text_of_usual(program: Lowered, lanes: int, threads: int) -> str:
         with w.counted(0, len(nodes)) as k:
             w.store(_median_or_largest(w, w.at(seen, k * probes, w.real), probes), found, k)
         w.give()
-    write_rows(w, len(given), len(nodes), threads)
-    return w.text
+    write_rows(w, len(given), len(nodes))
 
 
 def _median_or_largest(w: Writer, seen: Value, count: int) -> Value:

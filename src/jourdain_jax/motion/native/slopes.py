@@ -14,25 +14,26 @@ from jourdain_jax.motion.native.pulled import write_pulled_rates
 from jourdain_jax.motion.native.step import each_row
 from jourdain_jax.native.ffi import write_handler
 from jourdain_jax.native.ir import Value, Writer
+from jourdain_jax.native.threads import lanes_taken, next_lane
 
 _STARTS, _OTHERS, _FOUND = range(FIRST_ARRAY, FIRST_ARRAY + 3)  # what lies between the rows and what is found also says how many rows there are
 
 
-def written(form: Form, lanes: int, fused: bool, threads: int) -> str:
-    """The module of LLVM IR for rates."""
-    w, layout = Writer(lanes, fused), form.layout
+def write(w: Writer, form: Form) -> None:
+    """The module for rates."""
+    layout = form.layout
     _write_inputs(w, form)
     write_rates(w, form)
 
     def rates(state: Value, _: Value, found: Value) -> None:
         w.call("rates", "void", state, Lanes(w, layout, state)["t"], state, found, w.room(w.real, max(form.pivots, 1)))
 
-    return _written(w, form, threads, layout.integrated, rates)
+    _write(w, form, layout.integrated, rates)
 
 
-def written_back(form: Form, asked: Sequence[int], lanes: int, fused: bool, threads: int) -> str:
-    """The module of LLVM IR for cotangents of the state and of what is `asked` for of the numbers known, from those of the rates."""
-    w, layout = Writer(lanes, fused), form.layout
+def write_back(w: Writer, form: Form, asked: Sequence[int]) -> None:
+    """The module for cotangents of the state and of what is `asked` for of the numbers known, from those of the rates."""
+    layout = form.layout
     _write_inputs(w, form)
     write_pulled_rates(w, form, asked)
 
@@ -41,7 +42,7 @@ def written_back(form: Form, asked: Sequence[int], lanes: int, fused: bool, thre
         each_row(w, range(len(asked)), to_known, lambda i: w.number(0.0))
         w.call("pull_rates", "void", state, Lanes(w, layout, state)["t"], state, g, found, to_known)
 
-    return _written(w, form, threads, layout.y + len(asked), pulled, layout.y)
+    _write(w, form, layout.y + len(asked), pulled, layout.y)
 
 
 def _write_inputs(w: Writer, form: Form) -> None:
@@ -49,13 +50,12 @@ def _write_inputs(w: Writer, form: Form) -> None:
         samples.write_inputs(w, form.layout, form.time_moves)
 
 
-def _written(w: Writer, form: Form, threads: int, count: int, evaluate: Callable[[Value, Value, Value], None], others: int = 0) -> str:
+def _write(w: Writer, form: Form, count: int, evaluate: Callable[[Value, Value, Value], None], others: int = 0) -> None:
     """`evaluate(state, others, found)`: so many numbers for each row, and for so many others that are given with it."""
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
         _write_rows(w, form, job, count, evaluate, others)
         w.give(Value(w, "ptr", "null"))
-    write_handler(w, 2 + samples.arguments(form.layout), 1, lambda arguments, results: write_job(w, form, arguments, results, threads))
-    return w.text
+    write_handler(w, 2 + samples.arguments(form.layout), 1, lambda arguments, results: write_job(w, form, arguments, results))
 
 
 def _write_rows(w: Writer, form: Form, job: Value, count: int, evaluate: Callable[[Value, Value, Value], None], others: int) -> None:
@@ -67,11 +67,11 @@ def _write_rows(w: Writer, form: Form, job: Value, count: int, evaluate: Callabl
     starts, given, results = (w.load("ptr", job, word) for word in (_STARTS, _OTHERS, _FOUND))
     each_row(w, range(others), more, lambda i: w.number(0.0))
     with w.repeated() as leave:
-        leave(w.load("i64", job, NEXT) >= w.load("i64", job, COUNT))
+        leave(~w.together(lanes_taken(w, job, NEXT) < w.load("i64", job, COUNT)))
         with w.counted(0, layout.all) as row:
             w.store(w.number(1.0), state, row)
         with w.counted(0, w.lanes) as lane:
-            number = w.counted_up(job, NEXT)
+            number = next_lane(w, job, NEXT)
             there = number < w.load("i64", job, COUNT)
             w.store(w.where(there, number, -1), who, lane)
             with w.when(there):

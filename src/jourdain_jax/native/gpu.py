@@ -1,0 +1,152 @@
+"""Kernels of NVIDIA GPUs as functions of JAX: a handler on the host, which is machine code of the CPU, puts each call into XLA's stream.
+
+The handler is one for all kernels: a call names its own by a number, which a table in this process takes to what the driver has loaded. It hands over for
+each array where it is, the size of the last axis, and the products of the sizes of all axes but the last and but the last three. The last result is memory
+of the call's own: a counter of the lanes, and what threads need beyond their own memory. Layouts are those of `ffi.py`.
+"""
+
+import ctypes
+import functools
+import hashlib
+import threading
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jax.interpreters import mlir
+
+from jourdain_jax.native import disk, ffi, host, nvidia
+from jourdain_jax.native.ir import Value, Writer
+
+_TARGET = "jourdain_jax_on_gpu"
+MOST_KERNELS = 4096  # of a process
+MOST_SCRATCH = 4 << 30  # bytes of what threads use beyond what they need, and no more than an eighth of the device
+_NUMBER, _FUNCTION, _WORDS = range(3)  # words of a kernel in the table; the number of words
+_API, _CONTEXT, _ARGUMENT_COUNT, _RESULT_COUNT, _ATTRIBUTES = 2, 3, 7, 12, 20  # words of a frame
+_BLOCKS, _KERNEL = range(2)  # attributes, in the order of their names
+_ERROR_CREATE, _STREAM_GET = 6, 10  # words of XLA's interface
+_INTERNAL, _EXHAUSTED, _OUT_OF_MEMORY = 13, 8, 2  # XLA's codes of errors, and one of the driver's
+
+_table = (ctypes.c_uint64 * (_WORDS * MOST_KERNELS))()
+_loading = threading.RLock()
+_kernels: dict[int, "Kernel"] = {}
+
+
+class Kernel(NamedTuple):
+    """A kernel that can be called."""
+
+    number: int
+    loaded: nvidia.Loaded
+    scratch: tuple[int, int]  # as `Writer.scratch`
+
+
+def handler_text() -> str:
+    """The module of the handler."""
+    w = Writer(1, False)
+    _write_described(w)
+    with w.function(ffi.HANDLER, "ptr", {"frame": "ptr"}, how="") as (frame,):
+        ffi.answer_metadata(w, frame)
+        nothing, attributes = Value(w, "ptr", "null"), w.load("ptr", frame, _ATTRIBUTES)
+        blocks, number = (w.load("i64", w.load("ptr", w.load("ptr", attributes, k), 1)) for k in (_BLOCKS, _KERNEL))
+        words, count = w.room("i64", ffi.WORDS * ffi.MOST_BUFFERS), w.room("i64")
+        w.store(w.literal(0, "i64"), count)
+        for of, buffers in ((_ARGUMENT_COUNT, ffi.ARGS), (_RESULT_COUNT, ffi.RETS)):
+            with w.counted(0, w.load("i64", frame, of)) as k:
+                place = w.load("i64", count)
+                w.call("described", "void", w.load("ptr", w.load("ptr", frame, buffers), k), w.at(words, place * ffi.WORDS, "i64"))
+                w.store(place + 1, count)
+        scratch = w.load("i64", words, (w.load("i64", count) - 1) * ffi.WORDS)
+        table, entry = Value(w, "ptr", "@jourdain_jax_kernels"), w.room("i64")
+        w.declare("jourdain_jax_kernels", "@jourdain_jax_kernels = external global i64")
+        w.store(w.literal(0, "i64"), entry)
+        with w.repeated() as leave:
+            leave(w.load("i64", table, w.load("i64", entry)).equals(number))
+            w.store(w.load("i64", entry) + _WORDS, entry)
+        function = w.load("ptr", table, w.load("i64", entry) + _FUNCTION)
+        api, asked = w.load("ptr", frame, _API), w.room("i64", 4)
+        for word, value in enumerate((w.literal(32, "i64"), w.literal(0, "i64"), w.load("i64", frame, _CONTEXT), w.literal(0, "i64"))):
+            w.store(value, asked, word)
+        failed = w.through(w.load("ptr", api, _STREAM_GET), "ptr", asked)
+        with w.when(w.converted("ptrtoint", failed, "i64").differs(0)):
+            w.give(failed)
+            w.place(w.label())
+        stream, code, parameters = w.load("ptr", asked, 3), w.room("i32"), w.room("ptr")
+        w.store(words, parameters)
+        w.store(w.external("cuMemsetD32Async", "i32", scratch, w.literal(0, "i32"), w.literal(2, "i64"), stream), code)
+        one, zero = w.literal(1, "i32"), w.literal(0, "i32")
+        with w.when(w.load("i32", code).equals(0)):
+            shape = [w.converted("trunc", blocks, "i32"), one, one, w.literal(nvidia.WARP, "i32"), one, one, zero]
+            w.store(w.external("cuLaunchKernel", "i32", function, *shape, stream, parameters, nothing), code)
+        with w.when(w.load("i32", code).differs(0)):
+            message, error = w.room("ptr"), w.room("i64", 4)
+            w.external("cuGetErrorString", "i32", w.load("i32", code), message)
+            kind = w.where(w.load("i32", code).equals(_OUT_OF_MEMORY), w.literal(_EXHAUSTED, "i64"), _INTERNAL)
+            for word, value in enumerate((w.literal(28, "i64"), w.literal(0, "i64"), w.load("i64", message), kind)):
+                w.store(value, error, word)
+            w.give(w.through(w.load("ptr", api, _ERROR_CREATE), "ptr", error))
+            w.place(w.label())
+        w.give(nothing)
+    return w.text
+
+
+def _write_described(w: Writer) -> None:
+    """`described(buffer, words)`: what a kernel is told of an array."""
+    with w.function("described", "void", {"buffer": "ptr", "words": "ptr"}) as (buffer, words):
+        x = ffi.given(w, buffer)
+        told = (w.converted("ptrtoint", x.data, "i64"), ffi.last_size(w, x), ffi.product(w, x, 1), ffi.product(w, x, 3))
+        for word, value in enumerate(told):
+            w.store(value, words, word)
+        w.give()
+
+
+@functools.cache
+def _handler() -> str:
+    """The name under which JAX calls kernels."""
+    for name in ("cuMemsetD32Async", "cuLaunchKernel", "cuGetErrorString"):
+        host.llvm.add_symbol(name, ctypes.cast(getattr(nvidia.driver(), name), ctypes.c_void_p).value)
+    host.llvm.add_symbol("jourdain_jax_kernels", ctypes.addressof(_table))
+    ffi.register(_TARGET, handler_text(), "CUDA")
+    return _TARGET
+
+
+def registered(text: str, scratch: tuple[int, int]) -> Kernel:
+    """The kernel of a module of LLVM IR."""
+    made_by = f"{host.llvm.llvm_version_info} {nvidia.architecture()}"
+    digest = hashlib.sha256(f"{made_by} {text}".encode())
+    number = int.from_bytes(digest.digest()[:7], "big") + 1  # a whole number of 64 bits with a sign
+    with _loading:
+        if number not in _kernels:
+            if len(_kernels) == MOST_KERNELS:
+                raise RuntimeError(f"this process has compiled {MOST_KERNELS} kernels for GPUs, the most that it can keep; start a new one")
+            ptx = disk.kept(f"jourdain_jax_{digest.hexdigest()[:24]}", made_by, lambda: nvidia.text_for(text, nvidia.architecture()).encode())
+            found = nvidia.loaded(ptx, ffi.KERNEL)
+            place = _WORDS * len(_kernels)
+            _table[place + _FUNCTION] = found.function
+            _table[place + _NUMBER] = number
+            _kernels[number] = Kernel(number, found, scratch)
+    return _kernels[number]
+
+
+def lowered(ctx: mlir.LoweringRuleContext, arguments: Sequence, kernel: Kernel) -> list:
+    """The call of a kernel, on arrays of doubles; those in single precision are converted."""
+    lanes = int(np.prod(ctx.avals_in[-1].shape[:-1]))
+    blocks = nvidia.blocks(lanes, kernel.loaded)
+    needed, most = kernel.scratch
+    each = 8 * blocks * nvidia.WARP * max(needed, 1)
+    times = min(most, max(1, min(MOST_SCRATCH, nvidia.memory() // 8) // max(each, 1)))
+    doubles = [x.update(dtype=np.dtype(np.float64), weak_type=False) for x in (*ctx.avals_in, *ctx.avals_out)]
+    given, found = doubles[: len(arguments)], doubles[len(arguments) :]
+    scratch = found[0].update(shape=(ffi.FIRST_OF_SCRATCH + blocks * nvidia.WARP * needed * times,))
+    inner = ctx.replace(primitive=None, avals_in=given, avals_out=[*found, scratch])
+    wide = [_converted(ctx, x, aval, double) for x, aval, double in zip(arguments, ctx.avals_in, given, strict=True)]
+    call = jax.ffi.ffi_lowering(_handler())
+    results = call(inner, *wide, blocks=np.int64(blocks), kernel=np.int64(kernel.number))
+    return [_converted(ctx, x, double, aval) for x, double, aval in zip(results, found, ctx.avals_out, strict=False)]
+
+
+def _converted(ctx: mlir.LoweringRuleContext, x, given, to):
+    (found,) = mlir.lower_fun(lambda x: jax.lax.convert_element_type_p.bind(x, new_dtype=to.dtype, weak_type=False, sharding=None), multiple_results=False)(
+        ctx.replace(primitive=None, avals_in=[given], avals_out=[to]), x
+    )
+    return found

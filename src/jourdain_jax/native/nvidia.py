@@ -1,0 +1,166 @@
+"""NVIDIA GPUs: the driver, text for it by LLVM, and kernels that it has compiled. No toolkit is needed; calls go to `libcuda` by ctypes.
+
+A kernel is loaded for all devices at once (`cuLibraryLoadData`, of CUDA 12), and the driver compiles it for each where it is first used; it keeps what it
+has compiled between processes.
+"""
+
+import ctypes
+import functools
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
+from jourdain_jax.native import host
+
+TRIPLE = "nvptx64-nvidia-cuda"
+KNOWN = (75, 80, 86, 89, 90, 100, 120)  # compute capabilities that text is made for; newer GPUs take that of older ones
+WARP = 32
+FEWEST_WARPS = 4  # of a multiprocessor: one for each of its parts
+_CALLED = (
+    "cuCtxPopCurrent_v2",
+    "cuCtxPushCurrent_v2",
+    "cuDeviceGetAttribute",
+    "cuDeviceGetName",
+    "cuDevicePrimaryCtxRetain",
+    "cuDeviceTotalMem_v2",
+    "cuGetErrorString",
+    "cuKernelGetAttribute",
+    "cuLaunchKernel",
+    "cuLibraryGetKernel",
+    "cuLibraryLoadData",
+    "cuMemsetD32Async",
+)
+_MULTIPROCESSORS, _MAJOR, _MINOR, _CACHE, _REGISTERS = 16, 75, 76, 81, 82  # attributes of a device; the cache is what of it can be shared memory
+_LOCAL_BYTES, _REGISTERS_EACH = 3, 4  # of a kernel
+
+
+class Loaded(NamedTuple):
+    """A kernel, and what each of its threads takes."""
+
+    function: int
+    local: int  # bytes of memory
+    registers: int
+
+
+@functools.cache
+def driver() -> ctypes.CDLL:
+    """The library of the driver."""
+    return ctypes.CDLL("libcuda.so.1")
+
+
+@functools.cache
+def reason_against() -> str:
+    """Why no machine code is made here for GPUs; empty where it is."""
+    if reason := host.reason_against() or reason_against_text():
+        return reason
+    try:
+        library = driver()
+    except OSError as error:
+        return f"NVIDIA's driver is not there ({error})"
+    if missing := [name for name in _CALLED if not hasattr(library, name)]:
+        return f"NVIDIA's driver is older than CUDA 12 (it has no {missing[0]})"
+    count = ctypes.c_int()
+    try:
+        _checked(library.cuInit(0))
+        _checked(library.cuDeviceGetCount(ctypes.byref(count)))
+    except RuntimeError as error:
+        return str(error)
+    return "" if count.value else "NVIDIA's driver knows of no GPU"
+
+
+@functools.cache
+def reason_against_text() -> str:
+    """Why LLVM writes no text for NVIDIA's driver; empty where it does."""
+    try:
+        host.llvm.initialize_all_targets()
+        host.llvm.initialize_all_asmprinters()
+        host.llvm.Target.from_triple(TRIPLE)
+    except Exception as error:
+        return f"LLVM of llvmlite writes nothing for NVIDIA GPUs ({str(error).splitlines()[0]})"
+    return ""
+
+
+def _checked(code: int) -> None:
+    """Raises what the driver says, unless all is well."""
+    if code:
+        text = ctypes.c_char_p()
+        driver().cuGetErrorString(code, ctypes.byref(text))
+        raise RuntimeError(f"NVIDIA's driver says: {(text.value or b'error %d' % code).decode()}")
+
+
+def _devices() -> range:
+    count = ctypes.c_int()
+    _checked(driver().cuDeviceGetCount(ctypes.byref(count)))
+    return range(count.value)  # their handles are their numbers
+
+
+def _of_device(attribute: int) -> int:
+    """The least of any device's."""
+    found, each = ctypes.c_int(), []
+    for device in _devices():
+        _checked(driver().cuDeviceGetAttribute(ctypes.byref(found), attribute, device))
+        each.append(found.value)
+    return min(each)
+
+
+@functools.cache
+def memory() -> int:
+    """Bytes of the smallest device."""
+    found, each = ctypes.c_size_t(), []
+    for device in _devices():
+        _checked(driver().cuDeviceTotalMem_v2(ctypes.byref(found), device))
+        each.append(found.value)
+    return min(each)
+
+
+@functools.cache
+def architecture() -> str:
+    """What text is made for, such as `sm_90`."""
+    capability = 10 * _of_device(_MAJOR) + _of_device(_MINOR)
+    return f"sm_{max((known for known in KNOWN if known <= capability), default=KNOWN[0])}"
+
+
+def text_for(module: str, architecture: str) -> str:
+    """PTX of a module of LLVM IR."""
+    llvm = host.llvm
+    machine = llvm.Target.from_triple(TRIPLE).create_target_machine(cpu=architecture, opt=3)
+    parsed = llvm.parse_assembly(module)
+    parsed.triple, parsed.data_layout = TRIPLE, str(machine.target_data)
+    for _ in range(2):  # loops that the first pass has unrolled no longer keep numbers in memory
+        options = llvm.create_pipeline_tuning_options(speed_level=3)
+        options.loop_vectorization = options.slp_vectorization = False
+        builder = llvm.create_pass_builder(machine, options)
+        builder.getModulePassManager().run(parsed, builder)
+    return machine.emit_assembly(parsed)
+
+
+@contextmanager
+def _in_context() -> Iterator[None]:
+    """What is done inside is done for the first device, in the context that it has in this process; it stays for JAX."""
+    context = ctypes.c_void_p()
+    _checked(driver().cuDevicePrimaryCtxRetain(ctypes.byref(context), 0))
+    _checked(driver().cuCtxPushCurrent_v2(context))
+    try:
+        yield
+    finally:
+        _checked(driver().cuCtxPopCurrent_v2(ctypes.byref(context)))
+
+
+def loaded(text: bytes, name: str) -> Loaded:
+    """The kernel of this name in PTX."""
+    with _in_context():
+        library, kernel, found = ctypes.c_void_p(), ctypes.c_void_p(), []
+        _checked(driver().cuLibraryLoadData(ctypes.byref(library), ctypes.c_char_p(text + b"\0"), None, None, 0, None, None, 0))
+        _checked(driver().cuLibraryGetKernel(ctypes.byref(kernel), library, name.encode()))
+        for attribute in (_LOCAL_BYTES, _REGISTERS_EACH):
+            value = ctypes.c_int()
+            _checked(driver().cuKernelGetAttribute(ctypes.byref(value), attribute, kernel, 0))
+            found.append(value.value)
+    return Loaded(kernel.value or 0, *found)
+
+
+def blocks(lanes: int, kernel: Loaded) -> int:
+    """How many warps serve so many lanes: as many as registers allow, and no more than whose local memory stays in the first cache, where that is not too few."""
+    by_registers = _of_device(_REGISTERS) // (WARP * max(8, kernel.registers + -kernel.registers % 8))
+    by_cache = _of_device(_CACHE) // max(1, WARP * kernel.local)
+    return min(-(lanes // -WARP), _of_device(_MULTIPROCESSORS) * min(by_registers, WARP, max(by_cache, FEWEST_WARPS)))
