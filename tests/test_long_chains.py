@@ -23,8 +23,9 @@ from jourdain_jax.lowering import ignorable
 from jourdain_jax.models import TrailerChain
 from jourdain_jax.motion import put_on_rows
 from jourdain_jax.motion.native import onto_rows
-from jourdain_jax.motion.native.onto_rows import Rows, written
+from jourdain_jax.motion.native.onto_rows import Rows, write
 from jourdain_jax.native import ffi
+from jourdain_jax.native.ir import Writer
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.identity_test import identity_probes
@@ -153,7 +154,9 @@ def test_machine_code_of_a_chain_grows_with_its_length():
     for n in (22, 44):
         rows = Rows(row_program(TrailerChain(trailers=n)), "determined speeds", affine=True)
         assert not rows.reason_against()
-        lines.append(written(rows, 2, True, 1, rank_cutoff("float64")).count("\n"))
+        w = Writer(2, True)
+        write(w, rows, rank_cutoff("float64"))
+        lines.append(w.text.count("\n"))
     assert lines[1] < 2.05 * lines[0]
 
 

@@ -20,10 +20,25 @@ from jourdain_jax.program.emit import COSINE, HALF_PI, SINE
 WHOLE = 1.5 * 2.0**52  # a number to which this is added is rounded to a whole one, whose last bits are the last of the sum
 LARGEST_ANGLE = 5e5  # rad; multiples of pi/2 below 2^20 times a part of 33 bits are exact
 TWO_OVER_PI = (  # its first 1,216 bits, 64 in each
-    0xA2F9836E4E441529, 0xFC2757D1F534DDC0, 0xDB6295993C439041, 0xFE5163ABDEBBC561, 0xB7246E3A424DD2E0,
-    0x06492EEA09D1921C, 0xFE1DEB1CB129A73E, 0xE88235F52EBB4484, 0xE99C7026B45F7E41, 0x3991D639835339F4,
-    0x9C845F8BBDF9283B, 0x1FF897FFDE05980F, 0xEF2F118B5A0A6D1F, 0x6D367ECF27CB09B7, 0x4F463F669E5FEA2D,
-    0x7527BAC7EBE5F17B, 0x3D0739F78A5292EA, 0x6BFB5FB11F8D5D08, 0x56033046FC7B6BAB,
+    0xA2F9836E4E441529,
+    0xFC2757D1F534DDC0,
+    0xDB6295993C439041,
+    0xFE5163ABDEBBC561,
+    0xB7246E3A424DD2E0,
+    0x06492EEA09D1921C,
+    0xFE1DEB1CB129A73E,
+    0xE88235F52EBB4484,
+    0xE99C7026B45F7E41,
+    0x3991D639835339F4,
+    0x9C845F8BBDF9283B,
+    0x1FF897FFDE05980F,
+    0xEF2F118B5A0A6D1F,
+    0x6D367ECF27CB09B7,
+    0x4F463F669E5FEA2D,
+    0x7527BAC7EBE5F17B,
+    0x3D0739F78A5292EA,
+    0x6BFB5FB11F8D5D08,
+    0x56033046FC7B6BAB,
 )
 _HALF_PI = (1.5707963267948966, 6.123233995736766e-17)
 _LESS_SINE = tuple(-c for c in SINE)
@@ -123,7 +138,9 @@ def _write_far_angle(w: Writer, x: Value, r: Value, over: Value, quadrant: Value
     def digits(k: int) -> Value:
         """64 bits of 2/pi."""
         table = Value(w, "ptr", "@two_over_pi")
-        both = w.bitwise("shl", w.converted("zext", w.load("i64", table, word + k), "i128"), 64) | w.converted("zext", w.load("i64", table, word + (k + 1)), "i128")
+        both = w.bitwise("shl", w.converted("zext", w.load("i64", table, word + k), "i128"), 64) | w.converted(
+            "zext", w.load("i64", table, word + (k + 1)), "i128"
+        )
         return w.bitwise("lshr", w.bitwise("shl", both, w.converted("zext", shift, "i128")), 64)
 
     # in units of 2^-126 quarter turns, without whole turns

@@ -160,7 +160,7 @@ def loaded(text: bytes, name: str) -> Loaded:
 
 
 def blocks(lanes: int, kernel: Loaded) -> int:
-    """How many warps serve so many lanes: as many as registers allow, and no more than whose local memory stays in the first cache, where that is not too few."""
+    """How many warps serve so many lanes: as many as registers allow, and whose local memory stays in the first cache, where that is not too few."""
     by_registers = _of_device(_REGISTERS) // (WARP * max(8, kernel.registers + -kernel.registers % 8))
     by_cache = _of_device(_CACHE) // max(1, WARP * kernel.local)
     return min(-(lanes // -WARP), _of_device(_MULTIPROCESSORS) * min(by_registers, WARP, max(by_cache, FEWEST_WARPS)))

@@ -1,9 +1,8 @@
 """The loop over steps, gone through once more and then back, as machine code: cotangents of the start from those of the states and the end.
 
 Lanes side by side begin and end together here. On the way forth every try of a step leaves a slot: the state before it, the slopes of its stages, by how
-far the state went on (zero where the step was refused, or the lane had ended), and how many times had been saved before it. On a GPU there is memory for
-so many slots; of motions that take more, the lane goes forth again for each window of slots, the last one first. On the way back, a step being a
-number,
+far the state went on (zero where the step was refused, or the lane had ended), and how many times had been saved before it
+(`record.py`). On the way back, a step being a number,
 
     Y_i = y_0 + h sum_j a_ij k_j,   v_i = b_i g_1 + sum_l a_li G_l,   (G_i, g_p) = (df/dy, df/dp)'(Y_i) h v_i,   g_0 = g_1 + sum G_i
 
@@ -16,80 +15,26 @@ As `motion/integrators/recorded_adjoint.py` and `step_adjoint.py` have it.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
 
-from jourdain_jax.motion.integrators.erk_step import LOCATING, RUNNING, Method
+from jourdain_jax.motion.integrators.erk_step import RUNNING, Method
 from jourdain_jax.motion.native import samples, search
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.layout import Lanes
-from jourdain_jax.motion.native.loop import COUNT, FIRST_ARRAY, FIRST_OF_SAMPLES, NEXT, OWN, TIMES, write_functions, write_job
+from jourdain_jax.motion.native.loop import COUNT, FIRST_OF_SAMPLES, TIMES, write_functions, write_job
 from jourdain_jax.motion.native.pulled import write_pulled
-from jourdain_jax.motion.native.step import IDLE, each_row, for_rows, weighted
+from jourdain_jax.motion.native.record import GOALS, STARTS, TO_ENDS, TO_STATES, Slot, prepare, write_record
+from jourdain_jax.motion.native.step import IDLE, each_row, weighted
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.native.ffi import FIRST_OF_SCRATCH, write_handler
+from jourdain_jax.native.ffi import write_handler
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.threads import lanes_taken, next_lane
-
-_STARTS, _TO_STATES, _TO_ENDS, _GOALS, _FOUND = range(FIRST_ARRAY, FIRST_ARRAY + 5)
-MOST_SLOTS = 4096  # of a thread of a GPU
-FIRST_SLOTS = 64  # for which there is memory at first; then twice as many, and so on
-
-
-@dataclass(frozen=True)
-class _Slot:
-    """Rows of a slot."""
-
-    y: int
-    k: int
-
-    @staticmethod
-    def of(form: Form, method: Method) -> "_Slot":
-        return _Slot(form.layout.integrated, form.layout.integrated * method.needed)
-
-    @property
-    def t(self) -> int:
-        return self.y + self.k
-
-    @property
-    def taken(self) -> int:
-        return self.t + 1
-
-    @property
-    def saved(self) -> int:
-        return self.t + 2
-
-    @property
-    def all(self) -> int:
-        return self.t + 3
-
-
-class _Rooms(NamedTuple):
-    """Memory of a block: its lanes and their numbers in the batch, of each how many times are saved, its cotangents, and how many slots there are."""
-
-    state: Value
-    who: Value
-    saved: Value
-    g: Value
-    by_known: Value
-    count: Value
-
-    @staticmethod
-    def of(w: Writer, form: Form, asked: int) -> "_Rooms":
-        rows = form.layout.all, form.layout.integrated, max(asked, 1)
-        state, g, by_known = (w.room(w.real, count) for count in rows)
-        return _Rooms(state, w.room("i64", w.lanes), w.room(w.real), g, by_known, w.room("i64"))
 
 
 def write(w: Writer, form: Form, method: Method, asked: Sequence[int]) -> None:
     """The module; `asked`: of which of the numbers that the rates are given cotangents are asked."""
     write_functions(w, form, method)
     write_pulled(w, form, asked)
-    if w.device:
-        w.scratch = _Slot.of(form, method).all, MOST_SLOTS
-    else:
-        _write_more_room(w)
+    prepare(w, form, method)
     _write_begin(w, form)
     _write_note(w, form)
     _write_added(w, form)
@@ -97,184 +42,9 @@ def write(w: Writer, form: Form, method: Method, asked: Sequence[int]) -> None:
     if form.has_events:
         _write_event_back(w, form, len(asked))
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
-        (_write_windows if w.device else _write_blocks)(w, form, method, len(asked), job)
+        write_record(w, form, method, len(asked), job)
         w.give(Value(w, "ptr", "null"))
     write_handler(w, 4 + samples.arguments(form.layout), 1, lambda arguments, results: write_job(w, form, arguments, results))
-
-
-def _write_more_room(w: Writer) -> None:
-    """`more_room(old, bytes)`: twice as many bytes, the first of them as before; null where there are none."""
-    with w.function("more_room", "ptr", {"old": "ptr", "bytes": "i64"}, attributes="noinline") as (old, size):
-        new = w.external("aligned_alloc", "ptr", w.literal(64, "i64"), size * 2)
-        there = w.converted("ptrtoint", new, "i64").differs(0)
-        with w.when(there):
-            w.external("memcpy", "ptr", new, old, size)
-        w.external("free", "void", old)
-        w.give(new)
-
-
-def _write_blocks(w: Writer, form: Form, method: Method, asked: int, job: Value) -> None:
-    """Lanes side by side, forth and back, until none is left."""
-    layout, slot = form.layout, _Slot.of(form, method)
-    size = slot.all * w.lanes * 8
-    rooms = _Rooms.of(w, form, asked)
-    state, who, count = rooms.state, rooms.who, rooms.count
-    record, bytes_there, lanes = w.room("ptr"), w.room("i64"), Lanes(w, layout, state)
-    w.store(w.literal(FIRST_SLOTS * size, "i64"), bytes_there)
-    w.store(w.external("aligned_alloc", "ptr", w.literal(64, "i64"), w.literal(FIRST_SLOTS * size, "i64")), record)
-
-    def has_room() -> Value:
-        return w.converted("ptrtoint", w.load("ptr", record), "i64").differs(0)
-
-    with w.repeated() as leave:
-        leave(w.load("i64", job, NEXT) >= w.load("i64", job, COUNT))
-        leave(~has_room())
-        _take(w, job, who)
-        _write_start(w, form, job, rooms)
-        with w.repeated() as ended:
-            code, number = lanes["code"], w.load("i64", count)
-            ended(~w.any(code.equals(float(RUNNING)) | code.equals(float(LOCATING))))
-            with w.when((number + 1) * size > w.load("i64", bytes_there)):
-                w.store(w.call("more_room", "ptr", w.load("ptr", record), w.load("i64", bytes_there)), record)
-                w.store(w.load("i64", bytes_there) * 2, bytes_there)
-            ended(~has_room())
-            _write_try(w, form, slot, job, rooms, w.at(w.load("ptr", record), number * slot.all, w.real))
-        leave(~has_room())
-        _write_ends(w, form, asked, job, rooms)
-        with w.repeated() as at_start:
-            at_start(w.load("i64", count) <= 0)
-            _write_try_back(w, slot, job, rooms, w.at(w.load("ptr", record), (w.load("i64", count) - 1) * slot.all, w.real))
-        _write_found(w, form, asked, job, rooms)
-    with w.when(~has_room()):
-        _give_nan(w, form, asked, job, who)
-    w.external("free", "void", w.load("ptr", record))
-
-
-def _write_windows(w: Writer, form: Form, method: Method, asked: int, job: Value) -> None:
-    """As `_write_blocks`, on a GPU: the lanes of a warp, in memory for so many of the last slots; the numbers of its threads stand side by side."""
-    slot, rooms = _Slot.of(form, method), _Rooms.of(w, form, asked)
-    lanes, here, end = Lanes(w, form.layout, rooms.state), w.room(w.real, slot.all), w.room("i64")
-    (thread, threads), count = w.thread(), rooms.count
-    record = w.at(w.load("ptr", job, NEXT), thread + FIRST_OF_SCRATCH, w.real)
-    slots = w.binary("sdiv", w.load("i64", job, OWN) - FIRST_OF_SCRATCH, threads * slot.all)
-
-    def place(number: Value, row: int | Value) -> Value:
-        return w.at(record, (w.binary("srem", number, slots) * slot.all + row) * threads, w.real)
-
-    with w.repeated() as leave:
-        leave(~w.together(lanes_taken(w, job, NEXT) < w.load("i64", job, COUNT)))
-        _take(w, job, rooms.who)
-        w.store(w.literal(2**62, "i64"), end)
-        with w.repeated() as done:
-            _write_start(w, form, job, rooms)
-            with w.repeated() as ended:
-                code, number = lanes["code"], w.load("i64", count)
-                on_its_way = w.any(code.equals(float(RUNNING)) | code.equals(float(LOCATING)))
-                ended(~w.together(on_its_way & (number < w.load("i64", end))))
-                _write_try(w, form, slot, job, rooms, here)
-                for_rows(w, range(slot.all), lambda row, number=number: w.store(w.load(w.real, here, row), place(number, row)))
-            with w.when(w.load("i64", end).equals(2**62)):
-                _write_ends(w, form, asked, job, rooms)
-            first = w.load("i64", count) - slots
-            w.store(w.where(first > 0, first, 0), end)
-            with w.repeated() as at_start:
-                number = w.load("i64", count) - 1
-                at_start(~w.together(number >= w.load("i64", end)))
-                for_rows(w, range(slot.all), lambda row, number=number: w.store(w.load(w.real, place(number, row)), here, row))
-                _write_try_back(w, slot, job, rooms, here)
-            done(~w.together(w.load("i64", end) > 0))
-        _write_found(w, form, asked, job, rooms)
-
-
-def _take(w: Writer, job: Value, who: Value) -> None:
-    """The next lanes of the batch; -1 where there is none."""
-    with w.counted(0, w.lanes) as lane:
-        number = next_lane(w, job, NEXT)
-        w.store(w.where(number < w.load("i64", job, COUNT), number, -1), who, lane)
-
-
-def _write_start(w: Writer, form: Form, job: Value, rooms: "_Rooms") -> None:
-    """All lanes at their starts."""
-    with w.counted(0, form.layout.all) as row:
-        w.store(w.number(1.0), rooms.state, row)
-    with w.counted(0, w.lanes) as lane:
-        w.call("begin", "void", job, rooms.state, rooms.who, lane)
-    w.store(w.number(0.0), rooms.saved)
-    w.call("note", "void", job, rooms.state, rooms.who, rooms.saved)
-    w.store(w.literal(0, "i64"), rooms.count)
-
-
-def _write_try(w: Writer, form: Form, slot: _Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
-    """A step that is tried, and its slot `here`."""
-    lanes = Lanes(w, form.layout, rooms.state)
-    each_row(w, range(form.layout.integrated), here, lambda i: w.load(w.real, rooms.state, i))
-    w.store(lanes["t"], here, slot.t)
-    w.store(w.load(w.real, rooms.saved), here, slot.saved)
-    w.call("step", "void", rooms.state, w.at(here, slot.y, w.real))
-    w.store(lanes["taken"], here, slot.taken)
-    w.call("note", "void", job, rooms.state, rooms.who, rooms.saved)
-    w.store(w.load("i64", rooms.count) + 1, rooms.count)
-
-
-def _write_ends(w: Writer, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
-    """Cotangents of the states at the end of a block."""
-    g, layout = rooms.g, form.layout
-    each_row(w, range(asked), rooms.by_known, lambda i: w.number(0.0))
-    ends, per_end = w.load("ptr", job, _TO_ENDS), layout.ends
-    with w.counted(0, w.lanes) as lane:
-        number = w.load("i64", rooms.who, lane)
-        with w.counted(0, layout.integrated) as row:
-            found = w.load("double", ends, w.where(number >= 0, number, 0) * per_end + row)
-            w.store(w.where(number >= 0, found, w.literal(0.0, "double")), w.at(g, row * w.lanes + lane, "double"))
-    # what was not reached repeats the last state
-    all_times = w.room(w.real)
-    with w.counted(0, w.lanes) as lane:
-        w.store(w.converted("sitofp", w.load("i64", job, TIMES), "double"), w.at(all_times, lane, "double"))
-    w.call("added", "void", job, rooms.who, w.load(w.real, rooms.saved), w.load(w.real, all_times), g)
-    if form.has_events:
-        w.call("event_back", "void", job, rooms.state, rooms.who, g, rooms.by_known)
-
-
-def _write_try_back(w: Writer, slot: _Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
-    """Back over the try in a slot."""
-    before = w.load(w.real, here, slot.saved)
-    w.call("added", "void", job, rooms.who, before, w.load(w.real, rooms.saved), rooms.g)
-    w.store(before, rooms.saved)
-    with w.when(w.any(w.load(w.real, here, slot.taken).differs(0.0))):
-        w.call("step_back", "void", rooms.state, here, rooms.g, rooms.by_known)
-    w.store(w.load("i64", rooms.count) - 1, rooms.count)
-
-
-def _write_found(w: Writer, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
-    """The results of a block."""
-    g, layout = rooms.g, form.layout
-    w.call("added", "void", job, rooms.who, w.number(0.0), w.load(w.real, rooms.saved), g)
-    found, each = w.load("ptr", job, _FOUND), layout.integrated + asked
-    with w.counted(0, w.lanes) as lane:
-        number = w.load("i64", rooms.who, lane)
-        with w.when(number >= 0):
-            with w.counted(0, layout.integrated) as row:
-                w.store(w.load("double", g, row * w.lanes + lane), found, number * each + row)
-            with w.counted(0, asked) as row:
-                w.store(w.load("double", rooms.by_known, row * w.lanes + lane), found, number * each + layout.integrated + row)
-
-
-def _give_nan(w: Writer, form: Form, asked: int, job: Value, who: Value) -> None:
-    """Where no memory is left: NaN for this block and for all lanes that are left."""
-    found, each = w.load("ptr", job, _FOUND), form.layout.integrated + asked
-
-    def lost(number: Value) -> None:
-        with w.counted(0, each) as row:
-            w.store(w.literal(math.nan, "double"), found, number * each + row)
-
-    with w.counted(0, w.lanes) as lane:
-        number = w.load("i64", who, lane)
-        with w.when(number >= 0):
-            lost(number)
-    with w.repeated() as leave:
-        number = next_lane(w, job, NEXT)
-        leave(number >= w.load("i64", job, COUNT))
-        lost(number)
 
 
 def _write_begin(w: Writer, form: Form) -> None:
@@ -284,10 +54,10 @@ def _write_begin(w: Writer, form: Form) -> None:
         number = w.load("i64", who, lane)
         there = number >= 0
         with w.when(there):
-            starts = w.load("ptr", job, _STARTS)
+            starts = w.load("ptr", job, STARTS)
             with w.counted(0, given) as row:
                 w.store(w.load("double", starts, number * given + row), lanes.place(row, lane))
-            lanes.set("goal", lane, w.load("double", w.load("ptr", job, _GOALS), number * w.load("i64", job, TIMES)))
+            lanes.set("goal", lane, w.load("double", w.load("ptr", job, GOALS), number * w.load("i64", job, TIMES)))
         with w.when(~there):
             lanes.set("code", lane, IDLE)
         if form.sampled:  # places without a lane are worked out too
@@ -308,7 +78,7 @@ def _write_note(w: Writer, form: Form) -> None:
             times, number = w.load("i64", job, TIMES), w.load("i64", who, lane)
             with w.repeated() as leave:
                 leave(~(lanes.of("code", lane).equals(float(RUNNING)) & lanes.of("t", lane).equals(lanes.of("goal", lane))))
-                before, goals = w.converted("fptosi", w.load("double", saved, lane), "i64"), w.load("ptr", job, _GOALS)
+                before, goals = w.converted("fptosi", w.load("double", saved, lane), "i64"), w.load("ptr", job, GOALS)
                 if form.sampled:
                     at_knot = lanes.of("t", lane).differs(w.load("double", goals, number * times + before))
                     with w.when(at_knot):
@@ -338,7 +108,7 @@ def _write_added(w: Writer, form: Form) -> None:
             with w.when(number >= 0):
                 a, b = (w.converted("fptosi", w.load("double", x, lane), "i64") for x in (firsts, ends))
                 with w.counted(a, b) as k, w.counted(0, count) as row:
-                    more = w.load("double", w.load("ptr", job, _TO_STATES), (number * times + k) * count + row)
+                    more = w.load("double", w.load("ptr", job, TO_STATES), (number * times + k) * count + row)
                     place = w.at(g, row * w.lanes + lane, "double")
                     w.store(w.load("double", place) + more, place)
         w.give()
@@ -346,7 +116,7 @@ def _write_added(w: Writer, form: Form) -> None:
 
 def _write_step_back(w: Writer, form: Form, method: Method, asked: int) -> None:
     """`step_back(state, here, g, by_known)`: back over the step in the slot `here`, in lanes that went on in it."""
-    layout, slot = form.layout, _Slot.of(form, method)
+    layout, slot = form.layout, Slot.of(form, method)
     rows, count = range(layout.integrated), layout.integrated
     arguments = dict.fromkeys(("state", "here", "g", "by_known"), "ptr")
     with w.function("step_back", "void", arguments, attributes="noinline") as (state, here, g, by_known):
@@ -417,7 +187,7 @@ def _write_event_back(w: Writer, form: Form, asked: int) -> None:
             t, g_t = lanes["t"], w.room(w.real, 1 + len(form.moving))
             with w.counted(0, w.lanes) as lane, w.counted(0, 1 + len(form.moving)) as row:
                 number = w.load("i64", who, lane)
-                there = w.load("double", w.load("ptr", job, _TO_ENDS), w.where(number >= 0, number, 0) * layout.ends + count + row)
+                there = w.load("double", w.load("ptr", job, TO_ENDS), w.where(number >= 0, number, 0) * layout.ends + count + row)
                 w.store(there, w.at(g_t, row * w.lanes + lane, "double"))
             w.call("rates", "void", state, t, state, f, pivots)
             if form.moving:  # the tangent, and its rates, at a number for a time

@@ -1,0 +1,258 @@
+"""The record of steps of a motion's way forth, by which its cotangents go back (`back.py`): one slot for each try of a step, for all lanes of a block.
+
+On a CPU the record grows with the steps. A GPU has memory for so many slots for each thread; of motions that take more, the lanes go forth again for each
+window of slots, the last one first.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from jourdain_jax.motion.integrators.erk_step import LOCATING, RUNNING, Method
+from jourdain_jax.motion.native.functions import Form
+from jourdain_jax.motion.native.layout import Lanes
+from jourdain_jax.motion.native.loop import COUNT, FIRST_ARRAY, NEXT, OWN, TIMES
+from jourdain_jax.motion.native.step import each_row, for_rows
+from jourdain_jax.native.ffi import FIRST_OF_SCRATCH
+from jourdain_jax.native.ir import Value, Writer
+from jourdain_jax.native.threads import lanes_taken, next_lane
+
+STARTS, TO_STATES, TO_ENDS, GOALS, FOUND = range(FIRST_ARRAY, FIRST_ARRAY + 5)
+MOST_SLOTS = 4096  # of a thread of a GPU
+FIRST_SLOTS = 64  # for which there is memory at first; then twice as many, and so on
+
+
+@dataclass(frozen=True)
+class Slot:
+    """Rows of a slot."""
+
+    y: int
+    k: int
+
+    @staticmethod
+    def of(form: Form, method: Method) -> "Slot":
+        return Slot(form.layout.integrated, form.layout.integrated * method.needed)
+
+    @property
+    def t(self) -> int:
+        return self.y + self.k
+
+    @property
+    def taken(self) -> int:
+        return self.t + 1
+
+    @property
+    def saved(self) -> int:
+        return self.t + 2
+
+    @property
+    def all(self) -> int:
+        return self.t + 3
+
+
+class _Rooms(NamedTuple):
+    """Memory of a block: its lanes and their numbers in the batch, of each how many times are saved, its cotangents, and how many slots there are."""
+
+    state: Value
+    who: Value
+    saved: Value
+    g: Value
+    by_known: Value
+    tries: Value
+
+    @staticmethod
+    def of(w: Writer, form: Form, asked: int) -> "_Rooms":
+        rows = form.layout.all, form.layout.integrated, max(asked, 1)
+        state, g, by_known = (w.room(w.real, count) for count in rows)
+        return _Rooms(state, w.room("i64", w.lanes), w.room(w.real), g, by_known, w.room("i64"))
+
+
+def write_record(w: Writer, form: Form, method: Method, asked: int, job: Value) -> None:
+    """Lanes side by side, forth and back, until none is left; inside a function."""
+    if w.device:
+        _write_windows(w, form, method, asked, job)
+    else:
+        _write_blocks(w, form, method, asked, job)
+
+
+def prepare(w: Writer, form: Form, method: Method) -> None:
+    """What the record needs in the module."""
+    if w.device:
+        w.scratch = Slot.of(form, method).all, MOST_SLOTS
+    else:
+        _write_more_room(w)
+
+
+def _write_more_room(w: Writer) -> None:
+    """`more_room(old, bytes)`: twice as many bytes, the first of them as before; null where there are none."""
+    with w.function("more_room", "ptr", {"old": "ptr", "bytes": "i64"}, attributes="noinline") as (old, size):
+        new = w.external("aligned_alloc", "ptr", w.literal(64, "i64"), size * 2)
+        there = w.converted("ptrtoint", new, "i64").differs(0)
+        with w.when(there):
+            w.external("memcpy", "ptr", new, old, size)
+        w.external("free", "void", old)
+        w.give(new)
+
+
+def _write_blocks(w: Writer, form: Form, method: Method, asked: int, job: Value) -> None:
+    """Lanes side by side, forth and back, until none is left."""
+    layout, slot = form.layout, Slot.of(form, method)
+    size = slot.all * w.lanes * 8
+    rooms = _Rooms.of(w, form, asked)
+    state, who, count = rooms.state, rooms.who, rooms.tries
+    record, bytes_there, lanes = w.room("ptr"), w.room("i64"), Lanes(w, layout, state)
+    w.store(w.literal(FIRST_SLOTS * size, "i64"), bytes_there)
+    w.store(w.external("aligned_alloc", "ptr", w.literal(64, "i64"), w.literal(FIRST_SLOTS * size, "i64")), record)
+
+    def has_room() -> Value:
+        return w.converted("ptrtoint", w.load("ptr", record), "i64").differs(0)
+
+    with w.repeated() as leave:
+        leave(w.load("i64", job, NEXT) >= w.load("i64", job, COUNT))
+        leave(~has_room())
+        _take(w, job, who)
+        _write_start(w, form, job, rooms)
+        with w.repeated() as ended:
+            code, number = lanes["code"], w.load("i64", count)
+            ended(~w.any(code.equals(float(RUNNING)) | code.equals(float(LOCATING))))
+            with w.when((number + 1) * size > w.load("i64", bytes_there)):
+                w.store(w.call("more_room", "ptr", w.load("ptr", record), w.load("i64", bytes_there)), record)
+                w.store(w.load("i64", bytes_there) * 2, bytes_there)
+            ended(~has_room())
+            _write_try(w, form, slot, job, rooms, w.at(w.load("ptr", record), number * slot.all, w.real))
+        leave(~has_room())
+        _write_ends(w, form, asked, job, rooms)
+        with w.repeated() as at_start:
+            at_start(w.load("i64", count) <= 0)
+            _write_try_back(w, slot, job, rooms, w.at(w.load("ptr", record), (w.load("i64", count) - 1) * slot.all, w.real))
+        _write_found(w, form, asked, job, rooms)
+    with w.when(~has_room()):
+        _give_nan(w, form, asked, job, who)
+    w.external("free", "void", w.load("ptr", record))
+
+
+def _write_windows(w: Writer, form: Form, method: Method, asked: int, job: Value) -> None:
+    """As `_write_blocks`, on a GPU: the lanes of a warp, in memory for so many of the last slots; the numbers of its threads stand side by side."""
+    slot, rooms = Slot.of(form, method), _Rooms.of(w, form, asked)
+    lanes, here, end = Lanes(w, form.layout, rooms.state), w.room(w.real, slot.all), w.room("i64")
+    (thread, threads), count = w.thread(), rooms.tries
+    record = w.at(w.load("ptr", job, NEXT), thread + FIRST_OF_SCRATCH, w.real)
+    slots = w.binary("sdiv", w.load("i64", job, OWN) - FIRST_OF_SCRATCH, threads * slot.all)
+
+    def place(number: Value, row: int | Value) -> Value:
+        return w.at(record, (w.binary("srem", number, slots) * slot.all + row) * threads, w.real)
+
+    with w.repeated() as leave:
+        leave(~w.together(lanes_taken(w, job, NEXT) < w.load("i64", job, COUNT)))
+        _take(w, job, rooms.who)
+        w.store(w.literal(2**62, "i64"), end)
+        with w.repeated() as done:
+            _write_start(w, form, job, rooms)
+            with w.repeated() as ended:
+                code, number = lanes["code"], w.load("i64", count)
+                on_its_way = w.any(code.equals(float(RUNNING)) | code.equals(float(LOCATING)))
+                ended(~w.together(on_its_way & (number < w.load("i64", end))))
+                _write_try(w, form, slot, job, rooms, here)
+                for_rows(w, range(slot.all), lambda row, number=number: w.store(w.load(w.real, here, row), place(number, row)))
+            with w.when(w.load("i64", end).equals(2**62)):
+                _write_ends(w, form, asked, job, rooms)
+            first = w.load("i64", count) - slots
+            w.store(w.where(first > 0, first, 0), end)
+            with w.repeated() as at_start:
+                number = w.load("i64", count) - 1
+                at_start(~w.together(number >= w.load("i64", end)))
+                for_rows(w, range(slot.all), lambda row, number=number: w.store(w.load(w.real, place(number, row)), here, row))
+                _write_try_back(w, slot, job, rooms, here)
+            done(~w.together(w.load("i64", end) > 0))
+        _write_found(w, form, asked, job, rooms)
+
+
+def _take(w: Writer, job: Value, who: Value) -> None:
+    """The next lanes of the batch; -1 where there is none."""
+    with w.counted(0, w.lanes) as lane:
+        number = next_lane(w, job, NEXT)
+        w.store(w.where(number < w.load("i64", job, COUNT), number, -1), who, lane)
+
+
+def _write_start(w: Writer, form: Form, job: Value, rooms: "_Rooms") -> None:
+    """All lanes at their starts."""
+    with w.counted(0, form.layout.all) as row:
+        w.store(w.number(1.0), rooms.state, row)
+    with w.counted(0, w.lanes) as lane:
+        w.call("begin", "void", job, rooms.state, rooms.who, lane)
+    w.store(w.number(0.0), rooms.saved)
+    w.call("note", "void", job, rooms.state, rooms.who, rooms.saved)
+    w.store(w.literal(0, "i64"), rooms.tries)
+
+
+def _write_try(w: Writer, form: Form, slot: Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
+    """A step that is tried, and its slot `here`."""
+    lanes = Lanes(w, form.layout, rooms.state)
+    each_row(w, range(form.layout.integrated), here, lambda i: w.load(w.real, rooms.state, i))
+    w.store(lanes["t"], here, slot.t)
+    w.store(w.load(w.real, rooms.saved), here, slot.saved)
+    w.call("step", "void", rooms.state, w.at(here, slot.y, w.real))
+    w.store(lanes["taken"], here, slot.taken)
+    w.call("note", "void", job, rooms.state, rooms.who, rooms.saved)
+    w.store(w.load("i64", rooms.tries) + 1, rooms.tries)
+
+
+def _write_ends(w: Writer, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
+    """Cotangents of the states at the end of a block."""
+    g, layout = rooms.g, form.layout
+    each_row(w, range(asked), rooms.by_known, lambda i: w.number(0.0))
+    ends, per_end = w.load("ptr", job, TO_ENDS), layout.ends
+    with w.counted(0, w.lanes) as lane:
+        number = w.load("i64", rooms.who, lane)
+        with w.counted(0, layout.integrated) as row:
+            found = w.load("double", ends, w.where(number >= 0, number, 0) * per_end + row)
+            w.store(w.where(number >= 0, found, w.literal(0.0, "double")), w.at(g, row * w.lanes + lane, "double"))
+    # what was not reached repeats the last state
+    all_times = w.room(w.real)
+    with w.counted(0, w.lanes) as lane:
+        w.store(w.converted("sitofp", w.load("i64", job, TIMES), "double"), w.at(all_times, lane, "double"))
+    w.call("added", "void", job, rooms.who, w.load(w.real, rooms.saved), w.load(w.real, all_times), g)
+    if form.has_events:
+        w.call("event_back", "void", job, rooms.state, rooms.who, g, rooms.by_known)
+
+
+def _write_try_back(w: Writer, slot: Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
+    """Back over the try in a slot."""
+    before = w.load(w.real, here, slot.saved)
+    w.call("added", "void", job, rooms.who, before, w.load(w.real, rooms.saved), rooms.g)
+    w.store(before, rooms.saved)
+    with w.when(w.any(w.load(w.real, here, slot.taken).differs(0.0))):
+        w.call("step_back", "void", rooms.state, here, rooms.g, rooms.by_known)
+    w.store(w.load("i64", rooms.tries) - 1, rooms.tries)
+
+
+def _write_found(w: Writer, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
+    """The results of a block."""
+    g, layout = rooms.g, form.layout
+    w.call("added", "void", job, rooms.who, w.number(0.0), w.load(w.real, rooms.saved), g)
+    found, each = w.load("ptr", job, FOUND), layout.integrated + asked
+    with w.counted(0, w.lanes) as lane:
+        number = w.load("i64", rooms.who, lane)
+        with w.when(number >= 0):
+            with w.counted(0, layout.integrated) as row:
+                w.store(w.load("double", g, row * w.lanes + lane), found, number * each + row)
+            with w.counted(0, asked) as row:
+                w.store(w.load("double", rooms.by_known, row * w.lanes + lane), found, number * each + layout.integrated + row)
+
+
+def _give_nan(w: Writer, form: Form, asked: int, job: Value, who: Value) -> None:
+    """Where no memory is left: NaN for this block and for all lanes that are left."""
+    found, each = w.load("ptr", job, FOUND), form.layout.integrated + asked
+
+    def lost(number: Value) -> None:
+        with w.counted(0, each) as row:
+            w.store(w.literal(math.nan, "double"), found, number * each + row)
+
+    with w.counted(0, w.lanes) as lane:
+        number = w.load("i64", who, lane)
+        with w.when(number >= 0):
+            lost(number)
+    with w.repeated() as leave:
+        number = next_lane(w, job, NEXT)
+        leave(number >= w.load("i64", job, COUNT))
+        lost(number)
