@@ -475,11 +475,11 @@ FILES: dict[str, Case] = {
     "jj.load_trajectory('nowhere.npz', Bead)": ("ValueError", "there is no file `nowhere.npz`; check the path"),
     "jj.load_trajectory('half.npz', Bead)": (
         "ValueError",
-        "`half.npz` is no trajectory file, or is damaged (File is not a zip file); expected an .npz written by `save`",
+        "`half.npz`: is no trajectory file written by `save` (File is not a zip file)",
     ),
-    "jj.load_trajectory('empty.npz', Bead)": ("ValueError", "`empty.npz` is no trajectory file, or is damaged (No data left in file)"),
-    "jj.load_trajectory('text.npz', Bead)": ("ValueError", "`text.npz` is no trajectory file, or is damaged"),
-    "jj.load_trajectory('.', Bead)": ("ValueError", "`.` is no trajectory file, or is damaged ([Errno 21] Is a directory: '.')"),
+    "jj.load_trajectory('empty.npz', Bead)": ("ValueError", "`empty.npz`: is no trajectory file written by `save` (File is not a zip file)"),
+    "jj.load_trajectory('text.npz', Bead)": ("ValueError", "`text.npz`: is no trajectory file written by `save`"),
+    "jj.load_trajectory('.', Bead)": ("ValueError", "`.` cannot be read (Is a directory)"),
     "jj.load_trajectory(3.5, Bead)": ("ValueError", "`path` is a float, expected the name of a file"),
     "jj.load_trajectory('run.npz', 3)": ("ValueError", "`scene` is an int, expected the class of the scene that moved, or any scene of that class"),
     "jj.load_trajectory('run.npz', ChaplyginSleigh)": (
@@ -496,14 +496,14 @@ FILES: dict[str, Case] = {
         "`later.npz` has format 9, expected 1; read it with the version of jourdain-jax that wrote it",
     ),
     "jj.load_trajectory(rewritten('bare.npz', solver=None), Bead)": ("ValueError", "`bare.npz` lacks `solver`; it is damaged or was not written by `save`"),
-    "jj.load_trajectory(rewritten('headless.npz', header=None), Bead)": ("ValueError", "`headless.npz` is no trajectory file, or is damaged ('header')"),
+    "jj.load_trajectory(rewritten('headless.npz', header=None), Bead)": ("ValueError", "`headless.npz`: is no trajectory file written by `save` ("),
     "jj.load_trajectory(rewritten('broken.npz', header=np.array('{')), Bead)": (
         "ValueError",
-        "`broken.npz` is no trajectory file, or is damaged (Expecting property name",
+        "`broken.npz`: is no trajectory file written by `save` (Expecting property name",
     ),
     "jj.load_trajectory(rewritten('listed.npz', header=np.array('[1]')), Bead)": (
         "ValueError",
-        "`listed.npz` is no trajectory file, or is damaged (its header is no dictionary)",
+        "`listed.npz` has a header that is no dictionary",
     ),
     "jj.load_trajectory(rewritten('other.npz', coordinates=['r', 'phi']), Bead)": ("ValueError", "the file holds the coordinates r, phi, but `Bead` has x, y"),
     "jj.load_trajectory(rewritten('minus.npz', parameter_mass=np.array(-1.0)), Bead)": (

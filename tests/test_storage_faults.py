@@ -1,7 +1,9 @@
 """Files that are not what they say: whatever entry is taken away, or changed, is named; and an old file stays until a new one is whole."""
 
+import io
 import json
 import os
+import zipfile
 
 import equinox as eqx
 import jax
@@ -132,6 +134,109 @@ def test_whatever_happens_to_an_entry_of_the_header_is_noticed(saved, tmp_path):
         except ValueError as error:
             silent += [] if str(new) in str(error) or "the file holds" in str(error) else [f"{what}: {error}"]
     assert not silent
+
+
+def _rezipped(path, new, change):
+    """The archive with its members changed: name and content -> (name, content), or several of these."""
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(new, "w") as written:
+        for member in old.infolist():
+            for name, content in change(member.filename, old.read(member)):
+                written.writestr(name, content)
+    return new
+
+
+def _claiming(shape):
+    """The array `q` with another shape in its head, of the same length."""
+
+    def change(name, content):
+        if name != "q.npy":
+            return [(name, content)]
+        end = content.index(b"\n")
+        head = content[:end].decode("latin-1")
+        told = head[: head.index("'shape': ")] + f"'shape': {shape}, }}"
+        return [(name, told.ljust(end).encode("latin-1") + content[end:])]
+
+    return change
+
+
+def _with_header(text):
+    return lambda name, content: [(name, _bytes_of(np.array(text)) if name == "header.npy" else content)]
+
+
+def _bytes_of(array):
+    held = io.BytesIO()
+    np.save(held, array)
+    return held.getvalue()
+
+
+ARCHIVES = {
+    "claims 8 TB": _claiming("(1000000, 1000000)"),
+    "claims no numbers": _claiming("(-3, -4)"),
+    "claims less": _claiming("(1, 4)"),
+    "a header of lists": _with_header("[" * 5000 + "]" * 5000),
+    "a deep header": _with_header('{"a": ' * 400 + "1" + "}" * 400),
+    "a header that is no JSON": _with_header("{'a': 1}"),
+    "an array twice": lambda name, content: [(name, content)] * (2 if name == "q.npy" else 1),
+    "objects": lambda name, content: [(name, _bytes_of(np.array([{}, None])) if name == "q.npy" else content)],
+    "an array without a head": lambda name, content: [(name, content[10:] if name == "q.npy" else content)],
+    "a head that is code": lambda name, content: [(name, content[:10] + b"(" * 100 + content[110:] if name == "q.npy" else content)],
+}
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+@pytest.mark.parametrize("change", ARCHIVES.values(), ids=ARCHIVES)
+def test_an_archive_that_claims_what_it_does_not_hold_is_named(saved, tmp_path, change):
+    kind, _, path = saved
+    new = _rezipped(path, tmp_path / "new.npz", change)
+    with pytest.raises(ValueError, match=r"new.npz`.* (is no|nested|has)") as error:
+        READ[kind](new, Belt)
+    assert len(str(error.value)) < 600
+
+
+def test_whatever_happens_to_a_byte_of_a_file_it_is_the_motion_or_named(saved, tmp_path):
+    """Also in what the archive says of itself: flags, ways of compression, lengths, names."""
+    kind, motion, path = saved
+    whole, new = path.read_bytes(), tmp_path / "new.npz"
+    generator = np.random.default_rng(2)
+    directory = whole.index(b"PK\x01\x02")
+    places = [*generator.integers(len(whole), size=30), *generator.integers(directory, len(whole), size=30)]
+    places += [*range(4, 28, 2), *range(directory + 4, directory + 46, 2)]
+    noticed = 0
+    for place in places:
+        for byte in (whole[place] ^ 1 << int(generator.integers(8)), int(generator.integers(256))):
+            new.write_bytes(whole[:place] + bytes([byte]) + whole[place + 1 :])
+            if byte == whole[place]:
+                continue
+            try:
+                good = _is_as_it_was(READ[kind](new, Belt), motion, allowed=True)
+            except ValueError as error:
+                noticed += 1
+                good = "new.npz" in str(error)
+            assert good, (place, byte)
+    assert noticed > 60
+
+
+def test_times_that_are_turned_round_are_noticed(saved, tmp_path):
+    kind, _, path = saved
+    arrays, _ = _contents(path)
+    ts = arrays["ts"]
+    for k, other in enumerate((ts[..., ::-1], ts + 0.1, -ts, np.roll(ts, 1, axis=-1), ts * 2)):
+        new = rewritten(path, tmp_path / f"{k}.npz", {"ts": other})
+        with pytest.raises(ValueError, match="has times in `ts` that do not go one way, towards the end of the motion"):
+            READ[kind](new, Belt)
+
+
+def test_motions_back_in_time_and_to_an_event_are_read_back(tmp_path):
+    scene = jj.models.TiltingDisc()
+    start = {"lean": 0.3, "spin_rate": -3.0}
+    for k, motion in enumerate((
+        jj.simulate(scene, start, t0=1.0, t1=0.0),
+        jj.simulate(scene, {"lean": 0.9}, t1=5.0),  # falls
+        jj.simulate(scene, start, ts=np.array([0.3, 0.3 + 1e-15, 0.7])),
+        jj.simulate(scene, start, ts=np.array([0.5])),
+    )):
+        jj.save(motion, tmp_path / f"{k}.npz")
+        assert_equal_to_the_bit(jj.load_trajectory(tmp_path / f"{k}.npz", type(scene)), motion)
 
 
 def test_a_parameter_that_the_file_lacks_is_not_the_default(saved, tmp_path):

@@ -62,15 +62,15 @@ def whole_number(text: str, what: str, low: int, high: int) -> int:
 
 
 def parsed(parse: Callable, content, source: str, what: str):
-    """Return what `parse` makes of the content of `source`; an error of its own (ValueError, SyntaxError, LookupError: unknown encodings), or nesting without
-    end, becomes a ValueError that names the source and `what` was expected.
+    """Return what `parse` makes of the content of `source`. Whatever a parser raises (of XML a SyntaxError, of archives half a dozen kinds), or runs out of,
+    becomes a ValueError that names the source and `what` was expected.
     """
     try:
         return parse(content)
     except RecursionError:
         raise _too_deep(source) from None
-    except (ValueError, SyntaxError, LookupError) as error:
-        raise ValueError(f"{source}: is no {what} ({shortened(error, 200)})") from None
+    except Exception as error:
+        raise ValueError(f"{source}: is no {what} ({shortened(error, 200) or type(error).__name__})") from None
 
 
 def check_depth(root, inner: Callable[..., Iterable], source: str) -> None:

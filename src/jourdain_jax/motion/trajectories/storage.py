@@ -12,17 +12,19 @@ What is absent, or is not what the names and the number of times ask for, is an 
 """
 
 import contextlib
+import io
 import json
+import math
 import os
 import secrets
 import zipfile
-import zlib
 from dataclasses import fields
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.calculus.reading import check_depth, parsed
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.batches.rollout import RERUN_FIELDS, Rollout
 from jourdain_jax.motion.inputs import Inputs, Sampled
@@ -37,6 +39,7 @@ from jourdain_jax.scene.scene import Scene
 
 _ARRAYS = tuple(name for name in AXES if name not in ("inputs", "work"))
 _NEEDS_NUMBERS = jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError
+MOST_DENSE = 1100  # bytes that a compressed one stands for, at most: deflate's longest match
 _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load_rollout(path, scene)"}
 
 
@@ -221,16 +224,17 @@ def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type
     """Header and arrays of a file of this kind, and the class of its scene."""
     if not isinstance(path, str | os.PathLike):
         raise ValueError(f"`path` is {described(path)}, expected the name of a file")
+    what = f"{kind} file written by `save`"
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files if name in (*AXES, "header") or name.startswith("parameter:")}
-        header = json.loads(str(arrays.pop("header")))
-        if not isinstance(header, dict):
-            raise ValueError("its header is no dictionary")
-    except FileNotFoundError:
-        raise ValueError(f"there is no file `{path}`; check the path") from None
-    except (OSError, ValueError, TypeError, AttributeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"`{path}` is no {kind} file, or is damaged ({error}); expected an .npz written by `save`") from None
+        with open(path, "rb") as file:
+            arrays = parsed(_unpacked, file, f"`{path}`", what)
+    except OSError as error:
+        said = f"there is no file `{path}`" if isinstance(error, FileNotFoundError) else f"`{path}` cannot be read ({error.strerror})"
+        raise ValueError(f"{said}; check the path") from None
+    header = parsed(json.loads, str(arrays.pop("header", "")), f"`{path}`", what)
+    check_depth(header, lambda x: x.values() if isinstance(x, dict) else x if isinstance(x, list) else (), f"`{path}`")
+    if not isinstance(header, dict):
+        raise refused(path, "has a header that is no dictionary")
     if header.get("format") != 1 or isinstance(header["format"], bool):
         raise ValueError(f"`{path}` has format {header.get('format')}, expected 1; read it with the version of jourdain-jax that wrote it")
     found = header.get("kind")
@@ -245,6 +249,26 @@ def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type
         raise refused(path, f"lacks `{missing[0]}`")
     check_arrays(path, header, arrays)
     return header, arrays, _checked_class(path, scene, header, arrays)
+
+
+def _unpacked(file) -> dict[str, np.ndarray]:
+    """The arrays of a zip archive by name, each as large as its content: what a member claims beyond that is never allocated."""
+    found = {}
+    with zipfile.ZipFile(file) as archive:
+        for member in archive.infolist():
+            name = member.filename.removesuffix(".npy")
+            if name not in (*AXES, "header") and not name.startswith("parameter:"):
+                continue
+            if name in found or member.file_size > MOST_DENSE * member.compress_size + 1000:
+                raise ValueError(f"`{name}` is there twice" if name in found else f"`{name}` claims {member.file_size} bytes")
+            content = archive.read(member)
+            head = io.BytesIO(content)
+            of_version = np.lib.format.read_array_header_1_0 if np.lib.format.read_magic(head) == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, by_columns, dtype = of_version(head)
+            if dtype.hasobject or head.tell() + dtype.itemsize * math.prod(shape) != len(content):
+                raise ValueError(f"`{name}` claims an array of shape {shape} in {len(content)} bytes")
+            found[name] = np.ndarray(shape, dtype, content, head.tell(), order="F" if by_columns else "C")
+    return found
 
 
 def _parameters(arrays: dict) -> dict:

@@ -89,6 +89,8 @@ def _check_finite(path, arrays: dict) -> None:
         if np.any(np.isnan(arrays[name])):
             raise refused(path, f"has times in `{name}` that are no numbers")
     reached = np.all(np.isfinite(arrays["q"]), axis=-1)
+    if np.any(whole & ~_go_one_way(arrays, reached)):
+        raise refused(path, "has times in `ts` that do not go one way, towards the end of the motion")
     due = np.isfinite(arrays["ts"]) & (np.asarray(arrays["result"]) == SUCCESS)[..., None]
     for name in ("q", "u", "inputs", *(["work"] if "work" in arrays else [])):
         values = arrays[name].reshape(*arrays["ts"].shape, -1)
@@ -96,6 +98,15 @@ def _check_finite(path, arrays: dict) -> None:
         apart = (np.any(np.isfinite(values), axis=-1) if name in ("q", "u") else reached) & ~finite
         if np.any((due | (apart & whole[..., None])) & ~finite):
             raise refused(path, f"has numbers in `{name}` that are not finite at times that were reached")
+
+
+def _go_one_way(arrays: dict, reached: np.ndarray) -> np.ndarray:
+    """Whether the saved times that each lane reached go one way, and to its end but for round-off."""
+    ts, end = np.asarray(arrays["ts"], float), np.asarray(arrays["t_end"], float)[..., None]
+    with np.errstate(invalid="ignore"):  # of motions that failed
+        steps = np.diff(np.concatenate([np.where(np.isfinite(ts) & reached, ts, end), end], axis=-1), axis=-1)
+    slack = 1e-6 * np.max(np.abs(steps), axis=-1, keepdims=True)
+    return np.asarray(np.all(steps >= -slack, axis=-1) | np.all(steps <= slack, axis=-1))
 
 
 def check_scenes(path, scene: Scene, result) -> None:
