@@ -16,8 +16,9 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.build.plausibility import body_faults
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.calculus.guards import forward_only, reverse_only
-from jourdain_jax.calculus.nan_where import nan_where
-from jourdain_jax.calculus.reals import in_default_precision, real_type
+from jourdain_jax.calculus.lanes_first import lanes_first
+from jourdain_jax.calculus.nan_where import entered, left
+from jourdain_jax.calculus.reals import in_default_precision
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.arguments import times_fit
 from jourdain_jax.motion.energy_check import conserves, energies_near, energy_lost
@@ -46,12 +47,13 @@ def integrate(setup: Setup) -> Trajectory | None:
 
 def _one_motion(setup: Setup) -> tuple[Trajectory, Bool[Array, ""]]:
     """The motion, and whether its start came onto the rows."""
-    setup, arrived = _with_machine_code(_prepared(setup)), jnp.array(True)
+    given, arrived = _with_machine_code(_prepared(setup)), jnp.array(True)
+    setup, asked = _entered(given)
     if not isinstance(setup.start, State):
         start, arrived = moved_onto_rows(setup.scene, setup.t0, setup.start, setup.inputs(setup.t0))
         setup = setup._replace(start=start)
     begun, fitting = _begin(setup), setup.fitting()
-    return _finish(setup, fitting, begun, setup.integrator.solved(fitting, begun)), arrived
+    return _finish(given, fitting, asked, begun, setup.integrator.solved(fitting, begun)), arrived
 
 
 def _compiler_options(setup: Setup) -> dict | None:
@@ -86,10 +88,22 @@ def _with_machine_code(setup: Setup) -> Setup:
 
 def integrate_lanes(setups: Setup) -> Trajectory:
     """The motions of all lanes: `lockstep.width` lanes at a time where the rates are a scalar program, otherwise under `vmap`."""
-    setups = _with_machine_code(_prepared(setups))
+    given = _with_machine_code(_prepared(setups))
+    setups, asked = eqx.filter_vmap(_entered)(given)
     begun, fitting = eqx.filter_vmap(_begin)(setups), eqx.filter_vmap(Setup.fitting)(setups)
     solved = setups.integrator.lanes_solved(fitting, begun)
-    return eqx.filter_vmap(_finish)(setups, fitting, begun, solved)
+    return eqx.filter_vmap(_finish)(given, fitting, asked, begun, solved)
+
+
+def _entered(setup: Setup) -> tuple[Setup, Float[Array, ""]]:
+    """The setup, whose derivatives are zero where nothing is asked of its motion, and NaN where what failed is;
+    and the zero by which `_finish` tells (`calculus/nan_where.py`).
+    """
+    names = ("scene", "start", "inputs", "t0", "t1", "ts")
+    numbers, rest = eqx.partition({name: getattr(setup, name) for name in names}, eqx.is_inexact_array)
+    leaves, treedef = jax.tree.flatten(numbers)
+    each, asked = zip(*map(entered, lanes_first(leaves)), strict=True)  # also of what all motions share
+    return setup._replace(**eqx.combine(jax.tree.unflatten(treedef, each), rest)), sum(asked)
 
 
 def _begin(setup: Setup) -> Begun:
@@ -100,7 +114,7 @@ def _begin(setup: Setup) -> Begun:
     return Begun(right, timely, start, args, field.pack(start.q, start.u))
 
 
-def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
+def _finish(given: Setup, setup: Setup, asked: Float[Array, ""], begun: Begun, solved: Solved) -> Trajectory:
     t0, field, integrator = setup.t0, setup.field, setup.integrator
     start, args = begun.start, begun.args
     _, scene, inputs, fixed, origin = args
@@ -124,34 +138,45 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
     start_and_end = (jnp.zeros_like(solved.t_end), begun.y0, begun.timely), (solved.t_end, solved.y_end, begun.timely)
     all_states = jax.tree.map(lambda saved, first, last: jnp.concatenate([first[None], saved, last[None]]), (solved.ts, solved.ys, valid), *start_and_end)
     found, pivots, states = jax.vmap(saved_state)(*all_states)
-    wrong = _wrong(begun.right, setup)
-    q, u, work = jax.tree.map(lambda x: jnp.where(begun.right, x, wrong), found)
+    found = jax.tree.map(lambda x: jnp.where(begun.right, x, jnp.nan), found)
     # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
     # without rows all are one, which XLA would go through while it compiles, for seconds, were it to know them
     pivots = jax.lax.optimization_barrier(pivots)
     pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.asarray(jnp.inf, pivots.dtype), jnp.fmin, (0,))
     pivot = jnp.fmin(pivot, jnp.asarray(solved.pivot, pivots.dtype))
     lost = energy_lost(energies_near(setup, args, *states), solved.accepted) if conserves(setup) else False
-    violated = rows_violated(setup, states[0], q, u) if field.rows_may_contradict else False
+    violated = rows_violated(setup, states[0], *found[:2]) if field.rows_may_contradict else False
     code = jnp.where(results.is_success(solved.code) & lost, results.ENERGY_LOST, solved.code)
     code = jnp.where(results.is_success(code) & violated, results.CONTRADICTORY_ROWS, code)
     unwatched = reason_against_watching(setup)
+    result = results.with_causes(
+        _result(code, solved.y_end, start, pivot if field.needs_pivot else jnp.inf),
+        parameters=begun.right,
+        times=begun.timely,
+        start=jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)),
+        moved=solved.accepted > 0,
+    )
+    failed = ~results.is_success(result)
+    # what the steps did not notice happened at a time that is not known
+    passed = (result == results.SINGULAR_PARTITION) & (pivot > 0) & ~results.is_success(solved.code)
+    noticed = passed | (result == solved.code) | (result == results.NOT_FINITE)
+    beyond = failed & ~(noticed & jnp.append(valid, False))  # of the saved states, and of the end
+
+    def marked(x, failed):
+        return left(jnp.reshape(failed, (*failed.shape, *[1] * (x.ndim - failed.ndim))), asked, x)
+
+    q, u, work = jax.tree.map(lambda x: marked(x[1:], beyond), found)
+    t_end = jnp.where(solved.t_end == setup.t1 - origin, setup.t1, origin + solved.t_end)
     return Trajectory(
-        scene=setup.scene,
+        scene=given.scene,
         ts=given.ts if integrator.saveat is None else origin + solved.ts,
-        q=q[1:-1],
-        u=u[1:-1],
-        work=None if work is None else work[1:-1],
-        t_end=jnp.where(begun.timely, jnp.where(solved.t_end == setup.t1 - origin, setup.t1, origin + solved.t_end), given.t0),
+        q=q[:-1],
+        u=u[:-1],
+        work=None if work is None else work[:-1],
+        t_end=marked(jnp.where(begun.timely, t_end, given.t0), failed),
         q_end=q[-1],
         u_end=u[-1],
-        result=results.with_causes(
-            _result(code, solved.y_end, start, pivot if field.needs_pivot else jnp.inf),
-            parameters=begun.right,
-            times=begun.timely,
-            start=jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)),
-            moved=solved.accepted > 0,
-        ),
+        result=result,
         event=solved.event,
         accepted=solved.accepted,
         rejected=solved.rejected,
@@ -159,10 +184,10 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
         crossings=jnp.full_like(solved.crossings, -1) if unwatched else solved.crossings,
         together=solved.together,
         fallback=jnp.zeros((), jnp.int32) + results.AS_ASKED,
-        moved_q=start.moved_q,
-        moved_u=start.moved_u,
-        smallest_pivot=pivot,
-        inputs=inputs,
+        moved_q=marked(start.moved_q, failed),
+        moved_u=marked(start.moved_u, failed),
+        smallest_pivot=marked(pivot, failed),
+        inputs=given.inputs,
         state_form=field.name,
         reduction=field.reduction_name if setup.reason_against_machine_code else f"{field.reduction_name} to machine code",
         solver=integrator.name,
@@ -181,12 +206,6 @@ def _without_faults(setup: Setup):
     else:
         right = seen.is_right(program, scene, t0, start.q)
     return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u)))
-
-
-def _wrong(right: Bool[Array, ""], setup: Setup) -> Float[Array, ""]:
-    """NaN where a parameter is not right; so are its derivatives with respect to all parameters: no step was taken, and those of states stayed zero."""
-    numbers = [jnp.sum(x) for x in jax.tree.leaves(setup.scene) if eqx.is_inexact_array(x)]
-    return nan_where(~right, sum(numbers, jnp.zeros((), real_type())))
 
 
 def _result(code, y_end: Integrated, start: State, pivot):

@@ -164,9 +164,8 @@ def rollout(
     - `chunk`: lanes that run together (default: 512, less where saved states would pass 1 GiB); `progress`: a bar (default: with several chunks).
     - `options`: further ones as in `simulate`; inputs are those of all lanes. Where lanes differ in inputs, take `jax.vmap` of `simulate`.
 
-    Raises ValueError for unknown names and unequal lengths. Lanes never raise: see `Rollout.failed` and `print(rollout)`. In reverse mode a lane whose start
-    or parameters are NaN makes derivatives with respect to what all lanes share NaN, even where its result is not used, as everywhere in JAX: leave it
-    out first.
+    Raises ValueError for unknown names and unequal lengths. Lanes never raise: see `Rollout.failed` and `print(rollout)`. Derivatives of
+    what lies after a failure are NaN; `jnp.where(rollout.lanes.succeeded, ..., 0.0)` leaves such lanes out of a loss, and of its derivatives.
 
     **Examples**
 

@@ -32,8 +32,8 @@ from jourdain_jax.scene.printing import preformatted, shapes_of
 class Trajectory(Record):
     """The motion of a scene. Times after an early end (event, failure) hold NaN.
 
-    `t_end`, `q_end`, `u_end` are the last state that was reached, of a failed motion the one at which it failed. What is made of them by itself, such as a
-    loss to be minimised, takes `motion.nan_if_failed()`, or looks at `motion.succeeded`.
+    `t_end`, `q_end`, `u_end` are the last state that was reached, of a failed motion the one at which it failed, with derivatives of
+    NaN. What is made of them by itself, such as a loss to be minimised, takes `motion.nan_if_failed()`, or looks at `motion.succeeded`.
     """
 
     def __getitem__(self, name: str) -> Float[Array, "times *shape"]:
