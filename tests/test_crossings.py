@@ -13,6 +13,7 @@ import pytest
 
 import jourdain_jax as jj
 from jourdain_jax.lowering.lower import lowered
+from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native import ffi
 
 BACKENDS = ("xla", *(() if ffi.reason_against() else ("native",)))
@@ -190,3 +191,31 @@ def test_what_is_not_watched_is_said():
     assert "not watched: the scene has no scalar program" in str(dense)
     assert "solvers of diffrax do not" in by_diffrax.unwatched
     assert not motion(Guarded()).unwatched
+
+
+class Friction(Sliding):
+    def force(self, t, x, v):
+        return -2.0 * jnp.sign(v)
+
+
+def test_a_motion_that_burns_its_steps_names_the_load_that_jumps():
+    stuck = motion(Friction(), max_steps=2000)
+    assert not stuck.succeeded
+    assert "the force along `x_rate` jumps, or has a kink, at the last state" in stuck.message
+
+
+class Ring(jj.Scene):
+    coordinates = jj.coordinates("x y")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(1.0, jnp.stack([q.x, q.y, 0 * q.x]))}
+
+    def geometric_constraints(self, pose):
+        return {"ring": pose.q.x**2 + pose.q.y**2 - 1.0}
+
+
+@pytest.mark.parametrize("backend", [*BACKENDS, "dense"])
+def test_a_tolerance_that_the_precision_does_not_hold_is_the_cause_that_is_told(backend):
+    lost = jj.simulate(Ring(), {"x": 1.0, "y_rate": 1.0}, ts=[1.0], rtol=1e-60, atol=1e-60, backend=backend, formulation=jj.Formulation("full"))
+    assert int(lost.result) == results.UNRESOLVED
+    assert "`rtol` is less than this precision resolves" in lost.message

@@ -155,6 +155,7 @@ def _finish(given: Setup, setup: Setup, asked: Float[Array, ""], begun: Begun, s
         times=begun.timely,
         start=jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)),
         moved=solved.accepted > 0,
+        resolved=jnp.asarray(setup.tolerances[0] >= jnp.finfo(start.q.dtype).eps),
     )
     failed = ~results.is_success(result)
     # what the steps did not notice happened at a time that is not known

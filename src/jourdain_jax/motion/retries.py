@@ -81,7 +81,11 @@ def may_be_another_form(field: VectorField) -> tuple[str, ...]:
 def lost_codes(field: VectorField) -> tuple[int, ...]:
     """Result codes after which another form of the state may do better."""
     guarded = field.lowered is not None and (field.lowered.guards or field.lowered.pivots)
-    return (results.SINGULAR_PARTITION, results.STEP_TOO_SMALL, results.NOT_FINITE, results.UNSOLVED_STEP) if guarded else (results.SINGULAR_PARTITION,)
+    return (
+        (results.SINGULAR_PARTITION, results.STEP_TOO_SMALL, results.NOT_FINITE, results.UNSOLVED_STEP, results.UNRESOLVED)
+        if guarded
+        else (results.SINGULAR_PARTITION,)
+    )
 
 
 def _is_stiff(field: VectorField, motion: Trajectory, t0) -> bool:

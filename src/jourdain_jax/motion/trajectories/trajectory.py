@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jourdain_jax.build.load_jumps import loads_without_slope
 from jourdain_jax.build.plausibility import body_faults
 from jourdain_jax.build.structure import usual_rows
 from jourdain_jax.calculus.nan_where import nan_where
@@ -145,6 +146,9 @@ class Trajectory(Record):
         text = results.MESSAGES[code]
         if code == results.BAD_PARAMETER:
             return f"{text} ({', '.join(self.faults)}); check where it was computed"
+        if code in (results.MAX_STEPS, results.SHRANK, results.STEP_TOO_SMALL, results.STIFF):
+            jumping = loads_without_slope(self.scene, self.t_end, self.q_end, self.u_end, inputs_at(self.inputs, self.t_end))
+            return text + f"; {jumping} jumps, or has a kink, at the last state: let it change within a short range, as by `jnp.tanh`" * bool(jumping)
         return f"{text} `{self.event_names[int(self.event)]}`" if code == results.EVENT else text
 
     @property
