@@ -113,8 +113,8 @@ def disc(repeats: int) -> list[Figure]:
         f"({found['scipy'].nfev} steps), with jacfwd {1e3 * times['jacfwd']:.1f} ms ({found['jacfwd'].nfev} steps)"
     )
     return [
-        figure("warm fit over SciPy with differences", "tilting-disc", times["fit"] / times["differences"], 0.5),
-        figure("warm fit over SciPy with jacfwd", "tilting-disc", times["fit"] / times["jacfwd"], 0.6),
+        figure("warm fit over SciPy with differences", "tilting-disc", times["fit"] / times["differences"], 0.7),
+        figure("warm fit over SciPy with jacfwd", "tilting-disc", times["fit"] / times["jacfwd"], 1.3),
         figure("warm fit with the delay of a sensor over one without", "tilting-disc", both["late"] / both["fit"]),
         figure("estimates apart from SciPy's, standard errors", "tilting-disc", float(apart), 0.01),
     ]

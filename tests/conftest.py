@@ -81,6 +81,16 @@ def _compiled_programs_are_dropped():
     gc.freeze()
 
 
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list:
+    """All figures of matplotlib that are written."""
+    from matplotlib.figure import Figure
+
+    figures, written = [], Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *given, **named: figures.append(self) or written(self, *given, **named))
+    return figures
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """In a process that runs tests: run-time checks, and compiled programs kept in pytest's cache, so that a second run does not compile again."""
     config.option.loadscopereorder = False  # pytest-xdist would hand out files by their number of tests, and not in the order above

@@ -93,7 +93,7 @@ def for_runs(fit, runs: Experiment | Sequence[Experiment], fitted: bool = False)
     checked = as_runs(asked.scene, runs, asked.simulation)
     unknowns = unknowns_of(asked.scene, checked, asked.free)
     of_runs = asked.scene, checked, unknowns.layout, asked.simulation, None
-    lanes = Piecewise(*of_runs, unknowns, asked.shooting) if fitted and asked.shooting is not None else Lanes(*of_runs, asked.loss)
+    lanes = Piecewise(*of_runs, unknowns, asked.shooting) if fitted and asked.shooting is not None else Lanes(*of_runs)
     problem = Problem(asked.scene, checked, unknowns, lanes, asked.loss)
     if problem.with_memory:
         problem.tau = np.array([[float(fit.correlation_time[name]) for name in problem.with_memory]])

@@ -171,7 +171,7 @@ def _fitted(fit, again: TakenUp, generator: np.random.Generator, count: int, poo
     """So many repeats, fitted. `pools`: noise of channels to draw from; none: it is that of the sigmas."""
     problem, asked, limits = again.problem, fit.asked, again.limits
     runs = _drawn(fit, problem, generator, count, pools)
-    lanes = Lanes(asked.scene, runs, problem.unknowns.layout, asked.simulation, count, asked.loss)
+    lanes = Lanes(asked.scene, runs, problem.unknowns.layout, asked.simulation, count)
     of_repeats = Problem(asked.scene, runs, problem.unknowns, lanes, asked.loss)
     of_repeats.prior_mean = _drawn_priors(problem, again.theta[0], generator, count)
     of_repeats.tau = np.tile(problem.tau, (count, 1))

@@ -150,7 +150,7 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
     asked = Asked(scene, free, simulation, loss or LEAST_SQUARES, control, shooting)
     of_runs = scene, runs, unknowns.layout, simulation, members
     pieces = None if shooting is None else Piecewise(*of_runs, unknowns, shooting)
-    problem = Problem(scene, runs, unknowns, Lanes(*of_runs, asked.loss) if pieces is None else pieces, asked.loss)
+    problem = Problem(scene, runs, unknowns, Lanes(*of_runs) if pieces is None else pieces, asked.loss)
     theta = unknowns.first_guesses(guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
     limits = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
     if pieces is None:

@@ -17,7 +17,6 @@ Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from jaxtyping import Bool, Float, Int
 
 from jourdain_jax.analysis.arrow import Arrow
 from jourdain_jax.analysis.joined import JoinedArrow
-from jourdain_jax.analysis.pace import BEGIN, LEAST, MOST, NUMBERS, SLOW, SURELY, Pace, after_trial, shrinkage
+from jourdain_jax.analysis.pace import LEAST, MOST, SLOW, SURELY, Pace
 
 LEAST_COLUMN = 1e-8  # of the longest column of J, both times the sizes of their unknowns: what counts as zero
 SHRINKS = 0.1  # by what factor an unknown whose bound is above zero may shrink in one step: with far smaller masses and lengths, motions take long
@@ -67,18 +66,6 @@ class Linearised:
     @property
     def _arrays(self) -> tuple[np.ndarray, ...]:
         return self.cost, self.rows, self.sigma, *self.arrow.arrays
-
-
-class LinearisedLater(Linearised):
-    """A `Linearised` whose arrow is made when it is first asked for."""
-
-    def __init__(self, cost: np.ndarray, make: Callable[[], Arrow], rows: np.ndarray, sigma: np.ndarray):
-        self.cost, self.rows, self.sigma, self._make = cost, rows, sigma, make
-
-    @cached_property
-    def arrow(self) -> Arrow:  # type: ignore[override]
-        """J and residuals."""
-        return self._make()
 
 
 @dataclass(frozen=True)
@@ -146,31 +133,16 @@ class Minimum:
         return self
 
 
-@dataclass
-class Begun:
-    """The first steps of one member, taken elsewhere (`first_steps`)."""
-
-    theta: Float[np.ndarray, "1 unknowns"]  # after them
-    at: Linearised
-    pace: Pace
-    costs: list[float]  # F at first and after each step
-    converged: bool
-
-
 def minimise(
     evaluate: Callable[[np.ndarray, np.ndarray], Linearised],
     theta: Float[np.ndarray, "members unknowns"],
     limits: Limits,
     control: Control,
     what: str = "",
-    begun: "Begun | None" = None,
 ) -> Minimum:
-    """Minimise from `theta`. `evaluate(theta, members)`: value and slopes of the members with these numbers; `what`: says in the trace what is minimised.
-
-    `begun`: the first steps from there.
-    """
-    way = _Way(evaluate, limits, control, theta, begun)
-    for _ in range(control.most_steps - way.taken):
+    """Minimise from `theta`. `evaluate(theta, members)`: value and slopes of the members with these numbers; `what`: says in the trace what is minimised."""
+    way = _Way(evaluate, limits, control, theta)
+    for _ in range(control.most_steps):
         if not way.going.size:
             break
         if (step := way.foretold(way.next_step())).members.size:
@@ -209,26 +181,19 @@ class _Step:
 class _Way:
     """Members on their way to a minimum: where each is, and which still go on."""
 
-    def __init__(self, evaluate: Callable, limits: Limits, control: Control, theta: np.ndarray, begun: Begun | None):
+    def __init__(self, evaluate: Callable, limits: Limits, control: Control, theta: np.ndarray):
         self._evaluate, self._limits, self._control, self._count = evaluate, limits, control, len(theta)
         self.going, self._converged, self._stuck = np.arange(self._count), np.zeros(self._count, bool), np.zeros(self._count, bool)
-        self._paces: list[Pace] = [BEGIN] * self._count if begun is None else [begun.pace]
-        if begun is None:
-            self._theta, self._at = theta.copy(), evaluate(theta, self.going)
-            self._costs = [[cost] for cost in self._at.cost.tolist()]
-        else:
-            self._theta, self._at, self._costs = begun.theta, begun.at, [begun.costs]
-            self._converged[:] = begun.converged
-        self.taken = len(self._costs[0]) - 1  # steps
-        self._steps, self.going = np.full(self._count, self.taken), self.going[np.isfinite(self._at.cost) & ~self._converged]
-        if self.taken:
-            self._give_up()
+        self._paces = [Pace() for _ in range(self._count)]
+        self._theta, self._at = theta.copy(), evaluate(theta, self.going)
+        self._costs = [[cost] for cost in self._at.cost.tolist()]
+        self._steps, self.going = np.zeros(self._count, int), self.going[np.isfinite(self._at.cost)]
 
     def next_step(self) -> _Step:
         """That of the members that go on; those have converged whose step is small, also without damping."""
         here, limits, control = self.going, self._limits, self._control
         arrow, x = (self._at.arrow, self._theta) if here.size == self._count else (self._at.arrow.at(here), self._theta[here])
-        size, damping = limits.size(x), np.array([self._paces[b][0] for b in here.tolist()])
+        size, damping = limits.size(x), np.array([self._paces[b].damping for b in here.tolist()])
         scaling = column_scaling(arrow, size)
         d = damped_step(arrow, x, scaling, damping, limits, control.cutoff)
         change = arrow.change(d)
@@ -243,7 +208,7 @@ class _Way:
         """The step but for members that need no look at its end, since the one after it will be small, as far as steps have shrunk: they are put there."""
         here = step.members.tolist()
         self._steps[step.members] += 1
-        shrank = np.array([shrinkage(NUMBERS, self._paces[b], one) for b, one in zip(here, np.sqrt(step.change).tolist(), strict=True)])
+        shrank = np.array([self._paces[b].shrinkage(one) for b, one in zip(here, np.sqrt(step.change).tolist(), strict=True)])
         if not (last := shrank < 1).any():
             return step
         surely = replace(self._control, tolerance=SURELY * self._control.tolerance)
@@ -263,7 +228,7 @@ class _Way:
         slopes, better = 0.5 * (step.fall - np.einsum("bi,bi->b", trial.arrow.gradient, step.d)), []
         numbers = (np.sqrt(step.change), trial.cost, step.promised, slopes)
         for b, length, cost, promised, slope in zip(step.members.tolist(), *(x.tolist() for x in numbers), strict=True):
-            is_better, self._paces[b] = after_trial(NUMBERS, self._paces[b], length, self._costs[b][-1], cost, promised, slope, self._control.tolerance)
+            is_better, self._paces[b] = self._paces[b].after_trial(length, self._costs[b][-1], cost, promised, slope, self._control.tolerance)
             better.append(is_better)
         self._put(step, trial, np.array(better))
         self._give_up()
@@ -288,7 +253,7 @@ class _Way:
 
     def _give_up(self) -> None:
         """Members for which no step is found are stuck; those that are far off and get nowhere go on no more."""
-        lost = np.array([self._paces[b][0] > MOST for b in self.going.tolist()], bool)
+        lost = np.array([self._paces[b].damping > MOST for b in self.going.tolist()], bool)
         self._stuck[self.going[lost]], self.going = True, self.going[~lost]
         if self._control.patience is None:
             return

@@ -45,8 +45,6 @@ class Shot:
 class PieceLanes:
     """Lanes of all pieces, which keep the states at their ends aside. `states`: how many numbers each piece ends at."""
 
-    together = takes_steps = False
-
     def __init__(self, lanes: Lanes, states: Int[np.ndarray, "pieces"]):
         self._lanes, self._states, pieces = lanes, states, len(states)
         self.members, self.counted, self.whitened, self.channels = lanes.members, lanes.counted, lanes.whitened, lanes.channels
@@ -92,8 +90,6 @@ class _Standing:
 
 class Piecewise:
     """Lanes of whole runs that are worked out in pieces; what `Lanes` offers, and the same with nodes as unknowns."""
-
-    together = takes_steps = False
 
     def __init__(
         self, scene: Scene, runs: tuple[Experiment, ...], layout: Layout, simulation: dict, members: int | None, unknowns: Unknowns, shooting: MultipleShooting

@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import NamedTuple
 
 import jax
@@ -18,14 +18,11 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.correlated_noise import Chains, whitened
 from jourdain_jax.analysis.experiment import Experiment
-from jourdain_jax.analysis.first_steps import Told, first_steps, read
 from jourdain_jax.analysis.layout import Layout
-from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
 from jourdain_jax.analysis.runs import Run, filled_up, grouped, is_array, most_knots, on_equal_grids, run_of
 from jourdain_jax.build.reference import Reference
-from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.motion.forward_mode import simulate_alongside
-from jourdain_jax.motion.quick_compilation import quickly_compiled, sparingly_compiled
+from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.scene.scene import Scene
 
 TOUCHED = 2**18  # bytes of saved states with their tangents in one loop: far below what XLA compiles into one function (see `jourdain_jax`)
@@ -37,22 +34,17 @@ _WHITE, _NONE = np.zeros((1, 1)), np.zeros(0)
 class Lanes:
     """All lanes of a problem; `evaluate` gives their weighted residuals with derivatives."""
 
-    def __init__(self, scene: Scene, data: Sequence[Experiment], layout: Layout, simulation: dict, members: int | None, loss: Loss = LEAST_SQUARES):
+    def __init__(self, scene: Scene, data: Sequence[Experiment], layout: Layout, simulation: dict, members: int | None):
         self.members = members
-        self.takes_steps = False  # whether runs that go `together` are evaluated by the program that takes steps, so that no other is compiled
-        white = not any(run.unknown_sigma or run.correlation_time for run in data) and real_type() == np.float64  # of single precision, J'J would tell little
         ready = lambda i: run_of(data[i], repeats=members is not None)  # noqa: E731
-        self._groups = [_Group(scene, indices, list(map(ready, indices)), layout, simulation, members, loss) for indices in grouped(data)]
-        equal = members is None and len(self._groups) == 1 and (len(data) == 1 or not layout.sizes[1])
-        self.together = white and equal and self._groups[0].is_one_chunk  # all runs in one program, without unknowns of their own beside others
-        self.first_steps = self._groups[0].first_steps  # of these
+        self._groups = [_Group(scene, indices, list(map(ready, indices)), layout, simulation, members) for indices in grouped(data)]
         self.lengths = [run.ts.shape[0] for run in data]
         self._of_run = {run: group for group in self._groups for run in group.indices}
 
     def evaluate(self, shared: Float[np.ndarray, "members shared"], local: Float[np.ndarray, "members runs local"], members: np.ndarray):
         """Yields, some lanes at a time: numbers of members (among those given) and of runs, and [J r] (lanes, samples, unknowns + 1), own unknowns first."""
         for group in self._groups:
-            yield from group.evaluate(shared, local, members, self.takes_steps)
+            yield from group.evaluate(shared, local, members)
 
     def counted(self, names: Sequence[str], members: np.ndarray) -> Float[np.ndarray, "members names"]:
         """Samples of each of these channels that are not missing, in all runs."""
@@ -96,7 +88,7 @@ class Lanes:
 class _Group:
     """Runs of equal structure, filled up to one length."""
 
-    def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, simulation: dict, members: int | None, loss: Loss):
+    def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, simulation: dict, members: int | None):
         self.indices, self._members, self._runs = indices, members, np.array(indices)
         times, knots = max(run.ts.shape[0] for run in runs), most_knots(runs)
         equal = runs if runs[0].grid is None or len(runs) == 1 else on_equal_grids(runs)
@@ -122,8 +114,7 @@ class _Group:
             begin, end = end, end + math.prod(weight.shape[0 if members is None else 1 :])
             self.channels[name] = slice(begin, end)
         self.samples = end
-        self._run, steps = _program(reference, treedef, tuple(marks), layout, end)
-        self._steps = steps(loss)
+        self._run = _program(reference, treedef, tuple(marks), layout)
         taus = {name: np.stack([run.correlation_time[name] for run in filled]) for name in filled[0].correlation_time}
         self.chains = Chains.of(self.weights, self._ts, taus, self.channels, members is not None) if taus else None
         saved = times if filled[0].grid is None else filled[0].grid.shape[0]
@@ -131,17 +122,7 @@ class _Group:
         self._width = int(min(MOST_LANES, max(1, TOUCHED // states)))
         self._kept: dict[int, list] = {}
 
-    @property
-    def is_one_chunk(self) -> bool:
-        """Whether all runs of one member go through the program at once."""
-        return len(self._chunks(1)) == 1
-
-    def evaluate(self, shared, local, members, takes_steps):
-        if takes_steps and len(members) == 1:
-            x = np.concatenate([local[0, 0], shared[0]])
-            nothing = np.zeros((len(self.indices), self.samples))
-            yield np.zeros(len(nothing), int), self._runs, self.first_steps(x, np.zeros(Told.length(x.size, 0)), nothing)[-1]
-            return
+    def evaluate(self, shared, local, members):
         if len(members) not in self._kept:
             self._kept = {len(members): self._chunks(len(members))}
         first, *chunks = self._kept[len(members)]
@@ -170,13 +151,6 @@ class _Group:
         width = min(self._width, 1 << (count - 1).bit_length())
         lanes = np.minimum(np.arange(-(-count // width) * width), count - 1).reshape(-1, width)
         return [(min(width, count - k * width), *np.divmod(some, len(self.indices))) for k, some in enumerate(lanes)]
-
-    def first_steps(self, x: Float[np.ndarray, "unknowns"], told: Float[np.ndarray, "_"], counts: Float[np.ndarray, "runs samples"]):
-        """The first steps of all runs together, from unknowns with own ones first, as `read` gives them; [J r] of each run."""
-        (kept, _, j), *_ = self._chunks(1)
-        of_lanes = np.concatenate([self._rows[j], np.where(np.arange(len(j))[:, None] < kept, counts[j], 0.0)], axis=1)
-        *found, rows = read(np.asarray(self._steps(self._common, np.concatenate([x, told]), of_lanes)), x.size)
-        return *found, rows.reshape(len(j), self.samples, -1)[:kept]
 
     def chained(self, runs: np.ndarray, members: np.ndarray, taus: dict[str, np.ndarray]) -> tuple[np.ndarray | None, np.ndarray]:
         """For each sample of lanes, the place of the one before it (None: all noise is white) and their correlation."""
@@ -218,11 +192,10 @@ class _Number(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def _program(reference: Reference, treedef, leaves: tuple, layout: Layout, samples: int) -> tuple[Callable, Callable]:
-    """Two programs: [J r] of lanes, shape (lanes, samples, local + shared + 1), from numbers that all share and rows of runs with their unknowns; and, of a
-    loss, the one that takes the `first_steps` of a run.
+def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Callable:
+    """Compile [J r] of lanes, shape (lanes, samples, local + shared + 1), from numbers that all share and rows of runs with their unknowns.
 
-    Each is compiled once. `reference`: of the scene; `treedef`, `leaves`: of scene, options and run, with a `_Number` in place of each array.
+    `reference`: of the scene; `treedef`, `leaves`: of scene, options and run, with a `_Number` in place of each array.
     """
     own, unknowns = layout.sizes[1], sum(layout.sizes)
 
@@ -250,12 +223,4 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout, sampl
     def lanes(common: Float[Array, "shared"], rows: Float[Array, "lanes own"]) -> Float[Array, "lanes samples width"]:
         return each(common, *jnp.split(rows, [rows.shape[1] - unknowns], axis=1))
 
-    def steps(loss: Loss, common: Float[Array, "shared"], x_and_told: Float[Array, "_"], rows: Float[Array, "lanes own_and_counts"]) -> Float[Array, "_"]:
-        fixed, counts = jnp.split(rows, [rows.shape[1] - samples], axis=1)
-
-        def evaluate(x, common, fixed):
-            return each(common, fixed, jnp.broadcast_to(x, (fixed.shape[0], unknowns))).reshape(-1, unknowns + 1)
-
-        return first_steps(evaluate, loss, x_and_told[:unknowns], (common, fixed), jnp.concatenate([x_and_told[unknowns:], counts.ravel()]))
-
-    return quickly_compiled(lanes, jax.jit), lru_cache(maxsize=4)(lambda loss: sparingly_compiled(partial(steps, loss), most_loops=1))
+    return quickly_compiled(lanes, jax.jit)

@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float
 from jourdain_jax.analysis.arrow import Arrow, arrow, triangle, with_prior
 from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits, half_log_determinant, lowest
 from jourdain_jax.analysis.experiment import Experiment
-from jourdain_jax.analysis.first_steps import ROOM
-from jourdain_jax.analysis.levenberg_marquardt import Begun, Control, Limits, Linearised, LinearisedLater, Minimum, minimise
+from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Linearised, Minimum, minimise
 from jourdain_jax.analysis.losses import Loss
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.scene.scene import Scene
@@ -38,8 +37,6 @@ class Problem:
         self.prior_mean = np.tile(unknowns.prior_mean, (lanes.members or 1, 1))  # by member
         self.with_memory = tuple(sorted({name for run in runs for name in run.unknown_correlation}))  # channels whose correlation time is estimated
         self.tau = np.zeros((lanes.members or 1, len(self.with_memory)))  # s, of these: at first as if their noise were white
-        independent = not unknowns.with_prior.size or np.array_equal(unknowns.whitening, np.eye(len(unknowns.whitening)))
-        lanes.takes_steps = lanes.together and independent  # by `first_steps`
         self._counted = lanes.counted(self.estimated, np.arange(lanes.members or 1))  # samples of channels whose sigma is estimated, of each member
 
     def taus(self, members: np.ndarray) -> dict[str, np.ndarray]:
@@ -59,30 +56,8 @@ class Problem:
         return None if self.shares is None else self.shares[members]
 
     def minimum(self, theta: np.ndarray, members: np.ndarray, limits: Limits, control: Control, what: str) -> Minimum:
-        """The minimum of some members, from theta; of runs that go together, the first steps are taken in one program."""
-        begun = None
-        if self.lanes.takes_steps and len(theta) == 1 and not limits.fixed.any():
-            begun = self._first_steps(theta, members, limits, control)
-        return minimise(lambda x, here: self.linearised(x, members[here]), theta, limits, control, what, begun)
-
-    def _first_steps(self, theta: np.ndarray, members: np.ndarray, limits: Limits, control: Control) -> Begun:
-        (p, m), every = self.unknowns.layout.sizes, np.arange(self.unknowns.runs)
-        order = [*range(p, p + m), *range(p)]  # of columns
-        shares = self._share(members)
-        (mean,), (spread,) = self._known_before(theta, members, shares)
-        known = np.isfinite(mean)
-        each = limits.low, limits.high, self.unknowns.least, np.where(known, mean, 0.0), np.where(known, 1 / spread, 0.0)
-        counts = self.lanes.within(every, np.ones(len(every)) if shares is None else np.repeat(shares, len(every))).astype(float)
-        patience = np.inf if control.patience is None else control.patience
-        numbers = min(ROOM, control.most_steps), control.tolerance, control.cutoff, patience, control.near
-        told = np.concatenate([numbers, np.array(each)[:, order].ravel()])
-        pace, costs, converged, x, rows = self.lanes.first_steps(theta[0, order], told, counts)
-        theta = np.empty_like(theta)
-        theta[0, order] = x
-        kept, there = np.empty((1, len(every)), object), theta.copy()
-        kept[0, :] = list(rows[..., [*range(m, m + p), *range(m), m + p]])
-        arrow = lambda: self._assembled(there, members, [(0 * every, every, rows)], {}, shares).arrow  # noqa: E731
-        return Begun(theta, LinearisedLater(np.array(costs[-1:]), arrow, kept, np.zeros((1, 0))), pace, costs, converged)
+        """Return the minimum of some members, from theta."""
+        return minimise(lambda x, here: self.linearised(x, members[here]), theta, limits, control, what)
 
     def _assembled(self, theta: np.ndarray, members: np.ndarray, evaluated: Iterable, taus: dict[str, np.ndarray], shares=None) -> Linearised:
         """What is minimised, from what was evaluated; `taus`: correlation times by channel, and shares of the span that count, of these members."""

@@ -2,10 +2,10 @@
 
 from dataclasses import asdict, dataclass
 
-from jourdain_jax.analysis.drawings import MODEL, QUIET, Axes, drawing, text
 from jourdain_jax.analysis.integrability import growth_vector, row_integrability
 from jourdain_jax.build.domain import COORDINATE_DOMAIN, SPEED_DOMAIN
 from jourdain_jax.build.structure import structure_of
+from jourdain_jax.calculus.figures import MODEL, QUIET, figure
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reduced import cyclic_coordinates, ignorable_coordinates
 from jourdain_jax.lowering.built import Built, build
@@ -105,13 +105,14 @@ class Report(Printed):
         """The growth vector as bars, up to the number of coordinates."""
         names = ["freedoms", *(f"brackets of {k}" for k in range(2, len(self.growth_vector) + 1)), "coordinates"]
         sizes = [*self.growth_vector, len(self.coordinates)]
-        axes = Axes(100, 4, 260, 18 * len(sizes), (0, max(sizes)), (len(sizes), 0))
-        bars = [axes.bar(0, size, k + 0.15, k + 0.85, QUIET if k == len(sizes) - 1 else MODEL) for k, size in enumerate(sizes)]
-        words = [text(94, float(axes.down(k + 0.7)), name, "end") for k, name in enumerate(names)]
-        numbers = [text(float(axes.right(size)) + 6, float(axes.down(k + 0.7)), str(size)) for k, size in enumerate(sizes)]
-        return drawing(
-            400, 18 * len(sizes) + 8, [*bars, *words, *numbers], "Directions of motion: those that are free, and those that are reached by manoeuvres"
-        )
+        caption = "Directions of motion: those that are free, and those that are reached by manoeuvres"
+
+        def draw(whole) -> None:
+            axes = whole.add_subplot(frame_on=False, xticks=[])
+            axes.bar_label(axes.barh(names, sizes, color=[*[MODEL] * len(self.growth_vector), QUIET]))
+            axes.invert_yaxis()
+
+        return figure(draw, 400, 18 * len(sizes) + 30, caption)
 
     def _no_redundant_rows(self) -> str:
         if self.rank < len(self.rows):

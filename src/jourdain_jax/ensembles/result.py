@@ -9,9 +9,8 @@ from functools import cached_property
 
 import numpy as np
 
+from jourdain_jax.calculus.figures import figure
 from jourdain_jax.calculus.on_first_use import needed
-from jourdain_jax.ensembles.histograms import CELLS as BARS
-from jourdain_jax.ensembles.histograms import Histogram, pictures
 from jourdain_jax.ensembles.sensitivity import SobolIndices, sobol_indices
 from jourdain_jax.ensembles.statistics import CELLS, Grid, Statistics, combined
 from jourdain_jax.ensembles.store import Store
@@ -23,6 +22,7 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.tracebacks import users_level
 
 LEVELS = (0.025, 0.5, 0.975)
+_MOST_DRAWN = 12  # outputs in a notebook
 
 
 @dataclass(frozen=True, repr=False)
@@ -215,9 +215,16 @@ class StudyResult(Printed):
         """Histograms of `outputs` (default: all) in one figure, which is returned, and written to `path` where that is given. Needs matplotlib."""
         plt = needed("matplotlib.pyplot", "a plot", "plot")
         names = outputs or self.outputs
-        figure, axes = plt.subplots(1, len(names), figsize=(3.6 * len(names), 3.0), squeeze=False, layout="constrained")
-        for axis, name in zip(axes[0], names, strict=True):
-            counts, edges, beyond = self._bars(name, 64)
+        drawn = plt.figure(figsize=(3.6 * len(names), 3.0), layout="constrained")
+        self._draw(drawn, names)
+        if path is not None:
+            drawn.savefig(path, dpi=150)
+        return drawn
+
+    def _draw(self, whole, names: Sequence[str], cells: int = 64) -> None:
+        """Draw lanes per cell of outputs beside each other; cells that reach beyond the grid are pale, the mean is a line."""
+        for k, name in enumerate(names):
+            axis, (counts, edges, beyond) = whole.add_subplot(1, len(names), k + 1), self._bars(name, cells)
             axis.stairs(np.where(beyond, 0, counts), edges, fill=True, color="#1f5fa8", alpha=0.8)
             if beyond.any():
                 axis.stairs(np.where(beyond, counts, 0), edges, fill=True, color="#1f5fa8", alpha=0.25, label="anywhere in here")
@@ -226,16 +233,13 @@ class StudyResult(Printed):
             unit = self._unit(name)
             axis.set_xlabel(f"{name} ({unit})" if unit else name)
             axis.spines[["top", "right"]].set_visible(False)
-        axes[0, 0].set_ylabel("lanes")
-        if path is not None:
-            figure.savefig(path, dpi=150)
-        return figure
+        whole.axes[0].set_ylabel("lanes")
 
     def _repr_html_(self) -> str:
-        if not self._gathered["chunks"]:
-            return super()._repr_html_()
-        drawn = [Histogram(name, self._unit(name), *self._bars(name, BARS), self.mean(name)) for name in self.outputs]
-        return super()._repr_html_() + pictures(drawn)
+        drawn = [name for name in self.outputs if self._gathered["chunks"] and self._bars(name, 40)[0].sum() > 0]
+        shown = drawn[:_MOST_DRAWN]
+        more = f"and {len(drawn) - len(shown)} more" if len(drawn) > len(shown) else ""
+        return super()._repr_html_() + (figure(lambda whole: self._draw(whole, shown, 40), 240 * len(shown), 200, more) if shown else "")
 
     def _unit(self, output: str) -> str:
         return self.store.columns[output].attributes.get("units", "") if output in self.store.columns else ""

@@ -14,7 +14,6 @@ import jax
 import jaxlib.version
 
 from jourdain_jax.calculus.collecting import without_collecting
-from jourdain_jax.calculus.jaxprs import loops
 from jourdain_jax.calculus.reals import is_array_type, nothing_is_traced
 
 # From jaxlib 0.11.1 on, XLA has these emitters alone.
@@ -80,20 +79,5 @@ def quickly_compiled(f: Callable, compiler: Callable = compiled, options: dict |
 
     def run(*arguments):
         return (quick if jax.default_backend() == "cpu" and nothing_is_traced() else plain)(*arguments)
-
-    return run
-
-
-def sparingly_compiled(f: Callable, most_loops: int) -> Callable:
-    """`f` of arrays of the same shapes in each call, compiled for a CPU with the least effort where it has no more loops than these: then none of them is one
-    of XLA's over the steps of a motion. Not inside another transformation."""
-    chosen: list[Callable] = []
-
-    def run(*arrays):
-        if not chosen:
-            plain = jax.jit(f)
-            few = jax.default_backend() == "cpu" and sum(1 for _ in loops(plain.trace(*arrays).jaxpr.jaxpr)) <= most_loops
-            chosen.append(jax.jit(f, compiler_options=RUN_SELDOM) if few else quickly_compiled(f, jax.jit))
-        return chosen[0](*arrays)
 
     return run
