@@ -148,7 +148,7 @@ def in_fresh_process(model: str) -> dict[str, dict]:
 
 def figure(name: str, model: str, value: float, required: float | None = None) -> dict:
     """One entry of the JSON; `required`: the largest value that is allowed."""
-    return {"figure": name, "model": model, "value": value, "required": required, "met": None if required is None else value <= required}
+    return {"figure": name, "model": model, "value": value, "required": required, "met": required is None or value <= required}
 
 
 def figures_of_source() -> Iterator[dict]:

@@ -37,7 +37,7 @@ BLUE, ORANGE = "#1f5fa8", "#b3470f"
 def figure(name: str, value: float, required: float | None = None) -> dict:
     """One entry of the JSON."""
     print(f"  {name}: {value:.4g}", flush=True)
-    return {"figure": name, "model": BICYCLE, "value": value, "required": required, "met": None if required is None else bool(value <= required)}
+    return {"figure": name, "model": BICYCLE, "value": value, "required": required, "met": required is None or bool(value <= required)}
 
 
 def in_parts(function, columns: dict, size: int = 4096) -> np.ndarray:

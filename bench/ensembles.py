@@ -106,7 +106,7 @@ def in_fresh_process(lanes: int, folder: Path, on_one_core: bool = False, **opti
 
 def figure(name: str, value: float, required: float | None = None, *, at_least: bool = False, model: str = MODEL) -> dict:
     """One entry of the JSON."""
-    met = None if required is None else bool(value >= required if at_least else value <= required)
+    met = required is None or bool(value >= required if at_least else value <= required)
     return {"figure": name, "model": model, "value": value, "required": required, "met": met}
 
 

@@ -278,7 +278,8 @@ def named_starts(quick: bool) -> Iterator[Figure]:
 def all_parameters(quick: bool) -> Iterator[Figure]:
     """Derivative of all speeds at the saved times of 1 s with respect to every parameter of a scene: what each mode takes to compile."""
     chain, ts = jj.models.TrailerChain(trailers=16), jnp.linspace(0.0, 1.0, 101)
-    for name, scene in {"trailer-chain, n = 16": chain} if quick else {"trailer-chain, n = 16": chain, "whipple-bicycle": jj.models.WhippleBicycle()}.items():
+    scenes = {"trailer-chain, n = 16": chain} | ({} if quick else {"whipple-bicycle": jj.models.WhippleBicycle()})
+    for name, scene in scenes.items():
         start = jj.start(scene, **scene.example)
 
         def loss(scene, adjoint, start=start):

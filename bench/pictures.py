@@ -25,7 +25,7 @@ view = jj.show(motion)
 
 def row(figure: str, model: str, value, required=None) -> dict:
     """One figure; `required` is the most that is allowed."""
-    met = None if required is None else bool(value <= required)
+    met = required is None or bool(value <= required)
     print(f"{model:28} {figure:44} {value:>10}  {'' if required is None else f'required <= {required}: ' + ('met' if met else 'NOT MET')}", flush=True)
     return {"figure": figure, "model": model, "value": value, "required": required, "met": met}
 
