@@ -36,6 +36,11 @@ def test_the_speeds_are_those_of_the_linear_formulas(studies):
     np.testing.assert_allclose(studies[1].speeds["weave_speed"]["value"], 3.7592036310992, rtol=1e-9)
 
 
+def test_a_file_that_is_missing_is_named(tmp_path, capsys):
+    assert main(["bicycle", "missing.txt", "--out", str(tmp_path)]) == 1
+    assert "refused: missing.txt: cannot be read" in capsys.readouterr().out
+
+
 def test_limits_hold_the_value_and_say_how_many_samples_have_the_speed(studies):
     weave = studies[0].speeds["weave_speed"]
     assert weave["low"] < weave["value"] < weave["high"]
@@ -88,4 +93,5 @@ def test_the_command_writes_its_table_and_figures(tmp_path, capsys):
 
 def test_figures_of_two_bicycles_with_one_name_have_two_names():
     assert prefixes(["Rigid"]) == [""]
+    assert prefixes([]) == []
     assert prefixes(["Rigid", "my bike", "Rigid", "my_bike"]) == ["Rigid-", "my_bike-", "Rigid-2-", "my_bike-2-"]

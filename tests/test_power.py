@@ -123,6 +123,10 @@ def test_a_built_scene_its_report_and_its_motion_say_why_dense_matrices_integrat
     without = jj.simulate(wire, {"r": 0.5}, t1=0.1, work=False)
     assert "lowered" in without.reduction
     assert why not in str(without)
+    driven = jj.simulate(wire, {"r": 0.5}, t1=1.0, work=False)  # T + V changes, and that is no fault
+    assert float(jj.diagnose(driven).energy_drift) > 0.1
+    assert driven.warnings == ()
+    assert "T + V, which the work changes that was left out" in str(driven)
     assert why not in str(jj.build(TiltingDisc()))
 
 

@@ -2,6 +2,7 @@
 
 import html
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +13,15 @@ from jourdain_jax.models import ChaplyginSleigh, TiltingDisc, TrailerChain
 
 SLEIGH = ChaplyginSleigh()
 RUN = {"t1": 0.2, "ts": jnp.linspace(0.0, 0.2, 5)}
+
+
+def test_round_off_is_printed_as_zero():
+    state = jj.start(jj.models.DoublePendulumRods(), {"x1": 0.6, "z1": -0.8})
+    small = eqx.tree_at(lambda s: (s.q, s.u), state, (state.q.at[0].set(-1.3e-136), state.u.at[1].set(2e-17)))
+    assert "x1 = 0," in str(small)
+    assert "z1_rate = 0," in str(small)
+    tiny = eqx.tree_at(lambda s: (s.q, s.u), state, (1e-30 * state.q, 1e-30 * state.u))
+    assert "x1 = 6e-31" in str(tiny)
 
 
 def measured():

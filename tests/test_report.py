@@ -63,6 +63,37 @@ def test_an_isolated_loss_of_rank_is_seen_at_the_configuration_where_it_happens(
     assert "steer = 1.571" in str(found)
 
 
+class Roller(jj.Scene):
+    """A roller whose two rims roll on a plane; slip is stated along axes of the plane."""
+
+    coordinates = jj.coordinates("x y heading spin")
+    privileged = "spin_rate"
+
+    def bodies(self, t, q):
+        turned = jj.rot_z(q.heading) @ jj.rot_y(q.spin)
+        return {"roller": jj.RigidBody(1.0, jnp.array([0.1, 0.05, 0.1]), jnp.stack([q.x, q.y, 0.0 * q.x + 0.3]), turned)}
+
+    def contacts(self, pose):
+        return {side: jj.disc_contact(pose["roller"], 0.3, centre=(0.0, y, 0.0)) for side, y in (("left", 0.5), ("right", -0.5))}
+
+
+def test_rows_that_follow_from_the_others_in_another_way_at_each_configuration_are_counted():
+    found = report(Roller())
+    assert (len(found.rows), found.rank, found.redundant_rows) == (4, 3, ())
+    assert "1 at each configuration, but none at all of them" in " ".join(str(found).split())
+
+
+def test_privileged_speeds_may_stand_in_one_text():
+    class Free(Drifting):
+        coordinates, speeds = jj.coordinates("x y"), None
+        privileged = " x_rate  y_rate "
+
+        def coordinate_rates(self, t, q, u):
+            return u.array
+
+    assert report(Free()).privileged_velocities == ("x_rate", "y_rate")
+
+
 class Drifting(jj.Scene):
     """A bead that is carried along x and free along y: a relation between coordinates that no row states."""
 

@@ -116,7 +116,7 @@ class Report(Printed):
 
     def _no_redundant_rows(self) -> str:
         if self.rank < len(self.rows):
-            return f"none may be left out, though {len(self.rows)} rows have rank {self.rank}: each is needed at some configuration"
+            return f"{len(self.rows) - self.rank} at each configuration, but none at all of them: which rows follow from the others changes along the motion"
         return "none"
 
     def _at_start(self) -> str:

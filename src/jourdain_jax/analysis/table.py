@@ -4,6 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jourdain_jax.scene.printing import in_digits
+
 
 def table(rows: Sequence[tuple[str, ...]]) -> list[str]:
     """Lines with the cells of all rows in columns, indented by two blanks."""
@@ -13,13 +15,16 @@ def table(rows: Sequence[tuple[str, ...]]) -> list[str]:
 
 def matrix(name: str, values, row_names: Sequence[str], column_names: Sequence[str]) -> list[str]:
     """A matrix under the names of its columns."""
+    shape, digits = np.shape(values), in_digits(np.ravel(values))
+    return table([(name, *column_names), *((row, *digits[k * shape[1] : (k + 1) * shape[1]]) for k, row in enumerate(row_names))])
+
+
+def complex_numbers(values) -> list[str]:
+    """Texts such as `-0.5+2.1i`."""
     values = np.asarray(values)
-    return table([(name, *column_names), *((row, *(f"{x:.6g}" for x in line)) for row, line in zip(row_names, values, strict=True))])
-
-
-def complex_number(s) -> str:
-    """`-0.5+2.1i`."""
-    return f"{s.real:.6g}{s.imag:+.6g}i" if abs(s.imag) > 0 else f"{s.real:.6g}"
+    parts = in_digits(np.concatenate([values.real, values.imag]))
+    pairs = zip(parts[: len(values)], parts[len(values) :], strict=True)
+    return [real if imag in ("0", "-0") else f"{real}{imag if imag.startswith('-') else f'+{imag}'}i" for real, imag in pairs]
 
 
 def linearization_text(found) -> str:
@@ -37,4 +42,4 @@ def linearization_text(found) -> str:
         lines += matrix("A", found.A, found.states, found.states)
         lines += matrix("B", found.B, found.states, found.inputs) if found.inputs else []
         values = found.state_eigenvalues()
-    return "\n".join([*lines, "  eigenvalues in 1/s: " + ", ".join(complex_number(s) for s in np.asarray(values))])
+    return "\n".join([*lines, "  eigenvalues in 1/s: " + ", ".join(complex_numbers(values))])

@@ -60,7 +60,11 @@ def _job(options) -> bool:
 def prefixes(names: list[str]) -> list[str]:
     """What stands before the names of figures: nothing for one bicycle; otherwise the bicycle's name, with a number from the second of a name on."""
     plain = [re.sub(r"[^\w.-]", "_", name) for name in names]
-    return [f"{name}-{number}-" if (number := plain[: k + 1].count(name)) > 1 else f"{name}-" for k, name in enumerate(plain)] if len(names) > 1 else [""]
+    return (
+        [f"{name}-{number}-" if (number := plain[: k + 1].count(name)) > 1 else f"{name}-" for k, name in enumerate(plain)]
+        if len(names) > 1
+        else [""] * len(names)
+    )
 
 
 def _figures(study: Study, out: Path, prefix: str) -> list[Path]:

@@ -18,7 +18,7 @@ from jourdain_jax.importers.tree import Joint, Link, Look, Mass, Matrix, Motor, 
 from jourdain_jax.importers.tree_scene import tree_scene
 from jourdain_jax.importers.urdf import colour_of
 from jourdain_jax.importers.xml_file import Element, XmlFile
-from jourdain_jax.scene.names import as_names, nearest
+from jourdain_jax.scene.names import as_labels, nearest
 from jourdain_jax.scene.scene import Scene
 
 _TYPES = ("free", "ball", "slide", "hinge")
@@ -51,7 +51,7 @@ def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> 
     unless `ignore` names it. A warning lists what else is left out.
     """
     file = XmlFile(path, TABLE, "MJCF", ignore)
-    tree = _Reader(file).tree(as_names(free))
+    tree = _Reader(file).tree(as_labels(free))
     file.warn()
     return tree_scene(tree, file.source, file.ignore)
 

@@ -13,7 +13,7 @@ from jourdain_jax.importers.placing import by_roll_pitch_yaw
 from jourdain_jax.importers.tree import Follower, Joint, Link, Look, Mass, Matrix, Motor, Tree, Vector
 from jourdain_jax.importers.tree_scene import tree_scene
 from jourdain_jax.importers.xml_file import Element, Holds, XmlFile
-from jourdain_jax.scene.names import as_names, nearest
+from jourdain_jax.scene.names import as_labels, nearest
 from jourdain_jax.scene.scene import Scene
 
 _KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free", "planar": "planar", "fixed": ""}
@@ -86,7 +86,7 @@ def from_urdf(
     joints = list(file.named(file.root.findall("joint"), "joint").values())
     if not links:
         raise file.fault("it has no links")
-    tree = _Reader(file, links, packages or {}).tree(joints, base, as_names(motors), as_names(free))
+    tree = _Reader(file, links, packages or {}).tree(joints, base, as_labels(motors), as_labels(free))
     file.warn()
     return tree_scene(tree, file.source, file.ignore)
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from jourdain_jax.calculus.reading import check_depth, number, parsed, read_bytes, shortened
 from jourdain_jax.calculus.reals import described
-from jourdain_jax.scene.names import as_names, nearest
+from jourdain_jax.scene.names import as_labels, nearest
 from jourdain_jax.scene.tracebacks import users_level
 
 Element = ElementTree.Element
@@ -42,7 +42,7 @@ class XmlFile:
         """The file at `path`, or the text itself; `table`: what elements may hold, the root first. ValueError where it cannot be read or holds more."""
         if not isinstance(path, str | os.PathLike):
             raise ValueError(f"`path` is {described(path)}, expected the path of a {format_name} file, or its text")
-        self.ignore, self.table = as_names(ignore), table
+        self.ignore, self.table = as_labels(ignore), table
         text = str(path) if isinstance(path, str) and path.lstrip().startswith("<") else None
         self.source = f"the {format_name} text" if text is not None else str(path)
         content = read_bytes(path, LARGEST, f"a {format_name} file") if text is None else text

@@ -35,7 +35,7 @@ from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.printing import Printed
+from jourdain_jax.scene.printing import Printed, in_digits
 from jourdain_jax.scene.scene import Scene, vectors_named
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
@@ -72,7 +72,8 @@ class State(Printed, eqx.Module):
     def _text(self) -> str:
         if self.q.ndim > 1:
             return f"States of shape {self.q.shape[:-1]}: {', '.join((*self.names[0].entries, *self.names[1].entries))}"
-        pairs = [f"{n} = {v:.6g}" for names, x in zip(self.names, (self.q, self.u), strict=True) for n, v in zip(names.entries, np.asarray(x), strict=True)]
+        entries, values = (*self.names[0].entries, *self.names[1].entries), in_digits(np.concatenate([self.q, self.u]))
+        pairs = [f"{name} = {value}" for name, value in zip(entries, values, strict=True)]
         moved = f"moved by {self.moved_q:.2e} (q), {self.moved_u:.2e} (u) onto the constraints; residual {self.residual:.1e}"
         if int(self.guess):
             moved += f"; from guess {int(self.guess)}: coordinates that were not given begin elsewhere in the domain, those near the reference lead nowhere"

@@ -23,10 +23,15 @@ def nearest(name: str, valid: Iterable[str]) -> str:
 
 
 def as_names(names: "str | Iterable[str]") -> tuple[str, ...]:
-    """Names as a tuple; a text is one name."""
+    """Names as a tuple; those in a text are parted by blanks, as in `jj.coordinates`."""
     if not isinstance(names, str | Iterable):
         raise ValueError(f"names were expected, in one text or several, and `{names}` was given")
-    return (names,) if isinstance(names, str) else tuple(names)
+    return tuple(names.split() if isinstance(names, str) else names)
+
+
+def as_labels(labels: "str | Iterable[str]") -> tuple[str, ...]:
+    """Names of another tool as a tuple, which may have blanks: a text is one."""
+    return (labels,) if isinstance(labels, str) else as_names(labels)
 
 
 class Named(eqx.Module):

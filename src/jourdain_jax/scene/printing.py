@@ -71,6 +71,13 @@ def _value(value) -> str:
     return f"{float(value):.6g}" if value.ndim == 0 else f"array of shape {value.shape}" if value.size > 6 else ", ".join(f"{x:.6g}" for x in value.ravel())
 
 
+def in_digits(values) -> list[str]:
+    """Numbers with six digits; those that are round-off of the largest of them are 0."""
+    values = np.asarray(values)
+    least = np.finfo(values.dtype).eps * np.nanmax(np.abs(values), initial=0.0, where=np.isfinite(values))
+    return [f"{0.0 if abs(x) < least else x:.6g}" for x in values]
+
+
 def preformatted(text: str) -> str:
     """A text for a notebook, its columns kept."""
     return f"<pre>{html.escape(text)}</pre>"

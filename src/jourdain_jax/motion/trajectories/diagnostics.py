@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from jourdain_jax.build.structure import structure_of, usual_rows
 from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
+from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.dynamics.reactions import ContactForce
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.motion.inputs import Constant, Sampled
@@ -93,7 +94,7 @@ def _diagnosed(trajectory: Record, found: Checked) -> Diagnostics:
     reached = jnp.all(jnp.isfinite(trajectory.q), axis=-1)
     return Diagnostics(
         energy_drift=_span(energy.balance),
-        energy_kind=energy.kind,
+        energy_kind=energy.kind + (", which the work changes that was left out" if _lacks_work(trajectory) else ""),
         energy_size=jnp.nanmax(energy.kinetic) + _span(energy.potential) + _ROUND_OFF * jnp.nanmax(jnp.abs(energy.balance)),
         position_residual=_largest(geometric),
         velocity_residual=_largest(rows),
@@ -102,6 +103,11 @@ def _diagnosed(trajectory: Record, found: Checked) -> Diagnostics:
         invariant_drifts={name: _span(values) for name, values in found.invariants.items()},
         contacts={name: _extremes(force) for name, force in found.contacts.items()},
     )
+
+
+def _lacks_work(trajectory: Record) -> bool:
+    """Whether work was done that is not tracked, so that T + V is not constant."""
+    return trajectory.work is None and needs_work(trajectory.scene, structure_of(trajectory.scene))
 
 
 def _extremes(force: ContactForce) -> ContactExtremes:
@@ -138,7 +144,7 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
                 f"{kind} rows are violated by up to {float(residual):.1e}: take projection or smaller tolerances, or look for rows that contradict each other"
             )
     drift, size = float(found.energy_drift), float(found.energy_size)
-    if drift > DRIFTED * size:
+    if drift > DRIFTED * size and not _lacks_work(trajectory):
         share = f"{drift:.1e} J, {drift / size:.0%} of the energy that moves"
         warned.append(
             f"{found.energy_kind}, which is constant for a right motion, drifts by {share}: tighten `rtol`, or let `verify` look at potentials and rows"
