@@ -42,9 +42,11 @@ def as_real(x) -> Float[Array, "*shape"]:
 
 
 def _of_jax(x) -> Array:
-    """`x` as an array of JAX, which has no extended precision."""
+    """`x` as an array of JAX, which has no extended precision. TypeError for a quantity with a unit."""
     if isinstance(x, jax.Array):
         return x
+    if has_unit(x):
+        raise TypeError(f"real numbers are expected, but this is {described(x)}")
     try:
         return jnp.asarray(np.asarray(x, real_type()) if type(x) in (int, float) or getattr(x, "dtype", None) == np.longdouble else x)
     except OverflowError:
@@ -77,7 +79,7 @@ def checked_known(value, what: str, shape: tuple[int, ...] | None = None, *, adv
     if type(value) is float and not shape:
         return np.array(value, real_type())
     try:
-        array = np.asarray(value)
+        array = np.array(None) if has_unit(value) else np.asarray(value)
     except (TypeError, ValueError):
         array = np.array(None)
     if array.dtype.kind in "OUSMm" or np.ma.is_masked(value):
@@ -91,6 +93,13 @@ def checked_unless_traced(value, what: str, shape: tuple[int, ...] | None = None
     if type(value) is not float and is_traced(value):
         return checked_real(value, what, shape, advice=advice).astype(real_type())
     return checked_known(value, what, shape, advice=advice)
+
+
+def has_unit(x) -> bool:
+    """Whether it is a quantity, or a list with one in it, whose unit would be lost where it becomes a number: 1,300 g would be 1,300 kg."""
+    if isinstance(x, list | tuple):
+        return any(has_unit(part) for part in x if type(part) is not float)
+    return _may_have_unit(type(x)) and any(hasattr(type(x), name) or name in getattr(x, "__dict__", ()) for name in _UNITS)
 
 
 def as_array(x, dtype):
@@ -115,6 +124,8 @@ def described(value) -> str:
     """A value in an error message: `None`, the text 'abc', the class `Skate`, a list."""
     if value is None:
         return "`None`"
+    if has_unit(value):
+        return f"a quantity with a unit (`{type(value).__name__}`), which would be lost"
     if isinstance(value, str):
         return f"the text {value!r}"
     if isinstance(value, complex):
@@ -145,6 +156,13 @@ def nothing_is_traced() -> bool:
 
 with jax.ensure_compile_time_eval():
     _NOTHING_TRACED = _core.get_opaque_trace_state(convention="flax")
+
+_UNITS = "units", "unit", "magnitude"  # as pint, astropy, unyt and others call what is more than a number
+_PLAIN = bool, int, float, complex, np.ndarray
+_NEVER = np.generic | jax.Array | jax.core.Tracer | type
+_may_have_unit: Callable[[type], bool] = lru_cache(maxsize=1024)(
+    lambda kind: kind not in _PLAIN and not issubclass(kind, _NEVER) and (hasattr(kind, "__float__") or hasattr(kind, "__array__"))
+)
 
 # Whether what is of this type is being traced, or is an array of JAX or NumPy: looked up, at a tenth of the time of asking the classes of JAX.
 is_traced_type: Callable[[type], bool] = lru_cache(maxsize=1024)(lambda kind: issubclass(kind, jax.core.Tracer))

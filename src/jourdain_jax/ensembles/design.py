@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from jourdain_jax.calculus.reals import checked_known, described
+from jourdain_jax.calculus.reals import checked_known, described, has_unit
 from jourdain_jax.ensembles.distributions import Distribution, Levels
 from jourdain_jax.ensembles.optional import special_functions
 from jourdain_jax.ensembles.samplers import MOST_SOBOL, SAMPLERS
@@ -66,7 +66,7 @@ class Design(Printed):
         if isinstance(what, Levels):
             return "levels"
         try:
-            column = np.asarray(what)
+            column = np.empty(0) if has_unit(what) else np.asarray(what)
         except ValueError:  # rows of unequal length
             column = np.empty(0)
         if column.ndim != 1 or column.dtype.kind not in "fiu" or not column.size:

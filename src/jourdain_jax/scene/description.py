@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from jourdain_jax.calculus.reals import described, is_traced
+from jourdain_jax.calculus.reals import described, has_unit, is_traced
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import as_names, nearest
 
@@ -134,7 +134,7 @@ def _check_domain(scene) -> None:
     kind, domain = type(scene), scene.domain
     _check_keys(kind, "domain", domain, (*scene.coordinate_names.entries, *scene.speed_names.entries))
     for name, pair in domain.items():
-        if not is_traced(pair) and (np.shape(pair) != (2,) or not _is_finite(pair) or pair[0] > pair[1]):
+        if not is_traced(pair) and (has_unit(pair) or np.shape(pair) != (2,) or not _is_finite(pair) or pair[0] > pair[1]):
             raise ValueError(f"`domain` of `{kind.__name__}` gives {pair} for `{name}`, expected two finite numbers (low, high) with low <= high")
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from jourdain_jax.calculus.reals import as_real, described
+from jourdain_jax.calculus.reals import as_real, described, has_unit
 
 
 def _as_leaf(value):
@@ -53,7 +53,7 @@ def check_parameters(scene) -> None:
     """Raise a ValueError that names a parameter which is not finite or has the wrong sign; traced values are not checked."""
     for name, value, metadata in parameters_of(scene):
         where = f"parameter `{name}` of `{type(scene).__name__}`"
-        if not hasattr(value, "dtype"):
+        if has_unit(value) or not hasattr(value, "dtype"):
             raise ValueError(f"{where} is {described(value)}, expected a number{_in(metadata)} or an array of numbers")
         if not jnp.issubdtype(value.dtype, jnp.floating):
             raise ValueError(f"{where} is of type {value.dtype}, expected real numbers{_in(metadata)}; check where it was computed")

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import checked_unless_traced, described, is_traced, real_type
+from jourdain_jax.calculus.reals import checked_unless_traced, described, has_unit, is_traced, real_type
 from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.coordinates import Coordinates, Names
@@ -269,11 +269,11 @@ def hold_leaves(scene) -> None:
             continue
         value = getattr(scene, field.name)
         leaves = jax.tree.leaves(value)
-        text = next((leaf for leaf in leaves if isinstance(leaf, str)), None)
+        text = next((leaf for leaf in leaves if isinstance(leaf, str) or has_unit(leaf)), None)
         if text is not None:
             raise ValueError(
                 f"field `{field.name}` of `{type(scene).__name__}` holds {described(text)}, expected numbers; "
-                f"for what is no number write `{field.name}: str = eqx.field(static=True, default={text!r})`"
+                f"give the number, or for what is none write `{field.name}: str = eqx.field(static=True, default={text!r})`"
             )
         if any(callable(leaf) or type(leaf) is float for leaf in leaves):
             object.__setattr__(scene, field.name, jax.tree.map(held, value))
