@@ -38,7 +38,7 @@ def show_scenes_with(picture: Callable) -> None:
 def scene_text(scene) -> str:
     """A scene in a console, as one writes it: `ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)`; of large fields, what they are."""
     shown = []
-    for field in dataclasses.fields(scene):
+    for field in (field for field in dataclasses.fields(scene) if field.repr):
         value = getattr(scene, field.name)
         if isinstance(value, jax.Array | np.ndarray):
             text = _value(value)
