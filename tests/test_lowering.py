@@ -386,8 +386,10 @@ def test_rates_mapped_over_states_are_linearised_inside_jit():
 
 
 def test_loops_over_steps_are_compiled_into_one_function():
-    """Ten times the time per step hangs on it."""
-    assert lockstep.loops_are_single_functions()
+    """Ten times the time per step hangs on it, and on it the number of lanes in lockstep."""
+    x = jnp.zeros(512)
+    loop = jax.jit(lambda x: jax.lax.while_loop(lambda s: s[0] < 9, lambda s: (s[0] + 1, jnp.sin(s[1]) + x), (0, x)))
+    assert "xla_cpu_small_call" in loop.lower(x).compile().as_text()
 
 
 @pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])

@@ -6,7 +6,6 @@ function, which it does for loops that touch little memory (see `jourdain_jax`);
 must share that cost.
 """
 
-import functools
 from collections.abc import Callable
 
 import equinox as eqx
@@ -33,17 +32,5 @@ def in_blocks(function: Callable, lanes_at_once: int, *trees: PyTree) -> PyTree:
 
 
 def width(program: Lowered) -> int:
-    """How many lanes of a lowered scene run in lockstep."""
-    small = program.operations <= LARGEST_PROGRAM
-    return TOGETHER if small and loops_are_single_functions() else 2**30
-
-
-@functools.cache
-def loops_are_single_functions() -> bool:
-    """Whether XLA compiles loops over steps into one function each, found by compiling one that touches some ten kilobytes."""
-    if jax.default_backend() != "cpu":
-        return False
-    with jax.ensure_compile_time_eval():
-        x = jnp.zeros(512)
-        loop = jax.jit(lambda x: jax.lax.while_loop(lambda s: s[0] < 9, lambda s: (s[0] + 1, jnp.sin(s[1]) + x), (0, x)))
-        return "xla_cpu_small_call" in loop.lower(x).compile().as_text()
+    """Return how many lanes of a lowered scene run in lockstep."""
+    return TOGETHER if program.operations <= LARGEST_PROGRAM and jax.default_backend() == "cpu" else 2**30
