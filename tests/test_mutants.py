@@ -29,6 +29,7 @@ from jourdain_jax.motion.integrators import crossings, erk_loop, erk_step, event
 from jourdain_jax.motion.integrators.tableaus import method_of
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.graph import Graph
 
 
 def rewritten(function: Callable, right: str, wrong: str) -> Callable:
@@ -274,6 +275,14 @@ def reverse_mode_to_an_event():
 # The mutants
 
 
+def rates_of_coordinates_have_their_divisors():
+    graph = Graph()
+    a, w = graph.input("a", True), graph.input("w", True)
+    sine, cosine = graph.call("sin", a), graph.call("cos", a)
+    found = lower._divisors(graph, [graph.div(w, sine), graph.mul(w, graph.call("tan", a))])
+    assert set(found) == {sine, cosine}, "what rates are divided by differs"
+
+
 @dataclass
 class Mutant:
     """One line made wrong, and the check that must show it, with a word of what it says then."""
@@ -296,7 +305,10 @@ BUILD, KINEMATICS, VJP = appell.AppellOnGraph, appell._Kinematics, recorded_adjo
 DISC, BOARD = a_tilting_disc_accelerates_as_by_dense_matrices, a_snakeboard_accelerates_as_by_dense_matrices
 LONGEST, LEAVES = steps_are_no_longer_than_allowed, a_motion_leaves_an_event_at_which_it_starts
 STEPS, TIMES, EVENT = steps_follow_a_closed_form, reverse_mode_through_saved_times, reverse_mode_to_an_event
+DIVISORS = rates_of_coordinates_have_their_divisors
 MUTANTS = [
+    Mutant("no divisors of rates", lower, "_divisors", '== "div"]', '== "none"]', DIVISORS, "differs"),
+    Mutant("no tangents among rates", lower, "_divisors", '== "tan"]', '== "none"]', DIVISORS, "differs"),
     Mutant("no gyroscopic torque", BUILD, "_inertia_resultants", "g.add(g.dot(row, alpha), w)", "g.dot(row, alpha)", DISC, DENSE),
     Mutant("no a_0", BUILD, "_inertia_resultants", "g.mul(int(at.mass[b]), x) for x in a", "g.zero for x in a", DISC, DENSE),
     Mutant(

@@ -241,7 +241,8 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
     stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors taken out", fewest))
     put_q, put_u = builder.projection(MOST_TERMS if fewest < SMALL else 0, held)
     groups = {name: getattr(best, name) for name in ("qdot", "ydot", "z", "pivots", "guards", "power", "events", "energies")}
-    groups |= {"power": [best.power], "projected_q": put_q, "projected_u": put_u}
+    of_rates = [] if scene.speeds is None else _divisors(graph, builder.traced.at.qdot.tolist())
+    groups |= {"power": [best.power], "projected_q": put_q, "projected_u": put_u, "pivots": [*of_rates, *best.pivots]}
     outputs = graph.with_quotients(_with_equal_calls_once(builder.identity_probes, [n for group in groups.values() for n in group]))
     rest = iter(outputs)
     nodes = {name: tuple(islice(rest, len(group))) for name, group in groups.items()}
@@ -264,6 +265,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
         independent=tuple(builder.independent),
         dependent=tuple(builder.dependent),
         sizes=tuple(sizes),
+        divisors=len(of_rates),
         power=None if structure.driven else power,
         by_partition=builder.kept is not None and builder.kept.by_partition,
         left_out=structure.redundant_rows,
@@ -276,6 +278,14 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
         states=_some_states(graph, probes, stands_for.values()),
         **nodes,
     )
+
+
+def _divisors(graph: Graph, qdot: list[int]) -> list[int]:
+    """What the rates of coordinates are divided by, as in w/sin q; a choice by `where` keeps away from zero itself."""
+    nodes = [n for n in graph.reachable(qdot) if graph.varies[n]]
+    found = [graph.args[n][1] for n in nodes if graph.op[n] == "div"]
+    found += [graph.call("cos", *graph.args[n]) for n in nodes if graph.op[n] == "tan"]
+    return [n for n in dict.fromkeys(found) if graph.varies[n] and graph.op[n] != "select"]
 
 
 def _strategies(builder: AppellOnGraph, held: tuple[int, ...], small: bool, plainly: int) -> Iterator[Strategy]:

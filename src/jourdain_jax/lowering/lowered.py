@@ -53,7 +53,8 @@ class Lowered:
     qdot: tuple[int, ...]  # nodes
     ydot: tuple[int, ...]
     z: tuple[int, ...]  # dependent speeds
-    pivots: tuple[int, ...]  # must not vanish
+    pivots: tuple[int, ...]  # must not vanish; those that coordinate rates are divided by come first
+    divisors: int  # how many those are
     sizes: tuple[int, ...]  # inputs for what the magnitudes of the pivots usually are
     guards: tuple[int, ...]  # must stay positive
     power: int | None  # `rate_of_work` (d(T + V)/dt at constant inputs, or that part of it that is integrated); None where poses are driven

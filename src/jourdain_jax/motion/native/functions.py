@@ -33,7 +33,7 @@ class Form:
     projects: bool
     affine: bool
     has_events: bool
-    has_pivots: bool
+    pivots: int  # how many are monitored
     moving: tuple[tuple[int, ...], ...] = ()  # of every tangent (`Layout`), which of the numbers known have it
     sampled: tuple[int, ...] = ()  # which of the inputs are given by samples
     time_moves: bool = False  # whether time has tangents
@@ -53,11 +53,6 @@ class Form:
             len(self.sampled),
             len(self.watched),
         )
-
-    @property
-    def pivots(self) -> int:
-        """How many are monitored."""
-        return len(self.program.pivots) if self.has_pivots else 0
 
     @property
     def relations(self) -> tuple[int, ...]:

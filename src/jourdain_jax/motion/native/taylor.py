@@ -110,7 +110,7 @@ def _evaluated(w: Writer, form: Form, graph, nodes: Sequence[int], values: Mappi
     count, holds = len(form.program.guards), w.literal(-1, w.truth)
     for guard in found[:count]:
         holds = holds & (guard > 0.0)
-    sizes = [of_variables[form.program.variables.index(n)] for n in form.program.sizes] if form.pivots else []
+    sizes = [of_variables[form.program.variables.index(n)] for n in form.program.sizes[: form.pivots]]
     return Monitored(holds, [x / size for x, size in zip(found[count:], sizes, strict=True)])
 
 

@@ -18,7 +18,8 @@ MESSAGES = {
     "rank, no inertia along a free direction); look at the last state with `accelerations` and `verify`",
     INCONSISTENT_START: "the start does not meet the constraints and could not be projected onto them",
     SINGULAR_PARTITION: "the motion came near a configuration where the rows, as they are solved here, do not determine all speeds: another choice of "
-    "`privileged` may serve there, and `formulation=jj.Formulation('full')`, `backend='dense'` do unless the rows lose rank",
+    "`privileged` may serve there, and `formulation=jj.Formulation('full')`, `backend='dense'` do unless the rows lose rank; or where the scene's own "
+    "`coordinate_rates` become infinite: state other speeds there",
     BAD_PARAMETER: "a parameter is not finite or has the wrong sign",
     BAD_START: "the start is not finite; check where its values were computed",
     SHRANK: "ran out of steps, which had shrunk to less than a hundredth of their average: a singularity, a discontinuity or a stiff force near the last time",

@@ -32,8 +32,13 @@ class ByProgram(VectorField):
 
     @property
     def has_pivots(self) -> bool:
-        """Whether an elimination divides by numbers that must not vanish."""
-        return self.independent is not None and bool(self.program.pivots)
+        """Whether an elimination, or the rates of the coordinates, divide by numbers that must not vanish."""
+        return self.pivots > 0
+
+    @property
+    def pivots(self) -> int:
+        """How many are monitored: all; with all speeds in the state, those of the coordinate rates alone."""
+        return self.program.divisors if self.independent is None else len(self.program.pivots)
 
     def fixed(self, scene: Scene) -> tuple:
         """What depends on parameters alone."""
@@ -61,7 +66,9 @@ class ByProgram(VectorField):
     def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Integrated, Float[Array, "pivots *lanes"]]:
         """As `rates`, and the pivots of the elimination relative to their usual sizes."""
         qdot, vdot, power, pivots = self.program.rates_and_pivots(fixed, t, tuple(y.q), tuple(y.v), inputs, self.with_work)
-        return Integrated(jnp.stack(qdot), jnp.stack(vdot) if vdot else y.v, power), jnp.stack(pivots) if pivots else jnp.zeros((0, *y.q.shape[1:]))
+        pivots = pivots[: self.pivots]
+        monitored = jnp.stack(pivots) if pivots else jnp.zeros((0, *y.q.shape[1:]))
+        return Integrated(jnp.stack(qdot), jnp.stack(vdot) if vdot else y.v, power), monitored
 
     def project(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
         """The state put back onto the rows."""
