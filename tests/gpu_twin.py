@@ -5,10 +5,10 @@ import functools
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
+from unittest import mock
 
 import jax
 import numpy as np
-import pytest
 from jax.interpreters import mlir
 
 from jourdain_jax.motion.native import called
@@ -97,9 +97,14 @@ def by_twins(order: str = "in order", slots: int = 64):
 
     @functools.cache
     def made(kernel) -> Twin:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(gpu, "registered", lambda text, scratch: texts.append(text) or gpu.Kernel(0, nvidia.Loaded(0, 0, 0), scratch))
+        def registered(text, scratch):
+            texts.append(text)
+            return gpu.Kernel(0, nvidia.Loaded(0, 0, 0), scratch)
+
+        kernel.cache_clear()
+        with mock.patch.object(gpu, "registered", registered):
             scratch = kernel().scratch
+        kernel.cache_clear()
         return Twin(texts[-1], scratch)
 
     def lowered(ctx, *values, kernel, **_):

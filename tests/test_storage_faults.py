@@ -229,12 +229,14 @@ def test_times_that_are_turned_round_are_noticed(saved, tmp_path):
 def test_motions_back_in_time_and_to_an_event_are_read_back(tmp_path):
     scene = jj.models.TiltingDisc()
     start = {"lean": 0.3, "spin_rate": -3.0}
-    for k, motion in enumerate((
-        jj.simulate(scene, start, t0=1.0, t1=0.0),
-        jj.simulate(scene, {"lean": 0.9}, t1=5.0),  # falls
-        jj.simulate(scene, start, ts=np.array([0.3, 0.3 + 1e-15, 0.7])),
-        jj.simulate(scene, start, ts=np.array([0.5])),
-    )):
+    for k, motion in enumerate(
+        (
+            jj.simulate(scene, start, t0=1.0, t1=0.0),
+            jj.simulate(scene, {"lean": 0.9}, t1=5.0),  # falls
+            jj.simulate(scene, start, ts=np.array([0.3, 0.3 + 1e-15, 0.7])),
+            jj.simulate(scene, start, ts=np.array([0.5])),
+        )
+    ):
         jj.save(motion, tmp_path / f"{k}.npz")
         assert_equal_to_the_bit(jj.load_trajectory(tmp_path / f"{k}.npz", type(scene)), motion)
 

@@ -2,6 +2,8 @@
 
 from dataclasses import asdict, dataclass
 
+import jax
+
 from jourdain_jax.analysis.integrability import growth_vector, row_integrability
 from jourdain_jax.build.domain import COORDINATE_DOMAIN, SPEED_DOMAIN
 from jourdain_jax.build.structure import structure_of
@@ -14,6 +16,7 @@ from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.vector_fields.choice import vector_field
+from jourdain_jax.native import nvidia
 from jourdain_jax.scene.arguments import BuiltFor, of_known_numbers
 from jourdain_jax.scene.printing import Printed, preformatted
 from jourdain_jax.scene.scene import Scene
@@ -230,4 +233,7 @@ def _lowering(built: Built) -> str:
     if built.not_integrated:
         return f"a scalar program of {found.operations} operations{calls}; not integrated: {built.not_integrated}"
     reason = native_motion.reason_against(vector_field(built.scene), built.scene, as_inputs(built.scene, None), bool(built.events))
-    return f"a scalar program of {found.operations} operations{calls}; {f'not to machine code: {reason}' if reason else 'to machine code'}"
+    where = f"not to machine code: {reason}" if reason else "to machine code"
+    if not reason and jax.default_backend() == "gpu":
+        where += f" of the CPU and of NVIDIA GPUs ({nvidia.architecture()})"
+    return f"a scalar program of {found.operations} operations{calls}; {where}"

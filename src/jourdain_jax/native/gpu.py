@@ -131,8 +131,8 @@ def registered(text: str, scratch: tuple[int, int]) -> Kernel:
 def lowered(ctx: mlir.LoweringRuleContext, arguments: Sequence, kernel: Kernel) -> list:
     """The call of a kernel, on arrays of doubles; those in single precision are converted."""
     lanes = int(np.prod(ctx.avals_in[-1].shape[:-1]))
-    blocks = nvidia.blocks(lanes, kernel.loaded)
     needed, most = kernel.scratch
+    blocks = min(nvidia.blocks(lanes, kernel.loaded), max(1, MOST_SCRATCH // (8 * nvidia.WARP * max(needed, 1))))
     each = 8 * blocks * nvidia.WARP * max(needed, 1)
     times = min(most, max(1, min(MOST_SCRATCH, nvidia.memory() // 8) // max(each, 1)))
     doubles = [x.update(dtype=np.dtype(np.float64), weak_type=False) for x in (*ctx.avals_in, *ctx.avals_out)]

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
-MOST_INLINED = 6_000  # lines of a function times its calls, up to which it is written out at these on a GPU
+MOST_INLINED = 10_000  # lines of a function times its calls, up to which it is written out at these on a GPU
 _COMPARED = {"lt": ("olt", "slt"), "le": ("ole", "sle"), "gt": ("ogt", "sgt"), "ge": ("oge", "sge"), "eq": ("oeq", "eq"), "ne": ("une", "ne")}
 
 

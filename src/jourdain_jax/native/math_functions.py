@@ -63,5 +63,6 @@ def _power(w: Writer, x: Value, y: Value) -> Value:
 
 # Those of C's library, by the names that they have there; of sines, cosines, tangents and arcs beyond the range of the polynomials.
 LIBM = {name: operation.c or name for name, operation in TABLE.items() if operation.is_number and name not in _BY_INSTRUCTIONS and "{" not in operation.c}
+ONLY_IN_C = frozenset(LIBM) - frozenset(BY_POLYNOMIALS) - {"sin", "cos"}  # which a GPU has not
 FUNCTIONS = {name: partial(by_libm, in_c) for name, in_c in LIBM.items()} | {name: partial(_shared, name) for name in BY_POLYNOMIALS}
 FUNCTIONS |= {"pow": _power} | _BY_INSTRUCTIONS

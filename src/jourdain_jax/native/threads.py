@@ -1,6 +1,6 @@
 """Lanes of a batch among threads: this one, and others that it starts and waits for."""
 
-from jourdain_jax.native.ffi import Given, product, write_handler
+from jourdain_jax.native.ffi import FIRST_OF_SCRATCH, Given, product, write_handler
 from jourdain_jax.native.ir import Value, Writer
 
 MANY = 8  # times as many lanes as side by side make it worth while to start another thread, which takes some 30 us
@@ -46,11 +46,15 @@ def share(w: Writer, job: Value, count: Value) -> None:
 def write_rows(w: Writer, given: int, returned: int) -> None:
     """A handler that takes rows of `given` numbers to rows of `returned` ones, lanes side by side, by the module's `row(given, returned)`.
 
+    On a GPU a pointer to the thread's own part of the call's memory (`Writer.scratch`) comes after what is given.
     Places for which no row is left work out the last one once more.
     """
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
-        state, found, who = w.room(w.real, given), w.room(w.real, returned), w.room("i64", w.lanes)
+        state, found, who = w.room(w.real, given + w.device), w.room(w.real, returned), w.room("i64", w.lanes)
         rows, results, count = w.load("ptr", job, IN), w.load("ptr", job, OUT), w.load("i64", job, COUNT)
+        if w.device and w.scratch[0]:
+            own = w.at(w.load("ptr", job, NEXT), w.thread()[0] * w.scratch[0] + FIRST_OF_SCRATCH, "double")
+            w.store(own, state, given)
         with w.repeated() as leave:
             leave(~w.together(lanes_taken(w, job, NEXT) < count))
             with w.counted(0, w.lanes) as lane:

@@ -81,7 +81,7 @@ _call_p.def_impl(lambda *arguments, **how: _compiled(**how)(*arguments))
 _call_p.def_abstract_eval(_results)
 mlir.register_lowering(_call_p, on_cpu, platform="cpu")
 mlir.register_lowering(_call_p, lambda ctx, *arguments, kernel, **_: gpu.lowered(ctx, arguments, kernel()), platform="cuda")
-PLATFORMS["cuda"] = lambda: not nvidia.reason_against()
+PLATFORMS["cuda"] = lambda: jax.default_backend() == "gpu" and not nvidia.reason_against()
 batching.primitive_batchers[_call_p] = lambda values, axes, **how: (found := _call_p.bind(*with_lanes_first(values, axes), **how), [0] * len(found))
 
 

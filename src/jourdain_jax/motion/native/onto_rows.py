@@ -111,6 +111,7 @@ def write(w: Writer, of: Rows, cutoff: float) -> None:
         _write_moved(w, of)
     else:
         _write_in_band(w, of, of.in_band, min(REGULAR, CLEARLY / cutoff**2))
+        w.scratch = rows * (rows + columns), 1
     _write_row(w, of)
     write_rows(w, len(of.given) + columns + rows, columns + rows)
 
@@ -238,6 +239,9 @@ def _write_row(w: Writer, of: Rows) -> None:
         if of.in_band is None:
             n = columns if of.metric is not None else 0
             _write_putting(w, of, first, state, [w.room(w.real, max(count, 1)) for count in (n * n, n, entries, rows, rows)], x)
+        elif w.device:
+            dense = w.load("ptr", state, len(of.given) + columns + rows)
+            _write_putting(w, of, first, state, [dense if count is None else w.room(w.real, count) for count in sizes(of.in_band)], x)
         else:  # memory that nothing is written to costs next to nothing
             dense = w.external("aligned_alloc", "ptr", w.literal(64, "i64"), w.literal(-(entries * w.lanes * 8 // -64) * 64, "i64"))
             there = w.converted("ptrtoint", dense, "i64").differs(0)
@@ -248,7 +252,7 @@ def _write_row(w: Writer, of: Rows) -> None:
         with w.counted(0, columns) as k:
             w.store(w.load(w.real, state, k + first), found, k)
         w.call("residuals", "void", state, w.at(found, columns, w.real))
-        if of.in_band is not None:
+        if of.in_band is not None and not w.device:
             w.external("free", "void", dense)
         w.give()
 
