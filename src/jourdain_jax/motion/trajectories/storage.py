@@ -11,12 +11,10 @@ says how lanes with a `fallback` were run.
 What is absent, or is not what the names and the number of times ask for, is an error, and so is a parameter of the scene's class that the file lacks.
 """
 
-import contextlib
 import io
 import json
 import math
 import os
-import secrets
 import zipfile
 from dataclasses import fields
 
@@ -26,6 +24,7 @@ import numpy as np
 
 from jourdain_jax.calculus.reading import check_depth, parsed
 from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.writing import write_whole
 from jourdain_jax.motion.batches.rollout import RERUN_FIELDS, Rollout
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.marks import with_nan_as_a_mark
@@ -72,22 +71,9 @@ def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
         "arrays": sorted(arrays),
         "versions": {name: version_of(name) for name in ("jourdain-jax", "jax", "diffrax", "numpy")},
     }
-    _write(os.path.realpath(path), {"header": np.array(json.dumps(header)), **arrays})
-
-
-def _write(path: str, arrays: dict) -> None:
-    """The whole file or, where writing is interrupted, what was there before: written beside it under another name, which then takes its place."""
-    beside = os.path.join(os.path.dirname(path), f".{os.path.basename(path)}.{secrets.token_hex(8)}")
-    try:
-        with open(beside, "xb") as file:  # a handle, so that numpy does not append a suffix to the name
-            np.savez_compressed(file, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(beside, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(beside)
-        raise
+    content = io.BytesIO()
+    np.savez_compressed(content, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
+    write_whole(os.path.realpath(path), content.getbuffer(), wait=True)
 
 
 def _sampled(inputs: Inputs, ts):
