@@ -12,7 +12,6 @@ from tolerances import tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.build.structure import LONG, structure_of
-from jourdain_jax.calculus.collecting import without_collecting
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.trajectories import results
@@ -101,9 +100,8 @@ def test_a_long_chain_counts_as_well_conditioned_where_a_short_one_with_the_same
 
 def test_garbage_is_collected_again_after_a_scene_was_looked_at_or_refused():
     def refused():
-        with without_collecting():
-            assert not gc.isenabled()
-            raise ValueError("refused")
+        assert not gc.isenabled()
+        raise ValueError("refused")
 
     with pytest.raises(ValueError, match="refused"):
         refused()

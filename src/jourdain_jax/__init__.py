@@ -10,12 +10,10 @@ What a first motion does not need, such as fits, studies and pictures, is import
 import os as _os
 import typing as _typing
 
-from jourdain_jax.calculus.collecting import without_collecting as _without_collecting
+import jax as _jax
+
 from jourdain_jax.calculus.on_first_use import module_on_first_use as _module_on_first_use
 from jourdain_jax.calculus.on_first_use import names_on_first_use as _names_on_first_use
-
-with _without_collecting():
-    import jax as _jax
 
 if _os.environ.get("JAX_ENABLE_X64", "1").lower() not in ("0", "false", "off"):
     _jax.config.update("jax_enable_x64", True)
@@ -31,52 +29,51 @@ if "xla_backend_extra_options" not in _os.environ.get("XLA_FLAGS", ""):
     _option = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1048576"
     _os.environ["XLA_FLAGS"] = f"{_os.environ.get('XLA_FLAGS', '')} {_option}".strip()
 
-with _without_collecting(all_stays=True):  # what a motion needs
-    from jourdain_jax import models
-    from jourdain_jax.build.sampling import sample_states
-    from jourdain_jax.build.structure import structure_of
-    from jourdain_jax.calculus.guards import DifferentiationModeError
-    from jourdain_jax.calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
-    from jourdain_jax.dynamics.accelerations import Accelerations, Baumgarte, accelerations, reductions
-    from jourdain_jax.dynamics.newton_euler import newton_residual
-    from jourdain_jax.equations.instant import constraint_rows
-    from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, partial_velocities, pose_at
-    from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, NullSpaceSVD, Privileged, UdwadiaKalaba
-    from jourdain_jax.equations.rows import position_residual, velocity_residual
-    from jourdain_jax.equations.virtual_power import (
-        generalized_forces,
-        kinetic_energy,
-        potential_energy,
-        unconstrained_equations,
-        virtual_power,
-    )
-    from jourdain_jax.lowering.built import Built, build
-    from jourdain_jax.lowering.lower import lower
-    from jourdain_jax.lowering.lowered import Lowered, NotLowered
-    from jourdain_jax.motion.inputs import Sampled
-    from jourdain_jax.motion.integrators.taylor import Taylor
-    from jourdain_jax.motion.sensitivity import SensitivityWarning
-    from jourdain_jax.motion.simulate import simulate
-    from jourdain_jax.motion.start import State, consistent, start
-    from jourdain_jax.motion.trajectories.diagnostics import diagnose
-    from jourdain_jax.motion.trajectories.results import SimulationError
-    from jourdain_jax.motion.trajectories.trajectory import Trajectory
-    from jourdain_jax.motion.trajectories.versions import version_of as _version_of
-    from jourdain_jax.motion.vector_fields.choice import Formulation
-    from jourdain_jax.scene.bodies import Particle, RigidBody
-    from jourdain_jax.scene.constraints import knife_edge, pin, rod, weld
-    from jourdain_jax.scene.contacts import Contact, ball_contact, disc_contact, ellipsoid_contact, wheel_contact
-    from jourdain_jax.scene.coordinates import coordinates, inputs, quaternion, speeds
-    from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere, Surface
-    from jourdain_jax.scene.loads import Load, damper, generalized_force, gravity, point_force, spring, torque
-    from jourdain_jax.scene.motion_state import fixed_point
-    from jourdain_jax.scene.names_read import clear_caches
-    from jourdain_jax.scene.parameters import parameter
-    from jourdain_jax.scene.possible_inertia import inertia_from_log_cholesky, log_cholesky
-    from jourdain_jax.scene.printing import show_scenes_with as _show_scenes_with
-    from jourdain_jax.scene.scene import Scene
-    from jourdain_jax.scene.spline import Spline
-    from jourdain_jax.scene.visuals import Visual
+from jourdain_jax import models
+from jourdain_jax.build.sampling import sample_states
+from jourdain_jax.build.structure import structure_of
+from jourdain_jax.calculus.guards import DifferentiationModeError
+from jourdain_jax.calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
+from jourdain_jax.dynamics.accelerations import Accelerations, Baumgarte, accelerations, reductions
+from jourdain_jax.dynamics.newton_euler import newton_residual
+from jourdain_jax.equations.instant import constraint_rows
+from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, partial_velocities, pose_at
+from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, NullSpaceSVD, Privileged, UdwadiaKalaba
+from jourdain_jax.equations.rows import position_residual, velocity_residual
+from jourdain_jax.equations.virtual_power import (
+    generalized_forces,
+    kinetic_energy,
+    potential_energy,
+    unconstrained_equations,
+    virtual_power,
+)
+from jourdain_jax.lowering.built import Built, build
+from jourdain_jax.lowering.lower import lower
+from jourdain_jax.lowering.lowered import Lowered, NotLowered
+from jourdain_jax.motion.inputs import Sampled
+from jourdain_jax.motion.integrators.taylor import Taylor
+from jourdain_jax.motion.sensitivity import SensitivityWarning
+from jourdain_jax.motion.simulate import simulate
+from jourdain_jax.motion.start import State, consistent, start
+from jourdain_jax.motion.trajectories.diagnostics import diagnose
+from jourdain_jax.motion.trajectories.results import SimulationError
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.motion.trajectories.versions import version_of as _version_of
+from jourdain_jax.motion.vector_fields.choice import Formulation
+from jourdain_jax.scene.bodies import Particle, RigidBody
+from jourdain_jax.scene.constraints import knife_edge, pin, rod, weld
+from jourdain_jax.scene.contacts import Contact, ball_contact, disc_contact, ellipsoid_contact, wheel_contact
+from jourdain_jax.scene.coordinates import coordinates, inputs, quaternion, speeds
+from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere, Surface
+from jourdain_jax.scene.loads import Load, damper, generalized_force, gravity, point_force, spring, torque
+from jourdain_jax.scene.motion_state import fixed_point
+from jourdain_jax.scene.names_read import clear_caches
+from jourdain_jax.scene.parameters import parameter
+from jourdain_jax.scene.possible_inertia import inertia_from_log_cholesky, log_cholesky
+from jourdain_jax.scene.printing import show_scenes_with as _show_scenes_with
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.spline import Spline
+from jourdain_jax.scene.visuals import Visual
 
 if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.analysis.body_inertia import possible_inertia

@@ -18,7 +18,6 @@ from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.smoothness import across, in_time
 from jourdain_jax.build.structure import structure_whatever_its_faults
 from jourdain_jax.build.trace import jaxpr_of_scene
-from jourdain_jax.calculus.collecting import without_collecting
 from jourdain_jax.calculus.jumps import jumps
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import inertias_of, motion_at
@@ -54,7 +53,7 @@ def jump_of_loads(scene: Scene) -> str:
     q = structure_whatever_its_faults(scene).coordinates if in_parameters or in_state else np.zeros((0, 0))
     if not q.size:
         return ""
-    with without_collecting(), np.errstate(all="ignore"):  # what is no number on a line does not count there
+    with np.errstate(all="ignore"):  # what is no number on a line does not count there
         try:
             return _first_jump(scene, q, in_parameters, in_state)
         except NotImplementedError:  # callbacks that take one state at a time
@@ -83,7 +82,7 @@ def loads_without_slope(scene: Scene, t, q, u, inputs) -> str:
         return ""
     at = np.concatenate([np.ravel(x).astype(float) for x in (t, q, u, inputs)])
     step = np.diag(np.maximum(1.0, np.abs(at)))[1:]
-    with without_collecting(), np.errstate(all="ignore"):
+    with np.errstate(all="ignore"):
         try:
             near, nearer = (_differences(scene, at, step, size) for size in (NEAR, NEARER))
         except NotImplementedError:  # as of `jump_of_loads`

@@ -20,7 +20,6 @@ from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.row_lengths import speed_scales, typical_row_lengths
 from jourdain_jax.build.sampling import no_numbers, random_states, states_near_what_was_seen, symmetric_configurations, usable_states
 from jourdain_jax.build.smoothness import check_smoothness
-from jourdain_jax.calculus.collecting import without_collecting
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.rows import UsualRows
@@ -211,7 +210,7 @@ def usual_rows(scene: Scene) -> UsualRows:
 
 @once_per_values
 def _structure(scene: Scene) -> Structure:
-    with without_collecting(), np.errstate(all="ignore"):  # what is no number at a probe does not count there
+    with np.errstate(all="ignore"):  # what is no number at a probe does not count there
         return _probed_structure(scene)
 
 

@@ -14,8 +14,6 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
-from jourdain_jax.calculus.collecting import without_collecting
-
 
 class _OnFirstUse(ModuleType):
     """Stands for the module of its name."""
@@ -54,8 +52,7 @@ def names_on_first_use(package: dict[str, Any], where: Mapping[str, str]) -> tup
     def __getattr__(name: str) -> Any:
         if name not in where:
             raise AttributeError(f"module {package['__name__']!r} has no attribute {name!r}")
-        with without_collecting():
-            package[name] = getattr(import_module(f"{package['__name__']}.{where[name]}"), name)
+        package[name] = getattr(import_module(f"{package['__name__']}.{where[name]}"), name)
         return package[name]
 
     def __dir__() -> list[str]:

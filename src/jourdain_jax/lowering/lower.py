@@ -18,7 +18,6 @@ from jourdain_jax.build.reference_parameters import varied, with_reference_param
 from jourdain_jax.build.sampling import random_states
 from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.build.trace import TracedScene, Variables, named_values, traced_scene
-from jourdain_jax.calculus.collecting import without_collecting
 from jourdain_jax.lowering.appell import AppellOnGraph, Strategy
 from jourdain_jax.lowering.comparison import agree, check_against_dense, rates_of, values_at
 from jourdain_jax.lowering.far import full_turns, on_velocity_rows
@@ -116,7 +115,7 @@ class _Key:
 @lru_cache(maxsize=256)
 def _lowered(key: _Key) -> Lowered | NotLowered:
     try:
-        with without_collecting(), np.errstate(all="ignore"):  # what is no number at a probe does not count there
+        with np.errstate(all="ignore"):  # what is no number at a probe does not count there
             return _timed(key)
     except NotLowered as reason:
         return NotLowered(str(reason))  # kept without its traceback

@@ -5,7 +5,6 @@ XLA's newer fusion emitters on the CPU take up to twice as long to compile a sca
 """
 
 from collections.abc import Callable
-from contextlib import nullcontext
 from functools import lru_cache
 from typing import Any
 
@@ -13,7 +12,6 @@ import equinox as eqx
 import jax
 import jaxlib.version
 
-from jourdain_jax.calculus.collecting import without_collecting
 from jourdain_jax.calculus.reals import is_array_type, nothing_is_traced
 
 # From jaxlib 0.11.1 on, XLA has these emitters alone.
@@ -40,10 +38,7 @@ def compiled(f: Callable, compiler_options: dict | Callable | None = None) -> Ca
 
     def run(*arguments):
         arrays, structure = _parted(arguments)
-        before = program.cache_info().misses
-        wanted = program(*structure)
-        with without_collecting() if program.cache_info().misses > before else nullcontext():  # what is traced makes millions of objects
-            found, kept = wanted(arrays)
+        found, kept = program(*structure)(arrays)
         return _whole(found, *kept.value)
 
     return run
