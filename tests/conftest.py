@@ -3,11 +3,14 @@
 `JOURDAIN_JAX_NO_TYPE_CHECKS=1` switches the jaxtyping/beartype checks off (faster, for timing only).
 """
 
+import ctypes
 import gc
 import importlib.metadata
 import os
+import sys
 from pathlib import Path
 
+import psutil
 import pytest
 
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -64,20 +67,24 @@ def _less_effort():
         yield
 
 
+MOST_RESIDENT = 1e9  # bytes of a process between files: workers of two, with what a file adds, stay below 5 GB
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _compiled_programs_are_dropped():
-    """Compiled programs hold memory maps, of which a process may have 65530 on Linux: without this a long run aborts inside the compiler.
+    """Compiled programs are dropped after a file where they hold much memory: machine code and its memory maps, of which a process may have 65530.
 
     What a file leaves behind is kept by caches: it is not looked through for garbage until these are emptied, which would take seconds each time.
     """
     yield
-    maps = Path("/proc/self/maps")
-    if not maps.exists() or maps.read_bytes().count(b"\n") > 35_000:
+    if psutil.Process().memory_info().rss > MOST_RESIDENT:
         import jax
 
         jax.clear_caches()
         gc.unfreeze()
         gc.collect()
+        if sys.platform == "linux":
+            ctypes.CDLL(None).malloc_trim(0)  # glibc keeps what was freed otherwise
     gc.freeze()
 
 
