@@ -24,7 +24,9 @@ from pathlib import PurePath
 from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.reals import is_traced
@@ -78,7 +80,7 @@ def now_read_by(function: Callable) -> Hashable | None:
 
 def is_function(x) -> bool:
     """Whether it is a function that may read something, and not a module that holds numbers."""
-    return isinstance(x, FunctionType | MethodType | functools.partial) or callable(_attribute(x, "__wrapped__"))
+    return isinstance(x, FunctionType | MethodType | functools.partial) or callable(_attribute(x, "__wrapped__")) or type(x) is eqx.filter_custom_jvp
 
 
 class _Same:
@@ -230,9 +232,11 @@ def key(x: Any) -> Hashable:
 
     **Raises** StatefulError for what may change: arrays, containers, objects.
     """
-    if type(x) in _VALUES or (isinstance(x, np.generic) and not x.dtype.hasobject) or isinstance(x, enum.Enum):
+    if type(x) in _VALUES or (isinstance(x, np.number | np.bool_)) or isinstance(x, enum.Enum):
         return type(x), repr(x)
-    if isinstance(x, tuple | frozenset):
+    if isinstance(x, slice):
+        return type(x), key((x.start, x.stop, x.step))
+    if isinstance(x, tuple | frozenset) and not getattr(x, "__dict__", None):
         return type(x), tuple(map(key, x)) if isinstance(x, tuple) else frozenset(map(key, x))
     if isinstance(x, functools.partial):
         return type(x), key(x.func), key(x.args), tuple((name, key(value)) for name, value in x.keywords.items())
@@ -247,6 +251,6 @@ def _is_constant(x: Any) -> bool:
     """Whether it is a module, a class, a function, or something else that has no state of its own."""
     if isinstance(x, BuiltinFunctionType | MethodType):
         return x.__self__ is None or isinstance(x.__self__, ModuleType | type)
-    if isinstance(x, ModuleType | type | FunctionType | staticmethod | classmethod | property | np.ufunc | functools.cached_property):
+    if isinstance(x, ModuleType | type | FunctionType | staticmethod | classmethod | property | np.ufunc | jnp.ufunc | functools.cached_property):
         return True
     return type(x) is object or type(x).__module__ == "typing" or callable(_attribute(x, "__wrapped__"))
