@@ -346,7 +346,7 @@ MUTANTS = [
     ),
     Mutant("no projection", step, "_project", 'w.call("project", "void", p.pointer, t1, y1)', "None", CIRCLE, "circle"),
     Mutant("no events", step, "_monitored", "~search.no_event(w, c_1)", "~search.no_event(w, c_0)", EVENT, "event"),
-    Mutant("no dips", step, "_monitored", "dips = accept & dips", "dips = accept & ~accept", DIP, "passed over"),
+    Mutant("no dips", step, "_monitored", "accept & (dips | again)", "accept & again", DIP, "passed over"),
     Mutant("a bracket with the wrong end", search, "advance", "w.where(same_side, t[1], t[0])", "t[0]", EVENT, "event"),
     Mutant("rows by half", onto_rows, "_write_moved", "- w.where(moves, change, 0.0)", "- 0.5 * w.where(moves, change, 0.0)", ROWS, "coordinates|speeds"),
     Mutant(

@@ -79,7 +79,7 @@ def test_unreadable_files_are_refused_with_the_reason(rolling, tmp_path):
     (tmp_path / "text.npz").write_text("no numbers here")
     np.savez(tmp_path / "other.npz", a=1)
     for name, sentence in (
-        ("cut.npz", "is damaged"),
+        ("cut.npz", "no trajectory file"),
         ("text.npz", "no trajectory file"),
         ("other.npz", "no trajectory file"),
         ("none.npz", "there is no file"),
