@@ -12,6 +12,7 @@ Errors are below 0.9 ulp.
 """
 
 import math
+from collections.abc import Callable, Sequence
 
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.two_parts import polynomial, product_less, quotient, two_sum
@@ -76,14 +77,34 @@ ASIN = (
 
 def sine_and_cosine(w: Writer, x: Value) -> tuple[Value, Value]:
     """(sin x, cos x)"""
-    (r, less), (most, more), quadrant = _waves(w, x)
-    sine, cosine, odd = r - less, most + more, (quadrant & 1).differs(0)
-    return _turned(w, w.where(odd, cosine, sine), quadrant), _turned(w, w.where(odd, sine, cosine), quadrant + 1)
+    s, c = _or_far(w, x, _sine_and_cosine(w, _reduced(w, x)), _FAR_SINE_AND_COSINE)
+    return s, c
 
 
 def tangent(w: Writer, x: Value) -> Value:
     """tan x"""
-    (r, less), (most, more), quadrant = _waves(w, x)
+    return _or_far(w, x, [_tangent(w, _reduced(w, x))], _FAR_TANGENT)[0]
+
+
+def _or_far(w: Writer, x: Value, quick: Sequence[Value], far_ones: dict[str, Callable]) -> list[Value]:
+    """The quick values, but others in the lanes whose angle is large; these are functions of their own, so that what is usual runs past them."""
+    far, places = w.magnitude(x) > LARGEST_ANGLE, [w.room(w.real) for _ in quick]
+    for value, place in zip(quick, places, strict=True):
+        w.store(value, place)
+    with w.when(w.any(far)):
+        for value, place, (name, function) in zip(quick, places, far_ones.items(), strict=True):
+            w.store(w.where(far, w.shared(name, lambda w, x, function=function: function(w, _reduced_far(w, x)), x), value), place)
+    return [w.load(w.real, place) for place in places]
+
+
+def _sine_and_cosine(w: Writer, angle: tuple[Value, Value, Value]) -> tuple[Value, Value]:
+    (r, less), (most, more), quadrant = _waves(w, *angle)
+    sine, cosine, odd = r - less, most + more, (quadrant & 1).differs(0)
+    return _turned(w, w.where(odd, cosine, sine), quadrant), _turned(w, w.where(odd, sine, cosine), quadrant + 1)
+
+
+def _tangent(w: Writer, angle: tuple[Value, Value, Value]) -> Value:
+    (r, less), (most, more), quadrant = _waves(w, *angle)
     sine, sine_rest = two_sum(r, -less)
     cosine, cosine_rest = two_sum(most, more - 0.5 * product_less(w, r, r, r * r))
     odd = (quadrant & 1).differs(0)
@@ -92,20 +113,21 @@ def tangent(w: Writer, x: Value) -> Value:
     return head - over
 
 
-def _waves(w: Writer, x: Value) -> tuple[tuple[Value, Value], tuple[Value, Value], Value]:
-    """(r, s), (m, c) and k: the angle that k quarter turns leave has the sine r - s, in which zeros keep their signs, and the cosine m + c."""
+_FAR_SINE_AND_COSINE = {"far_sine": lambda w, angle: _sine_and_cosine(w, angle)[0], "far_cosine": lambda w, angle: _sine_and_cosine(w, angle)[1]}
+_FAR_TANGENT = {"far_tangent": _tangent}
+
+
+def _reduced(w: Writer, x: Value) -> tuple[Value, Value, Value]:
+    """What whole quarter turns leave of an angle that is not large, by how much that is over, and how many turns they are."""
     shifted = w.fma(x, 2 / math.pi, WHOLE)
     turns, quadrant = shifted - WHOLE, w.converted("bitcast", shifted, w.whole)
     near = w.fma(-turns, HALF_PI[0], x)  # exact
     r = w.fma(-turns, HALF_PI[1], near)
-    over = w.fma(turns, HALF_PI[2], w.fma(turns, HALF_PI[1], r - near))
-    places = [w.room(a.type) for a in (r, over, quadrant)]
-    for value, place in zip((r, over, quadrant), places, strict=True):
-        w.store(value, place)
-    far = (w.magnitude(x) > LARGEST_ANGLE) & (w.magnitude(x) < math.inf)
-    with w.when(w.any(far)):
-        _reduce_far(w, x, far, places)
-    r, over, quadrant = (w.load(place_of.type, place) for place_of, place in zip((r, over, quadrant), places, strict=True))
+    return r, w.fma(turns, HALF_PI[2], w.fma(turns, HALF_PI[1], r - near)), quadrant
+
+
+def _waves(w: Writer, r: Value, over: Value, quadrant: Value) -> tuple[tuple[Value, Value], tuple[Value, Value], Value]:
+    """(r, s), (m, c) and k: the angle that k quarter turns leave has the sine r - s, in which zeros keep their signs, and the cosine m + c."""
     square = r * r
     half = 0.5 * square
     most = 1.0 - half
@@ -114,19 +136,23 @@ def _waves(w: Writer, x: Value) -> tuple[tuple[Value, Value], tuple[Value, Value
     return (r, less), (most, more), quadrant
 
 
-def _reduce_far(w: Writer, x: Value, far: Value, places: list[Value]) -> None:
-    """What a large angle leaves, that by which it is over, and its quarter turns, into these places in the lanes that are far.
+def _reduced_far(w: Writer, x: Value) -> tuple[Value, Value, Value]:
+    """As `_reduced`, of large angles; NaN for others.
 
     x = m 2^e with a whole number m of 53 bits; of 2/pi those 192 bits count whose products with m are no multiples of whole turns, and not far below 2^-126.
     """
     w.whole_numbers("two_over_pi", (0, *(word - 2**64 * (word >> 63) for word in TWO_OVER_PI)))
-    given, flags = w.room(w.real), w.room(w.real)
+    w.once("far_angle", "void", dict.fromkeys(("x", "r", "over", "quadrant"), "ptr"), _write_far_angle)
+    given, r, over, quadrant = w.room(w.real), w.room(w.real), w.room(w.real), w.room(w.whole)
     w.store(x, given)
-    w.store(w.where(far, 1.0, w.number(0.0)), flags)
-    with w.counted(0, w.lanes) as lane, w.when(w.load("double", flags, lane) > 0.0):
-        arguments = [w.at(place, lane, "double") for place in (given, *places)]
-        w.once("far_angle", "void", dict.fromkeys(("x", "r", "over", "quadrant"), "ptr"), _write_far_angle)
-        w.call("far_angle", "void", *arguments)
+    w.store(w.number(math.nan), r)
+    w.store(w.number(0.0), over)
+    w.store(w.literal(0, w.whole), quadrant)
+    with w.counted(0, w.lanes) as lane:
+        one = w.intrinsic("fabs", w.load("double", given, lane))
+        with w.when((one > LARGEST_ANGLE) & (one < math.inf)):
+            w.call("far_angle", "void", *(w.at(place, lane, "double") for place in (given, r, over, quadrant)))
+    return w.load(w.real, r), w.load(w.real, over), w.load(w.whole, quadrant)
 
 
 def _write_far_angle(w: Writer, x: Value, r: Value, over: Value, quadrant: Value) -> None:
