@@ -232,7 +232,7 @@ def key(x: Any) -> Hashable:
 
     **Raises** StatefulError for what may change: arrays, containers, objects.
     """
-    if type(x) in _VALUES or (isinstance(x, np.number | np.bool_)) or isinstance(x, enum.Enum):
+    if type(x) in _VALUES or isinstance(x, np.number | np.bool_ | enum.Enum):
         return type(x), repr(x)
     if isinstance(x, slice):
         return type(x), key((x.start, x.stop, x.step))
