@@ -38,7 +38,8 @@ def described(**members):
 def shaped(mass, inertia, orientation=eye, position=None):
     """The bead as a rigid body."""
     at = lambda q: jnp.stack([q.x, q.y, 0.0 * q.x]) if position is None else position * jnp.ones(3)
-    return described(bodies=lambda self, t, q: {"bead": jj.RigidBody(mass, inertia, at(q), orientation)})
+    bead = lambda q: jj.RigidBody(mass, inertia, at(q), orientation)
+    return described(bodies=lambda self, t, q: {"bead": bead(q)})
 
 
 def looked_at(**members):
@@ -47,7 +48,8 @@ def looked_at(**members):
 
 def held(**rows):
     """The bead with velocity rows."""
-    return described(velocity_constraints=lambda self, motion: {name: row(motion) for name, row in rows.items()})
+    named = lambda motion: {name: row(motion) for name, row in rows.items()}
+    return described(velocity_constraints=lambda self, motion: named(motion))
 
 
 def shell(line):

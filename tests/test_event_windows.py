@@ -35,6 +35,8 @@ USUAL = ("distance", "window", "clock")
 
 
 def scene_of(kind: str):
+    value, _ = KINDS[kind]
+
     class Passing(jj.Scene):
         a: float = jj.parameter(A)
         w: float = jj.parameter(W)
@@ -44,7 +46,7 @@ def scene_of(kind: str):
             return {"bead": jj.Particle(1.0, jnp.stack([q.x, 0 * q.x, 0 * q.x]))}
 
         def events(self, motion):
-            return {"met": KINDS[kind][0](motion.q.x, motion.t, self.a, self.w), "far": 30.0 - jnp.abs(motion.q.x)}
+            return {"met": value(motion.q.x, motion.t, self.a, self.w), "far": 30.0 - jnp.abs(motion.q.x)}
 
     return Passing
 

@@ -1,7 +1,6 @@
 """Scenes whose speeds all stay in the state: rows kept by multipliers on the graph, states put back onto rows by the program."""
 
 import dataclasses
-import gc
 
 import diffrax
 import jax
@@ -96,13 +95,3 @@ def test_a_long_chain_counts_as_well_conditioned_where_a_short_one_with_the_same
     structure = dataclasses.replace(structure_of(MODELS["skate"]()), worst_pivot=0.01)
     assert dataclasses.replace(structure, rank=2 * LONG).well_conditioned
     assert not dataclasses.replace(structure, rank=LONG).well_conditioned
-
-
-def test_garbage_is_collected_again_after_a_scene_was_looked_at_or_refused():
-    def refused():
-        assert not gc.isenabled()
-        raise ValueError("refused")
-
-    with pytest.raises(ValueError, match="refused"):
-        refused()
-    assert gc.isenabled()

@@ -133,7 +133,7 @@ def test_threads_that_make_the_same_machine_code_at_once_all_get_it(monkeypatch)
     writer, both = Writer(1, fused=False), threading.Barrier(2)
     ffi.write_handler(writer, 1, 1, lambda given, found: None)
     make = host.object_code
-    monkeypatch.setattr(disk, "kept", lambda name, find: find())
+    monkeypatch.setattr(disk, "kept", lambda name, made_by, find: find())
     monkeypatch.setattr(host, "object_code", lambda text, effort: (both.wait(20), make(text, effort))[1])
     with ThreadPoolExecutor(2) as threads:
         names = set(threads.map(ffi.registered, [f"{writer.text}; of this test alone"] * 2))

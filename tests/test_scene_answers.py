@@ -40,6 +40,10 @@ def test_one_load_counts_as_a_tuple_of_one():
 PLACE = jnp.zeros(3)
 
 
+def place():
+    return PLACE
+
+
 def unchecked(field, value):
     """A load as a user makes it, without the run-time type checks of these tests."""
     return eqx.tree_at(lambda load: getattr(load, field), jj.Load(), value, is_leaf=lambda x: x is None or x == {})
@@ -60,10 +64,10 @@ def unchecked(field, value):
         ({"loads": lambda self, m: (jj.gravity(m, 9.81, (0.0, -1.0)),)}, "direction of gravity has shape .2,., expected .3,."),
         ({"loads": lambda self, m: (jj.gravity(m, 9.81, (1.0, 1.0, 0.0)),)}, "direction of gravity has length 1.414, expected a unit vector"),
         ({"potential": lambda self, pose: pose.q.array}, "what `potential` of `Described` returned has shape .2,., expected one number"),
-        ({"bodies": lambda self, t, q: [jj.Particle(1.0, PLACE)]}, "`bodies` of `Described` returned a list, expected a dictionary by name"),
+        ({"bodies": lambda self, t, q: [jj.Particle(1.0, place())]}, "`bodies` of `Described` returned a list, expected a dictionary by name"),
         ({"bodies": lambda self, t, q: {}}, "`bodies` of `Described` returned no body; return at least one by name"),
-        ({"bodies": lambda self, t, q: {"bead": PLACE}}, "body `bead` of `Described` is .*, expected a `jj.Particle` or a `jj.RigidBody`"),
-        ({"bodies": lambda self, t, q: {1: jj.Particle(1.0, PLACE)}}, "`bodies` of `Described` returned a dictionary with the key 1, expected names"),
+        ({"bodies": lambda self, t, q: {"bead": place()}}, "body `bead` of `Described` is .*, expected a `jj.Particle` or a `jj.RigidBody`"),
+        ({"bodies": lambda self, t, q: {1: jj.Particle(1.0, place())}}, "`bodies` of `Described` returned a dictionary with the key 1, expected names"),
         ({"geometric_constraints": lambda self, p: p.q.x - p.q.y}, "`geometric_constraints` of `Described` returned .*, expected a dictionary by name"),
         ({"geometric_constraints": lambda self, p: {"row": p.q.x > 0}}, "row `row` of `Described` is of type bool, expected real numbers"),
         ({"velocity_constraints": lambda self, m: (m.u.x_rate,)}, "`velocity_constraints` of `Described` returned a tuple, expected a dictionary"),

@@ -180,12 +180,13 @@ def test_a_pose_with_a_wrong_derivative_is_found_at_its_body():
     ],
 )
 def test_an_inertia_that_no_body_has_is_found_at_its_body(inertia, sentence):
-    refused(statements(*wrong(inertia=lambda self: jnp.array(inertia))), "inertia", sentence)
+    entries = tuple(map(tuple, inertia))
+    refused(statements(*wrong(inertia=lambda self: jnp.array(entries))), "inertia", sentence)
 
 
 def test_an_inertia_that_is_not_symmetric_fails_the_whole_verification():
-    tensor = jnp.array([[0.2, 0.0, 0.0], [0.05, 0.3, 0.0], [0.0, 0.0, 0.4]])
-    refused(jj.verify(*wrong(inertia=lambda self: tensor)), "inertia", "body `sledge`: its inertia is not symmetric")
+    tensor = ((0.2, 0.0, 0.0), (0.05, 0.3, 0.0), (0.0, 0.0, 0.4))
+    refused(jj.verify(*wrong(inertia=lambda self: jnp.array(tensor))), "inertia", "body `sledge`: its inertia is not symmetric")
 
 
 def test_a_negative_mass_is_found_at_its_body():

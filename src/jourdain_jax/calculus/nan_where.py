@@ -63,7 +63,7 @@ def _leaving(primals, tangents):
 
 
 def _any(x, lanes):
-    return jnp.any(x != 0, axis=tuple(range(lanes, jnp.ndim(x)))).astype(x.dtype)
+    return jnp.any(x.astype(bool), axis=tuple(range(lanes, jnp.ndim(x)))).astype(x.dtype)
 
 
 def _over(counts, x):

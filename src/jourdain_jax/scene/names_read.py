@@ -33,7 +33,7 @@ from jourdain_jax.calculus.reals import is_traced
 
 _UNSET = object()
 _BASE = f"{__name__.rpartition('.')[0]}.scene"  # the module of the base class, below which nothing of a user's stands
-_VALUES = (bool, int, float, complex, str, bytes, type(None), type(...), range, Fraction, Decimal, re.Pattern, np.dtype, *PurePath.__subclasses__())
+_VALUES = (bool, int, float, complex, str, bytes, type(None), type(...), range, Fraction, Decimal, re.Pattern, np.dtype)
 _epoch = 0  # of `clear_caches`
 
 
@@ -66,14 +66,16 @@ jax.tree_util.register_pytree_node(NamesRead, lambda read: ((), read.now()), lam
 
 
 def names_read(*roots: type | Callable) -> NamesRead:
-    """Return the names that the methods of classes, and functions, read. ValueError where one stands for an array, a container or an object with state."""
+    """Return the names that the methods of classes, and functions, read. ValueError where one of a method stands for an array, a container or an object with
+    state; of a function in a field such an object is a constant.
+    """
     return NamesRead(_watch(*roots))
 
 
 def now_read_by(function: Callable) -> Hashable | None:
     """What the names that a function reads stand for now; None where one has state, so that a trace of the function cannot be kept."""
     try:
-        return names_read(function).now()
+        return _watch(function, strict=True).version(), function
     except (StatefulError, TypeError):  # the second: it cannot be hashed
         return None
 
@@ -101,8 +103,8 @@ class _Same:
 class _Watch:
     """Compares what names stand for with what they stood for when they were last looked up."""
 
-    def __init__(self, roots: tuple):
-        self.roots = roots
+    def __init__(self, roots: tuple, strict: bool):
+        self.roots, self._strict = roots, strict
         self._numbers: dict[Hashable, int] = {}
         self._look()
 
@@ -126,13 +128,14 @@ class _Watch:
             for kind in classes:
                 self._note(vars(kind).get, tuple(vars(kind)))
                 self._sizes.append((vars(kind), len(vars(kind))))
+            told = _key_or_refusal if classes or self._strict else lambda x, *_: _member_key(x)
             for name, member in members:
                 content.append((name, _member_key(member)))
                 for f in () if name.startswith("__") and name != "__call__" else functions_in(member):
                     where = f"`{root.__name__}.{name}`" if name else f"the function `{f.__qualname__}`"
                     for space, names in spaces(f):
                         found = self._note(space.get, names)
-                        content += [(n, _key_or_refusal(x, n, where)) for n, x in zip(names, found, strict=True)]
+                        content += [(n, told(x, n, where)) for n, x in zip(names, found, strict=True)]
         self._number = self._numbers.setdefault((_epoch, *content), len(self._numbers))
 
     def _note(self, get: Callable, names: tuple[str, ...]) -> tuple:
@@ -142,8 +145,8 @@ class _Watch:
 
 
 @functools.lru_cache(maxsize=1024)
-def _watch(*roots) -> _Watch:
-    return _Watch(roots)
+def _watch(*roots, strict: bool = False) -> _Watch:
+    return _Watch(roots, strict)
 
 
 def own_classes(kind: type) -> tuple[type, ...]:
@@ -232,7 +235,7 @@ def key(x: Any) -> Hashable:
 
     **Raises** StatefulError for what may change: arrays, containers, objects.
     """
-    if type(x) in _VALUES or isinstance(x, np.number | np.bool_ | enum.Enum):
+    if type(x) in _VALUES or isinstance(x, np.number | np.bool_ | enum.Enum | PurePath):
         return type(x), repr(x)
     if isinstance(x, slice):
         return type(x), key((x.start, x.stop, x.step))
