@@ -22,7 +22,7 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 # Hundreds of small programs: compiling them is most of the time. The first flag belongs to jaxlib 0.10.
 FLAGS = "--xla_backend_optimization_level=0" + (" --xla_cpu_use_fusion_emitters=false" if version("jaxlib").startswith("0.10.") else "")
-CASES, QUICK = 2000, 300  # in all
+CASES, QUICK = 2500, 300  # in all
 
 
 def prepare(dtype: str) -> None:

@@ -1,6 +1,6 @@
 """All families of generated cases, in one list."""
 
-from hunting import bodies, events, gradients, linkages, oscillators, pendulums, sliders, uses
+from hunting import bodies, events, gradients, linkages, oscillators, pendulums, refusals, short_features, sliders, uses
 
 FAMILIES = (
     *linkages.FAMILIES,
@@ -10,6 +10,8 @@ FAMILIES = (
     *oscillators.FAMILIES,
     *bodies.FAMILIES,
     *uses.FAMILIES,
+    *short_features.FAMILIES,
+    *refusals.FAMILIES,
     *gradients.families(),
 )
 

@@ -1,5 +1,6 @@
-"""Uses that are no plain motions: times that do not go together, changed globals, rows that set in later, tiny coefficients, loads of contacts and rods."""
+"""Uses that are no plain motions: times that do not go together, changed globals, rows that set in later, tiny coefficients."""
 
+import importlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,10 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import jourdain_jax as jj
-from hunting.bodies import Robot
 from hunting.family import Ask, Family, Truth
 from hunting.oscillators import Oscillator
-from hunting.pendulums import G, RodPendulum
+from hunting.pendulums import G
 from hunting.record import BY_CODE, BY_WARNING, RIGHT, WRONG, Record, refusal
 from hunting.reference import integrate
 
@@ -70,60 +70,60 @@ def _times(seed: int):
 
 # What a scene reads besides its numbers. ---------------------------------------------------------------------------
 
-STIFFNESS = 1.0
-
-
-class ReadsGlobal(Oscillator):
-    """Reads a global of its module."""
-
+NOTEBOOK = """
+class Spring(Oscillator):
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=-STIFFNESS * motion.q.x),)
-
-
-class ReadsClass(Oscillator):
-    """Reads an attribute of its class."""
-
-    stiffness = 1.0
-
-    def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=-ReadsClass.stiffness * motion.q.x),)
-
-
-class ReadsBox(Oscillator):
-    """Reads what stands in a dictionary of its module."""
-
-    def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=-BOX["k"] * motion.q.x),)
-
-
-BOX = {"k": 1.0}
+        return (jj.generalized_force(motion, x_rate=-({read}) * motion.q.x),)
+"""
+# what a cell of a notebook says, what the method reads, and what a later cell says; "" where the first is refused already
+READ = {
+    "number": ("k = 1.0", "k", "k = {k}"),
+    "integer": ("k = 1", "k", "k = {k}"),
+    "tuple": ("k = (1.0, 2.0)", "k[0]", "k = ({k}, 2.0)"),
+    "function": ("def law(): return 1.0", "law()", "def law(): return {k}"),
+    "function of a number": ("law = lambda x: 1.0 * x", "law(1.0)", "law = lambda x: {k} * x"),
+    "list": ("k = [1.0]", "k[0]", ""),
+    "dictionary": ("k = {{'a': 1.0}}", "k['a']", ""),
+    "array": ("k = np.ones(3)", "k[1]", ""),
+    "array of JAX": ("k = jnp.ones(3)", "k[1]", ""),
+    "large array": ("k = np.ones(5000)", "k[4321]", ""),
+    "array of objects": ("k = np.array([1.0, None])", "k[0]", ""),
+    "deque": ("k = collections.deque([1.0])", "k[0]", ""),
+    "mapping": ("k = collections.UserDict(a=1.0)", "k['a']", ""),
+    "typed array": ("k = array.array('d', [1.0])", "k[0]", ""),
+    "namespace": ("k = types.SimpleNamespace(a=1.0)", "k.a", ""),
+    "arguments": ("k = argparse.Namespace(a=1.0)", "k.a", ""),
+    "context": ("k = contextvars.ContextVar('k', default=1.0)", "k.get()", ""),
+    "controller": ("class Law:\n    def update(self, x): return x\nk = Law()", "k.update(1.0)", ""),
+}
 
 
 def _changed(seed: int):
-    """The motion after a change is that of the new value, in the way in which the first was made."""
-    global STIFFNESS
+    """The motion after a change of what a method reads is that of the new value, or what it reads is refused where it has state."""
     r = np.random.default_rng([seed, 81])
-    kind, way = ("global", "class attribute", "dictionary", "replaced method")[seed % 4], ("simulate", "rollout")[seed // 4 % 2]
-    k = r.uniform(2.0, 9.0)
-    scene = {"global": ReadsGlobal, "class attribute": ReadsClass, "dictionary": ReadsBox, "replaced method": type("Patched", (Oscillator,), {})}[kind]()
+    kind, way = list(READ)[seed % len(READ)], ("simulate", "rollout")[seed // len(READ) % 2]
+    k, (first, read, later) = r.uniform(2.0, 9.0), READ[kind]
+    cell = {"Oscillator": Oscillator, "jj": jj, "np": np, "jnp": jnp, "__name__": "__main__"}
+    cell |= {name: importlib.import_module(name) for name in ("argparse", "array", "collections", "contextvars", "types")}
+    exec(first.format(k=1.0), cell)
+    exec(NOTEBOOK.format(read=read), cell)
 
     def run():
         if way == "rollout":
-            return jax.tree.map(lambda x: x[0], jj.rollout(scene, {"x": np.ones(2), "x_rate": np.zeros(2)}, ts=[1.0]).lanes)
-        return jj.simulate(scene, {"x": 1.0, "x_rate": 0.0}, ts=[1.0])
+            return jax.tree.map(lambda x: x[0], jj.rollout(cell["Spring"](), {"x": np.ones(2), "x_rate": np.zeros(2)}, ts=[1.0]).lanes)
+        return jj.simulate(cell["Spring"](), {"x": 1.0, "x_rate": 0.0}, ts=[1.0])
 
-    STIFFNESS = ReadsClass.stiffness = BOX["k"] = 1.0
-    run()
-    STIFFNESS = ReadsClass.stiffness = BOX["k"] = k
-    if kind == "replaced method":
-        type(scene).loads = lambda self, motion: (jj.generalized_force(motion, x_rate=-k * motion.q.x),)
     motion = run()
-    return (
-        f"{way}, {kind}, k={k!r}",
-        abs(float(motion.q_end[0]) - np.cos(np.sqrt(k))) / 1e-5,
-        int(motion.result),
-        "; ".join(jax.tree.map(jnp.asarray, motion).warnings),
-    )
+    if not later:
+        return f"{way}, {kind}", np.inf, int(motion.result), ""
+    exec(later.format(k=repr(k)), cell)
+    motion = run()
+    return f"{way}, {kind}, k={k!r}", abs(float(motion.q_end[0]) - np.cos(np.sqrt(k))) / 1e-5, int(motion.result), warnings_of(motion)
+
+
+def warnings_of(motion) -> str:
+    """What a motion warns of, in one line."""
+    return "; ".join(jax.tree.map(jnp.asarray, motion).warnings)
 
 
 # Rows that set in later. -------------------------------------------------------------------------------------------
@@ -207,44 +207,10 @@ def _pushed(push):
     return truth
 
 
-# Loads. ------------------------------------------------------------------------------------------------------------
-
-
-def _wheels(seed: int):
-    """The normal forces of a robot's wheels add up to its weight."""
-    r = np.random.default_rng([seed, 82])
-    n = {"mass": r.uniform(1, 5), "ahead": 0.0, "wheel": r.uniform(0.1, 1)}
-    motion = jj.simulate(Robot(**n), {"heading": r.uniform(-3, 3), "left_rate": 2.0, "right_rate": r.uniform(-4, 4)}, ts=[0.5, 1.0])
-    normal = sum(np.asarray(force.normal) for force in motion.contact_forces().values())
-    weight = (n["mass"] + 2 * n["wheel"]) * G
-    undetermined = all(not np.any(np.asarray(force.determined)) for force in motion.contact_forces().values())
-    return (
-        f"contact_forces of a robot, {n}",
-        float(np.max(np.abs(normal / weight - 1)) / 1e-8),
-        int(motion.result),
-        "`determined` is False" if undetermined else "",
-    )
-
-
-def _tension(seed: int):
-    """m (v^2 - g z)/l along the rod."""
-    r = np.random.default_rng([seed, 83])
-    m, v = r.uniform(0.3, 3), r.uniform(1, 9)
-    motion = jj.simulate(RodPendulum(mass=m), {"x": 0.0, "z": -1.0, "x_rate": v, "z_rate": 0.0}, ts=np.linspace(0.1, 1.0, 3), rtol=1e-10, atol=1e-10)
-    force = np.array([np.asarray(motion.constraint_forces().force[k, 0, 0]) for k in range(3)])
-    x, z = np.asarray(motion["x"]), np.asarray(motion["z"])
-    pull = m * (np.asarray(motion["x_rate"]) ** 2 + np.asarray(motion["z_rate"]) ** 2 - G * z)
-    expected = -pull[:, None] * np.stack([x, 0 * x, z], axis=1)
-    asked = f"constraint_forces of a pendulum, m={m!r}, v={v!r}"
-    return asked, float(np.max(np.abs(force - expected)) / (1e-6 * np.max(np.abs(pull)))), int(motion.result), "; ".join(motion.warnings)
-
-
 FEW = (Ask("simulate"), Ask("jit", 33), Ask("rollout", 9, 1e-6), Ask("vmap"))
 FAMILIES = (
     Single("times", "times before the start, against the span or beyond it", _times, 32),
-    Single("changed", "globals, class attributes, dictionaries and methods that change between calls", _changed, 16),
-    Single("wheel-loads", "normal forces of a robot's wheels against its weight", _wheels, 8),
-    Single("tension", "constraint forces of a pendulum against its tension", _tension, 8),
+    Single("changed", "what methods read besides their arguments: numbers and functions that change between calls, and objects with state", _changed, 36),
     _late("late-row", "a row that sets in after some seconds", LateRow),
     _late("row-elsewhere", "a row that sets in beyond a place", ElsewhereRow),
     Family(

@@ -1,0 +1,310 @@
+"""What must be refused, flagged or noticed: impossible bodies in lanes, changed files, starts outside the domain, robot files with faults.
+
+A case counts as right only where the truth exists and is met; otherwise the engine must say that something is wrong.
+"""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import warnings
+from functools import cache
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jourdain_jax as jj
+from hunting.uses import Single, warnings_of
+
+WAYS = ("simulate", "jit", "rollout", "jit rollout")
+G = 9.81
+
+
+def _asked(scene, parameters: dict[str, float], start: dict, way: str, **options):
+    """The motion of a scene whose `parameters` are numbers, in one of the ways; of two lanes the second is the one that is meant."""
+    if way == "simulate":
+        return jj.simulate(scene.replace(**parameters), start, **options)
+    if way == "jit":
+        return jax.jit(lambda p: jj.simulate(scene.replace(**p), start, **options))({k: jnp.asarray(v) for k, v in parameters.items()})
+    lanes = {name: jnp.array([getattr(scene, name), value]) for name, value in parameters.items()}
+    call = lambda p: jj.rollout(scene, start, parameters=p, **options).lanes  # noqa: E731
+    return jax.tree.map(lambda x: x[1], jax.jit(call)(lanes) if way == "jit rollout" else call(lanes))
+
+
+# Impossible bodies. ------------------------------------------------------------------------------------------------
+
+
+def _beyond(x):
+    """How far a parameter is beyond 1e4: nothing at its default, nor near it, where a scene is probed."""
+    return jnp.maximum(x - 1e4, 0.0)
+
+
+class Block(jj.Scene):
+    """A block that slides and turns, under gravity along x; each parameter beyond 1e4 makes it impossible in a way of its own."""
+
+    coordinates = jj.coordinates("x turn")
+    above: object = jj.parameter(1.0)  # Ixy, not Iyx
+    largest: object = jj.parameter(1.0)
+    smallest: object = jj.parameter(1.0)
+    scale: object = jj.parameter(1.0)  # of the orientation
+    mirror: object = jj.parameter(1.0)
+    down: object = jj.parameter(1.0)  # length of gravity's direction
+
+    def bodies(self, t, q):
+        o = 0.0 * q.x
+        inertia = jnp.array([[1.0, 0.1, 0.0], [0.1, 1.2, 0.0], [0.0, 0.0, 1.1]])
+        inertia = inertia.at[0, 1].add(_beyond(self.above)).at[2, 2].add(_beyond(self.largest)).at[0, 0].add(-_beyond(self.smallest))
+        side = jnp.where(self.mirror > 1e4, -1.0, 1.0)
+        turned = (1.0 + _beyond(self.scale)) * jj.rot_z(q.turn) @ jnp.diag(jnp.stack([1.0 + o, 1.0 + o, side + o]))
+        return {"block": jj.RigidBody(1.0, inertia, jnp.stack([q.x, o, o]), turned)}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, G, (1.0 + _beyond(self.down)) * jnp.array([1.0, 0.0, 0.0])),)
+
+
+class Wheel(jj.Scene):
+    """An upright wheel that rolls along x and steers, kept at the height of its radius by its coordinates."""
+
+    coordinates = jj.coordinates("x y heading spin")
+    radius: object = jj.parameter(1.0)  # of the contact, less
+    height: object = jj.parameter(1.0)  # of the centre, more
+    normal: object = jj.parameter(1.0)  # length of the normal of the ground
+    flipped: object = jj.parameter(1.0)  # radius and height below zero
+
+    def sizes(self):
+        """Radius and height in m."""
+        side = jnp.where(self.flipped > 1e4, -1.0, 1.0)
+        return side * (0.3 - _beyond(self.radius)), side * (0.3 + _beyond(self.height))
+
+    def ground(self):
+        """The plane z = 0."""
+        return jj.Plane(normal=(1.0 + _beyond(self.normal)) * jnp.array([0.0, 0.0, 1.0]))
+
+    def bodies(self, t, q):
+        at = jnp.stack([q.x, q.y, 0.0 * q.x + self.sizes()[1]])
+        return {"wheel": jj.RigidBody(1.0, jnp.array([0.03, 0.05, 0.03]), at, jj.rot_z(q.heading) @ jj.rot_y(q.spin))}
+
+    def contacts(self, pose):
+        return {"floor": jj.disc_contact(pose["wheel"], self.sizes()[0], ground=self.ground())}
+
+
+class BallAbove(Wheel):
+    """The same as a ball."""
+
+    def contacts(self, pose):
+        return {"floor": jj.ball_contact(pose["wheel"], self.sizes()[0], ground=self.ground())}
+
+
+class TyredWheel(Wheel):
+    """The same with a tyre, which is below zero where `flipped`, and leaves the wheel its height."""
+
+    def contacts(self, pose):
+        tyre = jnp.where(self.flipped > 1e4, -0.05, 0.05)
+        return {"floor": jj.wheel_contact(pose["wheel"], 0.3 - tyre, tyre)}
+
+    def sizes(self):
+        """Radius and height in m."""
+        return 0.3, 0.3
+
+
+IMPOSSIBLE = (
+    ("inertia that is not symmetric", Block, "above", (0.1, 0.5)),
+    ("moment above the sum of the others", Block, "largest", (1.3, 9.0)),
+    ("negative moment", Block, "smallest", (1.1, 2.0)),
+    ("scaled orientation", Block, "scale", (0.02, 1.0)),
+    ("reflected orientation", Block, "mirror", (0.1, 1.0)),
+    ("direction of gravity", Block, "down", (0.02, 2.0)),
+    ("radius of a wheel that is not its height", Wheel, "radius", (0.02, 0.2)),
+    ("ball off its ground", BallAbove, "height", (0.02, 0.3)),
+    ("normal of the ground", BallAbove, "normal", (0.03, 1.0)),
+    ("negative radius", Wheel, "flipped", (1.0, 2.0)),
+    ("negative radius of a ball", BallAbove, "flipped", (1.0, 2.0)),
+    ("negative tyre", TyredWheel, "flipped", (1.0, 2.0)),
+)
+
+
+def _impossible(seed: int):
+    r = np.random.default_rng([seed, 90])
+    what, scene, name, least_and_most = IMPOSSIBLE[seed % len(IMPOSSIBLE)]
+    way, change = WAYS[seed // len(IMPOSSIBLE) % len(WAYS)], {name: 1e4 + r.uniform(*least_and_most)}
+    start = {"turn_rate": 1.0} if scene is Block else {"spin_rate": 2.0}
+    motion = _asked(scene(), change, start, way, t1=0.3)
+    return f"{way}: {what}, {change}", np.inf, int(motion.result), warnings_of(motion)
+
+
+# Starts outside the domain. ----------------------------------------------------------------------------------------
+
+
+class CrankAndSlider(jj.Scene):
+    """A crank and a slider in its line, joined by a rod; in its domain the slider is to the right of the crank, or below it."""
+
+    coordinates = jj.coordinates("crank slide")
+    long: object = jj.parameter(1.5, unit="m")
+    domain = {"crank": (-1.2, 1.2), "slide": (0.7, 2.6)}
+
+    def bodies(self, t, q):
+        pin = jnp.stack([jnp.cos(q.crank), jnp.sin(q.crank), 0.0 * q.crank])
+        return {"pin": jj.Particle(1.0, pin), "slider": jj.Particle(1.0, jnp.stack([q.slide, 0.0 * q.slide, 0.0 * q.slide]))}
+
+    def geometric_constraints(self, pose):
+        return {"rod": jj.rod(pose["pin"].position, pose["slider"].position, self.long)}
+
+
+class Hanging(jj.Scene):
+    """A pendulum in x, y, z that hangs."""
+
+    coordinates = jj.coordinates("x y z")
+    long: object = jj.parameter(1.0, unit="m")
+    domain = {"x": (-0.7, 0.7), "y": (-0.7, 0.7), "z": (-1.3, -0.3)}
+
+    def bodies(self, t, q):
+        return {"bob": jj.Particle(1.0, jnp.stack([q.x, q.y, q.z]))}
+
+    def geometric_constraints(self, pose):
+        return {"rod": jj.rod(jnp.zeros(3), pose["bob"].position, self.long)}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, G),)
+
+
+def _outside(seed: int):
+    """What `start` finds lies in the domain (a tenth of its width beyond is let pass), or it is refused."""
+    r = np.random.default_rng([seed, 91])
+    scene = (CrankAndSlider, Hanging)[seed % 2](long=r.uniform(1.25, 1.6) if seed % 2 == 0 else r.uniform(0.8, 1.2))
+    named = {"crank": r.uniform(-1.0, 1.0)} if seed % 2 == 0 else {"x": r.uniform(-0.5, 0.5), "y": r.uniform(-0.5, 0.5)}
+    state = jj.start(scene, named)
+    q = dict(zip(scene.coordinate_names.entries, np.asarray(state.q), strict=True))
+    off = max(max(low - q[name], q[name] - high) / (high - low) for name, (low, high) in scene.domain.items())
+    return f"start of {scene} with {named}: {q}", max(off, 0.0) / 0.1, 0, ""
+
+
+# Robot files. ------------------------------------------------------------------------------------------------------
+
+ARM = """<robot name="arm">
+  <link name="base"/>
+  <link name="upper"><inertial><origin xyz="0 0 -0.5"/><mass value="2.0"/>
+    <inertia ixx="0.17" iyy="0.17" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/><dynamics damping="0.3"/></joint>
+</robot>"""
+FAULTS = (
+    ("axis as text", '<axis xyz="0 1 0"/>', "<axis>0 1 0</axis>"),
+    ("axis as an element of SDF", '<axis xyz="0 1 0"/>', "<axis><xyz>0 1 0</xyz></axis>"),
+    ("two axes", '<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><axis xyz="1 0 0"/>'),
+    ("two dynamics", '<dynamics damping="0.3"/>', '<dynamics damping="0.3"/><dynamics damping="3"/>'),
+    ("a spring", '<dynamics damping="0.3"/>', '<dynamics damping="0.3" spring="9"/>'),
+    ("a misspelt damping", 'damping="0.3"', 'dampnig="0.3"'),
+    ("two inertials", "</inertial>", '</inertial><inertial><mass value="9"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'),
+    ("two links of one name", '<link name="base"/>', '<link name="base"/><link name="upper"/>'),
+    ("a loop joint", "</robot>", '<loop_joint name="l" type="revolute"><link1 link="base"/><link2 link="upper"/></loop_joint></robot>'),
+    ("a force element", "</robot>", '<force_element name="f"><spring k="3"/></force_element></robot>'),
+    ("a mass as text", '<mass value="2.0"/>', "<mass>2.0</mass>"),
+    ("a number of Python's", 'value="2.0"', 'value="2_0"'),
+    ("digits of another script", 'value="2.0"', 'value="\u0662"'),
+    ("a moment above the others", 'izz="0.01"', 'izz="0.9"'),
+    ("a misspelt product", 'ixz="0"', 'izx="0"'),
+    ("two origins", '<origin xyz="0 0 -0.5"/>', '<origin xyz="0 0 -0.5"/><origin xyz="0 0 0.5"/>'),
+    ("an angle of the frame in degrees", '<origin xyz="0 0 -0.5"/>', '<origin xyz="0 0 -0.5" rpy_deg="90 0 0"/>'),
+)
+
+
+def _robot(seed: int):
+    what, old, new = FAULTS[seed % len(FAULTS)]
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        scene = jj.from_urdf(ARM.replace(old, new, 1))
+    said = "; ".join(str(w.message).splitlines()[0] for w in heard)
+    return f"{what} in a URDF file: {scene.__name__}", np.inf, 0, said
+
+
+# Files of studies. -------------------------------------------------------------------------------------------------
+
+
+@cache
+def _study() -> tuple[Path, dict]:
+    path = Path(tempfile.mkdtemp()) / "discs.zarr"
+    study = jj.Study(jj.models.TiltingDisc(), start={"lean": jj.Uniform(-0.5, 0.5), "spin_rate": -2.0}, samples=64, seed=3)
+    result = study.run(path, t1=0.2, rtol=1e-6, atol=1e-6, outputs={"lean": jj.End("lean", "rad")}, progress=False)
+    return path, _facts(result)
+
+
+def _facts(result) -> dict:
+    found = result.statistics
+    numbers = {"mean": found.mean, "covariance": found.covariance, "counts": found.counts, "edges": found.histogram("lean")[1]}
+    return {name: x.tolist() for name, x in numbers.items()} | {"values": result.to_xarray()["lean"].values.tolist(), "complete": result.complete}
+
+
+def _study_file(seed: int):
+    """One character of one file of a study's folder is another: the study says so, or its numbers are what they were."""
+    r = np.random.default_rng([seed, 92])
+    path, before = _study()
+    files = sorted(p for p in path.rglob("*") if p.is_file() and p.stat().st_size and "lock" not in p.name)
+    kinds = sorted({re.sub(r"\d+", "0", str(p.relative_to(path))) for p in files})
+    kind = kinds[seed % len(kinds)]
+    changed = r.choice([p for p in files if re.sub(r"\d+", "0", str(p.relative_to(path))) == kind])
+    whole = changed.read_bytes()
+    digits = [k for k, byte in enumerate(whole) if 48 <= byte <= 57] or list(range(len(whole)))
+    at = int(r.choice(digits))
+    other = bytes([48 + (whole[at] - 48 + int(r.integers(1, 10))) % 10]) if 48 <= whole[at] <= 57 else bytes([whole[at] ^ 1])
+    changed.write_bytes(whole[:at] + other + whole[at + 1 :])
+    try:
+        with warnings.catch_warnings(record=True) as heard:
+            warnings.simplefilter("always")
+            result = jj.load_study(path)
+            after, shown = _facts(result), str(result)
+        same = json.dumps(after) == json.dumps(before)
+        said = "; ".join(str(w.message).splitlines()[0] for w in heard) or ("" if after["complete"] else shown.splitlines()[0])
+    finally:
+        changed.write_bytes(whole)
+    return f"byte {at} of {kind}", 0.0 if same else np.inf, 0, said
+
+
+# Machine code on disk. ---------------------------------------------------------------------------------------------
+
+TWO_MOTIONS = """
+import warnings; warnings.simplefilter("ignore")
+import jourdain_jax as jj
+for scene in (jj.models.VerticalDisc(), jj.models.ChaplyginSleigh()):
+    print(jj.simulate(scene, jj.start(scene, heading_rate=0.7), t1=1.0).q_end.tolist())
+"""
+
+
+def _run_twice(folder: Path) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", TWO_MOTIONS], env=os.environ | {"JOURDAIN_JAX_CACHE": str(folder)}, capture_output=True, text=True, timeout=300, check=False
+    )
+    return done.stdout if done.returncode == 0 else f"exit status {done.returncode}: {done.stderr.strip().splitlines()[-1:]}"
+
+
+def _cache_file(seed: int):
+    """Files of machine code are exchanged, torn, or hold something else: the next process returns the same motions."""
+    r = np.random.default_rng([seed, 93])
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        folder.chmod(0o700)
+        before = _run_twice(folder)
+        files = sorted(file for file in folder.rglob("*") if file.is_file())
+        contents = [file.read_bytes() for file in files]
+        how = ("exchanged", "torn", "other bytes", "one bit")[seed % 4]
+        for k, file in enumerate(files):
+            old = contents[k]
+            at = int(r.integers(len(old)))
+            changed = {
+                "exchanged": contents[(k + 1) % len(files)], "torn": old[:at], "other bytes": old[:32] + r.bytes(len(old) - 32),
+                "one bit": old[:at] + bytes([old[at] ^ (1 << int(r.integers(8)))]) + old[at + 1 :],
+            }  # fmt: skip
+            file.write_bytes(changed[how])
+        after = _run_twice(folder)
+    return f"{len(files)} files of machine code {how}", 0.0 if files and after == before else np.inf, 0, ""
+
+
+FAMILIES = (
+    Single("impossible", "bodies, contacts and directions that cannot be, alone, in lanes and under `jit`", _impossible, 48),
+    Single("outside", "starts of linkages and pendulums, of which only some coordinates are named, against the domain", _outside, 20),
+    Single("robot-files", "URDF files with faults", _robot, len(FAULTS)),
+    Single("cache-files", "machine code on disk that is exchanged or damaged", _cache_file, 8),
+    Single("study-files", "a study one of whose files has another digit", _study_file, 60),
+)

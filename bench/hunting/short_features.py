@@ -1,0 +1,265 @@
+"""Features that act in a small part of the way or of the time, and constraints that lose their slope between two steps.
+
+Motions are free between the features, where nothing bounds a step but the rules for its length.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+
+import jourdain_jax as jj
+from hunting.events import _stopped
+from hunting.family import Ask, Family, Truth
+
+G = 9.81
+
+
+class Strip(jj.Scene):
+    """A mass that slides freely along x, and is braked by `force` N on a strip from `at` to `at + width` m."""
+
+    coordinates = jj.coordinates("x")
+    force: object = jj.parameter(1.0, unit="N")
+    at: object = jj.parameter(1.0, unit="m")
+    width: object = jj.parameter(0.1, unit="m")
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        x = motion.q.x
+        inside = (x > self.at) & (x < self.at + self.width)
+        return (jj.generalized_force(motion, x_rate=jnp.where(inside, -self.force, 0.0)),)
+
+
+class Pulse(Strip):
+    """The same mass under a force that acts from the time `at` for `width` s."""
+
+    def loads(self, motion):
+        since = motion.t - self.at
+        push = self.force * jnp.sign(jnp.maximum(since, 0.0)) * jnp.where(since < self.width, 1.0, 0.0)
+        return (jj.generalized_force(motion, x_rate=push),)
+
+
+class Bump(Strip):
+    """A mass on a road that is flat but for a bump of height `force` m with the shape of a cosine."""
+
+    def bodies(self, t, q):
+        phase = (q.x - self.at) / self.width
+        rise = jnp.where((phase > 0.0) & (phase < 1.0), 1.0 - jnp.cos(2 * jnp.pi * phase), 0.0)
+        return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.5 * self.force * rise]))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, G),)
+
+
+def _strip_truth(n, ts):
+    """Speed v before the strip, (v^2 - 2 F w)^(1/2) behind it."""
+    v, f, a, w = (n[name][:, None] for name in ("v", "force", "at", "width"))
+    behind = np.sqrt(v * v - 2 * f * w)
+    enters = a / v
+    leaves = enters + (v - behind) / f
+    inside = ts - enters
+    x = np.where(ts < enters, v * ts, np.where(ts < leaves, a + v * inside - f / 2 * inside**2, a + w + behind * (ts - leaves)))
+    speed = np.where(ts < enters, v, np.where(ts < leaves, v - f * inside, behind))
+    return Truth(np.stack([x, speed], axis=-1))
+
+
+def _pulse_truth(n, ts):
+    v, f, a, w = (n[name][:, None] for name in ("v", "force", "at", "width"))
+    during = np.clip(ts - a, 0.0, w)
+    after = np.maximum(ts - a - w, 0.0)
+    return Truth(np.stack([v * ts + f * (during**2 / 2 + during * after), v + f * during], axis=-1))
+
+
+def _bump_truth(n, ts):
+    """xdot^2 (1 + z'^2) + 2 g z = v^2; the time over the bump by quadrature, of order 10 in 400 pieces."""
+    found = np.empty((*ts.shape, 2))
+    nodes, weights = np.polynomial.legendre.leggauss(5)
+    for i, times in enumerate(ts):
+        v, h, a, w = (float(n[name][i]) for name in ("v", "force", "at", "width"))
+
+        def speed(x, v=v, h=h, a=a, w=w):
+            phase = 2 * np.pi * (x - a) / w
+            z, slope = h / 2 * (1 - np.cos(phase)), h * np.pi / w * np.sin(phase)
+            return np.sqrt((v * v - 2 * G * z) / (1 + slope**2))
+
+        grid = np.linspace(a, a + w, 401)
+        half = np.diff(grid)[:, None] / 2
+        passed = np.sum(weights * half / speed((grid[1:] + grid[:-1])[:, None] / 2 + half * nodes), axis=1)
+        at = a / v + np.concatenate([[0.0], np.cumsum(passed)])
+        x = np.where(times < at[0], v * times, a + w + v * (times - at[-1]))
+        over = (times >= at[0]) & (times <= at[-1])
+        x[over] = CubicHermiteSpline(at, grid, speed(grid))(times[over])
+        found[i] = np.stack([x, np.where(over, speed(x), v)], axis=-1)
+    return Truth(found)
+
+
+def _strip_drawn(r):
+    v, width = r.uniform(1.0, 4.0), 10 ** r.uniform(-2.2, -0.7)
+    return {"v": v, "width": width, "force": r.uniform(0.1, 0.4) * v * v / (2 * width), "at": r.uniform(0.5, 2.0), "span": 3.0}
+
+
+def _pulse_drawn(r):
+    width = 3.0 * 10 ** r.uniform(-2.2, -0.9)
+    return {"v": r.uniform(-2.0, 2.0), "width": width, "force": r.uniform(-2.0, 2.0) / width, "at": r.uniform(0.3, 2.5), "span": 3.0}
+
+
+def _bump_drawn(r):
+    v, width = r.uniform(2.0, 4.0), 10 ** r.uniform(-1.5, -0.5)
+    return {"v": v, "width": width, "force": r.uniform(0.2, 0.5) * min(width, v * v / (2 * G)), "at": r.uniform(0.5, 3.0), "span": 3.0}
+
+
+# Events with a short negative part. ------------------------------------------------------------------------------
+
+
+class Window(Strip):
+    """A free mass that stops where it comes within `width` of `at`."""
+
+    def loads(self, motion):
+        return ()
+
+    def events(self, motion):
+        return {"near": jnp.abs(motion.q.x - self.at) - self.width}
+
+
+class Gate(Window):
+    """The same as a window of `where`."""
+
+    def events(self, motion):
+        x = motion.q.x
+        return {"near": jnp.where((x > self.at - self.width) & (x < self.at + self.width), -1.0, 1.0)}
+
+
+def _window_truth(n, ts):
+    t_end = (n["at"] - n["width"]) / n["v"]
+    return _stopped(lambda t: np.stack([n["v"][:, None] * t, n["v"][:, None] + 0 * t], axis=-1), t_end, ["near"] * len(t_end), ts)
+
+
+def _window_drawn(r):
+    return {"v": r.uniform(0.7, 4.0), "at": r.uniform(0.5, 2.0), "width": 10 ** r.uniform(-4.0, -1.0), "span": 3.0}
+
+
+# Speeds and constraints that lose their slope. -------------------------------------------------------------------
+
+
+class TurnedSpeed(jj.Scene):
+    """A free turning wheel with the speed w = sin(q) qdot, whose inverse is infinite at q = 0."""
+
+    coordinates = jj.coordinates("q")
+    speeds = jj.speeds("w")
+    domain = {"q": (0.4, 1.5)}
+
+    def coordinate_rates(self, t, q, u):
+        return jnp.stack([u.w / jnp.sin(q.q)])
+
+    def bodies(self, t, q):
+        return {"wheel": jj.RigidBody(1.0, jnp.ones(3), jnp.zeros(3), jj.rot_z(q.q))}
+
+
+class SwingSpeed(TurnedSpeed):
+    """The same by the cosine."""
+
+    domain = {"q": (-1.0, 1.0)}
+
+    def coordinate_rates(self, t, q, u):
+        return jnp.stack([u.w / jnp.cos(q.q)])
+
+
+def _turned(name, scene, weight, centre):
+    """q = q0 + r t; it passes the place where the rate of the coordinate is infinite."""
+
+    def truth(n, ts):
+        q = n["q"][:, None] + n["rate"][:, None] * ts
+        return Truth(np.stack([q, weight(q) * n["rate"][:, None]], axis=-1))
+
+    return Family(
+        name=name, what="a quasi-velocity whose coordinate rate is infinite at one place", scene=scene, truth=truth, names=("q", "w"),
+        draw=lambda r: {"q": centre(r), "rate": -r.uniform(0.5, 2.0), "span": r.uniform(0.3, 3.0)},
+        start=lambda n: {"q": n["q"], "w": (jnp.sin if scene is TurnedSpeed else jnp.cos)(n["q"]) * n["rate"]}, cases=40,
+    )  # fmt: skip
+
+
+class EvenPace(jj.Scene):
+    """Appell and Hamel's constraint zdot^2 = k^2 (xdot^2 + ydot^2): without slope where the speeds vanish, at the top of the throw."""
+
+    coordinates = jj.coordinates("x y z")
+    slope: object = jj.parameter(1.0)
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(1.0, jnp.stack([q.x, q.y, q.z]))}
+
+    def velocity_constraints(self, motion):
+        u = motion.u
+        return {"pace": u.z_rate**2 - self.slope**2 * (u.x_rate**2 + u.y_rate**2)}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, G),)
+
+
+def _pace_truth(n, ts):
+    """Along its straight line the mass is slowed by g k^2/(1 + k^2) in z; at the top the constraint no longer determines the motion, which has no truth."""
+    k, v, turn = (n[name][:, None] for name in ("slope", "v", "turn"))
+    pull = G * k * k / (1 + k * k)
+    z, up = k * v * ts - pull / 2 * ts**2, k * v - pull * ts
+    ahead, pace = z / k, up / k
+    values = np.stack([np.cos(turn) * ahead, np.sin(turn) * ahead, z, np.cos(turn) * pace, np.sin(turn) * pace, up], axis=-1)
+    return Truth(values)
+
+
+def _pace_drawn(r):
+    k, v = r.uniform(0.5, 2.0), r.uniform(1.0, 3.0)
+    top = k * v / (G * k * k / (1 + k * k))
+    return {"slope": k, "v": v, "turn": r.uniform(0.0, 6.0), "span": float(r.choice([0.7, r.uniform(1.2, 2.0)])) * top}
+
+
+class SetPace(jj.Scene):
+    """A mass whose speed is prescribed by xdot^2 + ydot^2 = (pace cos t)^2: without slope where the pace passes zero."""
+
+    coordinates = jj.coordinates("x y")
+    pace: object = jj.parameter(1.0, unit="m/s")
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+    def velocity_constraints(self, motion):
+        return {"pace": motion.u.x_rate**2 + motion.u.y_rate**2 - (self.pace * jnp.cos(motion.t)) ** 2}
+
+
+def _set_pace_truth(n, ts):
+    """Straight ahead, and, without a force, straight back: pace sin t."""
+    along = np.stack([np.cos(n["turn"]), np.sin(n["turn"])], axis=-1)[:, None]
+    ahead, pace = (n["v"][:, None] * f(ts) for f in (np.sin, np.cos))
+    return Truth(np.concatenate([along * ahead[..., None], along * pace[..., None]], axis=-1))
+
+
+def _family(name, what, scene, drawn, truth, names=("x", "x_rate"), **more):
+    own = ("force", "at", "width")
+    return Family(
+        name=name, what=what, scene=scene, draw=drawn, truth=truth, names=names, start=lambda n: {"x": 0.0 * n["v"], "x_rate": n["v"]},
+        parameters=lambda n: {key: n[key] for key in own if key in n}, **more,
+    )  # fmt: skip
+
+
+ASKS = (Ask("simulate"), Ask("jit", 33), Ask("rollout", 9, 1e-6), Ask("vmap", 3), Ask("simulate", 9, 1e-6))
+FAMILIES = (
+    _family("strip", "a free mass that a strip of 0.6 to 20 cm brakes", Strip, _strip_drawn, _strip_truth, cases=63),
+    _family("pulse", "a force for 0.6 to 12 % of the span", Pulse, _pulse_drawn, _pulse_truth, cases=63),
+    _family("bump", "a flat road with a bump of 3 to 30 cm", Bump, _bump_drawn, _bump_truth, cases=42, single=False),
+    _family("window", "an event within 0.1 to 100 mm of a place, by `abs`", Window, _window_drawn, _window_truth, cases=63),
+    _family("gate", "the same by `where`", Gate, _window_drawn, _window_truth, cases=42),
+    _turned("turned-speed", TurnedSpeed, np.sin, lambda r: r.uniform(0.4, 1.5)),
+    _turned("swing-speed", SwingSpeed, np.cos, lambda r: r.uniform(-1.0, 1.0)),
+    Family(
+        name="even-pace", what="Appell and Hamel's constraint up to the top of the throw, and beyond", scene=EvenPace, draw=_pace_drawn, truth=_pace_truth,
+        names=("x", "y", "z", "x_rate", "y_rate", "z_rate"), parameters=lambda n: {"slope": n["slope"]}, cases=42, single=False,
+        start=lambda n: {"x": 0.0 * n["v"], "y": 0.0 * n["v"], "z": 0.0 * n["v"]} | {
+            "x_rate": n["v"] * jnp.cos(n["turn"]), "y_rate": n["v"] * jnp.sin(n["turn"]), "z_rate": n["slope"] * n["v"]},
+        asks=ASKS,
+    ),
+    Family(
+        name="set-pace", what="a prescribed magnitude of the velocity that passes zero", scene=SetPace, truth=_set_pace_truth,
+        names=("x", "y", "x_rate", "y_rate"), parameters=lambda n: {"pace": n["v"]}, cases=42, single=False, asks=ASKS,
+        draw=lambda r: {"v": r.uniform(0.5, 3.0), "turn": r.uniform(0.0, 6.0), "span": r.uniform(1.0, 4.5)},
+        start=lambda n: {"x": 0.0 * n["v"], "y": 0.0 * n["v"], "x_rate": n["v"] * jnp.cos(n["turn"]), "y_rate": n["v"] * jnp.sin(n["turn"])},
+    ),
+)  # fmt: skip
