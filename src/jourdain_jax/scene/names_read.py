@@ -82,7 +82,7 @@ def now_read_by(function: Callable) -> Hashable | None:
 
 def is_function(x) -> bool:
     """Whether it is a function that may read something, and not a module that holds numbers."""
-    return isinstance(x, FunctionType | MethodType | functools.partial) or callable(_attribute(x, "__wrapped__")) or type(x) is eqx.filter_custom_jvp
+    return isinstance(x, FunctionType | MethodType | functools.partial) or callable(_attribute(x, "__wrapped__"))
 
 
 class _Same:
@@ -119,29 +119,30 @@ class _Watch:
         return self._number
 
     def _look(self) -> None:
-        self._epoch, content = _epoch, []
-        self._before: list[tuple] = []
-        self._sizes: list[tuple] = []
+        content: list[tuple] = []
+        before: list[tuple] = []
+        sizes: list[tuple] = []
+
+        def noted(get: Callable, names: tuple[str, ...]) -> tuple:
+            before.append((get, names, tuple(map(get, names, repeat(_UNSET)))))
+            return before[-1][-1]
+
         for root in self.roots:
             classes = own_classes(root) if isinstance(root, type) else ()
             members = [(name, x) for kind in classes for name, x in vars(kind).items()] or [("", root)]
             for kind in classes:
-                self._note(vars(kind).get, tuple(vars(kind)))
-                self._sizes.append((vars(kind), len(vars(kind))))
+                noted(vars(kind).get, tuple(vars(kind)))
+                sizes.append((vars(kind), len(vars(kind))))
             told = _key_or_refusal if classes or self._strict else lambda x, *_: _member_key(x)
             for name, member in members:
                 content.append((name, _member_key(member)))
                 for f in () if name.startswith("__") and name != "__call__" else functions_in(member):
                     where = f"`{root.__name__}.{name}`" if name else f"the function `{f.__qualname__}`"
                     for space, names in spaces(f):
-                        found = self._note(space.get, names)
+                        found = noted(space.get, names)
                         content += [(n, told(x, n, where)) for n, x in zip(names, found, strict=True)]
         self._number = self._numbers.setdefault((_epoch, *content), len(self._numbers))
-
-    def _note(self, get: Callable, names: tuple[str, ...]) -> tuple:
-        found = tuple(map(get, names, repeat(_UNSET)))
-        self._before.append((get, names, found))
-        return found
+        self._epoch, self._before, self._sizes = _epoch, before, sizes  # last: what is refused now is refused at the next call, too
 
 
 @functools.lru_cache(maxsize=1024)
@@ -256,4 +257,4 @@ def _is_constant(x: Any) -> bool:
         return x.__self__ is None or isinstance(x.__self__, ModuleType | type)
     if isinstance(x, ModuleType | type | FunctionType | staticmethod | classmethod | property | np.ufunc | jnp.ufunc | functools.cached_property):
         return True
-    return type(x) is object or type(x).__module__ == "typing" or callable(_attribute(x, "__wrapped__"))
+    return type(x) is object or type(x).__module__ == "typing" or type(x) is eqx.filter_custom_jvp or callable(_attribute(x, "__wrapped__"))
