@@ -93,14 +93,14 @@ class Wheel(jj.Scene):
 
 
 class BallAbove(Wheel):
-    """The same as a ball."""
+    """A ball in place of the wheel."""
 
     def contacts(self, pose):
         return {"floor": jj.ball_contact(pose["wheel"], self.sizes()[0], ground=self.ground())}
 
 
 class TyredWheel(Wheel):
-    """The same with a tyre, which is below zero where `flipped`, and leaves the wheel its height."""
+    """A wheel with a tyre, which is below zero where `flipped`, and leaves the wheel its height."""
 
     def contacts(self, pose):
         tyre = jnp.where(self.flipped > 1e4, -0.05, 0.05)

@@ -32,7 +32,7 @@ class Strip(jj.Scene):
 
 
 class Pulse(Strip):
-    """The same mass under a force that acts from the time `at` for `width` s."""
+    """A free mass under a force that acts from the time `at` for `width` s."""
 
     def loads(self, motion):
         since = motion.t - self.at
@@ -123,7 +123,7 @@ class Window(Strip):
 
 
 class Gate(Window):
-    """The same as a window of `where`."""
+    """A window of `where` in place of the distance."""
 
     def events(self, motion):
         x = motion.q.x
@@ -157,7 +157,7 @@ class TurnedSpeed(jj.Scene):
 
 
 class SwingSpeed(TurnedSpeed):
-    """The same by the cosine."""
+    """A speed by the cosine in place of the sine."""
 
     domain = {"q": (-1.0, 1.0)}
 
