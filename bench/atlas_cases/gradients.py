@@ -42,8 +42,7 @@ class DerivativeOfMotion:
     def cell(self, method: Method, tolerance: float) -> Outcome:
         """Outcome of one method."""
         why = self.skip.get(method.name, self.skip.get(method.group))
-        others = ("Radau IIA", "Munthe-Kaas")
-        if why is not None or method.group in ("constraints", "elsewhere") or method.even_steps or method.name in others:
+        if why is not None or method.group in ("constraints", "elsewhere") or method.even_steps or method.name == "Radau IIA":
             return not_applicable(why or "asked of motions")
         x = jnp.asarray(self.x, jnp.result_type(float))
         if method.naive is not None:

@@ -27,7 +27,6 @@ USUAL = {
     "Dopri8": "the tolerance is met per step, and errors add up over the run or are amplified by the motion; explicit: a stiff force bounds its steps",
     "Kvaerno5": "order 5, by iterations that stop at the tolerance: errors of the order of it add up; where these iterations fail, steps shrink",
     "Radau IIA": "order 5 with an estimate of order 3: many short steps at a tight tolerance, whose errors add up over the run",
-    "Munthe-Kaas": "turns are advanced exactly, everything else as by the method within: errors are amplified by the motion all the same",
     "implicit midpoint": "order 2: its energy error stays bounded, but is of the size of the step squared; a fast transient is not damped, only its sign flips",
     "DLA": "order 2: the discrete Lagrangian is conserved, not the energy; a gauge term, which changes no motion, changes its errors",
     "discrete gradient": "order 2: the energy is kept to round-off, every other integral and the path itself only to the size of the step squared",

@@ -20,7 +20,6 @@ INTEGRATORS: dict[str, Callable[[], diffrax.AbstractSolver]] = {
     "Dopri8": diffrax.Dopri8,
     "Kvaerno5": diffrax.Kvaerno5,
     "Radau IIA": jj.RadauIIA,
-    "Munthe-Kaas": lambda: jj.MuntheKaas(diffrax.Dopri8()),
     "implicit midpoint": jj.ImplicitMidpoint,
     "DLA": jj.DiscreteLagrangeDAlembert,
     "discrete gradient": jj.DiscreteGradient,

@@ -20,7 +20,6 @@ SELDOM = {
     "rollout": "a batch is one more program; asked in a dozen cases",
     "Kvaerno5": "implicit; asked where a motion is stiff or long",
     "Radau IIA": "implicit; asked where a motion is stiff or long",
-    "Munthe-Kaas": "asked of some scenes with attitudes",
     "Baumgarte 1e4/s": "its steps are bound to 1e-4 s; asked in E9 and E10",
 }
 

@@ -60,7 +60,6 @@ OWN_LOOKS = {
     "Dopri8": Look("Dopri8 (lowered)", BLUE, "o", width=2.4),
     "Tsit5": Look("Tsit5 (lowered)", BLUE, "s", "--", 2.0),
     "Kvaerno5": Look("Kvaerno5", GREEN, "^"),
-    "Munthe-Kaas Dopri8": Look("Munthe-Kaas, Dopri8", GREEN, "v", "--"),
     "implicit midpoint": Look("implicit midpoint", BLACK, "d"),
     "discrete Lagrange-d'Alembert": Look("discrete Lagrange-d'Alembert", BLACK, "P", "--"),
     "discrete gradient": Look("discrete gradient", BLACK, "X", ":"),

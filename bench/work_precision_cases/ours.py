@@ -23,8 +23,6 @@ DEFAULT = "simulate, as it comes"
 
 def stages(solver) -> int | None:
     """Evaluations per step of an explicit method in the engine's own loop; None for implicit ones, whose inner iterations are not counted."""
-    if isinstance(solver, jj.MuntheKaas):
-        solver = solver.solver
     if not isinstance(solver, diffrax.AbstractERK):
         return None
     tableau = solver.tableau
@@ -120,8 +118,6 @@ def curves(problem: Problem, quick: bool) -> list[Curve]:
         found.append(_tolerance("Kvaerno5", "solver", diffrax.Kvaerno5(), IMPLICIT_TOLERANCES))
     if problem.structure_preserving:
         found += [_step("discrete Lagrange-d'Alembert", problem, jj.DiscreteLagrangeDAlembert()), _step("discrete gradient", problem, jj.DiscreteGradient())]
-    if problem.scene.coordinates.quaternions:
-        found.append(_tolerance("Munthe-Kaas Dopri8", "solver", jj.MuntheKaas(diffrax.Dopri8()), COARSE))
     loose = _tolerance("full state, not projected, Dopri8", "state", diffrax.Dopri8(), COARSE, formulation=jj.Formulation("full", stabilisation=None))
     # the privileged reduction is the default one, here with dense matrices
     reductions = ("privileged", "kkt") if problem.large else REDUCTIONS

@@ -115,7 +115,6 @@ if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
     from jourdain_jax.motion.integrators.discrete_lagrange_dalembert import DiscreteLagrangeDAlembert
     from jourdain_jax.motion.integrators.implicit_midpoint import ImplicitMidpoint
-    from jourdain_jax.motion.integrators.munthe_kaas import MuntheKaas
     from jourdain_jax.motion.integrators.radau import RadauIIA
     from jourdain_jax.motion.trajectories.storage import load_rollout, load_trajectory, save
     from jourdain_jax.plotting.animation import animate
@@ -162,16 +161,16 @@ _ON_FIRST_USE = {
     "motion.integrators.discrete_gradient": "DiscreteGradient",
     "motion.integrators.discrete_lagrange_dalembert": "DiscreteLagrangeDAlembert",
     "motion.integrators.implicit_midpoint": "ImplicitMidpoint",
-    "motion.integrators.munthe_kaas": "MuntheKaas",
     "motion.integrators.radau": "RadauIIA",
     "motion.trajectories.storage": "load_rollout load_trajectory save",
     "plotting.animation": "animate",
     "plotting.quantities": "plot",
     "plotting.show": "View show",
 }
+_GONE = {"MuntheKaas": "the default solvers renormalise quaternions after each step, are as accurate and take half of its time"}
 _pictures = _module_on_first_use("jourdain_jax.plotting.scene_picture")
 _show_scenes_with(lambda scene: _pictures.scene_svg(scene))
-__getattr__, __dir__ = _names_on_first_use(globals(), {name: module for module, names in _ON_FIRST_USE.items() for name in names.split()})
+__getattr__, __dir__ = _names_on_first_use(globals(), {name: module for module, names in _ON_FIRST_USE.items() for name in names.split()}, _GONE)
 __version__ = _version_of("jourdain-jax")
 
 __all__ = [
@@ -213,7 +212,6 @@ __all__ = [
     "MeanGradients",
     "MultipleShooting",
     "Multipliers",
-    "MuntheKaas",
     "Normal",
     "NotLowered",
     "NullSpaceQR",

@@ -43,15 +43,20 @@ def needed(module: str, purpose: str, extra: str = "") -> Any:
         raise ImportError(f"{purpose} needs the package `{package}`, which is not installed; install it with: pip install {install}") from error
 
 
-def names_on_first_use(package: dict[str, Any], where: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+def names_on_first_use(
+    package: dict[str, Any], where: Mapping[str, str], gone: Mapping[str, str]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """`__getattr__` and `__dir__` of a package, given its globals, for names that are defined in modules below it: name -> module, such as "analysis.fit".
+
+    `gone`: names that there were once -> what serves now.
 
     A name is looked up once: from then on it is a global of the package as any other.
     """
 
     def __getattr__(name: str) -> Any:
         if name not in where:
-            raise AttributeError(f"module {package['__name__']!r} has no attribute {name!r}")
+            advice = f": {gone[name]}" if name in gone else ""
+            raise AttributeError(f"module {package['__name__']!r} has no attribute {name!r}{advice}")
         package[name] = getattr(import_module(f"{package['__name__']}.{where[name]}"), name)
         return package[name]
 

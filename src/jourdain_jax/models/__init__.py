@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from jourdain_jax.models.vertical_disc import VerticalDisc
     from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 
-__getattr__, __dir__ = names_on_first_use(globals(), {kind: module for module, kind in PLACES.values()})
+__getattr__, __dir__ = names_on_first_use(globals(), {kind: module for module, kind in PLACES.values()}, {})
 
 __all__ = [
     "MODELS",
