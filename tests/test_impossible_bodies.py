@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.build.plausibility import body_faults
+from jourdain_jax.build.plausibility import CHECKS
 from jourdain_jax.motion.trajectories import results
 
 
@@ -56,8 +56,8 @@ def test_lanes_whose_bodies_cannot_be_end_with_a_code_and_their_neighbours_move(
         else:
             assert np.isnan(found.lanes.q[i]).all()
     named = {name: found.lane(i).message for i, name in enumerate(LANES)}
-    assert "(a negative mass or moment of inertia of body `pebble`)" in named["negative mass"]
-    assert "of body `top`)" in named["products beyond the moments"]
+    assert "(a negative mass: body `pebble`)" in named["negative mass"]
+    assert "(a negative moment of inertia: body `top`)" in named["products beyond the moments"]
     assert "(`radius`)" in named["wrong radius"]
     assert "(`moment`)" in named["no number"]
     assert "body `pebble`" in str(found)
@@ -73,17 +73,75 @@ def test_a_traced_negative_mass_ends_with_a_code_inside_jit():
 def test_an_inertia_is_impossible_where_an_eigenvalue_is_negative():
     generator = np.random.default_rng(0)
 
-    class Any(jj.Scene):
-        inertia: jnp.ndarray = jj.parameter(jnp.eye(3))
-        coordinates = jj.coordinates("x")
-
-        def bodies(self, t, q):
-            return {"body": jj.RigidBody(1.0, self.inertia, jnp.stack([q.x, q.x, q.x]), jnp.eye(3))}
-
     turns = np.linalg.qr(generator.normal(size=(300, 3, 3)))[0]
     moments = (
         generator.uniform(0.01, 1.0, size=(300, 3)) * np.where(generator.uniform(size=(300, 3)) < 0.25, -1.0, 1.0) * 10.0 ** generator.uniform(-9, 9, (300, 1))
     )
     inertias = jnp.asarray(np.einsum("kij,kj,klj->kil", turns, moments, turns))
-    wrong = jax.vmap(lambda I: body_faults(Any(inertia=I), 0.0, jnp.zeros(1))["body"])(inertias)
+    (negative,) = (check.wrong for check in CHECKS if check.label == "a negative moment of inertia")
+    wrong = jax.jit(negative)(jnp.pad(inertias, ((0, 0), (0, 1), (0, 0))))
     np.testing.assert_array_equal(wrong, moments.min(axis=1) < 0)
+
+
+class Wheel(jj.Scene):
+    """A wheel that rolls on a plane, each of its numbers open to mistakes."""
+
+    moment: jnp.ndarray = jj.parameter(0.3)
+    lopsided: jnp.ndarray = jj.parameter(0.0)
+    stretch: jnp.ndarray = jj.parameter(1.0)
+    mirror: jnp.ndarray = jj.parameter(1.0)
+    radius: jnp.ndarray = jj.parameter(0.1)
+    height: jnp.ndarray = jj.parameter(0.1)
+    tyre: jnp.ndarray = jj.parameter(0.02)
+    down: jnp.ndarray = jj.parameter((0.0, 0.0, -1.0))
+    coordinates = jj.coordinates("x roll")
+
+    def bodies(self, t, q):
+        o = 0.0 * q.x
+        inertia = jnp.diag(jnp.stack([self.moment, 0.3 + o, 0.3 + o])) + self.lopsided * jnp.eye(3, k=1)
+        turned = jj.rot_y(q.roll) @ jnp.diag(jnp.stack([self.stretch, self.stretch * self.mirror, self.stretch]))
+        return {"wheel": jj.RigidBody(1.0, inertia, jnp.stack([q.x, o, o + self.height]), turned)}
+
+    def contacts(self, pose):
+        return {"rim": jj.wheel_contact(pose["wheel"], self.radius, self.tyre)}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, 9.81, direction=self.down),)
+
+
+WRONG = {
+    "lopsided": (0.01, "an inertia that is not symmetric: body `wheel`"),
+    "moment": (-0.3, "a negative moment of inertia: body `wheel`"),
+    "stretch": (2.0, "an orientation that is no rotation: body `wheel`"),
+    "mirror": (-1.0, "a reflected orientation: body `wheel`"),
+    "height": (0.2, "a body off its ground: contact `rim`"),
+    "radius": (0.12, "a body off its ground: contact `rim`"),
+    "tyre": (-0.01, "a negative tyre: contact `rim`"),
+    "down": ((0.0, 0.0, -2.0), "a direction of gravity that is no unit vector: load 0"),
+}
+
+
+@pytest.mark.parametrize("backend", ["auto", pytest.param("dense", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", WRONG)
+def test_what_a_single_motion_refuses_is_a_code_in_lanes(name, backend):
+    sound, start, (value, fault) = Wheel(), {"x_rate": 0.1}, WRONG[name]
+    with pytest.raises(ValueError, match=r"`wheel`|`rim`|gravity"):
+        jj.simulate(sound.replace(**{name: value}), start, ts=[0.1])
+    lanes = jj.rollout(sound, start, parameters={name: jnp.array([value, getattr(sound, name)])}, ts=[0.1], backend=backend, progress=False)
+    assert lanes.result.tolist() == [results.BAD_PARAMETER, results.SUCCESS]
+    assert fault in str(lanes)
+
+
+@pytest.mark.parametrize("values", [{"radius": -0.1, "height": -0.1}, {"tyre": -0.01}, {"tyre": 0.2}])
+def test_lengths_of_contacts_that_parameters_make_negative_are_refused(values):
+    with pytest.raises(ValueError, match=r"contact `rim` of `Wheel` (is|has a tyre of) -"):
+        jj.simulate(Wheel(**values), {"x_rate": 0.1}, ts=[0.1])
+
+
+def test_wrong_numbers_inside_jit_and_vmap_are_a_code():
+    def code(values):
+        return jj.simulate(Wheel(stretch=values[0], radius=values[1]), {"x_rate": 0.1}, ts=[0.1]).result
+
+    given = jnp.array([[1.0, 0.1], [2.0, 0.1], [1.0, 0.12]])
+    assert jax.jit(jax.vmap(code))(given).tolist() == [results.SUCCESS, results.BAD_PARAMETER, results.BAD_PARAMETER]
+    assert [int(jax.jit(code)(values)) for values in given[:2]] == [results.SUCCESS, results.BAD_PARAMETER]

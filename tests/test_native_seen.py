@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.build.plausibility import body_faults
+from jourdain_jax.build.plausibility import faults_at
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
@@ -126,7 +126,9 @@ def test_wrong_parameters_and_bodies_are_found_alike(name):
     q = jnp.asarray(jj.sample_states(scene, 1)[1])[0]
 
     def theirs(scene):
-        return ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *body_faults(scene, 0.0, q).values()]))
+        return ~jnp.any(
+            jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *faults_at(scene, 0.0, q, jnp.zeros(len(scene.speed_names)), None).values()])
+        )
 
     found = jax.vmap(lambda scene: seen.is_right(program, scene, 0.0, q))(lanes)
     np.testing.assert_array_equal(found, jax.vmap(theirs)(lanes))

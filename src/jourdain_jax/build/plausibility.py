@@ -1,13 +1,20 @@
-"""Whether the numbers that a scene gives for its bodies and contacts can be those of bodies and contacts; looked at while it is probed.
+"""Whether the numbers that a scene gives for its bodies and contacts can be those of bodies and contacts.
 
 m >= 0,   I = I' >= 0,   R' R = 1,   det R = 1
-n.n = 1,   e.e = 1 of gravity,   gap = 0 where the coordinates keep a body on the ground
+n.n = 1,   e.e = 1 of gravity,   gap = 0 where the coordinates keep a body on the ground,   0 < r of what rolls and of its ground,   0 <= tyre < r
+
+These are one table of functions of numbers, `CHECKS`: evaluated at the states at which a scene is probed, where a fault is an error with its text, and at the
+start of each motion, in the compiled program, where it is a result code. What takes the motion of several bodies is looked at while a scene is probed:
+
 d[n.(p - o)]/dt at a fixed point p = - n.(v + w x (p - o))        a plane's motion, stated twice: by o(t, q), n(t, q) and by v, w
 dg/dt along the motion of the other bodies = 0  or  v, w != 0      g: all that says where the ground of a contact is
 """
 
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import reduce
 from itertools import combinations
+from operator import or_
 
 import equinox as eqx
 import jax
@@ -16,10 +23,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.equations.kinematics import inertias_of, pose_at
+from jourdain_jax.equations.kinematics import motion_at, pose_at
 from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.contact_points import Ball, Ellipsoid, Wheel
 from jourdain_jax.scene.contacts import Contact
-from jourdain_jax.scene.loads import Gravity
+from jourdain_jax.scene.grounds import Cylinder, Sphere
+from jourdain_jax.scene.loads import Gravity, Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import contacts_of, loads_of
@@ -30,40 +39,192 @@ _ROUNDED = 1e-2  # relative: of thin wheels the last moment is the sum of the ot
 _ROWS_INSTEAD = "write its rows in `velocity_constraints`: tangents @ (rolling.velocity_at(point) - ground.velocity_at(point))"
 
 
+class Stated(eqx.Module):
+    """What the table judges, by names of bodies and contacts, at one state or, with a leading axis, at many; numbers, or nodes of a graph."""
+
+    mass: dict[str, Float[Array, "*states"]]
+    inertia: dict[str, Float[Array, "*states 4 3"]]  # of rigid bodies only; and, as a fourth row, what those of a point of their mass may be
+    orientation: dict[str, Float[Array, "*states 3 3"]]
+    normal: dict[str, Float[Array, "*states 2"]]  # squares of the lengths of the normals of contacts; and how far out the contact is, m
+    gap: dict[str, Float[Array, "*states 2"]]  # where the coordinates keep them closed; and the distance of the contact from the mass centre, m
+    length: dict[str, Float[Array, "*states"]]  # of what rolls and of its ground, m, by what and of which contact
+    tyre: dict[str, Float[Array, "*states"]]  # m
+    gravity: dict[str, Float[Array, "*states"]]  # squares of the lengths of directions
+
+
 class PoseNumbers(eqx.Module):
     """Numbers of all bodies and contacts at one state (or, with a leading axis, at many), by name."""
 
-    mass: dict[str, Float[Array, "*states"]]
+    stated: Stated
     position: dict[str, Float[Array, "*states 3"]]
-    inertia: dict[str, Float[Array, "*states 3 3"]]  # of rigid bodies only
-    orientation: dict[str, Float[Array, "*states 3 3"]]
     planes: dict[str, Float[Array, "*states 3"]]  # normal velocity by origin and tilt, by velocity and angular velocity; size of both, m/s
     carried: dict[str, Float[Array, "*states 3"]]  # rates of a ground along the motion of other bodies; size of that motion, and of the stated one, m/s
-    normals: dict[str, Float[Array, "*states 2"]]  # squares of the lengths of the normals of contacts; and how far out the contact is, m
-    downwards: dict[str, Float[Array, "*states"]]  # squares of the lengths of directions of gravity
-    gaps: dict[str, Float[Array, "*states 2"]]  # where the coordinates keep them closed; and the distance of the contact from the mass centre, m
 
 
 def numbers_of(scene: Scene, motion: Motion) -> PoseNumbers:
     """What the scene gives for its bodies and planes, from known poses and velocities."""
-    pose = motion.pose()
-    rigid = {name: body.body for name, body in pose.bodies.items() if isinstance(body.body, RigidBody)}
-    contacts = contacts_of(scene, pose)
+    contacts = contacts_of(scene, motion.pose())
     return PoseNumbers(
-        mass={name: body.mass for name, body in pose.bodies.items()},
-        position={name: body.position for name, body in pose.bodies.items()},
-        inertia={name: body.inertia for name, body in rigid.items()},
-        orientation={name: body.orientation for name, body in rigid.items()},
+        stated=stated_of(scene, motion.pose(), loads_of(scene, motion)),
+        position={name: body.position for name, body in motion.pose().bodies.items()},
         planes=_normal_velocities(scene, motion, contacts),
         carried={name: _carried_speeds(scene, motion, name, contact) for name, contact in contacts.items() if contact.ground is not None},
-        normals={name: jnp.stack([contact.plane.normal @ contact.plane.normal, jnp.sum(jnp.abs(contact.point))]) for name, contact in contacts.items()},
-        downwards={str(k): load.direction @ load.direction for k, load in enumerate(loads_of(scene, motion)) if isinstance(load, Gravity)},
-        gaps={
-            name: jnp.stack([contact.gap(), jnp.sum(jnp.abs(contact.point - pose[contact.body].position))])
-            for name, contact in contacts.items()
-            if contact.height == "coordinates"
-        },
     )
+
+
+def stated_of(scene: Scene, pose: Pose, loads: tuple[Load, ...] = ()) -> Stated:
+    """What the table judges of known poses and loads."""
+    bodies, contacts = {name: body.body for name, body in pose.bodies.items()}, contacts_of(scene, pose)
+    rigid = {name: body for name, body in bodies.items() if isinstance(body, RigidBody)}
+    away = 1e6 * jnp.finfo(pose.q.array.dtype).eps  # of round-off in the places of contacts that are far out
+    size = lambda x: jnp.sum(jnp.abs(x))  # noqa: E731
+    tyres = {f"contact `{name}`": c.shape.tyre for name, c in contacts.items() if isinstance(c.shape, Wheel) and c.shape.tyre is not None}
+    return Stated(
+        mass={f"body `{name}`": body.mass for name, body in bodies.items()},
+        inertia={f"body `{name}`": jnp.concatenate([body.inertia, jnp.full((1, 3), _POINT * body.mass)]) for name, body in rigid.items()},
+        orientation={f"body `{name}`": body.orientation for name, body in rigid.items()},
+        normal={f"contact `{name}`": jnp.stack([c.plane.normal @ c.plane.normal, size(c.point)]) for name, c in contacts.items()},
+        gap={
+            f"contact `{name}`": jnp.stack([c.gap(), size(c.point - pose[c.body].position) + away * size(c.point)])
+            for name, c in contacts.items()
+            if c.height == "coordinates"
+        },
+        length={f"{what} of contact `{name}`": length for name, contact in contacts.items() for what, length in _lengths(contact).items()},
+        tyre=tyres,
+        gravity={f"load {k}": load.direction @ load.direction for k, load in enumerate(loads) if isinstance(load, Gravity)},
+    )
+
+
+def _lengths(contact: Contact) -> dict[str, Float[Array, ""]]:
+    """Lengths (m) that must be positive."""
+    found, shape, ground = {}, contact.shape, contact.ground
+    if isinstance(shape, Ball | Wheel):
+        found["the radius"] = shape.radius
+    if isinstance(shape, Wheel) and shape.tyre is not None:
+        found["the radius less the tyre"] = shape.circle
+    if isinstance(shape, Ellipsoid):
+        found["the smallest semi-axis"] = jnp.min(shape.semi_axes)
+    if isinstance(ground, Cylinder | Sphere):
+        found["the radius of the ground"] = ground.radius
+    return found
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the table: of which numbers, whether they are wrong (axes of states and names first), and what is said of them at one state."""
+
+    of: str
+    label: str
+    wrong: Callable
+    says: Callable[[np.ndarray], str]
+
+
+def _size(x):
+    return abs(x).max((-2, -1))
+
+
+def _lopsided(x):
+    I = x[..., :3, :]
+    return _size(I - I.swapaxes(-1, -2)) > TOLERANCE * _size(x)
+
+
+def _negative(x):
+    """Whether an eigenvalue of a symmetric inertia is below zero: by its principal minors, relative to its largest entry, or that of a point."""
+    I, size = x[..., :3, :], _size(x)
+    I = (I + I.swapaxes(-1, -2)) / (2 * (size + (size == 0)))[..., None, None]
+    at = lambda i, k: I[..., i, k] + (TOLERANCE if i == k else 0.0)  # noqa: E731
+    minor = lambda i, j, k, m: at(i, k) * at(j, m) - at(i, m) * at(j, k)  # noqa: E731
+    whole = sum(at(0, i) * minor(1, 2, (i + 1) % 3, (i + 2) % 3) for i in range(3))
+    return reduce(or_, (x < 0 for x in (*(at(i, i) for i in range(3)), *(minor(i, j, i, j) for i, j in combinations(range(3), 2)), whole)))
+
+
+def _from_identity(R):
+    return _size(R.swapaxes(-1, -2) @ R - np.eye(3))
+
+
+def _volume(R):
+    at = lambda i, k: R[..., i, k]  # noqa: E731
+    return sum(at(0, i) * (at(1, (i + 1) % 3) * at(2, (i + 2) % 3) - at(1, (i + 2) % 3) * at(2, (i + 1) % 3)) for i in range(3))
+
+
+def _off(square):
+    return abs(square**0.5 - 1)
+
+
+CHECKS = (
+    Check(
+        "mass",
+        "a negative mass",
+        lambda m: m < 0,
+        lambda m: f"has a mass of {m:.4g} kg, expected a number that is not negative; check what its mass is computed from",
+    ),
+    Check(
+        "inertia",
+        "an inertia that is not symmetric",
+        _lopsided,
+        lambda x: "has an inertia that is not symmetric; give the same products of inertia above and below the diagonal",
+    ),
+    Check(
+        "inertia",
+        "a negative moment of inertia",
+        _negative,
+        lambda x: (
+            f"has a principal moment of inertia of {np.linalg.eigvalsh(x[:3])[0]:.4g} kg m^2, expected none below zero; check signs and products of inertia"
+        ),
+    ),
+    Check(
+        "orientation",
+        "an orientation that is no rotation",
+        lambda R: _from_identity(R) > TOLERANCE,
+        lambda R: (
+            f"has an orientation R that is no rotation: R' R differs from the identity by {_from_identity(R):.2g}; build it from jj.rot_x, jj.rot_y, jj.rot_z "
+            "or jj.quaternion_to_matrix"
+        ),
+    ),
+    Check(
+        "orientation",
+        "a reflected orientation",
+        lambda R: _volume(R) < 0,
+        lambda R: "has an orientation of determinant -1, a reflection and no rotation; turn one of its axes round",
+    ),
+    Check(
+        "normal",
+        "a normal that is no unit vector",
+        lambda x: _off(x[..., 0]) > TOLERANCE,
+        lambda x: f"has a normal whose length differs from 1 by {_off(x[0]):.2g}, expected a unit vector; divide it by its length",
+    ),
+    Check("length", "no positive length", lambda x: x <= 0, lambda x: f"is {x:.4g} m, expected a positive number; check what it is computed from"),
+    Check("tyre", "a negative tyre", lambda x: x < 0, lambda x: f"has a tyre of {x:.4g} m, expected a radius of its section that is not negative"),
+    Check(
+        "gap",
+        "a body off its ground",
+        lambda x: abs(x[..., 0]) > TOLERANCE * x[..., 1],
+        lambda x: (
+            f'has height="coordinates", but at a probed state its body is {x[0]:.4g} m off the ground; let the coordinates keep it there, or write height="row"'
+        ),
+    ),
+    Check(
+        "gravity",
+        "a direction of gravity that is no unit vector",
+        lambda square: _off(square) > TOLERANCE,
+        lambda square: f"has a length that differs from 1 by {_off(square):.2g}, expected a unit vector; divide it by its length",
+    ),
+)
+
+
+def faults_at(scene: Scene, t, q, u, inputs) -> dict[str, Bool[Array, ""]]:
+    """Fault by the table -> whether the scene has it at this state, under jit and vmap as well. What is NaN is none."""
+    motion = motion_at(scene, t, q, u, inputs)
+    stated = stated_of(scene, motion.pose(), loads_of(scene, motion))
+    return {f"{check.label}: {name}": check.wrong(x) for check in CHECKS for name, x in getattr(stated, check.of).items()}
+
+
+known_faults_at = eval_numpy(faults_at)
+
+
+def any_wrong(stacked: dict[str, Array]) -> Bool[Array, ""]:
+    """Whether the table finds a fault in numbers that are stacked along a first axis, by the names of the fields of `Stated`."""
+    return jnp.any(jnp.concatenate([jnp.zeros(1, bool), *(check.wrong(stacked[check.of]) for check in CHECKS if check.of in stacked)]))
 
 
 def _normal_velocities(scene: Scene, motion: Motion, contacts: dict[str, Contact]) -> dict[str, Float[Array, "3"]]:
@@ -106,107 +267,61 @@ def _carried_speeds(scene: Scene, motion: Motion, name: str, contact: Contact) -
     return jnp.stack([sum(jnp.sum(jnp.abs(x)) for x in part) for part in parts])
 
 
-def body_faults(scene: Scene, t, q) -> dict[str, Bool[Array, ""]]:
-    """Body name -> whether its mass is negative, or its inertia has a negative principal moment; also under jit and vmap. What is NaN is no fault of a body."""
-    pose = pose_at(scene, t, q)
-    weights = inertias_of(pose)
-    return dict(zip(pose.bodies, are_negative(weights.mass, weights.inertia), strict=True))
-
-
 def impossible_bodies(scene: Scene, q) -> tuple[str, ...]:
     """Bodies that no distribution of mass can make, one sentence each; bodies without thickness whose other moments are zero are passed over.
 
     m >= 0,   0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2
     """
-    found = []
-    for name, (mass, inertia) in _masses_and_inertias(scene, q).items():
-        what = f"body `{name}` of `{type(scene).__name__}`"
-        found.append(_of_mass(what, np.atleast_1d(mass)))
-        if inertia is not None:
-            found.append(_of_inertia(what, np.atleast_1d(mass), inertia[None]))
-            least, middle, largest = np.linalg.eigvalsh(inertia)
-            if least > TOLERANCE * largest and largest > (1 + _ROUNDED) * (least + middle):
-                found.append(
-                    f"{what} has principal moments of inertia {least:.4g}, {middle:.4g} and {largest:.4g} kg m^2, the last above the sum of the others: no "
-                    "distribution of mass has them; bound the parameters of its inertia, or free fewer"
-                )
-    return tuple(sentence for sentence in found if sentence)
+    stated, who = _bodies_stated(scene, q), type(scene).__name__
+    found = _sentences(who, jax.tree.map(lambda x: x[None], stated), CHECKS)
+    for name, inertia in stated.inertia.items():
+        least, middle, largest = np.linalg.eigvalsh(inertia[:3])
+        if least > TOLERANCE * largest and largest > (1 + _ROUNDED) * (least + middle):
+            found.append(
+                f"{name} of `{who}` has principal moments of inertia {least:.4g}, {middle:.4g} and {largest:.4g} kg m^2, the last above the sum of the others: "
+                "no distribution of mass has them; bound the parameters of its inertia, or free fewer"
+            )
+    return tuple(found)
 
 
 @eval_numpy
-def _masses_and_inertias(scene: Scene, q) -> dict:
-    bodies = {name: placed.body for name, placed in pose_at(scene, 0.0, q).bodies.items()}
-    return {name: (body.mass, body.inertia if isinstance(body, RigidBody) else None) for name, body in bodies.items()}
+def _bodies_stated(scene: Scene, q) -> Stated:
+    found = stated_of(scene, pose_at(scene, 0.0, q))
+    return Stated(found.mass, found.inertia, *({} for _ in range(6)))
 
 
-def are_negative(mass: Float[Array, "bodies"], inertia: Float[Array, "bodies 3 3"]) -> Bool[Array, "bodies"]:
-    """Whether a mass is below zero, or an eigenvalue of a symmetric inertia: by its principal minors, relative to its largest entry, or that of a point."""
-    I = jnp.moveaxis(inertia, 0, 2)
-    size = reduce(jnp.maximum, (jnp.abs(x) for row in I for x in row), _POINT * mass)
-    I = I / jnp.where(size > 0, size, 1.0) + TOLERANCE * jnp.eye(3, dtype=I.dtype)[..., None]
-
-    def minor(i: int, j: int, k: int, m: int):
-        return I[i, k] * I[j, m] - I[i, m] * I[j, k]
-
-    whole = sum(I[0, i] * minor(1, 2, (i + 1) % 3, (i + 2) % 3) for i in range(3))
-    return reduce(jnp.logical_or, (x < 0 for x in (mass, *(I[i, i] for i in range(3)), *(minor(i, j, i, j) for i, j in combinations(range(3), 2)), whole)))
+def _sentences(who: str, stated: Stated, checks: Iterable[Check]) -> list[str]:
+    """What the table finds at many states, one sentence for each fault, about the state where it is found first."""
+    found = []
+    for check in checks:
+        for name, x in getattr(stated, check.of).items():
+            wrong = np.flatnonzero(check.wrong(x))
+            found += [f"{name} of `{who}` {check.says(x[wrong[0]])}"] if wrong.size else []
+    return found
 
 
 def implausible(scene: Scene, numbers: PoseNumbers) -> tuple[str, ...]:
     """What cannot be, one sentence each; `numbers` at many states, those that are not finite are passed over."""
-    who = type(scene).__name__
-    pieces = {"mass": numbers.mass, "inertia": numbers.inertia, "position": numbers.position, "orientation": numbers.orientation}
-    sentences = [_of_nothing(f"body `{name}` of `{who}`", what, x) for what, part in pieces.items() for name, x in part.items()]
-    sentences += [_of_mass(f"body `{name}` of `{who}`", mass) for name, mass in numbers.mass.items()]
-    sentences += [_of_inertia(f"body `{name}` of `{who}`", numbers.mass[name], I) for name, I in numbers.inertia.items()]
-    sentences += [_of_orientation(f"body `{name}` of `{who}`", R) for name, R in numbers.orientation.items()]
+    who, stated = type(scene).__name__, numbers.stated
+    pieces = {"mass": stated.mass, "inertia": stated.inertia, "orientation": stated.orientation}
+    pieces["position"] = {f"body `{name}`": x for name, x in numbers.position.items()}
+    sentences = [_of_nothing(f"{name} of `{who}`", what, x) for what, part in pieces.items() for name, x in part.items()]
+    sentences += [_of_touch(f"{name} of `{who}`", x) for name, x in stated.normal.items()]
     sentences += [_of_carried(f"the ground of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.carried.items()]
+    sentences += _sentences(who, stated, CHECKS[:-1])
     sentences += [_of_plane(f"the plane of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.planes.items()]
-    sentences += [_of_normal(f"contact `{name}` of `{who}`", squares) for name, squares in numbers.normals.items()]
-    sentences += [_of_gap(f"contact `{name}` of `{who}`", gaps) for name, gaps in numbers.gaps.items()]
     return tuple(sentence for sentence in sentences if sentence)
 
 
 def odd_gravity(scene: Scene, numbers: PoseNumbers) -> tuple[str, ...]:
     """Directions of gravity that are no unit vectors, one sentence each; `numbers` as in `implausible`."""
-    off = [np.max(np.abs(np.sqrt(_finite(squares)) - 1), initial=0.0) for squares in numbers.downwards.values()]
-    who = f"the direction of gravity of `{type(scene).__name__}`"
-    return tuple(f"{who} has a length that differs from 1 by {x:.2g}, expected a unit vector; divide it by its length" for x in off if x > TOLERANCE)
+    return tuple(f"the direction of gravity in {sentence}" for sentence in _sentences(type(scene).__name__, numbers.stated, CHECKS[-1:]))
 
 
 def _of_nothing(what: str, piece: str, values: np.ndarray) -> str:
     if not len(values) or len(_finite(values)):
         return ""
     return f"{what} has no finite {piece} at any probed state, expected finite numbers; check what its {piece} is computed from"
-
-
-def _of_mass(what: str, mass: np.ndarray) -> str:
-    lowest = np.min(_finite(mass), initial=0.0)
-    return f"{what} has a mass of {lowest:.4g} kg, expected a number that is not negative; check what its mass is computed from" if lowest < 0 else ""
-
-
-def _of_inertia(what: str, mass: np.ndarray, I: np.ndarray) -> str:
-    I, heaviest = _finite(I), np.max(_finite(mass), initial=0.0)
-    size = np.max(np.abs(I), axis=(1, 2), initial=max(_POINT * heaviest, np.finfo(float).tiny))
-    if np.any(np.max(np.abs(I - np.swapaxes(I, 1, 2)), axis=(1, 2), initial=0.0) > TOLERANCE * size):
-        return f"{what} has an inertia that is not symmetric; give the same products of inertia above and below the diagonal"
-    least = np.linalg.eigvalsh(I)[:, 0]
-    if np.any(least < -TOLERANCE * size):
-        return f"{what} has a principal moment of inertia of {least.min():.4g} kg m^2, expected none below zero; check signs and products of inertia"
-    return ""
-
-
-def _of_orientation(what: str, R: np.ndarray) -> str:
-    R = _finite(R)
-    off = np.max(np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)), initial=0.0)
-    if off > TOLERANCE:
-        return (
-            f"{what} has an orientation R that is no rotation: R' R differs from the identity by {off:.2g}; build it from jj.rot_x, jj.rot_y, jj.rot_z "
-            "or jj.quaternion_to_matrix"
-        )
-    if np.any(np.linalg.det(R) < 0):
-        return f"{what} has an orientation of determinant -1, a reflection and no rotation; turn one of its axes round"
-    return ""
 
 
 def _of_plane(what: str, speeds: np.ndarray) -> str:
@@ -232,25 +347,12 @@ def _of_carried(what: str, speeds: np.ndarray) -> str:
     )
 
 
-def _of_normal(what: str, squares: np.ndarray) -> str:
-    if len(squares) and not len(_finite(squares)):
-        return (
-            f"{what} finds no point where body and ground touch at any probed state; a ball must be smaller than the cylinder or sphere that it rolls in, "
-            "a surface needs a gradient that does not vanish, coordinates a `domain` that lies near it"
-        )
-    off = np.max(np.abs(np.sqrt(_finite(squares)[:, 0]) - 1), initial=0.0)
-    return f"{what} has a normal whose length differs from 1 by {off:.2g}, expected a unit vector; divide it by its length" if off > TOLERANCE else ""
-
-
-def _of_gap(what: str, gaps: np.ndarray) -> str:
-    gap, size = _finite(gaps).T
-    off = np.abs(gap) - TOLERANCE * size
-    if not np.any(off > 0):
+def _of_touch(what: str, squares: np.ndarray) -> str:
+    if not len(squares) or len(_finite(squares)):
         return ""
-    k = int(np.argmax(off))
     return (
-        f'{what} has height="coordinates", but at a probed state its body is {gap[k]:.4g} m off the ground; let the coordinates keep it there, '
-        'or write height="row"'
+        f"{what} finds no point where body and ground touch at any probed state; a ball must be smaller than the cylinder or sphere that it rolls in, "
+        "a surface needs a gradient that does not vanish, coordinates a `domain` that lies near it"
     )
 
 

@@ -11,10 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.build.plausibility import are_negative
+from jourdain_jax.build.plausibility import any_wrong
 from jourdain_jax.build.probed_on_graph import LookedAt, looked_at
 from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.build.trace import TracedScene
+from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 from jourdain_jax.program.part import part_of
@@ -86,17 +87,28 @@ def row_program(scene: Scene) -> RowProgram | None:
 
 
 def _right(scene: Scene, traced: TracedScene) -> int:
-    """The node of a truth value: every parameter is finite and has its sign, no mass and no principal moment of inertia is below zero."""
-    nodes = [*traced.parameters, traced.at.mass, traced.at.inertia]
-    treedef = jax.tree.structure(scene)
+    """The node of a truth value: every parameter is finite and has its sign, and `plausibility.CHECKS` finds no fault in what parameters decide.
+
+    What they do not decide is judged where the scene is probed, and what speeds or inputs decide, there alone.
+    """
+    g, known = traced.graph, [n for part in (traced.u, traced.inputs) for n in part.tolist()]
+    of_parameters = [n for leaf in traced.parameters for n in leaf.ravel().tolist()]
+
+    def decided(of: np.ndarray) -> bool:
+        return any(depend_on(g, of.ravel().tolist(), of_parameters)) and not any(depend_on(g, of.ravel().tolist(), known))
+
+    kept = {name: [x for x in map(np.asarray, of.values()) if decided(x)] for name, of in vars(traced.particulars.numbers.stated).items()}
+    stacked = {name: np.stack(of) for name, of in kept.items() if of}
+    nodes = [*traced.parameters, *stacked.values()]
+    treedef, count = jax.tree.structure(scene), len(traced.parameters)
 
     def right(*given):
-        *leaves, mass, inertia = given
-        return ~jnp.any(jnp.stack([*parameter_faults(jax.tree.unflatten(treedef, leaves)).values(), jnp.any(are_negative(mass, inertia))]))
+        faults = parameter_faults(jax.tree.unflatten(treedef, given[:count])).values()
+        return ~jnp.any(jnp.stack([*faults, any_wrong(dict(zip(stacked, given[count:], strict=True)))]))
 
     closed = jax.make_jaxpr(right)(*(jax.ShapeDtypeStruct(x.shape, jnp.result_type(float)) for x in nodes))
-    (found,) = interpret(traced.graph, closed, [Nodes(x) for x in nodes])
-    return int(as_nodes(traced.graph, found))
+    (found,) = interpret(g, closed, [Nodes(x) for x in nodes])
+    return int(as_nodes(g, found))
 
 
 def _entries(rows: list[dict[int, int]], variables: list[int]) -> dict[tuple[int, int], int]:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.build.plausibility import body_faults
+from jourdain_jax.build.plausibility import faults_at
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.calculus.guards import forward_only, reverse_only
 from jourdain_jax.calculus.lanes_first import lanes_first
@@ -199,11 +199,11 @@ def _finish(given: Setup, setup: Setup, asked: Float[Array, ""], begun: Begun, s
 
 
 def _without_faults(setup: Setup):
-    """Whether all parameters are right, and the bodies they make; and the start: NaN where they are not, so that such a lane ends at once."""
+    """Whether all parameters are right, and the bodies and contacts they make; and the start: NaN where they are not, so that such a lane ends at once."""
     scene, t0, start, field = setup.scene, setup.t0, setup.start, setup.field
     program = row_program(scene) if isinstance(field, ByProgram) and field.native else None
     if program is None or unsupported(program.graph, [program.right]):
-        right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *body_faults(scene, t0, start.q).values()]))
+        right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *faults_at(scene, t0, start.q, start.u, setup.inputs(t0)).values()]))
     else:
         right = seen.is_right(program, scene, t0, start.q)
     return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u)))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.load_jumps import loads_without_slope
-from jourdain_jax.build.plausibility import body_faults
+from jourdain_jax.build.plausibility import known_faults_at
 from jourdain_jax.build.structure import usual_rows
 from jourdain_jax.calculus.nan_where import nan_where
 from jourdain_jax.calculus.reals import checked_real, is_traced
@@ -170,13 +170,11 @@ class Trajectory(Record):
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """Parameters that are not finite or have the wrong sign, otherwise bodies whose mass or inertia cannot be, as they stand in messages."""
-        reference = jnp.asarray(self.scene.coordinates.reference(), self.q.dtype)
-        bodies = () if self.wrong_parameters else body_faults(self.scene, self.t_end, reference).items()
-        return (
-            *(f"`{name}`" for name in self.wrong_parameters),
-            *(f"a negative mass or moment of inertia of body `{name}`" for name, wrong in bodies if bool(wrong)),
-        )
+        """Parameters that are not finite or have the wrong sign, otherwise what bodies, contacts and gravity cannot have, as they stand in messages."""
+        if self.wrong_parameters:
+            return tuple(f"`{name}`" for name in self.wrong_parameters)
+        q, u, _ = self.scene.named()
+        return tuple(fault for fault, wrong in known_faults_at(self.scene, self.t_end, q, u, inputs_at(self.inputs, self.t_end)).items() if bool(wrong))
 
     def nan_if_failed(self) -> "Trajectory":
         """The trajectory itself, with NaN in place of its states where it reached neither its end nor an event: under `jit`, `vmap` and `grad`, lane by lane.
