@@ -1,31 +1,32 @@
-"""Size of the package, layer by layer, and how much of it one simulation runs.
+"""Size of the code by one rule, and how much of the package one simulation runs.
 
-    python bench/code_map.py [--quick] [--json FILE]
+    python bench/code_map.py [--quick] [--json FILE] [--private]
 
-What is read from the source: files and lines of every layer (a package of `src/jourdain_jax`; their order is that of `tests/test_layers.py`), and the
-files that `motion/simulate.py` imports, directly or through others.
+Read from the source: code tokens of every folder (docstrings, comments and layout are free, a string counts one per 40 characters begun, as Python 3.11
+splits text); test files that reach names below the top level of the package, through other files of `tests` too; caches (decorators, containers at module
+level that are filled later); numbers at module level and as defaults of classes; tests for tracers; functions with more than 8 parameters.
 
-What is measured, in a fresh process for each model, with every call of a Python function observed: the files of the package of which some function runs
+Measured, in a fresh process for each model, with every call of a Python function observed: files of the package of which some function runs
 
-    start       in the first `jj.start` of the model's example, which also probes the structure of the scene
-    first       in the first `jj.simulate(scene, start, t1=...)`, which lowers and compiles
-    second      in the second one, which finds all that is kept
+    build       in the first `jj.build` of the model
+    first       in the first `jj.simulate(scene, start, t1=...)` after it
+    gradient    in the first gradient of its end with respect to the start
+    warm        in one more `jj.simulate`
 
-and calls that go up: a function that was called, through jax or directly, by one of a lower layer. Imports point down only, so these are functions that a
-lower layer was handed. Steps of generators do not count as calls, and the methods of the scene itself (the layer `models`) count apart.
-
-The JSON is a list of {"figure", "model", "value", "required", "met"}. `--quick`: one model.
+`tests/test_code_map.py` holds what is read as ceilings. The JSON is a list of {"figure", "model", "value", "required", "met"}; `--quick`: one model;
+`--private`: which private modules every test file reaches.
 """
 
 import argparse
 import ast
 import inspect
+import io
 import json
 import os
-import statistics
 import subprocess
 import sys
 import threading
+import tokenize
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -33,83 +34,150 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "jourdain_jax"
 SOURCE = ROOT / "src" / PACKAGE
-TOP = "(top)"  # modules above all layers
-MOST_LINES, MOST_FILES = {"all": 17_000, "equations": 1_300}, 20  # of the package, of the equations of motion; that a call runs
-ENTRY = "motion/simulate.py"
+FOLDERS = ("src", "tests", "bench", "docs", "notebooks")
+PUBLIC = {PACKAGE, *(f"{PACKAGE}.{name}" for name in ("models", "bicycle", "cli"))}
+SEAMS = tuple(f"{PACKAGE}.{name}" for name in ("program", "motion.integrators.erk_step", "motion.native.step"))  # the scalar program; one step
+CACHES = {"cache", "lru_cache", "cached_property"}
+CONTAINERS = {"dict", "list", "set", "defaultdict", "OrderedDict", "Counter", "WeakKeyDictionary", "WeakValueDictionary", "WeakSet", "deque"}
+TRACERS = {"is_traced", "is_traced_type", "nothing_is_traced", "checked_unless_traced", "Tracer", "ConcretizationTypeError", "TracerBoolConversionError"}
+MOST_PARAMETERS = 8
+MOST_FILES = 20  # that a warm call runs
 MODELS = ("tilting-disc", "skate", "whipple-bicycle")
-CALLS = ("start", "first", "second")
+LAYOUT = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER, tokenize.ENCODING}
+OPENS, CLOSES = (getattr(tokenize, f"FSTRING_{end}", -1) for end in ("START", "END"))  # from Python 3.12 on
 
 
 def layers() -> tuple[str, ...]:
-    """The layers from bottom to top, as `tests/test_layers.py` states them."""
+    """Return the layers from bottom to top, as `tests/test_layers.py` states them."""
     for node in ast.parse((ROOT / "tests" / "test_layers.py").read_text(encoding="utf-8")).body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "LAYERS":
             return ast.literal_eval(node.value)
     raise ValueError("tests/test_layers.py states no LAYERS")
 
 
-def layer_of(file: str) -> str:
-    """The layer of a file, given by its path within the package."""
-    return file.split("/")[0] if "/" in file else TOP
-
-
-def lines_of_files() -> dict[str, int]:
-    """Number of lines of every source file, by its path within the package."""
-    return {path.relative_to(SOURCE).as_posix(): len(path.read_text(encoding="utf-8").splitlines()) for path in sorted(SOURCE.rglob("*.py"))}
-
-
 def packages() -> set[str]:
-    """Names of the packages directly below the package."""
+    """Return the names of the packages directly below the package."""
     return {path.parent.name for path in SOURCE.glob("*/__init__.py")}
 
 
-def imported(file: str) -> set[str]:
-    """Files of the package that a file imports by its own statements."""
+def code_tokens(text: str) -> int:
+    """Return the number of code tokens of a file."""
+    documented = {
+        node.body[0].lineno
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and ast.get_docstring(node) is not None
+    }
+    lines, total, opened = text.splitlines(keepends=True), 0, []
+    starts = [sum(map(len, lines[:k])) for k in range(len(lines) + 1)]
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type == OPENS:
+            opened.append(starts[token.start[0] - 1] + token.start[1])
+        elif token.type == CLOSES:
+            begin = opened.pop()
+            total += 0 if opened else 1 + (starts[token.end[0] - 1] + token.end[1] - begin - 1) // 40
+        elif not opened and token.type == tokenize.STRING:
+            total += 0 if token.start[0] in documented else 1 + (len(token.string) - 1) // 40
+        elif not opened:
+            total += token.type not in LAYOUT
+    return total
+
+
+def modules_imported(path: Path) -> set[str]:
+    """Return the names of the modules that a file imports, those of the package and of `tests` as far down as a file goes."""
     found = set()
-    for node in ast.walk(ast.parse((SOURCE / file).read_text(encoding="utf-8"))):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            parents = [PACKAGE, *file.split("/")[:-1]][: len(file.split("/")) + 1 - node.level] if node.level else []
-            base = ".".join([*parents, *([node.module] if node.module else [])])
-            found |= {base} | {f"{base}.{alias.name}" for alias in node.names}
-    paths = (name.removeprefix(f"{PACKAGE}.").replace(".", "/") + ".py" for name in found if name.startswith(f"{PACKAGE}."))
-    return {path for path in paths if (SOURCE / path).is_file()}
-
-
-def import_closure(file: str) -> set[str]:
-    """The file, and all files of the package that it imports, directly or through others; `__init__` files are left out."""
-    found, waiting = set(), [file]
-    while waiting:
-        new = waiting.pop()
-        if new not in found:
-            found.add(new)
-            waiting += imported(new)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            deeper = {alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {name if _file(name) else node.module for name in deeper.values()}
     return found
 
 
-def observed(call: Callable[[], object]) -> tuple[object, dict]:
-    """What `call` returns; and calls per file of the package, calls that went up a layer, those of them to methods of models."""
-    order, root = {name: k for k, name in enumerate(layers())}, f"{SOURCE}/"
-    files: Counter[str] = Counter()
-    up: Counter[tuple[str, str]] = Counter()
+def _file(module: str) -> Path | None:
+    """Return the file of a module of the package or of `tests`."""
+    for root in (ROOT / "src", ROOT / "tests"):
+        for path in (root.joinpath(*module.split(".")).with_suffix(".py"), root.joinpath(*module.split("."), "__init__.py")):
+            if path.is_file():
+                return path
+    return None
 
-    def own(frame) -> str | None:
-        path = frame.f_code.co_filename
-        return path[len(root) :] if path.startswith(root) else None
+
+def private_modules(path: Path, known: dict[Path, set[str]]) -> set[str]:
+    """Return the modules of the package that a file of `tests` reaches, itself or through others there, beyond public ones and the seams."""
+    if path not in known:
+        known[path] = set()
+        for module in modules_imported(path):
+            if module.split(".")[0] == PACKAGE:
+                seam = any(module == name or module.startswith(f"{name}.") for name in SEAMS)
+                known[path] |= set() if seam or module in PUBLIC else {module}
+            elif (other := _file(module)) is not None:
+                known[path] |= private_modules(other, known)
+    return known[path]
+
+
+def reaching() -> dict[str, list[str]]:
+    """Return the private modules that every test file reaches, by the name of the file, where there are any."""
+    known: dict[Path, set[str]] = {}
+    found = {path.name: sorted(private_modules(path, known)) for path in sorted((ROOT / "tests").glob("test_*.py"))}
+    return {name: modules for name, modules in found.items() if modules}
+
+
+def counted(tree: ast.Module) -> Counter:
+    """Return caches, numbers, tests for tracers and functions with many parameters of a file."""
+    found: Counter = Counter()
+    for node in ast.walk(tree):
+        name = getattr(node, "id", None) or getattr(node, "attr", None)
+        found["caches"] += name in CACHES
+        found["tests for a tracer"] += name in TRACERS
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            named = [x for x in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs) if x.arg not in ("self", "cls")]
+            found[f"functions with more than {MOST_PARAMETERS} parameters"] += len(named) > MOST_PARAMETERS
+    for body in (tree.body, *(node.body for node in tree.body if isinstance(node, ast.ClassDef))):
+        for value in (node.value for node in body if isinstance(node, ast.Assign | ast.AnnAssign)):
+            found["caches"] += body is tree.body and _is_empty(value)
+            found["named numbers"] += sum(map(_is_number, value.elts if isinstance(value, ast.Tuple) else [value]))
+    return found
+
+
+def _is_empty(value: ast.expr | None) -> bool:
+    """Return whether this makes a container with nothing in it."""
+    if isinstance(value, ast.Call):
+        name = getattr(value.func, "id", None) or getattr(value.func, "attr", None)
+        return name in CONTAINERS and all(isinstance(argument, ast.Name) for argument in value.args)
+    return (isinstance(value, ast.Dict) and not value.keys) or (isinstance(value, ast.List) and not value.elts)
+
+
+def _is_number(value: ast.expr | None) -> bool:
+    """Return whether this is a number, or worked out from one."""
+    if isinstance(value, ast.BinOp):
+        return _is_number(value.left) or _is_number(value.right)
+    if isinstance(value, ast.UnaryOp):
+        return _is_number(value.operand)
+    return isinstance(value, ast.Constant) and type(value.value) in (int, float)
+
+
+def figures_of_source() -> dict[str, int]:
+    """Return what is read from the source."""
+    found: Counter = Counter()
+    for folder in FOLDERS:
+        files = [path for path in sorted((ROOT / folder).rglob("*.py*")) if path.suffix in (".py", ".pyi")]
+        found[f"code tokens of {folder}"] = sum(code_tokens(path.read_text(encoding="utf-8")) for path in files)
+    for path in sorted(SOURCE.rglob("*.py")):
+        found += counted(ast.parse(path.read_text(encoding="utf-8")))
+    found["test files that reach private names"] = len(reaching())
+    return dict(found)
+
+
+def observed(call: Callable[[], object]) -> tuple[object, dict[str, int]]:
+    """Return what `call` returns, and calls of Python functions per file of the package."""
+    files: Counter[str] = Counter()
+    root = f"{SOURCE}/"
 
     def look(frame, event, argument):
-        called = own(frame) if event == "call" else None
-        if called is None or frame.f_code.co_name == "<module>":
-            return
-        files[called] += 1
-        if frame.f_code.co_flags & inspect.CO_GENERATOR:
-            return
-        caller = frame.f_back
-        while caller is not None and own(caller) is None:
-            caller = caller.f_back
-        if caller is not None and order.get(layer_of(called), 0) > order.get(layer_of(own(caller)), len(order)):
-            up[(f"{own(caller)}: {caller.f_code.co_qualname}", f"{called}: {frame.f_code.co_qualname}")] += 1
+        path = frame.f_code.co_filename
+        if event == "call" and path.startswith(root) and frame.f_code.co_name != "<module>" and not frame.f_code.co_flags & inspect.CO_GENERATOR:
+            files[path[len(root) :]] += 1
 
     threading.setprofile(look)
     sys.setprofile(look)
@@ -118,26 +186,33 @@ def observed(call: Callable[[], object]) -> tuple[object, dict]:
     finally:
         sys.setprofile(None)
         threading.setprofile(None)
-    return result, {"files": dict(files), "up": [[*pair, count] for pair, count in up.most_common()]}
+    return result, dict(files)
 
 
-def observed_calls(model: str) -> dict[str, dict]:
-    """What a start and two simulations of a model run; for a process that has done nothing before."""
+def observed_calls(model: str) -> dict[str, dict[str, int]]:
+    """Return what the calls run for a model; for a process that has done nothing before."""
     import jax
 
     import jourdain_jax as jj
 
     scene = jj.models.MODELS[model]()
-    start, first_start = observed(lambda: jax.block_until_ready(jj.start(scene, **scene.example)))
-    found = {"start": first_start}
-    for name in CALLS[1:]:
-        motion, found[name] = observed(lambda: jax.block_until_ready(jj.simulate(scene, start, t1=scene.example_span)))
-        motion.raise_if_failed()
-    return found
+    span = scene.example_span
+    _, built = observed(lambda: jj.build(scene))
+    start = jj.start(scene, **scene.example)
+
+    def moved():
+        return jax.block_until_ready(jj.simulate(scene, start, t1=span))
+
+    def slope():
+        return jax.block_until_ready(jax.grad(lambda start: jj.simulate(scene, start, t1=span).q_end.sum())(start))
+
+    motion, first = observed(moved)
+    motion.raise_if_failed()
+    return {"build": built, "first": first, "gradient": observed(slope)[1], "warm": observed(moved)[1]}
 
 
-def in_fresh_process(model: str) -> dict[str, dict]:
-    """`observed_calls` of a model, in a process of its own."""
+def in_fresh_process(model: str) -> dict[str, dict[str, int]]:
+    """Return `observed_calls` of a model, in a process of its own."""
     paths = [str(SOURCE.parent), *filter(None, [os.environ.get("PYTHONPATH")])]  # this source, whatever is installed
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
     done = subprocess.run([sys.executable, __file__, "--observe", model], env=environment, capture_output=True, text=True)
@@ -147,66 +222,19 @@ def in_fresh_process(model: str) -> dict[str, dict]:
 
 
 def figure(name: str, model: str, value: float, required: float | None = None) -> dict:
-    """One entry of the JSON; `required`: the largest value that is allowed."""
+    """Return one entry of the JSON; `required`: the largest value that is allowed."""
     return {"figure": name, "model": model, "value": value, "required": required, "met": required is None or value <= required}
 
 
-def figures_of_source() -> Iterator[dict]:
-    """Sizes, and what the entry imports."""
-    lines = lines_of_files()
-    for layer in (*layers(), TOP):
-        own = [count for file, count in lines.items() if layer_of(file) == layer]
-        yield figure("files", layer, len(own))
-        yield figure("lines", layer, sum(own), MOST_LINES.get(layer))
-    yield figure("files", "all", len(lines))
-    yield figure("lines", "all", sum(lines.values()), MOST_LINES["all"])
-    yield figure("lines of the median file", "all", statistics.median(lines.values()))
-    yield figure("lines of the longest file", max(lines, key=lines.__getitem__), max(lines.values()))
-    closure = import_closure(ENTRY)
-    yield figure("files imported, directly or through others", ENTRY, len(closure))
-    yield figure("lines imported, directly or through others", ENTRY, sum(lines[file] for file in closure))
-
-
-def figures_of_calls(model: str, found: dict[str, dict]) -> Iterator[dict]:
-    """What the calls of one model run."""
-    said = {"start": "first start", "first": "first simulate", "second": "second simulate"}
-    for name in CALLS:
-        files, up = found[name]["files"], found[name]["up"]
-        yield figure(f"files run, {said[name]}", model, len(files), MOST_FILES if name == "second" else None)
-        yield figure(f"lines of the files run, {said[name]}", model, sum(count for file, count in lines_of_files().items() if file in files))
-        yield figure(f"calls of own functions, {said[name]}", model, sum(files.values()))
-        of_scene = sum(count for _, called, count in up if layer_of(called) == "models")
-        yield figure(f"calls up the layers, {said[name]}", model, sum(count for *_, count in up) - of_scene)
-        yield figure(f"calls of the scene's own methods, {said[name]}", model, of_scene)
-    cold = set(found["start"]["files"]) | set(found["first"]["files"])
-    yield figure("files run, first start and first simulate together", model, len(cold))
-
-
-def source_table() -> Iterator[str]:
-    """Files and lines of every layer, bottom first."""
-    lines = lines_of_files()
-    closure = import_closure(ENTRY)
-    yield f"{'layer':<12}{'files':>7}{'lines':>8}{'median':>8}{'longest':>9}  longest file"
-    for layer in (*layers(), TOP, "all"):
-        own = {file: count for file, count in lines.items() if layer in ("all", layer_of(file))}
-        longest = max(own, key=own.__getitem__, default="")
-        yield f"{layer:<12}{len(own):>7}{sum(own.values()):>8}{statistics.median(own.values() or [0]):>8.0f}{own.get(longest, 0):>9}  {longest}"
-    yield f"{ENTRY} imports {len(closure)} files, itself included, of {sum(lines[file] for file in closure)} lines, directly or through others"
-
-
-def calls_table(model: str, found: dict[str, dict]) -> Iterator[str]:
-    """Files that ran, by layer, and calls that went up."""
-    counts = {name: Counter(layer_of(file) for file in found[name]["files"]) for name in CALLS}
-    yield f"{model}: files run in the first start, the first and the second simulate"
-    for layer in (*layers(), TOP):
-        if any(count[layer] for count in counts.values()):
-            here = " ".join(sorted(file.removeprefix(f"{layer}/").removesuffix(".py") for file in found["second"]["files"] if layer_of(file) == layer))
-            yield f"  {layer:<12}" + "".join(f"{counts[name][layer]:>6}" for name in CALLS) + f"   {here}"
-    yield f"  {'all':<12}" + "".join(f"{sum(counts[name].values()):>6}" for name in CALLS) + "   (names: those of the second simulate)"
-    for name in CALLS:
-        shown = [(caller, called, count) for caller, called, count in found[name]["up"] if layer_of(called) != "models"]
-        yield f"  calls up, {name}: {sum(count for *_, count in shown)}"
-        yield from (f"    {count:>5}  {caller}  ->  {called}" for caller, called, count in shown)
+def figures(models: tuple[str, ...]) -> Iterator[dict]:
+    """Yield all figures."""
+    yield from (figure(name, "all", value) for name, value in figures_of_source().items())
+    for model in models:
+        found = in_fresh_process(model)
+        for name, files in found.items():
+            yield figure(f"files run, {name}", model, len(files), MOST_FILES if name == "warm" else None)
+            yield figure(f"calls of own functions, {name}", model, sum(files.values()))
+        yield figure("files run, build, first and gradient", model, len(set().union(*found.values())))
 
 
 def main() -> int:
@@ -214,29 +242,22 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help=f"only {MODELS[0]}")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to this file")
+    parser.add_argument("--private", action="store_true", help="list the private modules that test files reach")
     parser.add_argument("--observe", metavar="MODEL", help="print what one model runs, as JSON, in this process")
     options = parser.parse_args()
     if options.observe:
         print(json.dumps(observed_calls(options.observe)))
         return 0
-    print("\n".join(source_table()))
-    figures, failures = list(figures_of_source()), 0
-    for model in MODELS[:1] if options.quick else MODELS:
-        try:
-            found = in_fresh_process(model)
-        except RuntimeError as error:
-            failures += 1
-            print(error, file=sys.stderr, flush=True)
-            continue
-        print("\n" + "\n".join(calls_table(model, found)), flush=True)
-        figures += figures_of_calls(model, found)
-    print()
-    for entry in figures:
-        if entry["required"] is not None:
-            print(f"{'met ' if entry['met'] else 'MISS'} {entry['value']:>7} (required {entry['required']})  {entry['figure']}: {entry['model']}")
+    if options.private:
+        print(*(f"{name}: {' '.join(modules)}" for name, modules in reaching().items()), sep="\n")
+        return 0
+    found = []
+    for entry in figures(MODELS[:1] if options.quick else MODELS):
+        found.append(entry)
+        print(f"{entry['value']:>8}  {entry['figure']}: {entry['model']}{'' if entry['met'] else ' MISS'}", flush=True)
     if options.json:
-        options.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
-    return 1 if failures else 0
+        options.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    return 0
 
 
 if __name__ == "__main__":

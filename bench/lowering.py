@@ -1,18 +1,15 @@
-"""Every figure about lowered equations, in one run on one core: operations, time per evaluation, whole motions, gradients, cold starts, growth.
+"""Every figure about lowered equations, in one run on one core: operations, time per evaluation, whole motions, gradients, growth.
 
     taskset -c 0 python bench/lowering.py [--quick] [--json FILE] [--only NAME ...]
 
 Writes a list of {"figure", "model", "value", "required", "aim", "met"} (met: the required figure). float64, warm unless said; ratios come from
-one run, times are the fastest of some repeats. Baselines, frozen: `bench/baselines` (by hand, dense autodiff, flat arrays, heyoka).
+one run, times are the fastest of some repeats. Baselines, frozen: `bench/baselines` (by hand, dense autodiff, flat arrays).
 """
 
 import argparse
-import importlib
 import json
 import os
 import platform
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 
@@ -20,30 +17,18 @@ os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_th
 os.environ["JOURDAIN_JAX_CACHE"] = "0"  # all is found and compiled here, and what is found beyond the budget of operations is kept for nobody
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from baselines import dense, disc_run, heyoka_disc
+from baselines import dense, disc_run
 from baselines.hand_derived import HAND_DERIVED, operations
 from baselines.timing import fastest, least_processor_time, seconds_per_evaluation
 
 import jourdain_jax as jj
-from jourdain_jax.models import PendulumChain, TiltingDisc, TrailerChain
-from jourdain_jax.motion.batches import lockstep
-from jourdain_jax.motion.vector_fields.choice import vector_field
+from jourdain_jax.models import PendulumChain, TrailerChain
 
 Figure = dict
 BY_HAND_LANES, DENSE_LANES = 4096, 1024
-ALONE = 400  # evaluations per call for one lane: handing over hundreds of scalars takes longer than one evaluation
-COLD = """
-import time; begin = time.perf_counter()
-import jax, sys, jourdain_jax as jj
-scene = jj.models.MODELS[sys.argv[1]]()
-motion = jj.simulate(scene, backend="auto" if sys.argv[2] == "lowered" else "dense")
-jax.block_until_ready(motion.q)
-print(time.perf_counter() - begin)
-"""
 
 
 def figure(name: str, model: str, value: float | None, required: float, aim: float, at_least: bool = False) -> Figure:
@@ -137,15 +122,6 @@ def disc_motions(quick: bool) -> Iterator[Figure]:
     one = disc_run.START[None]
     alone = disc_seconds(our_disc(alone=True), one, disc_run.reference(one), 1e-9, 20)
     print(f"  ours: {1e3 * alone:.3f} ms alone", flush=True)
-    names = [("throughput in the batch, ours / heyoka's", ours, 8, 0.15, 1), ("throughput alone, ours / heyoka's", alone, 1, 0.05, 0.5)]
-    for name, seconds, width, required, aim in names:
-        if heyoka_disc.heyoka is None:
-            print(heyoka_disc.MISSING)
-            yield figure(name, "tilting-disc", None, required, aim, at_least=True)
-            continue
-        tolerance, _ = disc_run.loosest(lambda tolerance, width=width: heyoka_disc.final_states(tolerance, width)(starts), expected)
-        theirs = heyoka_disc.seconds_per_trajectory(tolerance, width, lanes=len(starts))
-        yield figure(name, "tilting-disc", theirs / seconds, required, aim, at_least=True)
 
 
 # span in s, names of parameters, and which coordinates and speeds of the start vary: eight numbers in all
@@ -298,20 +274,6 @@ def all_parameters(quick: bool) -> Iterator[Figure]:
         np.testing.assert_allclose(found["forward"], found["reverse"], rtol=1e-5, atol=1e-5 * np.max(np.abs(found["reverse"])))
 
 
-def cold_seconds(name: str, way: str) -> float:
-    """From a fresh process to the first trajectory: import, build, probe, compile, run."""
-    done = subprocess.run([sys.executable, "-c", COLD, name, way], capture_output=True, text=True, check=True)
-    return float(done.stdout.split()[-1])
-
-
-def cold_starts(quick: bool) -> Iterator[Figure]:
-    """Fresh processes."""
-    yield figure("fresh process to the first trajectory, s", "whipple-bicycle", cold_seconds("whipple-bicycle", "lowered"), 10, 4)
-    for name in () if quick else jj.models.MODELS:
-        ratio = cold_seconds(name, "lowered") / cold_seconds(name, "dense")
-        yield figure("fresh process, lowered / dense", name, ratio, 1.5, 1)
-
-
 LONGEST = 200  # trailers of the chain that is to be built in a minute
 
 
@@ -345,146 +307,6 @@ def growth(quick: bool) -> Iterator[Figure]:
         yield figure(f"n = {LONGEST}, built and its first motion, s", "trailer-chain", time.perf_counter() - begin, 60, 24)
 
 
-class TabulatedDisc(TiltingDisc):
-    """With rolling resistance by a table."""
-
-    def loads(self, motion):
-        speeds = jnp.linspace(0.0, 10.0, 21)
-        resistance = jnp.sign(motion.u.spin_rate) * jnp.interp(jnp.abs(motion.u.spin_rate), speeds, 0.01 * jnp.sqrt(speeds))
-        return (*super().loads(motion), jj.generalized_force(motion, spin_rate=-resistance))
-
-
-class LearnedDisc(TiltingDisc):
-    """With torques by a network of two hidden layers of 32."""
-
-    first: object = eqx.field(default_factory=lambda: np.random.default_rng(0).normal(size=(32, 4)))
-    second: object = eqx.field(default_factory=lambda: np.random.default_rng(1).normal(size=(32, 32)) / 8)
-    last: object = eqx.field(default_factory=lambda: np.random.default_rng(2).normal(size=(2, 32)) / 100)
-
-    def loads(self, motion):
-        u = motion.u
-        state = jnp.stack([motion.q.lean, u.lean_rate, u.yaw_rate, u.spin_rate])
-        lean, spin = self.last @ jnp.tanh(self.second @ jnp.tanh(self.first @ state))
-        return (*super().loads(motion), jj.generalized_force(motion, lean_rate=lean, spin_rate=spin))
-
-
-class IteratedDisc(TiltingDisc):
-    """With rolling resistance by Newton's method."""
-
-    def loads(self, motion):
-        newton = lambda v: v - (v**3 + v - motion.u.spin_rate) / (3 * v * v + 1)  # noqa: E731
-        root = jax.lax.while_loop(lambda v: jnp.abs(newton(v) - v) > 1e-12, newton, jnp.zeros_like(motion.u.spin_rate))
-        return (*super().loads(motion), jj.generalized_force(motion, spin_rate=-0.01 * root))
-
-
-def opaque_calls(quick: bool) -> Iterator[Figure]:
-    """2 s of a disc with a load that has no scalar form, alone and in a batch of 1024: our dense path relative to the lowered scene with a call."""
-    if quick:
-        return
-    for scene in (TabulatedDisc(), LearnedDisc(), IteratedDisc()):
-        for lanes in (1, 1024):
-            lean = jnp.linspace(0.1, 0.3, lanes)
-            seconds = {}
-            for backend in ("auto", "dense"):
-                options = {"ts": jnp.array([2.0]), "rtol": 1e-8, "atol": 1e-8, "events": False, "backend": backend}
-                run = jax.jit(lambda lean, s=scene, o=options: jj.rollout(s, {"lean": lean, "spin_rate": -3.0}, **o).lanes.q_end)
-                if lanes == 1:
-                    run = jax.jit(lambda lean, s=scene, o=options: jj.simulate(s, {"lean": lean[0], "spin_rate": -3.0}, **o).q_end)
-                seconds[backend] = fastest(lambda run=run, lean=lean: jax.block_until_ready(run(lean)), 5 if backend == "auto" else 2) / lanes
-            print(f"  {type(scene).__name__}, {lanes} lanes: {1e3 * seconds['auto']:.3f} ms per trajectory, dense {1e3 * seconds['dense']:.3f} ms", flush=True)
-            yield figure(f"2 s with a call, dense / lowered, {lanes} lanes", type(scene).__name__, seconds["dense"] / seconds["auto"], 5, 20, at_least=True)
-
-
-class AngleChain(jj.Scene):
-    """A plane chain of massless links in its joint angles, a particle at the end of each: no rows, M full, where unrolled elimination is at its worst."""
-
-    links: int = eqx.field(static=True, default=4)
-    mass: object = jj.parameter(0.2, unit="kg", positive=True)
-    length: object = jj.parameter(0.3, unit="m", positive=True)
-
-    @property
-    def coordinates(self):
-        """The angle of every joint."""
-        return jj.coordinates(" ".join(f"angle{i}" for i in range(1, self.links + 1)))
-
-    def bodies(self, t, q):
-        """The particles, from the pivot on."""
-        bodies, turn, place = {}, 0.0, jnp.zeros(3)
-        for i in range(1, self.links + 1):
-            turn = turn + q[f"angle{i}"]
-            place = place + self.length * jnp.stack([jnp.sin(turn), 0.0 * turn, -jnp.cos(turn)])
-            bodies[f"particle {i}"] = jj.Particle(self.mass, place)
-        return bodies
-
-    def loads(self, motion):
-        """Weight."""
-        return (jj.gravity(motion, 9.81),)
-
-
-def many_times(rates: Callable, state, evaluations: int):
-    """A state after so many explicit Euler steps of a microsecond."""
-    return jax.lax.fori_loop(0, evaluations, lambda _, y: jax.tree.map(lambda y, rate: y + 1e-6 * rate, y, rates(y)), state)
-
-
-def seconds_to_compile_and_run(function: Callable, state, lanes: int) -> tuple[float, float]:
-    """Seconds to compile `many_times` of some rates, and per evaluation and lane."""
-    evaluations, repeats = (ALONE, 20) if lanes == 1 else (10, 3)
-    begin = time.perf_counter()
-    compiled = jax.jit(lambda state: function(state, evaluations)).lower(state).compile()
-    taken = time.perf_counter() - begin
-    return taken, fastest(lambda: jax.block_until_ready(compiled(state)), repeats) / (evaluations * lanes)
-
-
-BEYOND = 60_000  # operations, that `limit` asks for beyond the budget of the engine
-SIZES = (
-    ("angle-chain", lambda n: AngleChain(links=n), (4, 8, 12, 16, 20, 24)),
-    ("pendulum-chain", lambda n: PendulumChain(links=n), (8, 16, 32)),
-    ("trailer-chain", lambda n: TrailerChain(trailers=n), (8, 16)),  # 32: minutes to compile densely
-)
-
-
-def ways_of(scene: jj.Scene, program: jj.Lowered) -> dict[str, tuple]:
-    """Way -> function of a state and of how often, the state, its lanes: by the program and densely, alone and in a batch as `rollout` runs it."""
-    form, fixed, inputs = vector_field(scene, backend="dense"), program.fixed_values(scene), jnp.zeros(len(scene.inputs))
-    _, q, u = (jnp.asarray(x) for x in jj.sample_states(scene, DENSE_LANES))
-    by_program = lambda y: program.rates(fixed, 0.0, *y, inputs)[:2]  # noqa: E731
-    densely = lambda y: form.rates(scene, (), 0.0, y, inputs)  # noqa: E731
-    scalars, packed = (tuple(q.T), tuple(u[:, k] for k in program.independent)), jax.vmap(form.pack)(q, u)
-    first = lambda state: jax.tree.map(lambda x: x[0], state)  # noqa: E731
-    return {
-        "lowered": (lambda y, n: many_times(by_program, y, n), first(scalars), 1),
-        "lowered, batch": (lambda y, n: lockstep.in_blocks(lambda y: many_times(by_program, y, n), lockstep.width(program), y), scalars, DENSE_LANES),
-        "dense": (lambda y, n: many_times(densely, y, n), first(packed), 1),
-        "dense, batch": (lambda y, n: many_times(jax.vmap(densely), y, n), packed, DENSE_LANES),
-    }
-
-
-def limit(quick: bool) -> Iterator[Figure]:
-    """Lowered against dense over the size of a scene, beyond the budget of operations too: time per evaluation, and what it takes to compile."""
-    if quick:
-        return
-    lower_module = importlib.import_module("jourdain_jax.lowering.lower")
-    budget, lower_module.MOST_OPERATIONS, lower_module.MOST_IN_MACHINE_CODE = lower_module.MOST_OPERATIONS, BEYOND, BEYOND
-    for name, make, counts in SIZES:
-        for n in counts:
-            scene, begin = make(n), time.perf_counter()
-            try:
-                program = jj.lower(scene)
-            except jj.NotLowered as reason:
-                print(f"  {name}, n = {n}: {reason}", flush=True)
-                continue
-            built = time.perf_counter() - begin
-            found = {way: seconds_to_compile_and_run(*asked) for way, asked in ways_of(scene, program).items()}
-            print(f"  {name}, n = {n}: {program.operations} operations, lowered in {built:.1f} s", flush=True)
-            for way, (compiled, seconds) in found.items():
-                print(f"    {way}: compiled in {compiled:.1f} s, {1e6 * seconds:.2f} us per evaluation and lane", flush=True)
-            if program.operations > budget:
-                continue  # the engine takes the dense path
-            for where in ("", ", batch"):
-                ratio = found[f"lowered{where}"][1] / found[f"dense{where}"][1]
-                yield figure(f"time per evaluation, lowered / dense{where}, n = {n}, {program.operations} operations", name, ratio, 1, 0.1)
-
-
 FIGURES = {
     f.__name__: f
     for f in (
@@ -495,10 +317,7 @@ FIGURES = {
         second_derivatives,
         all_parameters,
         named_starts,
-        cold_starts,
         growth,
-        opaque_calls,
-        limit,
     )
 }
 
