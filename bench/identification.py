@@ -3,7 +3,7 @@
     python bench/identification.py [--quick] [--only NAME ...] [--json FILE]
 
 Parts: disc (one fit against SciPy), outlier, bound, starts (30 first guesses within a factor of 5), unstable (100 first guesses of a bicycle below its weave
-speed), chaotic (100 of a double pendulum, by growing spans and by multiple shooting), coverage, bootstrap (its coverage), three (coverage of three models,
+speed), chaotic (100 of a double pendulum, by growing spans and by multiple shooting), coverage, three (coverage of three models,
 unknown starts and sigmas, white noise and AR(1) noise), nuts (sampling by BlackJAX), disturbed (a motion with process noise), design (a start that tells more),
 windows (57 runs of the steer-by-wire bicycle with an unknown start each; the data are in `notebooks/data`), logs (what halves of these runs say of each other:
 numbers of the notebook on them), optimistix (its Levenberg-Marquardt on the same residuals: the disc, the 30 first guesses, the damping that is zero).
@@ -247,24 +247,6 @@ def coverage(repeats: int) -> list[Figure]:
             share = 100 * float(np.mean((fits[label].low < truth[label]) & (truth[label] < fits[label].high)))
             found.append(share_of_intervals(f"intervals that hold the truth, %, {label}, {name}", "tilting-disc", share, repeats))
     return found
-
-
-def bootstrap(experiments: int) -> list[Figure]:
-    """How often the 95 % interval of a bootstrap of 400 repeats holds the truth, and its standard errors over those of Gauss-Newton: a disc."""
-    truth = {"radius": 0.5, "gravity": 9.81, "run 0: lean": 0.3, "run 0: spin_rate": -3.0}
-    guess, inside, ratios, failed = jj.models.TiltingDisc(radius=0.51, gravity=10.0), [], [], 0
-    for seed in range(experiments):
-        data = disc_data(100 + seed)
-        fit = jj.fit(guess, data, ("radius", "gravity"))
-        found = fit.bootstrap(data, 400, seed=seed)
-        inside.append([found[label].low < x < found[label].high for label, x in truth.items()])
-        ratios.append([found[label].standard_error / fit[label].standard_error for label in truth])
-        failed += np.count_nonzero(~found.converged)
-    figures = [figure("fits of repeats that did not converge, of all", "tilting-disc", failed / (400 * experiments))]
-    for label, share, ratio in zip(truth, 100 * np.mean(inside, axis=0), np.mean(ratios, axis=0), strict=True):
-        figures.append(share_of_intervals(f"intervals of a bootstrap that hold the truth, %, {label}", "tilting-disc", share, experiments))
-        figures.append(figure(f"standard error of a bootstrap over that of Gauss-Newton, mean, {label}", "tilting-disc", ratio))
-    return figures
 
 
 CORRELATION = 0.8  # of neighbouring samples, where noise has a memory
@@ -710,7 +692,6 @@ def main() -> None:
         "unstable": lambda: unstable(20 if options.quick else 100),
         "chaotic": lambda: chaotic(10 if options.quick else 100),
         "coverage": lambda: coverage(50 if options.quick else 500),
-        "bootstrap": lambda: bootstrap(40 if options.quick else 500),
         "three": lambda: three(50 if options.quick else 1000),
         "nuts": lambda: nuts(500 if options.quick else 2000),
         "disturbed": lambda: disturbed(50 if options.quick else 200),

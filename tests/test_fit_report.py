@@ -142,22 +142,17 @@ def test_runs_held_out_are_predicted_in_table_and_drawing(fitted, tmp_path):
     assert {"held out, run 0: x", "held out, run 0: heading"} <= set(captions(tmp_path / "fit.html"))
 
 
-def test_profiles_and_a_bootstrap_stand_beside_the_intervals(fitted, tmp_path):
+def test_profiles_stand_beside_the_intervals(fitted, tmp_path):
     fit, data = fitted
     along = fit.profiles(data, "offset")
-    again = fit.bootstrap(data, 40)
-    fit.report(tmp_path / "fit.html", profiles=along, bootstrap=again)
+    fit.report(tmp_path / "fit.html", profiles=along)
     rows = tables(tmp_path / "fit.html")["estimates"]
     offset, inertia = (dict(zip(rows[0], row, strict=True)) for row in rows[1:])
     assert offset["profile"] == along["offset"].kind == "bounded"
     assert float(offset["low (profile)"]) == pytest.approx(along["offset"].low, rel=1e-5)
     assert inertia["profile"] == "-"
-    assert float(inertia["high (bootstrap)"]) == pytest.approx(again["inertia"].high, rel=1e-5)
-    assert "quantiles of 40 fits of repeats; 0 did not converge" in (tmp_path / "fit.html").read_text(encoding="utf-8")
-    with pytest.raises(ValueError, match="`bootstrap` is a Fit"):
-        fit.report(tmp_path / "fit.html", bootstrap=fit)
-    with pytest.raises(ValueError, match="profiles and a bootstrap are computed from the runs"):
-        fit.report(tmp_path / "fit.html", bootstrap=True)
+    with pytest.raises(AttributeError, match=r"`Fit\.profiles`.*`fit_batch`"):
+        fit.bootstrap  # noqa: B018
 
 
 def test_report_tells_the_way_to_the_minimum(tmp_path):

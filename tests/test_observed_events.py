@@ -81,12 +81,6 @@ def test_a_likelihood_has_the_slopes_of_the_time_in_both_modes():
     np.testing.assert_allclose(jax.grad(density)(z)[0], jax.grad(lambda z: by_time(jnp.exp(z)) + z)(log), rtol=1e-6)
 
 
-def test_a_bootstrap_draws_the_time_too():
-    found = fit(run())
-    spread = found.bootstrap(run(), 200)["mass"].standard_error
-    np.testing.assert_allclose(spread, found["mass"].standard_error, rtol=0.15)  # by chance one of 20
-
-
 def test_a_motion_that_does_not_meet_the_event_is_named():
     other = fit(run(values=np.full(9, 0.3), events={"far": (0.9, SIGMA)}))
     assert not other.converged

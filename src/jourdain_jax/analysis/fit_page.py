@@ -38,13 +38,12 @@ def fit_page(
     shares: Informed | None = None,
     held_out: Sequence[dict[str, Prediction]] = (),
     profiles: Mapping[str, Profile] | None = None,
-    bootstrap=None,
     units: Mapping[str, str] | None = None,
 ) -> str:
-    """The page of a `Fit` of one experiment; `fitted` and `held_out`: predictions by run, `bootstrap`: of repeats, `units`: of channels."""
+    """The page of a `Fit` of one experiment; `fitted` and `held_out`: predictions by run, `units`: of channels."""
     name = type(fit.scene).__name__
     profiles, units = profiles or {}, units or {}
-    parts = [f"<h1>Fit of {html.escape(name)}</h1>", *_summary(fit), "<h2>Estimates</h2>", _estimates(fit, profiles, bootstrap), interval_widths(fit)]
+    parts = [f"<h1>Fit of {html.escape(name)}</h1>", *_summary(fit), "<h2>Estimates</h2>", _estimates(fit, profiles), interval_widths(fit)]
     parts += _untold(fit)
     if profiles:
         parts += ["<h2>Profile likelihood</h2>", _note(_ABOUT_PROFILES), *(profile(one, _error(fit, one.name)) for one in profiles.values())]
@@ -92,26 +91,19 @@ def _estimate(name: str, e) -> list[str]:
     return [name, e.unit, f"{e.value:.6g}", _number(e.standard_error, ".2g"), _number(e.low), _number(e.high)]
 
 
-def _estimates(fit, profiles: Mapping[str, Profile], bootstrap) -> str:
+def _estimates(fit, profiles: Mapping[str, Profile]) -> str:
     heads = ["unknown", "unit", "estimate", "std. error", "low", "high"]
     heads += ["profile", "low (profile)", "high (profile)"] if profiles else []
-    heads += ["low (bootstrap)", "high (bootstrap)"] if bootstrap is not None else []
     rows = []
     for i, (name, e) in enumerate(fit.estimates.items()):
         row = _estimate(name + (" (at its bound)" if fit.at_bound[i] else ""), e)
         if profiles:
             one = profiles.get(name)
             row += ["-"] * 3 if one is None else [one.kind, *(_end(x, closed) for x, closed in zip((one.low, one.high), one.is_closed, strict=True))]
-        row += [_number(x) for x in (bootstrap[name].low, bootstrap[name].high)] if bootstrap is not None else []
         rows.append(tuple(row))
     tied = [_estimate(f"{name} (tied)", e) for name, e in fit.tied.items() if e.value.ndim == 0]
     rows += [(*row, *["-"] * (len(heads) - len(row))) for row in tied]
-    more = ""
-    if bootstrap is not None:
-        good = int(np.sum(bootstrap.converged))
-        more = _note(f"Bootstrap: from 2.5 and 97.5 % quantiles of {good} fits of repeats; {len(bootstrap.values) - good} did not converge.")
-        more += "".join(f'<p class="warning">{_words(sentence)}</p>' for sentence in bootstrap.warnings)
-    return _table("estimates", tuple(heads), rows) + more
+    return _table("estimates", tuple(heads), rows)
 
 
 def _untold(fit) -> list[str]:

@@ -4,13 +4,12 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.analysis.asked import Asked, taken_up
-from jourdain_jax.analysis.bootstrap import Bootstrap, bootstrap
 from jourdain_jax.analysis.derived import derived, standard_errors
 from jourdain_jax.analysis.estimated import ChannelResiduals, Estimated, summary
 from jourdain_jax.analysis.experiment import Experiment
@@ -27,33 +26,28 @@ from jourdain_jax.analysis.likelihood_profiles import Profile, profiles
 from jourdain_jax.analysis.piecewise import Shot
 from jourdain_jax.analysis.weak_directions import CORRELATED, weak_combinations
 from jourdain_jax.build.plausibility import impossible_bodies
-from jourdain_jax.calculus.reals import described
 from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
-T = TypeVar("T")
 MOST_COMPARED = 1000  # unknowns
 MOST_INFORMED = 24  # unknowns of which the report says what informs them
 
 
-def _of_minimum(part: Callable[[Statistics], T], doc: str) -> T:
-    """A part of `Fit.statistics` as a property of the fit."""
-
-    def read(self):
-        return part(self.statistics)
-
-    read.__doc__ = doc
-    return property(read)  # type: ignore[return-value]
+GONE = {
+    "bootstrap": "`Fit.profiles` gives intervals where the scene is not linear; of repeats, draw them about `simulate` of `scene` and `starts`, and give them "
+    "to `fit_batch`"
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit(Printed):
     """Estimates by name (`fit["offset"].value`), with covariance, residuals and the fitted scene; `print(fit)` shows a table.
 
-    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too. What follows from the minimum (`statistics`) is worked out when it is
-    first asked for.
+    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too. What follows from the minimum is worked out when it is first asked
+    for; each part of it can be asked for here: `scene`, `starts`, `standard_errors`, `low`, `high`, `at_bound`, `residuals`, `whitened`, `sigma`,
+    `correlation_time`, `chi_square`, `samples`, `degrees_of_freedom` and all else of `Statistics`.
     """
 
     values: Float[np.ndarray, "*repeats unknowns"]
@@ -76,29 +70,17 @@ class Fit(Printed):
 
     @cached_property
     def statistics(self) -> Statistics:
-        """What follows from the minimum; each part of it is a property here."""
+        """What follows from the minimum."""
         return self.work_out()
 
     def __getstate__(self) -> dict:
         return vars(self) | {"statistics": self.statistics, "work_out": None}  # what was compiled stays in its process
 
-    scene = _of_minimum(lambda found: found.scene, "The scene with the estimates.")
-    starts = _of_minimum(lambda found: found.starts, "Initial values of each run, with the estimates.")
-    sizes = _of_minimum(lambda found: found.sizes, "Magnitudes of the unknowns, against which the rank is judged.")
-    standard_errors = _of_minimum(lambda found: found.standard_errors, "Standard errors; NaN where not identifiable.")
-    low = _of_minimum(lambda found: found.low, "Lower ends of the 95 % intervals; NaN where not identifiable.")
-    high = _of_minimum(lambda found: found.high, "Upper ends of the 95 % intervals; NaN where not identifiable.")
-    at_bound = _of_minimum(lambda found: found.at_bound, "Which estimates lie at a bound: no standard error, and a one-sided interval.")
-    information = _of_minimum(lambda found: found.information, "Covariance in blocks, and the directions that do not show.")
-    residuals = _of_minimum(
-        lambda found: found.residuals, "Residuals of each run by channel: (prediction - value) / sigma, (times, *channel); NaN where missing."
-    )
-    whitened = _of_minimum(lambda found: found.whitened, "Residuals, where their noise has a memory less what the sample before foretells.")
-    sigma = _of_minimum(lambda found: found.sigma, "Sigmas of channels whose noise was estimated.")
-    correlation_time = _of_minimum(lambda found: found.correlation_time, "Correlation times in s, of channels where they were estimated; near zero: white.")
-    chi_square = _of_minimum(lambda found: found.chi_square, "Sum of squared whitened residuals; NaN where the motion fails.")
-    samples = _of_minimum(lambda found: found.samples, "How many samples have a finite sigma.")
-    degrees_of_freedom = _of_minimum(lambda found: found.degrees_of_freedom, "Samples less the directions that they determined; priors take their share.")
+    def __getattr__(self, name: str) -> Any:
+        """A part of `statistics`, such as `standard_errors`."""
+        if name in Statistics.__dataclass_fields__:
+            return getattr(self.statistics, name)
+        raise AttributeError(f"`{name}` has gone: {GONE[name]}" if name in GONE else f"`Fit` has no `{name}`; {nearest(name, dir(self))}")
 
     def __getitem__(self, name: str) -> Estimated:
         if name not in self.labels:
@@ -226,23 +208,6 @@ class Fit(Printed):
         errors, of_rise = (dict(zip(self.labels, x.tolist(), strict=True)) for x in (self.standard_errors, self.statistics.of_rise))
         return profiles(fitted, as_names(names) or of_all, errors, of_rise)
 
-    def bootstrap(self, data: Experiment | Sequence[Experiment], repeats: int = 1000, *, seed: int = 0, noise: str = "sigmas") -> Bootstrap:
-        """The parametric bootstrap: measurements of so many repeats of the experiment, drawn about what the fit predicts, and fitted side by side.
-
-        `data`: the runs fitted. Noise is drawn as the fit takes it: of the sigmas, given or estimated; with its correlation times; of Student's t under that
-        loss. `noise="residuals"` draws it from the whitened residuals of each channel, whatever their sigmas and distribution. What is missing, start values
-        and inputs stay, means of priors are drawn anew. Repeats begin from the estimates, so that minima far away are not looked for.
-
-        **Returns** estimates with standard errors and 95 % intervals of the repeats (from their quantiles; wider where the size of noise was estimated), their
-        bias, `converged` and `at_bound` of each, and `warnings`. 1000 repeats tell an end of an interval to a tenth of a standard error; the same `seed` gives
-        the same ones.
-
-        **Raises** ValueError for a fit of a batch, one that failed or has not converged, other data than the fit's, `errors="runs"`, and noise that `huber()`
-        does not state.
-        """
-        self._check_one()
-        return bootstrap(self, data, repeats, seed, noise)
-
     def predict(self, runs: Experiment | Sequence[Experiment]) -> tuple[dict[str, Prediction], ...]:
         """What the fit predicts for `runs` that had no part in it, by channel: `prediction`, `error`, `rms` (in the unit of the channel) and `r_squared`.
 
@@ -259,7 +224,6 @@ class Fit(Printed):
         *,
         held_out: Experiment | Sequence[Experiment] = (),
         profiles: "bool | str | Iterable[str] | Mapping[str, Profile]" = False,
-        bootstrap: Any = False,  # bool or `Bootstrap`
         units: Mapping[str, str] | None = None,
     ) -> None:
         """Write this fit as one HTML file that loads nothing from elsewhere: estimates, warnings, what the data do not tell, correlations, residuals, the way
@@ -269,10 +233,9 @@ class Fit(Printed):
           told which run, channel and time span informs which unknown: shares a_k^2 / sum a^2, a = C J', of the variance of the estimate.
         - `held_out`: other runs, which are predicted as by `predict`.
         - `profiles`: True or names, to compute them now; or what `profiles` returned.
-        - `bootstrap`: True, or what `bootstrap` returned, whose intervals stand beside those of standard errors.
         - `units`: channel -> its unit, for labels, such as `{"x": "m"}`; a scene knows the units of its parameters only.
 
-        ValueError for a path that is no .html file, a fit of a batch or one that failed, other data than the fit's, and the bootstrap of another fit.
+        ValueError for a path that is no .html file, a fit of a batch or one that failed, and other data than the fit's.
         """
         runs, others = ((x,) if isinstance(x, Experiment) else tuple(x) for x in (data, held_out))
         if not str(path).lower().endswith((".html", ".htm")):
@@ -283,10 +246,8 @@ class Fit(Printed):
             raise ValueError(
                 f"`data` has {len(runs)} runs with channels {shapes(run.values for run in runs)}, expected those of the fit: {shapes(self.residuals)}"
             )
-        if not isinstance(bootstrap, bool) and not (isinstance(bootstrap, Bootstrap) and np.array_equal(bootstrap.fit.values, self.values)):
-            raise ValueError(f"`bootstrap` is {described(bootstrap)}, expected True, or what `bootstrap` of this fit returned")
-        if not runs and ((profiles and not isinstance(profiles, Mapping)) or bootstrap is True):
-            raise ValueError("profiles and a bootstrap are computed from the runs that were fitted; give them as `data`")
+        if not runs and profiles and not isinstance(profiles, Mapping):
+            raise ValueError("profiles are computed from the runs that were fitted; give them as `data`")
         along = profiles if isinstance(profiles, Mapping) else self.profiles(runs, () if profiles is True else profiles) if profiles else {}
         page = fit_page(
             self,
@@ -294,7 +255,6 @@ class Fit(Printed):
             shares=informed(taken_up(self, runs), MOST_INFORMED) if runs else None,
             held_out=self.predict(others) if others else (),
             profiles=along,
-            bootstrap=self.bootstrap(runs) if bootstrap is True else bootstrap or None,
             units=units or {},
         )
         with open(path, "w", encoding="utf-8") as file:

@@ -27,23 +27,23 @@ from jourdain_jax.scene.scene import Scene
 class Statistics:
     """All that is told of a minimum besides where it lies."""
 
-    scene: Scene
-    starts: tuple[dict[str, Float[Array | np.ndarray, "..."]], ...]
-    sizes: Float[np.ndarray, "*repeats unknowns"]
-    standard_errors: Float[np.ndarray, "*repeats unknowns"]
-    low: Float[np.ndarray, "*repeats unknowns"]
+    scene: Scene  # with the estimates
+    starts: tuple[dict[str, Float[Array | np.ndarray, "..."]], ...]  # initial values of each run, with the estimates
+    sizes: Float[np.ndarray, "*repeats unknowns"]  # magnitudes of the unknowns, against which the rank is judged
+    standard_errors: Float[np.ndarray, "*repeats unknowns"]  # NaN where not identifiable
+    low: Float[np.ndarray, "*repeats unknowns"]  # ends of the 95 % intervals; NaN where not identifiable
     high: Float[np.ndarray, "*repeats unknowns"]
-    at_bound: Bool[np.ndarray, "*repeats unknowns"]
+    at_bound: Bool[np.ndarray, "*repeats unknowns"]  # these have no standard error, and a one-sided interval
     quantiles: Float[np.ndarray, "*repeats unknowns"]  # q
-    information: Information
-    residuals: tuple[dict[str, Float[np.ndarray, "..."]], ...]
-    whitened: tuple[dict[str, Float[np.ndarray, "..."]], ...]
-    sigma: dict[str, Float[np.ndarray, "*repeats"]]
-    correlation_time: dict[str, Float[np.ndarray, "*repeats"]]
+    information: Information  # covariance in blocks, and the directions that do not show
+    residuals: tuple[dict[str, Float[np.ndarray, "..."]], ...]  # of each run by channel: (prediction - value) / sigma; NaN where missing
+    whitened: tuple[dict[str, Float[np.ndarray, "..."]], ...]  # residuals, where their noise has a memory less what the sample before foretells
+    sigma: dict[str, Float[np.ndarray, "*repeats"]]  # of channels whose noise was estimated
+    correlation_time: dict[str, Float[np.ndarray, "*repeats"]]  # s, of channels where they were estimated; near zero: white
     untold: tuple[str, ...]  # channels that do not tell their sigma, in any repeat
-    chi_square: Float[np.ndarray, "*repeats"]
-    samples: Int[np.ndarray, "*repeats"]
-    degrees_of_freedom: Float[np.ndarray, "*repeats"]
+    chi_square: Float[np.ndarray, "*repeats"]  # sum of squared whitened residuals; NaN where the motion fails
+    samples: Int[np.ndarray, "*repeats"]  # with a finite sigma
+    degrees_of_freedom: Float[np.ndarray, "*repeats"]  # samples less the directions that they determined; priors take their share
     of_rise: Float[np.ndarray, "*repeats unknowns"]  # by what 2 (F - F_min) is to be divided, for an interval that ends where it is `RISE_95`
     from_prior: Float[np.ndarray, "*repeats unknowns"]  # in standard deviations of the prior; NaN where there is none
     oddities: tuple[str, ...]  # sentences about what is odd in the runs

@@ -2,7 +2,6 @@
 
     estimate_i = ... + sum_k a_ik r_k,     a_i = (C J')_i       C = (J'J)^-1: covariance of all unknowns; J: derivatives of residuals r, whitened and weighted
     share_ik = a_ik^2 / C_ii = - d log C_ii / d log w_k          w_k: weight of sample k, one over the square of its sigma
-    leverage_k = (J C J')_kk,    var(residual_k) = 1 - leverage_k
 
 It allows for all other unknowns being estimated, too. The shares of all samples add up to one; a prior takes what is missing.
 Source: R. D. Cook and S. Weisberg, Residuals and Influence in Regression (1982), section 2.2.
@@ -69,16 +68,6 @@ def informed(fitted: TakenUp, most: int) -> Informed:
         by_channel = problem.lanes.by_channel(run, share)
         found[run] = {name: np.nansum(x, axis=tuple(range(2, x.ndim))) for name, x in by_channel.items()}
     return Informed(labels, tuple(found), tuple(np.asarray(run.ts) for run in problem.runs))
-
-
-def leverages(fitted: TakenUp) -> tuple[dict[str, Float[np.ndarray, "times *channel"]], ...]:
-    """The leverage of each sample, of each run by channel; NaN where it is missing."""
-    known = fitted.information()
-    found: list[dict[str, np.ndarray]] = [{}] * len(fitted.problem.runs)
-    for run, own, shared in _derivatives(fitted):
-        X = shared - own @ known.follow[run]
-        found[run] = fitted.problem.lanes.by_channel(run, np.sum(X @ known.shared * X, axis=1) + np.sum(own @ known.own[run] * own, axis=1))
-    return tuple(found)
 
 
 def _derivatives(fitted: TakenUp) -> Iterator[tuple[int, Float[np.ndarray, "samples own"], Float[np.ndarray, "samples shared"]]]:
