@@ -90,9 +90,9 @@ def test_what_a_method_returns_wrongly_is_named_with_what_to_return(members, sen
 def test_a_direction_of_gravity_that_is_computed_is_looked_at_when_the_scene_is_probed():
     tilted = described(loads=lambda self, m: (jj.gravity(m, 9.81, self.mass * jnp.array([0.6, 0.8, 0.0])),))
     jj.simulate(tilted, {}, t1=0.1)
-    with pytest.raises(ValueError, match=r"the direction of gravity of `Described` has a length that differs from 1 by .*, expected a unit vector"):
+    with pytest.raises(ValueError, match=r"the direction of gravity in load 1 of `Described` has a length that differs from 1 by .*, expected a unit vector"):
         jj.simulate(tilted.replace(mass=1.5), {}, t1=0.1)
-    with pytest.raises(ValueError, match=r"the direction of gravity of `Described`"):
+    with pytest.raises(ValueError, match=r"the direction of gravity in load 1 of `Described`"):
         jj.accelerations(tilted.replace(mass=1.5), 0.0, np.zeros(2), np.zeros(2))
     (failed,) = [check for check in jj.verify(tilted.replace(mass=1.5)).checks if check.name == "inertia"]
     assert not failed.passed

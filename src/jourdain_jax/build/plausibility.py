@@ -91,7 +91,7 @@ def stated_of(scene: Scene, pose: Pose, loads: tuple[Load, ...] = ()) -> Stated:
         },
         length={f"{what} of contact `{name}`": length for name, contact in contacts.items() for what, length in _lengths(contact).items()},
         tyre=tyres,
-        gravity={f"load {k}": load.direction @ load.direction for k, load in enumerate(loads) if isinstance(load, Gravity)},
+        gravity={f"load {k}": load.direction @ load.direction for k, load in enumerate(loads, 1) if isinstance(load, Gravity)},
     )
 
 
