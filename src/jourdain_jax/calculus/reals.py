@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import jax
 import jax.extend.core
@@ -24,7 +24,7 @@ def real_type() -> np.dtype:
 
 
 def is_array(x) -> bool:
-    """Whether x is an array, of a kind of its own too, as constants are in programs that jax 0.8 traces."""
+    """Return whether x is an array, of JAX, of NumPy or of a kind of its own."""
     return hasattr(x, "__array__") and not isinstance(x, type)
 
 
@@ -146,16 +146,13 @@ def is_traced(*trees) -> bool:
     return not known and any(is_traced_type(type(leaf)) for leaf in jax.tree.leaves(trees))
 
 
-_core: Any = jax.extend.core if hasattr(jax.extend.core, "get_opaque_trace_state") else jax.core  # the latter before jax 0.10
-
-
 def nothing_is_traced() -> bool:
     """Whether this call stands outside of every transformation: no function around it is being traced, and so no argument."""
-    return _core.get_opaque_trace_state(convention="flax") == _NOTHING_TRACED
+    return jax.extend.core.get_opaque_trace_state(convention="flax") == _NOTHING_TRACED
 
 
 with jax.ensure_compile_time_eval():
-    _NOTHING_TRACED = _core.get_opaque_trace_state(convention="flax")
+    _NOTHING_TRACED = jax.extend.core.get_opaque_trace_state(convention="flax")
 
 _UNITS = "units", "unit", "magnitude"  # as pint, astropy, unyt and others call what is more than a number
 _PLAIN = bool, int, float, complex, np.ndarray
