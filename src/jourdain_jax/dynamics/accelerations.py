@@ -131,7 +131,7 @@ def accelerations(
 
 @eager_if_concrete
 def _accelerations(scene: Scene, t, q, u, inputs, reduction, stabilisation, usual) -> Accelerations:
-    return diagnosed(*_reduced(scene, t, q, u, inputs, reduction, stabilisation, usual))
+    return diagnosed(*reduced_at(scene, t, q, u, inputs, reduction, stabilisation, usual))
 
 
 def diagnosed(found: Reduced, equations: UnconstrainedEquations, rows: ConstraintRows) -> Accelerations:
@@ -153,10 +153,11 @@ def bare_accelerations(
     scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None, usual: UsualRows | None = None
 ) -> Reduced:
     """Accelerations and constraint force alone, as `accelerations` but without multipliers and diagnostics: for use inside integration."""
-    return _reduced(scene, t, q, u, inputs, reduction, stabilisation, usual_rows(scene) if usual is None else usual)[0]
+    return reduced_at(scene, t, q, u, inputs, reduction, stabilisation, usual_rows(scene) if usual is None else usual)[0]
 
 
-def _reduced(scene: Scene, t, q, u, inputs, reduction, stabilisation, usual) -> tuple[Reduced, UnconstrainedEquations, ConstraintRows]:
+def reduced_at(scene: Scene, t, q, u, inputs, reduction, stabilisation, usual) -> tuple[Reduced, UnconstrainedEquations, ConstraintRows]:
+    """Accelerations with the equations and rows that they solve; as `accelerations`, whose `usual` is not optional here."""
     q, u = as_coordinates(scene, q), as_speeds(scene, u)
     reduction = as_reduction(scene, reduction)
     equations, rows = equations_and_rows(scene, t, q, u, inputs)

@@ -19,7 +19,7 @@ from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import TracedScene, VelocityQuantities
 from jourdain_jax.lowering.elimination import eliminate, pivots_ok, solve_symmetric
 from jourdain_jax.lowering.kept_rows import KeptRows
-from jourdain_jax.lowering.multipliers import projected_coordinates
+from jourdain_jax.lowering.multipliers import Accelerations, projected_coordinates
 from jourdain_jax.program.derivative import columns, derivatives, directional_derivative, jacobian, matrix
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.identity_test import equal, unaffected
@@ -57,6 +57,7 @@ class Equations:
     events: list[int] = field(default_factory=list)  # values of the stop events
     energies: list[int] = field(default_factory=list)  # kinetic and potential
     usual: dict[int, int] = field(default_factory=dict)  # inputs that stand for what a node usually is, with that node
+    directions: list[int] = field(default_factory=list)  # of rows nonlinear in the speeds, an entry for each speed: must not turn round
 
 
 class AppellOnGraph:
@@ -79,11 +80,12 @@ class AppellOnGraph:
         forms_of_equations = self._forms(strategy.most_terms_of_equations)
         M, f = self._equations(kinematics, forms_of_equations)
         if self.kept and self.multiplied:
-            ydot, sines, margins, usual = self.kept.accelerations(M, f, *kinematics.rows_along_motion(self.multiplied), forms)
+            found = self.kept.accelerations(M, f, *kinematics.rows_along_motion(self.multiplied), forms)
         else:
-            ydot, sines, margins, usual = self._solved(M, f, forms_of_equations, strategy.by_determinants), [], [], {}
+            found = Accelerations(self._solved(M, f, forms_of_equations, strategy.by_determinants), [], [], {})
+        ydot, sines, directions = found.udot, found.sines, [n for row in found.directions for n in row]
         z, qdot, pivots = self._true_rates(kinematics, forms) if held else (kinematics.z, kinematics.qdot, [])
-        guards = forms.guards | forms_of_equations.guards | set(margins)
+        guards = forms.guards | forms_of_equations.guards | set(found.margins)
         power = self._power(kinematics, ydot)
         if strategy.by_determinants:
             *ydot, power = self.graph.substituted([*ydot, power], kinematics.known)
@@ -95,7 +97,8 @@ class AppellOnGraph:
         elif held:
             true_power = self._power(_Kinematics(self, forms, {}, explicit=False), ydot)
             power = power if equal(self.identity_probes([power]), self.identity_probes([true_power])).all() else true_power
-        return Equations(qdot, ydot, z, list(dict.fromkeys([*kinematics.pivots, *pivots, *sines])), sorted(guards), power, events, [T, V], usual)
+        pivots = list(dict.fromkeys([*kinematics.pivots, *pivots, *sines]))
+        return Equations(qdot, ydot, z, pivots, sorted(guards), power, events, [T, V], found.usual, directions)
 
     def _at_reference(self, held: tuple[int, ...]) -> dict[int, int]:
         return {int(self.traced.q[i]): self.graph.const(self.reference[i]) for i in held}

@@ -1,7 +1,7 @@
 """Linear systems of nodes solved by unrolled elimination, with pivots chosen once (`pivots.py`)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -19,6 +19,7 @@ class Eliminated:
 
     solution: list[list[int]]
     pivots: list[int]
+    forward: list[list[int]] = field(default_factory=list)  # of a symmetric system, `L^-1 right`
 
 
 def pivots_ok(pivots: list[int], probes: Probes | IdentityProbes) -> Bool[np.ndarray, "probes"]:
@@ -96,4 +97,4 @@ def solve_symmetric(graph: Graph, M: list[list[int]], right: list[list[int]]) ->
             known = graph.total(graph.mul(factor, x[i]) for i, factor in factors[pivot].items())
             x[pivot] = graph.sub(quotient(graph, b[pivot], S[pivot][pivot]), known)
         solution.append([x[k] for k in range(count)])
-    return Eliminated(solution, [S[k][k] for k in range(count)])
+    return Eliminated(solution, [S[k][k] for k in range(count)], columns)

@@ -19,7 +19,7 @@ class KeptRows:
     def __init__(self, graph: Graph, structure: Structure, massless: bool, probes, far):
         self.graph, self.probes, self.far, self.independent = graph, probes, far, structure.independent
         self.by_partition = (massless or structure.dependent_rows) and structure.well_conditioned
-        self.massless = massless and not self.by_partition
+        self.massless, self.affine = massless and not self.by_partition, structure.affine
 
     @property
     def description(self) -> str:
@@ -32,7 +32,7 @@ class KeptRows:
         """The accelerations under all rows, and what must not vanish on the way."""
         if self.by_partition:
             return self._accelerations_by_partition(M, f, A, drift, forms)
-        return accelerations_by_multipliers(self.graph, self._inertia(M, A), f, A, drift, self.probes, forms)
+        return accelerations_by_multipliers(self.graph, self._inertia(M, A), f, A, drift, self.probes, forms, affine=self.affine)
 
     def projected_speeds(self, M: Columns, u: list[int], phi: list[int], forms: NormalForms) -> list[int]:
         """The speeds on `phi = 0`; where privileged speeds serve, these as they are."""

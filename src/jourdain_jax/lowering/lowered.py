@@ -56,6 +56,7 @@ class Lowered:
     pivots: tuple[int, ...]  # must not vanish; those that coordinate rates are divided by come first
     divisors: int  # how many those are
     sizes: tuple[int, ...]  # inputs for what the magnitudes of the pivots usually are
+    directions: tuple[int, ...]  # of rows nonlinear in the speeds, an entry for each speed: must not turn round
     guards: tuple[int, ...]  # must stay positive
     power: int | None  # `rate_of_work` (d(T + V)/dt at constant inputs, or that part of it that is integrated); None where poses are driven
     events: tuple[int, ...]  # values of the stop events, sorted by name; none where they have no scalar form
@@ -145,26 +146,28 @@ class Lowered:
         """
         return self.rates_and_pivots(fixed, t, q, y, inputs, with_power)[:3]
 
-    def rates_and_pivots(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple[tuple, tuple, Array | None, tuple]:
-        """As `rates`, and the pivots relative to their usual sizes, which must keep their signs; they are numbers to differentiation.
+    def rates_and_pivots(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple[tuple, tuple, Array | None, tuple, tuple]:
+        """As `rates`; the pivots relative to their usual sizes, which must keep their signs; and directions. These are numbers to differentiation.
 
         `fixed`, `t` (s), `q`, `y`, `inputs`, `with_power`: as in `rates`.
         """
         found = list(self._program_of_rates(with_power)(*self._known(fixed, t, q, y, inputs).values()))
-        count = len(found) - len(self.pivots)
+        count = len(found) - len(self.directions)
+        directions = tuple(found[count:])
+        found, count = found[:count], count - len(self.pivots)
         pivots = tuple(value / size for value, size in zip(found[count:], self.pivot_sizes(fixed), strict=True))
         count -= len(self.guards)
         for guard in found[count : count + len(self.guards)]:
             found[0] = jnp.where(guard > 0, found[0], jnp.nan)
         at = len(self.qdot)
         power = found[count - 1] if with_power and self.power is not None else None
-        return tuple(found[:at]), tuple(found[at : at + len(self.ydot)]), power, pivots
+        return tuple(found[:at]), tuple(found[at : at + len(self.ydot)]), power, pivots, directions
 
     @functools.cached_property
     def _program_of_rates(self) -> Callable[[bool], Callable[..., tuple]]:
         def made(with_power: bool):
             outputs = [*self.qdot, *self.ydot, *([self.power] if with_power and self.power is not None else []), *self.guards]
-            return differentiable(self.graph, outputs, self.variables, like=len(self.fixed) + 1, monitored=self.pivots)
+            return differentiable(self.graph, outputs, self.variables, like=len(self.fixed) + 1, monitored=(*self.pivots, *self.directions))
 
         return functools.cache(made)
 

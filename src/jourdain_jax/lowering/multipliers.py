@@ -7,7 +7,8 @@
 S is symmetric and positive definite where the rows are independent, and as sparse as the rows are local: tridiagonal for a chain. What is
 left of a diagonal entry of S after elimination, relative to the entry, is the squared sine of the angle between that row and those before it.
 Accelerations lose as many digits as that square is small. A row that vanishes at some configuration makes no small angle, but a small entry: entries
-are therefore compared with what they usually are, at the states where the scene was probed, for the parameters of the motion.
+are therefore compared with what they usually are, at the states where the scene was probed, for the parameters of the motion. Rows that are nonlinear in
+the speeds are as small as these, and are lost where what is left of one after elimination, L^-1 A, passes through zero: it turns round there.
 
 Where M is singular, though no admissible velocity is without inertia, M + A' W A stands in its place: A udot is known, so only the multipliers change.
 """
@@ -36,10 +37,13 @@ class Accelerations(NamedTuple):
     sines: list[int]  # one per row, between that row and those before it; or the pivots of privileged speeds
     margins: list[int]  # must stay positive: what is left of each entry, above its least
     usual: dict[int, int]  # inputs for the usual value of an entry, with the node of that entry
+    directions: Columns = []  # that rows must not leave by more than a right angle within a step
 
 
-def accelerations_by_multipliers(graph: Graph, M: Columns, f: list[int], A: Columns, drift: list[int], probes: Probes, forms: NormalForms) -> Accelerations:
-    """The accelerations under all rows; at `probes` usual entries are found."""
+def accelerations_by_multipliers(
+    graph: Graph, M: Columns, f: list[int], A: Columns, drift: list[int], probes: Probes, forms: NormalForms, *, affine: bool
+) -> Accelerations:
+    """The accelerations under all rows; at `probes` usual entries are found, of rows that are `affine` in the speeds."""
     *impulses, free = (list(column) for column in solve_symmetric(graph, M, [*A, f]).solution)  # M^-1 A' column by column, M^-1 f
     S = _products(graph, A, impulses, forms)
     for r in range(len(A)):
@@ -48,19 +52,22 @@ def accelerations_by_multipliers(graph: Graph, M: Columns, f: list[int], A: Colu
             impulses[r] = [forms.simplified(quotient(graph, n, S[r][r])) for n in impulses[r]]
             S[r][r] = graph.one
     right = [graph.neg(graph.add(d, graph.dot(row, free))) for d, row in zip(drift, A, strict=True)]
-    solved = solve_symmetric(graph, S, [right])
+    solved = solve_symmetric(graph, S, [right] if affine else [right, *map(list, zip(*A, strict=True))])
     multipliers = solved.solution[0]
     udot = [graph.add(w, graph.total(graph.mul(x[k], m) for x, m in zip(impulses, multipliers, strict=True))) for k, w in enumerate(free)]
     left = [(r, pivot) for r, pivot in enumerate(solved.pivots) if graph.varies[pivot]]
     sines = [graph.call("sqrt", graph.call("max", graph.zero, graph.div(pivot, S[r][r]))) for r, pivot in left]
-    least = max(LEAST, undecided(jnp.result_type(float))) ** 2
+    least = max(LEAST if affine else 0.0, undecided(jnp.result_type(float))) ** 2
     usual = {graph.input(f"usual_{r}", False): S[r][r] for r, _ in left}
     margins = []
     for (r, pivot), (size, entry) in zip(left, usual.items(), strict=True):
         values = np.abs(probes([entry])[0])
         probes.inputs[f"usual_{r}"] = np.full(probes.count, np.median(values[np.isfinite(values)]) if np.isfinite(values).any() else np.nan)
         margins.append(graph.sub(pivot, graph.mul(graph.const(least), graph.call("max", entry, size))))
-    return Accelerations(udot, sines, margins, usual)
+    if affine:
+        return Accelerations(udot, sines, margins, usual)
+    signs = [[margin, *[graph.zero] * (len(f) - 1)] for margin in margins]
+    return Accelerations(udot, sines, [], usual, [*signs, *([column[r] for column in solved.forward[1:]] for r, _ in left)])
 
 
 def with_inertia_of_rows(graph: Graph, M: Columns, A: Columns, probes: Probes) -> Columns:

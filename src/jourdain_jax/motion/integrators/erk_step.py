@@ -65,7 +65,7 @@ class Problem(eqx.Module):
     longest: Float[Array, "*lanes"]
     max_steps: int = eqx.field(static=True)
     knots: Float[Array, "knots *lanes"] | None = None  # times at which a step must end, in the order of the motion; the last are infinite, with its sign
-    # as `rates`, and pivots (pivots, *lanes) that must keep their signs; None: the rates have none
+    # as `rates`; pivots (pivots, *lanes) that must keep their signs, and directions (rows, speeds, *lanes) that must not turn round; None: there are none
     rates_and_pivots: Callable | None = None
     relations: Callable | None = None  # (args, t, y) -> numbers whose signs are watched, (numbers, *lanes): first so many relations, then stop events
     relation_count: int = eqx.field(static=True, default=0)
@@ -204,7 +204,7 @@ class Pivots(eqx.Module):
     """What the pivots were at the stages of a step."""
 
     smallest: Float[Array, "*lanes"]  # magnitude
-    changed_sign: Bool[Array, "*lanes"]  # whether any did
+    changed_sign: Bool[Array, "*lanes"]  # whether any did, or a row turned round
 
 
 class Stages(NamedTuple):
@@ -228,19 +228,19 @@ def stages(problem: Problem, method: Method, t, y: PyTree, h, monitored: bool = 
         c, i, next_A = row
         there = t + c * h, treedef.unflatten(at), problem.args
         if monitored:
-            found, pivots = problem.rates_and_pivots(*there)
+            found, pivots, directions = problem.rates_and_pivots(*there)
             extremes = jnp.minimum(extremes[0], pivots), jnp.maximum(extremes[1], pivots)
         else:
-            found = problem.rates(*there)
+            found, directions = problem.rates(*there), None
         found = jax.tree.leaves(found)
         slopes = [jax.lax.dynamic_update_index_in_dim(k, as_in(f, k), i, 0) for k, f in zip(slopes, found, strict=True)]
-        return ([y + as_in(h, y) * weighted(next_A, k) for y, k in zip(leaves, slopes, strict=True)], slopes, extremes), at
+        return ([y + as_in(h, y) * weighted(next_A, k) for y, k in zip(leaves, slopes, strict=True)], slopes, extremes), (at, directions)
 
     count = method.needed
     rows = (jnp.asarray(method.c[:count]), jnp.arange(count), jnp.asarray([*method.A[1:count], method.b]))
     slopes = [jnp.zeros((len(method.c), *y.shape), y.dtype) for y in leaves]
-    (y_1, slopes, extremes), at = jax.lax.scan(stage, (leaves, slopes, _no_extremes(problem, t, y) if monitored else None), rows)
-    return Stages(treedef.unflatten(y_1), treedef.unflatten(slopes), treedef.unflatten(at), _pivots(extremes) if monitored else None)
+    (y_1, slopes, extremes), (at, directions) = jax.lax.scan(stage, (leaves, slopes, _no_extremes(problem, t, y) if monitored else None), rows)
+    return Stages(treedef.unflatten(y_1), treedef.unflatten(slopes), treedef.unflatten(at), _pivots(extremes, directions) if monitored else None)
 
 
 def _no_extremes(problem: Problem, t, y: PyTree) -> tuple[Array, Array]:
@@ -249,9 +249,10 @@ def _no_extremes(problem: Problem, t, y: PyTree) -> tuple[Array, Array]:
     return jnp.full(shape.shape, jnp.inf, shape.dtype), jnp.full(shape.shape, -jnp.inf, shape.dtype)
 
 
-def _pivots(extremes: tuple[Float[Array, "pivots *lanes"], Float[Array, "pivots *lanes"]]) -> Pivots:
+def _pivots(extremes: tuple[Array, Array], directions: Float[Array, "stages rows speeds *lanes"]) -> Pivots:
     lowest, highest = extremes
-    return Pivots(jnp.min(jnp.minimum(jnp.abs(lowest), jnp.abs(highest)), axis=0), jnp.any((lowest < 0) & (highest > 0), axis=0))
+    turned = ~jnp.all(jnp.sum(directions[0] * directions, axis=2) > 0, axis=(0, 1))
+    return Pivots(jnp.min(jnp.minimum(jnp.abs(lowest), jnp.abs(highest)), axis=0, initial=jnp.inf), jnp.any((lowest < 0) & (highest > 0), axis=0) | turned)
 
 
 def weighted(weights, slopes: Float[Array, "stages *shape"]) -> Float[Array, "*shape"]:

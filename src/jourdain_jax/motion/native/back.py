@@ -182,7 +182,7 @@ def _write_event_back(w: Writer, form: Form, asked: int) -> None:
         lanes = Lanes(w, layout, state)
         located = lanes["code"].equals(float(results.EVENT)) & (lanes["accepted"] > 0.0)
         with w.when(w.any(located)):
-            f, out, pivots, added = (w.room(w.real, max(n, 1)) for n in (count, count, form.pivots, asked + 1))
+            f, out, pivots, added = (w.room(w.real, max(n, 1)) for n in (count, count, len(form.monitored), asked + 1))
             values, rates, weights = (w.room(w.real, layout.events) for _ in range(3))
             t, g_t = lanes["t"], w.room(w.real, 1 + len(form.moving))
             with w.counted(0, w.lanes) as lane, w.counted(0, 1 + len(form.moving)) as row:

@@ -66,6 +66,17 @@ class Form:
         return (*self.relations, *(self.program.events if self.relations and self.has_events and self.program.event_relations else ()))
 
     @property
+    def monitored(self) -> list[int]:
+        """What is watched at all stages of a step: pivots first, then directions of rows."""
+        return [*self.program.pivots[: self.pivots], *self.program.directions]
+
+    @property
+    def directions(self) -> list[range]:
+        """Which of these are the entries of a direction, one direction after the other."""
+        first, width = self.pivots, len(self.program.ydot)
+        return [range(k, k + width) for k in range(first, first + len(self.program.directions), max(width, 1))]
+
+    @property
     def moves(self) -> list[int]:
         """A projection step by step, 1: of the coordinates, 0: of the speeds."""
         return [1, 1] + [0] * (0 if not self.program.projected_u else 1 if self.affine else 2)
@@ -77,7 +88,7 @@ class Form:
         projected = [*program.projected_q, *program.projected_u] if self.projects else []
         events = program.events if self.has_events else ()
         power = [program.power] if self.with_work and program.power is not None else []
-        return [*program.qdot, *program.ydot, *power, *program.guards, *program.pivots, *projected, *events, *self.watched]
+        return [*program.qdot, *program.ydot, *power, *program.guards, *program.pivots, *program.directions, *projected, *events, *self.watched]
 
 
 class Outputs(NamedTuple):
@@ -150,7 +161,7 @@ def known_values(w: Writer, form: Form, state: Value, tau: Value, y: Value) -> d
 
 
 def write_rates(w: Writer, form: Form) -> None:
-    """`rates(state, tau, y, k, pivots)`: the rates of the state `y` into `k`, and the pivots relative to their usual sizes."""
+    """`rates(state, tau, y, k, pivots)`: the rates of the state `y` into `k`, and what is monitored, pivots relative to their usual sizes."""
     program, layout = form.program, form.layout
     how = "alwaysinline" if program.operations <= INLINED else "noinline"
     arguments = {"state": "ptr", "tau": w.real, "y": "ptr", "k": "ptr", "pivots": "ptr"}
@@ -158,7 +169,7 @@ def write_rates(w: Writer, form: Form) -> None:
         power = [program.power] if form.with_work and program.power is not None else []
         rates = [*program.qdot, *program.ydot, *power]
         known = known_values(w, form, state, tau, y)
-        found, tangents = _found(w, form, outputs_of(form, [*rates, *program.guards, *program.pivots[: form.pivots]], len(rates)), known, state, tau, y)
+        found, tangents = _found(w, form, outputs_of(form, [*rates, *program.guards, *form.monitored], len(rates)), known, state, tau, y)
         if form.with_work and not power:
             found.insert(layout.coordinates + layout.speeds, w.number(0.0))
             tangents = [[*part, w.number(0.0)] for part in tangents]
@@ -166,8 +177,8 @@ def write_rates(w: Writer, form: Form) -> None:
             found[0] = w.where(guard > 0.0, found[0], float("nan"))
         for i, x in enumerate([*found[: layout.y], *(x for part in tangents for x in part)]):
             w.store(x, k, i)
-        for i in range(form.pivots):
-            w.store(found[layout.y + len(program.guards) + i] / known[program.sizes[i]], pivots, i)
+        for i, x in enumerate(found[layout.y + len(program.guards) :]):
+            w.store(x / known[program.sizes[i]] if i < form.pivots else x, pivots, i)
         w.give()
 
 

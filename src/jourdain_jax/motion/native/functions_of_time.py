@@ -44,8 +44,8 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
     except (Unsupported, ValueError) as error:
         return f"an input is a function of time without scalar form ({error})"
     power = [] if program.power is None else [program.power]
-    outputs = [*program.qdot, *program.ydot, *power, *program.pivots, *program.guards, *program.events, *program.projected_q, *program.projected_u]
-    outputs += [*program.relations, *program.event_relations]
+    outputs = [*program.qdot, *program.ydot, *power, *program.pivots, *program.directions, *program.guards, *program.events]
+    outputs += [*program.projected_q, *program.projected_u, *program.relations, *program.event_relations]
     of_functions = [new[n] for n in program.traced.inputs.tolist() if n in new]
     new = graph.copied(outputs, program.graph, new)
 
@@ -65,6 +65,7 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
         ydot=on_it(program.ydot),
         power=new[power[0]] if power else None,
         pivots=on_it(program.pivots),
+        directions=on_it(program.directions),
         guards=on_it(program.guards),
         events=on_it(program.events),
         relations=tuple(dict.fromkeys([*on_it(program.relations), *switches(graph, of_functions)])),

@@ -147,7 +147,7 @@ def form_of(field: VectorField, inputs: Inputs, has_events: bool) -> Form:
     sampled = tuple(i for i, channel in enumerate(_others(inputs)) if isinstance(channel, Sampled))
     program = driven(field.program, inputs)
     assert not isinstance(program, str), program
-    return Form(program, field.with_work, field.projects, field.affine, has_events, field.pivots if field.has_pivots else 0, sampled=sampled)
+    return Form(program, field.with_work, field.projects, field.affine, has_events, field.pivots, sampled=sampled)
 
 
 def _form_of(motion: Motion) -> Form:

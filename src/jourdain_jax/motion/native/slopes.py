@@ -26,7 +26,7 @@ def write(w: Writer, form: Form) -> None:
     write_rates(w, form)
 
     def rates(state: Value, _: Value, found: Value) -> None:
-        w.call("rates", "void", state, Lanes(w, layout, state)["t"], state, found, w.room(w.real, max(form.pivots, 1)))
+        w.call("rates", "void", state, Lanes(w, layout, state)["t"], state, found, w.room(w.real, max(len(form.monitored), 1)))
 
     _write(w, form, layout.integrated, rates)
 

@@ -67,7 +67,7 @@ def _tried_by_stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value) 
     if form.projects:
         _project(w, layout, p, t1, y1, error)
     size_of_error = _norm(w, layout, p, error, y1)
-    if form.pivots:
+    if form.monitored:
         size_of_error = w.where(changed_sign & ~locating, math.inf, size_of_error)
     accept = locating | (size_of_error <= 1.0)
     factor = SAFETY * power(w, w.where(size_of_error > 0.0, size_of_error, 1e-30), -1 / method.order)
@@ -104,10 +104,11 @@ def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Va
     holds = at_start.holds & at_end.holds
     w.store(w.where(holds, w.load(w.real, y1), math.nan), y1)
     accept, length = accept & holds, w.where(at_start.holds, length, 0.0)
-    for a, b in zip(at_start.pivots, at_end.pivots, strict=True):
+    for a, b in zip(at_start.values[: form.pivots], at_end.values, strict=False):
         least = w.smaller(w.magnitude(a), w.magnitude(b))
         pivot = least if pivot is None else w.smaller(pivot, least)
         accept = accept & ~(((a < 0.0) & (b > 0.0)) | ((a > 0.0) & (b < 0.0)))
+    accept = accept & ~_turns_round(w, form, at_start.values, at_end.values)
     if form.projects:
         error = w.room(w.real, layout.y)
         each_row(w, range(layout.y), error, lambda i: w.number(0.0))
@@ -181,8 +182,9 @@ def over_rows(w: Writer, rows: range, start: float, added: Callable[[Value, int 
 def _stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value, t: Value, step: Value) -> tuple[Value, Value]:
     """The smallest magnitude of a pivot, and whether any changed its sign; puts the slopes of all stages into `k`."""
     layout, count = form.layout, form.pivots
-    every = layout.integrated
-    at, pivots = w.room(w.real, every), w.room(w.real, max(count, 1))
+    every, turned = layout.integrated, w.literal(0, w.truth)
+    first: list[Value] = []
+    at, pivots = w.room(w.real, every), w.room(w.real, max(len(form.monitored), 1))
     low, high = [w.number(math.inf)] * count, [w.number(-math.inf)] * count
 
     def next_state(i: int, row: int | Value) -> Value:
@@ -192,13 +194,21 @@ def _stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value, t: Value,
     for i in range(method.needed):
         each_row(w, range(every), at, partial(next_state, i))
         w.call("rates", "void", p.pointer, w.fma(step, float(method.c[i]), t), at, w.at(k, i * every, w.real), pivots)
-        now = [w.load(w.real, pivots, j) for j in range(count)]
-        low, high = [w.smaller(a, b) for a, b in zip(low, now, strict=True)], [w.larger(a, b) for a, b in zip(high, now, strict=True)]
-    smallest, changed = w.number(math.inf), w.literal(0, w.truth)
+        now = [w.load(w.real, pivots, j) for j in range(len(form.monitored))]
+        first = first or now
+        turned = turned | _turns_round(w, form, first, now)
+        low, high = [w.smaller(a, b) for a, b in zip(low, now, strict=False)], [w.larger(a, b) for a, b in zip(high, now, strict=False)]
+    smallest, changed = w.number(math.inf), turned
     for a, b in zip(low, high, strict=True):
         smallest = w.smaller(smallest, w.smaller(w.magnitude(a), w.magnitude(b)))
         changed = changed | ((a < 0.0) & (b > 0.0))
     return smallest, changed
+
+
+def _turns_round(w: Writer, form: Form, first: list[Value], now: list[Value]) -> Value:
+    """Whether a direction of a row makes no acute angle with what it was at first."""
+    acute = [reduce(operator.add, (first[k] * now[k] for k in row)) > 0.0 for row in form.directions]
+    return ~reduce(operator.and_, acute) if acute else w.literal(0, w.truth)
 
 
 def weighted(w: Writer, weights: np.ndarray, k: Value, layout: Layout, row: int | Value) -> Value:
@@ -316,7 +326,7 @@ def _put_tangents_at_event(w: Writer, form: Form, p: Lanes, k: Value, found: Val
     """
     layout, count, times = form.layout, form.layout.events, form.layout.rows["dt"]
     with w.when(w.any(found)):
-        values, pivots = w.room(w.real, count * len(times)), w.room(w.real, max(form.pivots, 1))
+        values, pivots = w.room(w.real, count * len(times)), w.room(w.real, max(len(form.monitored), 1))
         slope = search.chosen(w, p["event"], rate)
         usable = found & slope.differs(0.0) & (w.magnitude(slope) < math.inf)
         flat = found & search.is_flat(w, p, slope)

@@ -44,7 +44,7 @@ class Monitored(NamedTuple):
     """What must not change its sign."""
 
     holds: Value  # whether all guards are positive
-    pivots: list[Value]  # relative to their usual sizes
+    values: list[Value]  # as `Form.monitored`, pivots relative to their usual sizes
 
 
 class Jet(NamedTuple):
@@ -96,7 +96,7 @@ def rates_of(form: Form) -> list[int]:
 
 
 def _monitored(form: Form) -> list[int]:
-    return [*form.program.guards, *form.program.pivots[: form.pivots]]
+    return [*form.program.guards, *form.monitored]
 
 
 def monitored_at(w: Writer, form: Form, p: Lanes, t: Value, y: Value) -> Monitored:
@@ -111,7 +111,8 @@ def _evaluated(w: Writer, form: Form, graph, nodes: Sequence[int], values: Mappi
     for guard in found[:count]:
         holds = holds & (guard > 0.0)
     sizes = [of_variables[form.program.variables.index(n)] for n in form.program.sizes[: form.pivots]]
-    return Monitored(holds, [x / size for x, size in zip(found[count:], sizes, strict=True)])
+    pivots = [x / size for x, size in zip(found[count:], sizes, strict=False)]
+    return Monitored(holds, [*pivots, *found[count + len(pivots) :]])
 
 
 def radius(w: Writer, layout: Layout, p: Lanes, rows: Sequence[Coefficients]) -> Value:

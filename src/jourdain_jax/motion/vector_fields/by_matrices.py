@@ -1,7 +1,5 @@
 """Rates by dense matrices that JAX differentiates, in the minimal or the full state: for scenes without a program, and for reductions that a user chooses."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,14 +7,15 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.usual_lengths import UsualLengths, usual_lengths
 from jourdain_jax.calculus.pseudo_inverse import undecided
-from jourdain_jax.dynamics.accelerations import Baumgarte, bare_accelerations
+from jourdain_jax.dynamics.accelerations import Baumgarte, bare_accelerations, reduced_at
 from jourdain_jax.dynamics.power import rate_of_work
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import MinimalKinematics, accelerations_of, minimal_kinematics
 from jourdain_jax.equations.projection import project_positions, project_speeds
-from jourdain_jax.equations.reductions import Partition, Privileged
-from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
+from jourdain_jax.equations.reductions import Partition, Privileged, Reduced
+from jourdain_jax.equations.scaling import scaled
+from jourdain_jax.motion.vector_fields.field import Integrated, VectorField, Watched
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 
@@ -27,16 +26,17 @@ class ByMatrices(VectorField):
     stabilisation: Baumgarte | None
     usual: UsualLengths  # of the rows
     inputs_in_rows: bool = eqx.field(static=True)  # some change in time, and rows depend on them: their rates are needed
+    nonlinear_rows: tuple[int, ...] = eqx.field(static=True)  # all, where some are nonlinear in the speeds, and none follows from the others
     cutoff: float | None = eqx.field(static=True)  # of the projection of speeds: below it rows count as dependent; None: round-off
 
     def now(self, inputs, t):
         """The values of the inputs, with their own rates where rows depend on them."""
         return inputs.near(t) if self.inputs_in_rows else inputs(t)
 
-    def solved(self, scene: Scene, t, q, u, inputs) -> tuple[Motion, Any]:
-        """The motion with these speeds, and its accelerations by the reduction."""
-        found = bare_accelerations(scene, t, q, u, inputs, reduction=self.reduction, stabilisation=self.stabilisation, usual=self.usual.rows)
-        return motion_at(scene, t, q, u, inputs), found
+    def solved(self, scene: Scene, t, q, u, inputs) -> tuple[Motion, Reduced, Float[Array, "rows speeds"]]:
+        """The motion with these speeds, its accelerations by the reduction, and what must not turn round (`Watched.directions`)."""
+        found, equations, rows = reduced_at(scene, t, q, u, inputs, self.reduction, self.stabilisation, self.usual.rows)
+        return motion_at(scene, t, q, u, inputs), found, _left_by_elimination(scaled(equations, rows).A[jnp.array(self.nonlinear_rows, int)])
 
     def power(self, scene: Scene, motion: Motion, found) -> Float[Array, ""] | None:
         """The rate of the work that is integrated, W."""
@@ -68,13 +68,14 @@ class MinimalByMatrices(ByMatrices):
         found = self._kinematics(scene, t, y, inputs)
         return found.u, Partition(jax.lax.stop_gradient(found.split.A), self.independent).signed_pivot()
 
-    def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Integrated, Float[Array, "pivots"]]:
+    def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Watched:
         """As `rates`, and the sign of det A_z."""
         known = self._kinematics(scene, t, y, inputs)
         own = isinstance(self.reduction, Privileged) and self.reduction.independent == self.independent and self.stabilisation is None
-        motion, found = accelerations_of(scene, known, t, y.q, inputs) if own else self.solved(scene, t, y.q, known.u, inputs)
+        motion, found = accelerations_of(scene, known, t, y.q, inputs) if own else self.solved(scene, t, y.q, known.u, inputs)[:2]
         v = found.udot[jnp.array(self.independent, jnp.int32)]
-        return Integrated(motion.qdot.array, v, self.power(scene, motion, found)), known.split.orientation()[None]
+        rates = Integrated(motion.qdot.array, v, self.power(scene, motion, found))
+        return Watched(rates, known.split.orientation()[None], jnp.zeros((0, len(known.u))))
 
     def _kinematics(self, scene: Scene, t, y: Integrated, inputs) -> MinimalKinematics:
         return minimal_kinematics(scene, self.independent, self.rows, t, y.q, y.v, inputs)
@@ -100,7 +101,7 @@ class FullByMatrices(ByMatrices):
     @property
     def has_pivots(self) -> bool:
         """Whether round-off might decide on which branch a motion goes on."""
-        return self.may_branch
+        return self.may_branch or bool(self.nonlinear_rows)
 
     def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "speeds"]:
         return y.v
@@ -110,13 +111,19 @@ class FullByMatrices(ByMatrices):
             return y.v, jnp.ones(())
         return y.v, bare_accelerations(scene, t, y.q, y.v, inputs, reduction=self.reduction).pivot
 
-    def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Integrated, Float[Array, "pivots"]]:
-        """As `rates`; and 1 where the rows say on which branch the motion goes on, -1 where round-off does."""
-        motion, found = self.solved(scene, t, y.q, y.v, inputs)
+    def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Watched:
+        """As `rates`; what is left of rows; and 1 where the rows say on which branch the motion goes on, -1 where round-off does."""
+        motion, found, directions = self.solved(scene, t, y.q, y.v, inputs)
         rates = Integrated(motion.qdot.array, found.udot, self.power(scene, motion, found))
         if not self.may_branch:
-            return rates, jnp.zeros(0, y.q.dtype)
-        return rates, jnp.where(found.pivot > undecided(found.pivot.dtype), 1.0, -1.0).astype(found.pivot.dtype)[None]
+            return Watched(rates, jnp.zeros(0, y.q.dtype), directions)
+        return Watched(rates, jnp.where(found.pivot > undecided(found.pivot.dtype), 1.0, -1.0).astype(found.pivot.dtype)[None], directions)
+
+
+def _left_by_elimination(A: Float[Array, "rows speeds"]) -> Float[Array, "rows speeds"]:
+    """What is left of each row orthogonal to those before it."""
+    Q, R = jnp.linalg.qr(jax.lax.stop_gradient(A).T)
+    return (Q * jnp.diagonal(R)).T
 
 
 def full_without_projection(field: VectorField, scene: Scene, own_equations: str) -> FullByMatrices:
@@ -131,6 +138,7 @@ def full_without_projection(field: VectorField, scene: Scene, own_equations: str
         rows_may_contradict=False,
         of_inputs=field.of_inputs,
         event_names=field.event_names,
+        nonlinear_rows=(),
         stabilisation=field.stabilisation if isinstance(field, ByMatrices) else None,
         usual=usual_lengths(scene),
         inputs_in_rows=isinstance(field, ByMatrices) and field.inputs_in_rows,

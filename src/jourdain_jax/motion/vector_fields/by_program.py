@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.native import seen
-from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
+from jourdain_jax.motion.vector_fields.field import Integrated, VectorField, Watched
 from jourdain_jax.scene.scene import Scene
 
 
@@ -33,12 +33,12 @@ class ByProgram(VectorField):
     @property
     def has_pivots(self) -> bool:
         """Whether an elimination, or the rates of the coordinates, divide by numbers that must not vanish."""
-        return self.pivots > 0
+        return self.pivots > 0 or bool(self.program.directions)
 
     @property
     def pivots(self) -> int:
-        """How many are monitored: all; with all speeds in the state, those of the coordinate rates alone."""
-        return self.program.divisors if self.independent is None else len(self.program.pivots)
+        """How many are monitored: all; where multipliers keep all speeds on the rows, those of the coordinate rates alone."""
+        return self.program.divisors if self.independent is None and not self.program.by_partition else len(self.program.pivots)
 
     def fixed(self, scene: Scene) -> tuple:
         """What depends on parameters alone."""
@@ -63,12 +63,13 @@ class ByProgram(VectorField):
             return self.program.event_values(fixed, t, tuple(y.q), tuple(y.v), inputs)
         return super().events(scene, fixed, t, y, inputs)
 
-    def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Integrated, Float[Array, "pivots *lanes"]]:
-        """As `rates`, and the pivots of the elimination relative to their usual sizes."""
-        qdot, vdot, power, pivots = self.program.rates_and_pivots(fixed, t, tuple(y.q), tuple(y.v), inputs, self.with_work)
+    def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Watched:
+        """As `rates`, the pivots of the elimination relative to their usual sizes, and what is left of rows by it."""
+        qdot, vdot, power, pivots, directions = self.program.rates_and_pivots(fixed, t, tuple(y.q), tuple(y.v), inputs, self.with_work)
         pivots = pivots[: self.pivots]
         monitored = jnp.stack(pivots) if pivots else jnp.zeros((0, *y.q.shape[1:]))
-        return Integrated(jnp.stack(qdot), jnp.stack(vdot) if vdot else y.v, power), monitored
+        rows = jnp.reshape(jnp.stack(directions), (-1, *y.v.shape)) if directions else jnp.zeros((0, *y.v.shape))
+        return Watched(Integrated(jnp.stack(qdot), jnp.stack(vdot) if vdot else y.v, power), monitored, rows)
 
     def project(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
         """The state put back onto the rows."""

@@ -114,10 +114,13 @@ def _vector_field(scene: Scene, formulation: Formulation, work: bool, backend: s
     }
     if program is not None:
         return ByProgram(**common, program=program, affine=structure.affine)
-    common |= {"stabilisation": formulation.baumgarte, "usual": usual_lengths(scene), "inputs_in_rows": inputs_in_rows, "cutoff": cutoff}
+    nonlinear = () if structure.affine or structure.dependent_rows else structure.kept_rows
+    common |= {"stabilisation": formulation.baumgarte, "usual": usual_lengths(scene), "inputs_in_rows": inputs_in_rows, "nonlinear_rows": nonlinear}
+    common["cutoff"] = cutoff
     if minimal:
         return MinimalByMatrices(**common, rows=structure.kept_rows)
-    return FullByMatrices(**common, may_branch=cutoff is not None and isinstance(reduction, NullSpaceQR) and bool(names_of_position_rows(scene)))
+    loses_rank = bool(names_of_position_rows(scene)) or not structure.affine
+    return FullByMatrices(**common, may_branch=cutoff is not None and isinstance(reduction, NullSpaceQR) and loses_rank)
 
 
 def reason_for_matrices(structure: Structure, with_work: bool, constant: bool) -> str:

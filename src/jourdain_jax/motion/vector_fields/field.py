@@ -7,6 +7,7 @@ Where some force or row does work that no potential accounts for, that work is i
 """
 
 import abc
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -29,6 +30,14 @@ class Integrated(eqx.Module):
     q: Float[Array, "coordinates *lanes"]
     v: Float[Array, "integrated_speeds *lanes"]
     work: Float[Array, "*lanes"] | None
+
+
+class Watched(NamedTuple):
+    """Rates, what must keep its sign, and rows that must not turn round: where these are nonlinear in the speeds."""
+
+    rates: Integrated
+    pivots: Float[Array, "pivots *lanes"]
+    directions: Float[Array, "rows speeds *lanes"]
 
 
 class VectorField(eqx.Module):
@@ -123,11 +132,11 @@ class VectorField(eqx.Module):
 
     def rates(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
         """Time derivative of the integrated state."""
-        return self.rates_and_pivots(scene, fixed, t, y, inputs)[0]
+        return self.rates_and_pivots(scene, fixed, t, y, inputs).rates
 
     @abc.abstractmethod
-    def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Integrated, Float[Array, "pivots *lanes"]]:
-        """As `rates`, and what must keep its sign."""
+    def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Watched:
+        """As `rates`, and what is watched at all stages of a step."""
 
     @abc.abstractmethod
     def project(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:

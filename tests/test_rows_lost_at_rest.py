@@ -1,0 +1,93 @@
+"""Rows that are nonlinear in the speeds and lose their slope where these vanish: no motion is determined beyond, whatever times are saved."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.motion.trajectories import results
+
+# rows in the speeds x, y, z, and in c, which falls through zero at `stop`; and speeds on them where c = 1
+ROWS = {
+    "speed": (lambda x, y, z, c: x**2 + y**2 - c**2, (0.6, 0.8, 0.3)),
+    "one component": (lambda x, y, z, c: x**2 - c**2, (1.0, 0.4, 0.3)),
+    "quadric": (lambda x, y, z, c: x**2 + y**2 + z**2 + x * y - 2.0 * c**2, (0.0, 1.0, 1.0)),
+    "two rows": (lambda x, y, z, c: jnp.stack([x**2 + y**2 + z**2 - 2.0 * c**2, x + 2.0 * y - z - c]), (0.0, 1.0, 1.0)),
+    "weighted": (lambda x, y, z, c: 1e4 * (x**2 + 3.0 * z**2 - c**2), (0.5, 0.4, 0.5)),
+}
+# and such as determine the motion beyond, though their slope vanishes
+PASSED = {"cube": (lambda x, y, z, c: x**3 - c**3, (1.0, 0.4, 0.3)), "magnitude": (lambda x, y, z, c: x * jnp.abs(x) - c, (1.0, 0.4, 0.3))}
+
+
+def _scene(row, stop, pull=0.0):
+    class Lawful(jj.Scene):
+        """A particle whose speeds obey a row."""
+
+        stop: jnp.ndarray = jj.parameter(0.7)
+        pull: jnp.ndarray = jj.parameter(0.0)
+        coordinates = jj.coordinates("x y z")
+
+        def bodies(self, t, q):
+            return {"particle": jj.Particle(1.0, jnp.stack([q.x, q.y, q.z]))}
+
+        def velocity_constraints(self, motion):
+            u = motion.u
+            return {"row": row(u.x_rate, u.y_rate, u.z_rate, 1.0 - motion.t / self.stop)}
+
+        def loads(self, motion):
+            return (jj.gravity(motion, self.pull, (0.0, -1.0, 0.0)),)
+
+    return Lawful(stop=stop, pull=pull)
+
+
+def _end(scene, speeds, **options):
+    return jj.simulate(scene, dict(zip(("x_rate", "y_rate", "z_rate"), speeds, strict=True)), **options)
+
+
+@pytest.mark.parametrize("options", [{"backend": "native"}, {"backend": "dense"}, {"backend": "xla"}, {"solver": jj.Taylor()}], ids=str)
+@pytest.mark.parametrize("name", ROWS)
+def test_no_lane_goes_through_a_row_that_is_lost(name, options):
+    row, speeds = ROWS[name]
+    scene = _scene(row, 0.7)
+    ts = jnp.linspace(0.0, 2.0, 3 + 8 * len(name))[1:]
+
+    def code(stop, pull):
+        return _end(scene.replace(stop=stop, pull=pull), speeds, ts=ts, **options).result
+
+    lanes = 4 if options.get("backend") in ("dense", "xla") else 32
+    stops = jnp.concatenate([ts[lanes // 2 : lanes], jnp.linspace(0.3, 1.7, lanes // 2)])  # half of them are saved times
+    pulls = jnp.asarray(np.random.default_rng(len(name)).choice([0.0, 0.7, 2.0], lanes))
+    assert not np.isin(jax.jit(jax.vmap(code))(stops, pulls), (results.SUCCESS, results.EVENT)).any()
+
+
+@pytest.mark.parametrize("backend", ["native", "dense"])
+@pytest.mark.parametrize("name", PASSED)
+def test_motions_that_rows_determine_beyond_are_right_or_flagged(name, backend):
+    row, speeds = PASSED[name]
+    for count in (1, 5, 40):
+        motion = _end(_scene(row, 0.7), speeds, ts=jnp.linspace(0.0, 2.0, count + 1)[1:], backend=backend)
+        c = 1.0 - float(motion.t_end) / 0.7
+        expected = c if name == "cube" else np.sign(c) * np.sqrt(abs(c))
+        assert int(motion.result) != results.SUCCESS or float(motion.u_end[0]) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-3, 1e-5, 1e-7])
+def test_slow_motions_are_as_fast_ones(size):
+    def end(speeds, pull):
+        return _end(_scene(lambda x, y, z, c: (x**2 + y**2) / size**2 - 1.0, 0.7, pull), speeds, t1=1.0, backend="native")
+
+    found = end((0.6 * size, 0.8 * size, 0.0), 2.0 * size)
+    assert int(found.result) == results.SUCCESS
+    np.testing.assert_allclose(found.u_end[:2] / size, [0.69710104, -0.7169729], rtol=1e-6)
+
+
+def test_derivatives_beyond_are_no_numbers():
+    row, speeds = ROWS["speed"]
+
+    def end(stop):
+        return _end(_scene(row, stop), speeds, ts=[0.5, 2.0], backend="native")
+
+    before = jax.jacfwd(lambda stop: end(stop).q[0, 0])(0.7), jax.grad(lambda stop: end(stop).q[0, 0])(0.7)
+    np.testing.assert_allclose(before, 0.6 * 0.5**2 / (2 * 0.7**2), rtol=1e-6)  # of x = 0.6 (t - t^2/(2 stop))
+    assert np.isnan([jax.jacfwd(lambda stop: end(stop).q_end[0])(0.7), jax.grad(lambda stop: end(stop).q_end[0])(0.7)]).all()
