@@ -844,7 +844,7 @@ def test_start_values_that_depend_on_each_other_are_refused():
         fit(TRUTH, [data, run({"y_rate": 1.0, "x_rate": 0.0, "heading_rate": 0.0})], ("inertia",))
 
 
-def test_the_last_step_is_taken_without_a_look_at_its_end_and_ends_at_the_minimum():
+def test_a_fit_ends_at_the_minimum_whatever_its_tolerance():
     ts = jnp.linspace(0.0, 4.0, 41)
     truth, start = ChaplyginSleigh(offset=0.25), {"x_rate": -0.6, "heading_rate": 0.9}
     motion, noise = jj.simulate(truth, start, ts=ts), np.random.default_rng(3)

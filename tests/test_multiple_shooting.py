@@ -7,9 +7,7 @@ import pytest
 import jourdain_jax as jj
 from jourdain_jax.analysis import grids
 from jourdain_jax.analysis.arrow import Arrow
-from jourdain_jax.analysis.joined import JoinedArrow
 from jourdain_jax.analysis.lagged import read
-from jourdain_jax.analysis.levenberg_marquardt import Linearised
 
 FREE = ("mass2", "length1", "length2")
 TIGHT = {"rtol": 1e-8, "atol": 1e-8}
@@ -97,21 +95,24 @@ def test_pieces_that_cannot_join_in_time_are_no_result():
 
 def test_a_step_of_joined_pieces_is_that_of_dense_least_squares():
     g, (runs, m, p) = np.random.default_rng(0), (5, 3, 2)
-    pieces = Arrow(g.normal(size=(2, runs, m, m + p + 1)), g.normal(size=(2, 4, p + 1)), np.zeros((2, runs, p)))
+    local, shared = g.normal(size=(2, runs, m, m + p + 1)), g.normal(size=(2, 4, p + 1))
     follows = np.array([False, True, True, False, True])
-    joins = g.normal(size=(2, runs, 2, 2 * m + p + 1)) * np.append(follows[1:], False)[:, None, None]
-    arrow, D, damping = JoinedArrow(pieces, joins, follows), g.uniform(0.5, 2.0, (2, p + runs * m)), np.array([0.3, 1e-3])
+    joins = g.normal(size=(2, runs, 2, 2 * m + p + 1)) * follows[:, None, None]  # of own unknowns, those of the piece before, shared ones
+    arrow, D, damping = Arrow(local, shared, np.zeros((2, runs, p)), joins), g.uniform(0.5, 2.0, (2, p + runs * m)), np.array([0.3, 1e-3])
     held, moved = np.zeros((2, p + runs * m), bool), np.zeros((2, p + runs * m))
     held[0, [1, 4]], moved[0, [1, 4]] = True, [0.2, -0.1]
     step = arrow.step(damping, D, held, moved, 1e-12)
     for b in range(2):
-        rows = [np.concatenate([pieces.shared[b, :, :p], np.zeros((4, runs * m)), pieces.shared[b, :, p:]], axis=1)]
+        rows = [np.concatenate([shared[b, :, :p], np.zeros((4, runs * m)), shared[b, :, p:]], axis=1)]
         for i in range(runs):
-            for block, width in ((pieces.local[b, i], m), (joins[b, i], 2 * m)):
-                if width == 2 * m and not (i + 1 < runs and follows[i + 1]):
+            own, before = slice(p + i * m, p + (i + 1) * m), slice(p + (i - 1) * m, p + i * m)
+            for block, parts in ((local[b, i], (own,)), (joins[b, i], (own, before))):
+                if len(parts) > 1 and not follows[i]:
                     continue
                 row = np.zeros((len(block), p + runs * m + 1))
-                row[:, p + i * m : p + i * m + width], row[:, :p], row[:, -1] = block[:, :width], block[:, width:-1], block[:, -1]
+                for k, part in enumerate(parts):
+                    row[:, part] = block[:, k * m : (k + 1) * m]
+                row[:, :p], row[:, -1] = block[:, len(parts) * m : -1], block[:, -1]
                 rows.append(row)
         dense = np.concatenate(rows)
         J, r, free = dense[:, :-1], dense[:, -1] + dense[:, :-1] @ moved[b], ~held[b]
@@ -121,19 +122,6 @@ def test_a_step_of_joined_pieces_is_that_of_dense_least_squares():
         np.testing.assert_allclose(arrow.change(step)[b], np.sum((J @ step[b]) ** 2))
         np.testing.assert_allclose(arrow.gradient[b], J.T @ dense[:, -1], atol=1e-10)
         np.testing.assert_allclose(arrow.column_norms[b], np.linalg.norm(J, axis=0))
-
-
-def test_what_pieces_show_after_a_last_step_is_told_without_a_look_at_it():
-    g, (runs, m, p) = np.random.default_rng(1), (3, 2, 1)
-    pieces = Arrow(g.normal(size=(1, runs, m, m + p + 1)), g.normal(size=(1, 2, p + 1)), np.zeros((1, runs, p)))
-    rows, d = np.empty((1, runs), object), g.normal(size=(1, p + runs * m))
-    rows[0, :] = [g.normal(size=(4, m + p + 1)) for _ in range(runs)]
-    arrow = JoinedArrow(pieces, g.normal(size=(1, runs, 2, 2 * m + p + 1)), np.array([False, True, True]))
-    moved = Linearised(np.ones(1), arrow, rows, np.zeros((1, 0))).moved(d, np.array([0.25]))
-    assert moved.cost == 0.75
-    for i in range(runs):
-        own = np.concatenate([d[0, p + i * m : p + (i + 1) * m], d[0, :p]])
-        np.testing.assert_allclose(moved.rows[0, i][:, -1], rows[0, i][:, -1] + rows[0, i][:, :-1] @ own)
 
 
 def test_pieces_lie_along_the_fit_though_an_unknown_at_its_bound_was_moved():

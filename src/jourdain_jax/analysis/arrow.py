@@ -1,20 +1,25 @@
-"""Least squares with unknowns that all runs share and unknowns of one run each: an arrow-shaped problem, kept as one small triangle per run.
+"""Least squares with unknowns that all runs share and unknowns of one run, or of one piece of a run, each: an arrow, through which a chain may go.
 
-minimise sum_i |r_i + J_i dx_i + S_i ds|^2 + lambda |D d|^2          run i: its own unknowns x_i, the shared ones s
+minimise sum_i |r_i + J_i dx_i + S_i ds|^2 + sum_i |c_i + B_i dx_i + A_i dx_i-1 + C_i ds|^2 + lambda |D d|^2
+         piece i: its own unknowns x_i, the shared ones s; its join with the piece before, if it has one
 
-    [J_i S_i r_i] = Q_i [ T_i ; 0 ]          one QR factorisation per run: T_i is all that is kept of its samples
-    x_i goes out by a QR factorisation of the first columns of T_i, below them sqrt(lambda) D_i: the Schur complement, without squaring anything
+    [J_i S_i r_i] = Q_i [ T_i ; 0 ]          one QR factorisation per piece: T_i is all that is kept of its samples
+    from the last pieces of the runs to their first, x_i goes out by a QR factorisation of
+    [ B_i A_i C_i c_i ; T_i ; sqrt(lambda) D_i ; what the piece after it left ]:     the Schur complement, without squaring anything
     s by the singular values of what is left of all runs; directions whose singular value is below a cut-off stay as they are
 
-Time and memory grow linearly with the number of runs. A leading axis `members` holds problems of equal shape. All on NumPy.
-Source: G. H. Golub and V. Pereyra, Inverse Problems 19 (2003) R1; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105 (the scaling D).
+A run that is not cut is one piece without a join. Time and memory grow linearly with the number of pieces. A leading axis `members` holds problems of equal
+shape. All on NumPy.
+Source: G. H. Golub and V. Pereyra, Inverse Problems 19 (2003) R1; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105 (the scaling D); G. J. Bierman,
+Factorization Methods for Discrete Sequential Estimation (1977), chapter VI (square-root information, the chain).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Bool, Float, Shaped
 
 
 def triangle(whole: Float[np.ndarray, "*batch samples width"]) -> Float[np.ndarray, "*batch width width"]:
@@ -33,29 +38,30 @@ def _upper(width: int) -> Float[np.ndarray, "width width"]:
 
 @dataclass(frozen=True)
 class Arrow:
-    """A linearised problem: of each run the rows of T that hold its own unknowns, and of all runs together the rest as one triangle."""
+    """A linearised problem. Unknowns are (shared, own of piece 0, own of piece 1, ...)."""
 
-    local: Float[np.ndarray, "members runs local width"]
-    shared: Float[np.ndarray, "members rows columns"]
-    scores: Float[np.ndarray, "members runs _"]  # of each run: gradient in the shared unknowns, its own ones being fitted
+    local: Float[np.ndarray, "members pieces local width"]  # the rows of T that hold own unknowns
+    shared: Float[np.ndarray, "members rows columns"]  # of all pieces together the rest, as one triangle
+    scores: Float[np.ndarray, "members pieces _"]  # of each: gradient in the shared unknowns, its own ones being fitted
+    joins: Float[np.ndarray, "members pieces joined both"] | None = None  # [B A C c]; zero of the first piece of a run
 
     @property
     def arrays(self) -> tuple[np.ndarray, ...]:
         """All that it holds, with the axis of members first."""
-        return self.local, self.shared, self.scores
+        return (self.local, self.shared, self.scores) if self.joins is None else (self.local, self.shared, self.scores, self.joins)
 
     @property
     def counts(self) -> tuple[int, int, int]:
-        """Numbers of runs, of unknowns of each run, and of shared unknowns."""
-        runs, local = self.local.shape[1:3]
-        return runs, local, self.shared.shape[-1] - 1
+        """Numbers of pieces, of unknowns of each piece, and of shared unknowns."""
+        pieces, local = self.local.shape[1:3]
+        return pieces, local, self.shared.shape[-1] - 1
 
     def at(self, members) -> "Arrow":
-        """That of some members."""
+        """Return the problems of some members."""
         return Arrow(*(x[members] for x in self.arrays))
 
     def scaled(self, size: Float[np.ndarray, "members unknowns"]) -> "Arrow":
-        """This arrow in unknowns divided by `size`."""
+        """Return this arrow, which has no joins, in unknowns divided by `size`."""
         shared, local = self.split(size)
         whole = np.concatenate([local, np.broadcast_to(shared[:, None], (*local.shape[:2], shared.shape[1])), np.ones((*local.shape[:2], 1))], axis=-1)
         return Arrow(
@@ -63,71 +69,80 @@ class Arrow:
         )
 
     def split(self, x: Shaped[np.ndarray, "members unknowns"]) -> tuple[np.ndarray, np.ndarray]:
-        """Shared unknowns (members, shared), and those of the runs (members, runs, local)."""
-        runs, local, shared = self.counts
-        return x[:, :shared], x[:, shared:].reshape(len(x), runs, local)
+        """Return shared unknowns (members, shared), and those of the pieces (members, pieces, local)."""
+        pieces, local, shared = self.counts
+        return x[:, :shared], x[:, shared:].reshape(len(x), pieces, local)
+
+    def _by_unknown(self, of: Callable[[np.ndarray], np.ndarray]) -> Float[np.ndarray, "members unknowns"]:
+        """Return the sums over all rows of what is `of` rows: (..., rows, columns and residual) -> (..., columns)."""
+        _, m, _ = self.counts
+        shared = of(self.shared)
+        if not m:
+            return shared
+        local = of(self.local)
+        shared, own = shared + local[..., m:].sum(axis=1), local[..., :m]
+        if self.joins is not None:
+            joins = of(self.joins)
+            shared, own = shared + joins[..., 2 * m :].sum(axis=1), own + joins[..., :m]
+            own[:, :-1] += joins[:, 1:, m : 2 * m]
+        return np.concatenate([shared, own.reshape(len(own), -1)], axis=1)
 
     @cached_property
     def column_norms(self) -> Float[np.ndarray, "members unknowns"]:
         """Length of each column of the Jacobian."""
-        _, m, _ = self.counts
-        squares = np.einsum("bij,bij->bj", self.shared[..., :-1], self.shared[..., :-1])
-        if not m:
-            return np.sqrt(squares)
-        of_runs = np.sum(self.local[..., :-1] ** 2, axis=2)
-        return np.sqrt(np.concatenate([squares + np.sum(of_runs[..., m:], axis=1), of_runs[..., :m].reshape(len(of_runs), -1)], axis=1))
+        return np.sqrt(self._by_unknown(lambda rows: np.einsum("...ij,...ij->...j", rows[..., :-1], rows[..., :-1])))
 
     @cached_property
     def gradient(self) -> Float[np.ndarray, "members unknowns"]:
         """`J' r`."""
-        _, m, _ = self.counts
-        found = (self.shared[:, None, :, -1] @ self.shared[..., :-1])[:, 0]
-        if not m:
-            return found
-        of_runs = (self.local[..., None, :, -1] @ self.local[..., :-1])[..., 0, :]
-        return np.concatenate([found + np.sum(of_runs[..., m:], axis=1), of_runs[..., :m].reshape(len(of_runs), -1)], axis=1)
+        return self._by_unknown(lambda rows: (rows[..., None, :, -1] @ rows[..., :-1])[..., 0, :])
 
-    def moved(self, d: Float[np.ndarray, "members unknowns"]) -> "Arrow":
-        """Close by, with the residuals that it has there to first order. The scores stay."""
+    def _changes(self, d: Float[np.ndarray, "members unknowns"]) -> list[np.ndarray]:
+        """Return by how much the residuals of each part change, to first order."""
         shared, own = self.split(d)
         _, m, _ = self.counts
-        local, rest = self.local.copy(), self.shared.copy()
-        rest[..., -1] += (rest[..., :-1] @ shared[..., None])[..., 0]
+        found = [(self.shared[..., :-1] @ shared[..., None])[..., 0]]
         if m:
-            local[..., -1] += (local[..., :m] @ own[..., None] + local[..., m:-1] @ shared[:, None, :, None])[..., 0]
-        return Arrow(local, rest, self.scores)
+            found.append((self.local[..., :m] @ own[..., None] + self.local[..., m:-1] @ shared[:, None, :, None])[..., 0])
+        if self.joins is not None:
+            before = np.roll(own, 1, axis=1)[..., None]  # of the first piece it meets a zero
+            joins = self.joins
+            found.append((joins[..., :m] @ own[..., None] + joins[..., m : 2 * m] @ before + joins[..., 2 * m : -1] @ shared[:, None, :, None])[..., 0])
+        return found
 
     def change(self, d: Float[np.ndarray, "members unknowns"]) -> Float[np.ndarray, "members"]:
         """`|J d|^2`."""
-        shared, own = self.split(d)
-        _, m, _ = self.counts
-        moved = (self.shared[..., :-1] @ shared[..., None])[..., 0]
-        found = np.einsum("bi,bi->b", moved, moved)
-        if not m:
-            return found
-        of_runs = self.local[..., :m] @ own[..., None] + self.local[..., m:-1] @ shared[:, None, :, None]
-        return found + np.sum(of_runs**2, axis=(1, 2, 3))
+        return sum(np.einsum("bi,bi->b", x, x) for x in (x.reshape(len(x), -1) for x in self._changes(d)))
 
-    def step(self, damping: Float[np.ndarray, "members"], D, held, moved, cutoff) -> Float[np.ndarray, "members unknowns"]:
-        """The damped step; unknowns that are `held` move by `moved`. D: (members, unknowns), positive."""
+    def _held(self, held: Bool[np.ndarray, "members unknowns"], moved: Float[np.ndarray, "members unknowns"]) -> "Arrow":
+        """Return the problem of all other unknowns, with the residuals where those that are `held` have `moved`."""
         _, m, _ = self.counts
-        local, shared, any_held = self.local, self.shared, held.any()
-        if any_held:
-            held_s, held_l = self.split(held)
-            ended = self.moved(np.where(held, moved, 0.0))
-            local, shared = ended.local, ended.shared
-            local[..., :m] *= ~held_l[:, :, None]
-            local[..., m:-1] *= ~held_s[:, None, None]
-            shared[..., :-1] *= ~held_s[:, None]
-        if not m:
-            ds = by_singular_values(shared, D, damping, cutoff)
-        else:
-            D_s, D_l = self.split(D)
-            upper, rest = eliminated(local, np.sqrt(damping)[:, None, None] * D_l)
-            ds = by_singular_values(np.concatenate([shared, rest], axis=1), D_s, damping, cutoff)
-            right = -(upper[..., -1:] + upper[..., m:-1] @ ds[:, None, :, None])
-            ds = np.concatenate([ds, np.linalg.solve(upper[..., :m], right).reshape(len(ds), -1)], axis=1)
-        return np.where(held, moved, ds) if any_held else ds
+        shared, own = self.split(~held)
+        parts = [self.shared.copy(), self.local.copy(), *([] if self.joins is None else [self.joins.copy()])]
+        for part, change in zip(parts, self._changes(np.where(held, moved, 0.0)), strict=False):
+            part[..., -1] += change
+        parts[0][..., :-1] *= shared[:, None]
+        for part, start in zip(parts[1:], (m, 2 * m), strict=False):
+            part[..., :m] *= own[:, :, None]
+            part[..., start:-1] *= shared[:, None, None]
+        if self.joins is not None:
+            parts[2][..., m : 2 * m] *= np.roll(own, 1, axis=1)[:, :, None]
+        return Arrow(parts[1], parts[0], self.scores, *parts[2:])
+
+    def step(self, damping: Float[np.ndarray, "members"], D, held, moved, cutoff: float) -> Float[np.ndarray, "members unknowns"]:
+        """Return the damped step; unknowns that are `held` move by `moved`. D: (members, unknowns), positive."""
+        _, m, p = self.counts
+        here = self._held(held, moved) if held.any() else self
+        D_s, D_l = self.split(D)
+        tops, left = eliminated(here.local, np.sqrt(damping)[:, None, None] * D_l, here.joins)
+        found = by_singular_values(np.concatenate([here.shared, left], axis=1) if m else here.shared, D_s, damping, cutoff)
+        if m:
+            right = -(tops[..., -1:] + tops[..., -1 - p : -1] @ found[:, None, :, None])
+            own = np.linalg.solve(tops[..., :m], right)
+            for i in range(1, 1 if here.joins is None else own.shape[1]):
+                own[:, i] -= np.linalg.solve(tops[:, i, :, :m], tops[:, i, :, m : 2 * m] @ own[:, i - 1])
+            found = np.concatenate([found, own.reshape(len(own), -1)], axis=1)
+        return np.where(held, moved, found)
 
 
 def with_prior(
@@ -146,17 +161,35 @@ def with_prior(
     return Arrow(R[:, :, :m], np.linalg.qr(np.concatenate([arrow.shared, *below], axis=1), mode="r"), arrow.scores)
 
 
-def eliminated(local: np.ndarray, below: Float[np.ndarray, "members runs local"]) -> tuple[np.ndarray, np.ndarray]:
-    """The rows that give a run's own unknowns in terms of the shared ones, and those that are left for the latter, all runs one after another.
+def eliminated(local: np.ndarray, below: Float[np.ndarray, "members pieces local"], joins: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows that give own unknowns in terms of those of the piece before and the shared ones, and the rows that are left for the latter.
 
-    `below`: the diagonal of the rows that are added.
+    `below`: the diagonal of the rows that are added. The rows that are left stand one after another.
     """
-    members, runs, m, width = local.shape
+    members, pieces, m, width = local.shape
     if not m:
         return local, np.zeros((members, 0, width))
-    added = np.concatenate([below[..., None] * np.eye(m), np.zeros((members, runs, m, width - m))], axis=-1)
-    R = np.linalg.qr(np.concatenate([local, added], axis=2), mode="r")
-    return R[:, :, :m], R[:, :, m:, m:].reshape(members, -1, width - m)
+    added = np.concatenate([below[..., None] * np.eye(m), np.zeros((members, pieces, m, width - m))], axis=-1)
+    rows = np.concatenate([local, added], axis=2)
+    if joins is None:
+        R = np.linalg.qr(rows, mode="r")
+        return R[:, :, :m], R[:, :, m:, m:].reshape(members, -1, width - m)
+    apart = _beside(rows, m)
+    tops, left, carried = np.zeros((members, pieces, m, width + m)), [], apart[:, 0, :0]
+    for i in reversed(range(pieces)):
+        R = np.linalg.qr(np.concatenate([joins[:, i], apart[:, i], carried], axis=1), mode="r")
+        tops[:, i], rest = R[:, :m], R[:, m:, m:]
+        if joins[:, i].any():
+            carried = _beside(rest, m)
+        else:
+            left.append(rest[..., m:])
+            carried = carried[:, :0]
+    return tops, np.concatenate(left, axis=1)
+
+
+def _beside(rows: Float[np.ndarray, "*batch rows width"], m: int) -> Float[np.ndarray, "*batch rows wider"]:
+    """Return the rows with zeros in the columns of the piece before, which come after their first m."""
+    return np.concatenate([rows[..., :m], np.zeros((*rows.shape[:-1], m)), rows[..., m:]], axis=-1)
 
 
 def by_singular_values(shared: np.ndarray, D: np.ndarray, damping: Float[np.ndarray, "members"], cutoff: float) -> Float[np.ndarray, "members shared"]:

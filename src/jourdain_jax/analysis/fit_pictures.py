@@ -10,31 +10,27 @@ from jourdain_jax.analysis.likelihood_profiles import RISE_95, Profile
 from jourdain_jax.calculus.figures import DATA, MODEL, QUIET, figure
 
 _WIDTH, _HEIGHT = 460, 200  # pixels
-_BINS = 60  # of time, at most
 _MOST_ROWS = 40  # unknowns in one figure
 _NARROWEST, _WIDEST = 1e-4, 100.0  # per cent
 _LEAST_ABOVE = 1e-3  # F above its minimum: less is drawn as this
 
 
-def data_and_prediction(caption: str, label: str, one: Prediction, component: int, most: int) -> str:
-    """Draw samples of one component and their prediction; below, errors in sigmas, over a band of two. At most so many samples, evenly chosen."""
-    count = len(one.ts)
-    value, predicted, sigma = (np.asarray(x).reshape(count, -1)[:, component] for x in (one.values, one.prediction, one.sigma))
-    every = -(-count // most)
-    ts, value, predicted, sigma = (x[::every] for x in (one.ts, value, predicted, sigma))
+def data_and_prediction(caption: str, label: str, one: Prediction, component: int) -> str:
+    """Draw samples of one component and their prediction; below, errors in sigmas, over a band of two."""
+    value, predicted, sigma = (np.asarray(x).reshape(len(one.ts), -1)[:, component] for x in (one.values, one.prediction, one.sigma))
 
     def draw(whole) -> None:
         above, below = whole.subplots(2, 1, sharex=True, height_ratios=(5, 2))
-        above.plot(ts, value, ".", color=DATA, ms=3, alpha=0.6)
+        above.plot(one.ts, value, ".", color=DATA, ms=3, alpha=0.6)
         known = np.isfinite(predicted)
-        above.plot(ts[known], predicted[known], color=MODEL, lw=1.2)
+        above.plot(one.ts[known], predicted[known], color=MODEL, lw=1.2)
         below.axhspan(-2, 2, color="#e6e6e6")
         below.axhline(0.0, color=QUIET, lw=0.8)
-        below.plot(ts, (predicted - value) / sigma, ".", color=MODEL, ms=2)
+        below.plot(one.ts, (predicted - value) / sigma, ".", color=MODEL, ms=2)
         above.set_ylabel(label)
         below.set(xlabel="t in s", ylabel="error / sigma")
 
-    return figure(draw, _WIDTH, 270, caption + (f"; every {every}th sample is drawn" if every > 1 else ""))
+    return figure(draw, _WIDTH, 270, caption)
 
 
 def autocorrelation(name: str, found: np.ndarray, limit: float) -> str:
@@ -74,40 +70,21 @@ def interval_widths(fit) -> str:
 
 
 def information_over_time(shares: Informed, run: int) -> str:
-    """Draw what the samples of a run tell of each unknown per second, by channel; the highest bar of each unknown, of all runs, has full height."""
-    edges, _ = _cells(shares.times[run])
-    most = np.max([np.max(_per_second(ts, sum(of.values())), axis=1) for ts, of in zip(shares.times, shares.of_samples, strict=True)], axis=0)
-    found = {channel: _per_second(shares.times[run], told) / most[:, None] for channel, told in shares.of_samples[run].items()}
+    """Draw what the samples of a run tell of each unknown per second, by channel; the highest value of each unknown, of all runs, has full height."""
+    spans = [np.gradient(ts) if len(ts) > 1 else np.ones(1) for ts in shares.times]
+    most = np.max([np.max(sum(of.values()) / span, axis=1) for of, span in zip(shares.of_samples, spans, strict=True)], axis=0)
 
     def draw(whole) -> None:
         rows = whole.subplots(len(shares.labels), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
         for i, (axes, name) in enumerate(zip(rows, shares.labels, strict=True)):
-            base = np.zeros(len(edges) - 1)
-            for k, channel in enumerate(shares.of_channels):
-                if channel in found:
-                    axes.stairs(base + found[channel][i], edges, baseline=base, fill=True, color=f"C{k % 10}", label=channel)
-                    base = base + found[channel][i]
+            told = shares.of_samples[run]
+            axes.stackplot(shares.times[run], *(of[i] / spans[run] / most[i] for of in told.values()), labels=list(told), step="mid")
             axes.set_yticks([0.5], [name if len(name) <= 22 else name[:21] + "…"])
             axes.text(1.01, 0.3, f"{100 * shares.of_runs[i, run]:.0f} %", transform=axes.transAxes, fontsize=8)
         rows[0].legend(fontsize=7, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
         rows[-1].set(xlabel="t in s", ylim=(0.0, 1.05))
 
     return figure(draw, _WIDTH + 90, 24 * len(shares.labels) + 80, f"run {run}: share of what the data tell of each unknown, along time")
-
-
-def _cells(ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return edges of cells of equally many samples, halfway between neighbours, and the first sample of each; the outer ones reach as far beyond."""
-    first = np.arange(0, len(ts), -(-len(ts) // _BINS))
-    if len(ts) == 1:
-        return np.array([ts[0] - 0.5, ts[0] + 0.5]), first
-    halfway = np.concatenate([[1.5 * ts[0] - 0.5 * ts[1]], (ts[1:] + ts[:-1]) / 2, [1.5 * ts[-1] - 0.5 * ts[-2]]])
-    return np.append(halfway[first], halfway[-1]), first
-
-
-def _per_second(ts: np.ndarray, told: np.ndarray) -> np.ndarray:
-    """Return sums over the samples of each cell, by its width; the last axis is that of the samples."""
-    edges, first = _cells(ts)
-    return np.add.reduceat(told, first, axis=-1) / np.diff(edges)
 
 
 def profile(one: Profile, error: float) -> str:

@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jourdain_jax.analysis.experiment import Experiment
-from jourdain_jax.analysis.joined import JoinedArrow
 from jourdain_jax.analysis.layout import Layout, Place
 from jourdain_jax.analysis.levenberg_marquardt import Linearised
 from jourdain_jax.analysis.losses import Loss
@@ -166,20 +165,20 @@ class Piecewise:
         count, pieces, M = local.shape
         joins = np.zeros((count, pieces, self.states + carried.size, 2 * M + self.shared + 1))
         with np.errstate(invalid="ignore"):
-            for i in np.flatnonzero(self.follows) - 1:
-                end, join = self.lanes.ends[:, i], joins[:, i]
-                join[:, : self.states, :M], join[:, : self.states, 2 * M : -1] = end[..., :M], end[..., M:-1]
-                join[:, : self.states, -1] = end[..., -1] - local[:, i + 1, m:]
-                join[:, range(self.states), range(M + m, 2 * M)] = -1.0
+            for i in np.flatnonzero(self.follows):
+                end, join = self.lanes.ends[:, i - 1], joins[:, i]
+                join[:, : self.states, M:-1] = end[..., :-1]
+                join[:, : self.states, -1] = end[..., -1] - local[:, i, m:]
+                join[:, range(self.states), range(m, M)] = -1.0
                 rows = range(self.states, joins.shape[2])
-                join[:, rows, carried], join[:, rows, M + carried], join[:, rows, -1] = 1.0, -1.0, local[:, i, carried] - local[:, i + 1, carried]
+                join[:, rows, carried], join[:, rows, M + carried], join[:, rows, -1] = -1.0, 1.0, local[:, i - 1, carried] - local[:, i, carried]
             sizes = np.concatenate([self.node_sizes, self.unknowns.least[self.shared :][carried]]) if carried.size else self.node_sizes
             joins = joins / (width * sizes)[:, None]
         joins[~np.isfinite(at.cost)] = 0.0
         finite = np.isfinite(joins.sum(axis=(1, 2, 3)))
         joins[~finite] = 0.0
         cost = np.where(finite, at.cost + 0.5 * np.sum(joins[..., -1] ** 2, axis=(1, 2)), np.inf)
-        return replace(at, cost=cost, arrow=JoinedArrow(at.arrow, joins, self.follows))
+        return replace(at, cost=cost, arrow=replace(at.arrow, joins=joins))
 
     # Condensed. -----------------------------------------------------------------------------------------------------
 

@@ -3,7 +3,7 @@
     g(t, q) = 0,   phi(t, q, u) = 0,   dy/dt = 0,   qdot_j = 0        y: the privileged speeds;  j: the coordinates not ignorable
 
 Whether what was found is steady is then judged without that list, by dy/dt and d2y/dt2 along the motion.
-Levenberg-Marquardt from the guess (J. Nocedal and S. Wright, Numerical Optimization, 2006, section 10.3).
+Levenberg-Marquardt from the guess (`calculus/damped`).
 """
 
 from collections.abc import Mapping
@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.analysis.tangent import flow_of, privileged_speeds
 from jourdain_jax.build.domain import coordinate_bounds
 from jourdain_jax.build.probed_on_graph import coordinates_on_rows
+from jourdain_jax.calculus.damped import damped_search
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
 from jourdain_jax.calculus.reals import Number, Numbers, described
 from jourdain_jax.dynamics.reduced import ignorable_coordinates
@@ -31,7 +32,7 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 _FINAL_STEPS = 3
-_FARTHEST = 0.5  # of the width of the domain: how far a coordinate moves in one step of the search
+_SPEEDS = 10.0  # size of a speed, SI units: how far it moves in some steps of the search
 
 
 class SteadyMotion(Printed, eqx.Module):
@@ -142,16 +143,6 @@ class _Problem(eqx.Module):
         return now.udot[y], slope(jnp.ones_like(self.t), now.qdot, now.udot).udot[y]
 
 
-class _Search(eqx.Module):
-    """The best point so far, and the next to try."""
-
-    trial: Float[Array, "unknowns"]
-    best: Float[Array, "unknowns"]
-    R: Float[Array, "residuals"]  # at the best point, and its Jacobian
-    J: Float[Array, "residuals unknowns"]
-    damping: Float[Array, ""]
-
-
 @partial(quickly_compiled, options=RUN_SELDOM)  # of a bicycle in 6.5 s of processor time, not in 24; run in 0.11 s, not in 0.09
 def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], max_steps: int) -> SteadyMotion:
     z = jnp.concatenate([q, u])
@@ -168,35 +159,13 @@ def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], max_steps: in
 def _root(problem: _Problem, z: Float[Array, "unknowns"], free: Bool[Array, "unknowns"], max_steps: int) -> Float[Array, "unknowns"]:
     """The root near z: a search without derivative, then steps `z <- z - J+ R(z)` with the J found, which carry one order of derivative each."""
     still, guess, movable = jax.lax.stop_gradient((problem, z, free))
-    found = jax.lax.stop_gradient(_search(still, guess, movable, max_steps))
-    inverse = pseudo_inverse(found.J, _round_off_root(z.dtype))
-    root = jax.lax.scan(lambda z, _: (z - jnp.where(free, inverse @ problem(z), 0.0), None), jnp.where(free, found.best, z), length=_FINAL_STEPS)
-    return root[0]
-
-
-def _search(problem: _Problem, z: Float[Array, "unknowns"], free: Bool[Array, "unknowns"], max_steps: int) -> _Search:
-    """Levenberg-Marquardt: `min |J d + R|^2 + damping^2 |d|^2`, of minimum norm where many steady motions are near.
-
-    That of optimistix takes 1.5 (a disc) and 1.8 times as long to compile (a bicycle, on which it finds 19 of 20 steady turns and this one all).
-    """
-
-    def step(search: _Search, _):
-        R, J = problem(search.trial), jnp.where(free, jax.jacfwd(problem)(search.trial), 0.0)
-        better = R @ R < search.R @ search.R
-        best, R, J = (jnp.where(better, a, b) for a, b in ((search.trial, search.best), (R, search.R), (J, search.J)))
-        damping = jnp.clip(jnp.where(better, search.damping / 5, search.damping * 3), 1e-8, 1e8)
-        system = jnp.concatenate([J, damping * jnp.eye(z.shape[0], dtype=z.dtype)])
-        d = -pseudo_inverse(system, _round_off_root(z.dtype)) @ jnp.concatenate([R, jnp.zeros_like(z)])
-        d = jnp.where(free, d, 0.0)
-        farthest = jnp.max(jnp.abs(d[: width.shape[0]]) / width, initial=0.0)
-        return _Search(best + d * jnp.minimum(1.0, _FARTHEST / jnp.maximum(farthest, jnp.finfo(z.dtype).tiny)), best, R, J, damping), None
-
     low, high = coordinate_bounds(problem.scene)
-    width = jnp.asarray(np.where(high > low, high - low, 1.0), z.dtype)
-
-    size = jax.eval_shape(problem, z).shape[0]
-    start = _Search(z, z, jnp.full(size, jnp.inf, z.dtype), jnp.zeros((size, z.shape[0]), z.dtype), jnp.full((), 1e-3, z.dtype))
-    return jax.lax.scan(step, start, length=max_steps)[0]
+    sizes = np.concatenate([np.where(high > low, high - low, 1.0), np.full(z.shape[0] - low.size, _SPEEDS)])
+    size = jnp.where(movable, jnp.asarray(sizes, z.dtype), 0.0)
+    found = damped_search(lambda z: (still(z), jax.jacfwd(still)(z)), guess, size, float(np.finfo(z.dtype).eps), most_steps=max_steps)
+    found = jax.lax.stop_gradient(found)
+    inverse = size[:, None] * pseudo_inverse(found.J, _round_off_root(z.dtype))
+    return jax.lax.scan(lambda z, _: (z - inverse @ problem(z), None), jnp.where(free, found.best, z), length=_FINAL_STEPS)[0]
 
 
 def _round_off_root(dtype) -> float:

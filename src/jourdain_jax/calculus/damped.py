@@ -27,7 +27,9 @@ class Nearest(eqx.Module):
     left: Float[Array, ""]  # largest of the rows
 
 
-class _Search(eqx.Module):
+class Search(eqx.Module):
+    """The best point so far, and the next to try."""
+
     trial: Float[Array, "unknowns"]
     best: Float[Array, "unknowns"]
     f: Float[Array, "rows"]  # at the best, and their slopes
@@ -36,9 +38,17 @@ class _Search(eqx.Module):
     steps: Int[Array, ""]
     going: Bool[Array, ""]
 
+    @property
+    def left(self) -> Float[Array, ""]:
+        """The largest of the rows at the best point."""
+        left = jnp.max(jnp.abs(self.f), initial=0.0)
+        return jnp.where(jnp.isfinite(left), left, jnp.inf)
 
-def damped_root(rows: Callable, guess: Float[Array, "unknowns"], size: Float[Array, "unknowns"], tolerance: float, low=-np.inf, high=np.inf) -> Nearest:
-    """x near `guess` from `low` to `high` at which no row exceeds the `tolerance`, or where they are smallest.
+
+def damped_search(
+    rows: Callable, guess: Float[Array, "unknowns"], size: Float[Array, "unknowns"], tolerance: float, low=-np.inf, high=np.inf, most_steps=MOST_STEPS
+) -> Search:
+    """Search for x near `guess` from `low` to `high` at which no row exceeds the `tolerance`; it ends where they are smallest. J is per size of an unknown.
 
     `rows`: x -> f and J. `size`: of each unknown, by which steps are measured; zero for one that is held. Rows should be of order one where unknowns change
     by their size.
@@ -48,28 +58,26 @@ def damped_root(rows: Callable, guess: Float[Array, "unknowns"], size: Float[Arr
         f, J = rows(x)
         return f, J * size  # per unit of size
 
-    def once(search: _Search) -> _Search:
+    def once(search: Search) -> Search:
         f, J = look(search.trial)
         better = (f @ f < search.f @ search.f) & jnp.all(jnp.isfinite(J))  # never where it is not a number
         best, f, J = (jnp.where(better, a, b) for a, b in ((search.trial, search.best), (f, search.f), (J, search.J)))
         damping = jnp.clip(jnp.where(better, search.damping / 6, search.damping * 5), 1e-14, 1e8)
         step = -J.T @ jnp.linalg.solve(J @ J.T + damping * jnp.eye(f.shape[0], dtype=f.dtype), f)
         step = step * jnp.minimum(1.0, _FARTHEST / jnp.maximum(jnp.max(jnp.abs(step), initial=0.0), jnp.finfo(f.dtype).tiny))
-        going = (jnp.max(jnp.abs(f), initial=0.0) > tolerance) & (damping < _GIVEN_UP) & (search.steps < MOST_STEPS) & jnp.all(jnp.isfinite(f))
-        return _Search(jnp.clip(best + size * step, low, high), best, f, J, damping, search.steps + 1, going)
+        going = (jnp.max(jnp.abs(f), initial=0.0) > tolerance) & (damping < _GIVEN_UP) & (search.steps < most_steps) & jnp.all(jnp.isfinite(f))
+        return Search(jnp.clip(best + size * step, low, high), best, f, J, damping, search.steps + 1, going)
 
     f, J = jax.eval_shape(look, guess)
     unknown = jnp.full(f.shape, jnp.inf, f.dtype), jnp.zeros(J.shape, J.dtype)
-    start = _Search(guess, guess, *unknown, jnp.full((), 6e-2, f.dtype), jnp.zeros((), jnp.int32), jnp.array(True))
-    found = jax.lax.while_loop(lambda search: search.going, once, start)
-    left = jnp.max(jnp.abs(found.f), initial=0.0)
-    return Nearest(found.best, jnp.where(jnp.isfinite(left), left, jnp.inf))
+    start = Search(guess, guess, *unknown, jnp.full((), 6e-2, f.dtype), jnp.zeros((), jnp.int32), jnp.array(True))
+    return jax.lax.while_loop(lambda search: search.going, once, start)
 
 
 def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, tolerance: float, good: float, *bounds) -> tuple[Nearest, Int[Array, ""]]:
     """The root that is found from the first of the `guesses` that leads to one, and its number; where none does, what comes nearest.
 
-    A root leaves at most `good`; all else, also the `bounds`, is as for `damped_root`.
+    A root leaves at most `good`; all else, also the `bounds`, is as for `damped_search`.
     """
     count = guesses.shape[0]
     block = max(1, min(count, MOST_ENTRIES // max(1, jax.eval_shape(rows, guesses[0])[1].size)))
@@ -78,10 +86,11 @@ def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, 
 
     def next_block(carried):
         k, best, number = carried
-        found = jax.vmap(lambda guess: damped_root(rows, guess, size, tolerance, *bounds))(guesses[jnp.asarray(places)[k]])
-        which = jnp.where(jnp.any(found.left <= good), jnp.argmax(found.left <= good), jnp.argmin(found.left)).astype(jnp.int32)
-        better = (k == 0) | (found.left[which] < best.left)
-        chosen = (Nearest(found.x[which], found.left[which]), jnp.asarray(places, jnp.int32)[k, which])
+        found = jax.vmap(lambda guess: damped_search(rows, guess, size, tolerance, *bounds))(guesses[jnp.asarray(places)[k]])
+        left = jax.vmap(lambda search: search.left)(found)
+        which = jnp.where(jnp.any(left <= good), jnp.argmax(left <= good), jnp.argmin(left)).astype(jnp.int32)
+        better = (k == 0) | (left[which] < best.left)
+        chosen = (Nearest(found.best[which], left[which]), jnp.asarray(places, jnp.int32)[k, which])
         return k + 1, *jax.tree.map(lambda new, old: jnp.where(better, new, old), chosen, (best, number))
 
     nothing = Nearest(guesses[0], jnp.full((), jnp.inf, guesses.dtype)), jnp.zeros((), jnp.int32)
