@@ -1,4 +1,4 @@
-"""Stop events of a scene that fitted motions go through, though samples come later (a disc that has fallen), or that were observed and are not met."""
+"""What fitted motions pass on their way: stop events before samples (a disc that has fallen), or none where one was observed, and jumps of loads."""
 
 from functools import partial
 
@@ -8,19 +8,30 @@ from jaxtyping import Float
 from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.analysis.runs import run_of
 from jourdain_jax.analysis.stop_events import LATEST, StopEvent
+from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.simulate import simulate
+from jourdain_jax.motion.vector_fields.choice import vector_field
+from jourdain_jax.motion.watched import moving_jumps
 from jourdain_jax.scene.scene import Scene
 
 
 def events_met(problem: Problem, theta: Float[np.ndarray, "places"], simulation: dict) -> tuple[str, ...]:
-    """One sentence for each run whose motion, with these unknowns, meets an event before a sample that counts, or not the one that was observed."""
-    if type(problem.scene).events is Scene.events:
-        return ()
+    """One sentence for each run whose motion, with these unknowns, meets an event before a sample that counts, or not the one that was observed, or crosses
+    a jump of its loads.
+    """
     shared, local = problem.unknowns.split(theta)
     found, layout = [], problem.unknowns.layout
     for index, run in enumerate(problem.runs):
         one = run_of(run).at(layout, shared, local[index])
-        motion = partial(one.motion, layout.scene(problem.scene, shared), simulate, **simulation)
+        scene = layout.scene(problem.scene, shared)
+        motion = partial(one.motion, scene, simulate, **simulation)
+        if moving_jumps(vector_field(scene, work=False), scene, as_inputs(scene, None), True) and motion(one.ts, events=False).crossings:
+            found.append(
+                f"the motion of run {index} crosses relations (`<`, `sign`, ...) at which loads jump: the slopes that are fitted by leave out how the times of "
+                "jumps move, and so do standard errors; let loads change within a short time or length"
+            )
+        if type(scene).events is Scene.events:
+            continue
         if run.ended_by:
             if np.any(one.weights[run.ended_by] > 0) and not np.isfinite(one.stops(StopEvent(run.ended_by), run.ended_by, motion)):
                 found.append(f"the motion of run {index} does not meet `{run.ended_by}` before {LATEST:g} times the observed time; start nearer")

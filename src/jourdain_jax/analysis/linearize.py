@@ -30,10 +30,10 @@ from jourdain_jax.analysis.tangent import (
     privileged_at,
     privileged_speeds,
 )
-from jourdain_jax.build.load_jumps import loads_without_slope
 from jourdain_jax.build.structure import WELL_CONDITIONED
 from jourdain_jax.calculus.reals import Numbers, is_traced
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
+from jourdain_jax.lowering.kinks import bent_load
 from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.quick_compilation import RUN_SELDOM, quickly_compiled
 from jourdain_jax.motion.sensitivity import SensitivityWarning
@@ -158,7 +158,7 @@ def linearize(
 
 def _warn_of_loads(scene: Scene, state: State, f) -> None:
     """A warning where loads have no derivative; what is traced is not looked at."""
-    if not is_traced((scene, state, f)) and (rough := loads_without_slope(scene, state.t, state.q, state.u, f)):
+    if not is_traced((scene, state, f)) and (rough := bent_load(scene, state.t, state.q, state.u, f)):
         text = (
             f"the linearization of `{type(scene).__name__}` leaves out that {rough} has no derivative at this state: it has a kink or jumps there, as dry "
             "friction does at rest. Linearize at a state beside it, or let the load change within a short range, as by `jnp.tanh`"

@@ -1,8 +1,7 @@
 """Taps: identities that call a Python function with the derivatives that pass through them.
 
 `tap_cotangents(values, look)` hands `look` the cotangents in reverse mode. `tap_tangents(values, look)` hands it the tangents in forward mode, with a first
-axis of directions. Both act outside of `jit` only, where derivatives are numbers: no compiled program calls back to Python. `tap_differentiation(values, tell)`
-calls `tell` where a derivative is traced, inside `jit`, too.
+axis of directions. Both act outside of `jit` only, where derivatives are numbers: no compiled program calls back to Python.
 """
 
 from collections.abc import Callable
@@ -13,7 +12,7 @@ from jax.interpreters import ad, batching
 
 from jourdain_jax.calculus.identities import identity
 
-_shown_p, _forwards_p, _tangents_p, _told_p = (identity(f"jourdain_shown_{name}") for name in ("backwards", "forwards", "tangents", "told"))
+_shown_p, _forwards_p, _tangents_p = (identity(f"jourdain_shown_{name}") for name in ("backwards", "forwards", "tangents"))
 
 
 def _transposed(cotangents, *values, look: Callable):
@@ -50,14 +49,6 @@ ad.deflinear2(_tangents_p, lambda cotangents, *values, look: [ad.instantiate_zer
 ad.primitive_jvps[_tangents_p] = lambda primals, tangents, *, look: (_tangents_p.bind(*primals, look=look), list(tangents))
 
 
-def _told(primals, tangents, *, tell: Callable):
-    tell([type(tangent) is not ad.Zero for tangent in tangents])
-    return list(primals), list(tangents)  # once: derivatives of derivatives do not meet it again
-
-
-ad.primitive_jvps[_told_p] = _told
-
-
 def tap_tangents(values: tuple, look: Callable) -> tuple:
     """`values`, a tuple of arrays; `look` is called with the list of their tangents, with a first axis of directions, where these are numbers."""
     return tuple(_forwards_p.bind(*values, look=look))
@@ -66,8 +57,3 @@ def tap_tangents(values: tuple, look: Callable) -> tuple:
 def tap_cotangents(values: tuple, look: Callable) -> tuple:
     """`values`, a tuple of arrays; `look` is called with the list of their cotangents where these are numbers."""
     return tuple(_shown_p.bind(*values, look=look))
-
-
-def tap_differentiation(values: list, tell: Callable[[list[bool]], None]) -> list:
-    """`values`, arrays; `tell` is called with which of them vary where a derivative with respect to any is traced, in either mode."""
-    return _told_p.bind(*values, tell=tell)

@@ -25,7 +25,7 @@ from jourdain_jax.lowering.ignorable import ignorable
 from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.lowered import Lowered, NotLowered, Stage
 from jourdain_jax.lowering.massless import may_be_massless
-from jourdain_jax.lowering.relations import relations
+from jourdain_jax.lowering.relations import jumps, relations
 from jourdain_jax.native import ffi
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, Unsupported
@@ -58,6 +58,7 @@ _NODES = (
     "energies",
     "relations",
     "event_relations",
+    "jumps",
     "projected_q",
     "projected_u",
     "fixed",
@@ -247,7 +248,9 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
     rest = iter(outputs)
     nodes = {name: tuple(islice(rest, len(group))) for name, group in groups.items()}
     (power,) = nodes.pop("power")
-    nodes["relations"], nodes["event_relations"] = watched = relations(graph, [*nodes["qdot"], *nodes["ydot"]], nodes["events"], probes)
+    rates = [*nodes["qdot"], *nodes["ydot"]]
+    nodes["relations"], nodes["event_relations"] = watched = relations(graph, rates, nodes["events"], probes)
+    nodes["jumps"] = jumps(graph, nodes["relations"], rates, probes)
     sizes = {graph.input(f"usual_pivot_{k}", False): n for k, n in enumerate(nodes["pivots"])}
     stands_for = best.usual | sizes
     names = scene.coordinate_names.entries

@@ -63,6 +63,7 @@ class Lowered:
     energies: tuple[int, ...]  # kinetic and potential
     relations: tuple[int, ...]  # numbers whose signs decide between branches of the rates (`lowering/relations.py`)
     event_relations: tuple[int, ...]  # and those that do so in stop events besides
+    jumps: tuple[int, ...]  # those of the former at whose zeros rates may jump
     projected_q: tuple[int, ...]  # coordinates put back onto norms and geometric rows, one step of Gauss-Newton
     projected_u: tuple[int, ...]  # all speeds put back onto the rows; none where dependent speeds are eliminated
     by_partition: bool  # all speeds are in the state, but the accelerations come from privileged ones

@@ -5,9 +5,11 @@
 A relation counts where a rate, or its slope, is another one on either side of where that number vanishes, or where a stop event may have a dip there;
 with it count the relations that its number is made of. Where its branches agree, as those of a guard do, it does not. Both branches are evaluated on
 either side of such places, which are found between the states that are probed; a relation that vanishes between none of these counts.
+
+A rate jumps where such a number vanishes if it changes as much over a way that is much shorter, and bends there if it does not.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -17,7 +19,7 @@ from jourdain_jax.program.graph import Graph
 MOST_WATCHED = 32  # of a scene
 COMPARED = {"lt": (False, True), "le": (False, True), "gt": (True, False), "ge": (True, False)}  # the truth where a > b, and where a < b
 PLACES, HALVINGS = 6, 40  # for each relation, between probes
-ASIDE, AGREE = 1e-5, 1e-7  # of the way between two probes; of the size of a rate
+ASIDE, CLOSER, AGREE = 1e-5, 1e-9, 1e-7  # of the way between two probes; of the size of a rate
 _WHOLE = {"floor": "sin", "ceil": "sin", "round": "cos", "rem": "sin"}
 
 
@@ -64,6 +66,13 @@ def _branch(graph: Graph, node: int, above: bool) -> int:
     return args[0] if above == (op in ("abs", "max")) else graph.neg(args[0]) if op == "abs" else args[1]
 
 
+def branches(graph: Graph, nodes: list[tuple[int, int]], outputs: Iterable[int]) -> tuple[list[int], list[int]]:
+    """The outputs with these relations (as `switches` has them) taken as they are where their number is positive, and negative."""
+    outputs = list(outputs)
+    above, below = (graph.substituted(outputs, {n: _branch(graph, n, side == turned) for n, turned in nodes}) for side in (1, -1))
+    return above, below
+
+
 def relations(graph: Graph, rates: Sequence[int], events: Sequence[int], probes: Probes) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Numbers whose signs are to be watched: of the rates, and those of stop events besides."""
     found: list[list[int]] = []
@@ -77,10 +86,10 @@ def relations(graph: Graph, rates: Sequence[int], events: Sequence[int], probes:
 
 def _counts(graph: Graph, number: int, nodes: list[tuple[int, int]], outputs: Sequence[int], counts, probes: Probes) -> bool:
     """Whether the branches of relations matter on either side of where their number vanishes."""
-    beside = [here for place in _places(number, probes) for here in place]
+    beside = [here for place in _places(number, probes) for here in place(ASIDE)]
     if not beside:
         return True
-    above, below = (graph.substituted(outputs, {n: _branch(graph, n, side == turned) for n, turned in nodes}) for side in (1, -1))
+    above, below = branches(graph, nodes, outputs)
     size = np.nanmax(np.abs(probes(outputs)), axis=1, initial=0.0)
     return any(counts(here(outputs)[:, 0], here(above)[:, 0], here(below)[:, 0], AGREE * size) for here in beside)
 
@@ -94,8 +103,23 @@ def _may_dip(values, above, below, least) -> bool:
     return not np.all(values <= np.minimum(above, below) + least)
 
 
-def _places(number: int, probes: Probes) -> Iterator[tuple[Probes, Probes]]:
-    """Pairs of states on either side of a place where a number vanishes."""
+def jumps(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: Probes) -> tuple[int, ...]:
+    """Those of the numbers at whose zeros, between probes, an output jumps."""
+    size = np.nanmax(np.abs(probes(outputs)), axis=1, initial=0.0)
+
+    def change(pair: tuple[Probes, Probes]) -> np.ndarray:
+        before, behind = (here(outputs)[:, 0] for here in pair)
+        return np.abs(behind - before)
+
+    def jumps_at(number: int) -> bool:
+        near = [(change(place(CLOSER)), change(place(ASIDE))) for place in _places(number, probes)]
+        return any(np.any((closer > AGREE * size) & (closer > 0.5 * wide)) for closer, wide in near)
+
+    return tuple(n for n in numbers if jumps_at(n))
+
+
+def _places(number: int, probes: Probes) -> Iterator[Callable[[float], tuple[Probes, Probes]]]:
+    """Places where a number vanishes, as functions: states on either side of it, this far away."""
     values = probes([number])[0]
     positive, negative = np.flatnonzero(values > 0), np.flatnonzero(values < 0)
     for i, j in list(zip(positive, negative, strict=False))[:PLACES]:
@@ -108,4 +132,4 @@ def _places(number: int, probes: Probes) -> Iterator[tuple[Probes, Probes]]:
         for _ in range(HALVINGS):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if at(middle)([number])[0, 0] > 0 else (low, middle)
-        yield at(low - ASIDE), at(high + ASIDE)
+        yield lambda aside, at=at, low=low, high=high: (at(low - aside), at(high + aside))

@@ -1,4 +1,4 @@
-"""Warnings about derivatives through motions that amplify errors, by what differentiation finds out anyway.
+"""Warnings about derivatives through motions that amplify errors, by what differentiation finds out anyway, or that crossed a jump of their loads.
 
 A value L of a motion has the cotangents g = dL/dy at the states it looks at and g_0 = dL/dy_0 at the start. With s = atol + rtol |y|, what the step-size
 control lets pass at one state,
@@ -10,6 +10,12 @@ Forward mode has tangents d instead, of the states saved and of the start, and s
 
     amplification = max |d_1|/s / max |d_0|/s                  where nothing but the start depends on what is varied
                     (max |d_1|/s / max |d_middle|/s)^2         otherwise, and the smaller of both where the start does, too
+
+Where rates are f_1 before and f_2 after the time s(p) of a jump,
+
+    dy/dp = (what JAX finds) + (f_1 - f_2) ds/dp
+
+and relations that a motion crossed are counted by its steps (`motion/integrators/crossings.py`).
 """
 
 import warnings
@@ -23,6 +29,9 @@ from jourdain_jax.calculus.cotangents import tap_cotangents, tap_tangents
 from jourdain_jax.calculus.reals import is_traced, nothing_is_traced
 from jourdain_jax.motion.setup import Setup
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.motion.vector_fields.field import VectorField
+from jourdain_jax.motion.watched import moving_jumps
+from jourdain_jax.scene.tracebacks import users_level
 
 LARGEST_ERROR = 0.05  # relative, of a derivative, beyond which a warning is given
 
@@ -129,12 +138,29 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory | None:
     seen = _known((*parts, motion.accepted))
     if seen is None:
         return motion
+    if is_traced((setup.scene, setup.start, setup.inputs, setup.t0)):
+        warn_of_jumps(setup.field, motion, is_traced(setup.scene))
     for shown, size in sizes:
         parts = shown(parts, size.ends(seen[:-1], int(seen[-1])))
     return eqx.tree_at(lambda m: (m.q, m.u, m.q_end, m.u_end), motion, parts)
 
 
-def _known(values) -> tuple | None:
+def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -> None:
+    """A warning where one of the `motions`, which are differentiated, crossed relations at which rates jump; nothing where that is not known."""
+    crossings = _known(motions.crossings)
+    if crossings is None or not np.any(crossings):
+        return
+    names = jax.tree.map(lambda x: x[0], motions.scene) if motions.q.ndim > 2 else motions.scene
+    if moving_jumps(field, names, motions.inputs, scene_varies):
+        text = (
+            f"a motion of `{type(motions.scene).__name__}` that is differentiated crossed relations (`<`, `where`, `sign`, `floor`, ...) at which loads jump: "
+            "its derivatives leave out how the time of the jump moves. Let loads change within a short time or length, as by `jnp.tanh`, or end the motion "
+            "there by an event and start another; the motion itself is right"
+        )
+        warnings.warn(text, SensitivityWarning, stacklevel=users_level())
+
+
+def _known(values):
     """The numbers of values that are being differentiated outside of `jit`; None where they have none."""
     bare = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, values)
-    return None if is_traced(bare) else tuple(np.asarray(x) for x in bare)
+    return None if is_traced(bare) else jax.tree.map(np.asarray, bare)

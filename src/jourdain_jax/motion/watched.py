@@ -2,13 +2,15 @@
 
 from collections.abc import Callable
 from functools import partial
+from itertools import compress
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.build.load_jumps import loads_may_jump
+from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.lowering.kinks import loads_have_relations, loads_may_jump
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.lowering.relations import MOST_WATCHED
 from jourdain_jax.motion.input_programs import FunctionOfTime
@@ -17,6 +19,8 @@ from jourdain_jax.motion.native.functions_of_time import numbers_of
 from jourdain_jax.motion.native.native_motion import driven
 from jourdain_jax.motion.setup import Setup
 from jourdain_jax.motion.vector_fields.field import VectorField
+from jourdain_jax.program.analyticity import depend_on
+from jourdain_jax.scene.scene import Scene
 
 
 def watched(field: VectorField, inputs: Inputs, has_events: bool) -> tuple[Callable | None, int]:
@@ -31,11 +35,26 @@ def watched(field: VectorField, inputs: Inputs, has_events: bool) -> tuple[Calla
 def reason_against_watching(setup: Setup) -> str:
     """Why no step watches the relations that the loads of a scene, or its stop events, have; empty where one does, or they have none."""
     if setup.field.lowered is None:
-        return "the scene has no scalar program" if any(loads_may_jump(setup.scene)) else ""
+        return "the scene has no scalar program" if loads_have_relations(setup.scene) else ""
     count = len(_relations(setup.field.lowered, setup.inputs, bool(setup.integrator.event_names))[1])
     if not setup.integrator.watches:
         return "solvers of diffrax do not" if count else ""
     return f"they are {count}, more than {MOST_WATCHED}" if count > MOST_WATCHED else ""
+
+
+def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies: bool) -> bool:
+    """Whether rates may jump at a time that moves with the state or with what is differentiated: parameters where the `scene_varies`, and numbers of inputs."""
+    if field.lowered is None:
+        return loads_may_jump(scene)
+    program, _ = _relations(field.lowered, inputs, False)
+    if not program.jumps:
+        return False
+    lowered = [isinstance(channel, FunctionOfTime) and program is not field.lowered for channel in inputs.channels]
+    numbers = [varies for channel in compress(inputs.channels, lowered) for varies in numbers_of(jax.tree.map(is_traced, channel))]
+    others = [is_traced(channel) for channel, is_lowered in zip(inputs.channels, lowered, strict=True) if not is_lowered]
+    count = len(program.traced.q) + len(program.independent)
+    varies = [*[scene_varies] * len(field.lowered.fixed), *numbers, False, *[True] * count, *others]
+    return any(depend_on(program.graph, program.jumps, compress(program.variables, varies)))
 
 
 def _relations(program: Lowered, inputs: Inputs, has_events: bool) -> tuple[Lowered, tuple[int, ...]]:

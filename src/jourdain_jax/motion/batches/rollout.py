@@ -24,6 +24,7 @@ from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.retries import OUT_OF_STEPS, lost_codes, mark_retried, next_retry, retry_options
+from jourdain_jax.motion.sensitivity import warn_of_jumps
 from jourdain_jax.motion.setup import TOLERANCE
 from jourdain_jax.motion.simulate import default_solver, set_up, warn_float32
 from jourdain_jax.motion.start import State
@@ -188,7 +189,9 @@ def rollout(
     options["inputs"] = as_inputs(scene, options.get("inputs"))
     _check_times_of_lanes(scene, starts, options)
     if is_traced((scene, fixed, varied, parameters, options)):
-        return Rollout(_run_lanes(scene, fixed, _with_arrays(options), varied, parameters))  # being differentiated or batched: one piece, no host loop
+        lanes = _run_lanes(scene, fixed, _with_arrays(options), varied, parameters)  # being differentiated or batched: one piece, no host loop
+        warn_of_jumps(_form(scene, options), lanes, is_traced((scene, parameters)))
+        return Rollout(lanes)
 
     def run(options: dict, index) -> Trajectory:
         return _run_lanes(scene, fixed, _with_arrays(options), *jax.tree.map(lambda x: x[index], (varied, parameters)))

@@ -14,13 +14,15 @@ import numpy as np
 
 from jourdain_jax.build.trace import Variables
 from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.lowering.relations import switches
+from jourdain_jax.lowering.relations import jumps, switches
 from jourdain_jax.motion.input_programs import FunctionOfTime, TimeProgram
+from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import ARRAYS, Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 
 MOST_NUMBERS = 200  # in a function of time; of a long table each is a row of a lane, and `jj.Sampled` looks up in it
 MOST_KEPT = 64
+STATES = 64  # at which it is seen whether functions jump
 
 
 @lru_cache(maxsize=MOST_KEPT)
@@ -47,6 +49,8 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
     outputs = [*program.qdot, *program.ydot, *power, *program.pivots, *program.directions, *program.guards, *program.events]
     outputs += [*program.projected_q, *program.projected_u, *program.relations, *program.event_relations]
     of_functions = [new[n] for n in program.traced.inputs.tolist() if n in new]
+    by_functions = switches(graph, of_functions)
+    jumping = jumps(graph, by_functions, of_functions, _random(graph, [*by_functions, *of_functions]))
     new = graph.copied(outputs, program.graph, new)
 
     def on_it(nodes: Iterable[int]) -> tuple[int, ...]:
@@ -68,8 +72,9 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
         directions=on_it(program.directions),
         guards=on_it(program.guards),
         events=on_it(program.events),
-        relations=tuple(dict.fromkeys([*on_it(program.relations), *switches(graph, of_functions)])),
+        relations=tuple(dict.fromkeys([*on_it(program.relations), *by_functions])),
         event_relations=on_it(program.event_relations),
+        jumps=(*on_it(program.jumps), *jumping),
         projected_q=on_it(program.projected_q),
         projected_u=on_it(program.projected_u),
         z=(),  # what is seen of a motion is evaluated with the values of inputs
@@ -77,6 +82,12 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
         usual={},
         states={},
     )
+
+
+def _random(graph: Graph, nodes: Iterable[int]) -> Probes:
+    """Any times and any numbers in functions."""
+    generator = np.random.default_rng(11)
+    return Probes(graph, {str(graph.value[n]): generator.uniform(-1.0, 3.0, STATES) for n in graph.reachable(nodes) if graph.op[n] == "input"})
 
 
 def numbers_of(channel: FunctionOfTime) -> list:

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.build.load_jumps import loads_without_slope
 from jourdain_jax.build.plausibility import known_faults_at
 from jourdain_jax.build.structure import usual_rows
 from jourdain_jax.calculus.nan_where import nan_where
@@ -16,6 +15,7 @@ from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.listed import names_of_bodies
+from jourdain_jax.lowering.kinks import bent_load
 from jourdain_jax.motion.inputs import inputs_at
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.start import State, consistent
@@ -147,7 +147,7 @@ class Trajectory(Record):
         if code == results.BAD_PARAMETER:
             return f"{text} ({', '.join(self.faults)}); check where it was computed"
         if code in (results.MAX_STEPS, results.SHRANK, results.STEP_TOO_SMALL, results.STIFF):
-            jumping = loads_without_slope(self.scene, self.t_end, self.q_end, self.u_end, inputs_at(self.inputs, self.t_end))
+            jumping = bent_load(self.scene, self.t_end, self.q_end, self.u_end, inputs_at(self.inputs, self.t_end))
             return text + f"; {jumping} jumps, or has a kink, at the last state: let it change within a short range, as by `jnp.tanh`" * bool(jumping)
         return f"{text} `{self.event_names[int(self.event)]}`" if code == results.EVENT else text
 
