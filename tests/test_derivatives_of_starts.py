@@ -14,8 +14,6 @@ from jax.flatten_util import ravel_pytree
 import jourdain_jax as jj
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.least_change import least_change
-from jourdain_jax.motion.arguments import as_state
-from jourdain_jax.motion.start import put_on_rows
 
 STEP = 2e-3
 
@@ -27,7 +25,7 @@ def _slope(function, s: float = 0.0) -> np.ndarray:
     return (16 * D[1] - D[0]) / 15
 
 
-def _along(scene: jj.Scene, held: tuple[str, ...], off: float, native: bool):
+def _along(scene: jj.Scene, held: tuple[str, ...], off: float):
     """What is put onto the rows as a function of one number, on which parameters, time, coordinates and speeds depend."""
     generator = np.random.default_rng(2)
     _, q, u = jj.sample_states(scene, 1)
@@ -38,24 +36,23 @@ def _along(scene: jj.Scene, held: tuple[str, ...], off: float, native: bool):
 
     def put(s):
         here, t, q, u = restored(numbers + s * direction)
-        state = put_on_rows(here, t, q, u, jnp.full(len(scene.inputs), 0.3), held=held, native=native)
+        state = jj.consistent(here, t, q, u, jnp.full(len(scene.inputs), 0.3), held=held)
         return jnp.concatenate([state.q, state.u])
 
     return put
 
 
 @pytest.mark.parametrize(
-    ("scene", "held", "off", "native"),
+    ("scene", "held", "off"),
     [
-        (jj.models.DoublePendulumRods(), ("x1", "x2"), 0.02, True),
-        (linkages.Parallelogram(), (), 1e-2, True),
-        (small_scenes.BeadOnTurningWire(), (), 0.1, True),
-        (small_scenes.BeadOnTurningWire(), (), 0.1, False),
+        (jj.models.DoublePendulumRods(), ("x1", "x2"), 0.02),
+        (linkages.Parallelogram(), (), 1e-2),
+        (small_scenes.BeadOnTurningWire(), (), 0.1),
     ],
-    ids=["held", "redundant rows", "rows of time", "rows of time, by XLA"],
+    ids=["held", "redundant rows", "rows of time"],
 )
-def test_derivatives_are_those_of_what_is_computed(scene, held, off, native):
-    put = _along(scene, held, off, native)
+def test_derivatives_are_those_of_what_is_computed(scene, held, off):
+    put = _along(scene, held, off)
     weights = jnp.asarray(np.random.default_rng(3).normal(size=put(0.0).size))
     forward = jax.jit(jax.jacfwd(put))(0.0)
     np.testing.assert_allclose(forward, _slope(jax.jit(put)), atol=1e-8 * np.max(np.abs(forward)))
@@ -70,7 +67,7 @@ def test_values_that_are_all_given_move_with_the_rows_in_derivatives(derivative)
     def begins(length, along):
         scene = moving_linkages.NarrowPendulum(length=length)
         rates = {"x_rate": cos + along * sin, "z_rate": sin - along * cos}
-        state = as_state(scene, {"x": sin, "z": -cos, **rates}, onto_rows=True)
+        state = jj.start(scene, {"x": sin, "z": -cos, **rates})
         return jnp.concatenate([state.q, state.u])
 
     np.testing.assert_allclose(begins(1.0, 0.0), [sin, -cos, cos, sin], atol=1e-15)
@@ -80,7 +77,7 @@ def test_values_that_are_all_given_move_with_the_rows_in_derivatives(derivative)
 
 
 def test_second_derivatives_are_differences_of_first_ones():
-    put = _along(small_scenes.BeadOnTurningWire(), (), 0.1, True)
+    put = _along(small_scenes.BeadOnTurningWire(), (), 0.1)
     expected = _slope(jax.jit(jax.jacfwd(put)))
     for second in (jax.jacfwd(jax.jacfwd(put)), jax.jacfwd(jax.jacrev(put)), jax.jacrev(jax.jacrev(put))):
         np.testing.assert_allclose(jax.jit(second)(0.0), expected, atol=1e-7 * np.max(np.abs(expected)))

@@ -1,4 +1,4 @@
-"""Long chains of bodies take a time in proportion to their length: counted in operations, entries and lines of machine code, not in seconds.
+"""Long chains of bodies take a time in proportion to their length: counted in operations and entries, not in seconds.
 
 Elimination in a narrow band is compared with dense matrices.
 """
@@ -6,31 +6,18 @@ Elimination in a narrow band is compared with dense matrices.
 from dataclasses import replace
 from types import SimpleNamespace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-import pytest
-from test_mutants import rewritten
 
 import jourdain_jax as jj
 from jourdain_jax.build import structure
 from jourdain_jax.build.assembling import assemble
-from jourdain_jax.build.row_program import row_program
 from jourdain_jax.calculus import sparse_slopes
-from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.lowering import ignorable
 from jourdain_jax.models import TrailerChain
-from jourdain_jax.motion import put_on_rows
-from jourdain_jax.motion.native import onto_rows
-from jourdain_jax.motion.native.onto_rows import Rows, write
-from jourdain_jax.native import ffi
-from jourdain_jax.native.ir import Writer
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.identity_test import identity_probes
-
-native = pytest.mark.skipif(bool(ffi.reason_against()), reason="no machine code here")
 
 
 def links(count: int) -> tuple[Pattern, np.ndarray]:
@@ -100,64 +87,6 @@ def test_nearly_dependent_rows_are_known_although_every_pivot_is_large():
     pattern = Pattern.of([(i, i) for i in range(n)] + [(i + 1, i) for i in range(n - 1)], (n, n))
     values = np.concatenate([[1.0], np.full(n - 1, 0.5), np.full(n - 1, np.sqrt(0.75))])[None]
     assert not pattern.band.solved(values, np.zeros(1), np.ones((1, n)))[1][0] < sparse_slopes.REGULAR
-
-
-@native
-@pytest.mark.parametrize("kind", ["positions", "determined speeds", "speeds"])
-def test_machine_code_in_a_band_puts_lanes_onto_rows_as_by_rotations(kind):
-    generator, lanes = np.random.default_rng(4), 4
-    scene = TrailerChain(trailers=33, trailer_mass=generator.uniform(1.0, 9.0, 33))
-    program = row_program(scene)
-    in_band, dense = (Rows(program, kind, affine=kind != "positions") for _ in range(2))
-    assert in_band.in_band is not None
-    object.__setattr__(dense, "in_band", None)
-    q = np.array([list(scene.towing(np.linspace(0, 1, 34) * k).values())[2:] for k in (0.2, 0.5, 1.0, 1.5)])
-    t, free, typical = np.zeros((lanes, 1)), np.ones((lanes, len(in_band.moving))), np.full((lanes, len(in_band.residuals)), 1e-3)
-    free[1] = generator.uniform(size=free.shape[1]) > 0.05
-    free[2] = 0.0  # nothing moves: rows vanish, which no elimination serves
-    u = generator.normal(size=(lanes, len(program.u)))
-    state = [t, q + 1e-3 * generator.normal(size=q.shape)] + ([] if kind == "positions" else [u, np.zeros((lanes, 2))])
-    given = [jnp.asarray(x) for x in (*state, free, typical)]
-    by = lambda rows, scene=scene: jax.vmap(lambda *x: put_on_rows._put(rows, scene, x[0][0], *x[1:]))(*given)  # noqa: E731
-    found, expected = by(in_band), by(dense)
-    for x, y in zip(found, expected, strict=True):
-        np.testing.assert_allclose(x, y, rtol=0, atol=1e-10)
-    assert np.max(np.abs(found[1][0])) < 1e-13
-    np.testing.assert_array_equal(found[0][2], state[1 if kind == "positions" else 2][2])
-    if kind == "speeds":
-        heavy = jax.jit(lambda mass: by(in_band, scene.replace(trailer_mass=mass)))
-        assert np.isnan(heavy(jnp.full(33, jnp.nan))[0][0]).any()
-
-
-def test_mass_matrices_of_speeds_along_a_bodys_own_axes_are_diagonal():
-    assert all(i == k for i, k in row_program(TrailerChain(trailers=2)).M)
-
-
-@native
-def test_rows_in_a_band_are_no_numbers_where_memory_is_lost(monkeypatch):
-    scene = TrailerChain(trailers=33)
-    rows = Rows(row_program(scene), "positions")
-    monkeypatch.setattr(onto_rows, "_write_row", rewritten(onto_rows._write_row, "-(entries * w.lanes * 8 // -64) * 64", "1 << 60"))
-    put_on_rows._kernel.cache_clear()
-    q = scene.coordinates.reference()
-    given = [jnp.zeros(()), jnp.asarray(q), jnp.ones(len(q)), jnp.zeros(len(rows.residuals))]
-    found, left = put_on_rows._put(rows, scene, *given)
-    put_on_rows._kernel.cache_clear()
-    assert rows.in_band is not None
-    assert np.isnan(found).all()
-    assert np.isnan(left).any()
-
-
-@native
-def test_machine_code_of_a_chain_grows_with_its_length():
-    lines = []
-    for n in (22, 44):
-        rows = Rows(row_program(TrailerChain(trailers=n)), "determined speeds", affine=True)
-        assert not rows.reason_against()
-        w = Writer(2, True)
-        write(w, rows, rank_cutoff("float64"))
-        lines.append(w.text.count("\n"))
-    assert lines[1] < 2.05 * lines[0]
 
 
 def test_what_acts_by_less_than_round_off_is_not_left_out():

@@ -24,13 +24,12 @@ class Pattern:
     columns: np.ndarray
     shape: tuple[int, int]
     fewest: int = FEWEST_ROWS  # rows of a matrix whose band is looked for
-    narrow: int = NARROW  # as many times the width of a narrow band there are rows
 
     @classmethod
-    def of(cls, entries: Iterable[tuple[int, int]], shape: tuple[int, int], **limits: int) -> "Pattern":
+    def of(cls, entries: Iterable[tuple[int, int]], shape: tuple[int, int]) -> "Pattern":
         """The pattern with entries at these places."""
         rows, columns = np.array(list(entries), int).reshape(-1, 2).T
-        return cls(rows, columns, shape, **limits)
+        return cls(rows, columns, shape)
 
     def dense(self, values: np.ndarray) -> np.ndarray:
         """The matrices."""
@@ -64,7 +63,7 @@ class Pattern:
         if self.shape[0] < self.fewest:
             return None
         found = Band.of(self)
-        return found if self.narrow * (found.width + 1) <= self.shape[0] else None
+        return found if NARROW * (found.width + 1) <= self.shape[0] else None
 
     def transposed_times(self, values: np.ndarray, y: np.ndarray) -> np.ndarray:
         """`G' y` at every state."""

@@ -30,23 +30,20 @@ _KINDS = {  # of diffrax, and an example
 }
 
 
-def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None, native: bool = True, onto_rows: bool = False) -> State:
+def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None, native: bool = True) -> State:
     """A state from a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for the scene's example.
 
     `inputs`: the scene's inputs at that instant, a vector or by name (default: zero); they count where velocity rows depend on them.
-    `native`: whether machine code of our own may put it onto the rows, as in `put_on_rows`. `onto_rows`: as of `named_start`.
+    `native`: whether machine code may put it onto the rows.
     """
-    return given if isinstance(given, State) else named_start(scene, named_values(scene, given, what), t0, inputs, native, onto_rows)
-
-
-def named_values(scene: Scene, given, what: str = "start") -> Mapping:
-    """A dictionary of named values, the scene's example for None; a ValueError for anything else."""
+    if isinstance(given, State):
+        return given
     if given is not None and not isinstance(given, Mapping):
         raise ValueError(
             f"`{what}` is {described(given)}, expected a State (from `jj.start` or `jj.consistent`), a dictionary of named values, or None for the "
             f"scene's example{'; write `.state` after it' if isinstance(getattr(given, 'state', None), State) else ''}"
         )
-    return scene.example if given is None else given
+    return named_start(scene, scene.example if given is None else given, t0, inputs, native=native)
 
 
 def check_options(*, rtol=1e-8, atol=1e-8, max_steps=1, dt0=None, max_step=None, switches: dict | None = None, **objects) -> None:

@@ -10,8 +10,7 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jourdain_jax.build.plausibility import faults_at
 from jourdain_jax.build.row_program import row_program
@@ -29,7 +28,7 @@ from jourdain_jax.motion.native import seen
 from jourdain_jax.motion.quick_compilation import QUICK, RUN_SELDOM, quickly_compiled
 from jourdain_jax.motion.row_check import rows_violated
 from jourdain_jax.motion.setup import Begun, Setup, Solved
-from jourdain_jax.motion.start import State, moved_onto_rows
+from jourdain_jax.motion.start import State
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
@@ -39,21 +38,16 @@ from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.scene.parameters import parameter_faults
 
 
-def integrate(setup: Setup) -> Trajectory | None:
-    """The motion of one setup; None where its start was yet to be put onto the rows, and Newton's method alone did not arrive."""
-    motion, arrived = _compiled(setup.inputs.programs)(setup)
-    return motion if isinstance(setup.start, State) or np.asarray(arrived) else None
+def integrate(setup: Setup) -> Trajectory:
+    """Return the motion of one setup."""
+    return _compiled(setup.inputs.programs)(setup)
 
 
-def _one_motion(setup: Setup) -> tuple[Trajectory, Bool[Array, ""]]:
-    """The motion, and whether its start came onto the rows."""
-    given, arrived = _with_machine_code(_prepared(setup)), jnp.array(True)
+def _one_motion(setup: Setup) -> Trajectory:
+    given = _with_machine_code(_prepared(setup))
     setup, asked = _entered(given)
-    if not isinstance(setup.start, State):
-        start, arrived = moved_onto_rows(setup.scene, setup.t0, setup.start, setup.inputs(setup.t0))
-        setup = setup._replace(start=start)
     begun, fitting = _begin(setup), setup.fitting()
-    return _finish(given, fitting, asked, begun, setup.integrator.solved(fitting, begun)), arrived
+    return _finish(given, fitting, asked, begun, setup.integrator.solved(fitting, begun))
 
 
 def _compiler_options(setup: Setup) -> dict | None:

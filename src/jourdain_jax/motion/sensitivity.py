@@ -117,7 +117,7 @@ def _judge(amplification: float, rtol: float, steps: int) -> None:
         warnings.warn(text, SensitivityWarning, stacklevel=3)
 
 
-def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory | None:
+def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
     """`integrate(setup)`; its derivative, taken outside of `jit`, warns where the motion amplifies errors too much."""
     if nothing_is_traced() or not is_traced(setup):
         return integrate(setup)

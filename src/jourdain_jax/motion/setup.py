@@ -19,7 +19,7 @@ from jourdain_jax.motion.integrators.knots import knots_between
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.integrators.solver_choice import steps_are_given
 from jourdain_jax.motion.integrators.tableaus import Method
-from jourdain_jax.motion.start import State, Unmoved
+from jourdain_jax.motion.start import State
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
@@ -87,7 +87,7 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     """A motion to be integrated; in a batch all arrays have a leading axis of lanes."""
 
     scene: Scene
-    start: State | Unmoved
+    start: State
     inputs: PyTree
     t0: Float[Array | np.ndarray, "*lanes"]
     t1: Float[Array | np.ndarray, "*lanes"]

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.on_first_use import module_on_first_use
-from jourdain_jax.calculus.reals import Number, as_array, is_traced, nothing_is_traced
-from jourdain_jax.motion.arguments import as_state, check_options, named_values, span_and_times
+from jourdain_jax.calculus.reals import Number, as_array, is_traced
+from jourdain_jax.motion.arguments import as_state, check_options, span_and_times
 from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.inputs_in_rows import check_inputs_in_rows
 from jourdain_jax.motion.integration import integrate
@@ -27,7 +27,7 @@ from jourdain_jax.motion.own_steps import own_steps, reason_against_series
 from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
 from jourdain_jax.motion.setup import LONGEST, MOST_STEPS, TOLERANCE, Setup
-from jourdain_jax.motion.start import State, Unmoved, named_unmoved, put_on_rows, unmoved
+from jourdain_jax.motion.start import State, nearest_state
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.choice import Formulation, as_formulation, vector_field
@@ -123,22 +123,18 @@ def simulate(
 
 
 def _run(given: dict) -> tuple[Setup, Trajectory]:
-    """What was integrated, and its motion; in the rare case that Newton's method alone does not put the start onto the rows, from one that is searched for."""
+    """What was integrated, and its motion."""
     setup = _set_up(**given)
-    if (motion := warn_if_ill_conditioned(setup, _integrated)) is None:
-        setup = _set_up(**given, searches=True)
-        motion = warn_if_ill_conditioned(setup, _integrated)
-    assert motion is not None
-    return setup, motion
+    return setup, warn_if_ill_conditioned(setup, _integrated)
 
 
-def _integrated(setup: Setup) -> Trajectory | None:
+def _integrated(setup: Setup) -> Trajectory:
     """The motion; under `jax_debug_nans`, NaN after an event is a mark, and a motion that failed is integrated again for JAX to find the NaN."""
     if not jax.config.jax_debug_nans:
         return integrate(setup)
     with nan_is_a_mark():
         motion = integrate(setup)
-    if motion is None or is_traced(motion.result) or int(motion.result) in (results.SUCCESS, results.EVENT):
+    if is_traced(motion.result) or int(motion.result) in (results.SUCCESS, results.EVENT):
         return motion
     return integrate(setup)
 
@@ -155,7 +151,6 @@ def set_up(scene: Scene | BuiltFor, start=None, **options) -> Setup:
 
 def _set_up(
     *, scene, start, t0, t1, ts, saveat, rtol, atol, solver, stepsize_controller, dt0, max_step, adjoint, max_steps, formulation, backend, inputs, events, work,
-    searches: bool = False,
 ) -> Setup:  # fmt: skip
     scene, formulation = as_scene(scene), as_formulation(formulation)
     switches = {"events": events, "work": work}
@@ -167,7 +162,7 @@ def _set_up(
     native = backend in ("auto", "native")
     inputs = as_inputs(scene, inputs)
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
-    start = _start(scene, start, t0, inputs, native, formulation.projects, searches)
+    start = _start(scene, start, t0, inputs, native, formulation.projects)
     field = fitted(solver, scene, vector_field(scene, formulation, work, backend, inputs), formulation.state)
     if not inputs.constant:
         check_inputs_in_rows(scene, inputs, t0, t1)
@@ -211,15 +206,11 @@ def _check_adjoint(adjoint) -> None:
         )
 
 
-def _start(scene: Scene, given, t0, inputs: Inputs, native: bool, projects: bool, searches: bool) -> State | Unmoved:
-    """The start; numbers that are known are put onto the rows by the program that integrates, unless it takes a search."""
-    if projects and not searches and nothing_is_traced():
-        if isinstance(given, State):
-            return unmoved(scene, given.q, given.u, native)
-        return named_unmoved(scene, named_values(scene, given), t0, inputs_at(inputs, t0), native).start
-    if isinstance(given, State):
-        return put_on_rows(scene, t0, given.q, given.u, inputs_at(inputs, t0), native=native) if projects else given
-    return as_state(scene, given, t0=t0, inputs=inputs_at(inputs, t0), native=native, onto_rows=projects)
+def _start(scene: Scene, given, t0, inputs: Inputs, native: bool, projects: bool) -> State:
+    """Return the start, on its constraints where the formulation `projects`."""
+    if projects and isinstance(given, State):
+        return nearest_state(scene, t0, given.q, given.u, inputs_at(inputs, t0), native=native)
+    return as_state(scene, given, t0=t0, inputs=inputs_at(inputs, t0), native=native)
 
 
 def default_solver(rtol: Number) -> Method:

@@ -88,23 +88,29 @@ def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tu
     Differentiable in any mode. What cannot be met stays in `residual`, which is infinite where numbers are not finite (no error: this also runs
     inside jit and vmap); the quaternion (0, 0, 0, 0) has no direction and stays as it is, with a residual of 1/2. ValueError for wrong shapes.
     """
-    return put_on_rows(scene, t, q, u, inputs, held=held)
+    return nearest_state(scene, t, q, u, inputs, held=held)
 
 
-def put_on_rows(scene: Scene, t, q, u, inputs, *, held: tuple[str, ...] = (), native: bool = True) -> State:
-    """As `consistent`; `native`: whether machine code of our own may do it."""
-    t, start = _as_time(t), unmoved(scene, q, u, native, held)
-    return _consistent(scene, t, start, _as_input_vector(scene, inputs, start.q.dtype), lambda: np.zeros((0, start.q.shape[0]), start.q.dtype))
+def nearest_state(scene: Scene, t, q, u, inputs, *, held: tuple[str, ...] = (), native: bool = True) -> State:
+    """Project as `consistent` does; `native`: whether machine code may."""
+    coordinates, speeds = scene.coordinate_names.entries, scene.speed_names.entries
+    t, q, u = _as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
+    for name in held:
+        if name not in coordinates + speeds:
+            raise ValueError(f"`held` names `{name}`, which is no coordinate or speed; {nearest(name, coordinates + speeds)}")
+    free_q, free_u = (_free(names, tuple(held)) for names in (coordinates, speeds))
+    guess = _Guess(q, u, free_q, free_u, _free(coordinates, coordinates), usual_sizes(scene, False, native))
+    return _consistent(scene, t, guess, _as_input_vector(scene, inputs, q.dtype), lambda: np.zeros((0, q.shape[0]), q.dtype))
 
 
-class Unmoved(NamedTuple):
-    """A start that is yet to be put onto the rows."""
+class _Guess(NamedTuple):
+    """Coordinates and speeds that are to be projected, and which of them may move."""
 
     q: Float[Array | np.ndarray, "coordinates"]
     u: Float[Array | np.ndarray, "speeds"]
-    free_q: Bool[np.ndarray, "coordinates"]  # what may move
+    free_q: Bool[np.ndarray, "coordinates"]
     free_u: Bool[np.ndarray, "speeds"]
-    bounded: Bool[np.ndarray, "coordinates"]  # what may not be found outside of the domain that the scene states
+    bounded: Bool[np.ndarray, "coordinates"]  # which must end inside the domain that the scene states
     usual: Usual
 
     def inside(self, q) -> Bool[Array, "coordinates"]:
@@ -113,23 +119,13 @@ class Unmoved(NamedTuple):
         return ~self.bounded | ((q >= self.usual.low) & (q <= self.usual.high))
 
 
-def unmoved(scene: Scene, q, u, native: bool, held: tuple[str, ...] = ()) -> Unmoved:
-    """Coordinates and speeds of which all move but what is `held`; a ValueError where they are none of this scene. `native`: as in `put_on_rows`."""
-    coordinates, speeds = scene.coordinate_names.entries, scene.speed_names.entries
-    q, u = as_coordinates(scene, q), as_speeds(scene, u)
-    for name in held:
-        if name not in coordinates + speeds:
-            raise ValueError(f"`held` names `{name}`, which is no coordinate or speed; {nearest(name, coordinates + speeds)}")
-    return Unmoved(q, u, _free(coordinates, tuple(held)), _free(speeds, tuple(held)), _free(coordinates, coordinates), usual_sizes(scene, False, native))
-
-
 @lru_cache(maxsize=1024)
 def _free(names: tuple[str, ...], held: tuple[str, ...]) -> Bool[np.ndarray, "entries"]:
     """Which of these entries are not held."""
     return np.array([name not in held for name in names], bool)
 
 
-def _consistent(scene: Scene, t, start: Unmoved, inputs, guesses: Callable) -> State:
+def _consistent(scene: Scene, t, start: _Guess, inputs, guesses: Callable) -> State:
     """The nearest state; where Newton's method does not arrive, what a damped search finds from q, and then from other configurations, `guesses()`."""
     given = scene, t, start, inputs
     if not nothing_is_traced() and is_traced(given):
@@ -153,22 +149,12 @@ def _as_input_vector(scene: Scene, inputs, dtype):
     return inputs if isinstance(inputs, np.ndarray) and inputs.shape == (len(scene.inputs),) else as_input_vector(scene, inputs, dtype)
 
 
-def moved_onto_rows(scene: Scene, t, start: Unmoved, inputs) -> tuple[State, Bool[Array, ""]]:
-    """The state on the rows nearest to `start`, by Newton's method alone, as a part of a larger compiled function; and whether it arrived.
-
-    Where something is held, it has when nothing but round-off is left of the rows.
-    """
-    state, arrived = _put_onto_constraints(scene, t, start, inputs, None)
-    holds = ~(jnp.all(start.free_q) & jnp.all(start.free_u))
-    return state, arrived & ~(holds & is_off(state))
-
-
-def is_off(state: State) -> Bool[Array | np.ndarray, ""]:
+def _is_off(state: State) -> Bool[Array | np.ndarray, ""]:
     """Whether more than round-off is left of the rows; also where that is no number."""
     return ~(state.residual <= _OFF * np.finfo(state.q.dtype).eps)
 
 
-def _put_onto_constraints(scene: Scene, t, start: Unmoved, inputs, guesses) -> tuple[State, Bool[Array, ""]]:
+def _put_onto_constraints(scene: Scene, t, start: _Guess, inputs, guesses) -> tuple[State, Bool[Array, ""]]:
     """The start on the constraints, and whether its coordinates arrived, where they may be found; no search where `guesses` is None.
 
     The residual is infinite where a number is not finite, or a coordinate was found where it may not be.
@@ -201,7 +187,7 @@ def _left(g: Float[Array, "closures"]) -> Float[Array, ""]:
     return jnp.where(left < _tolerance(g.dtype), 0.0, jnp.where(jnp.isfinite(left), left, jnp.inf))
 
 
-def _arrived(q, near_q, g, start: Unmoved) -> Bool[Array, ""]:
+def _arrived(q, near_q, g, start: _Guess) -> Bool[Array, ""]:
     """Whether the rows are met, where coordinates may be found and without running far away."""
     close = jnp.all(jnp.abs(near_q - q) <= FAR * start.usual.width)  # never where it is not a number
     return jax.lax.stop_gradient(close & (_left(g) == 0)) & jnp.all(start.inside(near_q))
@@ -217,7 +203,7 @@ class _Put(NamedTuple):
     met: Bool[Array, ""]  # whether it was worth while
 
 
-def _searched(scene: Scene, t, q, start: Unmoved, guesses) -> _Put:
+def _searched(scene: Scene, t, q, start: _Guess, guesses) -> _Put:
     """Coordinates from the first guess that leads to the rows, q itself counting as the first."""
     free, usual = jnp.asarray(start.free_q), start.usual
     size = jnp.where(free, jnp.asarray(usual.width, q.dtype), 0.0)
@@ -250,7 +236,8 @@ _uncompiled_projection = eval_numpy(_put_onto_constraints)
 def start(scene: Scene | BuiltFor, given=None, *, near=None, t0: Number = 0.0, inputs=None, **values) -> State:
     """A consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`, or `start(disc, {"lean": 0.3, "spin_rate": -3.0})`.
 
-    `values`, by keyword or in a dictionary `given` (where both name one, the keyword counts), are kept, at time `t0` (s).
+    `values`, by keyword or in a dictionary `given` (where both name one, the keyword counts), are kept, at time `t0` (s); values that contradict each other by
+    no more than a few typed digits do, 1.5e-5, move onto the constraints.
     Coordinates that are not given begin at zero (a quaternion at the identity) and follow from the rows; where that leads nowhere, or out of the `domain`
     that the scene states, they begin at those of states of the domain, nearest first, and the state says so (`guess`). `near`: coordinates by name, with
     values from which they begin but at which they are not held; those may be found outside of the domain, as may coordinates of which the rows leave no choice.
@@ -269,46 +256,9 @@ def start(scene: Scene | BuiltFor, given=None, *, near=None, t0: Number = 0.0, i
     return named_start(scene, {**(given or {}), **values}, t0, inputs_at(as_inputs(scene, inputs), _as_time(t0)), near=near or {})
 
 
-def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, native: bool = True, onto_rows: bool = False, near: Mapping = _NOTHING) -> State:
-    """A start from a dictionary of `values`, as of `start`, and the `inputs` at time `t0`: a vector, or by name (None: zero).
-
-    `native`: as in `put_on_rows`. `onto_rows`: where given values contradict each other by so little that it passes for round-off of what was typed, they
-    move, too.
-    """
+def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, *, near: Mapping = _NOTHING, native: bool = True) -> State:
+    """Return the start that `start` describes; `inputs` at time `t0`: a vector, or by name (None: zero); `native`: as in `nearest_state`."""
     scene = as_scene(scene)
-    t, start, inputs, known, given = named_unmoved(scene, values, t0, inputs, native, near)
-    state = _consistent(scene, t, start, inputs, lambda: guesses_of(scene, known.coordinates[: known.random], start.q, start.free_q))
-    _check_residual(scene, start, state, inputs, given)
-    return _moved_if_near(scene, state, inputs, native) if onto_rows and may_contradict(scene, known, start.free_q, start.free_u) else state
-
-
-def _moved_if_near(scene: Scene, start: State, inputs, native: bool) -> State:
-    """The start moved onto the rows as a whole, where it is off them by less than what counts as a contradiction.
-
-    Where it is off by round-off alone, its numbers stay as they are, but what is traced gets the derivatives of a start that is moved: values that agree at
-    these parameters contradict each other at others.
-    """
-    near = start.residual < _tolerance(start.q.dtype)
-    if not is_traced(near) and not (near and is_off(start)):
-        return start
-    state = put_on_rows(scene, start.t, start.q, start.u, inputs, native=native)
-    moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
-    state = eqx.tree_at(lambda s: (s.moved_q, s.moved_u, s.guess), state, (*moved, start.guess))
-    return jax.tree.map(lambda x, y: jnp.where(near, x, y), state, start)
-
-
-class _Named(NamedTuple):
-    """Named values as a start that is yet to be put onto the rows."""
-
-    t: Float[Array | np.ndarray, ""]
-    start: Unmoved
-    inputs: Float[Array | np.ndarray, "inputs"]
-    known: Structure
-    given: tuple[str, ...]
-
-
-def named_unmoved(scene: Scene, values: Mapping, t0, inputs, native: bool, near: Mapping = _NOTHING) -> _Named:
-    """Named values as vectors, and what of them may move; arguments as of `named_start`."""
     q, u, given = vectors_named(scene, {**near, **values})
     about = given if near else ()
     if near:
@@ -325,7 +275,25 @@ def named_unmoved(scene: Scene, values: Mapping, t0, inputs, native: bool, near:
     determined = known.affine and not any(free_u[i] for i in known.independent)  # rows determine the speeds that are free
     usual = usual_sizes(scene, determined, native)
     bounded = _bounded(usual.program, scene.coordinate_names.entries, given, about)
-    return _Named(t, Unmoved(q, u, free_q, free_u, bounded, usual), inputs, known, given)
+    guess = _Guess(q, u, free_q, free_u, bounded, usual)
+    state = _consistent(scene, t, guess, inputs, lambda: guesses_of(scene, known.coordinates[: known.random], q, free_q))
+    _check_residual(scene, guess, state, inputs, given)
+    return _moved_if_near(scene, state, inputs, native) if may_contradict(scene, known, free_q, free_u) else state
+
+
+def _moved_if_near(scene: Scene, start: State, inputs, native: bool) -> State:
+    """Move the start as a whole where it is off the rows by less than counts as a contradiction.
+
+    Where it is off by round-off alone, its numbers stay as they are, but what is traced gets the derivatives of a start that is moved: values that agree at
+    these parameters contradict each other at others.
+    """
+    near = start.residual < _tolerance(start.q.dtype)
+    if not is_traced(near) and not (near and _is_off(start)):
+        return start
+    state = nearest_state(scene, start.t, start.q, start.u, inputs, native=native)
+    moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
+    state = eqx.tree_at(lambda s: (s.moved_q, s.moved_u, s.guess), state, (*moved, start.guess))
+    return jax.tree.map(lambda x, y: jnp.where(near, x, y), state, start)
 
 
 @lru_cache(maxsize=1024)
@@ -368,7 +336,7 @@ def _check_finite(values: Mapping) -> None:
             raise ValueError(f"start value `{name}` is {value}, expected a finite number; check where it was computed")
 
 
-def _check_residual(scene: Scene, start: Unmoved, state: State, inputs, given: tuple[str, ...]) -> None:
+def _check_residual(scene: Scene, start: _Guess, state: State, inputs, given: tuple[str, ...]) -> None:
     if is_traced(state.residual) or np.asarray(state.residual) < _tolerance(state.q.dtype):
         return
     who, held = type(scene).__name__, ", ".join(f"`{name}`" for name in given) or "none"

@@ -9,28 +9,20 @@ the mass matrix. A lane that nothing changes any more stays as it is.
 import math
 import sys
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Literal
 
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.fixed_point import QUIET, ROUND_OFF
-from jourdain_jax.calculus.sparse_slopes import REGULAR, Pattern
 from jourdain_jax.equations.projection import MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS
-from jourdain_jax.motion.native.rows_in_band import PLACES, sizes, write_eliminated, write_factors, write_solution
 from jourdain_jax.native.dense import cleared, write_cholesky, write_inverted, write_rotated, write_solved, write_triangular
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.scalar_program import as_real, unsupported, written_in_turn
 from jourdain_jax.native.threads import write_rows
 
 LARGEST_PROGRAM = 60_000  # operations
-# Of a band. Measured: speeds of 3, 5, 8 and 12 trailers (10 to 37 rows, width 4) take 0.010, 0.011, 0.012 and 0.013 ms in a band, by dense matrices 0.019,
-# 0.045, 0.14 and 0.45; in a batch 0.2 to 0.7 microseconds each, and 1.5, 5, 18 and 58.
-FEWEST_ROWS, NARROW = 8, 2
-# Of a dense matrix. Measured: speeds of 6 trailers take 0.10 ms here and 0.08 by XLA alone, 0.05 and 0.06 each in a batch; of 12 (2,812 entries) 0.68 and 0.20,
+# Of a matrix. Measured: speeds of 6 trailers take 0.10 ms here and 0.08 by XLA alone, 0.05 and 0.06 each in a batch; of 12 (2,812 entries) 0.68 and 0.20,
 # 0.32 and 0.18; of 32 14.6 and 1.4, 3.6 and 1.2.
 MOST_ENTRIES = 3_000
-MOST_IN_BAND = 10_000_000  # of a matrix that is there only where rows in a band are nearly dependent
-CLEARLY = 1e-2  # the square of a cut-off over that of a singular value which surely counts
 _EPS = sys.float_info.epsilon
 
 Kind = Literal["positions", "speeds", "determined speeds"]
@@ -71,18 +63,12 @@ class Rows:
         parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
         return [*parameters, program.t, *program.q, *(() if self.kind == "positions" else (*program.u, *program.inputs))]
 
-    @cached_property
-    def in_band(self) -> Pattern | None:
-        """Where the slopes are, of rows whose products lie in a narrow band; None for others, and where the mass matrix is not diagonal."""
-        pattern = Pattern.of(self.slopes, (len(self.residuals), len(self.moving)), fewest=FEWEST_ROWS, narrow=NARROW)
-        return pattern if all(i == k for i, k in self.metric or ()) and pattern.band is not None else None
-
     def reason_against(self) -> str:
         """Why this is not written as machine code, in words; empty where it can be."""
         if self.kind == "speeds" and self.program.M is None:
             return "the mass matrix is too large"
         rows, columns = len(self.residuals), len(self.moving)
-        if max((rows + columns) * rows, columns**2) > (MOST_ENTRIES if self.in_band is None else MOST_IN_BAND):
+        if max((rows + columns) * rows, columns**2) > MOST_ENTRIES:
             return "the rows are too many"
         nodes = [*self.residuals, *self.slopes.values(), *({} if self.metric is None else self.metric).values()]
         if self.program.graph.operations(nodes) > LARGEST_PROGRAM:
@@ -100,18 +86,14 @@ def write(w: Writer, of: Rows, cutoff: float) -> None:
     write_rotated(w, rows, columns)
     write_inverted(w, rows, columns, cutoff)
     write_solved(w, rows, columns)
-    if of.in_band is None:
-        if of.metric is not None:
-            _write_values(w, of, "masses", {i * columns + k: node for (i, k), node in of.metric.items()})
-            write_cholesky(w, columns)
-            write_triangular(w, columns)
-            _write_metric(w, of)
-        _write_values(w, of, "slopes", {i * (rows + columns) + k: node for (i, k), node in of.slopes.items()})
-        _write_factored(w, of)
-        _write_moved(w, of)
-    else:
-        _write_in_band(w, of, of.in_band, min(REGULAR, CLEARLY / cutoff**2))
-        w.scratch = rows * (rows + columns), 1
+    if of.metric is not None:
+        _write_values(w, of, "masses", {i * columns + k: node for (i, k), node in of.metric.items()})
+        write_cholesky(w, columns)
+        write_triangular(w, columns)
+        _write_metric(w, of)
+    _write_values(w, of, "slopes", {i * (rows + columns) + k: node for (i, k), node in of.slopes.items()})
+    _write_factored(w, of)
+    _write_moved(w, of)
     _write_row(w, of)
     write_rows(w, len(of.given) + columns + rows, columns + rows)
 
@@ -201,65 +183,23 @@ def _write_moved(w: Writer, of: Rows) -> None:
         w.give()
 
 
-def _write_in_band(w: Writer, of: Rows, pattern: Pattern, regular: float) -> None:
-    """`factored` and `moved` as above, of rows whose products lie in a narrow band, where the inverse of these is below `regular`."""
-    (rows, columns), first_free, first = pattern.shape, len(of.given), of.given.index(of.moving[0])
-    write_eliminated(w, pattern)
-    _write_values(w, of, "slopes", dict(enumerate(of.slopes.values())))
-    _write_values(w, of, "masses", {k: node for (k, _), node in (of.metric or {}).items()})
-    with w.function("factored", "void", dict.fromkeys(("state", *PLACES), "ptr"), attributes="noinline") as (state, *places):
-        S, c = (places[PLACES.index(name)] for name in ("S", "c"))
-        w.call("slopes", "void", state, S)
-        cleared(w, c, columns)
-        w.call("masses", "void", state, c)
-        with w.counted(0, columns) as k:
-            own = w.load(w.real, c, k)
-            w.store(_scale_of_speed(w, own) + (own - own), c, k)  # NaN where the mass is NaN
-        free, typical = (w.at(state, first_free + k, w.real) for k in (0, columns))
-        write_factors(w, pattern, free, typical, places, regular)
-        w.give()
-    with w.function("moved", "void", dict.fromkeys(("state", *PLACES, "x"), "ptr"), attributes="noinline") as (state, *places, x):
-        left, d = w.room(w.real, rows), places[PLACES.index("d")]
-        w.call("residuals", "void", state, left)
-        with w.counted(0, rows) as i:
-            w.store(w.load(w.real, left, i) * w.load(w.real, d, i), left, i)
-        write_solution(w, pattern, places, left, x, regular)
-        with w.counted(0, columns) as k:
-            moves = w.load(w.real, state, k + first_free) > 0.0  # what is held does not move by round-off either
-            w.store(w.load(w.real, state, k + first) - w.where(moves, w.load(w.real, x, k), 0.0), x, k)
-        w.give()
-
-
 def _write_row(w: Writer, of: Rows) -> None:
     """`row(state, found)`: the lanes of a block, from what they are given to what they return."""
     rows, columns = len(of.residuals), len(of.moving)
     first = of.given.index(of.moving[0])
     with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
-        x, entries = w.room(w.real, columns), rows * (rows + columns)
-        if of.in_band is None:
-            n = columns if of.metric is not None else 0
-            _write_putting(w, of, first, state, [w.room(w.real, max(count, 1)) for count in (n * n, n, entries, rows, rows)], x)
-        elif w.device:
-            dense = w.load("ptr", state, len(of.given) + columns + rows)
-            _write_putting(w, of, first, state, [dense if count is None else w.room(w.real, count) for count in sizes(of.in_band)], x)
-        else:  # memory that nothing is written to costs next to nothing
-            dense = w.external("aligned_alloc", "ptr", w.literal(64, "i64"), w.literal(-(entries * w.lanes * 8 // -64) * 64, "i64"))
-            there = w.converted("ptrtoint", dense, "i64").differs(0)
-            with w.when(there):
-                _write_putting(w, of, first, state, [dense if count is None else w.room(w.real, count) for count in sizes(of.in_band)], x)
-            with w.when(~there), w.counted(0, columns) as k:
-                w.store(w.number(math.nan), state, k + first)
+        n = columns if of.metric is not None else 0
+        factors = [w.room(w.real, max(count, 1)) for count in (n * n, n, rows * (rows + columns), rows, rows)]
+        _write_putting(w, of, first, state, factors, w.room(w.real, columns))
         with w.counted(0, columns) as k:
             w.store(w.load(w.real, state, k + first), found, k)
         w.call("residuals", "void", state, w.at(found, columns, w.real))
-        if of.in_band is not None and not w.device:
-            w.external("free", "void", dense)
         w.give()
 
 
 def _write_putting(w: Writer, of: Rows, first: int, state: Value, factors: list[Value], x: Value) -> None:
     """What moves, put onto the rows in its place."""
-    if of.metric is not None and of.in_band is None:
+    if of.metric is not None:
         w.call("metric", "void", state, *factors[:2])
     if not of.affine:
         _write_iteration(w, of, first, (state, *factors, x))
