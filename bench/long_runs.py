@@ -25,10 +25,10 @@ from long_runs_scenes import ChaoticOscillator, ContactOscillator, GaugeTwin, Tr
 import jourdain_jax as jj
 
 METHODS = {
-    "implicit midpoint": jj.ImplicitMidpoint(),
-    "DLA, midpoint": jj.DiscreteLagrangeDAlembert(),
-    "DLA, trapezoidal": jj.DiscreteLagrangeDAlembert("trapezoidal"),
-    "discrete gradient": jj.DiscreteGradient(),
+    "implicit midpoint": jj.ImplicitMidpoint,
+    "DLA, midpoint": jj.DiscreteLagrangeDAlembert,
+    "DLA, trapezoidal": partial(jj.DiscreteLagrangeDAlembert, "trapezoidal"),
+    "discrete gradient": jj.DiscreteGradient,
 }
 EXPLICIT = {"Tsit5": diffrax.Tsit5(), "Dopri8": diffrax.Dopri8()}
 DLA = ("DLA, midpoint", "DLA, trapezoidal")
@@ -136,8 +136,8 @@ def runs(problem: Problem, steps: int) -> list:
     span = problem.step * steps
     found = []
 
-    def with_step(solver, ts):
-        return jj.simulate(scene, start, ts=ts, dt0=problem.step, solver=solver, max_steps=2 * steps)
+    def with_step(method, ts):
+        return jj.simulate(scene, start, ts=ts, solver=method(step=problem.step), max_steps=2 * steps)
 
     def with_tolerance(solver, ts, tolerance):
         tolerance = jnp.asarray(tolerance)

@@ -100,7 +100,7 @@ def test_where_work_is_integrated_nothing_is_told(k):
 
 
 def test_steps_without_control_are_taken_as_they_are():
-    motion = jj.simulate(Spring(), {"x": 1.0}, ts=[40.0], solver=jj.ImplicitMidpoint(), dt0=0.5)
+    motion = jj.simulate(Spring(), {"x": 1.0}, ts=[40.0], solver=jj.ImplicitMidpoint(step=0.5))
     assert int(motion.result) == results.SUCCESS
 
 

@@ -61,7 +61,7 @@ def test_derivatives_go_through_bounded_steps(backend, adjoint):
     assert np.isclose((jax.grad if adjoint is None else jax.jacfwd)(end)(2.0), expected, atol=1e-7)
 
 
-@pytest.mark.parametrize("options", [{"stepsize_controller": diffrax.PIDController(rtol=1e-6, atol=1e-6)}, {"solver": jj.ImplicitMidpoint(), "dt0": 0.1}])
+@pytest.mark.parametrize("options", [{"stepsize_controller": diffrax.PIDController(rtol=1e-6, atol=1e-6)}, {"solver": jj.ImplicitMidpoint(step=0.1)}])
 def test_a_control_of_the_users_has_its_own_bound(options):
-    with pytest.raises(ValueError, match="`max_step` bounds the steps of the default control"):
+    with pytest.raises(ValueError, match="`max_step`"):
         jj.simulate(FREE, START, ts=[3.0], max_step=0.1, **options)

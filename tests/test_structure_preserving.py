@@ -1,5 +1,7 @@
 """Structure-preserving solvers: what each keeps, their order, their derivatives, and what is said where one does not apply."""
 
+from functools import partial
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -15,21 +17,18 @@ from jourdain_jax.calculus.newton import newton_root
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.trajectories import results
 
-MIDPOINT, DLA, TRAPEZOIDAL, GRADIENT = (
-    jj.ImplicitMidpoint(),
-    jj.DiscreteLagrangeDAlembert(),
-    jj.DiscreteLagrangeDAlembert("trapezoidal"),
-    jj.DiscreteGradient(),
-)
+MIDPOINT, DLA, GRADIENT = jj.ImplicitMidpoint, jj.DiscreteLagrangeDAlembert, jj.DiscreteGradient
+TRAPEZOIDAL = partial(DLA, "trapezoidal")
 
 
-def named(solver) -> str:
-    return f"{type(solver).__name__} {getattr(solver, 'rule', '')}".strip()
+def named(method) -> str:
+    solver = method(step=0.1)
+    return f"{solver.name} {getattr(solver, 'rule', '')}".strip()
 
 
-def run(scene, start, solver, *, t1, dt0, t0=0.0, **options):
-    """The end of a motion; always the same shapes, so that a solver and a scene are compiled once."""
-    motion = jj.simulate(scene, start, t0=t0, t1=t1, ts=jnp.array([t1]), dt0=dt0, solver=solver, **options)
+def run(scene, start, method, *, t1, step, t0=0.0, **options):
+    """The end of a motion; always the same shapes, so that a method and a scene are compiled once."""
+    motion = jj.simulate(scene, start, t0=t0, t1=t1, ts=jnp.array([t1]), solver=method(step=step), **options)
     return motion.raise_if_failed() if not isinstance(motion.result, jax.core.Tracer) else motion
 
 
@@ -49,8 +48,8 @@ def test_the_chaplygin_sleigh_is_followed_to_second_order(solver):
     sleigh = MODELS["chaplygin-sleigh"](mass=data["mass"], inertia=data["inertia"], offset=a)
     start = jj.start(sleigh, x_rate=v0, heading_rate=w0)
     errors = []
-    for dt0 in (0.05, 0.025):
-        end = run(sleigh, start, solver, t1=4.0, dt0=dt0)
+    for step in (0.05, 0.025):
+        end = run(sleigh, start, solver, t1=4.0, step=step)
         errors.append(np.max(np.abs(np.asarray(end.q_end) - [exact["x"], exact["y"], exact["th"]])))
     assert errors[-1] < 1e-3
     assert 1.9 < order(errors) < 2.1
@@ -60,7 +59,7 @@ def test_discrete_forces_and_prescribed_coordinates_are_of_second_order_too():
     pendulum = DrivenPendulum()  # damped, sprung to a moving point, its pivot driven
     start = jj.start(pendulum, angle=0.3)
     exact = jj.simulate(pendulum, start, ts=jnp.array([1.0]), rtol=1e-11, atol=1e-11)
-    ends = [run(pendulum, start, TRAPEZOIDAL, t1=1.0, dt0=dt0) for dt0 in (0.02, 0.01)]
+    ends = [run(pendulum, start, TRAPEZOIDAL, t1=1.0, step=step) for step in (0.02, 0.01)]
     for part in ("q_end", "u_end", "work"):
         errors = [np.max(np.abs(getattr(end, part) - getattr(exact, part))) for end in ends]
         assert 1.9 < order(errors) < 2.1, part
@@ -78,7 +77,7 @@ def test_rows_that_depend_on_each_other_are_left_out():
     data = skate.RUN | {"t_end": 1.0}
     edges = TwoEdges(slope=data["slope"], mass=data["mass"], inertia=data["inertia"])
     exact = skate.motion(np.array([0.0, 1.0]), **data)
-    errors = [np.abs(run(edges, jj.start(edges, heading_rate=data["th_rate"]), DLA, t1=1.0, dt0=dt0).q_end[0] - exact["x"][-1]) for dt0 in (0.05, 0.025)]
+    errors = [np.abs(run(edges, jj.start(edges, heading_rate=data["th_rate"]), DLA, t1=1.0, step=step).q_end[0] - exact["x"][-1]) for step in (0.05, 0.025)]
     assert errors[-1] < 1e-3
     assert 1.9 < order(errors) < 2.1
 
@@ -86,10 +85,10 @@ def test_rows_that_depend_on_each_other_are_left_out():
 # What is kept. ---------------------------------------------------------------------------------------------------------
 
 
-def change(scene, solver, quantity, dt0, **options) -> float:
+def change(scene, solver, quantity, step, **options) -> float:
     """Largest relative change of `quantity(q, u)` after 300, 700 and 1000 steps."""
     start = jj.start(scene, **scene.example)
-    ends = [run(scene, start, solver, t1=steps * dt0, dt0=jnp.array(dt0), **options) for steps in (300, 700, 1000)]
+    ends = [run(scene, start, solver, t1=steps * step, step=jnp.array(step), **options) for steps in (300, 700, 1000)]
     assert int(ends[-1].accepted) == 1000
     first = quantity(start.q, start.u)
     return max(float(jnp.abs(quantity(end.q_end, end.u_end) / first - 1)) for end in ends)
@@ -107,9 +106,9 @@ def driver(q, u):
 def test_steps_back_undo_the_steps_forth(solver):
     twin = GaugeTwin()
     start = jj.start(twin, **twin.example)
-    there = run(twin, start, solver, t1=4.0, dt0=0.2)
+    there = run(twin, start, solver, t1=4.0, step=0.2)
     end = jj.State(there.t_end, there.q_end, there.u_end, start.moved_q, start.moved_u, start.residual, start.names)
-    back = run(twin, end, solver, t0=4.0, t1=0.0, dt0=0.2)
+    back = run(twin, end, solver, t0=4.0, t1=0.0, step=0.2)
     assert np.max(np.abs(there.q_end - start.q)) > 0.1
     np.testing.assert_allclose(back.q_end, start.q, rtol=0, atol=tolerance("round_off"))
     np.testing.assert_allclose(back.u_end, start.u, rtol=0, atol=tolerance("round_off"))
@@ -129,10 +128,10 @@ def test_midpoint_rules_keep_a_quadratic_integral(solver):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "dt0"), [("free-rigid-body", 0.02), ("chaplygin-sleigh", 0.02), ("tilting-disc", 0.01)])
-def test_the_discrete_gradient_keeps_the_energy_of_models(name, dt0):
+@pytest.mark.parametrize(("name", "step"), [("free-rigid-body", 0.02), ("chaplygin-sleigh", 0.02), ("tilting-disc", 0.01)])
+def test_the_discrete_gradient_keeps_the_energy_of_models(name, step):
     scene = MODELS[name]()
-    assert change(scene, GRADIENT, energy_of(scene), dt0) < tolerance("round_off")
+    assert change(scene, GRADIENT, energy_of(scene), step) < tolerance("round_off")
 
 
 def test_a_gauge_changes_no_motion_but_that_of_the_discrete_lagrangian():
@@ -141,13 +140,13 @@ def test_a_gauge_changes_no_motion_but_that_of_the_discrete_lagrangian():
     found, of_twin = (jj.accelerations(scene, 0.0, start.q, start.u) for scene in (oscillator, twin))
     np.testing.assert_array_equal(found.udot, of_twin.udot)
     for solver, told_apart in ((MIDPOINT, False), (DLA, True)):
-        ends = [run(scene, start, solver, t1=4.0, dt0=0.2).q_end for scene in (oscillator, twin)]
+        ends = [run(scene, start, solver, t1=4.0, step=0.2).q_end for scene in (oscillator, twin)]
         assert (float(jnp.max(jnp.abs(ends[0] - ends[1]))) > 1e-4) == told_apart, named(solver)
 
 
 def test_geometric_rows_hold_at_every_node():
     rods = MODELS["double-pendulum-rods"]()
-    motion = run(rods, jj.start(rods, **rods.example), DLA, t1=1.0, dt0=0.02)
+    motion = run(rods, jj.start(rods, **rods.example), DLA, t1=1.0, step=0.02)
     assert float(jnp.max(jnp.abs(motion.residuals()[0]))) < tolerance("round_off")
     assert float(jnp.max(jnp.abs(motion.residuals()[1]))) < tolerance("round_off")
 
@@ -165,7 +164,7 @@ def test_derivatives_through_fifty_steps_are_right_in_both_modes(solver):
     start = jj.start(scene, **scene.example)
 
     def end(value, **options):
-        motion = run(scene.replace(**{parameter: value}), start, solver, t1=5.0, dt0=0.1, **options)
+        motion = run(scene.replace(**{parameter: value}), start, solver, t1=5.0, step=0.1, **options)
         return jnp.sum(jnp.sin(jnp.arange(1.0, scene.coordinates.reference().size + 1) * motion.q_end)) + motion.u_end[-1]
 
     step = 1e-4
@@ -183,12 +182,12 @@ def test_a_rollout_solves_every_lane_and_names_those_whose_step_was_not_solved()
     oscillator = ContactOscillator()
     strengths = jnp.array([0.0, 0.3, 0.6, 1e8])  # at the last, a step of 0.2 s is thousands of periods
     starts = {"x": jnp.ones(4), "y": 1.0, "z": 0.5, "y_rate": 0.3}
-    rolled = jj.rollout(oscillator, starts, parameters={"strength": strengths}, ts=[0.0, 2.0, 4.0], dt0=0.2, solver=DLA)
+    rolled = jj.rollout(oscillator, starts, parameters={"strength": strengths}, ts=[0.0, 2.0, 4.0], solver=DLA(step=0.2))
     assert rolled.result.tolist() == [results.SUCCESS] * 3 + [results.UNSOLVED_STEP]
     assert "equations of an implicit step were not solved" in str(rolled)
     assert not np.isfinite(np.asarray(rolled.lanes.q[3, -1])).any()
     assert np.isfinite(np.asarray(rolled.lanes.q_end)).all()
-    alone = run(oscillator.replace(strength=0.6), jj.start(oscillator, x=1.0, y=1.0, z=0.5, y_rate=0.3), DLA, t1=4.0, dt0=0.2)
+    alone = run(oscillator.replace(strength=0.6), jj.start(oscillator, x=1.0, y=1.0, z=0.5, y_rate=0.3), DLA, t1=4.0, step=0.2)
     np.testing.assert_allclose(rolled.lanes.q_end[2], alone.q_end, rtol=0, atol=tolerance("round_off"))
 
 
@@ -205,9 +204,9 @@ def test_a_root_is_differentiated_twice_and_a_missing_one_is_flagged():
 
 def test_steps_between_saved_times_are_equal_and_no_longer_than_asked():
     oscillator = ContactOscillator()
-    motion = jj.simulate(oscillator, ts=jnp.array([0.0, 1.0, 1.5, 4.0]), dt0=0.3, solver=MIDPOINT)
+    motion = jj.simulate(oscillator, ts=jnp.array([0.0, 1.0, 1.5, 4.0]), solver=MIDPOINT(step=0.3))
     assert int(motion.raise_if_failed().accepted) == 4 + 2 + 9
-    whole = jj.simulate(oscillator, ts=jnp.array([0.0, 1.0, 1.5, 3.0]), t1=3.0, dt0=0.1, solver=MIDPOINT)
+    whole = jj.simulate(oscillator, ts=jnp.array([0.0, 1.0, 1.5, 3.0]), t1=3.0, solver=MIDPOINT(step=0.1))
     assert int(whole.raise_if_failed().accepted) == 30
 
 
@@ -227,26 +226,22 @@ def test_reversed_time_is_what_projections_and_events_are_given():
 
 
 WRONG = {
-    "jj.simulate(oscillator, solver=jj.ImplicitMidpoint())": r"`ImplicitMidpoint` takes steps of one length; give `dt0`, the step in s",
-    "jj.simulate(oscillator, dt0=0.1, solver=jj.DiscreteGradient(), stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6))": (
-        r"`DiscreteGradient` takes steps of one length and has no error estimate, which `stepsize_controller` = PIDController needs; leave it away"
+    "jj.ImplicitMidpoint(step=0.0)": r"`step` of `ImplicitMidpoint` is 0, expected a positive finite length of steps in s",
+    "jj.simulate(oscillator, max_step=0.1, solver=jj.ImplicitMidpoint(step=0.2))": r"its steps are at most as long as its `step`: jj.ImplicitMidpoint\(step=",
+    "jj.DiscreteLagrangeDAlembert('midpiont', step=0.1)": r"unknown rule `midpiont` of `DiscreteLagrangeDAlembert`; did you mean `midpoint`",
+    "jj.simulate(oscillator, solver=jj.DiscreteLagrangeDAlembert(step=0.1), formulation=jj.Formulation('minimal'))": r"leave the `state` of its `Formulation`",
+    "jj.simulate(model('free-rigid-body'), solver=jj.DiscreteLagrangeDAlembert(step=0.1))": (
+        r"does not apply to `FreeRigidBody`: its speeds are quasi-velocities or angular velocities.*; use solver=jj.ImplicitMidpoint\(step="
     ),
-    "jj.simulate(oscillator, dt0=0.0, solver=jj.ImplicitMidpoint())": r"`dt0` is 0, expected a finite first step in s that is not zero",
-    "jj.simulate(oscillator, dt0=0.1, solver=jj.ImplicitMidpoint(), saveat=diffrax.SaveAt(ts=[0.1]))": r"states at ends of steps only: give times",
-    "jj.DiscreteLagrangeDAlembert('midpiont')": r"unknown rule `midpiont` of `DiscreteLagrangeDAlembert`; did you mean `midpoint`",
-    "jj.simulate(oscillator, dt0=0.1, solver=jj.DiscreteLagrangeDAlembert(), formulation=jj.Formulation('minimal'))": r"leave the `state` of its `Formulation`",
-    "jj.simulate(model('free-rigid-body'), dt0=0.1, solver=jj.DiscreteLagrangeDAlembert())": (
-        r"does not apply to `FreeRigidBody`: its speeds are quasi-velocities or angular velocities.*; use solver=jj.ImplicitMidpoint\(\)"
-    ),
-    "jj.simulate(model('isokinetic-particle'), dt0=0.1, solver=jj.DiscreteLagrangeDAlembert())": r"its rows are nonlinear in the speeds",
-    "jj.simulate(DrivenPendulum(), dt0=0.1, solver=jj.DiscreteGradient())": r"does not apply to `DrivenPendulum`: its T \+ V is not constant",
-    "jj.simulate(model('double-pendulum-rods'), dt0=0.1, solver=jj.DiscreteGradient())": r"its geometric rows would have to be projected",
-    "jj.simulate(model('skate'), dt0=0.1, solver=jj.DiscreteGradient())": r"needs the minimal state \(`jj.Formulation\('minimal'\)` keeps to the privileged",
+    "jj.simulate(model('isokinetic-particle'), solver=jj.DiscreteLagrangeDAlembert(step=0.1))": r"its rows are nonlinear in the speeds",
+    "jj.simulate(DrivenPendulum(), solver=jj.DiscreteGradient(step=0.1))": r"does not apply to `DrivenPendulum`: its T \+ V is not constant",
+    "jj.simulate(model('double-pendulum-rods'), solver=jj.DiscreteGradient(step=0.1))": r"its geometric rows would have to be projected",
+    "jj.simulate(model('skate'), solver=jj.DiscreteGradient(step=0.1))": r"needs the minimal state \(`jj.Formulation\('minimal'\)` keeps to the privileged",
 }
 
 
 @pytest.mark.parametrize("call", WRONG)
 def test_a_method_that_does_not_apply_says_so_and_what_to_do(call):
-    names = {"jj": jj, "diffrax": diffrax, "oscillator": ContactOscillator(), "model": lambda name: MODELS[name](), "DrivenPendulum": DrivenPendulum}
+    names = {"jj": jj, "oscillator": ContactOscillator(), "model": lambda name: MODELS[name](), "DrivenPendulum": DrivenPendulum}
     with pytest.raises(ValueError, match=WRONG[call]):
         eval(call, names)

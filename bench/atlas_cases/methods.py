@@ -15,16 +15,13 @@ import jourdain_jax as jj
 from jourdain_jax.equations.reductions import Reduced, reduce
 
 REDUCTIONS = ("privileged", "qr", "svd", "kkt", "udwadia-kalaba", "gibbs-appell")
-INTEGRATORS: dict[str, Callable[[], diffrax.AbstractSolver]] = {
+INTEGRATORS: dict[str, Callable] = {
     "Tsit5": diffrax.Tsit5,
     "Dopri8": diffrax.Dopri8,
     "Kvaerno5": diffrax.Kvaerno5,
     "Radau IIA": jj.RadauIIA,
-    "implicit midpoint": jj.ImplicitMidpoint,
-    "DLA": jj.DiscreteLagrangeDAlembert,
-    "discrete gradient": jj.DiscreteGradient,
 }
-EVEN_STEPS = ("implicit midpoint", "DLA", "discrete gradient")  # they take steps of one length, `step` of a case
+EVEN_STEPS = {"implicit midpoint": jj.ImplicitMidpoint, "DLA": jj.DiscreteLagrangeDAlembert, "discrete gradient": jj.DiscreteGradient}  # of a `step`
 ADJOINTS: dict[str, Callable[[], diffrax.AbstractAdjoint]] = {
     "forward mode": diffrax.ForwardMode,
     "direct adjoint": diffrax.DirectAdjoint,
@@ -109,6 +106,7 @@ METHODS: tuple[Method, ...] = (
     *(_by_reduction(name) for name in REDUCTIONS),
     *(_stabilised(name, rate) for name, rate in STABILISED.items()),
     *(Method(name, "integrators", lambda scene, make=make: {"solver": make()}) for name, make in INTEGRATORS.items()),
+    *(Method(name, "integrators") for name in EVEN_STEPS),
     *(Method(name, "adjoints", lambda scene, make=make: {"adjoint": make()}) for name, make in ADJOINTS.items()),
     *(Method(name, "naive", naive=name) for name in NAIVE),
     Method("MuJoCo", "elsewhere", elsewhere=True),

@@ -11,7 +11,7 @@ import jourdain_jax as jj
 from atlas_cases import elsewhere, naive
 from atlas_cases.case import by_type, single
 from atlas_cases.elsewhere import Elsewhere
-from atlas_cases.methods import Method
+from atlas_cases.methods import EVEN_STEPS, Method
 from atlas_cases.outcomes import NAN, Outcome, judged, not_applicable, worst
 from jourdain_jax.motion.trajectories import results
 
@@ -77,7 +77,7 @@ class Motion:
     def _simulate(self, method: Method):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            steps = {"dt0": self.step} if method.even_steps else {}
+            steps: dict = {"solver": EVEN_STEPS[method.name](step=self.step)} if method.even_steps else {}
             if method.reduction or (single() and method.group == "constraints" and method.name not in SELDOM):
                 steps["max_steps"] = by_type(self.most_steps, 5_000)
             return jj.simulate(self.scene, self.start, ts=self.ts, **self.tolerances, **{**self.options, **method.options(self.scene), **steps})

@@ -47,8 +47,8 @@ def _by_simulate(solver, stepped: bool = False, **options) -> Callable[[Problem]
 
         @jax.jit
         def compiled(setting, start):
-            sizes = {"dt0": setting} if stepped else {"rtol": setting, "atol": setting}
-            motion = jj.simulate(scene, start, ts=ends, solver=solver, events=False, max_steps=MAX_STEPS, **sizes, **options)
+            how = {"solver": solver(step=setting)} if stepped else {"solver": solver, "rtol": setting, "atol": setting}
+            motion = jj.simulate(scene, start, ts=ends, events=False, max_steps=MAX_STEPS, **how, **options)
             return motion.q_end, motion.u_end, motion.accepted, motion.rejected, motion.result
 
         start = dataclasses.replace(problem.state)
@@ -109,7 +109,7 @@ def curves(problem: Problem, quick: bool) -> list[Curve]:
     ]
     found.append(Curve("Taylor", "ours", TOLERANCES, "tolerance", _by_series, group="solver"))
     if not problem.large:
-        found.append(_step("implicit midpoint", problem, jj.ImplicitMidpoint()))
+        found.append(_step("implicit midpoint", problem, jj.ImplicitMidpoint))
     given = _tolerance("minimal state, not projected, Dopri8", "state", diffrax.Dopri8(), formulation=jj.Formulation(stabilisation=None))
     full = _tolerance("full state, projected, Dopri8", "state", diffrax.Dopri8(), COARSE, formulation=jj.Formulation("full"))
     if quick:
@@ -117,7 +117,7 @@ def curves(problem: Problem, quick: bool) -> list[Curve]:
     if not problem.large:
         found.append(_tolerance("Kvaerno5", "solver", diffrax.Kvaerno5(), IMPLICIT_TOLERANCES))
     if problem.structure_preserving:
-        found += [_step("discrete Lagrange-d'Alembert", problem, jj.DiscreteLagrangeDAlembert()), _step("discrete gradient", problem, jj.DiscreteGradient())]
+        found += [_step("discrete Lagrange-d'Alembert", problem, jj.DiscreteLagrangeDAlembert), _step("discrete gradient", problem, jj.DiscreteGradient)]
     loose = _tolerance("full state, not projected, Dopri8", "state", diffrax.Dopri8(), COARSE, formulation=jj.Formulation("full", stabilisation=None))
     # the privileged reduction is the default one, here with dense matrices
     reductions = ("privileged", "kkt") if problem.large else REDUCTIONS

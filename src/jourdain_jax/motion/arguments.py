@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.reals import as_array, checked_unless_traced, described, is_traced, real_type
+from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.start import State, named_start
@@ -68,7 +69,7 @@ def check_options(*, rtol=1e-8, atol=1e-8, max_steps=1, dt0=None, max_step=None,
     if max_steps is not None and (not isinstance(max_steps, int | np.integer) or isinstance(max_steps, bool) or max_steps < 1):
         raise ValueError(f"`max_steps` is {max_steps!r}, expected a whole number of at least 1; give the number of steps after which to stop")
     for name, value in objects.items():
-        if value is None or isinstance(value, Method):
+        if value is None or isinstance(value, Method | ImplicitMethod):
             continue
         kind, example = getattr(diffrax, _KINDS[name][0]), _KINDS[name][1]
         if not isinstance(value, kind):

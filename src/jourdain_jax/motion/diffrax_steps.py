@@ -20,8 +20,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from jourdain_jax.motion.integrators import event_search, integrands
 from jourdain_jax.motion.integrators.event_location import Remembering, locate, with_tolerances
 from jourdain_jax.motion.integrators.guarded_solver import GuardedSolver
-from jourdain_jax.motion.integrators.solver_choice import takes_even_steps
-from jourdain_jax.motion.integrators.step_to_times import EvenSteps, merged, step_to_times
+from jourdain_jax.motion.integrators.step_to_times import merged, step_to_times
 from jourdain_jax.motion.integrators.wrapping_solver import for_adjoint
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
@@ -59,12 +58,9 @@ class Diffrax(Integrator):
         names, (rtol, atol) = self.event_names, setup.tolerances
         landings = jnp.append(ts if self.saveat is None else ts[:0], t1)
         landings = landings if knots is None else merged(landings, knots + t0, jnp.sign(t1 - t0))
-        if takes_even_steps(self.solver) and (self.controller is None or type(self.controller) is diffrax.ConstantStepSize):
-            controller = to_times = EvenSteps(landings)
-        else:
-            by_tolerance = diffrax.PIDController(rtol=rtol, atol=atol, norm=integrands.state_norm, dtmin=setup.shortest, dtmax=setup.longest, force_dtmin=False)
-            controller = by_tolerance if self.controller is None else self.controller
-            to_times = step_to_times(landings, controller) if self.saveat is None or knots is not None else controller
+        by_tolerance = diffrax.PIDController(rtol=rtol, atol=atol, norm=integrands.state_norm, dtmin=setup.shortest, dtmax=setup.longest, force_dtmin=False)
+        controller = by_tolerance if self.controller is None else self.controller
+        to_times = step_to_times(landings, controller) if self.saveat is None or knots is not None else controller
         saveat = diffrax.SaveAt(ts=ts) if self.saveat is None else self.saveat
         if self.saveat is not None and saveat.subs.ts is not None:
             saveat = eqx.tree_at(lambda saveat: saveat.subs.ts, saveat, saveat.subs.ts - origin)

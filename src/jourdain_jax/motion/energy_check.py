@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.motion.integrators.solver_choice import takes_even_steps
+from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod
 from jourdain_jax.motion.setup import Setup
 from jourdain_jax.motion.vector_fields.field import Integrated
 
@@ -24,7 +24,7 @@ def conserves(setup: Setup) -> bool:
 
     Integrated work is no part of the check: it may be the small rest of large powers, whose errors nothing at the ends of steps bounds.
     """
-    by_tolerance = setup.integrator.controller is None and not takes_even_steps(setup.integrator.solver)
+    by_tolerance = setup.integrator.controller is None and not isinstance(setup.integrator.solver, FixedStepMethod)
     return by_tolerance and setup.field.conserves
 
 

@@ -1,4 +1,4 @@
-"""Our own explicit Runge-Kutta loop as an integrator: as machine code where that serves, its derivatives too, and as a loop of XLA where not.
+"""Our own loop over steps as an integrator: as machine code where that serves, its derivatives too, and as a loop of XLA where not.
 
 One motion, or lanes side by side: those of a scalar program in blocks of `lockstep.width`.
 """
@@ -18,7 +18,9 @@ from jourdain_jax.calculus.guards import reverse_only
 from jourdain_jax.motion.batches.lockstep import in_blocks, width
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators import erk_loop, integrands
+from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
 from jourdain_jax.motion.integrators.of_diffrax import alongside, diffrax
+from jourdain_jax.motion.integrators.problem import Problem
 from jourdain_jax.motion.integrators.tableaus import Method, method_of
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
@@ -29,9 +31,9 @@ Mode = Literal["forward", "reverse"]
 
 
 class OwnSteps(Integrator):
-    """Our own loop, with a solver's tableau or by Taylor series; a static object, the same for all calls with these options."""
+    """Our own loop, by a tableau, an implicit method or Taylor series; a static object, the same for all calls with these options."""
 
-    solver: Method = eqx.field(static=True)
+    solver: Method | ImplicitMethod = eqx.field(static=True)
     kind: Literal["forward", "reverse", "both"] = eqx.field(static=True)  # of derivatives
     alongside: bool = eqx.field(static=True)  # whether values and tangents come from one run
     max_steps: int = eqx.field(static=True)
@@ -55,13 +57,15 @@ class OwnSteps(Integrator):
     def reason_against_machine_code(self, setup: Setup) -> str:
         if not self.native:
             return "another backend was asked for"
+        if not isinstance(self.solver, Method):
+            return "a solver with equations in each step was asked for"
         return native_motion.reason_against(setup.field, setup.scene, setup.inputs, bool(self.event_names))
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
         return self._by_either(lambda mode: partial(_by_xla, mode), lambda f: f, setup, begun)
 
     def lanes_solved(self, setups: Setup, begun: Begun) -> Solved:
-        if (program := setups.field.lowered) is None:
+        if (program := setups.field.lowered) is None or not isinstance(self.solver, Method):
             return super().lanes_solved(setups, begun)
         return self._by_either(lambda mode: partial(in_blocks, partial(_lanes_by_xla, mode), width(program)), eqx.filter_vmap, setups, begun)
 
@@ -81,7 +85,9 @@ _once: Callable[..., OwnSteps] = lru_cache(maxsize=64)(OwnSteps)
 
 def own_steps(solver, stepsize_controller, adjoint, saveat, **static) -> OwnSteps | None:
     """Our own loop, where it has such a solver and such an adjoint (None: the default one), and nothing else is stated."""
-    method = solver if isinstance(solver, Method) else method_of(solver)
+    own = isinstance(solver, Method | ImplicitMethod)
+    method = solver if own else method_of(solver)
+    method = method.without_step() if isinstance(method, FixedStepMethod) else method
     kind = "both" if adjoint is None else _kind(adjoint)
     if stepsize_controller is not None or saveat is not None or method is None or kind is None:
         return None
@@ -116,7 +122,7 @@ def _loop(mode: Mode, setup: Setup, y0, args, ts, knots) -> Solved:
     goals = _goals(setup, ts)
     args = args if knots is None else integrands.within(jnp.full_like(setup.t0, jnp.inf), args)
     relations, relation_count = watched(field, setup.inputs, bool(own.event_names))
-    problem = erk_loop.Problem(
+    problem = Problem(
         rates=integrands.rates,
         args=args,
         project=integrands.project if field.projects else None,
@@ -147,6 +153,7 @@ def _motion(setup: Setup, begun: Begun) -> native_motion.Motion:
     own, knots = _own(setup), setup.knots
     rtol, atol = setup.tolerances
     control = native_motion.Control(rtol, atol, setup.shortest, setup.longest, setup.dt0, setup.most_steps(knots))
+    assert isinstance(own.solver, Method)
     return native_motion.Motion(begun.args, own.solver, own.order, bool(own.event_names), begun.y0, _goals(setup, setup.ts), knots, control)
 
 

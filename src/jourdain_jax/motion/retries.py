@@ -20,7 +20,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import is_traced
-from jourdain_jax.motion.integrators.of_diffrax import radau
+from jourdain_jax.motion.integrators.radau import RadauIIA
 from jourdain_jax.motion.integrators.solver_choice import may_be_full
 from jourdain_jax.motion.integrators.tableaus import DOPRI8
 from jourdain_jax.motion.integrators.taylor import Taylor
@@ -61,7 +61,7 @@ def retry_options(retries: int, options: dict) -> dict:
         if isinstance(options.get("solver"), Taylor):  # which dense matrices do not have
             changed["solver"] = DOPRI8
     if retries & results.IMPLICIT:
-        changed |= {"solver": radau.RadauIIA(), "max_steps": max(1, options.get("max_steps", MOST_STEPS) // _SHARE)}
+        changed |= {"solver": RadauIIA(), "max_steps": max(1, options.get("max_steps", MOST_STEPS) // _SHARE)}
     return changed
 
 

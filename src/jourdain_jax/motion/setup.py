@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.motion.arguments import fitting_times
+from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
 from jourdain_jax.motion.integrators.knots import knots_between
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.integrators.solver_choice import steps_are_given
@@ -52,7 +53,7 @@ class Integrator(eqx.Module):
 
     max_steps: eqx.AbstractVar[int]
     event_names: eqx.AbstractVar[tuple[str, ...]]
-    solver: eqx.AbstractVar["diffrax.AbstractSolver | Method"]
+    solver: eqx.AbstractVar["diffrax.AbstractSolver | Method | ImplicitMethod"]
     controller: eqx.AbstractVar["diffrax.AbstractStepSizeController | None"]  # None: the default one
     saveat: eqx.AbstractVar["diffrax.SaveAt | None"]  # None: at the times asked for, at each of which a step ends
     watches: eqx.AbstractClassVar[bool]  # whether steps watch relations (`crossings.py`)

@@ -18,6 +18,7 @@ from jourdain_jax.motion.arguments import as_state, check_options, span_and_time
 from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.inputs_in_rows import check_inputs_in_rows
 from jourdain_jax.motion.integration import integrate
+from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted
 from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method, as_solver
@@ -53,7 +54,7 @@ def simulate(
     saveat: "diffrax.SaveAt | None" = None,
     rtol: Number = TOLERANCE,
     atol: Number = TOLERANCE,
-    solver: "diffrax.AbstractSolver | Taylor | None" = None,
+    solver: "diffrax.AbstractSolver | Method | ImplicitMethod | Taylor | None" = None,
     stepsize_controller: "diffrax.AbstractStepSizeController | None" = None,
     dt0: Number | None = None,
     max_step: Number | None = None,
@@ -77,7 +78,7 @@ def simulate(
       `diffrax.diffeqsolve`. Default solver: Tsit5 for
       rtol >= 1e-6, Dopri8 below, and where these run out of steps on a stiff motion, `RadauIIA`; `Taylor` for small scenes at
       tight tolerances; structure-preserving ones (`ImplicitMidpoint`,
-      `DiscreteLagrangeDAlembert`, `DiscreteGradient`) take equal steps of at most `dt0` between saved times.
+      `DiscreteLagrangeDAlembert`, `DiscreteGradient`) take equal steps of at most their `step` between saved times.
       Default adjoint: forward and reverse mode, to the second order (`jax.hessian`), where machine code integrates; otherwise
       `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order, by recorded steps; with `checkpoints=`, that of diffrax);
       `diffrax.ForwardMode()` for forward mode of any order; `diffrax.DirectAdjoint()` for all.
@@ -158,7 +159,9 @@ def _set_up(
     objects = {"solver": solver, "adjoint": adjoint, "stepsize_controller": stepsize_controller, "saveat": saveat}
     check_options(rtol=rtol, atol=atol, max_steps=max_steps, dt0=dt0, max_step=max_step, switches=switches, **objects)
     _check_adjoint(adjoint)
-    check_solver(solver, stepsize_controller, dt0, saveat, max_step)
+    check_solver(solver, stepsize_controller, dt0, saveat, max_step, adjoint)
+    if isinstance(solver, FixedStepMethod):
+        dt0 = max_step = solver.step
     native = backend in ("auto", "native")
     inputs = as_inputs(scene, inputs)
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)

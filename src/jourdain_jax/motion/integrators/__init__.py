@@ -1,1 +1,1 @@
-"""How a motion is integrated: our explicit Runge-Kutta loop and its adjoint, solvers for diffrax, events, knots of the inputs."""
+"""How a motion is integrated: our loop over steps and its adjoint, explicit and implicit methods, events, knots of the inputs."""

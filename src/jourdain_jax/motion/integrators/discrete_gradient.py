@@ -14,7 +14,7 @@ S at the midpoint and Gonzalez's discrete gradient in the place of grad H, whenc
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.newton import newton_root
@@ -22,13 +22,14 @@ from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.virtual_power import energies_at
-from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step
+from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, Solution
+from jourdain_jax.motion.integrators.problem import Problem
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
 
-class DiscreteGradient(FixedStepSolver):
-    """The energy-preserving discrete-gradient method in reduced form, `simulate(..., solver=DiscreteGradient(), dt0=h)`; h in s.
+class DiscreteGradient(FixedStepMethod):
+    """The energy-preserving discrete-gradient method in reduced form, `simulate(..., solver=DiscreteGradient(step=h))`; h in s.
 
     With z = (q, y), y the privileged speeds, and the rates written as `zdot = S(z) grad H(z)`, S skew and H = T + V: `z_1 - z_0 = h S(z_m) gbar`,
     z_m = (z_0 + z_1)/2, gbar Gonzalez's discrete gradient of H. Order 2, symmetric in time; T + V is kept to round-off, velocity rows hold exactly.
@@ -50,24 +51,24 @@ class DiscreteGradient(FixedStepSolver):
         """
         fault = _fault(scene, field, asked)
         if fault:
-            raise ValueError(f"`DiscreteGradient` does not apply to `{type(scene).__name__}`: {fault}; use solver=jj.ImplicitMidpoint()")
+            raise ValueError(f"`DiscreteGradient` does not apply to `{type(scene).__name__}`: {fault}; use solver=jj.ImplicitMidpoint(step=...)")
         return field
 
-    def stepped(self, step: Step, y: Integrated) -> tuple[Integrated, Bool[Array, ""]]:
-        """The state `y` after one `step`, and whether its equations were solved."""
-        return _stepped(step.args, step.args[4] + step.t + step.h / 2, jnp.asarray(step.h, y.q.dtype), y)
+    def solve(self, problem: Problem, t, y: Integrated, h) -> Solution:
+        """Return the change of the state `y` at `t` by a step `h` (s) of a `problem`."""
+        return _solved(problem.args, problem.args[4] + t + h / 2, jnp.asarray(h, y.q.dtype), y)
 
 
-@eqx.filter_jit  # traced once, not wherever diffrax looks at a step
-def _stepped(args, t, h, y: Integrated) -> tuple[Integrated, Bool[Array, ""]]:
+@eqx.filter_jit  # traced once
+def _solved(args, t, h, y: Integrated) -> Solution:
     n, z0 = y.q.shape[0], jnp.concatenate([y.q, y.v])
     H0 = _energy(args, t, z0, n)
     guess = h * jnp.concatenate(_rates(args, t, y.q, y.v))
     size = jnp.max(jnp.abs(z0)) + jnp.max(jnp.abs(guess))
     scale = jnp.broadcast_to(jnp.where(size == 0, 1.0, size), z0.shape)
     found = newton_root(lambda d: _residual(args, t, h, n, z0, H0, d), guess, jax.lax.stop_gradient(scale))
-    z1 = z0 + found.x
-    return Integrated(z1[:n], z1[n:], y.work), found.converged
+    change = jnp.where(found.converged, found.x, 0.0)
+    return Solution(Integrated(change[:n], change[n:], jax.tree.map(jnp.zeros_like, y.work)), None, found.converged)
 
 
 @eqx.filter_jit  # traced once; its derivatives are then taken of what was traced

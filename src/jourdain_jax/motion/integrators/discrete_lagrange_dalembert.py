@@ -20,7 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.calculus.newton import newton_root
@@ -29,7 +29,8 @@ from jourdain_jax.equations.lagrange import speeds_are_rates
 from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.rows import position_residual, velocity_residual
 from jourdain_jax.equations.virtual_power import energies_at, resultants
-from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step
+from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, Solution
+from jourdain_jax.motion.integrators.problem import Problem
 from jourdain_jax.motion.vector_fields.by_matrices import full_without_projection
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.names import nearest
@@ -110,8 +111,8 @@ def _force(scene: Scene, t, q, u, inputs) -> Float[Array, "speeds"]:
     return jnp.einsum("bik,bi->k", partial.linear, loads.force) + jnp.einsum("bik,bi->k", partial.angular, torque) + loads.direct
 
 
-class DiscreteLagrangeDAlembert(FixedStepSolver):
-    """The nonholonomic integrator of the discrete Lagrange-d'Alembert principle, `simulate(..., solver=DiscreteLagrangeDAlembert(), dt0=h)`.
+class DiscreteLagrangeDAlembert(FixedStepMethod):
+    """The nonholonomic integrator of the discrete Lagrange-d'Alembert principle, `simulate(..., solver=DiscreteLagrangeDAlembert(step=h))`.
 
     `D_1 L_d(q_k, q_k+1) + D_2 L_d(q_k-1, q_k) = -A(q_k)' lambda` with discrete rows `phi_d(q_k, q_k+1) = 0`, from the scene's own Lagrangian
     L = T - V - dS/dt (S: its `gauge`) by autodiff. `rule`: "midpoint", `L_d = h L((q_0 + q_1)/2, (q_1 - q_0)/h)`, or "trapezoidal",
@@ -141,19 +142,19 @@ class DiscreteLagrangeDAlembert(FixedStepSolver):
         structure, name = structure_of(scene), type(scene).__name__
         fault = _fault(scene, structure)
         if fault:
-            raise ValueError(f"`DiscreteLagrangeDAlembert` does not apply to `{name}`: {fault}; use solver=jj.ImplicitMidpoint()")
+            raise ValueError(f"`DiscreteLagrangeDAlembert` does not apply to `{name}`: {fault}; use solver=jj.ImplicitMidpoint(step=...)")
         if asked == "minimal":
             raise ValueError("`DiscreteLagrangeDAlembert` integrates all speeds; leave the `state` of its `Formulation` at 'auto'")
         equations = f"discrete Lagrange-d'Alembert equations, {self.rule} rule"
         return full_without_projection(field, scene, equations)
 
-    def stepped(self, step: Step, y: Integrated) -> tuple[Integrated, Bool[Array, ""]]:
-        """The state `y` after one `step`, and whether its equations were solved."""
-        return _stepped(step.args, Interval(step.args[4] + step.t, step.h, self.rule), y)
+    def solve(self, problem: Problem, t, y: Integrated, h) -> Solution:
+        """Return the change of the state `y` at `t` by a step `h` (s) of a `problem`."""
+        return _solved(problem.args, Interval(problem.args[4] + t, h, self.rule), y)
 
 
-@eqx.filter_jit  # traced once, not wherever diffrax looks at a step
-def _stepped(args, over: Interval, y: Integrated) -> tuple[Integrated, Bool[Array, ""]]:
+@eqx.filter_jit  # traced once
+def _solved(args, over: Interval, y: Integrated) -> Solution:
     _, scene, inputs, *_ = args
     q0, u0, h = y.q, y.v, over.h
     n = q0.shape[0]
@@ -166,7 +167,9 @@ def _stepped(args, over: Interval, y: Integrated) -> tuple[Integrated, Bool[Arra
     found = newton_root(lambda x: _residual(args, over, q0, p0, A0, x), guess, jax.lax.stop_gradient(scale))
     q1 = q0 + found.x[:n]
     u1 = _projected(args, over, q0, q1)
-    return Integrated(q1, u1, _work(args, over, y, q1, u1)), found.converged & jnp.all(jnp.isfinite(u1))
+    solved = found.converged & jnp.all(jnp.isfinite(u1))
+    change = Integrated(found.x[:n], u1 - u0, _work(args, over, y, q1, u1))
+    return Solution(jax.tree.map(lambda x: jnp.where(solved, x, 0.0), change), None, solved)
 
 
 @eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
@@ -214,9 +217,9 @@ def _fault(scene: Scene, structure: Structure) -> str:
 
 
 def _work(args, over: Interval, y: Integrated, q1, u1):
-    """The work so far, by the midpoint rule."""
+    """The work of the step, by the midpoint rule."""
     if y.work is None:
         return None
     field, scene, inputs, fixed, _ = args
     t = (over.t0 + over.t1) / 2
-    return y.work + over.h * field.rates(scene, fixed, t, Integrated((y.q + q1) / 2, (y.v + u1) / 2, y.work), field.now(inputs, t)).work
+    return over.h * field.rates(scene, fixed, t, Integrated((y.q + q1) / 2, (y.v + u1) / 2, y.work), field.now(inputs, t)).work

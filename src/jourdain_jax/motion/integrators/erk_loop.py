@@ -1,9 +1,8 @@
-"""The loop over steps of an explicit Runge-Kutta method with an embedded error estimate, with little besides: for the default options.
+"""The loop over steps of one of our own methods, explicit (`tableaus.py`) or implicit (`implicit_steps.py`), with little besides.
 
 A batch of lanes runs in lockstep, from one time asked for to the next (`erk_step`). Every lane carries its own result code, and a lane that has ended
 stands still. A lane whose step ended beyond a stop event goes back to it in further steps of the same loop, so that there is one copy of the rates to
-compile (`event_search`). In reverse mode the loop keeps a record of its steps, which are then gone back over (`recorded_adjoint`). `diffrax` serves all
-other solvers, controllers and ways of saving.
+compile (`event_search`). In reverse mode the loop keeps a record of its steps, which are then gone back over (`recorded_adjoint`).
 """
 
 from typing import Literal
@@ -15,7 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jourdain_jax.motion.integrators import recorded_adjoint
-from jourdain_jax.motion.integrators.erk_step import RUNNING, Problem, Progress, advanced, begun, running
+from jourdain_jax.motion.integrators.erk_step import RUNNING, Progress, advanced, begun, running
+from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
+from jourdain_jax.motion.integrators.problem import Problem
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.trajectories import results
 
@@ -23,7 +24,7 @@ _SHRANK = 0.01  # of the average step: a singularity is near
 
 
 def integrate(
-    problem: Problem, method: Method, y0: PyTree, t0, goals: Float[Array, "times *lanes"], dt0, kind: Literal["forward", "reverse"]
+    problem: Problem, method: Method | ImplicitMethod, y0: PyTree, t0, goals: Float[Array, "times *lanes"], dt0, kind: Literal["forward", "reverse"]
 ) -> tuple[PyTree, Bool[Array, "times *lanes"], Progress]:
     """States at the goals (monotonic; what was not reached repeats the last state), which were reached, and where the lane ended.
 
@@ -44,7 +45,7 @@ def ended(end: Progress, t0) -> Progress:
     return eqx.tree_at(lambda p: p.code, end, code)
 
 
-def _motion(problem: Problem, method: Method, y0: PyTree, t0, goals, dt0) -> tuple[PyTree, Bool[Array, "times *lanes"], Progress]:
+def _motion(problem: Problem, method: Method | ImplicitMethod, y0: PyTree, t0, goals, dt0) -> tuple[PyTree, Bool[Array, "times *lanes"], Progress]:
     direction = jnp.sign(goals[-1] - t0)
 
     def to_goal(progress: Progress, goal):

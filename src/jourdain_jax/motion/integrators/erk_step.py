@@ -1,4 +1,4 @@
-"""One step of our explicit Runge-Kutta loop: an explicit Runge-Kutta method with an embedded error estimate, or a step of the search for a stop event.
+"""One step of our loop: an explicit Runge-Kutta method with an embedded error estimate, an implicit method, or a step of the search for a stop event.
 
     k_i = f(t + c_i h, y + h sum_j a_ij k_j),   y_1 = y + h sum b_i k_i,   e = h sum b^err_i k_i
     |e| = rms(e / (atol + rtol max(|y|, |y_1|))) <= 1 accepts;   h <- min(h clip(0.9 |e|^(-1/order), 0.2, 10), longest)
@@ -7,11 +7,14 @@ The state is any tree of arrays; in a batch all arrays, times and step sizes amo
 neighbours. A step ends at every time asked for and at every knot of the inputs; the step size found before such a shortened step is remembered. The state
 advances by the difference of the times at the ends of a step, as they are after rounding.
 
+Implicit methods (`implicit_steps.py`) give a state, and an error or none. A step whose equations are not solved has an infinite error. Methods of equal steps
+cannot try one again: what would refuse it ends the motion with a code of its own. Trials of the search for an event are steps of the method too; its last
+shifts, which are tiny, are steps of Tsit5, whose derivatives are those of the motion.
+
 In single precision the state is summed with compensation (Kahan): what rounding leaves off an increment is added to the next one. Otherwise a state whose
 increments are smaller than its last digit stands still while time passes, and no error estimate sees it.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -26,12 +29,15 @@ from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.integrators import crossings, event_search
 from jourdain_jax.motion.integrators.crossings import Crossings
 from jourdain_jax.motion.integrators.event_search import Search
-from jourdain_jax.motion.integrators.tableaus import Method
+from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod, Solution, even_step
+from jourdain_jax.motion.integrators.problem import Problem, as_in
+from jourdain_jax.motion.integrators.tableaus import TSIT5, Method
 from jourdain_jax.motion.trajectories import results
 
 RUNNING, LOCATING = -1, -2
 NOISE = 0.6  # exponent of round-off: rows shrink to about its power 0.4 before a step passes
 SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
+_REST = 1e-6  # of the size of the state: a step that changes less counts as one that changes so much
 
 
 class Progress(eqx.Module):
@@ -49,43 +55,6 @@ class Progress(eqx.Module):
     pivot: Float[Array, "*lanes"]  # smallest magnitude so far of a pivot, at any stage of an accepted step
     rest: PyTree  # what rounding has left off `y`, to be added by the next step; None where that cannot add up to much
     crossings: Crossings | None  # of relations, where there are any
-
-
-class Problem(eqx.Module):
-    """What is integrated and how well."""
-
-    rates: Callable  # (t, y, args) -> dy/dt
-    args: PyTree
-    project: Callable | None  # (t, y, args) -> y
-    events: Callable | None  # (t, y, args) -> values, (events, *lanes)
-    norm: Callable  # of a state, one number per lane
-    rtol: Float[Array, "*lanes"]
-    atol: Float[Array, "*lanes"]
-    shortest: Float[Array, "*lanes"]
-    longest: Float[Array, "*lanes"]
-    max_steps: int = eqx.field(static=True)
-    knots: Float[Array, "knots *lanes"] | None = None  # times at which a step must end, in the order of the motion; the last are infinite, with its sign
-    # as `rates`; pivots (pivots, *lanes) that must keep their signs, and directions (rows, speeds, *lanes) that must not turn round; None: there are none
-    rates_and_pivots: Callable | None = None
-    relations: Callable | None = None  # (args, t, y) -> numbers whose signs are watched, (numbers, *lanes): first so many relations, then stop events
-    relation_count: int = eqx.field(static=True, default=0)
-    span: Float[Array, "*lanes"] | None = None  # of the motion, s
-    within: Callable | None = None  # (t, args) -> args for the stages of a step with the middle t; None: the same in all steps
-
-    def in_step(self, t, h) -> "Problem":
-        """The problem for the stages of a step."""
-        return self if self.within is None else replace(self, args=self.within(t + 0.5 * h, self.args))
-
-    def knot_ahead(self, p: "Progress", direction) -> Float[Array, "*lanes"]:
-        """The time of the knot ahead, infinity with the sign of the motion where there is none."""
-        if self.knots is None:
-            return direction * jnp.full_like(p.t, jnp.inf)
-        return jnp.take_along_axis(self.knots, p.knot[None], axis=0)[0]
-
-    def knots_passed(self, t: Float[Array, "*lanes"], direction) -> Int[Array, "*lanes"]:
-        """How many knots lie at `t` or before it."""
-        zero = jnp.zeros(jnp.shape(t), jnp.int32)
-        return zero if self.knots is None else zero + jnp.sum((self.knots - t) * direction <= 0, axis=0, dtype=jnp.int32)
 
 
 def begun(problem: Problem, y0: PyTree, t0: Float[Array, "*lanes"], dt0, direction) -> Progress:
@@ -116,39 +85,52 @@ def running(p: Progress, goal: Float[Array, "*lanes"]) -> Bool[Array, "*lanes"]:
     return (p.code == LOCATING) | ((p.code == RUNNING) & (p.t != goal))
 
 
-def advanced(problem: Problem, method: Method, p: Progress, goal, last_goal, direction) -> Progress:
+def advanced(problem: Problem, method: Method | ImplicitMethod, p: Progress, goal, last_goal, direction) -> Progress:
     """One step, tried by all lanes that are on their way to `goal`; the others stand still."""
     moving = running(p, goal)
     return jax.tree.map(lambda new, old: jnp.where(moving, new, old), _tried(problem, method, p, goal, last_goal, direction), p)
 
 
-def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direction) -> Progress:
+def _tried(problem: Problem, method: Method | ImplicitMethod, p: Progress, goal, last_goal, direction) -> Progress:
     locating = jnp.array(False) if p.search is None else p.code == LOCATING
-    knot = problem.knot_ahead(p, direction)
+    knot = problem.knot_ahead(p.t, p.knot, direction)
     target = jnp.where((knot - goal) * direction < 0, knot, goal)
     rest = jnp.abs(target - p.t)
     reach = p.h if p.crossings is None else jnp.minimum(p.h, p.crossings.reach(p.t, direction, problem.span))
+    reach = jnp.minimum(reach, even_step(problem.longest, rest)) if method.even else reach
     lands = ~locating & (reach >= 0.999 * rest)
     size = jnp.where(lands, rest, jnp.where(2 * reach > rest, 0.5 * rest, reach))
     shortened = size < p.h
     h = direction * size if p.search is None else jnp.where(locating, p.search.shift, direction * size)
     t1 = jnp.where(lands, target, p.t + h)
     h = t1 - p.t  # as rounded: the state and the time advance together
-    y1, slopes, _, pivots = stages(problem, method, p.t, p.y, h, monitored=True)
+    if isinstance(method, Method):
+        y1, slopes, _, pivots = stages(problem, method, p.t, p.y, h, monitored=True)
+        increments = jax.tree.map(lambda k: as_in(h, k) * weighted(method.b, k), slopes)
+        error = jax.tree.map(lambda k: as_in(h, k) * weighted(method.b_error, k), slopes)
+        ends, solved = [jax.tree.map(lambda k, i=i: k[i], slopes) for i in (0, method.at_the_end)], True
+    else:
+        (increments, error, solved), ends, pivots = _by_equations(problem, method, p, h)
+        y1 = jax.tree.map(jnp.add, p.y, increments)
     rest = p.rest
     if rest is not None:
-        y1, rest = _compensated(p.y, rest, jax.tree.map(lambda k: as_in(h, k) * weighted(method.b, k), slopes))
-    error = jax.tree.map(lambda k: as_in(h, k) * weighted(method.b_error, k), slopes)
+        y1, rest = _compensated(p.y, rest, increments)
+    fault = jnp.where(solved, RUNNING, results.UNSOLVED_STEP)  # of a step that cannot be tried again
     if problem.project is not None:
         free, y1 = y1, problem.project(t1, y1, problem.args)
         # the projection removes what the error estimate does not see; it must be no larger than an error
-        error = jax.tree.map(lambda e, moved: jnp.maximum(jnp.abs(e), moved), error, removed(y1, free, p.t.ndim))
-    scale = jax.tree.map(lambda a, b: problem.atol + problem.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)), p.y, y1)
-    relative = jax.lax.stop_gradient(jax.tree.map(lambda e, s: e / s, error, scale))
-    size_of_error = problem.norm(relative)
+        if error is None:
+            fault = jnp.where(solved & (_relative(free, p.y, y1) > results.MOST_PROJECTED), results.OFF_CONSTRAINTS, fault)
+        else:
+            error = jax.tree.map(lambda e, moved: jnp.maximum(jnp.abs(e), moved), error, removed(y1, free, p.t.ndim))
+    size_of_error = jnp.zeros_like(p.t)
+    if error is not None:
+        scale = jax.tree.map(lambda a, b: problem.atol + problem.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)), p.y, y1)
+        size_of_error = problem.norm(jax.lax.stop_gradient(jax.tree.map(lambda e, s: e / s, error, scale)))
     if pivots is not None:
         # a step in which a pivot changes its sign passes over a singularity, which no error estimate need notice
-        size_of_error = jnp.where(pivots.changed_sign & ~locating, jnp.inf, size_of_error)
+        fault = jnp.where(solved & pivots.changed_sign, results.SINGULAR_PARTITION, fault)
+    size_of_error = jnp.where((fault != RUNNING) & ~locating, jnp.inf, size_of_error)
     accept = locating | (size_of_error <= 1)
     factor = SAFETY * jnp.where(size_of_error > 0, size_of_error, 1e-30) ** (-1 / method.order)
     factor = jnp.clip(jnp.where(jnp.isfinite(size_of_error), factor, 0.0), LEAST_FACTOR, jnp.where(accept, LARGEST_FACTOR, 1.0))
@@ -157,7 +139,7 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
     watched = None
     if p.crossings is not None and problem.relations is not None:
         watched = p.crossings.watched(
-            partial(problem.relations, problem.args), problem.relation_count, (p.t, p.y), (t1, y1), accept & ~locating, h, problem.span
+            partial(problem.relations, problem.args), problem.relation_count, (p.t, p.y), (t1, y1), accept & ~locating & (not method.even), h, problem.span
         )
         accept, next_h = accept & ~watched.refused, jnp.where(watched.refused, jnp.where(watched.falls, watched.to_event, p.h), next_h)
     accepted, rejected = p.accepted + (accept & ~locating).astype(jnp.int32), p.rejected + (~accept).astype(jnp.int32)
@@ -171,8 +153,10 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
         jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, passed, accepted, rejected, p.event, p.search, p.pivot, rest, p.crossings
     )
     if problem.events is not None:
-        slopes = [jax.tree.map(lambda k, i=i: k[i], slopes) for i in (0, method.at_the_end)]  # first and last
-        moved = _monitored(problem, p, moved, h, slopes, accept & ~locating & (code == RUNNING))
+        moved = _monitored(problem, p, moved, h, ends, accept & ~locating & (code == RUNNING))
+    if not isinstance(method, Method):
+        fails = ~accept if method.even else locating & (fault == results.UNSOLVED_STEP)
+        moved = replace(moved, code=jnp.where(fails, fault, moved.code).astype(jnp.int32))
     # what lies beyond an event does not count
     counts = accept & ~locating & (moved.code == RUNNING) & (moved.t == t1)
     if watched is not None and p.crossings is not None:
@@ -181,6 +165,34 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
         return moved
     pivot = jnp.where(counts, jnp.minimum(p.pivot, pivots.smallest), p.pivot)
     return replace(moved, pivot=pivot, code=jnp.where(counts & (pivot < SMALLEST_PIVOT), results.SINGULAR_PARTITION, moved.code).astype(jnp.int32))
+
+
+def _by_equations(problem: Problem, method: ImplicitMethod, p: Progress, h) -> tuple[Solution, list[PyTree], "Pivots | None"]:
+    """A step from `p` by an implicit method; the slopes at both ends where events need them; what the pivots were, where there are any."""
+    inside = problem.in_step(p.t, h)
+    found = method.solve(inside, p.t, p.y, h)
+    if p.search is not None:
+        shifts = (p.code == LOCATING) & ~p.search.trying
+        near = jax.tree.map(jnp.subtract, stages(problem, TSIT5, p.t, p.y, h).y_1, p.y)
+        found = found._replace(change=jax.tree.map(lambda a, b: jnp.where(shifts, a, b), near, found.change), solved=found.solved | shifts)
+    monitored = problem.rates_and_pivots is not None
+    if not monitored and p.search is None:
+        return found, [], None
+    end = p.t + h, jax.tree.map(jnp.add, p.y, found.change)
+    states = jax.tree.map(lambda a, b: jnp.stack([a, (a + b) / 2, b]), (p.t, p.y), end)
+    seen_at = problem.rates_and_pivots if monitored else lambda *given: (problem.rates(*given), None, None)
+    slopes, seen, directions = jax.lax.map(lambda at: tuple(seen_at(*at, inside.args)), states)
+    ends = [jax.tree.map(lambda k, y, i=i: as_in(k[i], y), slopes, p.y) for i in (0, 2)]
+    return found, ends, _pivots((jnp.min(seen, axis=0), jnp.max(seen, axis=0)), directions) if monitored else None
+
+
+def _relative(free: PyTree, y_0: PyTree, y_1: PyTree) -> Float[Array, ""]:
+    """How far a projection moved a state, from `free` to `y_1`, relative to the change from `y_0`: the largest ratio of any part of the state."""
+    ratios = []
+    for given, before, after in zip(*map(jax.tree.leaves, (free, y_0, y_1)), strict=True):
+        change = jnp.max(jnp.abs(after - before), initial=0.0) + _REST * (1 + jnp.max(jnp.abs(after), initial=0.0))
+        ratios.append(jnp.max(jnp.abs(after - given), initial=0.0) / change)
+    return jax.lax.stop_gradient(jnp.max(jnp.stack(ratios)))
 
 
 def _compensated(y: PyTree, rest: PyTree, increments: PyTree) -> tuple[PyTree, PyTree]:
@@ -259,11 +271,6 @@ def weighted(weights, slopes: Float[Array, "stages *shape"]) -> Float[Array, "*s
     """sum_j w_j k_j, element by element."""
     used = [j for j in range(len(slopes)) if isinstance(weights, jax.Array) or weights[j] != 0]
     return sum((as_in(weights[j], slopes) * slopes[j] for j in used[1:]), start=as_in(weights[used[0]], slopes) * slopes[used[0]])
-
-
-def as_in(x, like) -> Array:
-    """A number in the precision of the state: time keeps its own."""
-    return jnp.asarray(x, like.dtype)
 
 
 def _monitored(problem: Problem, p: Progress, moved: Progress, h, slopes, accept) -> Progress:

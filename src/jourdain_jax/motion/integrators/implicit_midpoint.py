@@ -3,16 +3,15 @@
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import PyTree
 
 from jourdain_jax.calculus.newton import newton_root
-from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step
-from jourdain_jax.motion.vector_fields.field import VectorField
-from jourdain_jax.scene.scene import Scene
+from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, Solution
+from jourdain_jax.motion.integrators.problem import Problem
 
 
-class ImplicitMidpoint(FixedStepSolver):
-    """The implicit midpoint rule, `y_1 = y_0 + h f(t_0 + h/2, (y_0 + y_1)/2)`, for `simulate(..., solver=ImplicitMidpoint(), dt0=h)`; h in s.
+class ImplicitMidpoint(FixedStepMethod):
+    """The implicit midpoint rule, `y_1 = y_0 + h f(t_0 + h/2, (y_0 + y_1)/2)`, for `simulate(..., solver=ImplicitMidpoint(step=h))`; h in s.
 
     Order 2, symmetric in time, stable for any step where the motion is. Keeps every integral that is quadratic in the integrated state (with
     the minimal state: in the coordinates and privileged speeds) to round-off; of unconstrained holonomic scenes in canonical coordinates it is
@@ -20,25 +19,21 @@ class ImplicitMidpoint(FixedStepSolver):
 
     Worth it for long motions of reversible scenes, where its energy error stays bounded, for stiff ones, and where a quadratic integral matters;
     otherwise the default solvers reach the same accuracy much faster. The equations of a step are solved by Newton's method to round-off, and
-    differentiated through the implicit function theorem. Steps are constant: give `dt0` (s); an adaptive controller is refused.
+    differentiated through the implicit function theorem. Between saved times it takes equal steps of at most `step` (s).
 
     Source: Hairer, Lubich and Wanner, Geometric Numerical Integration (2006), sections II.1.2 and IV.2.
     """
 
-    def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
-        """Any `field` of any `scene` serves, whatever was `asked` for."""
-        return field
-
-    def stepped(self, step: Step, y: PyTree) -> tuple[PyTree, Bool[Array, ""]]:
-        """The state `y` after one `step`, and whether its equations were solved."""
+    def solve(self, problem: Problem, t, y: PyTree, h) -> Solution:
+        """Return the change of the state `y` at `t` by a step `h` (s) of a `problem`."""
         y0, unravel = ravel_pytree(y)
-        t, h = step.t + step.h / 2, jnp.asarray(step.h, y0.dtype)
+        middle, h = t + h / 2, jnp.asarray(h, y0.dtype)
 
         def f(t, x):
-            return ravel_pytree(step.rates(t, unravel(x)))[0]
+            return ravel_pytree(problem.rates(t, unravel(x), problem.args))[0]
 
         # the unknown is the difference, which has more digits than the state
-        guess = h * f(step.t, y0)
+        guess = h * f(t, y0)
         scale = jnp.broadcast_to(jnp.max(jnp.abs(y0)) + jnp.max(jnp.abs(guess)), y0.shape)
-        found = newton_root(lambda d: d - h * f(t, y0 + d / 2), guess, jax.lax.stop_gradient(jnp.where(scale == 0, 1.0, scale)))
-        return unravel(y0 + found.x), found.converged
+        found = newton_root(lambda d: d - h * f(middle, y0 + d / 2), guess, jax.lax.stop_gradient(jnp.where(scale == 0, 1.0, scale)))
+        return Solution(unravel(jnp.where(found.converged, found.x, 0.0)), None, found.converged)

@@ -7,11 +7,9 @@ from jourdain_jax.calculus.on_first_use import module_on_first_use
 if TYPE_CHECKING:
     import diffrax
 
-    from jourdain_jax.motion.integrators import alongside, discrete_gradient, fixed_step, radau
+    from jourdain_jax.motion.integrators import alongside
 else:
     diffrax = module_on_first_use("diffrax")
-    alongside, discrete_gradient, fixed_step, radau = (
-        module_on_first_use(f"{__package__}.{name}") for name in ("alongside", "discrete_gradient", "fixed_step", "radau")
-    )
+    alongside = module_on_first_use(f"{__package__}.alongside")
 
-__all__ = ["alongside", "diffrax", "discrete_gradient", "fixed_step", "radau"]
+__all__ = ["alongside", "diffrax"]

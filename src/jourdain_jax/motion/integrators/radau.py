@@ -9,13 +9,15 @@ component decays at once.
 
 from typing import ClassVar
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jaxtyping import PyTree
 
 from jourdain_jax.calculus.newton import newton_root
+from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod, Solution
+from jourdain_jax.motion.integrators.problem import Problem
 
 _NODES = np.array([(4 - np.sqrt(6)) / 10, (4 + np.sqrt(6)) / 10, 1.0])
 _POWERS = np.arange(1, 4)
@@ -25,7 +27,7 @@ _REAL = 1 / next(float(value.real) for value in np.linalg.eigvals(np.linalg.inv(
 _ESTIMATE = _REAL / 3 * np.array([-13 - 7 * np.sqrt(6), -13 + 7 * np.sqrt(6), -1.0])
 
 
-class RadauIIA(diffrax.AbstractSolver):
+class RadauIIA(ImplicitMethod):
     """Radau's implicit method of order 5, `simulate(..., solver=RadauIIA())`: for stiff springs, dampers and drives.
 
     L-stable: what decays faster than the motion does not bound the steps. The equations of a step are solved by Newton's method to round-off, and
@@ -36,57 +38,29 @@ class RadauIIA(diffrax.AbstractSolver):
     Source: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (1996), section IV.5 and equations (IV.8.17) to (IV.8.19).
     """
 
-    term_structure: ClassVar = diffrax.AbstractTerm
+    order: ClassVar[int] = 4  # of the embedded estimate
 
-    @property
-    def interpolation_cls(self):
-        """A cubic between the ends of a step, by the states and rates there."""
-        return diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
-
-    def order(self, terms):
-        """Five. `terms` as in diffrax."""
-        return 5
-
-    def error_order(self, terms):
-        """Four: of the embedded estimate. `terms` as in diffrax."""
-        return 4
-
-    def init(self, terms, t0, t1, y0, args):
-        """Nothing is carried from step to step. `terms`, `t0`, `t1`, `y0`, `args`: as in diffrax."""
-        return None
-
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """One step; an infinite error where its equations were not solved.
-
-        `terms`, `t0`, `t1`, `y0`, `args`, `solver_state`, `made_jump`: as in diffrax.
-        """
-        x0, unravel = ravel_pytree(y0)
-        h = jnp.asarray(terms.contr(t0, t1), x0.dtype)  # signed, as the times that the rates are given
+    def solve(self, problem: Problem, t, y: PyTree, h) -> Solution:
+        """Return the change of the state `y` at `t` by a step `h` (s) of a `problem`, with an infinite error where its equations were not solved."""
+        x0, unravel = ravel_pytree(y)
+        h = jnp.asarray(h, x0.dtype)
         n, A, estimate = x0.shape[0], jnp.asarray(_A, x0.dtype), jnp.asarray(_ESTIMATE, x0.dtype)
-        times = t0 + jnp.asarray(_NODES, jnp.result_type(t0)) * (t1 - t0)
+        times = t + jnp.asarray(_NODES, jnp.result_type(t)) * h
 
         def f(t, x):
-            return ravel_pytree(terms.vf(t, unravel(x), args))[0]
+            return jnp.asarray(ravel_pytree(problem.rates(t, unravel(x), problem.args))[0], x0.dtype)
 
         def equations(z):
             z = z.reshape(3, n)
             rates = jax.lax.map(lambda stage: f(stage[0], x0 + stage[1]), (times, z))  # a loop: one copy of the rates to compile
             return (z - h * A @ rates).reshape(-1)
 
-        slope, along = jax.linearize(lambda x: f(t0, x), x0)
+        slope, along = jax.linearize(lambda x: f(t, x), x0)
         size = jnp.max(jnp.abs(x0)) + jnp.max(jnp.abs(h * slope))
         scale = jnp.broadcast_to(jnp.where(size == 0, 1.0, size), (3 * n,))
         found = newton_root(equations, jnp.zeros(3 * n, x0.dtype), jax.lax.stop_gradient(scale))
         z = found.x.reshape(3, n)
-        y1 = unravel(x0 + z[2])
         one = jnp.eye(n, dtype=x0.dtype)
         error = jnp.linalg.solve(one - h * _REAL * jax.vmap(along, 1, 1)(one), _REAL * h * slope + estimate @ z)
         error = jax.lax.stop_gradient(jnp.where(found.converged, jnp.abs(error), jnp.inf))
-        y1 = jax.tree.map(lambda new, old: jnp.where(found.converged, new, old), y1, y0)
-        last = jnp.linalg.solve(A, z)[2]  # h f(t_1, y_1)
-        dense = {"y0": y0, "y1": y1, "k": jax.tree.map(lambda *ends: jnp.stack(ends), unravel(h * slope), unravel(last))}
-        return y1, unravel(error), dense, None, diffrax.RESULTS.successful
-
-    def func(self, terms, t0, y0, args):
-        """The rates at a state. `terms`, `t0`, `y0`, `args`: as in diffrax."""
-        return terms.vf(t0, y0, args)
+        return Solution(unravel(jnp.where(found.converged, z[2], 0.0)), unravel(error), found.converged)

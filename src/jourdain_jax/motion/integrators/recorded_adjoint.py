@@ -1,4 +1,4 @@
-"""Reverse mode of our explicit Runge-Kutta loop: the steps that a motion took are recorded, and gone back over.
+"""Reverse mode of our loop: the steps that a motion took are recorded, and gone back over.
 
     y_(i+1) = step(t_i, t_(i+1), y_i, args)       g_i = (dstep/dy_i)' g_(i+1),   g_args += (dstep/dargs)' g_(i+1)
 
@@ -23,8 +23,11 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.calculus.promotion import with_usual_promotion
 from jourdain_jax.motion.integrators import step_adjoint
-from jourdain_jax.motion.integrators.erk_step import LOCATING, Method, Problem, Progress, advanced, begun, running, standing
+from jourdain_jax.motion.integrators.erk_step import LOCATING, Progress, advanced, begun, running, standing
 from jourdain_jax.motion.integrators.event_search import MOST_STEPS, chosen, is_flat
+from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
+from jourdain_jax.motion.integrators.problem import Problem
+from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.trajectories import results
 
 STEPS_ALONE, STEPS_TOGETHER = 2048, 512  # of a window: for one motion, for lanes in lockstep
@@ -83,7 +86,7 @@ class _Cotangents(eqx.Module):
     knots: Float[Array, "knots *lanes"] | None
 
 
-def motion(forward: Callable, problem: Problem, method: Method, y0: PyTree, t0, goals, dt0):
+def motion(forward: Callable, problem: Problem, method: Method | ImplicitMethod, y0: PyTree, t0, goals, dt0):
     """`forward` of the other arguments; in reverse mode it has derivatives with respect to `y0`, `t0`, `goals` and all that the functions of `problem` read."""
     like = (t0, y0, problem.args)
     rates, project, events = (f if f is None else eqx.filter_closure_convert(f, *like) for f in (problem.rates, problem.project, problem.events))
@@ -216,7 +219,9 @@ def _vjp(residuals, cotangents, perturbed, moving, control, forward, method):
     return g.shared, g_events, g.knots, g.y, g.t, g.goals
 
 
-def _again(problem: Problem, method: Method, beginnings: _Beginnings, number, window: _Window, goals, direction) -> tuple[_Window, Bool[Array, "*lanes"]]:
+def _again(
+    problem: Problem, method: Method | ImplicitMethod, beginnings: _Beginnings, number, window: _Window, goals, direction
+) -> tuple[_Window, Bool[Array, "*lanes"]]:
     """The window with this number, integrated to where the next one begins, and which lanes arrived there; nothing where the number is negative."""
     first = _at(beginnings, jnp.maximum(number, 0))
     target, last_goal = _at((beginnings.t, beginnings.goal), number + 1)

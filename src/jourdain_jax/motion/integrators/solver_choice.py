@@ -2,43 +2,35 @@
 
 import jax.numpy as jnp
 
-from jourdain_jax.motion.integrators.of_diffrax import diffrax, discrete_gradient, fixed_step
-from jourdain_jax.motion.integrators.tableaus import Method
+from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
+from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
+from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.scene import Scene
 
 
 def fitted(solver, scene: Scene, field: VectorField, asked: str) -> VectorField:
     """The form of the state that the solver integrates; a ValueError where it does not apply to the scene. `asked`: the `state` of its `Formulation`."""
-    return solver.fitted(scene, field, asked) if takes_even_steps(solver) else field
-
-
-def takes_even_steps(solver) -> bool:
-    """Whether it is a structure-preserving solver, which takes steps of one length."""
-    return not isinstance(solver, Method | None) and isinstance(solver, fixed_step.FixedStepSolver)
+    return solver.fitted(scene, field, asked) if isinstance(solver, ImplicitMethod) else field
 
 
 def may_be_full(solver) -> bool:
     """Whether a motion that lost its privileged speeds may go on with the full state."""
-    return isinstance(solver, Method | None) or not isinstance(solver, discrete_gradient.DiscreteGradient)
+    return not isinstance(solver, DiscreteGradient)
 
 
-def check_solver(solver, controller, dt0, saveat, max_step) -> None:
-    """ValueError for options that do not go with a structure-preserving solver, or with a control of steps of the user's; others pass."""
-    if max_step is not None and (controller is not None or takes_even_steps(solver)):
-        raise ValueError(f"`max_step` bounds the steps of the default control: give {'`dtmax` to `stepsize_controller`' if controller else '`dt0`, the step'}")
-    if not takes_even_steps(solver):
+def check_solver(solver, controller, dt0, saveat, max_step, adjoint) -> None:
+    """ValueError for options that do not go with one of our own implicit solvers, or with a control of steps of the user's; others pass."""
+    if max_step is not None and controller is not None:
+        raise ValueError("`max_step` bounds the steps of the default control: give `dtmax` to `stepsize_controller`")
+    if not isinstance(solver, ImplicitMethod):
         return
-    name = type(solver).__name__
-    if saveat is not None and saveat.subs.ts is not None:
-        raise ValueError(f"`{name}` has states at ends of steps only: give times to save at as `ts`, not in `saveat`")
-    if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
-        raise ValueError(
-            f"`{name}` takes steps of one length and has no error estimate, which `stepsize_controller` = {type(controller).__name__} needs; leave it away "
-            "and give `dt0`, the step in s"
-        )
-    if dt0 is None and not isinstance(controller, diffrax.StepTo):
-        raise ValueError(f"`{name}` takes steps of one length; give `dt0`, the step in s")
+    given = {"stepsize_controller": controller, "saveat": saveat} | ({"dt0": dt0, "max_step": max_step} if solver.even else {})
+    for name in (name for name, value in given.items() if value is not None):
+        advice = f"; its steps are at most as long as its `step`: jj.{solver.name}(step=...)" if solver.even else ""
+        raise ValueError(f"`{name}` does not go with `{solver.name}`, whose steps are our own{advice}")
+    if isinstance(adjoint, diffrax.DirectAdjoint):
+        raise ValueError(f"`{solver.name}` takes no diffrax.DirectAdjoint as `adjoint`; leave it away for reverse mode, or use diffrax.ForwardMode()")
 
 
 def time_origin(controller, t0):

@@ -1,4 +1,4 @@
-"""One step of an explicit Runge-Kutta method gone back over: cotangents of its start from those of its end.
+"""One step gone back over, in what follows of an explicit Runge-Kutta method: cotangents of its start from those of its end.
 
 Y_i = y_0 + h sum_j a_ij k_j,   k_i = f(t_0 + c_i h, Y_i, args),   y_1 = y_0 + h sum b_i k_i
 v_i = b_i g_1 + sum_l a_li G_l,   (tau_i, G_i) = (df/dt, df/dy)' h v_i              from the last stage to the first
@@ -14,7 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jourdain_jax.motion.integrators.erk_step import Method, Problem, as_in, stages, weighted
+from jourdain_jax.motion.integrators.erk_step import stages, weighted
+from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
+from jourdain_jax.motion.integrators.problem import Problem, as_in
+from jourdain_jax.motion.integrators.tableaus import Method
 
 
 class StepCotangents(eqx.Module):
@@ -26,8 +29,10 @@ class StepCotangents(eqx.Module):
     shared: PyTree
 
 
-def step_vjp(problem_of: Callable[[PyTree], Problem], shared: PyTree, method: Method, t_0, t_1, y: PyTree, g: PyTree) -> StepCotangents:
+def step_vjp(problem_of: Callable[[PyTree], Problem], shared: PyTree, method: Method | ImplicitMethod, t_0, t_1, y: PyTree, g: PyTree) -> StepCotangents:
     """Cotangents of the step from `y` at `t_0` to `t_1`, given that of its end, `g`. `problem_of(shared)`: rates, projection and args."""
+    if not isinstance(method, Method):
+        return _by_jax(problem_of, shared, method, t_0, t_1, y, g)
     problem, h = problem_of(shared), t_1 - t_0
     method = replace(method, b_error=np.zeros_like(method.b_error))  # no error is asked: a stage that only it needs is left out
     y_1, slopes, at, _ = stages(problem, method, t_0, y, h)
@@ -53,6 +58,19 @@ def step_vjp(problem_of: Callable[[PyTree], Problem], shared: PyTree, method: Me
     zero = jnp.zeros_like(t_0)
     (G, by_shared, by_t, by_h), _ = jax.lax.scan(stage, (jax.tree.map(jnp.zeros_like, at), by_shared, zero, zero), rows, reverse=True)
     return StepCotangents(by_t - by_h, by_t_1 + by_h, jax.tree.map(lambda g, G: g + jnp.sum(G, axis=0), g, G), by_shared)
+
+
+def _by_jax(problem_of: Callable[[PyTree], Problem], shared: PyTree, method: ImplicitMethod, t_0, t_1, y: PyTree, g: PyTree) -> StepCotangents:
+    """Cotangents of a step of an implicit method, which JAX takes through the equations of the step; none of a lane that stands still."""
+
+    def end(t_0, t_1, y, shared):
+        problem, h = problem_of(shared), t_1 - t_0
+        change = method.solve(problem.in_step(t_0, h), t_0, y, h).change
+        y_1 = jax.tree.map(jnp.add, y, change)
+        return y_1 if problem.project is None else problem.project(t_1, y_1, problem.args)
+
+    gone = jax.vjp(end, t_0, t_1, y, shared)[1](g)
+    return StepCotangents(*jax.tree.map(lambda x: jnp.where(t_0 == t_1, jnp.zeros_like(x), x), gone))
 
 
 def product(g: PyTree, f: PyTree, lane_axes: int) -> Float[Array, "*lanes"]:

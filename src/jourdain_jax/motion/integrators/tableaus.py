@@ -11,6 +11,7 @@ no diffrax. The weights of the solution stand as the last row of A too: the last
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -27,6 +28,7 @@ class Method:
     b: np.ndarray
     b_error: np.ndarray
     c: np.ndarray
+    even: ClassVar[bool] = False  # whether it takes steps of one length
 
     @property
     def last_is_next_first(self) -> bool:

@@ -35,7 +35,7 @@ MESSAGES = {
     PROCESS_DIED: "processes died on it again and again, and an earlier version's study skipped it",
     UNRESOLVED: "the step size shrank to nothing, and `rtol` is less than this precision resolves, 1.2e-7 in float32 and 2.2e-16 in float64: loosen it to "
     "1e-5 and 1e-13, or set jax.config.update('jax_enable_x64', True)",
-    UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; take a shorter step (`dt0`), or look for a singularity there",
+    UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; take a shorter step, or look for a singularity there",
 }
 
 # In what other ways a motion was run again after the first way had failed, which add up: `Trajectory.fallback`.

@@ -1,0 +1,72 @@
+"""Methods of our own loop whose steps are equations, solved by Newton's method: what such a method is.
+
+Each takes steps of one motion; lanes of a batch run under `vmap`. Structure-preserving methods keep something exactly or nearly so (an energy, a quadratic
+integral, a symmetry under reversed time) as long as their steps do not change, and have no error estimate: they carry their step. Between two times at
+which a step must end they take the fewest equal ones no longer than that.
+"""
+
+import abc
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
+
+from jourdain_jax.calculus.reals import Number, checked_unless_traced
+from jourdain_jax.motion.integrators.problem import Problem
+from jourdain_jax.motion.vector_fields.field import VectorField
+from jourdain_jax.scene.scene import Scene
+
+
+class Solution(NamedTuple):
+    """What a step changes."""
+
+    change: PyTree  # of the state; zero where the equations of the step were not solved
+    error: PyTree | None  # None: the method has no estimate
+    solved: Bool[Array, ""]  # whether they were
+
+
+class ImplicitMethod(eqx.Module):
+    """A method of our own loop whose steps are equations."""
+
+    order: ClassVar[int]  # a step of h has an error of about h^order
+    even: ClassVar[bool] = False  # whether it takes steps of one length
+
+    @property
+    def name(self) -> str:
+        """The name of the method, as it stands in a trajectory."""
+        return type(self).__name__
+
+    @abc.abstractmethod
+    def solve(self, problem: Problem, t: Float[Array, ""], y: PyTree, h: Float[Array, ""]) -> Solution:
+        """Return the change of the state by a step from `y` at `t` by `h` (s, negative backwards) of a `problem`, whose times count from `problem.args[4]`."""
+
+    def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
+        """The form of the state that is integrated in place of `field`.
+
+        ValueError where the method does not apply to the `scene`, or to the state that its `Formulation` `asked` for.
+        """
+        return field
+
+
+class FixedStepMethod(ImplicitMethod):
+    """Base of the structure-preserving methods."""
+
+    step: Number | None = eqx.field(kw_only=True)  # s, the longest; None where a program is given it as a number of its own
+    order: ClassVar[int] = 2
+    even: ClassVar[bool] = True
+
+    def __check_init__(self):
+        step = checked_unless_traced(self.step, f"`step` of `{self.name}`", (), advice="give the length of steps in s")
+        if isinstance(step, np.ndarray) and not 0 < float(step) < np.inf:
+            raise ValueError(f"`step` of `{self.name}` is {float(step):g}, expected a positive finite length of steps in s")
+
+    def without_step(self) -> "FixedStepMethod":
+        """The method alone: another step is no other program."""
+        return eqx.tree_at(lambda method: method.step, self, None)
+
+
+def even_step(longest: Float[Array, ""], rest: Float[Array, ""]) -> Float[Array, ""]:
+    """The first of the fewest equal steps no longer than `longest` that cover a `rest`; a ratio 1e-9 above a whole number counts as that number."""
+    return rest / jnp.maximum(jnp.ceil(rest / longest - 1e-9), 1)
