@@ -366,6 +366,7 @@ MOTIONS: dict[str, Case] = {
     "jj.simulate(b, rest, ts=[0.0, 2.0], t1=1.0)": ("ValueError", "`ts` runs from 0.0 to 2.0 s, outside of the span from t0 = 0.0 to t1 = 1.0 s"),
     "jj.simulate(b, rest, ts=[1.0, 0.5], t1=2.0)": ("ValueError", "`ts` runs from 1.0 to 0.5 s, outside of the span from t0 = 0.0 to t1 = 2.0 s or against it"),
     "jj.simulate(b, {}, t1=1.0, rtol=nan)": ("ValueError", "`rtol` is nan, expected a positive finite number; give a tolerance such as 1e-8"),
+    "jj.simulate(b, {}, t1=1.0, options={'rtol': 1e-8})": ("ValueError", "`options` is a dict, expected `jj.Options(...)`"),
     "jj.simulate(b, {}, t1=1.0, rtol='tight')": ("ValueError", "`rtol` is the text 'tight', expected real numbers; give one number, such as 1e-8"),
     "jj.simulate(b, {}, t1=1.0, atol=-1)": ("ValueError", "`atol` is -1, expected a positive finite number"),
     "jj.simulate(b, {}, t1=1.0, atol=[1e-8, 1e-8])": ("ValueError", "`atol` has shape (2,), expected one number"),

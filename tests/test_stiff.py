@@ -3,7 +3,6 @@
 import warnings
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +11,6 @@ from oracles import skate
 from tolerances import tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.motion.retries import next_retry, retry_options
-from jourdain_jax.motion.simulate import set_up
 from jourdain_jax.motion.trajectories import results
 
 TS = np.linspace(0.0, 2.0, 5)
@@ -69,7 +66,7 @@ class Drawn(OnALine):
 
 @pytest.fixture(scope="module")
 def damped():
-    return jj.simulate(Damped(), {"x_rate": 1.0}, ts=TS)
+    return jj.simulate(Damped(), {"x_rate": 1.0}, ts=TS, retry=True)
 
 
 def test_a_stiff_motion_is_run_again_by_an_implicit_solver_and_says_so(damped):
@@ -81,16 +78,16 @@ def test_a_stiff_motion_is_run_again_by_an_implicit_solver_and_says_so(damped):
 
 
 def test_a_solver_that_was_chosen_is_kept_and_a_motion_that_is_not_stiff_has_no_other_solver():
-    chosen = jj.simulate(Damped(), {"x_rate": 1.0}, ts=TS, solver=diffrax.Dopri8(), max_steps=2000)
+    chosen = jj.simulate(Damped(), {"x_rate": 1.0}, ts=TS, solver=diffrax.Dopri8(), max_steps=2000, retry=True)
     assert int(chosen.result) == results.MAX_STEPS
     assert int(chosen.fallback) == results.AS_ASKED
-    slow = jj.simulate(Ridge(strength=0.0), {"x": 1.0, "x_rate": 1.0}, ts=TS, max_steps=2)
+    slow = jj.simulate(Ridge(strength=0.0), {"x": 1.0, "x_rate": 1.0}, ts=TS, max_steps=2, retry=True)
     assert int(slow.result) in (results.MAX_STEPS, results.SHRANK)
     assert int(slow.fallback) == results.AS_ASKED
 
 
 def test_a_motion_too_stiff_for_its_number_of_steps_is_called_stiff():
-    motion = jj.simulate(Damped(), {"x_rate": 0.0}, ts=TS, max_steps=30)  # 3 for the implicit solver
+    motion = jj.simulate(Damped(), {"x_rate": 0.0}, ts=TS, max_steps=30, retry=True)  # 3 for the implicit solver
     assert int(motion.result) == results.STIFF
     assert motion.message.startswith("stiff: ran out of steps")
     assert motion.warnings[0] == motion.message
@@ -108,14 +105,14 @@ def test_the_method_of_radau_is_of_order_five():
 @pytest.mark.slow
 def test_a_derivative_through_a_stiff_motion_is_that_of_what_it_follows():
     def end(pace):  # x_rate of the start is forgotten at once, x is not
-        return jj.simulate(Damped(), {"x": pace, "x_rate": pace}, ts=TS[[0, -1]]).q_end[0]
+        return jj.simulate(Damped(), {"x": pace, "x_rate": pace}, ts=TS[[0, -1]], retry=True).q_end[0]
 
     np.testing.assert_allclose(jax.grad(end)(1.0), 1.0, rtol=0, atol=tolerance("gradient_simulation"))
 
 
 @pytest.mark.slow
 def test_stiff_lanes_of_a_rollout_are_run_again_and_the_others_are_kept():
-    batch = jj.rollout(Damped(), {"x_rate": jnp.ones(3)}, parameters={"rate": jnp.array([10.0, 1e7, 1e9])}, ts=TS)
+    batch = jj.rollout(Damped(), {"x_rate": jnp.ones(3)}, parameters={"rate": jnp.array([10.0, 1e7, 1e9])}, ts=TS, retry=True)
     assert batch.lanes.fallback.tolist() == [results.AS_ASKED, results.IMPLICIT, results.IMPLICIT]
     assert [batch.lane(i).solver for i in range(3)] == ["Dopri8", "RadauIIA", "RadauIIA"]
     assert "2 are stiff and were run with an implicit solver" in str(batch)
@@ -136,31 +133,28 @@ class TurnedSkate(jj.models.Skate):
 TURNED = {"heading": 0.0, "heading_rate": 1.3}
 
 
-def test_every_other_way_is_tried_once_and_ways_add_up(damped):
-    form = set_up(TurnedSkate(), TURNED, t1=1.0).field
-    lost = lambda ways, code=results.SINGULAR_PARTITION: eqx.tree_at(  # noqa: E731
-        lambda m: (m.result, m.fallback), damped, (jnp.array(code), jnp.array(ways))
-    )
-    both = results.FULL_STATE | results.IMPLICIT
-    assert next_retry(form, lost(results.AS_ASKED), 0.0, {}) == results.FULL_STATE
-    assert next_retry(form, lost(results.IMPLICIT), 0.0, {}) == both
-    assert next_retry(form, lost(both), 0.0, {}) == results.AS_ASKED
-    assert next_retry(form, lost(results.AS_ASKED, results.SUCCESS), 0.0, {}) == results.AS_ASKED
-    assert next_retry(form, lost(results.AS_ASKED), 0.0, {"formulation": jj.Formulation("minimal")}) == results.AS_ASKED
-    changed = {"formulation": jj.Formulation("full", "qr"), "backend": "dense", "solver": jj.RadauIIA(), "max_steps": 100}
-    assert retry_options(both, {"formulation": jj.Formulation(reduction="qr"), "max_steps": 1000}) == changed
-    assert "full state, dense matrices and an implicit solver" in results.FALLBACKS[both]
+def test_a_motion_that_left_its_domain_is_run_again_where_that_is_asked_for_and_its_code_says_how():
+    ts = np.array([2.0])
+    told = jj.simulate(TurnedSkate(), TURNED, ts=ts)
+    assert int(told.result) == results.SINGULAR_PARTITION
+    assert "retry=True" in told.message
+    again = jj.simulate(TurnedSkate(), TURNED, ts=ts, retry=True)
+    assert int(again.raise_if_failed().fallback) == results.FULL_STATE
+    kept = jj.simulate(TurnedSkate(), TURNED, ts=ts, retry=True, formulation=jj.Formulation("minimal"))
+    assert (int(kept.result), int(kept.fallback)) == (results.SINGULAR_PARTITION, results.AS_ASKED)
+    inside = jax.jit(lambda rate: jj.simulate(TurnedSkate(), TURNED | {"heading_rate": rate}, ts=ts, retry=True))(1.3)
+    assert (int(inside.result), int(inside.fallback)) == (results.SINGULAR_PARTITION, results.AS_ASKED)
 
 
 @pytest.mark.slow
 def test_a_lane_that_is_stiff_and_leaves_its_domain_is_run_with_the_full_state_and_an_implicit_solver():
     scene, (rates, ts) = TurnedSkate(), (np.array([0.0, 1e6]), np.linspace(0.0, 2.0, 9))
     both = results.FULL_STATE | results.IMPLICIT
-    batch = jj.rollout(scene, TURNED | {"x": np.zeros(2)}, parameters={"damping": rates}, ts=ts)
+    batch = jj.rollout(scene, TURNED | {"x": np.zeros(2)}, parameters={"damping": rates}, ts=ts, retry=True)
     assert batch.lanes.fallback.tolist() == [results.FULL_STATE, both]
     assert batch.continued.tolist() == [0, 1]
     assert [(batch.lane(i).solver, batch.lane(i).state_form) for i in range(2)] == [("Dopri8", "full"), ("RadauIIA", "full")]
-    alone = jj.simulate(scene.replace(damping=1e6), TURNED, ts=ts)
+    alone = jj.simulate(scene.replace(damping=1e6), TURNED, ts=ts, retry=True)
     assert int(alone.raise_if_failed().fallback) == both
     expected = skate.motion(ts, slope=0.3, gravity=9.81, u0=0.0, th0=0.0, th_rate=1.3)["x"]
     for motion in (alone, batch.lane(0), batch.lane(1)):

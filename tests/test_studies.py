@@ -204,8 +204,6 @@ def test_a_study_shows_its_table_and_a_histogram_of_each_output_in_a_notebook(wh
         (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(save="everything"), "`save` is 'everything'"),
         (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(every=2), "`every` is 2"),
         (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(t1=-np.inf), "t1"),
-        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(adjoint=None), "no option of a study"),
-        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(rtoll=1e-6), "`rtoll` is no option of a study; did you mean `rtol`"),
         (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"x": jj.End("leen")}), "did you mean `lean`"),
         (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"x": jj.EventTime("fell")}), "did you mean `fallen`"),
         (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"a/b": jj.End("lean")}), "without `/`"),

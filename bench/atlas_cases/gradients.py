@@ -52,7 +52,7 @@ class DerivativeOfMotion:
             options |= {"max_steps": FEWER_STEPS, "formulation": jj.Formulation("full", jj.reductions(self.begin(x)[0])[method.reduction])}
         if method.name == "Kvaerno5":
             options |= {"max_steps": IMPLICIT_STEPS}
-        options |= {"rtol": by_type(self.rtol, self.rtol32), "atol": by_type(self.atol, self.atol32), "ts": self.ts}
+        options |= {"rtol": by_type(self.rtol, self.rtol32), "atol": by_type(self.atol, self.atol32), "ts": self.ts, "retry": True}
 
         def value(x):
             scene, start = self.begin(x)

@@ -80,7 +80,7 @@ class Motion:
             steps: dict = {"solver": EVEN_STEPS[method.name](step=self.step)} if method.even_steps else {}
             if method.reduction or (single() and method.group == "constraints" and method.name not in SELDOM):
                 steps["max_steps"] = by_type(self.most_steps, 5_000)
-            return jj.simulate(self.scene, self.start, ts=self.ts, **self.tolerances, **{**self.options, **method.options(self.scene), **steps})
+            return jj.simulate(self.scene, self.start, ts=self.ts, retry=True, **self.tolerances, **{**self.options, **method.options(self.scene), **steps})
 
     def _rollout(self):
         """Two equal lanes of a batch; the second one."""
@@ -89,7 +89,7 @@ class Motion:
         lanes = jj.State(**leaves, names=state.names)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return jj.rollout(self.scene, lanes, ts=self.ts, **self.tolerances, **self.options).lane(1)
+            return jj.rollout(self.scene, lanes, ts=self.ts, retry=True, **self.tolerances, **self.options).lane(1)
 
     def of_trajectory(self, motion: jj.Trajectory, tolerance: float) -> Outcome:
         """Outcome of a trajectory: its result code, its numbers, and what its summary warns of."""

@@ -23,7 +23,7 @@ def ask_for(family: Family, ask: Ask, numbers: list[dict], ts: np.ndarray) -> li
     """A `Trajectory` (as numbers) or `Failed` for every case."""
     single = not jax.config.jax_enable_x64
     rtol = max(ask.rtol, family.rtol32) if single else ask.rtol
-    options = {"rtol": rtol, "atol": rtol} | {"events": True} | ask.options
+    options = {"rtol": rtol, "atol": rtol, "retry": True} | {"events": True} | ask.options
 
     def motion(numbers: dict, ts):
         given = {} if family.inputs is None else {"inputs": family.inputs(numbers)}

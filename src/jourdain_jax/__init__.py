@@ -52,6 +52,7 @@ from jourdain_jax.lowering.lower import lower
 from jourdain_jax.lowering.lowered import Lowered, NotLowered
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators.taylor import Taylor
+from jourdain_jax.motion.options import Options
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import State, consistent, start
@@ -216,6 +217,7 @@ __all__ = [
     "NotLowered",
     "NullSpaceQR",
     "NullSpaceSVD",
+    "Options",
     "Particle",
     "Plane",
     "PlannedInformation",

@@ -17,6 +17,7 @@ from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.analysis.shooting import MultipleShooting
 from jourdain_jax.analysis.unknowns import unknowns_of
+from jourdain_jax.motion.options import AllOptions
 from jourdain_jax.scene.scene import Scene
 
 _SAME = 0.01  # sigmas: between residuals of one fit, computed twice
@@ -28,7 +29,7 @@ class Asked:
 
     scene: Scene  # with the first guesses
     free: Mapping | tuple[str, ...]
-    simulation: dict
+    options: AllOptions
     loss: Loss
     control: Control
     shooting: MultipleShooting | None
@@ -90,9 +91,9 @@ def for_runs(fit, runs: Experiment | Sequence[Experiment], fitted: bool = False)
     `fitted`: they are those of the fit, in pieces where it was found so.
     """
     asked = fit.asked
-    checked = as_runs(asked.scene, runs, asked.simulation)
+    checked = as_runs(asked.scene, runs)
     unknowns = unknowns_of(asked.scene, checked, asked.free)
-    of_runs = asked.scene, checked, unknowns.layout, asked.simulation, None
+    of_runs = asked.scene, checked, unknowns.layout, asked.options, None
     lanes = Piecewise(*of_runs, unknowns, asked.shooting) if fitted and asked.shooting is not None else Lanes(*of_runs)
     problem = Problem(asked.scene, checked, unknowns, lanes, asked.loss)
     if problem.with_memory:

@@ -13,6 +13,8 @@ G. J. Bierman, Factorization Methods for Discrete Sequential Estimation (1977), 
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Unpack
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +26,7 @@ from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.instruments import Instrument
 from jourdain_jax.analysis.joint_prior import Correlated
-from jourdain_jax.analysis.likelihood import as_runs, check_known, mapped
+from jourdain_jax.analysis.likelihood import as_fit_options, as_runs, check_known, mapped
 from jourdain_jax.analysis.runs import Run, equal_runs
 from jourdain_jax.analysis.sensors import Reading, ideal
 from jourdain_jax.analysis.stop_events import StopEvent
@@ -33,6 +35,7 @@ from jourdain_jax.calculus.reals import checked_unless_traced, is_traced
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.forward_mode import simulate_forward
 from jourdain_jax.motion.inputs import Inputs, inputs_at
+from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
@@ -45,7 +48,9 @@ _NODES = _NODES + 0.5
 
 
 @shown_from_users_lines
-def filtered_log_likelihood(scene: Scene | BuiltFor, data: Experiment | Sequence[Experiment], *, process_noise: Mapping, **simulation) -> Float[Array, ""]:
+def filtered_log_likelihood(
+    scene: Scene | BuiltFor, data: Experiment | Sequence[Experiment], *, process_noise: Mapping, options: Options | None = None, **by_name: Unpack[OptionFields]
+) -> Float[Array, ""]:
     """`log_likelihood` of a motion that is disturbed as it goes on, by an extended Kalman filter: a rider or rough ground is no noise of a sensor.
 
     **Arguments**
@@ -53,7 +58,7 @@ def filtered_log_likelihood(scene: Scene | BuiltFor, data: Experiment | Sequence
       begins with this spread. Sensors show what is now, with known gain and bias; all numbers are known.
     - `process_noise`: independent speed -> intensity q of a white disturbance of its rate, in (unit of the speed)^2 / s: left to it alone, the variance of
       the speed grows by q t. Speeds that are not named are not disturbed. Which speeds are independent: `scene.privileged`, or the engine's choice.
-    - `simulation`: options of `simulate`.
+    - `options`, `by_name`: as of `simulate`.
 
     The motion and its derivatives with respect to the state come from `simulate`, from each sample to the next. Linear scenes have their exact likelihood; of
     others, the spread of the state is carried along to first order. With no process noise and a known start it is `log_likelihood`.
@@ -69,7 +74,8 @@ def filtered_log_likelihood(scene: Scene | BuiltFor, data: Experiment | Sequence
         jj.filtered_log_likelihood(sleigh, run, process_noise={"heading_rate": 0.01})      # (rad/s)^2 / s
     """
     scene = as_scene(scene)
-    runs = as_runs(scene, data, simulation)
+    settled = replace(as_fit_options(options, by_name, "filtered_log_likelihood"), events=False)
+    runs = as_runs(scene, data)
     _check_supported(scene, runs)
     speeds = privileged_speeds(scene)
     intensities = _intensities(scene, speeds, process_noise)
@@ -80,7 +86,7 @@ def filtered_log_likelihood(scene: Scene | BuiltFor, data: Experiment | Sequence
         def one(run: Run, begun: Float[Array, "2 unknown"], names=names) -> Float[Array, ""]:
             mean, sigma = begun
             run = run._replace(start=run.start | dict(zip(names, mean, strict=True)))
-            return _Filter(scene, run, simulation, speeds, intensities).log_likelihood(names, sigma)
+            return _Filter(scene, run, settled, speeds, intensities).log_likelihood(names, sigma)
 
         total = total + jnp.sum(mapped(one, alike, jnp.stack([_begun(runs[i], names) for i in numbers])))
     return jnp.where(jnp.isfinite(total), total, -jnp.inf)
@@ -89,9 +95,9 @@ def filtered_log_likelihood(scene: Scene | BuiltFor, data: Experiment | Sequence
 class _Filter:
     """The filter of one run."""
 
-    def __init__(self, scene: Scene, run: Run, simulation: dict, speeds: tuple[int, ...], intensities: Float[Array, "speeds"]):
+    def __init__(self, scene: Scene, run: Run, options: AllOptions, speeds: tuple[int, ...], intensities: Float[Array, "speeds"]):
         assert isinstance(run.inputs, Inputs)  # of a run that was checked
-        self.scene, self.run, self.inputs, self.simulation = scene, run, run.inputs, simulation
+        self.scene, self.run, self.inputs, self.options = scene, run, run.inputs, options
         self.speeds, self.intensities = np.array(speeds, int), intensities
         self.begin = self._start(run.start)
         count = len(scene.coordinate_names.entries)
@@ -143,7 +149,7 @@ class _Filter:
         times = jnp.concatenate([t + span * jnp.asarray(_NODES), jnp.where(moves, t1, t + span)[None]])
 
         def later(x):
-            motion = simulate_forward(self.scene, self._state(t, q, x), t0=t, ts=times, inputs=self.run.inputs, events=False, work=False, **self.simulation)
+            motion = simulate_forward(self.scene, self._state(t, q, x), t0=t, ts=times, inputs=self.run.inputs, options=self.options)
             found = self._independent(motion.q, motion.u)
             return found, (found[-1], motion.q[-1])
 

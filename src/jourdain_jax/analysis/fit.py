@@ -9,6 +9,7 @@ Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; G. A. F. Seber and C
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Unpack
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.fit_statistics import statistics
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum
-from jourdain_jax.analysis.likelihood import as_runs, in_all_or_none
+from jourdain_jax.analysis.likelihood import as_fit_options, as_runs, in_all_or_none
 from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
 from jourdain_jax.analysis.piecewise import Piecewise, Shot
 from jourdain_jax.analysis.predictions import Lanes
@@ -33,6 +34,7 @@ from jourdain_jax.analysis.starts import check_first_guess, check_starts
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.scene import Scene
@@ -55,7 +57,8 @@ def fit(
     errors: str = "sigmas",
     guesses: int = 1,
     shooting: MultipleShooting | None = None,
-    **simulation,
+    options: Options | None = None,
+    **by_name: Unpack[OptionFields],
 ) -> Fit:
     """Estimate the `free` parameters of a scene, unknown initial values of its runs and numbers of their sensors, from measurements.
 
@@ -79,9 +82,9 @@ def fit(
       unknowns, or within a factor of five of a `positive()` one. The lowest minimum counts; `Fit.agreeing` says how many led to it.
     - `shooting`: `MultipleShooting(duration=...)` or `MultipleShooting(pieces=...)` for unstable and chaotic motions: the runs are fitted in pieces with
       starts of their own, and continuity between them is an equation. What is minimised stays the same.
-    - `simulation`: options of `simulate` such as `rtol`, `solver`, `max_step`, `max_steps`. Stop events cut no run: what is given counts, and `Fit.warnings`
-      names those that the fitted motion meets before a sample. Give samples up to where the real motion met one; were runs cut where the fitted one does,
-      estimates whose motion ends early would have fewer residuals.
+    - `options`: a `jj.Options`; `by_name`: its fields, such as `rtol`, `solver`, `max_step`, `max_steps`. Stop events cut no run: what is given counts,
+      and `Fit.warnings` names those that the fitted motion meets before a sample. Give samples up to where the real motion met one; were runs cut where the
+      fitted one does, estimates whose motion ends early would have fewer residuals.
 
     Where that finds no minimum, or one whose residuals are far beyond their sigmas, the fit is made once more over growing spans (unless `shooting` is
     given): the first 1/32 of each run, then more of it, as far as the motion that was found follows the data, with the first guess as a weak prior (known to
@@ -107,7 +110,8 @@ def fit(
     """
     if isinstance(guesses, bool) or not isinstance(guesses, int | np.integer) or guesses < 1:
         raise ValueError(f"`guesses` is {guesses!r}, expected a whole number of at least 1: how many first guesses to begin from")
-    return _fit(scene, data, free, simulation, Control(tolerance, max_iterations, cutoff), loss, errors, False, int(guesses), shooting)
+    settled = as_fit_options(options, by_name, "fit")
+    return _fit(scene, data, free, settled, Control(tolerance, max_iterations, cutoff), loss, errors, False, int(guesses), shooting)
 
 
 def fit_batch(
@@ -120,26 +124,28 @@ def fit_batch(
     max_iterations: int = 50,
     loss: Loss | None = None,
     errors: str = "sigmas",
-    **simulation,
+    options: Options | None = None,
+    **by_name: Unpack[OptionFields],
 ) -> Fit:
     """`fit` for many repeats of the same experiment, as one batch.
 
     Every array in the `values` of `data` has a leading axis `repeats`; all else is shared. `free`, `cutoff`, `tolerance`,
-    `max_iterations`, `loss`, `errors` and `simulation` as in `fit`. **Returns** a `Fit` whose arrays have the leading axis; a repeat that fails has
+    `max_iterations`, `loss`, `errors`, `options` and `by_name` as in `fit`. **Returns** a `Fit` whose arrays have the leading axis; a repeat that fails has
     `converged` False and harms no other, as does one with fewer samples than unknowns. **Raises** as `fit`.
     """
-    return _fit(scene, data, free, simulation, Control(tolerance, max_iterations, cutoff), loss, errors, True)
+    settled = as_fit_options(options, by_name, "fit_batch")
+    return _fit(scene, data, free, settled, Control(tolerance, max_iterations, cutoff), loss, errors, True)
 
 
-def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | None, errors: str, repeats: bool, guesses: int = 1, shooting=None) -> Fit:
+def _fit(scene, data, free, options: AllOptions, control: Control, loss: Loss | None, errors: str, repeats: bool, guesses: int = 1, shooting=None) -> Fit:
     scene, data = as_scene(scene), tuple(data) if isinstance(data, Iterator) else data
-    if is_traced((scene, data, control.tolerance, control.cutoff, simulation)):
+    if is_traced((scene, data, control.tolerance, control.cutoff, options)):
         raise DifferentiationModeError(
             "`fit` was called inside jit, vmap or a derivative, but its steps are chosen outside of compiled code. Call it with known numbers; "
             "for many repeats use `fit_batch`, for derivatives of the fit's objective `log_likelihood`."
         )
     _check_control(control)
-    runs = as_runs(scene, data, simulation, repeats=repeats)
+    runs = as_runs(scene, data, repeats=repeats)
     _check_choices(runs, loss, errors)
     check_shooting(shooting)
     free = free if isinstance(free, Mapping) else tuple(as_names(free))
@@ -147,8 +153,8 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
     check_starts(scene, runs, unknowns)
     members = _repeats(runs) if repeats else None
     enough = _check_enough(runs, unknowns, repeats)
-    asked = Asked(scene, free, simulation, loss or LEAST_SQUARES, control, shooting)
-    of_runs = scene, runs, unknowns.layout, simulation, members
+    asked = Asked(scene, free, options, loss or LEAST_SQUARES, control, shooting)
+    of_runs = scene, runs, unknowns.layout, options, members
     pieces = None if shooting is None else Piecewise(*of_runs, unknowns, shooting)
     problem = Problem(scene, runs, unknowns, Lanes(*of_runs) if pieces is None else pieces, asked.loss)
     theta = unknowns.first_guesses(guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))

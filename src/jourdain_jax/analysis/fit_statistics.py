@@ -98,7 +98,7 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, e
         of_rise=one(np.where(bound[:, places], at_bounds.if_free.of_rise[:, places], about.of_rise)),
         from_prior=(values - unknowns.prior_mean[places]) / unknowns.prior_sigma[places],
         oddities=oddities(problem.scene, problem.runs, not single),
-        events_met=events_met(problem, theta[0], asked.simulation) if single and asked.shooting is None else (),
+        events_met=events_met(problem, theta[0], asked.options) if single and asked.shooting is None else (),
         too_narrow=tuple(too_narrow),
     )
 

@@ -103,7 +103,7 @@ class Layout:
         """Whether sensors or actuators have any."""
         return any(place.of_sensor for place in (*self.shared, *self.local))
 
-    def known(self, shared, local) -> dict[str, Array]:
+    def known(self, shared, local) -> dict[str, Array | np.ndarray]:
         """Numbers of sensors and actuators by name, of one run."""
         return {place.name: place.of(vector) for places, vector in ((self.shared, shared), (self.local, local)) for place in places if place.of_sensor}
 

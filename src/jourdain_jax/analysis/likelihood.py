@@ -3,10 +3,11 @@
 r = (reading - value) / sigma,   log L = - sum r^2 / 2 - sum log(sigma sqrt(2 pi));      where noise has a memory, as in `correlated_noise`
 """
 
-import inspect
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
+from typing import Unpack
 
 import equinox as eqx
 import jax
@@ -18,31 +19,30 @@ from jourdain_jax.analysis.experiment import Experiment, checked
 from jourdain_jax.analysis.oddities import oddities
 from jourdain_jax.analysis.runs import Run, equal_runs
 from jourdain_jax.calculus.reals import described
+from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import as_scene
-from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import users_level
 
-_STATED = ("start", "t0", "t1", "ts", "saveat", "inputs", "events", "work")  # otherwise than by options
-_OPTIONS = tuple(name for name in inspect.signature(simulate).parameters if name not in (*_STATED, "scene"))
+_STATED = "each `Experiment` states start, times and inputs, and its motion ends with its last sample"
+_REFUSED = dict.fromkeys(("start", "t0", "t1", "ts", "saveat", "inputs", "events", "work"), _STATED)
+_REFUSED["retry"] = "its motions are compiled, in one way"
+_FORWARD = {"adjoint": "derivatives come by forward mode; leave it out"}
 
 
-def as_runs(
-    scene: Scene, data: Experiment | Sequence[Experiment], simulation: Mapping, *, repeats: bool = False, forward: bool = True
-) -> tuple[Experiment, ...]:
-    """One run or several, checked against the scene; ValueError as in `checked`, where there is no run, and for options that a simulation of it does not have.
+def as_fit_options(options: Options | None, by_name: Mapping, function: str, forward: bool = True) -> AllOptions:
+    """Return the options of the motions of a fit, or of a likelihood. `forward`: its derivatives come by forward mode."""
+    found = as_options(options, by_name, function, _REFUSED | _FORWARD if forward else _REFUSED)
+    return replace(found, work=False, retry=False)
 
-    What is odd about a run (`oddities`) is warned of. `forward`: derivatives come by forward mode, whatever `adjoint` is.
+
+def as_runs(scene: Scene, data: Experiment | Sequence[Experiment], *, repeats: bool = False) -> tuple[Experiment, ...]:
+    """One run or several, checked against the scene; ValueError as in `checked`, and where there is no run.
+
+    What is odd about a run (`oddities`) is warned of.
     """
     as_scene(scene)
-    for name in simulation:
-        if name == "adjoint" and forward:
-            raise ValueError("`adjoint` is no option here: derivatives come by forward mode; leave it out")
-        if name in _STATED:
-            raise ValueError(f"`{name}` is no option here: each `Experiment` states start, times and inputs, and its motion ends with its last sample")
-        if name not in _OPTIONS:
-            raise ValueError(f"`{name}` is no option of `simulate`; {nearest(name, _OPTIONS)}")
     if not isinstance(data, Experiment | Iterable):
         raise ValueError(f"`data` is {described(data)}, expected an `Experiment` or a sequence of at least one")
     runs = (data,) if isinstance(data, Experiment) else tuple(data)
@@ -73,28 +73,31 @@ def check_known(runs: Sequence[Experiment], what: str) -> None:
             raise ValueError(f"`{label}` is to be estimated, but {what} needs its value; give a number, which may be traced, in place of the `Estimate`")
 
 
-def log_likelihood(scene: Scene, data: Experiment | Sequence[Experiment], **simulation) -> Float[Array, ""]:
+def log_likelihood(
+    scene: Scene, data: Experiment | Sequence[Experiment], *, options: Options | None = None, **by_name: Unpack[OptionFields]
+) -> Float[Array, ""]:
     """Logarithm of the probability density of the measurements `data` (one run or several): `- sum r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 
     Differentiable in scene, start values, measured values, sigmas and numbers of sensors and actuators (reverse mode, unless `adjoint` says
     otherwise) and in known correlation times of the noise;
-    -inf where the motion fails. `simulation`: options of `simulate`. Missing samples (NaN, or an infinite sigma) do not count.
+    -inf where the motion fails. `options`, `by_name`: as of `simulate`. Missing samples (NaN, or an infinite sigma) do not count.
 
         jax.grad(lambda a: jj.log_likelihood(sleigh.replace(offset=a), data))(0.25)
 
     **Raises** ValueError for measurements that do not fit the scene.
     """
-    runs = as_runs(scene, data, simulation, forward=False)
+    settled = as_fit_options(options, by_name, "log_likelihood", forward=False)
+    runs = as_runs(scene, data)
     if unknown := sorted({name for run in runs for name in run.unknown_correlation}):
         raise ValueError(f"the correlation time of channel `{unknown[0]}` is None, but a likelihood needs to know it; give a number in s, or 0 for white noise")
     check_known(runs, "a likelihood")
-    return jnp.sum(jnp.stack([jnp.sum(mapped(partial(of_run, scene, simulation=simulation), run)) for _, run in equal_runs(runs)]))
+    return jnp.sum(jnp.stack([jnp.sum(mapped(partial(of_run, scene, options=settled), run)) for _, run in equal_runs(runs)]))
 
 
-def of_run(scene: Scene, run: Run, *, simulation: dict) -> Float[Array, ""]:
+def of_run(scene: Scene, run: Run, *, options: AllOptions) -> Float[Array, ""]:
     """The logarithm of the density of the measurements of one run; -inf where its motion fails."""
     found = jnp.zeros(())
-    for name, r in run.residuals(scene, simulate, simulation).items():
+    for name, r in run.residuals(scene, simulate, options).items():
         weight = run.weights[name]
         counted = weight > 0
         # log sigma = - log weight

@@ -9,6 +9,7 @@ Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 1.8 a
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from typing import Unpack
 
 import equinox as eqx
 import jax
@@ -22,7 +23,7 @@ from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.layout import Layout
-from jourdain_jax.analysis.likelihood import as_runs, in_all_or_none, mapped, of_run
+from jourdain_jax.analysis.likelihood import as_fit_options, as_runs, in_all_or_none, mapped, of_run
 from jourdain_jax.analysis.ranges import Range, bounds, positive
 from jourdain_jax.analysis.runs import Run, equal_runs
 from jourdain_jax.analysis.starts import check_starts
@@ -31,6 +32,7 @@ from jourdain_jax.analysis.unknowns import unknowns_of
 from jourdain_jax.build.reference import Reference
 from jourdain_jax.build.reference_parameters import reference_parameters
 from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
@@ -49,7 +51,7 @@ class LogDensity(eqx.Module):
 
     scene: Scene
     groups: tuple[Run, ...]  # runs of equal structure, stacked
-    simulation: dict
+    options: AllOptions
     fixed: Float[np.ndarray, "places"]  # the first guess, and what is known, of all places of a layout
     transforms: Transforms
     guess: Float[np.ndarray, "unknowns"]  # in their units
@@ -91,7 +93,7 @@ class LogDensity(eqx.Module):
             here = run.at(self.layout, shared, local)
             weights = {name: weight / sigma[name] if name in sigma else weight for name, weight in here.weights.items()}
             memory = here.correlation_time | {name: tau[name] for name in here.correlation_time if name in tau}
-            return of_run(scene, here._replace(weights=weights, correlation_time=memory), simulation=self.simulation)
+            return of_run(scene, here._replace(weights=weights, correlation_time=memory), options=self.options)
 
         with reference.stands_in():
             return logs + sum(jnp.sum(mapped(one, group, local[np.array(runs)])) for group, runs in zip(self.groups, self.runs, strict=True))
@@ -191,13 +193,15 @@ def log_density(
     scene: Scene | BuiltFor,
     data: Experiment | Sequence[Experiment],
     free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
-    **simulation,
+    *,
+    options: Options | None = None,
+    **by_name: Unpack[OptionFields],
 ) -> LogDensity:
     """The posterior density of the unknowns of `fit`, as a function of a vector of any real numbers, for samplers such as those of BlackJAX and NumPyro.
 
     **Arguments**
-    - `scene`, `data`, `free`, `simulation`: as of `fit`: parameters that are free, start values that are unknown, numbers of sensors and actuators that are
-      estimated, and sigmas that are None, which are named `"lean.sigma"`.
+    - `scene`, `data`, `free`, `options`, `by_name`: as of `fit`: parameters that are free, start values that are unknown, numbers of sensors and actuators
+      that are estimated, and sigmas that are None, which are named `"lean.sigma"`.
     - Priors: `Normal` where an `Estimate` has one. Otherwise the prior is flat in the unknown itself, between its bounds; flat in the logarithm of a sigma,
       and in arcsin rho, rho = exp(-h / tau), of a correlation time tau that is None, where h is the shortest interval between samples of its channel.
       A flat prior without bounds has no integral: where the data do not tell an unknown, neither has the posterior, and a sampler runs away.
@@ -214,7 +218,8 @@ def log_density(
         draws = density.named(positions)["radius"]                               # m, of the positions (draws, unknowns) that were sampled
     """
     scene = as_scene(scene)
-    runs = as_runs(scene, data, simulation, forward=False)
+    settled = as_fit_options(options, by_name, "log_density", forward=False)
+    runs = as_runs(scene, data)
     sigmas = in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma)
     with_memory = in_all_or_none(runs, "the correlation time", lambda run: run.unknown_correlation)
     limits = [correlation_limits([np.asarray(run.ts) for run in runs if name in run.values]) for name in with_memory]
@@ -225,7 +230,7 @@ def log_density(
         if not is_traced((scene, [(run.start, run.t0, run.inputs) for run in runs])):
             check_starts(scene, runs, unknowns)
         grouped = equal_runs(runs)
-        guesses = [_rms(scene, [group for _, group in grouped if name in group.weights], name, simulation) for name in sigmas]
+        guesses = [_rms(scene, [group for _, group in grouped if name in group.weights], name, settled) for name in sigmas]
     guesses += (intervals / np.log(2)).tolist()  # neighbouring samples correlate by a half
     places, priors = unknowns.estimated, np.concatenate
     none = np.full(len(guesses), np.inf)
@@ -233,7 +238,7 @@ def log_density(
     return LogDensity(
         scene=scene,
         groups=tuple(group for _, group in grouped),
-        simulation=simulation,
+        options=settled,
         fixed=unknowns.guess,
         transforms=Transforms([*(unknowns.ranges[place] for place in places), *(positive() for _ in sigmas), *angles]),
         guess=np.concatenate([unknowns.guess[places], guesses]),
@@ -253,9 +258,9 @@ def log_density(
     )
 
 
-def _rms(scene: Scene, groups: Sequence[Run], name: str, simulation: dict) -> float:
+def _rms(scene: Scene, groups: Sequence[Run], name: str, options: AllOptions) -> float:
     """Root mean square of the residuals of a channel at the first guess, whose weights are one: a first guess of its sigma."""
-    of = partial(Run.residuals, scene=scene, simulate=simulate, simulation=simulation)
+    of = partial(Run.residuals, scene=scene, simulate=simulate, options=options)
     residuals = [mapped(lambda run: of(run)[name], group) for group in groups]
     samples = sum(np.count_nonzero(np.asarray(group.weights[name])) for group in groups)
     found = float(np.sqrt(sum(float(jnp.sum(r**2)) for r in residuals) / samples))

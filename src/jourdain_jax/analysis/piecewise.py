@@ -24,7 +24,7 @@ from jourdain_jax.analysis.problem import Problem, closed
 from jourdain_jax.analysis.ranges import Range, unbounded
 from jourdain_jax.analysis.shooting import MultipleShooting, ends_of_pieces, in_pieces, numbers_of_filters, owned
 from jourdain_jax.analysis.unknowns import Unknowns
-from jourdain_jax.motion.setup import TOLERANCE
+from jourdain_jax.motion.options import AllOptions
 from jourdain_jax.scene.scene import Scene
 
 _CLOSINGS = 8  # times at most that pieces are joined anew, to first order, at numbers that stay
@@ -91,7 +91,14 @@ class Piecewise:
     """Lanes of whole runs that are worked out in pieces; what `Lanes` offers, and the same with nodes as unknowns."""
 
     def __init__(
-        self, scene: Scene, runs: tuple[Experiment, ...], layout: Layout, simulation: dict, members: int | None, unknowns: Unknowns, shooting: MultipleShooting
+        self,
+        scene: Scene,
+        runs: tuple[Experiment, ...],
+        layout: Layout,
+        options: AllOptions,
+        members: int | None,
+        unknowns: Unknowns,
+        shooting: MultipleShooting,
     ):
         self.scene, self.runs, self.unknowns = scene, runs, unknowns
         of_runs = [len(scene.coordinate_names) + len(scene.speed_names) + numbers_of_filters(run, members is not None) for run in runs]
@@ -107,14 +114,14 @@ class Piecewise:
         self.own, self.shared = m, p
         self.layout = replace(layout, local=(*layout.local, Place(NODE, (self.states,), m)))
         self._carried = np.array([k for place in layout.local if place.of_sensor for k in range(place.begin, place.end)], int)  # the same in all pieces
-        self.lanes = PieceLanes(Lanes(scene, self.parts, self.layout, simulation, members), np.array(of_runs)[self.run_of])
-        self._whole = Lanes(scene, runs, layout, simulation, members)
+        self.lanes = PieceLanes(Lanes(scene, self.parts, self.layout, options, members), np.array(of_runs)[self.run_of])
+        self._whole = Lanes(scene, runs, layout, options, members)
         self.members, self.lengths = members, self._whole.lengths
         self.counted, self.whitened, self.channels = self._whole.counted, self._whole.whitened, self._whole.channels
         self.within, self.log_widths, self.by_channel = self._whole.within, self._whole.log_widths, self._whole.by_channel
         self._places = [self._places_of(i) for i in range(len(self.parts))]
         self.node_sizes = np.ones(self.states)
-        self.tolerance = float(simulation.get("rtol", TOLERANCE)), float(simulation.get("atol", TOLERANCE))
+        self.tolerance = float(options.rtol), float(options.atol)
         self.at = _Standing.of(np.zeros((0, len(self.parts), m + self.states)), np.zeros((0, p + len(runs) * m)), m + p, self.states)
         self.closing, self.share = True, np.ones(0)  # whether pieces are joined at each evaluation; else what share of their gaps goes, by member
 

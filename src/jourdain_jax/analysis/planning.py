@@ -7,6 +7,7 @@ Source: A. C. Atkinson, A. N. Donev and R. D. Tobias, Optimum Experimental Desig
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Unpack
 
 import equinox as eqx
 import jax
@@ -19,7 +20,7 @@ from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.information import hidden_combinations
 from jourdain_jax.analysis.layout import Layout
-from jourdain_jax.analysis.likelihood import as_runs
+from jourdain_jax.analysis.likelihood import as_fit_options, as_runs
 from jourdain_jax.analysis.ranges import Range
 from jourdain_jax.analysis.runs import Run, run_of
 from jourdain_jax.analysis.table import table
@@ -28,6 +29,7 @@ from jourdain_jax.build.reference import Reference
 from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.forward_mode import simulate_forward
+from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
@@ -108,14 +110,16 @@ def planned_information(
     scene: Scene | BuiltFor,
     plan: Experiment | Sequence[Experiment],
     free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
-    **simulation,
+    *,
+    options: Options | None = None,
+    **by_name: Unpack[OptionFields],
 ) -> PlannedInformation:
     """What runs that are planned will tell of the unknowns, taken at the values that the scene has.
 
     **Arguments**
     - `plan`: one run or several, as they will be measured: times, channels and sigmas, start, inputs and sensors. Their `values` do not matter, but where they
       are NaN there will be no sample.
-    - `free`, `simulation`: as of `fit`. Start values in `unknown_start` and numbers of sensors that are estimated are unknowns, too, and priors count.
+    - `free`, `options`, `by_name`: as of `fit`. Start values in `unknown_start` and numbers of sensors that are estimated are unknowns, too, and priors count.
 
     **Returns** a `PlannedInformation`: `matrix`, `standard_errors`, `log_det`. It is differentiable with respect to parameters, start values and samples of
     inputs in forward mode (`jax.jacfwd`; second derivatives of the motion, by XLA for samples) and under `jit`: starts and inputs can be optimised.
@@ -131,7 +135,8 @@ def planned_information(
         slope = jax.jacfwd(told)(-3.0)
     """
     scene = as_scene(scene)
-    runs = as_runs(scene, plan, simulation)
+    settled = as_fit_options(options, by_name, "planned_information")
+    runs = as_runs(scene, plan)
     for run in runs:
         for name in run.unknown_sigma:
             raise ValueError(f"sigma of channel `{name}` is None, but a plan needs the standard deviation of its noise; give a number")
@@ -142,21 +147,23 @@ def planned_information(
     places, count = unknowns.estimated, unknowns.layout.sizes[0]
     ready = tuple(run_of(run, jnp if is_traced((run.values, run.sigma)) else np) for run in runs)
     theta = _values(scene, runs, unknowns)
-    F, J = _sensitivities(scene, ready, theta, simulation, unknowns.layout, tuple(places.tolist()), Reference(scene))
+    F, J = _sensitivities(scene, ready, theta, settled, unknowns.layout, tuple(places.tolist()), Reference(scene))
     prior = np.diag(1 / np.where(np.isfinite(unknowns.prior_mean[places]), unknowns.prior_sigma[places], np.inf))
     prior[:count] = unknowns.whitening @ prior[:count]  # all that are shared are estimated
     return PlannedInformation(F + prior.T @ prior, theta[places], J, unknowns.labels, unknowns.units)
 
 
 @quickly_compiled
-def _sensitivities(scene: Scene, runs: tuple[Run, ...], theta: Float[Array, "places"], simulation: dict, layout: Layout, places: tuple, reference: Reference):
+def _sensitivities(
+    scene: Scene, runs: tuple[Run, ...], theta: Float[Array, "places"], options: AllOptions, layout: Layout, places: tuple, reference: Reference
+):
     """F without priors, and the sensitivities, of unknowns in these places."""
     some, count = np.array(places, int), layout.sizes[0]
 
     def residuals(free_ones: Float[Array, "unknowns"]):
         every = theta.at[some].set(free_ones)
         moved, local = layout.scene(scene, every[:count]), every[count:].reshape(len(runs), -1)
-        return tuple(run.at(layout, every[:count], own).residuals(moved, simulate_forward, simulation) for run, own in zip(runs, local, strict=True))
+        return tuple(run.at(layout, every[:count], own).residuals(moved, simulate_forward, options) for run, own in zip(runs, local, strict=True))
 
     with reference.stands_in():
         J = jax.jacfwd(residuals)(theta[some])

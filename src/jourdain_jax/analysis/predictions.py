@@ -22,6 +22,7 @@ from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.runs import Run, filled_up, grouped, is_array, most_knots, on_equal_grids, run_of
 from jourdain_jax.build.reference import Reference
 from jourdain_jax.motion.forward_mode import simulate_alongside
+from jourdain_jax.motion.options import AllOptions
 from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.scene.scene import Scene
 
@@ -34,10 +35,10 @@ _WHITE, _NONE = np.zeros((1, 1)), np.zeros(0)
 class Lanes:
     """All lanes of a problem; `evaluate` gives their weighted residuals with derivatives."""
 
-    def __init__(self, scene: Scene, data: Sequence[Experiment], layout: Layout, simulation: dict, members: int | None):
+    def __init__(self, scene: Scene, data: Sequence[Experiment], layout: Layout, options: AllOptions, members: int | None):
         self.members = members
         ready = lambda i: run_of(data[i], repeats=members is not None)  # noqa: E731
-        self._groups = [_Group(scene, indices, list(map(ready, indices)), layout, simulation, members) for indices in grouped(data)]
+        self._groups = [_Group(scene, indices, list(map(ready, indices)), layout, options, members) for indices in grouped(data)]
         self.lengths = [run.ts.shape[0] for run in data]
         self._of_run = {run: group for group in self._groups for run in group.indices}
 
@@ -88,12 +89,12 @@ class Lanes:
 class _Group:
     """Runs of equal structure, filled up to one length."""
 
-    def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, simulation: dict, members: int | None):
+    def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, options: AllOptions, members: int | None):
         self.indices, self._members, self._runs = indices, members, np.array(indices)
         times, knots = max(run.ts.shape[0] for run in runs), most_knots(runs)
         equal = runs if runs[0].grid is None or len(runs) == 1 else on_equal_grids(runs)
         filled = [filled_up(run, times, knots, 0 if members is None else 1) for run in equal]
-        leaves, treedef = jax.tree.flatten(((scene, simulation), filled[0]))
+        leaves, treedef = jax.tree.flatten(((scene, options), filled[0]))
         # numbers of a run in one row, since each array that is handed over costs as much as some of the steps of a motion
         repeated = {id(x) for part in (filled[0].values, filled[0].weights) for x in part.values()} if members is not None else set()
         common = treedef.children()[0].num_leaves
@@ -208,10 +209,10 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
                     if isinstance(leaf, _Number) and leaf[2:] == kind:
                         end = begin + math.prod(leaf.shape)
                         found[k], begin = vector[begin:end].reshape(leaf.shape).astype(jax.dtypes.canonicalize_dtype(leaf.dtype)), end
-        (scene, simulation), run = jax.tree.unflatten(treedef, [found[k] if isinstance(leaf, _Number) else leaf for k, leaf in enumerate(leaves)])
+        (scene, options), run = jax.tree.unflatten(treedef, [found[k] if isinstance(leaf, _Number) else leaf for k, leaf in enumerate(leaves)])
 
         def flat(x):
-            residuals = run.at(layout, x[own:], x[:own]).residuals(layout.scene(scene, x[own:]), simulate_alongside, simulation)
+            residuals = run.at(layout, x[own:], x[:own]).residuals(layout.scene(scene, x[own:]), simulate_alongside, options)
             return jnp.concatenate([jnp.ravel(residuals[name]) for name in sorted(residuals)])
 
         with reference.stands_in():

@@ -4,6 +4,7 @@ r = (reading - value) / sigma, zero where a sample is missing
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -21,6 +22,7 @@ from jourdain_jax.analysis.nodes import LAST, NODE, begin, ended
 from jourdain_jax.analysis.sensors import Drive, Reading, ideal, with_numbers
 from jourdain_jax.analysis.stop_events import StopEvent
 from jourdain_jax.motion.inputs import Inputs, Sampled
+from jourdain_jax.motion.options import AllOptions
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.scene import Scene
 
@@ -41,23 +43,23 @@ class Run(NamedTuple):
     drives: dict[str, Drive]
     correlation_time: dict[str, Float[Array | np.ndarray, ""]]  # s, of channels whose noise has a memory
 
-    def motion(self, scene: Scene, simulate: Callable, ts, **simulation) -> Trajectory:
+    def motion(self, scene: Scene, simulate: Callable, ts, options: AllOptions) -> Trajectory:
         """The motion at these times."""
         inputs = self.inputs
         for drive in self.drives.values():
             inputs = eqx.tree_at(lambda i, k=drive.index: i.channels[k], inputs, drive.signal())
-        return simulate(scene, begin(scene, self.start, self.t0), t0=self.t0, ts=ts, inputs=inputs, work=False, **simulation)
+        return simulate(scene, begin(scene, self.start, self.t0), t0=self.t0, ts=ts, inputs=inputs, options=options)
 
-    def residuals(self, scene: Scene, simulate: Callable, simulation: dict) -> dict[str, Float[Array | np.ndarray, "..."]]:
+    def residuals(self, scene: Scene, simulate: Callable, options: AllOptions) -> dict[str, Float[Array | np.ndarray, "..."]]:
         """`(reading - value) / sigma` by channel; of a piece of a run also what it ends at."""
         ts = self.ts if self.grid is None else self.grid
-        motion = self.motion(scene, simulate, ts, events=False, **simulation)
+        motion = self.motion(scene, simulate, ts, replace(options, events=False))
         states = motion.motions() if any(isinstance(sensor.operation, Channel) for sensor in self.sensors.values()) else None
         found, filters, place = {}, [], len(scene.coordinate_names) + len(scene.speed_names)
         for name, weight in self.weights.items():
             sensor, at_first = self.sensors.get(name, ideal(name)), None
             if isinstance(sensor.operation, StopEvent):
-                shown = self.stops(sensor.operation, name, partial(self.motion, scene, simulate, **simulation))
+                shown = self.stops(sensor.operation, name, partial(self.motion, scene, simulate, options=options))
             else:
                 x = sensor.quantity(motion, states)
                 if sensor.has_filter and NODE in self.start:

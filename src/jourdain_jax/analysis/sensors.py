@@ -208,7 +208,7 @@ def numbers_of(owner: Sensor | Actuator) -> tuple[dict, tuple[str, ...], tuple[s
     return numbers, unknown, used
 
 
-def with_numbers(parts: Mapping[str, "Reading | Drive"], known: Mapping[str, Array]) -> dict:
+def with_numbers(parts: Mapping[str, "Reading | Drive"], known: Mapping[str, Array | np.ndarray]) -> dict:
     """Readings or drives with these numbers (`gyro.gain` -> number) in place of those that are estimated."""
     changed = {}
     for label, part in parts.items():

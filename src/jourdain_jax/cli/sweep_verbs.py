@@ -34,8 +34,9 @@ from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, 
 from jourdain_jax.ensembles.files import InUseError
 from jourdain_jax.ensembles.outputs import End, EventTime, Happened, Integral, Largest, LargestMagnitude, Smallest
 from jourdain_jax.ensembles.result import LEVELS, StudyResult, load_study, merge_studies
-from jourdain_jax.ensembles.study import OPTIONS, Study
+from jourdain_jax.ensembles.study import REFUSED, Study
 from jourdain_jax.models.registry import model
+from jourdain_jax.motion.options import OPTION_NAMES, SPAN
 from jourdain_jax.scene.names import nearest
 
 _LARGEST = 100_000_000  # bytes of a file, whose tables may have a row for each sample
@@ -115,9 +116,10 @@ def described_study(asked: Mapping) -> tuple[Study, dict]:
             raise ValueError(f"the file has an entry `{key}`; {nearest(key, KEYS)}")
         if key in TABLES and not isinstance(asked[key], Mapping):
             raise ValueError(f"`{key}` is {described(asked[key])}, expected a table: a line [{key}] with entries below it")
+    known_options = [name for name in (*SPAN, *OPTION_NAMES) if name not in REFUSED and name not in asked]
     for name in asked.get("options", {}):
-        if name not in OPTIONS or name in asked:
-            raise ValueError(f"`{name}` is no entry of [options]; {nearest(name, [option for option in OPTIONS if option not in asked])}")
+        if name not in known_options:
+            raise ValueError(f"`{name}` is no entry of [options]; {nearest(name, known_options)}")
     if "model" not in asked:
         raise ValueError("the file names no `model`; write, for example, model = 'tilting-disc'")
     scene = model(asked["model"], **asked.get("set", {}))

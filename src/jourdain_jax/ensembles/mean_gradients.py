@@ -105,7 +105,7 @@ def _of_block(task: Task, columns: Sequence[str]):
 
     def outputs(drawn: Mapping):
         starts, parameters = task.starts_and_parameters(drawn)
-        rolled = rollout_forward(task.scene, starts, parameters=parameters or None, **task.options).lanes
+        rolled = rollout_forward(task.scene, starts, parameters=parameters or None, **task.span, options=task.options).lanes
         found = eqx.filter_vmap(task.outputs_of_lane)(rolled)
         return found, jnp.where(rolled.result == results.EVENT, rolled.event, jnp.where(rolled.succeeded, -1, -2))
 

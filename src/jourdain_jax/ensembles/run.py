@@ -154,7 +154,7 @@ def attributes(task: Task) -> dict:
         "sampler": task.design.sampler,
         "seed": int(task.design.seed),
         "samples": len(task.design),
-        "options": {name: _as_text(x) for name, x in task.options.items()},
+        "options": {name: _as_text(x) for name, x in task.settled.items()},
         "precision": str(jnp.result_type(float)),
         "versions": versions(),
         "command": " ".join(sys.argv),

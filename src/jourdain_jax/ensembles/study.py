@@ -1,11 +1,10 @@
 """A study: what varies over many motions of one scene, and how they are run."""
 
-import inspect
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -21,15 +20,15 @@ from jourdain_jax.ensembles.run import bounded, in_this_process, run
 from jourdain_jax.ensembles.task import AT_START, SAVES, Task
 from jourdain_jax.ensembles.workers import in_processes
 from jourdain_jax.motion.arguments import span_and_times
-from jourdain_jax.motion.simulate import simulate
+from jourdain_jax.motion.options import MotionFields, Options, as_options
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
-NO_OPTIONS = ("saveat", "adjoint", "progress", "parameters", "starts", "scene", "start")
-OPTIONS = tuple(name for name in inspect.signature(simulate).parameters if name not in NO_OPTIONS)
+_STATED = "times to save at are `ts`, and what is kept is said by `outputs` and `save`"
+REFUSED = dict.fromkeys(("saveat", "adjoint", "progress", "parameters", "starts", "scene", "start"), _STATED)
 
 
 @dataclass(frozen=True, repr=False)
@@ -100,17 +99,15 @@ class Study(Printed):
         pairs = {tuple(column.get(x, x) for x in pair) if isinstance(pair, tuple) else pair: value for pair, value in (self.correlation or {}).items()}
         return Design(varying, self.sampler, self.samples, self.seed, pairs or None)
 
-    def task(self, *, t1=None, ts=None, t0=None, outputs: Mapping | None = None, save: str = "outputs", every: int = 1, **options) -> Task:
-        """All that decides the numbers of a run; arguments as in `run`: `t1`, `ts`, `t0` in s, `outputs`, `save`, `every`, `options`."""
+    def task(
+        self, *, t1=None, ts=None, t0=None, outputs: Mapping | None = None, save: str = "outputs", every: int = 1, inputs=None, options=None, **by_name
+    ) -> Task:
+        """All that decides the numbers of a run; arguments as in `run`: `t1`, `ts`, `t0` in s, `outputs`, `save`, `every`, `inputs`, `options`, `by_name`."""
         if save not in SAVES:
             raise ValueError(f"`save` is {save!r}; {nearest(str(save), SAVES)}")
         if isinstance(every, bool) or not isinstance(every, int | np.integer) or every < 1 or (every > 1 and save != "trajectories"):
             raise ValueError(f"`every` is {every!r}, expected a whole number of at least 1; it says of which lanes save='trajectories' keeps the trajectory")
-        for name in options:
-            if name in NO_OPTIONS:
-                raise ValueError(f"`{name}` is no option of a study; times to save at are `ts`, and what is kept is said by `outputs` and `save`")
-            if name not in OPTIONS:
-                raise ValueError(f"`{name}` is no option of a study; {nearest(name, OPTIONS)}")
+        options = as_options(options, by_name, "Study.run", REFUSED)
         known = as_outputs(self.scene, outputs)
         first, times, last = span_and_times(self.scene, None, t0, t1, ts)
         if ts is None and save != "trajectories" and not any(output.over_times for output in known.values()):
@@ -118,8 +115,8 @@ class Study(Printed):
         if times[0] != first and (missed := [name for name, output in known.items() if isinstance(output, Integral)]):
             text = f"`ts` begins at {times[0]:g} s, and the motion at {first:g} s: the integral `{missed[0]}` would leave out what is between"
             raise ValueError(f"{text}; let `ts` begin where the motion does")
-        settled = {"t0": float(first), "t1": float(last), "ts": np.asarray(times, float)} | options
-        return Task(self.scene, self.design, self._named[1], known, settled, save, int(every))
+        span = {"t0": float(first), "t1": float(last), "ts": np.asarray(times, float), "inputs": inputs}
+        return Task(self.scene, self.design, self._named[1], known, span, options, save, int(every))
 
     def run(
         self,
@@ -138,7 +135,8 @@ class Study(Printed):
         memory: int | str | None = None,
         shard: tuple[int, int] = (1, 1),
         command: str = "",
-        **options,
+        options: Options | None = None,
+        **by_name: Unpack[MotionFields],
     ) -> StudyResult:
         """Run what is missing of the study in the folder `path`, which is made where there is none, and open it.
 
@@ -159,13 +157,14 @@ class Study(Printed):
           it included; with `client`, what each worker may hold. Blocks and chunks are made small enough. It is held on Linux. Means and covariances of
           studies with other blocks differ in their last digits.
         - `shard`: (k, n): only the k-th of n shares of the chunks, for a folder of its own on one of n machines; `jj.merge_studies` puts them together.
-        - `progress`: a bar; `command`: text that is kept with the study; `options`: further ones as in `rollout` (`rtol`, `atol`, `solver`, `max_step`, ...).
+        - `progress`: a bar; `command`: text that is kept with the study.
+        - `options`: a `jj.Options`; `by_name`: its fields, and `inputs`, as in `rollout`.
 
         Raises ValueError where the folder holds another study or `memory` is too little, MemoryError where it turned out to be, `InUseError` where another
         process runs it, OSError where it cannot be written.
         Ctrl-C: the chunk under way ends, all is kept, and KeyboardInterrupt says so.
         """
-        task = self.task(t1=t1, ts=ts, t0=t0, outputs=outputs, save=save, every=every, **options)
+        task = self.task(t1=t1, ts=ts, t0=t0, outputs=outputs, save=save, every=every, options=options, **by_name)
         shards = tuple(shard)
         if len(shards) != 2 or not all(isinstance(x, int) for x in shards) or not 1 <= shards[0] <= shards[1]:
             raise ValueError(f"`shard` is {shard}, expected (k, n) with 1 <= k <= n")
@@ -179,21 +178,21 @@ class Study(Printed):
         store = run(task, path, chunk=chunk, progress=progress, shard=shards, command=command, workers=compute)
         return StudyResult(store, task)
 
-    def mean_gradients(self, *, parameters: Sequence[str] = (), t1=None, ts=None, t0=None, outputs: Mapping | None = None, **options) -> MeanGradients:
+    def mean_gradients(self, *, parameters: Sequence[str] = (), t1=None, ts=None, t0=None, outputs: Mapping | None = None, **more) -> MeanGradients:
         """Derivatives of the means of all outputs with respect to the numbers of the distributions, and to the `parameters` that all lanes share.
 
         They are pathwise derivatives: the mean over lanes of exact derivatives of their motions, in forward mode, for the samples of this study. Where lanes
         end at events, a `SensitivityWarning`, also among `warnings` of the result, says what they may miss. This process computes it; nothing is
         stored.
 
-        - `t0`, `t1`, `ts`, `outputs`, `options`: as in `run`.
+        - `t0`, `t1`, `ts`, `outputs`, `more`: as in `run`.
 
             found = study.mean_gradients(t1=2.0, outputs={"final lean": jj.End("lean", "rad")}, parameters=("gravity",))
             found.of("final lean", "radius.sigma")
 
         Raises ValueError for unknown names.
         """
-        return mean_gradients(self.task(t1=t1, ts=ts, t0=t0, outputs=outputs, **options), tuple(parameters))
+        return mean_gradients(self.task(t1=t1, ts=ts, t0=t0, outputs=outputs, **more), tuple(parameters))
 
     def _text(self) -> str:
         constants = ", ".join(f"{name} = {np.asarray(value).tolist()}" for name, value in self._named[1].items())

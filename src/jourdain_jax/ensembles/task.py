@@ -24,6 +24,7 @@ from jourdain_jax.ensembles.store import Column
 from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.motion.batches.rollout import rollout
 from jourdain_jax.motion.marks import nan_is_a_mark
+from jourdain_jax.motion.options import AllOptions, stated
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.labelled import CODES, OF_LANES
@@ -54,7 +55,8 @@ class Task:
     design: Design  # parameters by name, start values by name and AT_START
     constants: Mapping[str, object]  # start values that all lanes share
     outputs: Mapping[str, Output]
-    options: Mapping[str, Any]  # of `rollout`, `ts` among them
+    span: Mapping[str, Any]  # t0, t1, ts, inputs
+    options: AllOptions
     save: str
     every: int
     largest_block: int | None = None  # lanes; default: LARGEST_BLOCK
@@ -81,7 +83,7 @@ class Task:
     @property
     def ts(self) -> np.ndarray:
         """Saved times, s."""
-        return np.asarray(self.options["ts"])
+        return np.asarray(self.span["ts"])
 
     def arguments(self, first: int, last: int, places: np.ndarray | None = None) -> tuple[dict, dict]:
         """Start values and parameters of some lanes, counted from `first`: those at `places`, or all."""
@@ -93,19 +95,20 @@ class Task:
         starts = {name.removesuffix(AT_START): column for name, column in values.items() if name.endswith(AT_START)}
         return dict(self.constants) | starts, {name: column for name, column in values.items() if not name.endswith(AT_START)}
 
-    def simulated(self, lane: int, **options) -> Trajectory:
-        """The motion of one lane alone; `options` replace those of the study."""
+    def simulated(self, lane: int, **by_name) -> Trajectory:
+        """The motion of one lane alone; span, inputs and options by name replace those of the study."""
         starts, parameters = self.arguments(lane, lane + 1)
         own = self.scene.replace(**{name: column[0] for name, column in parameters.items()}) if parameters else self.scene
         first = {name: value if name in self.constants else value[0] for name, value in starts.items()}
-        return simulate(own, first, **(dict(self.options) | options))
+        span = {name: by_name.pop(name, value) for name, value in self.span.items()}
+        return simulate(own, first, **span, options=self.options, **by_name)
 
     def run_block(self, number: int) -> Lanes:
         """All lanes of a block."""
         first = number * self.block
         last = min(first + self.block, len(self.design))
         starts, parameters = self.arguments(first, last, np.minimum(np.arange(self.block), last - first - 1))
-        rolled = rollout(self.scene, starts, parameters=parameters or None, chunk=self.block, progress=False, **self.options).lanes
+        rolled = rollout(self.scene, starts, parameters=parameters or None, chunk=self.block, progress=False, **self.span, options=self.options).lanes
         with nan_is_a_mark():
             outputs = np.array(self._outputs_of(rolled))[: last - first]
         if self.save == "statistics":
@@ -134,6 +137,11 @@ class Task:
 
     def __getstate__(self):
         return {name: value for name, value in vars(self).items() if name != "_outputs_of"}  # what was compiled stays in its process
+
+    @property
+    def settled(self) -> dict[str, Any]:
+        """Span, inputs and options that were stated, by name."""
+        return {name: value for name, value in self.span.items() if value is not None} | stated(self.options)
 
     def columns(self) -> dict[str, Column]:
         """The arrays of the store."""
@@ -169,7 +177,7 @@ class Task:
             "start": digest(dict(self.constants)),
             "design": digest((dict(self.design.variables), self.design.sampler, len(self.design), self.design.seed, self.design.correlation)),
             "outputs": digest(dict(self.outputs)),
-            "options": digest(dict(sorted(self.options.items()))),
+            "options": digest(dict(sorted(self.settled.items()))),
             "save": digest((self.save, self.every)),
             "precision": digest(str(jnp.result_type(float))),
             "backend": jax.default_backend(),

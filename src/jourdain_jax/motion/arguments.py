@@ -1,11 +1,10 @@
-"""What is handed to `simulate` and its kin, checked: the span, times to save at, starts, tolerances, objects of diffrax where a text or a class was given.
+"""Check what is handed to `simulate` and its kin: the span, times to save at, starts.
 
 Times are checked where they are known; where they are traced, whether they go together is found while the motion runs.
 
 t0 <= ts_1 < ts_2 < ... <= t1,   or the other way round in reversed time
 """
 
-import difflib
 from collections.abc import Mapping
 
 import jax.numpy as jnp
@@ -13,9 +12,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.reals import as_array, checked_unless_traced, described, is_traced, real_type
-from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
-from jourdain_jax.motion.integrators.of_diffrax import diffrax
-from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.start import State, named_start
 from jourdain_jax.scene.scene import Scene
 
@@ -23,12 +19,6 @@ DEFAULT_SAMPLES = 201
 _EVEN = np.linspace(0.0, 1.0, DEFAULT_SAMPLES)
 _SHORT = 1e-9  # s, a span for motions that are not asked for
 _ROUND_OFF = 4  # units in the last place by which a time at an end of the span may lie beyond it
-_KINDS = {  # of diffrax, and an example
-    "solver": ("AbstractSolver", "diffrax.Dopri8()"),
-    "adjoint": ("AbstractAdjoint", "diffrax.DirectAdjoint()"),
-    "stepsize_controller": ("AbstractStepSizeController", "diffrax.PIDController(rtol=1e-8, atol=1e-8)"),
-    "saveat": ("SaveAt", "diffrax.SaveAt(ts=...)"),
-}
 
 
 def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None, native: bool = True) -> State:
@@ -45,46 +35,6 @@ def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None, n
             f"scene's example{'; write `.state` after it' if isinstance(getattr(given, 'state', None), State) else ''}"
         )
     return named_start(scene, scene.example if given is None else given, t0, inputs, native=native)
-
-
-def check_options(*, rtol=1e-8, atol=1e-8, max_steps=1, dt0=None, max_step=None, switches: dict | None = None, **objects) -> None:
-    """ValueError for tolerances that are no positive numbers, and for `solver`, `adjoint`, ... that are no objects of their kind (None is let pass)."""
-    for name, value in (("rtol", rtol), ("atol", atol)):
-        if type(value) is float and 0 < value < np.inf:
-            continue
-        number = checked_unless_traced(value, f"`{name}`", (), advice="give one number, such as 1e-8")
-        if not is_traced(number) and not 0 < float(number) < np.inf:
-            raise ValueError(f"`{name}` is {float(number):g}, expected a positive finite number; give a tolerance such as 1e-8")
-    for name, value in (switches or {}).items():
-        if not isinstance(value, bool | np.bool_):
-            raise ValueError(f"`{name}` is {described(value)}, expected True or False")
-    if dt0 is not None:
-        first = checked_unless_traced(dt0, "`dt0`", (), advice="give the first step in s, or None for 1e-4 of the span")
-        if not is_traced(first) and not 0 < abs(float(first)) < np.inf:
-            raise ValueError(f"`dt0` is {float(first):g}, expected a finite first step in s that is not zero; or None for 1e-4 of the span")
-    if max_step is not None:
-        longest = checked_unless_traced(max_step, "`max_step`", (), advice="give the longest step in s, None for a part of the span, or inf for no bound")
-        if not is_traced(longest) and not float(longest) > 0:
-            raise ValueError(f"`max_step` is {float(longest):g}, expected a positive time in s; None bounds steps by the span, inf does not bound them")
-    if max_steps is not None and (not isinstance(max_steps, int | np.integer) or isinstance(max_steps, bool) or max_steps < 1):
-        raise ValueError(f"`max_steps` is {max_steps!r}, expected a whole number of at least 1; give the number of steps after which to stop")
-    for name, value in objects.items():
-        if value is None or isinstance(value, Method | ImplicitMethod):
-            continue
-        kind, example = getattr(diffrax, _KINDS[name][0]), _KINDS[name][1]
-        if not isinstance(value, kind):
-            raise ValueError(f"`{name}` is {described(value)}, expected an object of diffrax; write `{_meant(value, kind) or example}`")
-
-
-def _meant(value, kind: type) -> str:
-    """The object that a text or a class may stand for."""
-    if isinstance(value, type) and issubclass(value, kind):
-        return f"{'jj' if value.__module__.startswith('jourdain_jax') else 'diffrax'}.{value.__name__}()"
-    if not isinstance(value, str):
-        return ""
-    members = {name.lower(): name for name in dir(diffrax) if isinstance(member := getattr(diffrax, name), type) and issubclass(member, kind)}
-    near = difflib.get_close_matches(value.lower(), [name for name in members if not name.startswith("abstract")], n=1, cutoff=0.5)
-    return f"diffrax.{members[near[0]]}()" if near else ""
 
 
 def span_and_times(scene: Scene, start, t0, t1, ts):

@@ -1,4 +1,4 @@
-"""What is tried again after a motion failed, and how: one rule for single motions and for the lanes of rollouts.
+"""What is tried again after a motion failed, with `retry=True`, and how: one rule for single motions and for the lanes of rollouts.
 
 FULL_STATE    it left the domain in which its privileged speeds, or its program, serve: the full state, dense matrices
 IMPLICIT      an explicit solver ran out of steps that stability kept short: Radau's method
@@ -9,7 +9,8 @@ An explicit method of a step h follows a mode exp(-r t) only while h r stays bel
 little of the mode is left. A motion that ran out of steps with h r near that number ran out of them for stability: `h r >= 1` is called stiff here.
 """
 
-import dataclasses
+from collections.abc import Callable
+from dataclasses import replace
 from typing import TypeVar
 
 import equinox as eqx
@@ -17,14 +18,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.integrators.radau import RadauIIA
 from jourdain_jax.motion.integrators.solver_choice import may_be_full
 from jourdain_jax.motion.integrators.tableaus import DOPRI8
 from jourdain_jax.motion.integrators.taylor import Taylor
-from jourdain_jax.motion.setup import MOST_STEPS
+from jourdain_jax.motion.options import AllOptions
+from jourdain_jax.motion.setup import Setup
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.choice import as_formulation
@@ -33,39 +35,91 @@ from jourdain_jax.motion.vector_fields.field import VectorField
 OUT_OF_STEPS = (results.MAX_STEPS, results.SHRANK)
 _SHARE = 10  # a step of the implicit solver costs tens of explicit ones: it gets a tenth of the number
 
+RERUN_FIELDS = ("state_form", "reduction", "solver", "projected", "unwatched")  # of a trajectory, static: they say how a lane was run again
 Motions = TypeVar("Motions", bound=Trajectory)
 
 
-def next_retry(field: VectorField, motion: Trajectory, t0, options: dict) -> int:
+def retried(run: Callable[[AllOptions], tuple[Setup, Trajectory]], setup: Setup, motion: Trajectory, options: AllOptions) -> Trajectory:
+    """Return the motion, run again until a way succeeds or none is left; as it is where its result is traced."""
+    if is_traced(motion.result):
+        return motion
+    while retries := _next_retry(setup.field, motion, setup.t0, options):
+        setup, motion = run(_with_retries(retries, options))
+        motion = _marked(motion, retries)
+    return motion
+
+
+def lanes_retried(
+    run: Callable[[AllOptions, np.ndarray], Trajectory], form: Callable[[AllOptions], VectorField], lanes: Trajectory, begun, options: AllOptions, chunk: int
+):
+    """Return the lanes, of which those that failed were run again as single motions are, and for each way of retrying the `RERUN_FIELDS` of its lanes.
+
+    `run`: the motions of lanes with these numbers, with these options; `form`: what is integrated of them; `begun`: their start times; `chunk`: of `rollout`.
+    """
+    reruns: dict[int, tuple] = {}
+    while (again := _next_retries(form, lanes, begun, options)).any():
+        for way in np.unique(again[again > 0]).tolist():
+            chosen, changed = np.flatnonzero(again == way), _with_retries(way, options)
+            for first in range(0, len(chosen), chunk):
+                index = chosen[np.minimum(np.arange(first, first + min(chunk, _round_up(len(chosen)))), len(chosen) - 1)]
+                new = run(changed, index)
+                lanes, reruns[way] = _replaced(lanes, _marked(new, way), index), tuple(getattr(new, name) for name in RERUN_FIELDS)
+    return lanes, tuple(sorted(reruns.items()))
+
+
+def _next_retries(form: Callable[[AllOptions], VectorField], lanes: Trajectory, begun, options: AllOptions) -> Int[np.ndarray, "lanes"]:
+    """How each lane is run again, all earlier changes of its run included; AS_ASKED: it is not."""
+    begun = np.broadcast_to(np.asarray(begun), lanes.result.shape)
+    found = np.full(lanes.result.shape, results.AS_ASKED)
+    for tried in np.unique(lanes.fallback).tolist():
+        field = form(_with_retries(tried, options))
+        for i in np.flatnonzero((np.asarray(lanes.fallback) == tried) & np.isin(lanes.result, (*lost_codes(field), *OUT_OF_STEPS))):
+            found[i] = _next_retry(field, jax.tree.map(lambda x, i=i: x[i], lanes), begun[i], options)
+    return found
+
+
+def _round_up(count: int) -> int:
+    """The next power of two, at least 8: few programs to compile."""
+    return max(8, 1 << (count - 1).bit_length())
+
+
+def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajectory:
+    """`lanes` with those at `index` from another run."""
+    leaves, treedef = jax.tree.flatten(lanes)
+    new = [np.array(x) for x in leaves]
+    for old, y in zip(new, jax.tree.leaves(again), strict=True):
+        old[index] = np.asarray(y)
+    return jax.tree.unflatten(treedef, new)
+
+
+def _next_retry(field: VectorField, motion: Trajectory, t0, options: AllOptions) -> int:
     """The retries of a `motion` from `t0`: those already made and one more; AS_ASKED where none is left.
 
-    `field`: how it was integrated; `options`: those of `simulate` that were given.
+    `field`: how it was integrated; `options`: those that were given.
     """
     if np.asarray(motion.result) in (results.SUCCESS, results.EVENT):
         return results.AS_ASKED
-    tried, solver, backend = int(motion.fallback), options.get("solver"), options.get("backend", "auto")
-    lost = as_formulation(options.get("formulation")).state in may_be_another_form(field) and may_be_full(solver) and int(motion.result) in lost_codes(field)
+    tried, solver, backend = int(motion.fallback), options.solver, options.backend
+    lost = as_formulation(options.formulation).state in may_be_another_form(field) and may_be_full(solver) and int(motion.result) in lost_codes(field)
     if lost and backend in ("auto", "dense") and not tried & results.FULL_STATE:
         return tried | results.FULL_STATE
-    free = solver is None and backend != "native" and options.get("stepsize_controller") is None
+    free = solver is None and backend != "native" and options.stepsize_controller is None
     if free and not tried & results.IMPLICIT and _is_stiff(field, motion, t0):
         return tried | results.IMPLICIT
     return results.AS_ASKED
 
 
-def retry_options(retries: int, options: dict) -> dict:
-    """The options of `simulate` that make these retries; `options`: those that were given."""
-    changed: dict = {}
+def _with_retries(retries: int, options: AllOptions) -> AllOptions:
+    """The options with what makes these retries."""
     if retries & results.FULL_STATE:
-        changed = {"formulation": dataclasses.replace(as_formulation(options.get("formulation")), state="full"), "backend": "dense"}
-        if isinstance(options.get("solver"), Taylor):  # which dense matrices do not have
-            changed["solver"] = DOPRI8
+        solver = DOPRI8 if isinstance(options.solver, Taylor) else options.solver  # dense matrices have no series
+        options = replace(options, formulation=replace(as_formulation(options.formulation), state="full"), backend="dense", solver=solver)
     if retries & results.IMPLICIT:
-        changed |= {"solver": RadauIIA(), "max_steps": max(1, options.get("max_steps", MOST_STEPS) // _SHARE)}
-    return changed
+        options = replace(options, solver=RadauIIA(), max_steps=max(1, options.max_steps // _SHARE))
+    return options
 
 
-def mark_retried(motion: Motions, retries: int) -> Motions:
+def _marked(motion: Motions, retries: int) -> Motions:
     """A motion, or several, marked as run again by these retries; where it is out of steps once more, it is called stiff."""
     code = motion.result
     if retries & results.IMPLICIT:
@@ -115,7 +169,7 @@ def _jacobian(field: VectorField, motion: Trajectory) -> Float[Array, "state sta
 
     def rates(x):
         q, v = unravel(x)
-        found = field.rates(scene, fixed, t, dataclasses.replace(y, q=q, v=v), field.now(inputs, t))
+        found = field.rates(scene, fixed, t, replace(y, q=q, v=v), field.now(inputs, t))
         return jnp.concatenate([found.q, found.v])
 
     return jax.jacfwd(rates)(x)

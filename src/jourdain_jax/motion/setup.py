@@ -24,7 +24,7 @@ from jourdain_jax.motion.start import State
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
-TOLERANCE, MOST_STEPS, LONGEST = 1e-8, 100_000, 1 / 16  # of `simulate`, where nothing else is asked for; the last: of the span, a step
+LONGEST = 1 / 16  # of the span: the longest step, where nothing else is asked for
 
 
 class Solved(eqx.Module):

@@ -4,9 +4,9 @@ The default state is the minimal one (coordinates and privileged speeds) where t
 domain and the rows are linear or affine; otherwise the full one (coordinates and all speeds), projected after every step.
 """
 
-import inspect
 import warnings
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -14,26 +14,26 @@ import numpy as np
 
 from jourdain_jax.calculus.on_first_use import module_on_first_use
 from jourdain_jax.calculus.reals import Number, as_array, is_traced
-from jourdain_jax.motion.arguments import as_state, check_options, span_and_times
+from jourdain_jax.motion.arguments import as_state, span_and_times
 from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.inputs_in_rows import check_inputs_in_rows
 from jourdain_jax.motion.integration import integrate
-from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
+from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted
 from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method, as_solver
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import nan_is_a_mark
+from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.own_steps import own_steps, reason_against_series
-from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
+from jourdain_jax.motion.retries import retried
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
-from jourdain_jax.motion.setup import LONGEST, MOST_STEPS, TOLERANCE, Setup
+from jourdain_jax.motion.setup import LONGEST, Setup
 from jourdain_jax.motion.start import State, nearest_state
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.motion.vector_fields.choice import Formulation, as_formulation, vector_field
+from jourdain_jax.motion.vector_fields.choice import as_formulation, vector_field
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
-from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines, users_level
 
@@ -51,20 +51,9 @@ def simulate(
     t0: Number | None = None,
     t1: Number | None = None,
     ts=None,
-    saveat: "diffrax.SaveAt | None" = None,
-    rtol: Number = TOLERANCE,
-    atol: Number = TOLERANCE,
-    solver: "diffrax.AbstractSolver | Method | ImplicitMethod | Taylor | None" = None,
-    stepsize_controller: "diffrax.AbstractStepSizeController | None" = None,
-    dt0: Number | None = None,
-    max_step: Number | None = None,
-    adjoint: "diffrax.AbstractAdjoint | None" = None,
-    max_steps: int = MOST_STEPS,
-    formulation: Formulation | None = None,
-    backend: str = "auto",
     inputs=None,
-    events: bool = True,
-    work: bool = True,
+    options: Options | None = None,
+    **by_name: Unpack[OptionFields],
 ) -> Trajectory:
     """Integrate a scene's equations of motion from `start` over [t0, t1].
 
@@ -72,33 +61,27 @@ def simulate(
     - `start`: a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for the scene's example.
     - `t0`, `t1`: ends of the span (s; defaults: the time of a `State`, otherwise 0; the last of `ts`, or the scene's
       `example_span` after t0); `ts`: times to save at (default: 201 even ones), at each of which a step ends.
-    - `saveat`: a `diffrax.SaveAt` in place of `ts`. Values between steps come from the solver's dense output: fewer steps, but
-      its error can be far above the tolerance where steps are long (Dopri8 on a pendulum: 100 times at 1e-12; on a sleigh at 1e-11: 1e-6).
-    - `rtol`, `atol`, `solver`, `stepsize_controller`, `dt0` (default: 1e-4 of the span), `adjoint`, `max_steps`: as in
-      `diffrax.diffeqsolve`. Default solver: Tsit5 for
-      rtol >= 1e-6, Dopri8 below, and where these run out of steps on a stiff motion, `RadauIIA`; `Taylor` for small scenes at
-      tight tolerances; structure-preserving ones (`ImplicitMidpoint`,
-      `DiscreteLagrangeDAlembert`, `DiscreteGradient`) take equal steps of at most their `step` between saved times.
-      Default adjoint: forward and reverse mode, to the second order (`jax.hessian`), where machine code integrates; otherwise
-      `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order, by recorded steps; with `checkpoints=`, that of diffrax);
-      `diffrax.ForwardMode()` for forward mode of any order; `diffrax.DirectAdjoint()` for all.
-    - `max_step`: the longest step (s); None: 1/16 of the span, so that a load that acts on a part of the way, or a dip of an event, is not
-      stepped over where nothing else keeps steps short; inf: no bound. For one of your own `stepsize_controller`, give that its `dtmax`.
+    - `inputs`: name -> number, function of time, or `Sampled`.
+    - `options`: a `jj.Options`: tolerances, solver, steps, events, work, retries. `by_name`: its fields, as `rtol=1e-10`, which replace those of `options`.
+
+    By name alone:
     - `formulation`: which equations are integrated, a `jj.Formulation(state, reduction, stabilisation)` (default: what serves the scene).
     - `backend`: "native", the scene's scalar program (`jj.lower`) as machine code made for it, on CPUs, where llvmlite is installed and the solver is a
       default one; "xla", that program compiled by XLA, as third derivatives, those with respect to samples, and programs that are exported (`jax.export`)
       or for other devices are in any case; "dense", the dense matrices; "auto" (default), the first of these that serves. The first two take the same steps.
-    - `inputs`: name -> number, function of time, or `Sampled`.
-    - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.
+    - `saveat`: a `diffrax.SaveAt` in place of `ts`. Values between steps come from the solver's dense output: fewer steps, but
+      its error can be far above the tolerance where steps are long (Dopri8 on a pendulum: 100 times at 1e-12; on a sleigh at 1e-11: 1e-6).
+    - `stepsize_controller`, `adjoint`: as in `diffrax.diffeqsolve`; for a controller of your own, give that its `dtmax` in place of `max_step`.
+      Default adjoint: forward and reverse mode, to the second order (`jax.hessian`), where machine code integrates; otherwise
+      `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order, by recorded steps; with `checkpoints=`, that of diffrax);
+      `diffrax.ForwardMode()` for forward mode of any order; `diffrax.DirectAdjoint()` for all.
+    - `dt0`: the first step (s; default: 1e-4 of the span).
 
-    Where nothing is traced, a motion that leaves the domain of its privileged speeds is run again with the full state, and a stiff one by an implicit
-    solver (unless `formulation` or `solver` is chosen so); `trajectory.fallback` and its summary say so. Inside your own `jit` or `vmap` the result code
-    stays.
+    **Returns** a `Trajectory`, with a result code instead of an exception, whose message says what to do; `trajectory.raise_if_failed()` raises
+    `SimulationError`.
 
-    **Returns** a `Trajectory`, with a result code instead of an exception; `trajectory.raise_if_failed()` raises `SimulationError`.
-
-    **Raises** ValueError for bad arguments or a start that contradicts the constraints, `DifferentiationModeError` where the adjoint does not
-    support the mode of differentiation.
+    **Raises** TypeError for unknown options, ValueError for bad arguments or a start that contradicts the constraints, `DifferentiationModeError` where the
+    adjoint does not support the mode of differentiation.
 
     **Examples**
 
@@ -113,19 +96,15 @@ def simulate(
 
         slope = jax.grad(lean_at_end)(0.5)
     """
-    given = dict(locals())
-    setup, motion = _run(given)
-    if isinstance(motion.result, jax.core.Tracer):
-        return motion
-    while retries := next_retry(setup.field, motion, setup.t0, given):
-        setup, motion = _run(given | retry_options(retries, given))
-        motion = mark_retried(motion, retries)
-    return motion
+    options = as_options(options, by_name)
+    run = partial(_run, scene, start, {"t0": t0, "t1": t1, "ts": ts, "inputs": inputs})
+    setup, motion = run(options)
+    return retried(run, setup, motion, options) if options.retry else motion
 
 
-def _run(given: dict) -> tuple[Setup, Trajectory]:
+def _run(scene, start, span: dict, options: AllOptions) -> tuple[Setup, Trajectory]:
     """What was integrated, and its motion."""
-    setup = _set_up(**given)
+    setup = set_up(scene, start, **span, options=options)
     return setup, warn_if_ill_conditioned(setup, _integrated)
 
 
@@ -140,49 +119,38 @@ def _integrated(setup: Setup) -> Trajectory:
     return integrate(setup)
 
 
-def set_up(scene: Scene | BuiltFor, start=None, **options) -> Setup:
-    """What `simulate` integrates for these arguments, which are its own."""
-    signature = inspect.signature(simulate)
-    for name in options.keys() - signature.parameters.keys():
-        raise TypeError(f"simulate() got an unexpected keyword argument '{name}'; {nearest(name, signature.parameters)}")
-    bound = signature.bind(scene, start, **options)
-    bound.apply_defaults()
-    return _set_up(**bound.arguments)
-
-
-def _set_up(
-    *, scene, start, t0, t1, ts, saveat, rtol, atol, solver, stepsize_controller, dt0, max_step, adjoint, max_steps, formulation, backend, inputs, events, work,
-) -> Setup:  # fmt: skip
-    scene, formulation = as_scene(scene), as_formulation(formulation)
-    switches = {"events": events, "work": work}
-    order, solver = (solver.order or order_for(rtol), None) if isinstance(solver, Taylor) else (None, solver)
-    objects = {"solver": solver, "adjoint": adjoint, "stepsize_controller": stepsize_controller, "saveat": saveat}
-    check_options(rtol=rtol, atol=atol, max_steps=max_steps, dt0=dt0, max_step=max_step, switches=switches, **objects)
+def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, inputs=None, options: Options | None = None, **by_name) -> Setup:
+    """Return what `simulate` integrates for its arguments."""
+    options = as_options(options, by_name)
+    solver, adjoint, saveat, dt0, max_step = options.solver, options.adjoint, options.saveat, options.dt0, options.max_step
+    controller: Any = options.stepsize_controller
+    scene, formulation = as_scene(scene), as_formulation(options.formulation)
+    order, solver = (solver.order or order_for(options.rtol), None) if isinstance(solver, Taylor) else (None, solver)
     _check_adjoint(adjoint)
-    check_solver(solver, stepsize_controller, dt0, saveat, max_step, adjoint)
+    check_solver(solver, controller, dt0, saveat, max_step, adjoint)
     if isinstance(solver, FixedStepMethod):
         dt0 = max_step = solver.step
-    native = backend in ("auto", "native")
+    native = options.backend in ("auto", "native")
     inputs = as_inputs(scene, inputs)
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
     start = _start(scene, start, t0, inputs, native, formulation.projects)
-    field = fitted(solver, scene, vector_field(scene, formulation, work, backend, inputs), formulation.state)
+    field = fitted(solver, scene, vector_field(scene, formulation, options.work, options.backend, inputs), formulation.state)
     if not inputs.constant:
         check_inputs_in_rows(scene, inputs, t0, t1)
-    warn_float32(start.q.dtype, rtol)
+    warn_float32(start.q.dtype, options.rtol)
     if solver is None:
-        solver = default_solver(rtol) if order is None else DOPRI8
-    static = {"max_steps": max_steps, "event_names": field.event_names if events else ()}
-    integrator = own_steps(solver, stepsize_controller, adjoint, saveat, **static, native=native, order=order)
+        solver = default_solver(options.rtol) if order is None else DOPRI8
+    static: dict[str, Any] = {"max_steps": options.max_steps, "event_names": field.event_names if options.events else ()}
+    integrator = own_steps(solver, controller, adjoint, saveat, **static, native=native, order=order)
     if integrator is None:
         adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
         saveat = None if saveat is None else _checked_saveat(saveat)
-        integrator = diffrax_steps.Diffrax(as_solver(solver), stepsize_controller, adjoint, saveat, **static)
-    tolerances = tuple(as_array(x, start.q.dtype) for x in (rtol, atol))  # arrays: another tolerance is no other program
+        integrator = diffrax_steps.Diffrax(as_solver(solver), controller, adjoint, saveat, **static)
+    tolerances = tuple(as_array(x, start.q.dtype) for x in (options.rtol, options.atol))  # arrays: another tolerance is no other program
     first_step = _first_step(dt0, t0, t1)  # diffrax's own guess costs two more copies of the vector field to compile
     longest = as_array(LONGEST * abs(t1 - t0) if max_step is None else max_step, start.q.dtype)
     setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, longest, integrator)
-    if backend == "native" and (reason := setup.reason_against_machine_code):
+    if options.backend == "native" and (reason := setup.reason_against_machine_code):
         raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
     if order is not None and (reason := reason_against_series(setup, order)):
         raise ValueError(f"solver=jj.Taylor() cannot integrate `{type(scene).__name__}`: {reason}; leave `solver` away, or use solver=diffrax.Dopri8()")

@@ -5,27 +5,28 @@ Lanes of one chunk run in lockstep as one vmapped integration; chunks run one af
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Unpack
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 from tqdm import tqdm
 
 from jourdain_jax.build.reference import Reference
 from jourdain_jax.calculus.reals import checked_real, described, is_traced
-from jourdain_jax.motion.arguments import DEFAULT_SAMPLES, as_end, check_options, saved_times, span_and_times
+from jourdain_jax.motion.arguments import DEFAULT_SAMPLES, as_end, saved_times, span_and_times
 from jourdain_jax.motion.input_programs import for_programs
-from jourdain_jax.motion.inputs import as_inputs
+from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.inputs_in_rows import check_inputs_in_rows
 from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import with_nan_as_a_mark
+from jourdain_jax.motion.options import SPAN, AllOptions, MotionFields, Options, as_options
 from jourdain_jax.motion.quick_compilation import quickly_compiled
-from jourdain_jax.motion.retries import OUT_OF_STEPS, lost_codes, mark_retried, next_retry, retry_options
+from jourdain_jax.motion.retries import RERUN_FIELDS, lanes_retried
 from jourdain_jax.motion.sensitivity import warn_of_jumps
-from jourdain_jax.motion.setup import TOLERANCE
 from jourdain_jax.motion.simulate import default_solver, set_up, warn_float32
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.trajectories import labelled, results
@@ -41,7 +42,6 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 CHUNK = 512  # lanes whose stages fit the cache of a core
-RERUN_FIELDS = ("state_form", "reduction", "solver", "projected", "unwatched")  # of a trajectory, static: they say how a lane was run again
 MEMORY = 2**30  # bytes of saved states per chunk, at most
 
 
@@ -156,14 +156,16 @@ def rollout(
     parameters: dict | None = None,
     chunk: int | None = None,
     progress: bool | None = None,
-    **options,
+    options: Options | None = None,
+    **by_name: Unpack[MotionFields],
 ) -> Rollout:
     """Simulate many lanes.
 
     - `starts`: name -> number or array of shape (lanes,) (as in `jj.start`; the rest is solved for), or a `State` with a leading axis of lanes.
     - `parameters`: parameter name -> array with a leading axis of lanes, where lanes differ in parameters.
     - `chunk`: lanes that run together (default: 512, less where saved states would pass 1 GiB); `progress`: a bar (default: with several chunks).
-    - `options`: further ones as in `simulate`; inputs are those of all lanes. Where lanes differ in inputs, take `jax.vmap` of `simulate`.
+    - `options`: a `jj.Options`; `by_name`: its fields, and `t0`, `t1`, `ts`, `inputs`, as in `simulate`. Inputs are those of all lanes; where lanes differ in
+      inputs, take `jax.vmap` of `simulate`.
 
     Raises ValueError for unknown names and unequal lengths. Lanes never raise: see `Rollout.failed` and `print(rollout)`. Derivatives of
     what lies after a failure are NaN; `jnp.where(rollout.lanes.succeeded, ..., 0.0)` leaves such lanes out of a loss, and of its derivatives.
@@ -178,6 +180,8 @@ def rollout(
         lanes.failed, lanes.lane(3).energies().balance            # numbers of failed lanes; one lane as a trajectory
     """
     scene = as_scene(scene)
+    span = {name: by_name.pop(name, None) for name in SPAN}
+    options = as_options(options, by_name, "rollout")
     starts = dict(scene.example) if starts is None else starts
     for what, given in (("starts", starts), ("parameters", parameters)):
         if given is not None and not isinstance(given, Mapping) and not (what == "starts" and isinstance(given, State)):
@@ -185,94 +189,67 @@ def rollout(
     advice = "give an array with one entry per lane; a field that is a module varies by `equinox.filter_vmap` of `simulate`"
     parameters = {name: checked_real(value, f"parameter `{name}`", advice=advice) for name, value in (parameters or {}).items()}
     fixed, varied, count = _lanes(scene, starts, parameters)
-    chunk = _chunk(scene, count, chunk, options)
-    options["inputs"] = as_inputs(scene, options.get("inputs"))
-    _check_times_of_lanes(scene, starts, options)
-    if is_traced((scene, fixed, varied, parameters, options)):
-        lanes = _run_lanes(scene, fixed, _with_arrays(options), varied, parameters)  # being differentiated or batched: one piece, no host loop
-        warn_of_jumps(_form(scene, options), lanes, is_traced((scene, parameters)))
+    chunk = _chunk(scene, count, chunk, span["ts"])
+    span["inputs"] = as_inputs(scene, span["inputs"])
+    _check_times_of_lanes(scene, starts, span)
+    times = {name: None if span[name] is None else checked_real(span[name], f"`{name}`").astype(jnp.result_type(float)) for name in ("t0", "t1", "ts")}
+
+    def run(options: AllOptions, varied, parameters) -> Trajectory:
+        return _run_lanes(scene, fixed, span | times, _with_arrays(options), varied, parameters)
+
+    if is_traced((scene, fixed, varied, parameters, span, options)):
+        lanes = run(options, varied, parameters)  # being differentiated or batched: one piece, no host loop
+        warn_of_jumps(_form(scene, options, span["inputs"]), lanes, is_traced((scene, parameters)))
         return Rollout(lanes)
 
-    def run(options: dict, index) -> Trajectory:
-        return _run_lanes(scene, fixed, _with_arrays(options), *jax.tree.map(lambda x: x[index], (varied, parameters)))
+    def run_some(options: AllOptions, index: np.ndarray) -> Trajectory:
+        return run(options, *jax.tree.map(lambda x: x[index], (varied, parameters)))
 
     pieces = []
     bar = tqdm(total=count, unit="lane", disable=not (count > chunk if progress is None else progress))
     for first in range(0, count, chunk):
         index = np.minimum(np.arange(first, first + chunk), count - 1)  # the last chunk is filled up with copies of its last lane
-        pieces.append(jax.tree.map(np.asarray, run(options, index)))
+        pieces.append(jax.tree.map(np.asarray, run_some(options, index)))
         bar.update(min(chunk, count - first))
     bar.close()
-    lanes = jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *pieces)
-
-    reruns: dict[int, tuple] = {}
-    while (again := _next_retries(scene, lanes, varied, options)).any():
-        for way in np.unique(again[again > 0]).tolist():
-            chosen, changed = np.flatnonzero(again == way), options | retry_options(way, options)
-            for first in range(0, len(chosen), chunk):
-                index = chosen[np.minimum(np.arange(first, first + min(chunk, _round_up(len(chosen)))), len(chosen) - 1)]
-                new = run(changed, index)
-                lanes, reruns[way] = _replaced(lanes, mark_retried(new, way), index), tuple(getattr(new, name) for name in RERUN_FIELDS)
-    return Rollout(jax.tree.map(jnp.asarray, lanes), tuple(sorted(reruns.items())))
+    lanes, reruns = jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *pieces), ()
+    if options.retry:
+        own_times = isinstance(varied, State) and span["t0"] is None
+        begun = varied.t if own_times else 0.0 if span["t0"] is None else span["t0"]
+        lanes, reruns = lanes_retried(run_some, lambda options: _form(scene, options, span["inputs"]), lanes, begun, options, chunk)
+    return Rollout(jax.tree.map(jnp.asarray, lanes), reruns)
 
 
-def _check_times_of_lanes(scene: Scene, starts, options: dict) -> None:
+def _check_times_of_lanes(scene: Scene, starts, span: dict) -> None:
     """Checks times, and inputs for jumps between them, where all lanes have one span and it is known.
 
     Inside the lanes it is traced: a lane whose own time does not fit gets a result code.
     """
-    ts, t0, t1 = (options.get(name) for name in ("ts", "t0", "t1"))
+    ts, t0, t1 = (span[name] for name in ("ts", "t0", "t1"))
     if t0 is None and isinstance(starts, State):
         if ts is not None:
             saved_times(ts)
         as_end("t1", t1)
         return
     t0, _, t1 = span_and_times(scene, None, t0, t1, ts)
-    check_inputs_in_rows(scene, options["inputs"], t0, t1)
+    check_inputs_in_rows(scene, span["inputs"], t0, t1)
 
 
-def _next_retries(scene: Scene, lanes: Trajectory, starts, options: dict) -> Int[np.ndarray, "lanes"]:
-    """How each lane is run again, all earlier changes of its run included; AS_ASKED: it is not."""
-    own_times = isinstance(starts, State) and options.get("t0") is None
-    first = 0.0 if options.get("t0") is None else options["t0"]
-    begun = np.broadcast_to(np.asarray(starts.t if own_times else first), lanes.result.shape)
-    found = np.full(lanes.result.shape, results.AS_ASKED)
-    for tried in np.unique(lanes.fallback).tolist():
-        field = _form(scene, options | retry_options(tried, options))
-        for i in np.flatnonzero((np.asarray(lanes.fallback) == tried) & np.isin(lanes.result, (*lost_codes(field), *OUT_OF_STEPS))):
-            found[i] = next_retry(field, jax.tree.map(lambda x, i=i: x[i], lanes), begun[i], options)
-    return found
-
-
-def _form(scene: Scene, options: dict) -> VectorField:
+def _form(scene: Scene, options: AllOptions, inputs: Inputs) -> VectorField:
     """How the lanes' state is integrated."""
-    return vector_field(scene, **{name: options[name] for name in ("formulation", "work", "backend", "inputs") if name in options})
+    return vector_field(scene, options.formulation, options.work, options.backend, inputs)
 
 
-def _round_up(count: int) -> int:
-    """The next power of two, at least 8: few programs to compile."""
-    return max(8, 1 << (count - 1).bit_length())
-
-
-def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajectory:
-    """`lanes` with those at `index` from another run."""
-    leaves, treedef = jax.tree.flatten(lanes)
-    new = [np.array(x) for x in leaves]
-    for old, y in zip(new, jax.tree.leaves(again), strict=True):
-        old[index] = np.asarray(y)
-    return jax.tree.unflatten(treedef, new)
-
-
-def _run_lanes(scene, fixed, options, varied, parameters) -> Trajectory:
+def _run_lanes(scene, fixed, span, options: AllOptions, varied, parameters) -> Trajectory:
     """All given lanes in lockstep; compiled once for scenes and lanes of one shape."""
-    compiled = _compiled_dense if _form(scene, options).lowered is None else _compiled_lowered
-    return compiled(options["inputs"].programs)(Reference(scene), scene, fixed, options, varied, parameters)
+    compiled = _compiled_dense if _form(scene, options, span["inputs"]).lowered is None else _compiled_lowered
+    return compiled(span["inputs"].programs)(Reference(scene), scene, fixed, span, options, varied, parameters)
 
 
-def _lanes_in_lockstep(reference: Reference, scene, fixed, options, varied, parameters) -> Trajectory:
+def _lanes_in_lockstep(reference: Reference, scene, fixed, span, options: AllOptions, varied, parameters) -> Trajectory:
     def lane(varied, parameters):
         own = scene.replace(**parameters) if parameters else scene
-        return set_up(own, varied if isinstance(varied, State) else {**fixed, **varied}, **options)
+        return set_up(own, varied if isinstance(varied, State) else {**fixed, **varied}, **span, options=options)
 
     with reference.stands_in():
         return integrate_lanes(eqx.filter_vmap(lane)(varied, parameters))
@@ -281,18 +258,17 @@ def _lanes_in_lockstep(reference: Reference, scene, fixed, options, varied, para
 _compiled_dense, _compiled_lowered = for_programs(_lanes_in_lockstep), for_programs(_lanes_in_lockstep, quickly_compiled)
 
 
-def _with_arrays(options: dict) -> dict:
-    """Options with their numbers as arrays: another tolerance, first step or end is no other program."""
-    options = {"rtol": TOLERANCE, "atol": TOLERANCE} | options
-    numbers = {name: options[name] for name in ("rtol", "atol", "dt0", "max_step", "t0", "t1", "ts") if options.get(name) is not None}
-    check_options(**{name: value for name, value in numbers.items() if name in ("rtol", "atol", "dt0", "max_step")})
-    if options.get("solver") is None:
-        options["solver"] = default_solver(options["rtol"])
-    if isinstance(options["solver"], Taylor):
-        options["solver"] = Taylor(options["solver"].order or order_for(options["rtol"]))
-    real = jnp.result_type(float)
-    warn_float32(real, options["rtol"])
-    return options | {name: checked_real(value, f"`{name}`", None if name == "ts" else ()).astype(real) for name, value in numbers.items()}
+def _with_arrays(options: AllOptions) -> AllOptions:
+    """Options with their numbers as arrays: another tolerance or first step is no other program."""
+    real, solver = jnp.result_type(float), options.solver
+    warn_float32(real, options.rtol)
+    if solver is None:
+        solver = default_solver(options.rtol)
+    elif isinstance(solver, Taylor):
+        solver = Taylor(solver.order or order_for(options.rtol))
+    numbers = {name: getattr(options, name) for name in ("rtol", "atol", "dt0", "max_step")}
+    arrays = {name: jnp.asarray(value, real) for name, value in numbers.items() if value is not None}
+    return dataclasses.replace(options, solver=solver, **arrays)
 
 
 def _lanes(scene: Scene, starts, parameters: dict):
@@ -327,9 +303,9 @@ def _common_length(lengths: dict) -> int:
     return counts.pop()
 
 
-def _chunk(scene: Scene, count: int, chunk: int | None, options: dict) -> int:
+def _chunk(scene: Scene, count: int, chunk: int | None, ts) -> int:
     if chunk is not None and (not isinstance(chunk, int | np.integer) or chunk < 1):
         raise ValueError(f"`chunk` is {chunk!r}, expected a whole number, at least one lane")
-    times = DEFAULT_SAMPLES if options.get("ts") is None else np.shape(options["ts"])[0]
+    times = DEFAULT_SAMPLES if ts is None else np.shape(ts)[0]
     per_lane = 8 * times * (len(scene.coordinate_names) + len(scene.speed_names) + 2)
     return max(1, min(count, CHUNK if chunk is None else chunk, max(1, MEMORY // per_lane)))

@@ -11,15 +11,15 @@ MOST_PROJECTED = 0.5  # of the change by a step
 MESSAGES = {
     SUCCESS: "reached the end of its span",
     EVENT: "stopped at an event",
-    MAX_STEPS: "ran out of steps; raise `max_steps`, loosen the tolerances, give solver=jj.RadauIIA() where forces are stiff, or look for a singularity "
-    "near the last time",
+    MAX_STEPS: "ran out of steps; raise `max_steps`, loosen the tolerances, give solver=jj.RadauIIA() or retry=True where forces are stiff, or look for a "
+    "singularity near the last time",
     STEP_TOO_SMALL: "the step size shrank to nothing: a singularity, a discontinuity, or rows that cannot be met near the last time",
     NOT_FINITE: "the accelerations are not finite near the last time: a load, pose or row is no number there, or they are not determined (rows that lose "
     "rank, no inertia along a free direction); look at the last state with `accelerations` and `verify`",
     INCONSISTENT_START: "the start does not meet the constraints and could not be projected onto them",
     SINGULAR_PARTITION: "the motion came near a configuration where the rows, as they are solved here, do not determine all speeds: another choice of "
-    "`privileged` may serve there, and `formulation=jj.Formulation('full')`, `backend='dense'` do unless the rows lose rank; or where the scene's own "
-    "`coordinate_rates` become infinite: state other speeds there",
+    "`privileged` may serve there, and retry=True, or `formulation=jj.Formulation('full')` with `backend='dense'`, do unless the rows lose rank; or where the "
+    "scene's own `coordinate_rates` become infinite: state other speeds there",
     BAD_PARAMETER: "a parameter is not finite or has the wrong sign",
     BAD_START: "the start is not finite; check where its values were computed",
     SHRANK: "ran out of steps, which had shrunk to less than a hundredth of their average: a singularity, a discontinuity or a stiff force near the last time",
@@ -38,7 +38,7 @@ MESSAGES = {
     UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; take a shorter step, or look for a singularity there",
 }
 
-# In what other ways a motion was run again after the first way had failed, which add up: `Trajectory.fallback`.
+# In what other ways a motion was run again, with `retry=True`, after the first way had failed; they add up: `Trajectory.fallback`.
 AS_ASKED, FULL_STATE, IMPLICIT = 0, 1, 2
 FALLBACKS = {
     AS_ASKED: "",

@@ -25,9 +25,10 @@ import numpy as np
 from jourdain_jax.calculus.reading import check_depth, parsed
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.calculus.writing import write_whole
-from jourdain_jax.motion.batches.rollout import RERUN_FIELDS, Rollout
+from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.marks import with_nan_as_a_mark
+from jourdain_jax.motion.retries import RERUN_FIELDS
 from jourdain_jax.motion.trajectories.storage_checks import AXES, HEADER, check_arrays, check_header, check_scenes, refused
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.trajectories.versions import version_of

@@ -10,7 +10,7 @@ import numpy as np
 from jourdain_jax.build.trace import velocity_quantities
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.motion.batches.rollout import RERUN_FIELDS
+from jourdain_jax.motion.retries import RERUN_FIELDS
 from jourdain_jax.motion.trajectories.results import BAD_PARAMETER, EVENT, FALLBACKS, MESSAGES, SUCCESS
 from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.scene import Scene

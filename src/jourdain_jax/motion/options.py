@@ -1,0 +1,208 @@
+"""Options of a simulation: one object that `simulate`, `rollout`, `fit`, `Study` and their kin take, as it is or by the names of its fields."""
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, TypedDict
+
+import jax
+import numpy as np
+
+from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, described, is_traced
+from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
+from jourdain_jax.motion.integrators.of_diffrax import diffrax
+from jourdain_jax.motion.integrators.tableaus import Method
+from jourdain_jax.motion.integrators.taylor import Taylor
+from jourdain_jax.scene.names import nearest
+
+if TYPE_CHECKING:
+    from jourdain_jax.motion.vector_fields.choice import Formulation
+
+TOLERANCE, MOST_STEPS = 1e-8, 100_000
+
+
+@dataclass(frozen=True)
+class Options:
+    """How motions are integrated.
+
+    - `rtol`, `atol`: tolerances of a step, relative and absolute.
+    - `solver`: a solver of diffrax, or one of `jj.Taylor`, `jj.RadauIIA`, `jj.ImplicitMidpoint`, `jj.DiscreteLagrangeDAlembert`, `jj.DiscreteGradient`;
+      the last three take equal steps of at most their `step` between saved times. None: Tsit5 for rtol >= 1e-6, Dopri8 below.
+    - `max_steps`: the most steps; `max_step`: the longest one (s). None: 1/16 of the span, so that a load that acts on a part of the way, or a dip of an event,
+      is not stepped over where nothing else keeps steps short; inf: no bound.
+    - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.
+    - `retry`: run a motion again that left the domain of its privileged speeds (with the full state), or that is stiff (by an implicit solver), unless
+      `formulation` or `solver` is chosen so; `trajectory.fallback` and its summary say so. Inside your own `jit` or `vmap`, and without it, the result code
+      stays.
+
+    `simulate` and its kin take an `Options`, or its fields by name, which replace those of the object.
+
+    **Examples**
+
+        careful = jj.Options(rtol=1e-11, atol=1e-11, max_step=0.1)
+        motion = jj.simulate(jj.models.TiltingDisc(), t1=1.0, options=careful)
+        lanes = jj.rollout(jj.models.TiltingDisc(), {"lean": jnp.linspace(0.1, 0.3, 4)}, t1=1.0, options=careful, events=False)
+    """
+
+    rtol: Number = TOLERANCE
+    atol: Number = TOLERANCE
+    solver: "diffrax.AbstractSolver | ImplicitMethod | Taylor | None" = None
+    max_steps: int = MOST_STEPS
+    max_step: Number | None = None
+    events: bool = True
+    work: bool = True
+    retry: bool = False
+
+
+@dataclass(frozen=True)
+class AllOptions(Options):
+    """Options with what else says how a motion is integrated."""
+
+    solver: "diffrax.AbstractSolver | ImplicitMethod | Taylor | Method | None" = None
+    formulation: "Formulation | None" = None
+    backend: str = "auto"
+    saveat: "diffrax.SaveAt | None" = None
+    stepsize_controller: "diffrax.AbstractStepSizeController | None" = None
+    adjoint: "diffrax.AbstractAdjoint | None" = None
+    dt0: Number | None = None
+
+
+class OptionFields(TypedDict, total=False):
+    """The fields of `Options` by name, and what else says how a motion is integrated."""
+
+    rtol: Number
+    atol: Number
+    solver: "diffrax.AbstractSolver | ImplicitMethod | Taylor | None"
+    max_steps: int
+    max_step: Number | None
+    events: bool
+    work: bool
+    retry: bool
+    formulation: "Formulation | None"
+    backend: str
+    saveat: "diffrax.SaveAt | None"
+    stepsize_controller: "diffrax.AbstractStepSizeController | None"
+    adjoint: "diffrax.AbstractAdjoint | None"
+    dt0: Number | None
+
+
+class MotionFields(OptionFields, total=False):
+    """The span and inputs of a motion by name, and `OptionFields`."""
+
+    t0: Number
+    t1: Number
+    ts: Numbers
+    inputs: Any
+
+
+SPAN = ("t0", "t1", "ts", "inputs")  # what is said of a motion by name besides its options
+_STATIC = ("max_steps", "events", "work", "retry", "backend")
+OPTION_NAMES = tuple(field.name for field in fields(AllOptions))
+
+
+def _register(kind: type[Options]) -> None:
+    """Make options of a kind a tree, in which anything may stand in the place of numbers."""
+    names = [field.name for field in fields(kind)]
+    leaves, static = [name for name in names if name not in _STATIC], [name for name in names if name in _STATIC]
+
+    def unflattened(known: tuple, values) -> Options:
+        options = object.__new__(kind)
+        vars(options).update(zip((*leaves, *static), (*values, *known), strict=True))
+        return options
+
+    def flattened(options: Options) -> tuple[list, tuple]:
+        return [getattr(options, name) for name in leaves], tuple(getattr(options, name) for name in static)
+
+    jax.tree_util.register_pytree_node(kind, flattened, unflattened)
+
+
+_register(Options)
+_register(AllOptions)
+_DEFAULT = AllOptions()
+_KINDS = {  # of diffrax, and an example
+    "solver": ("AbstractSolver", "diffrax.Dopri8()"),
+    "adjoint": ("AbstractAdjoint", "diffrax.DirectAdjoint()"),
+    "stepsize_controller": ("AbstractStepSizeController", "diffrax.PIDController(rtol=1e-8, atol=1e-8)"),
+    "saveat": ("SaveAt", "diffrax.SaveAt(ts=...)"),
+}
+
+
+def as_options(options: Options | None, by_name: Mapping[str, Any], function: str = "simulate", refused: Mapping[str, str] | None = None) -> AllOptions:
+    """Return the options of a call of `function`: those of the object, replaced by what is given by name.
+
+    `refused`: names that have no meaning for this function, and why. Raises TypeError for these and for unknown names, ValueError for wrong values.
+    """
+    if not by_name and (options is None or type(options) is AllOptions):
+        return _DEFAULT if options is None else options
+    if options is not None and not isinstance(options, Options):
+        raise ValueError(f"`options` is {described(options)}, expected `jj.Options(...)`")
+    refused = refused or {}
+    for name in by_name:
+        if name in refused:
+            raise TypeError(f"{function}() takes no `{name}`: {refused[name]}")
+        if name not in OPTION_NAMES:
+            known = [option for option in (*SPAN, *OPTION_NAMES) if option not in refused]
+            raise TypeError(f"{function}() got an unexpected keyword argument '{name}'; {nearest(name, known)}")
+    found = AllOptions(**({} if options is None else vars(options)) | dict(by_name))
+    _check(found)
+    return found
+
+
+def stated(options: AllOptions) -> dict[str, Any]:
+    """Return the options that differ from the default ones, by name."""
+    return {name: value for name, value in vars(options).items() if value is not getattr(_DEFAULT, name) and value != getattr(_DEFAULT, name)}
+
+
+_POSITIVE = lambda x: 0 < x < np.inf, "a positive finite number; give a tolerance such as 1e-8", "give one number, such as 1e-8"
+_NUMBERS = {  # what fits, what is expected, and what to give
+    "rtol": _POSITIVE,
+    "atol": _POSITIVE,
+    "dt0": (
+        lambda x: 0 < abs(x) < np.inf,
+        "a finite first step in s that is not zero; or None for 1e-4 of the span",
+        "give the first step in s, or None for 1e-4 of the span",
+    ),
+    "max_step": (
+        lambda x: x > 0,
+        "a positive time in s; None bounds steps by the span, inf does not bound them",
+        "give the longest step in s, None for a part of the span, or inf for no bound",
+    ),
+}
+
+
+def _check(options: AllOptions) -> None:
+    """ValueError for numbers that do not fit, and for objects that are not of their kind."""
+    for name, (fits, expected, advice) in _NUMBERS.items():
+        value = getattr(options, name)
+        if (type(value) is float and fits(value)) or (value is None and name in ("dt0", "max_step")):
+            continue
+        number = checked_unless_traced(value, f"`{name}`", (), advice=advice)
+        if not is_traced(number) and not fits(float(number)):
+            raise ValueError(f"`{name}` is {float(number):g}, expected {expected}")
+    for name in ("events", "work", "retry"):
+        if not isinstance(value := getattr(options, name), bool | np.bool_):
+            raise ValueError(f"`{name}` is {described(value)}, expected True or False")
+    most = options.max_steps
+    if not isinstance(most, int | np.integer) or isinstance(most, bool) or most < 1:
+        raise ValueError(f"`max_steps` is {most!r}, expected a whole number of at least 1; give the number of steps after which to stop")
+    for name in ("solver", "adjoint", "stepsize_controller", "saveat"):
+        if (value := getattr(options, name)) is not None and not isinstance(value, Taylor | Method | ImplicitMethod):
+            _check_kind(name, value)
+
+
+def _check_kind(name: str, value) -> None:
+    """ValueError where an option is no object of its kind, with the one that a text or a class may stand for."""
+    kind, example = getattr(diffrax, _KINDS[name][0]), _KINDS[name][1]
+    if not isinstance(value, kind):
+        raise ValueError(f"`{name}` is {described(value)}, expected an object of diffrax; write `{_meant(value, kind) or example}`")
+
+
+def _meant(value, kind: type) -> str:
+    """The object that a text or a class may stand for."""
+    if isinstance(value, type) and issubclass(value, kind | ImplicitMethod | Taylor):
+        return f"{'jj' if value.__module__.startswith('jourdain_jax') else 'diffrax'}.{value.__name__}()"
+    if not isinstance(value, str):
+        return ""
+    members = {name.lower(): name for name in dir(diffrax) if isinstance(member := getattr(diffrax, name), type) and issubclass(member, kind)}
+    near = difflib.get_close_matches(value.lower(), [name for name in members if not name.startswith("abstract")], n=1, cutoff=0.5)
+    return f"diffrax.{members[near[0]]}()" if near else ""
