@@ -10,7 +10,7 @@ ENDS = np.linspace(0.0, 10.0, 101)[:, None]
 
 
 def found(f):
-    return list(jumps(lambda t: np.asarray(f(t), float)[:, None], ENDS[:-1], ENDS[1:]))
+    return list(jumps(lambda t: np.asarray(f(t), float), ENDS[:-1], ENDS[1:]))
 
 
 @pytest.mark.parametrize("at", [0.003, 0.3, 7.7])

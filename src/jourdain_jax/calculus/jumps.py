@@ -14,12 +14,12 @@ def jumps(
 ) -> Iterator[tuple[int, Float[np.ndarray, "variables"], Float[np.ndarray, "variables"]]]:
     """For every interval from `a` to `b` in which something jumps: which entry does most, and the points before and behind its jump.
 
-    `values`: of many points, (points, kinds, entries); an entry jumps if one of its kinds does.
+    `values`: of many points, (points, entries).
     """
     least, floor = (1e-2, 1e-3) if jnp.result_type(float) == jnp.float32 else (1e-6, 1e-9)
     at_a, at_b = values(a), values(b)
     largest = np.nanmax(np.abs(np.concatenate([at_a, at_b])), axis=0, initial=0.0)
-    size = np.maximum(largest, floor * np.max(largest, axis=-1, keepdims=True)) + np.finfo(largest.dtype).tiny
+    size = np.maximum(largest, floor * np.max(largest, initial=0.0)) + np.finfo(largest.dtype).tiny
     for turn in range(ALL):
         middle = (a + b) / 2
         at_middle = values(middle)
@@ -29,7 +29,7 @@ def jumps(
         if turn >= SOME and not np.any(off > least):
             return
         a, b = np.where(first[:, None], a, middle), np.where(first[:, None], middle, b)
-        at_a, at_b = np.where(first[:, None, None], at_a, at_middle), np.where(first[:, None, None], at_middle, at_b)
+        at_a, at_b = np.where(first[:, None], at_a, at_middle), np.where(first[:, None], at_middle, at_b)
     for k in np.flatnonzero(np.max(off, axis=1, initial=0.0) > least):
         yield int(np.argmax(off[k])), a[k], b[k]
 
@@ -37,5 +37,5 @@ def jumps(
 def _off(a: np.ndarray, b: np.ndarray, size: np.ndarray) -> np.ndarray:
     """How much entries differ, in their sizes."""
     with np.errstate(invalid="ignore", over="ignore"):
-        difference = np.max(np.abs(b - a) / size, axis=1)
+        difference = np.abs(b - a) / size
     return np.where(np.isfinite(difference), difference, 0.0)

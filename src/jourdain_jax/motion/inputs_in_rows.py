@@ -10,11 +10,10 @@ from jaxtyping import Bool
 from jourdain_jax.build.smoothness import SPEEDS_WOULD_JUMP
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.jumps import jumps
-from jourdain_jax.calculus.reals import is_traced, real_type
-from jourdain_jax.eager.lanes import uncompiled
+from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.eager.lanes import uncompiled_lanes
 from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.motion.inputs import Constant, Inputs, Sampled, inputs_at
-from jourdain_jax.program.roughness import may_bend
 from jourdain_jax.scene.scene import Scene
 
 EVENLY = 256  # intervals of time
@@ -25,19 +24,15 @@ def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
     known = structure_of(scene)
     if not known.rows_of_inputs or is_traced(scene, inputs, t0, t1):
         return
-    rough = [k for k, channel in enumerate(inputs.channels) if not isinstance(channel, Constant | Sampled) and _may_jump(channel)]
-    if not rough:
+    functions = [k for k, channel in enumerate(inputs.channels) if not isinstance(channel, Constant | Sampled)]
+    if not functions:
         return
     with jax.ensure_compile_time_eval():  # all is known, also inside a `jit`
         in_rows = _in_rows(scene, inputs, known.coordinates[0], t0)
-        for k in rough:
-            if in_rows[k] and (t := first_jump(inputs.channels[k], float(t0), float(t1))) is not None:
+        for k in functions:
+            if in_rows[k] and (t := _first_jump(inputs.channels[k], float(t0), float(t1))) is not None:
                 name = scene.inputs.entries[k]
                 raise ValueError(f"input `{name}` of `{type(scene).__name__}` jumps at t = {t:.6g} s, and velocity rows depend on it: {SPEEDS_WOULD_JUMP}")
-
-
-def _may_jump(channel: Callable) -> bool:
-    return any(may_bend(jax.make_jaxpr(lambda t: channel(t))(jax.ShapeDtypeStruct((), real_type())), (0,)))
 
 
 def _in_rows(scene: Scene, inputs: Inputs, q: np.ndarray, t0) -> Bool[np.ndarray, "inputs"]:
@@ -47,8 +42,8 @@ def _in_rows(scene: Scene, inputs: Inputs, q: np.ndarray, t0) -> Bool[np.ndarray
     return np.any(np.nan_to_num(np.asarray(slopes)) != 0, axis=0)
 
 
-def first_jump(channel: Callable, t0: float, t1: float) -> float | None:
+def _first_jump(channel: Callable, t0: float, t1: float) -> float | None:
     """When an input jumps between these times; None where it is not seen to."""
-    values, ts = uncompiled(jax.vmap(channel)), np.linspace(t0, t1, EVENLY + 1)[:, None]
-    found = jumps(lambda t: np.asarray(values(t[:, 0]), float)[:, None, None], ts[:-1], ts[1:])
+    values, ts = uncompiled_lanes(channel), np.linspace(t0, t1, EVENLY + 1)[:, None]
+    found = jumps(lambda t: np.asarray(values(t[:, 0]), float)[:, None], ts[:-1], ts[1:])
     return next((float(behind[0]) for _, _, behind in found), None)
