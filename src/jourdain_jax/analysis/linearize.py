@@ -31,11 +31,11 @@ from jourdain_jax.analysis.tangent import (
     privileged_speeds,
 )
 from jourdain_jax.build.structure import WELL_CONDITIONED
+from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.calculus.reals import Numbers, is_traced
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.lowering.kinks import bent_load
 from jourdain_jax.motion.arguments import as_state
-from jourdain_jax.motion.quick_compilation import RUN_SELDOM, quickly_compiled
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.start import State
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
@@ -44,7 +44,7 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines, users_level
 
-_compiled = partial(quickly_compiled, options=RUN_SELDOM)  # of a bicycle in 2.3 s of processor time, not in 11.4; run as quickly
+_compiled = partial(compiled, options=RUN_SELDOM)  # of a bicycle in 2.3 s of processor time, not in 11.4; run as quickly
 
 
 class Modes(eqx.Module):

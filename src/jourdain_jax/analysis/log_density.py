@@ -31,9 +31,9 @@ from jourdain_jax.analysis.transforms import Transforms
 from jourdain_jax.analysis.unknowns import unknowns_of
 from jourdain_jax.build.reference import Reference
 from jourdain_jax.build.reference_parameters import reference_parameters
+from jourdain_jax.calculus.compiled import compiled
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
-from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import as_names, nearest
@@ -185,7 +185,7 @@ class LogDensity(eqx.Module):
         return every[:shared], every[shared:].reshape(-1, local) if local else jnp.zeros((sum(map(len, self.runs)), 0))
 
 
-_density = quickly_compiled(LogDensity._at)
+_density = compiled(LogDensity._at)
 
 
 @shown_from_users_lines

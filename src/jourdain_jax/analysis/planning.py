@@ -27,10 +27,10 @@ from jourdain_jax.analysis.table import table
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.build.reference import Reference
 from jourdain_jax.build.reference_parameters import with_reference_parameters
+from jourdain_jax.calculus.compiled import compiled
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.forward_mode import simulate_forward
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
-from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
 from jourdain_jax.scene.printing import Printed
@@ -92,13 +92,13 @@ class PlannedInformation(Printed, eqx.Module):
         return "\n".join(lines + [f"  {sentence}" for sentence in self.not_identifiable])
 
 
-@quickly_compiled
+@compiled
 def _inverse(F: Float[Array, "unknowns unknowns"]) -> Float[Array, "unknowns unknowns"]:
     scale = 1 / jnp.sqrt(jnp.where(jnp.diagonal(F) > 0, jnp.diagonal(F), 1.0))
     return scale[:, None] * jnp.linalg.inv(scale[:, None] * F * scale) * scale
 
 
-@quickly_compiled
+@compiled
 def _log_det(F: Float[Array, "unknowns unknowns"], places: tuple[int, ...]) -> Float[Array, ""]:
     """The logarithm of the determinant of this block of the inverse."""
     some = np.array(places, int)
@@ -153,7 +153,7 @@ def planned_information(
     return PlannedInformation(F + prior.T @ prior, theta[places], J, unknowns.labels, unknowns.units)
 
 
-@quickly_compiled
+@compiled
 def _sensitivities(
     scene: Scene, runs: tuple[Run, ...], theta: Float[Array, "places"], options: AllOptions, layout: Layout, places: tuple, reference: Reference
 ):

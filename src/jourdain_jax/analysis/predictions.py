@@ -23,7 +23,6 @@ from jourdain_jax.analysis.runs import Run, filled_up, grouped, is_array, most_k
 from jourdain_jax.build.reference import Reference
 from jourdain_jax.motion.forward_mode import simulate_alongside
 from jourdain_jax.motion.options import AllOptions
-from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.scene.scene import Scene
 
 TOUCHED = 2**18  # bytes of saved states with their tangents in one loop: far below what XLA compiles into one function (see `jourdain_jax`)
@@ -224,4 +223,4 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
     def lanes(common: Float[Array, "shared"], rows: Float[Array, "lanes own"]) -> Float[Array, "lanes samples width"]:
         return each(common, *jnp.split(rows, [rows.shape[1] - unknowns], axis=1))
 
-    return quickly_compiled(lanes, jax.jit)
+    return jax.jit(lanes)

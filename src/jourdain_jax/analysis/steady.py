@@ -18,12 +18,12 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.analysis.tangent import flow_of, privileged_speeds
 from jourdain_jax.build.domain import coordinate_bounds
 from jourdain_jax.build.probed_on_graph import coordinates_on_rows
+from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.calculus.damped import damped_search
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
 from jourdain_jax.calculus.reals import Number, Numbers, described
 from jourdain_jax.dynamics.reduced import ignorable_coordinates
 from jourdain_jax.equations.projection import closure_residual
-from jourdain_jax.motion.quick_compilation import RUN_SELDOM, quickly_compiled
 from jourdain_jax.motion.start import State
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
 from jourdain_jax.scene.names import as_names, nearest
@@ -143,7 +143,7 @@ class _Problem(eqx.Module):
         return now.udot[y], slope(jnp.ones_like(self.t), now.qdot, now.udot).udot[y]
 
 
-@partial(quickly_compiled, options=RUN_SELDOM)  # of a bicycle in 6.5 s of processor time, not in 24; run in 0.11 s, not in 0.09
+@partial(compiled, options=RUN_SELDOM)  # of a bicycle in 6.5 s of processor time, not in 24; run in 0.11 s, not in 0.09
 def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], max_steps: int) -> SteadyMotion:
     z = jnp.concatenate([q, u])
     z = _root(problem, z, free, max_steps)

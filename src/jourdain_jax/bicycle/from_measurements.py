@@ -21,8 +21,8 @@ from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, shipped_measur
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, doubts, violations
 from jourdain_jax.bicycle.pendulums import SwungPart, TwistedPart, period
 from jourdain_jax.bicycle.readings import Readings, read_readings
+from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.calculus.newton import newton_root
-from jourdain_jax.motion.quick_compilation import RUN_SELDOM, quickly_compiled
 from jourdain_jax.scene.names import nearest
 
 Scalar = Float[Array, ""]
@@ -108,7 +108,7 @@ def _program(hangings: tuple[tuple[str, tuple[int, ...]], ...], by_table: bool):
         by = [{name: jnp.asarray(float(name == one)) for name in means} for one in means]
         return found, jax.vmap(slope)(jax.tree.map(lambda *x: jnp.stack(x), *by))
 
-    return quickly_compiled(run, options=RUN_SELDOM)
+    return compiled(run, options=RUN_SELDOM)
 
 
 def _parameters(y: Values, hangings: dict[str, tuple[int, ...]], by_table: bool) -> Values:

@@ -21,7 +21,7 @@ from jourdain_jax.bicycle.readings import holds_readings
 from jourdain_jax.bicycle.rides import Rides, ride, ride_speeds
 from jourdain_jax.bicycle.stability import eigenvalues, stability_speeds
 from jourdain_jax.bicycle.uncertainty import interval, sample_parameters
-from jourdain_jax.motion.quick_compilation import RUN_SELDOM, quickly_compiled
+from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.motion.trajectories.results import EVENT
 
 SPEEDS = ("weave_speed", "capsize_speed", "double_root_speed")
@@ -117,7 +117,7 @@ def _speeds_and_matrices(values):
     return jax.vmap(lambda m: stability_speeds(*m, max_speed=MAX_SPEED))(matrices), matrices
 
 
-_speeds = quickly_compiled(_speeds_and_matrices, options=RUN_SELDOM)  # 2,000 samples: compiled in 6 s, not 18; run in 3.4 s, not 2.0
+_speeds = compiled(_speeds_and_matrices, options=RUN_SELDOM)  # 2,000 samples: compiled in 6 s, not 18; run in 3.4 s, not 2.0
 
 
 @eqx.filter_jit

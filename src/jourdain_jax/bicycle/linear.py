@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.linearize import linearize
 from jourdain_jax.bicycle.characteristic import BicycleMatrices
+from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
-from jourdain_jax.motion.quick_compilation import RUN_SELDOM, quickly_compiled
 from jourdain_jax.motion.start import State
 
 _SPEED = 4.0  # m/s, of the second linearisation
@@ -45,4 +45,4 @@ def _linearised(values: dict[str, Float[Array, ""]]) -> BicycleMatrices:
     return BicycleMatrices(M[0], C[1] / _SPEED, K[0] / bicycle.g, (K[1] - K[0]) / _SPEED**2, bicycle.g)
 
 
-_matrices = quickly_compiled(_linearised, options=RUN_SELDOM)  # the first call in 10 s of processor time, not in 23; the second in 6 ms
+_matrices = compiled(_linearised, options=RUN_SELDOM)  # the first call in 10 s of processor time, not in 23; the second in 6 ms

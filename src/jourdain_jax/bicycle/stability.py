@@ -15,8 +15,8 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Complex, Float
 
+from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.calculus.newton import newton_root
-from jourdain_jax.motion.quick_compilation import RUN_SELDOM, quickly_compiled
 
 from .characteristic import (
     BicycleMatrices,
@@ -120,7 +120,7 @@ def _stability_speeds(matrices: BicycleMatrices, top: Scalar) -> StabilitySpeeds
     )
 
 
-_speeds = quickly_compiled(_stability_speeds, options=RUN_SELDOM)  # the first call in 2.5 s of processor time, not in 15; the second in 1 ms, not in 3 s
+_speeds = compiled(_stability_speeds, options=RUN_SELDOM)  # the first call in 2.5 s of processor time, not in 15; the second in 1 ms, not in 3 s
 
 
 def _name_modes(values: Complex[Array, " 4"]) -> Complex[Array, " 4"]:

@@ -30,11 +30,11 @@ def applied(equation, inputs) -> list[np.ndarray]:
         return _LOOPS[name](equation, inputs)
     if name in _CONTROL:
         return _CONTROL[name](params, inputs)
-    if name in ENTRYWISE:
-        with_type = ENTRYWISE[name](*inputs)
+    if name in _ENTRYWISE:
+        with_type = _ENTRYWISE[name](*inputs)
         return [np.asarray(with_type, equation.outvars[0].aval.dtype)]
-    if name in RULES or name in RULES_WITH_LANES:
-        result = RULES[name](equation, *inputs) if name in RULES else RULES_WITH_LANES[name](equation, 0, *inputs)
+    if name in RULES:
+        result = RULES[name](equation, *inputs)
         if result is not None:
             return result if isinstance(result, list) else [result]
     with jax.ensure_compile_time_eval():
@@ -95,11 +95,10 @@ def _where(equation) -> str:
     return "a function of the scene"
 
 
-def linear_solve(params, inputs: list) -> tuple[ClosedJaxpr, list]:
-    """The function that solves a linear system, and its arguments among the inputs."""
+def _linear_solve(params, inputs) -> list[np.ndarray]:
     lengths = params["const_lengths"]
     of_solve = inputs[lengths.matvec + lengths.vecmat :][: lengths.solve]
-    return params["jaxprs"].solve, [*of_solve, *inputs[sum(lengths) :]]
+    return evaluated(params["jaxprs"].solve, [*of_solve, *inputs[sum(lengths) :]], applied)
 
 
 def _here(params, inputs) -> list[np.ndarray]:
@@ -118,12 +117,12 @@ _CONTROL: dict[str, Callable] = {
     "jourdain_linear_map": _linear_map,
     "jourdain_or_elsewhere": _here,
     "custom_lin": lambda params, inputs: inputs,
-    "custom_linear_solve": lambda params, inputs: evaluated(*linear_solve(params, inputs), applied),
+    "custom_linear_solve": _linear_solve,
 }
 
-# Primitives. Where the second argument of a rule is `lanes`, so many axes of the arrays, none or one, are no axes of the primitive and come first.
+# Primitives.
 
-ENTRYWISE: dict[str, Callable] = {
+_ENTRYWISE: dict[str, Callable] = {
     **VALUES,
     "add_any": np.add,
     "square": np.square,
@@ -138,51 +137,40 @@ ENTRYWISE: dict[str, Callable] = {
     "unvmap_any": np.any,
     "convert_element_type": lambda x: x,
 }
-del ENTRYWISE["select"], ENTRYWISE["round"]
+del _ENTRYWISE["select"], _ENTRYWISE["round"]
 
 
-def _round(equation, lanes, x):
+def _round(equation, x):
     if equation.params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN:
         return np.rint(x)
     whole = np.trunc(x)
     return whole + np.copysign(np.abs(x - whole) >= 0.5, x)  # half away from zero
 
 
-def _axes(numbers, lanes: int) -> tuple[int, ...]:
-    """Axes of an array, by their numbers without those of lanes."""
-    return tuple(i + lanes for i in numbers)
-
-
-def _without_lanes(x: np.ndarray, lanes: int, shape) -> np.ndarray:
-    """An array in another shape, whose axes of lanes stay."""
-    return x.reshape((*x.shape[:lanes], *shape))
-
-
-def _dot_general(equation, lanes, a, b):
-    (over_a, over_b), (batch_a, batch_b) = [[_axes(part, lanes) for part in pair] for pair in equation.params["dimension_numbers"]]
-    batch_a, batch_b = (*range(lanes), *batch_a), (*range(lanes), *batch_b)
+def _dot_general(equation, a, b):
+    (over_a, over_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
     free_a = [i for i in range(a.ndim) if i not in (*over_a, *batch_a)]
     free_b = [i for i in range(b.ndim) if i not in (*over_b, *batch_b)]
     batch, contracted = [a.shape[i] for i in batch_a], int(np.prod([a.shape[i] for i in over_a]))
     left = np.transpose(a, (*batch_a, *free_a, *over_a)).reshape(*batch, int(np.prod([a.shape[i] for i in free_a])), contracted)
     right = np.transpose(b, (*batch_b, *over_b, *free_b)).reshape(*batch, contracted, int(np.prod([b.shape[i] for i in free_b])))
-    return _reshaped(equation, lanes, left @ right)
+    return _reshaped(equation, left @ right)
 
 
-def _broadcast_in_dim(equation, lanes, x, *dynamic):
+def _broadcast_in_dim(equation, x, *dynamic):
     shape = [1] * len(equation.params["shape"])
     for axis, place in enumerate(equation.params["broadcast_dimensions"]):
-        shape[place] = x.shape[axis + lanes]
-    return np.broadcast_to(_without_lanes(x, lanes, shape), (*x.shape[:lanes], *equation.params["shape"]))
+        shape[place] = x.shape[axis]
+    return np.broadcast_to(x.reshape(shape), equation.params["shape"])
 
 
-def _slice(equation, lanes, x):
+def _slice(equation, x):
     p = equation.params
-    strides = p["strides"] or (1,) * (x.ndim - lanes)
-    return x[(slice(None),) * lanes + tuple(slice(*s) for s in zip(p["start_indices"], p["limit_indices"], strides, strict=True))]
+    strides = p["strides"] or (1,) * x.ndim
+    return x[tuple(slice(*s) for s in zip(p["start_indices"], p["limit_indices"], strides, strict=True))]
 
 
-def _select(equation, lanes, which, *cases):
+def _select(equation, which, *cases):
     which = which.reshape((*which.shape, *(1,) * (cases[0].ndim - which.ndim)))
     return np.where(np.asarray(which, bool), cases[1], cases[0]) if len(cases) == 2 else np.choose(which, cases)
 
@@ -210,21 +198,21 @@ def _pad(equation, x, fill):
     return out
 
 
-def _svd(equation, lanes, A):
+def _svd(equation, A):
     good = np.all(np.isfinite(A), axis=(-2, -1), keepdims=True)
     found = np.linalg.svd(np.where(good, A, 0.0), full_matrices=equation.params["full_matrices"], compute_uv=equation.params["compute_uv"])
     found = [found[1], found[0], found[2]] if equation.params["compute_uv"] else [found]
     return [np.where(good if x.ndim == A.ndim else good[..., 0], x, np.nan) for x in found]
 
 
-def _cholesky(equation, lanes, A):
+def _cholesky(equation, A):
     try:
         return np.linalg.cholesky(np.tril(A) + np.swapaxes(np.tril(A, -1), -1, -2))
     except np.linalg.LinAlgError:
-        return np.full_like(A, np.nan) if A.ndim == 2 else np.stack([_cholesky(equation, lanes, a) for a in A])
+        return np.full_like(A, np.nan) if A.ndim == 2 else np.stack([_cholesky(equation, a) for a in A])
 
 
-def _triangular_solve(equation, lanes, A, b):
+def _triangular_solve(equation, A, b):
     p = equation.params
     if p["conjugate_a"]:
         return None  # left to JAX
@@ -238,7 +226,7 @@ def _triangular_solve(equation, lanes, A, b):
     return np.where(singular, np.nan, x)
 
 
-def _lu(equation, lanes, A):
+def _lu(equation, A):
     """LU decomposition with partial pivoting, as LAPACK's getrf: factors, row exchanges and their permutation, for all matrices together."""
     *lanes, rows, columns = A.shape
     LU = np.array(A).reshape(-1, rows, columns)
@@ -266,31 +254,31 @@ def _iota(equation, *dynamic):
 
 
 def _reduced(function: Callable, of_nothing=None) -> Callable:
-    def reduced(equation, lanes, x):
+    def reduced(equation, x):
         start = {} if of_nothing is None or x.dtype.kind != "f" else {"initial": of_nothing}
-        return np.asarray(function(x, axis=_axes(equation.params["axes"], lanes), **start), equation.outvars[0].aval.dtype)
+        return np.asarray(function(x, axis=tuple(equation.params["axes"]), **start), equation.outvars[0].aval.dtype)
 
     return reduced
 
 
-def _reshaped(equation, lanes, x, *dynamic):
-    return _without_lanes(x, lanes, equation.outvars[0].aval.shape)
+def _reshaped(equation, x, *dynamic):
+    return x.reshape(equation.outvars[0].aval.shape)
 
 
-RULES_WITH_LANES: dict[str, Callable] = {
+RULES: dict[str, Callable] = {
     **dict.fromkeys(("reshape", "squeeze", "expand_dims"), _reshaped),
     "dot_general": _dot_general,
     "broadcast_in_dim": _broadcast_in_dim,
-    "transpose": lambda e, lanes, x: np.transpose(x, (*range(lanes), *_axes(e.params["permutation"], lanes))),
-    "rev": lambda e, lanes, x: np.flip(x, _axes(e.params["dimensions"], lanes)),
-    "concatenate": lambda e, lanes, *xs: np.concatenate(xs, axis=e.params["dimension"] + lanes),
-    "stack": lambda e, lanes, *xs: np.stack(xs, axis=e.params["axis"] + lanes),
-    "unstack": lambda e, lanes, x: list(np.moveaxis(x, e.params["axis"] + lanes, 0)),
-    "split": lambda e, lanes, x: np.split(x, np.cumsum(e.params["sizes"])[:-1], axis=e.params["axis"] + lanes),
+    "transpose": lambda e, x: np.transpose(x, e.params["permutation"]),
+    "rev": lambda e, x: np.flip(x, e.params["dimensions"]),
+    "concatenate": lambda e, *xs: np.concatenate(xs, axis=e.params["dimension"]),
+    "stack": lambda e, *xs: np.stack(xs, axis=e.params["axis"]),
+    "unstack": lambda e, x: list(np.moveaxis(x, e.params["axis"], 0)),
+    "split": lambda e, x: np.split(x, np.cumsum(e.params["sizes"])[:-1], axis=e.params["axis"]),
     "slice": _slice,
     "round": _round,
     "select_n": _select,
-    "integer_pow": lambda e, lanes, x: np.asarray(x ** e.params["y"] if e.params["y"] >= 0 else 1 / x ** -e.params["y"]),
+    "integer_pow": lambda e, x: np.asarray(x ** e.params["y"] if e.params["y"] >= 0 else 1 / x ** -e.params["y"]),
     "svd": _svd,
     "lu": _lu,
     "cholesky": _cholesky,
@@ -301,9 +289,7 @@ RULES_WITH_LANES: dict[str, Callable] = {
     "reduce_prod": _reduced(np.prod),
     "reduce_and": _reduced(np.bitwise_and.reduce),
     "reduce_or": _reduced(np.bitwise_or.reduce),
-    "optimization_barrier": lambda e, lanes, *xs: list(xs),
-}
-RULES: dict[str, Callable] = {
+    "optimization_barrier": lambda e, *xs: list(xs),
     "dynamic_slice": lambda e, x, *starts: x[_window(x, starts, e.params["slice_sizes"])],
     "dynamic_update_slice": _dynamic_update_slice,
     "iota": _iota,

@@ -16,8 +16,8 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, Primitive, Var, jaxpr_as_fun
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.compiled import compiled
 from jourdain_jax.calculus.reals import is_traced
-from jourdain_jax.motion.quick_compilation import compiled
 from jourdain_jax.program.calls import description
 from jourdain_jax.scene.names_read import is_function, now_read_by
 
@@ -151,8 +151,8 @@ def _one_of_equals(program: TimeProgram) -> TimeProgram:
     return program
 
 
-def for_programs(f: Callable, compiled_by: Callable[[Callable], Callable] = compiled) -> Callable[[Hashable], Callable]:
+def for_programs(f: Callable, options: Callable | None = None) -> Callable[[Hashable], Callable]:
     """`f` compiled for a set of input programs; what was compiled for one is dropped, machine code included, when as many other sets were used since."""
-    for_none = compiled_by(f)
-    for_some = lru_cache(maxsize=MOST_COMPILED)(lambda programs: compiled_by(f))
+    for_none = compiled(f, options)
+    for_some = lru_cache(maxsize=MOST_COMPILED)(lambda programs: compiled(f, options))
     return lambda programs: for_some(programs) if programs else for_none

@@ -5,7 +5,6 @@ Both give states at the saved times, which of those were reached, and where and 
 """
 
 from dataclasses import replace
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -14,6 +13,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.plausibility import faults_at
 from jourdain_jax.build.row_program import row_program
+from jourdain_jax.calculus.compiled import RUN_SELDOM
 from jourdain_jax.calculus.guards import forward_only, reverse_only
 from jourdain_jax.calculus.lanes_first import lanes_first
 from jourdain_jax.calculus.nan_where import entered, left
@@ -25,7 +25,6 @@ from jourdain_jax.motion.input_programs import for_programs
 from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.solver_choice import time_origin
 from jourdain_jax.motion.native import seen
-from jourdain_jax.motion.quick_compilation import QUICK, RUN_SELDOM, quickly_compiled
 from jourdain_jax.motion.row_check import rows_violated
 from jourdain_jax.motion.setup import Begun, Setup, Solved
 from jourdain_jax.motion.start import State
@@ -52,14 +51,12 @@ def _one_motion(setup: Setup) -> Trajectory:
 
 def _compiler_options(setup: Setup) -> dict | None:
     """Those that save most for what is compiled; the arrays of the setup are not looked at."""
-    if setup.field.lowered is None:
-        return None
-    # The steps by machine code are no part of it: XLA compiles the rest for a disc in 0.6 s of processor time instead of 1.0, for a bicycle in 1.4 instead of
-    # 3.0; a motion with 201 saved times takes 0.34 ms instead of 0.27, and 2.10 instead of 2.05.
-    return QUICK if setup.reason_against_machine_code else RUN_SELDOM
+    # The steps by machine code are no part of it: a first motion of a disc takes 0.9 s of processor time in place of 1.8, of a bicycle 1.1 in place of 1.8; a
+    # motion with 201 saved times takes 0.34 ms instead of 0.27, and 2.10 instead of 2.05.
+    return None if setup.reason_against_machine_code else RUN_SELDOM
 
 
-_compiled = for_programs(_one_motion, partial(quickly_compiled, options=_compiler_options))
+_compiled = for_programs(_one_motion, _compiler_options)
 
 
 def _prepared(setup: Setup) -> Setup:

@@ -21,6 +21,7 @@ from jourdain_jax.build.held_values import may_contradict
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.build.sampling import NoStateFoundError, guesses_of, seen_on_rows
 from jourdain_jax.build.structure import Structure, structure_of
+from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.calculus.damped import first_root
 from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, described, is_traced, nothing_is_traced, real_type
 from jourdain_jax.eager.eager import eval_numpy
@@ -30,7 +31,6 @@ from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.motion.inputs import as_inputs, inputs_at
 from jourdain_jax.motion.put_on_rows import Usual, functions_of_rows, put_positions, put_speeds, usual_sizes
-from jourdain_jax.motion.quick_compilation import RUN_SELDOM, quickly_compiled
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds
 from jourdain_jax.scene.coordinates import Names
@@ -228,7 +228,7 @@ def _tolerance(dtype) -> float:
     return max(_TYPED, _OFF * float(np.finfo(dtype).eps))
 
 
-_compiled_projection = quickly_compiled(_put_onto_constraints, options=RUN_SELDOM)  # one program for every choice of what is held
+_compiled_projection = compiled(_put_onto_constraints, options=RUN_SELDOM)  # one program for every choice of what is held
 _uncompiled_projection = eval_numpy(_put_onto_constraints)
 
 

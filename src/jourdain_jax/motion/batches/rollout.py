@@ -24,7 +24,6 @@ from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.options import SPAN, AllOptions, MotionFields, Options, as_options
-from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.retries import RERUN_FIELDS, lanes_retried
 from jourdain_jax.motion.sensitivity import warn_of_jumps
 from jourdain_jax.motion.simulate import default_solver, set_up, warn_float32
@@ -242,8 +241,7 @@ def _form(scene: Scene, options: AllOptions, inputs: Inputs) -> VectorField:
 
 def _run_lanes(scene, fixed, span, options: AllOptions, varied, parameters) -> Trajectory:
     """All given lanes in lockstep; compiled once for scenes and lanes of one shape."""
-    compiled = _compiled_dense if _form(scene, options, span["inputs"]).lowered is None else _compiled_lowered
-    return compiled(span["inputs"].programs)(Reference(scene), scene, fixed, span, options, varied, parameters)
+    return _compiled(span["inputs"].programs)(Reference(scene), scene, fixed, span, options, varied, parameters)
 
 
 def _lanes_in_lockstep(reference: Reference, scene, fixed, span, options: AllOptions, varied, parameters) -> Trajectory:
@@ -255,7 +253,7 @@ def _lanes_in_lockstep(reference: Reference, scene, fixed, span, options: AllOpt
         return integrate_lanes(eqx.filter_vmap(lane)(varied, parameters))
 
 
-_compiled_dense, _compiled_lowered = for_programs(_lanes_in_lockstep), for_programs(_lanes_in_lockstep, quickly_compiled)
+_compiled = for_programs(_lanes_in_lockstep)
 
 
 def _with_arrays(options: AllOptions) -> AllOptions:

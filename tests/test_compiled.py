@@ -1,20 +1,22 @@
-"""Options of XLA are given to whole programs only: a quickly compiled function serves inside and outside of every transformation."""
+"""Options of XLA are given to whole programs only: a function compiled with some serves inside and outside of every transformation."""
+
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.motion.quick_compilation import quickly_compiled
+from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 
 X = jnp.linspace(0.1, 1.0, 4)
 
 
-@quickly_compiled
+@partial(compiled, options=RUN_SELDOM)
 def total(x):
     return jnp.sum(jnp.sin(x) ** 2)
 
 
-def test_a_quickly_compiled_function_serves_inside_every_transformation():
+def test_a_function_compiled_with_options_serves_inside_every_transformation():
     expected, slope = np.sum(np.sin(X) ** 2), np.sin(2 * X)
     np.testing.assert_allclose(total(X), expected, rtol=1e-14)
     np.testing.assert_allclose(jax.jit(total)(X), expected, rtol=1e-14)

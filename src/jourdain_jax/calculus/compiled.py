@@ -1,0 +1,60 @@
+"""Functions compiled at a tenth of the costs per call of `equinox.filter_jit`, and with options of XLA where compiling takes longer than running."""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import equinox as eqx
+import jax
+
+from jourdain_jax.calculus.reals import is_array_type, nothing_is_traced
+
+RUN_SELDOM: dict[str, Any] = {"xla_backend_optimization_level": 0}  # where a function's costs are those of its compilation
+MOST_STRUCTURES = 1024  # of arguments, arrays left out, for which one function is kept compiled
+
+
+def compiled(f: Callable, options: dict | Callable | None = None) -> Callable:
+    """As `equinox.filter_jit`; what was compiled is dropped with the function that is returned.
+
+    `options`: those of XLA on a CPU, or a function that chooses them, called once for arguments of one structure with a mark in place of each array. They
+    do not count in calls inside another transformation: JAX takes options of whole programs only.
+    """
+
+    @lru_cache(maxsize=MOST_STRUCTURES)
+    def program(treedef, others, with_options: bool) -> Callable:
+        def on_arrays(arrays):
+            found, kept = _parted(f(*_whole(arrays, treedef, others)))
+            return found, _Kept(kept)
+
+        on_arrays.__name__ = getattr(f, "__name__", "on_arrays")
+        chosen = options(*jax.tree.unflatten(treedef, others)) if callable(options) else options
+        return jax.jit(on_arrays, compiler_options=chosen if with_options else None)
+
+    def run(*arguments):
+        arrays, structure = _parted(arguments)
+        with_options = options is not None and jax.default_backend() == "cpu" and nothing_is_traced()
+        found, kept = program(*structure, with_options)(arrays)
+        return _whole(found, *kept.value)
+
+    return run
+
+
+class _Kept(eqx.Module):
+    """What is no array in what a compiled function returns."""
+
+    value: tuple = eqx.field(static=True)
+
+
+_AN_ARRAY = object()
+
+
+def _parted(tree) -> tuple[list, tuple]:
+    """The arrays of a tree, and what is left of it."""
+    leaves, treedef = jax.tree.flatten(tree)
+    return [x for x in leaves if is_array_type(type(x))], (treedef, tuple([_AN_ARRAY if is_array_type(type(x)) else x for x in leaves]))
+
+
+def _whole(arrays, treedef, rest):
+    """The tree of these parts."""
+    left = iter(arrays)
+    return jax.tree.unflatten(treedef, [next(left) if x is _AN_ARRAY else x for x in rest])
