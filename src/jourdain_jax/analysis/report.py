@@ -230,8 +230,6 @@ def _lowering(built: Built) -> str:
     if found is None:
         return f"not lowered: {built.not_lowered}"
     calls = "".join(f"; {reason} has no scalar form: kept as a call" for reason in found.calls)
-    if built.not_integrated:
-        return f"a scalar program of {found.operations} operations{calls}; not integrated: {built.not_integrated}"
     reason = native_motion.reason_against(vector_field(built.scene), built.scene, as_inputs(built.scene, None), bool(built.events))
     where = f"not to machine code: {reason}" if reason else "to machine code"
     if not reason and jax.default_backend() == "gpu":

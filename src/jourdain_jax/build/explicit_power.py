@@ -14,12 +14,12 @@ from jax.extend.core import jaxpr_as_fun
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.jaxprs import needed_only
-from jourdain_jax.equations.kinematics import coordinate_rates
+from jourdain_jax.equations.kinematics import coordinate_rates, pose_at
 from jourdain_jax.equations.virtual_power import potential_energy, resultants
 from jourdain_jax.scene.loads import Load
-from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.validated import loads_of
+from jourdain_jax.scene.validated import loads_of, potential_of
 
 
 def stored_by_inputs(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Float[Array, ""]:
@@ -34,7 +34,19 @@ def explicit_power(scene: Scene, motion: Motion, of_inputs: tuple[int, ...], loa
     `loads`: of the scene at this motion, where they are known already.
     """
     by_time = power_of_loads(scene, motion, conservative=False, loads=loads) + explicit_rate(scene, motion, potential_energy)
-    return by_time + forces_for_potentials(scene, motion, of_inputs)
+    return by_time + _of_driven_poses(scene, motion) + forces_for_potentials(scene, motion, of_inputs)
+
+
+def _of_driven_poses(scene: Scene, motion: Motion) -> Float[Array, ""]:
+    """Rate of the scene's own potential as poses move at `u = 0`: its forces stand on the speeds, along which no such motion is."""
+    if potential_of(scene, motion.pose()) is None:
+        return jnp.zeros_like(motion.t)
+    t, q = motion.t, motion.q.array
+    nu = coordinate_rates(scene, t, q, jnp.zeros_like(motion.u.array))
+    along = (t, q), (jnp.ones_like(t), nu)
+    held = motion.pose().bodies
+    whole = jax.jvp(lambda t, q: potential_of(scene, pose_at(scene, t, q)), *along)[1]
+    return whole - jax.jvp(lambda t, q: potential_of(scene, Pose(t, scene.coordinate_names.view(q), held)), *along)[1]
 
 
 def forces_for_potentials(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Float[Array, ""]:

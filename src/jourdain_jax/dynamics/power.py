@@ -53,13 +53,6 @@ def needs_work(scene: Scene, structure: Structure) -> bool:
     return by_structure or bool(structure.potentials_of_inputs) or has_load_without_potential(scene)
 
 
-def work_by_matrices(structure: Structure) -> str:
-    """Why no scalar program integrates the work of a scene, in words; empty where one may."""
-    if not (structure.driven or structure.varying_inertia):
-        return ""
-    return "the work along poses that are driven, or of masses that change, needs dense matrices; `work=False` leaves it out"
-
-
 def _rows_work(structure: Structure) -> bool:
     return not (structure.affine and structure.homogeneous)
 

@@ -53,7 +53,7 @@ class Equations:
     z: list[int]  # the dependent speeds
     pivots: list[int]  # must not vanish
     guards: list[int] = field(default_factory=list)  # must stay positive
-    power: int = 0  # `rate_of_work`; for scenes that no prescribed pose drives
+    power: int = 0  # `rate_of_work`
     events: list[int] = field(default_factory=list)  # values of the stop events
     energies: list[int] = field(default_factory=list)  # kinetic and potential
     usual: dict[int, int] = field(default_factory=dict)  # inputs that stand for what a node usually is, with that node
@@ -65,7 +65,8 @@ class AppellOnGraph:
 
     def __init__(self, traced: TracedScene, structure: Structure, kept: KeptRows | None, probes: Probes, far, reference):
         self.traced, self.graph, self.structure, self.probes = traced, traced.graph, structure, probes
-        self.rows_work = not (structure.affine and structure.homogeneous)
+        rows_work = not (structure.affine and structure.homogeneous)
+        self.forces_work = rows_work or structure.driven or structure.varying_inertia
         every, rows = range(len(traced.u)), list(structure.kept_rows)
         self.independent = list(every) if kept or not rows else list(structure.independent)
         self.dependent = [k for k in every if k not in self.independent]
@@ -92,7 +93,7 @@ class AppellOnGraph:
             qdot = self.graph.substituted(qdot, kinematics.known)
         true_z = {int(self.traced.u[k]): n for k, n in zip(self.dependent, z, strict=True)}
         *events, T, V = self.graph.substituted([*self.traced.at.events.tolist(), *self.traced.at.energies.tolist()], true_z)
-        if not self.rows_work:
+        if not self.forces_work:
             (power,) = self.graph.substituted([int(self.traced.at.power)], true_z)
         elif held:
             true_power = self._power(_Kinematics(self, forms, {}, explicit=False), ydot)
@@ -124,23 +125,28 @@ class AppellOnGraph:
         return moved, self.kept.projected_speeds(M, self.traced.u.tolist(), phi, forms)
 
     def _power(self, k: "_Kinematics", ydot: list[int]) -> int:
-        """Power of loads without a potential and of potentials in time, and `(A' lambda).u` where rows do work.
+        """Power of loads without a potential and of potentials in time, and of rows that do work, of what drives poses, and of masses that change.
 
-        `(A' lambda).u = sum (m a - F).(v - v_0) + (I alpha + omega x I omega - L).(omega - omega_0) - Q_direct.u`, v_0, omega_0: at u = 0.
+        `sum (m a - F).v + (I alpha + omega x I omega - L).omega - Q_direct.u + (mdot v.v + omega.(dI/dt omega))/2`
         """
         g, at = self.graph, k.at
-        if not self.rows_work:
+        if not self.forces_work:
             return int(at.power)
-        still = dict.fromkeys(self.traced.u.tolist(), g.zero)
-        v_0, omega_0 = (g.substituted(g.substituted(x.ravel().tolist(), still), k.held) for x in (self.traced.at.v, self.traced.at.omega))
         terms = [int(at.power)]
+        if self.structure.varying_inertia:
+            raw = [*self.traced.at.mass.tolist(), *self.traced.at.inertia.ravel().tolist()]
+            mass_rates, inertia_rates = np.split(np.array(k.rates_along_motion(raw), np.int64), [len(at.mass)])
+            for b, (rate, of_inertia) in enumerate(zip(mass_rates.tolist(), inertia_rates.reshape(-1, 3, 3).tolist(), strict=True)):
+                v, omega = at.v[b].tolist(), at.omega[b].tolist()
+                gained = g.add(g.mul(rate, g.dot(v, v)), g.dot(omega, [g.dot(row, omega) for row in of_inertia]))
+                terms.append(g.mul(g.const(0.5), gained))
         for b in range(len(at.mass)):
             a = [g.add(a0, g.dot([beta[b][i] for beta in k.beta], ydot)) for i, a0 in enumerate(k.a0[b])]
             alpha = [g.add(a0, g.dot([gamma[b][i] for gamma in k.gamma], ydot)) for i, a0 in enumerate(k.alpha0[b])]
             force, torque = self._inertia_resultants(at, b, a, alpha)
             for i in range(3):
-                terms.append(g.mul(g.sub(force[i], int(at.force[b][i])), g.sub(int(at.v[b][i]), v_0[3 * b + i])))
-                terms.append(g.mul(g.sub(torque[i], int(at.torque[b][i])), g.sub(int(at.omega[b][i]), omega_0[3 * b + i])))
+                terms.append(g.mul(g.sub(force[i], int(at.force[b][i])), int(at.v[b][i])))
+                terms.append(g.mul(g.sub(torque[i], int(at.torque[b][i])), int(at.omega[b][i])))
         u = dict(zip(self.dependent, k.z, strict=True)) | dict(zip(self.independent, k.y, strict=True))
         return g.sub(g.total(terms), g.total(g.mul(int(at.direct[i]), n) for i, n in u.items()))
 
@@ -299,6 +305,10 @@ class _Kinematics:
         simple = self._at(raw)
         by_speed = [self._simple(column) for column in columns(self.graph, simple, self.u)]
         return [list(row) for row in zip(*by_speed, strict=True)], self._along(simple, raw, self.qdot)
+
+    def rates_along_motion(self, raw: list[int]) -> list[int]:
+        """Rates of traced nodes along the motion, at the held coordinates."""
+        return self._along(self._at(raw), raw, self.qdot)
 
     # helpers
 

@@ -5,7 +5,7 @@ from functools import cached_property
 from itertools import chain
 
 from jourdain_jax.build.structure import structure_of
-from jourdain_jax.dynamics.power import needs_work, work_by_matrices
+from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.listed import names_of_events, names_of_invariants
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
@@ -79,7 +79,6 @@ class Built(BuiltFor, Printed):
     conserved: Conserved
     program: Lowered | None  # the scalar program
     not_lowered: str  # why there is none; empty where there is one
-    not_integrated: str  # why motions with their work are integrated by dense matrices all the same; empty where they are not
     state: str  # "minimal": coordinates and privileged speeds are integrated; "full": all speeds are
     events: tuple[str, ...]  # that stop a motion
 
@@ -101,7 +100,6 @@ class Built(BuiltFor, Printed):
     def _text(self) -> str:
         listed = lambda names: ", ".join(names) or "none"  # noqa: E731
         program = f"{self.program.operations} operations, {self.program.way}" if self.program is not None else f"none: {self.not_lowered}"
-        program += f"; not integrated: {self.not_integrated}" if self.not_integrated else ""
         pivots = f"pivot at least {self.freedoms.worst_pivot:.2g}, typically {self.freedoms.typical_pivot:.2g}" if self.freedoms.dependent else "no rows"
         facts = {
             "rows": f"{listed(self.rows.names)}; rank {self.rows.rank}",
@@ -148,7 +146,6 @@ def build(scene: Scene | BuiltFor) -> Built:
         conserved=Conserved(not needs_work(scene, known), () if program is None else program.held, names_of_invariants(scene)),
         program=program,
         not_lowered="" if program is not None else str(found),
-        not_integrated="" if program is None else work_by_matrices(known),
         state="minimal" if known.has_minimal_state else "full",
         events=names_of_events(scene),
     )

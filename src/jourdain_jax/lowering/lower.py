@@ -109,7 +109,7 @@ class _Key:
         """That of a scene whose parameters are known."""
         leaves, treedef = jax.tree.flatten(scene)
         kept = (every_speed, None if every_speed else structure.independent, structure.redundant_rows, structure.affine, structure.driven)
-        kept += (structure.homogeneous, structure.potentials_of_inputs, structure.may_set_in, massless)
+        kept += (structure.varying_inertia, structure.homogeneous, structure.potentials_of_inputs, structure.may_set_in, massless)
         kept += (structure.dependent_rows, structure.well_conditioned and structure.independent) if every_speed else ()
         return _Key((treedef, tuple(np.shape(x) for x in leaves), kept, jnp.result_type(float)), scene, structure, every_speed, massless)
 
@@ -131,16 +131,16 @@ def _timed(key: _Key) -> Lowered:
 
 def _alone(found: Lowered) -> Lowered:
     """The program in a graph of its own, without what was tried for it."""
-    of, power = found.traced, [] if found.power is None else [found.power]
+    of = found.traced
     variables = [of.t, *of.q.tolist(), *of.u.tolist(), *of.inputs.tolist(), *(n for x in of.parameters for n in x.ravel().tolist())]
     outputs = [n for name in _NODES for n in getattr(found, name)]
-    graph, nodes = part_of(found.graph, [*variables, *outputs, *power, *found.usual, *found.usual.values(), *found.states])
+    graph, nodes = part_of(found.graph, [*variables, *outputs, found.power, *found.usual, *found.usual.values(), *found.states])
     place = nodes.tolist()
     moved: dict[str, Any] = {name: tuple(place[n] for n in getattr(found, name)) for name in _NODES}
     return replace(
         found,
         traced=Variables(graph, place[of.t], nodes[of.q], nodes[of.u], nodes[of.inputs], [np.asarray(nodes[x]) for x in of.parameters]),
-        power=None if found.power is None else place[found.power],
+        power=place[found.power],
         usual={place[a]: place[b] for a, b in found.usual.items()},
         states={place[n]: x for n, x in found.states.items()},
         **moved,
@@ -269,7 +269,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
         dependent=tuple(builder.dependent),
         sizes=tuple(sizes),
         divisors=len(of_rates),
-        power=None if structure.driven else power,
+        power=power,
         by_partition=builder.kept is not None and builder.kept.by_partition,
         left_out=structure.redundant_rows,
         held=tuple(names[i] for i in held),

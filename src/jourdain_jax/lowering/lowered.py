@@ -58,7 +58,7 @@ class Lowered:
     sizes: tuple[int, ...]  # inputs for what the magnitudes of the pivots usually are
     directions: tuple[int, ...]  # of rows nonlinear in the speeds, an entry for each speed: must not turn round
     guards: tuple[int, ...]  # must stay positive
-    power: int | None  # `rate_of_work` (d(T + V)/dt at constant inputs, or that part of it that is integrated); None where poses are driven
+    power: int  # `rate_of_work` (d(T + V)/dt at constant inputs, or that part of it that is integrated)
     events: tuple[int, ...]  # values of the stop events, sorted by name; none where they have no scalar form
     energies: tuple[int, ...]  # kinetic and potential
     relations: tuple[int, ...]  # numbers whose signs decide between branches of the rates (`lowering/relations.py`)
@@ -161,13 +161,13 @@ class Lowered:
         for guard in found[count : count + len(self.guards)]:
             found[0] = jnp.where(guard > 0, found[0], jnp.nan)
         at = len(self.qdot)
-        power = found[count - 1] if with_power and self.power is not None else None
+        power = found[count - 1] if with_power else None
         return tuple(found[:at]), tuple(found[at : at + len(self.ydot)]), power, pivots, directions
 
     @functools.cached_property
     def _program_of_rates(self) -> Callable[[bool], Callable[..., tuple]]:
         def made(with_power: bool):
-            outputs = [*self.qdot, *self.ydot, *([self.power] if with_power and self.power is not None else []), *self.guards]
+            outputs = [*self.qdot, *self.ydot, *([self.power] if with_power else []), *self.guards]
             return differentiable(self.graph, outputs, self.variables, like=len(self.fixed) + 1, monitored=(*self.pivots, *self.directions))
 
         return functools.cache(made)

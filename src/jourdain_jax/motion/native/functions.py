@@ -87,7 +87,7 @@ class Form:
         program = self.program
         projected = [*program.projected_q, *program.projected_u] if self.projects else []
         events = program.events if self.has_events else ()
-        power = [program.power] if self.with_work and program.power is not None else []
+        power = [program.power] if self.with_work else []
         return [*program.qdot, *program.ydot, *power, *program.guards, *program.pivots, *program.directions, *projected, *events, *self.watched]
 
 
@@ -166,7 +166,7 @@ def write_rates(w: Writer, form: Form) -> None:
     how = "alwaysinline" if program.operations <= INLINED else "noinline"
     arguments = {"state": "ptr", "tau": w.real, "y": "ptr", "k": "ptr", "pivots": "ptr"}
     with w.function("rates", "void", arguments, attributes=how) as (state, tau, y, k, pivots):
-        power = [program.power] if form.with_work and program.power is not None else []
+        power = [program.power] if form.with_work else []
         rates = [*program.qdot, *program.ydot, *power]
         known = known_values(w, form, state, tau, y)
         found, tangents = _found(w, form, outputs_of(form, [*rates, *program.guards, *form.monitored], len(rates)), known, state, tau, y)

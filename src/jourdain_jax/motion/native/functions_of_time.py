@@ -45,8 +45,7 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
                 new[node] = int(as_nodes(graph, interpret(graph, function.closed, [*arguments, Nodes(t)])[0]))
     except (Unsupported, ValueError) as error:
         return f"an input is a function of time without scalar form ({error})"
-    power = [] if program.power is None else [program.power]
-    outputs = [*program.qdot, *program.ydot, *power, *program.pivots, *program.directions, *program.guards, *program.events]
+    outputs = [*program.qdot, *program.ydot, program.power, *program.pivots, *program.directions, *program.guards, *program.events]
     outputs += [*program.projected_q, *program.projected_u, *program.relations, *program.event_relations]
     of_functions = [new[n] for n in program.traced.inputs.tolist() if n in new]
     by_functions = switches(graph, of_functions)
@@ -67,7 +66,7 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
         sizes=on_it(program.sizes),
         qdot=on_it(program.qdot),
         ydot=on_it(program.ydot),
-        power=new[power[0]] if power else None,
+        power=new[program.power],
         pivots=on_it(program.pivots),
         directions=on_it(program.directions),
         guards=on_it(program.guards),

@@ -34,7 +34,7 @@ class Pulled(NamedTuple):
 def rates_of(form: Form) -> list[int]:
     """The nodes whose values are the rates of the state; that of the work may be zero, and is left out then."""
     program = form.program
-    return [*program.qdot, *program.ydot, *([program.power] if form.with_work and program.power is not None else [])]
+    return [*program.qdot, *program.ydot, *([program.power] if form.with_work else [])]
 
 
 def write_pulled(w: Writer, form: Form, asked: Sequence[int]) -> None:

@@ -92,7 +92,7 @@ def products(form: Form, order: int) -> int:
 def rates_of(form: Form) -> list[int]:
     """The nodes of the rates of all that is integrated; the last may be missing, where work is and is zero."""
     program = form.program
-    return [*program.qdot, *program.ydot, *([program.power] if form.with_work and program.power is not None else [])]
+    return [*program.qdot, *program.ydot, *([program.power] if form.with_work else [])]
 
 
 def _monitored(form: Form) -> list[int]:

@@ -180,7 +180,7 @@ def summary_rows(trajectory: Record, message: str) -> list[tuple[str, str]]:
     reached = int(np.sum(np.isfinite(np.asarray(trajectory.q)).all(axis=-1)))
     saved, several = f"{reached} of {len(ts)} times saved", reached > 1
     pivot = "" if trajectory.state_form == "full" else f"; pivot of the privileged speeds at least {float(trajectory.smallest_pivot):.1e}"
-    dense = reason_for_matrices(structure_of(trajectory.scene), trajectory.work is not None, trajectory.inputs.constant)
+    dense = reason_for_matrices(structure_of(trajectory.scene), trajectory.inputs.constant)
     low, high = (int(r) for r in found.rank)
     moved = float(trajectory.moved_q), float(trajectory.moved_u)
     inputs = [f"{name} {_channel_text(channel)}" for name, channel in zip(trajectory.scene.inputs, trajectory.inputs.channels, strict=True)]

@@ -11,7 +11,7 @@ from jourdain_jax.build.usual_lengths import usual_lengths
 from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.dynamics.accelerations import Baumgarte, as_reduction
-from jourdain_jax.dynamics.power import needs_work, work_by_matrices
+from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.listed import names_of_events, names_of_position_rows
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
@@ -98,7 +98,7 @@ def _vector_field(scene: Scene, formulation: Formulation, work: bool, backend: s
     inputs_in_rows = structure.rows_of_inputs and not constant
     conserves = not needs_work(scene, structure)
     with_work = work and not conserves
-    program = _program(scene, minimal, backend, formulation, reason_for_matrices(structure, with_work, constant))
+    program = _program(scene, minimal, backend, formulation, reason_for_matrices(structure, constant))
     cutoff = _cutoff(structure) if reduction is None and not minimal else None
     reduction = as_reduction(scene, _default_reduction(structure, independent, program) if reduction is None else reduction)
     common: dict[str, Any] = {
@@ -123,11 +123,11 @@ def _vector_field(scene: Scene, formulation: Formulation, work: bool, backend: s
     return FullByMatrices(**common, may_branch=cutoff is not None and isinstance(reduction, NullSpaceQR) and loses_rank)
 
 
-def reason_for_matrices(structure: Structure, with_work: bool, constant: bool) -> str:
+def reason_for_matrices(structure: Structure, constant: bool) -> str:
     """Why dense matrices are integrated also of a scene with a scalar program, in words; empty where that serves. `constant`: all inputs are."""
     if structure.rows_of_inputs and not constant:
         return "velocity rows with inputs that change with time need dense matrices"
-    return work_by_matrices(structure) if with_work else ""
+    return ""
 
 
 def _without_parts(scene: Scene, state, stabilisation, work: bool, backend: str, constant: bool) -> VectorField:
