@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, Float, Num
 
 from jourdain_jax.build.trace import Variables
-from jourdain_jax.build.usual_lengths import usual
 from jourdain_jax.lowering import export
 from jourdain_jax.lowering.jacobian import differentiable
 from jourdain_jax.program.emit import run
@@ -137,8 +136,7 @@ class Lowered:
             return {}
         parameters = jax.lax.stop_gradient(parameters)
         found = run(self.graph, list(self.usual.values()), parameters | {n: jnp.asarray(x) for n, x in self.states.items()})
-        sizes = [usual(jnp.abs(jnp.atleast_1d(jnp.asarray(x)))) for x in found]
-        return {n: jnp.where(size == 0, 1.0, size) for n, size in zip(self.usual, sizes, strict=True)}
+        return {n: _usual(jnp.abs(jnp.atleast_1d(jnp.asarray(x)))) for n, x in zip(self.usual, found, strict=True)}
 
     def rates(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple[tuple, tuple, Float[Array, "*lanes"] | None]:
         """`qdot` and `ydot`, tuples of scalars, and the power (W) where `with_power` asks for it; NaN where a guard is not positive.
@@ -252,3 +250,9 @@ class Lowered:
     def calls(self) -> tuple[str, ...]:
         """Why each call of JAX in the rates and stop events is one: a part of a load or event that has no scalar form."""
         return tuple(self.graph.value[n].reason for n in self.graph.calls([*self.qdot, *self.ydot, *self.events]))
+
+
+def _usual(sizes: Float[Array, "states"]) -> Float[Array, ""]:
+    """The median, or the largest where half of them vanish, or 1; what is no number does not count, and no derivative passes through."""
+    median, largest = jnp.nanmedian(sizes), jnp.nanmax(sizes, initial=0.0)
+    return jax.lax.stop_gradient(jnp.where(median > 0, median, jnp.where(largest > 0, largest, 1.0)))

@@ -204,7 +204,7 @@ def _places_of(program: Lowered) -> list[int]:
 
 
 def _write_usual(program: Lowered, w: Writer) -> None:
-    """`row(state, found)`: as `build/usual_lengths.py: usual` of the magnitudes at the probed states; 1 for what vanishes at all of them."""
+    """`row(state, found)`: as `Lowered.usual_values`, of the magnitudes at the probed states."""
     given, nodes, states = _places_of(program), list(program.usual.values()), list(program.states)
     probes = len(next(iter(program.states.values()), (None,)))
     table = w.constants("probed", (x[p] for p in range(probes) for x in program.states.values())) if states else Value(w, "ptr", "null")
