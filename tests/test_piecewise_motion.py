@@ -149,6 +149,12 @@ def test_a_road_by_linear_interpolation_is_refused():
         jj.simulate(Road(), {"x_rate": 1.0}, t1=1.0)
 
 
+def test_a_check_names_all_that_is_not_smooth_and_raises_nothing():
+    found = jj.check(Road())
+    assert not found.passed
+    assert "the pose of body `mass` of `Road` is not smooth" in str(found)
+
+
 class Pushed(Driven):
     """Tables of forces are no matter: they need no derivative."""
 

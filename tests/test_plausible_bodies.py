@@ -159,6 +159,12 @@ class OnLift(OnSledge):
         return {"back": jj.ball_contact(pose["ball"], 0.1, ground=self.ground(pose.q, jnp.stack([0.0 * pose.q.rise, 0.0 * pose.q.rise, pose.q.rise])))}
 
 
+def test_a_check_names_grounds_and_bodies_and_passes_all_models():
+    assert "moves with another body" in jj.check(OnSledge()).found["grounds"][0]
+    assert "above the sum of the others" in jj.check(Top(moments=(1.0, 1.0, 3.0))).found["bodies"][0]
+    assert all(jj.check(model()).passed for model in (jj.models.TiltingDisc, jj.models.Suslov))
+
+
 @pytest.mark.parametrize("ground", [lambda q, up: jj.Plane(up), lambda q, up: jj.Plane(tilt=q.rise)])
 def test_a_ground_that_a_coordinate_moves_along_its_normal_is_refused(ground):
     with pytest.raises(ValueError, match=r"the plane of contact `back` of `OnLift` moves along its normal .* where coordinates move it, leave"):

@@ -78,6 +78,7 @@ from jourdain_jax.scene.visuals import Visual
 
 if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.analysis.body_inertia import possible_inertia
+    from jourdain_jax.analysis.checked import Checked, check
     from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
     from jourdain_jax.analysis.estimate import Estimate
     from jourdain_jax.analysis.experiment import Experiment
@@ -138,6 +139,7 @@ _ON_FIRST_USE = {
     "analysis.log_density": "LogDensity log_density",
     "analysis.losses": "huber student_t",
     "analysis.planning": "PlannedInformation planned_information",
+    "analysis.checked": "Checked check",
     "analysis.ranges": "bounds positive unbounded",
     "analysis.report": "Report report",
     "analysis.sensors": "Actuator Sensor",
@@ -180,6 +182,7 @@ __all__ = [
     "Actuator",
     "Baumgarte",
     "Built",
+    "Checked",
     "Contact",
     "Cylinder",
     "Design",
@@ -253,6 +256,7 @@ __all__ = [
     "ball_contact",
     "bounds",
     "build",
+    "check",
     "clear_caches",
     "consistent",
     "constraint_rows",

@@ -307,8 +307,13 @@ def implausible(scene: Scene, numbers: PoseNumbers) -> tuple[str, ...]:
     pieces["position"] = {f"body `{name}`": x for name, x in numbers.position.items()}
     sentences = [_of_nothing(f"{name} of `{who}`", what, x) for what, part in pieces.items() for name, x in part.items()]
     sentences += [_of_touch(f"{name} of `{who}`", x) for name, x in stated.normal.items()]
-    sentences += [_of_carried(f"the ground of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.carried.items()]
-    sentences += _sentences(who, stated, CHECKS[:-1])
+    return tuple(sentence for sentence in (*sentences, *_sentences(who, stated, CHECKS[:-1])) if sentence)
+
+
+def odd_grounds(scene: Scene, numbers: PoseNumbers) -> tuple[str, ...]:
+    """Grounds that move in another way than they are stated to, one sentence each; `numbers` as in `implausible`."""
+    who = type(scene).__name__
+    sentences = [_of_carried(f"the ground of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.carried.items()]
     sentences += [_of_plane(f"the plane of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.planes.items()]
     return tuple(sentence for sentence in sentences if sentence)
 

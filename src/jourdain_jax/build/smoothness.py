@@ -29,22 +29,24 @@ SPEEDS_WOULD_JUMP = (
 )
 
 
-def check_smoothness(scene: Scene, q: np.ndarray, u: np.ndarray) -> None:
-    """A ValueError that names a body, a row or a coordinate that jumps, or whose velocity jumps; `q`, `u`: some states."""
+def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
+    """Bodies, rows and coordinates that jump, or whose velocity jumps, one sentence each; `q`, `u`: some states."""
     nodes = looked_at(scene)
     smooth, rows = _smooth(scene, nodes), _velocity_rows(scene, nodes)
     known = smooth | rows
     if not any(passes(nodes.graph, known, NONANALYTIC | CALLS)):
-        return
+        return ()
+    found: dict[str, str] = {}
     for node, before, behind in _jumps(scene, nodes, list(known), u[0], *_in_time(scene, q)):
         if node in smooth:
-            raise ValueError(_said(scene, smooth[node], f"at t = {behind[0]:.6g} s"))
-        if not _sets_in(scene, nodes, np.stack([before, behind]), u[0]):
-            raise ValueError(f"row `{rows[node]}` of `{type(scene).__name__}` jumps at t = {behind[0]:.6g} s: {SPEEDS_WOULD_JUMP}")
-    found = [smooth[node] for node, *_ in _jumps(scene, nodes, list(smooth), u[0], *_across(q))]
-    for name in dict.fromkeys(found):
-        if found.count(name) >= MANY:
-            raise ValueError(_said(scene, name, "at several places on its way"))
+            found.setdefault(smooth[node], _said(scene, smooth[node], f"at t = {behind[0]:.6g} s"))
+        elif not _sets_in(scene, nodes, np.stack([before, behind]), u[0]):
+            found.setdefault(rows[node], f"row `{rows[node]}` of `{type(scene).__name__}` jumps at t = {behind[0]:.6g} s: {SPEEDS_WOULD_JUMP}")
+    met = [smooth[node] for node, *_ in _jumps(scene, nodes, list(smooth), u[0], *_across(q))]
+    for name in dict.fromkeys(met):
+        if met.count(name) >= MANY:
+            found.setdefault(name, _said(scene, name, "at several places on its way"))
+    return tuple(found.values())
 
 
 def _smooth(scene: Scene, nodes: LookedAt) -> dict[int, str]:

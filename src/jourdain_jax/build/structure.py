@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.build.plausibility import implausible, odd_gravity
+from jourdain_jax.build.plausibility import implausible, odd_gravity, odd_grounds
 from jourdain_jax.build.privileged import best_privileged, pivots_at, privileged_by_user, worst_pivot
 from jourdain_jax.build.probed import TIMED, Probed
 from jourdain_jax.build.probed_on_graph import follow_from_others, probed_on_graph
@@ -19,7 +19,7 @@ from jourdain_jax.build.rank import Scaled, contradictions, ranks_of, redundant_
 from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.row_lengths import speed_scales, typical_row_lengths
 from jourdain_jax.build.sampling import no_numbers, random_states, states_near_what_was_seen, symmetric_configurations, usable_states
-from jourdain_jax.build.smoothness import check_smoothness
+from jourdain_jax.build.smoothness import kinks
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.rows import UsualRows
@@ -56,6 +56,8 @@ class Structure:
     potentials_of_inputs: tuple[int, ...]  # numbers of the loads whose potential depends on inputs
     rows_of_inputs: bool  # rows depend on inputs, so that the accelerations depend on their rates
     chosen_by_user: bool
+    kinks: tuple[str, ...]  # what is not smooth, as sentences
+    odd_grounds: tuple[str, ...]  # grounds of contacts that move in another way than is stated
     faults: tuple[str, ...]  # numbers of bodies and planes that cannot be, and rows that contradict each other, as sentences
     row_lengths: np.ndarray = field(compare=False, repr=False)  # typical ones, in scaled speeds: what the length of a row is judged by
     plain_row_lengths: np.ndarray = field(compare=False, repr=False)  # in the speeds as they are
@@ -173,8 +175,9 @@ def structure_of(scene: Scene) -> Structure:
     `privileged` names unknown or too few speeds; for known parameters also where numbers of its bodies or planes cannot be, or rows contradict each other.
     """
     structure = structure_whatever_its_faults(scene)
-    if structure.faults and not is_traced(scene):  # numbers that stand in for traced parameters prove nothing
-        raise ValueError(structure.faults[0])
+    # numbers that stand in for traced parameters prove nothing of bodies and grounds
+    if wrong := structure.kinks or (not is_traced(scene) and (structure.odd_grounds or structure.faults)):
+        raise ValueError(wrong[0])
     return structure
 
 
@@ -226,8 +229,8 @@ def _probed_structure(scene: Scene) -> Structure:
         drawn = near
         t, u, generic, found = _at_probes(scene, *near)
     on_rows = usable_states(scene, found, generic)
-    check_smoothness(scene, found.q[on_rows & generic], u)
-    faults = implausible(scene, jax.tree.map(lambda x: x[on_rows], found.numbers))
+    numbers = jax.tree.map(lambda x: x[on_rows], found.numbers)
+    rough, grounds, faults = kinks(scene, found.q[on_rows & generic], u), odd_grounds(scene, numbers), implausible(scene, numbers)
     A = found.A * speed_scales(found.M)[:, None]
     usable = np.all(np.isfinite(A), axis=(1, 2)) & on_rows
     if not faults and not usable.any():
@@ -282,6 +285,8 @@ def _probed_structure(scene: Scene) -> Structure:
         potentials_of_inputs=tuple(k for k, rate in enumerate(found.potential_rates.T) if f"potential {k}" in unproved or _moves(rate)),
         rows_of_inputs=rows_of_inputs,
         chosen_by_user=by_user,
+        kinks=rough,
+        odd_grounds=grounds,
         faults=faults,
         row_lengths=typical,
         plain_row_lengths=typical_row_lengths(found.A[generic], beyond),

@@ -17,6 +17,7 @@ LEAST_PROBES = 12  # at which programs can be compared, where so many were found
 LARGE = 5000  # operations: above, fewer probes are compared with the dense path
 FEW = 6  # of these probes
 TO_DENSE = {"float64": 1e-8, "float32": 1e-3}  # between the program (in double precision) and the dense path at the probes, relative to the size of each rate
+DIFFERS = "differs from the dense path"
 AGREEMENT = 1e-9  # between programs at the probes, relative to the size of each rate
 SHARED = 0.01  # of these, relative to the largest rate at a probe, whose round-off elimination spreads over all
 
@@ -72,6 +73,6 @@ def check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGra
     if np.max(error) > limit:
         worst = names[int(np.argmax(error))]
         culprit = diagnose_mismatch(scene, builder.traced, probes, limit, parameters, t, q, u, inputs)
-        raise NotLowered(f"the rate of `{worst}` differs from the dense path by {np.max(error):.1e}: {culprit}")
+        raise NotLowered(f"the rate of `{worst}` {DIFFERS} by {np.max(error):.1e}: {culprit}")
     if found.events and not np.allclose(probes(found.events)[:, chosen][:, usable], dense.events.T[:, usable], rtol=limit, atol=limit, equal_nan=True):
-        raise NotLowered("the value of a stop event differs from the dense path")
+        raise NotLowered(f"the value of a stop event {DIFFERS}")
