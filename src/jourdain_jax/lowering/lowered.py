@@ -131,7 +131,7 @@ class Lowered:
         return tuple(jnp.asarray(x) for x in run(self.graph, self.fixed, known | self.usual_values(known)))
 
     def usual_values(self, parameters: dict) -> dict[int, Float[Array, ""]]:
-        """What stands for usual magnitudes: those over `states`, for these parameters; 1 for what vanishes at all of them. Numbers to differentiation."""
+        """What stands for usual magnitudes: geometric means over `states`, for these parameters. Numbers to differentiation."""
         if not self.usual:
             return {}
         parameters = jax.lax.stop_gradient(parameters)
@@ -253,6 +253,7 @@ class Lowered:
 
 
 def _usual(sizes: Float[Array, "states"]) -> Float[Array, ""]:
-    """The median, or the largest where half of them vanish, or 1; what is no number does not count, and no derivative passes through."""
-    median, largest = jnp.nanmedian(sizes), jnp.nanmax(sizes, initial=0.0)
-    return jax.lax.stop_gradient(jnp.where(median > 0, median, jnp.where(largest > 0, largest, 1.0)))
+    """The geometric mean of those that are numbers and not zero, or 1; no derivative passes through."""
+    counts = (sizes > 0) & jnp.isfinite(sizes)
+    total = jnp.sum(jnp.where(counts, jnp.log(jnp.where(counts, sizes, 1.0)), 0.0))
+    return jax.lax.stop_gradient(jnp.exp(total / jnp.maximum(jnp.sum(counts), 1)))

@@ -5,6 +5,7 @@ rows of numbers are put together, takes twice as long there. Derivatives of what
 too (`values_of_nodes.py`); those of other speeds are derivatives of the same by XLA (`lowering/lowered.py`).
 """
 
+import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 
@@ -208,38 +209,22 @@ def _write_usual(program: Lowered, w: Writer) -> None:
     given, nodes, states = _places_of(program), list(program.usual.values()), list(program.states)
     probes = len(next(iter(program.states.values()), (None,)))
     table = w.constants("probed", (x[p] for p in range(probes) for x in program.states.values())) if states else Value(w, "ptr", "null")
+    log, exp = FUNCTIONS["log"], FUNCTIONS["exp"]
     with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
-        seen = w.room(w.real, len(nodes) * probes)
+        totals = w.room(w.real, 2 * len(nodes))  # of logarithms, and of how many these are
+        for k in range(2 * len(nodes)):
+            w.store(w.number(0.0), totals, k)
         known = {n: w.load(w.real, state, k) for k, n in enumerate(given)}
         with w.counted(0, probes) as p:
             at = {n: w.spread(w.load("double", table, p * len(states) + k)) for k, n in enumerate(states)}
             for k, value in enumerate(written(w, program.graph, nodes, known | at)):
-                w.store(w.magnitude(as_real(w, value)), seen, p + k * probes)
-        with w.counted(0, len(nodes)) as k:
-            w.store(_median_or_largest(w, w.at(seen, k * probes, w.real), probes), found, k)
+                size = w.magnitude(as_real(w, value))
+                counts = (size > 0.0) & (size < math.inf)
+                more = log(w, w.where(counts, size, w.number(1.0))), w.where(counts, 1.0, w.number(0.0))
+                for place, x in zip((2 * k, 2 * k + 1), more, strict=True):
+                    w.store(w.load(w.real, totals, place) + x, totals, place)
+        for k in range(len(nodes)):
+            count = w.larger(w.load(w.real, totals, 2 * k + 1), w.number(1.0))
+            w.store(exp(w, w.load(w.real, totals, 2 * k) / count), found, k)
         w.give()
     write_rows(w, len(given), len(nodes))
-
-
-def _median_or_largest(w: Writer, seen: Value, count: int) -> Value:
-    """The median of numbers that are not negative, or the largest where that is zero, or 1; what is no number does not count. `seen` is sorted."""
-    numbers, median = w.room(w.real), w.room(w.real)
-    w.store(w.number(0.0), numbers)
-    w.store(w.number(0.0), median)
-    with w.counted(0, count) as i:
-        x = w.load(w.real, seen, i)
-        w.store(w.load(w.real, numbers) + w.where(w.is_nan(x), 0.0, w.number(1.0)), numbers)
-        w.store(w.where(w.is_nan(x), -1.0, x), seen, i)  # first, when sorted
-    with w.counted(0, count) as i, w.counted(0, w.literal(count - 1, "i64") - i) as j:
-        a, b = w.load(w.real, seen, j), w.load(w.real, seen, j + 1)
-        w.store(w.smaller(a, b), seen, j)
-        w.store(w.larger(a, b), seen, j + 1)
-    last = w.number(count - 1.0)
-    middle = last - (w.load(w.real, numbers) - 1.0) * 0.5  # a whole number, or half of one
-    with w.counted(0, count) as i:
-        away = w.magnitude(w.spread(w.converted("sitofp", i, "double")) - middle)
-        share = w.where(away.equals(0.0), 1.0, w.where(away.equals(0.5), 0.5, w.number(0.0)))
-        w.store(w.where(share.equals(0.0), w.load(w.real, median), w.fma(share, w.load(w.real, seen, i), w.load(w.real, median))), median)
-    largest = w.load(w.real, seen, count - 1)
-    size = w.where(w.load(w.real, median) > 0.0, w.load(w.real, median), w.where(largest > 0.0, largest, w.number(0.0)))
-    return w.where(size.equals(0.0), 1.0, size)
