@@ -45,6 +45,13 @@ def coordinate_rates(scene: Scene, t, q: Numbers, u: Numbers) -> Float[Array, "c
     return coordinate_rates_of(scene, t, scene.coordinate_names.view(q), scene.speed_names.view(u))
 
 
+def rates_by_own_speeds(scene: Scene, t, q: Numbers) -> Float[Array, "speeds coordinates"]:
+    """`N'` of `qdot = N u + nu`, one row for each speed of the scene's own; none where speeds are rates of coordinates, or of quaternions."""
+    if scene.speeds is None:
+        return jnp.zeros((0, len(scene.coordinate_names)))
+    return jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(jnp.zeros(len(scene.speed_names))).T
+
+
 def pose_at(scene: Scene, t, q: Numbers) -> Pose:
     """Poses of all bodies (m, inertial frame), sorted by name: the order in which JAX returns dictionaries, so that it is the same everywhere."""
     t, q = as_time(t), as_coordinates(scene, q)

@@ -128,11 +128,7 @@ def _marked(motion: Motions, retries: int) -> Motions:
 
 
 def may_be_another_form(field: VectorField) -> tuple[str, ...]:
-    """The values of `state` that let a motion that was lost in this form run again, with the full state and dense
-    matrices: none where rates of coordinates may become infinite, which those do not watch.
-    """
-    if field.lowered is not None and field.lowered.divisors:
-        return ()
+    """The values of `state` that let a motion that was lost in this form run again, with the full state and dense matrices."""
     return ("auto", "full") if field.name == "full" and field.lowered is not None else ("auto",) if field.name == "minimal" else ()
 
 

@@ -183,7 +183,7 @@ def _by_equations(problem: Problem, method: ImplicitMethod, p: Progress, h) -> t
     seen_at = problem.rates_and_pivots if monitored else lambda *given: (problem.rates(*given), None, None)
     slopes, seen, directions = jax.lax.map(lambda at: tuple(seen_at(*at, inside.args)), states)
     ends = [jax.tree.map(lambda k, y, i=i: as_in(k[i], y), slopes, p.y) for i in (0, 2)]
-    return found, ends, _pivots((jnp.min(seen, axis=0), jnp.max(seen, axis=0)), directions) if monitored else None
+    return found, ends, _pivots(seen, directions) if monitored else None
 
 
 def _relative(free: PyTree, y_0: PyTree, y_1: PyTree) -> Float[Array, ""]:
@@ -236,33 +236,23 @@ def stages(problem: Problem, method: Method, t, y: PyTree, h, monitored: bool = 
 
     def stage(carried, row):
         # k_i = f(y_i), then the next y_i: what is carried from stage to stage is computed once, whatever uses it
-        at, slopes, extremes = carried
+        at, slopes = carried
         c, i, next_A = row
         there = t + c * h, treedef.unflatten(at), problem.args
-        if monitored:
-            found, pivots, directions = problem.rates_and_pivots(*there)
-            extremes = jnp.minimum(extremes[0], pivots), jnp.maximum(extremes[1], pivots)
-        else:
-            found, directions = problem.rates(*there), None
+        found, *watched = problem.rates_and_pivots(*there) if monitored else (problem.rates(*there),)
         found = jax.tree.leaves(found)
         slopes = [jax.lax.dynamic_update_index_in_dim(k, as_in(f, k), i, 0) for k, f in zip(slopes, found, strict=True)]
-        return ([y + as_in(h, y) * weighted(next_A, k) for y, k in zip(leaves, slopes, strict=True)], slopes, extremes), (at, directions)
+        return ([y + as_in(h, y) * weighted(next_A, k) for y, k in zip(leaves, slopes, strict=True)], slopes), (at, watched)
 
     count = method.needed
     rows = (jnp.asarray(method.c[:count]), jnp.arange(count), jnp.asarray([*method.A[1:count], method.b]))
     slopes = [jnp.zeros((len(method.c), *y.shape), y.dtype) for y in leaves]
-    (y_1, slopes, extremes), (at, directions) = jax.lax.scan(stage, (leaves, slopes, _no_extremes(problem, t, y) if monitored else None), rows)
-    return Stages(treedef.unflatten(y_1), treedef.unflatten(slopes), treedef.unflatten(at), _pivots(extremes, directions) if monitored else None)
+    (y_1, slopes), (at, watched) = jax.lax.scan(stage, (leaves, slopes), rows)
+    return Stages(treedef.unflatten(y_1), treedef.unflatten(slopes), treedef.unflatten(at), _pivots(*watched) if monitored else None)
 
 
-def _no_extremes(problem: Problem, t, y: PyTree) -> tuple[Array, Array]:
-    """The lowest and the highest value of every pivot before any was seen."""
-    shape = jax.eval_shape(lambda: problem.rates_and_pivots(t, y, problem.args)[1])
-    return jnp.full(shape.shape, jnp.inf, shape.dtype), jnp.full(shape.shape, -jnp.inf, shape.dtype)
-
-
-def _pivots(extremes: tuple[Array, Array], directions: Float[Array, "stages rows speeds *lanes"]) -> Pivots:
-    lowest, highest = extremes
+def _pivots(seen: Float[Array, "stages pivots *lanes"], directions: Float[Array, "stages rows speeds *lanes"]) -> Pivots:
+    lowest, highest = jnp.min(seen, axis=0), jnp.max(seen, axis=0)
     turned = ~jnp.all(jnp.sum(directions[0] * directions, axis=2) > 0, axis=(0, 1))
     return Pivots(jnp.min(jnp.minimum(jnp.abs(lowest), jnp.abs(highest)), axis=0, initial=jnp.inf), jnp.any((lowest < 0) & (highest > 0), axis=0) | turned)
 

@@ -10,7 +10,7 @@ from jourdain_jax.calculus.pseudo_inverse import undecided
 from jourdain_jax.dynamics.accelerations import Baumgarte, bare_accelerations, reduced_at
 from jourdain_jax.dynamics.power import rate_of_work
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
-from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.kinematics import motion_at, rates_by_own_speeds
 from jourdain_jax.equations.minimal import MinimalKinematics, accelerations_of, minimal_kinematics
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.equations.reductions import Partition, Privileged, Reduced
@@ -34,9 +34,16 @@ class ByMatrices(VectorField):
         return inputs.near(t) if self.inputs_in_rows else inputs(t)
 
     def solved(self, scene: Scene, t, q, u, inputs) -> tuple[Motion, Reduced, Float[Array, "rows speeds"]]:
-        """The motion with these speeds, its accelerations by the reduction, and what must not turn round (`Watched.directions`)."""
+        """The motion with these speeds, its accelerations by the reduction, and what it leaves of rows that are nonlinear in the speeds."""
         found, equations, rows = reduced_at(scene, t, q, u, inputs, self.reduction, self.stabilisation, self.usual.rows)
         return motion_at(scene, t, q, u, inputs), found, _left_by_elimination(scaled(equations, rows).A[jnp.array(self.nonlinear_rows, int)])
+
+    def watched(self, scene: Scene, t, y: Integrated, rates: Integrated, pivots, rows) -> Watched:
+        """These rates, pivots and rows; and rates of coordinates by each speed of the scene's own, which must not become infinite."""
+        N = jax.lax.stop_gradient(rates_by_own_speeds(scene, t, y.q))
+        width = max(rows.shape[1], N.shape[1])
+        padded = [jnp.pad(x, ((0, 0), (0, width - x.shape[1]))) for x in (rows, N)]
+        return Watched(rates, jnp.append(pivots, self.usual.own_speeds / jnp.linalg.norm(N, axis=1)), jnp.concatenate(padded))
 
     def power(self, scene: Scene, motion: Motion, found) -> Float[Array, ""] | None:
         """The rate of the work that is integrated, W."""
@@ -75,7 +82,7 @@ class MinimalByMatrices(ByMatrices):
         motion, found = accelerations_of(scene, known, t, y.q, inputs) if own else self.solved(scene, t, y.q, known.u, inputs)[:2]
         v = found.udot[jnp.array(self.independent, jnp.int32)]
         rates = Integrated(motion.qdot.array, v, self.power(scene, motion, found))
-        return Watched(rates, known.split.orientation()[None], jnp.zeros((0, len(known.u))))
+        return self.watched(scene, t, y, rates, known.split.orientation()[None], jnp.zeros((0, len(known.u))))
 
     def _kinematics(self, scene: Scene, t, y: Integrated, inputs) -> MinimalKinematics:
         return minimal_kinematics(scene, self.independent, self.rows, t, y.q, y.v, inputs)
@@ -101,7 +108,7 @@ class FullByMatrices(ByMatrices):
     @property
     def has_pivots(self) -> bool:
         """Whether round-off might decide on which branch a motion goes on."""
-        return self.may_branch or bool(self.nonlinear_rows)
+        return self.may_branch or bool(self.nonlinear_rows) or len(self.usual.own_speeds) > 0
 
     def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "speeds"]:
         return y.v
@@ -115,9 +122,8 @@ class FullByMatrices(ByMatrices):
         """As `rates`; what is left of rows; and 1 where the rows say on which branch the motion goes on, -1 where round-off does."""
         motion, found, directions = self.solved(scene, t, y.q, y.v, inputs)
         rates = Integrated(motion.qdot.array, found.udot, self.power(scene, motion, found))
-        if not self.may_branch:
-            return Watched(rates, jnp.zeros(0, y.q.dtype), directions)
-        return Watched(rates, jnp.where(found.pivot > undecided(found.pivot.dtype), 1.0, -1.0).astype(found.pivot.dtype)[None], directions)
+        branch = jnp.where(found.pivot > undecided(found.pivot.dtype), 1.0, -1.0).astype(found.pivot.dtype)[None]
+        return self.watched(scene, t, y, rates, branch if self.may_branch else branch[:0], directions)
 
 
 def _left_by_elimination(A: Float[Array, "rows speeds"]) -> Float[Array, "rows speeds"]:
