@@ -94,6 +94,7 @@ def test_a_derivative_across_a_jump_warns_in_both_modes_outside_of_jit(backend):
         assert "`Pushed`" in said
         assert "leave out how the time of the jump moves" in said
     assert len(warned(jax.grad(f), -0.1)) == (backend == "dense")  # the jump is not met, which dense matrices do not see
+    assert len(warned(jax.grad(f, 1), -1.0, 0.4)) == 1
 
 
 class UntilThere(Pushed):

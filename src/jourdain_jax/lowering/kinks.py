@@ -6,6 +6,7 @@ What a call of JAX hides (`jnp.interp`, a callback) is not seen.
 import numpy as np
 
 from jourdain_jax.build.probed_on_graph import looked_at
+from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.build.structure import structure_whatever_its_faults
 from jourdain_jax.build.trace import TracedScene, named_values
 from jourdain_jax.equations.listed import names_of_bodies
@@ -26,6 +27,7 @@ def loads_have_relations(scene: Scene) -> bool:
 
 def loads_may_jump(scene: Scene) -> bool:
     """Whether loads or masses jump where the state or parameters say so: where time alone does, no derivative misses anything."""
+    scene = with_reference_parameters(scene)
     traced = looked_at(scene).traced
     graph, loads = traced.graph, list(_loads(scene, traced))
     moving = [*traced.q.tolist(), *traced.u.tolist(), *(n for leaf in traced.parameters for n in leaf.ravel().tolist())]

@@ -152,8 +152,9 @@ def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -
         return
     names = jax.tree.map(lambda x: x[0], motions.scene) if motions.q.ndim > 2 else motions.scene
     if moving_jumps(field, names, motions.inputs, scene_varies):
+        met = "crossed" if np.any(crossings > 0) else "may have crossed"
         text = (
-            f"a motion of `{type(motions.scene).__name__}` that is differentiated crossed relations (`<`, `where`, `sign`, `floor`, ...) at which loads jump: "
+            f"a motion of `{type(motions.scene).__name__}` that is differentiated {met} relations (`<`, `where`, `sign`, `floor`, ...) at which loads jump: "
             "its derivatives leave out how the time of the jump moves. Let loads change within a short time or length, as by `jnp.tanh`, or end the motion "
             "there by an event and start another; the motion itself is right"
         )
