@@ -109,7 +109,8 @@ class AppellOnGraph:
         g, at, q = self.graph, self.traced.at, self.traced.q.tolist()
         redundant = {s for s in range(len(at.closure)) if s not in self.rows and s not in self.multiplied}
         closure = [int(n) for s, n in enumerate(at.closure) if s not in redundant]
-        closure = g.substituted(closure, unaffected(self.identity_probes, closure, self._at_reference(ignorable)))
+        varying = tuple(i for i in ignorable if self.identity_probes.varies(str(g.value[q[i]])))  # others have one value on the rows, but derivatives by them
+        closure = g.substituted(closure, unaffected(self.identity_probes, closure, self._at_reference(varying)))
         moved = list(q)
         if closure:
             moved = projected_coordinates(g, q, [*closure, *self.traced.closures[len(at.closure) :]])
