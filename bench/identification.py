@@ -6,7 +6,7 @@ Parts: disc (one fit against SciPy), outlier, bound, starts (30 first guesses wi
 speed), chaotic (100 of a double pendulum, by growing spans and by multiple shooting), coverage, three (coverage of three models,
 unknown starts and sigmas, white noise and AR(1) noise), nuts (sampling by BlackJAX), disturbed (a motion with process noise), design (a start that tells more),
 windows (57 runs of the steer-by-wire bicycle with an unknown start each; the data are in `notebooks/data`), logs (what halves of these runs say of each other:
-numbers of the notebook on them), optimistix (its Levenberg-Marquardt on the same residuals: the disc, the 30 first guesses, the damping that is zero).
+numbers of the notebook on them).
 Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves out windows and logs, with fewer repeats.
 Times are processor time, the least of some repeats, in turn; those of the windows are wall time of a fresh process.
 """
@@ -31,7 +31,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))  # small 
 from small_scenes import Oscillator
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.asked import for_runs
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
@@ -181,57 +180,6 @@ def starts() -> list[Figure]:
         figure("first guesses within a factor of 5 from which the minimum is found, of 30", "tilting-disc", sum(best), 27, at_least=True),
         figure("of the others, without a warning", "tilting-disc", false, 0),
         figure("time from such a guess over that from one within a tenth", "tilting-disc", spent / one, 5),
-    ]
-
-
-def optimistix_minimum(residual):
-    """Levenberg-Marquardt of optimistix as one program: of first numbers and data, where it ends, its steps, whether it takes this as a minimum, and r'r."""
-    import optimistix
-
-    solver = optimistix.LevenbergMarquardt(rtol=1e-4, atol=1e-4)
-
-    def minimum(first, data):
-        found = optimistix.least_squares(residual, solver, first, data, options={"jac": "fwd"}, max_steps=256, throw=False)
-        return found.value, found.stats["num_steps"], found.result == optimistix.RESULTS.successful, jnp.sum(residual(found.value, data) ** 2)
-
-    return jax.jit(minimum)
-
-
-def by_optimistix(repeats: int) -> list[Figure]:
-    """Fits by the Levenberg-Marquardt of optimistix, with derivatives in forward mode; what is above zero is the exponential of an unknown (a bijection)."""
-
-    def of_disc(x, values):
-        scene, start = jj.models.TiltingDisc(radius=jnp.exp(x[0]), gravity=jnp.exp(x[1])), {"lean": x[2], "spin_rate": x[3]}
-        motion = jj.simulate(scene, start, ts=jnp.linspace(0.0, 2.0, 61), events=False, work=False, adjoint=diffrax.ForwardMode())
-        return jnp.concatenate([(motion[name] - values[name]) / SIGMA[name] for name in SIGMA])
-
-    def of_oscillator(x, values):
-        scene, ts = Oscillator(damping=jnp.exp(x[0]), stiffness=jnp.exp(x[1])), jnp.linspace(0.0, 10.0, 101)
-        return (jj.simulate(scene, {"x": 0.3}, ts=ts, events=False, work=False, adjoint=diffrax.ForwardMode())["x"] - values) / 0.01
-
-    data, minimum = disc_data(0), optimistix_minimum(of_disc)
-    values, first = {name: jnp.asarray(x) for name, x in data.values.items()}, jnp.array([np.log(0.55), np.log(10.8), 0.31, -2.9])
-    fit = jj.fit(jj.models.TiltingDisc(radius=0.55, gravity=10.8), data, ("radius", "gravity"))
-    again, lowest = for_runs(fit, data), float(fit.chi_square)
-    ours = lambda: again.problem.minimum(again.theta, np.zeros(1, int), again.limits, fit.asked.control, "")  # noqa: E731
-    times = processor_times({"optimistix": lambda: jax.block_until_ready(minimum(first, values)), "ours": ours}, repeats)
-    generator, ended = np.random.default_rng(4), []
-    for factors in np.exp(generator.uniform(-np.log(5), np.log(5), (30, 4))):
-        begin = [np.log(0.5 * factors[0]), np.log(9.81 * factors[1]), 0.3 * min(factors[2], 1.4 / 0.3), -3.0 * factors[3]]
-        _, _, done, squares = minimum(jnp.array(begin), values)
-        ended.append((bool(squares < lowest + 0.1), bool(done)))
-    model, bounded, ts, steps = "tilting-disc, by optimistix", optimistix_minimum(of_oscillator), np.linspace(0.0, 10.0, 101), []
-    for seed in range(10):
-        x = 0.3 * np.cos(np.sqrt(2.5) * ts) + 0.01 * np.random.default_rng(seed).normal(size=101)
-        _, taken, done, _ = bounded(jnp.log(jnp.array([float(Oscillator().damping), float(Oscillator().stiffness)])), jnp.asarray(x))
-        steps.append((int(taken), bool(done)))
-    return [
-        figure("steps of a warm fit", model, int(minimum(first, values)[1])),
-        figure("its time over that of ours, without what a fit does before and after", model, times["optimistix"] / times["ours"]),
-        figure("first guesses within a factor of 5 from which the minimum is found, of 30", model, sum(same for same, _ in ended)),
-        figure("of the others, taken as a minimum", model, sum(done and not same for same, done in ended)),
-        figure("fits to a damping of zero that converge in 256 steps, of ten", "oscillator, by optimistix", sum(done for _, done in steps)),
-        figure("steps of these, the most", "oscillator, by optimistix", max((taken for taken, done in steps if done), default=0)),
     ]
 
 
@@ -688,7 +636,6 @@ def main() -> None:
         "outlier": outlier,
         "bound": bound,
         "starts": starts,
-        "optimistix": lambda: by_optimistix(3 if options.quick else 15),
         "unstable": lambda: unstable(20 if options.quick else 100),
         "chaotic": lambda: chaotic(10 if options.quick else 100),
         "coverage": lambda: coverage(50 if options.quick else 500),

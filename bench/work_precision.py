@@ -3,9 +3,9 @@
     taskset -c 0 python bench/work_precision.py [--quick] [--json FILE] [--out DIR] [--problem NAME ...] [--part NAME ...]
     python bench/work_precision.py --redraw FILE --out DIR
 
-Writes a list of records (see `work_precision_cases/record.py`), among them how every reference was obtained ({"reference", ...}), peak memory
-({"memory", ...}), cold starts ({"cold", ...}) and the figures ({"figure", "value", "required", "met", "how"}); pictures (PNG and SVG); a table. The main chart
-is `work_precision.png`. Times are wall time of the fastest of some warm runs. Peers that are not installed are skipped with a message.
+Writes a list of records (see `work_precision_cases/record.py`), among them how every reference was obtained ({"reference", ...}); pictures
+(PNG and SVG); a table. The main chart is `work_precision.png`.
+Times are wall time of the fastest of some warm runs. Peers that are not installed are skipped with a message.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
 sys.path[:0] = [str(HERE), str(HERE.parent / "tests")]  # `tests/oracles` holds the closed forms
-PARTS = ("curves", "batches", "gradients", "memory", "cold")
+PARTS = ("curves", "batches")
 BEGIN = time.perf_counter()
 
 
@@ -29,10 +29,9 @@ def say(text: str) -> None:
     print(f"[{time.perf_counter() - BEGIN:6.0f} s] {text}", flush=True)
 
 
-def curves(names, quick: bool, ready: dict, methods=None) -> Iterator[dict]:
-    """References and single trajectories; the disc's methods are kept ready for the figures."""
+def curves(names, quick: bool, methods=None) -> Iterator[dict]:
+    """References and single trajectories."""
     from work_precision_cases import measure, ours, peer_c, peer_diffrax, peer_exudyn, peer_heyoka, peer_mujoco, peer_sympy
-    from work_precision_cases.figures import DISC
     from work_precision_cases.problems import PROBLEMS
 
     for name in names:
@@ -42,46 +41,28 @@ def curves(names, quick: bool, ready: dict, methods=None) -> Iterator[dict]:
         yield {"reference": name, "how": reference.how, "against": reference.against, "uncertainty": reference.uncertainty}
         peers = [*peer_sympy.curves(problem, quick), *peer_c.curves(problem), *peer_heyoka.curves(problem), *peer_diffrax.curves(problem, quick)]
         for curve in [*ours.curves(problem, quick), *peers, *peer_exudyn.curves(problem, quick), *peer_mujoco.curves(problem, quick)]:
-            if methods and curve.method not in methods:
-                continue
-            found, prepared = measure.points(problem, curve, say)
-            yield from found
-            if name == DISC and prepared is not None:
-                ready[curve.method] = prepared
+            if not methods or curve.method in methods:
+                yield from measure.points(problem, curve, say)[0]
 
 
 def measured(arguments) -> Iterator[dict]:
     """All records."""
-    from work_precision_cases import batches, fresh_process, gradients
-    from work_precision_cases.figures import figures
+    from work_precision_cases import batches
     from work_precision_cases.problems import PROBLEMS, QUICK
 
     names, quick = arguments.problem or (QUICK if arguments.quick else tuple(PROBLEMS)), arguments.quick
-    ready: dict = {}
-    so_far: list[dict] = []
     if "curves" in arguments.part:
-        for entry in curves(names, quick, ready, arguments.method):
-            so_far.append(entry)
-            yield entry
+        yield from curves(names, quick, arguments.method)
     for name in names:
         if "batches" in arguments.part and name in batches.PROBLEMS:
             say(f"batches: {name}")
             yield from batches.measured(PROBLEMS[name], quick, say)
-        if "gradients" in arguments.part and name in gradients.BY:
-            say(f"gradients: {name}")
-            yield from gradients.measured(PROBLEMS[name], say, quick)
-    if "memory" in arguments.part:
-        yield from fresh_process.memory(quick, say)
-    if "cold" in arguments.part and not quick:
-        yield from fresh_process.cold(say)
-    if ready:
-        yield from figures(so_far, ready)
 
 
 def main() -> None:
-    """Measure, or read what was measured; draw, tabulate, print the figures."""
+    """Measure, or read what was measured; draw and tabulate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="disc and sleigh, fewer methods, no cold starts: under two minutes")
+    parser.add_argument("--quick", action="store_true", help="disc and sleigh, fewer methods: under two minutes")
     parser.add_argument("--json", type=Path, metavar="FILE", help="file for the list of records")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for pictures and the table")
     parser.add_argument("--problem", nargs="*", metavar="NAME", help="only these problems")
@@ -98,15 +79,13 @@ def main() -> None:
             found.append(entry)
             if arguments.json:
                 arguments.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    from work_precision_cases.tables import summary, write_table
-
     if arguments.out:
         from work_precision_cases.draw import draw
+        from work_precision_cases.tables import write_table
 
         arguments.out.mkdir(parents=True, exist_ok=True)
         draw(found, arguments.out)
         write_table(found, arguments.out)
-    print(summary(found))
 
 
 if __name__ == "__main__":

@@ -1,10 +1,9 @@
 """Random admissible states of a scene, and all its reductions against each other there."""
 
-import jax
 import jax.numpy as jnp
+from solved_states import over_states
 
 import jourdain_jax as jj
-from jourdain_jax.eager.eager import eval_numpy
 
 
 def admissible_states(scene: jj.Scene, count: int, seed: int = 0) -> list[tuple]:
@@ -20,8 +19,6 @@ def disagreement(scene: jj.Scene, count: int = 20, seed: int = 0) -> dict[str, f
     """
     by_name = jj.reductions(scene)
 
-    @eval_numpy
-    @jax.vmap
     def all_of_them(t, q, u):
         found = {name: jj.accelerations(scene, t, q, u, reduction=reduction) for name, reduction in by_name.items()}
         equations = jj.unconstrained_equations(scene, t, q, u)
@@ -31,7 +28,7 @@ def disagreement(scene: jj.Scene, count: int = 20, seed: int = 0) -> dict[str, f
 
     states = admissible_states(scene, count, seed)
     assert len(states) >= count // 2
-    results, sizes = all_of_them(*map(jnp.stack, zip(*states, strict=True)))
+    results, sizes = over_states(all_of_them, *zip(*states, strict=True))
     return {
         name: max(_relative(*compared) for compared in zip(result[:2], results["qr"][:2], sizes, strict=True))
         for name, result in results.items()

@@ -12,19 +12,18 @@ from generated_scenes import LENGTHS, Recipe, body_name, coordinate_list, genera
 from seen_differently import Seen, other_names, views
 
 import jourdain_jax as jj
+from jourdain_jax import GibbsAppell, structure_of, velocity_residual
 from jourdain_jax.build.explicit_power import power_of_loads
 from jourdain_jax.build.reference_parameters import reference_parameters
-from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.null_space import null_space_qr, null_space_svd, present
 from jourdain_jax.dynamics.accelerations import diagnosed
 from jourdain_jax.dynamics.power import power
 from jourdain_jax.dynamics.reactions import row_reactions
 from jourdain_jax.eager.lanes import uncompiled
 from jourdain_jax.equations import virtual_power as equations_module
-from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
 from jourdain_jax.equations.reductions import Partition, _by_null_space, reduce
-from jourdain_jax.equations.rows import ConstraintRows, velocity_residual
+from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.equations.scaling import scaled
 
 PUSH = 0.7  # value of the input, where a scene has one

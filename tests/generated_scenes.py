@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jourdain_jax as jj
-from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.scene.scene import Scene
+from jourdain_jax import Scene
 
 GROUND = -1
 MOST_SPEEDS = 6
@@ -423,7 +422,6 @@ def generated(recipe: Recipe, seed: int) -> Scene:
     return scene.replace(anchors=_anchors(scene, scene.reference())) if rows else scene
 
 
-@eval_numpy
 def _anchors(scene, q):
     """Lengths of rods and points of joints that assemble the scene at q."""
     pose = jj.pose_at(scene, 0.0, q)

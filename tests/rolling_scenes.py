@@ -1,7 +1,6 @@
 """Scenes of bodies that roll on any ground, for the tests of contacts: free bodies with height rows, and carts on balls."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 import jourdain_jax as jj
@@ -109,12 +108,6 @@ class CartOnRows(Cart):
 
     def chassis(self, q):
         return jnp.stack([q.x, q.y, q.z]), jj.quaternion_to_matrix(q.frame)
-
-
-def rates_of_normal(scene, t, q, u):
-    """Normal n of the contact, and dn/dt along the motion."""
-    normal = lambda t, q: scene.contacts(jj.pose_at(scene, t, q))["touch"].plane.normal  # noqa: E731
-    return jax.jvp(normal, (t, q), (jnp.ones_like(t), jj.coordinate_rates(scene, t, q, u)))
 
 
 class BallInBowl(jj.Scene):

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import jourdain_jax as jj
+from jourdain_jax import Scene
 from jourdain_jax.equations.rows import position_rows, velocity_rows
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose, Motion, Pose
-from jourdain_jax.scene.scene import Scene
 
 
 class View(eqx.Module):

@@ -5,6 +5,33 @@ import jax.numpy as jnp
 import jourdain_jax as jj
 
 
+class OnLine(jj.Scene):
+    """A mass on the x axis, of 1 kg where a scene states no other."""
+
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(getattr(self, "mass", 1.0), jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+
+class OnPlane(jj.Scene):
+    """A mass in the plane of x and y."""
+
+    coordinates = jj.coordinates("x y")
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(getattr(self, "mass", 1.0), jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+
+class Upright(jj.Scene):
+    """A mass in the upright plane of x and z."""
+
+    coordinates = jj.coordinates("x z")
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(getattr(self, "mass", 1.0), jnp.stack([q.x, 0.0 * q.x, q.z]))}
+
+
 class DiscWithHeightRow(jj.Scene):
     """A disc with six coordinates that rolls without slip; its height is a row."""
 

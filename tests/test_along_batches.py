@@ -10,8 +10,7 @@ import pytest
 from test_inputs import OnBelt
 
 import jourdain_jax as jj
-from jourdain_jax.models import DoublePendulumRods, TiltingDiscQuaternion
-from jourdain_jax.models.registry import model
+from jourdain_jax.models import DoublePendulumRods, TiltingDiscQuaternion, model
 
 TS = np.linspace(0.0, 0.3, 4)
 BELT = {"speed": lambda t: 1.0 + t, "push": 0.5}

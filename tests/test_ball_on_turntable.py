@@ -9,7 +9,7 @@ from solved_states import solved_at_random_states
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.models.ball_on_turntable import BallOnTurntable
+from jourdain_jax.models import BallOnTurntable
 
 SOLID, HOLLOW = 2 / 5, 2 / 3
 

@@ -1,16 +1,16 @@
 """The baselines of `bench/` give the accelerations of the engine, and their operations are counted right."""
 
+import dataclasses
 import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from solved_states import over_states
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.scene.parameters import parameters_of
 
 hand_derived = pytest.importorskip("baselines.hand_derived", reason="the scripts of `bench/` are not here")
 from baselines import count, dense, disc_run, flat, heyoka_disc  # noqa: E402
@@ -30,12 +30,7 @@ def _forward(q, u):
 def _with_random_parameters(name: str) -> jj.Scene:
     """A model whose parameters differ from the defaults by up to 20 %, angles that are zero excepted: they become 0.2."""
     scene, generator = jj.models.MODELS[name](), np.random.default_rng(7)
-    return scene.replace(**{key: (float(value) or 0.2) * generator.uniform(0.8, 1.2) for key, value, _ in parameters_of(scene)})
-
-
-@eval_numpy
-def _engine(scene, t, q, u):
-    return jax.vmap(lambda t, q, u: (jj.coordinate_rates(scene, t, q, u), jj.accelerations(scene, t, q, u).udot))(t, q, u)
+    return scene.replace(**{key: (value or 0.2) * generator.uniform(0.8, 1.2) for key, value in _parameters(scene).items()})
 
 
 @functools.cache
@@ -44,7 +39,7 @@ def _solved(name: str):
     scene = _with_random_parameters(name)
     t, q, u = jj.sample_states(scene, STATES)
     assert len(t) == STATES
-    return scene, (t, q, u), *map(np.asarray, _engine(scene, t, q, u))
+    return scene, (t, q, u), *map(np.asarray, over_states(lambda *y: (jj.coordinate_rates(scene, *y), jj.accelerations(scene, *y).udot), t, q, u))
 
 
 def _assert_equal(found, expected, among=None):
@@ -58,7 +53,7 @@ def _columns(states) -> tuple:
 
 
 def _parameters(scene: jj.Scene) -> dict:
-    return {name: value for name, value, _ in parameters_of(scene)}
+    return {field.name: float(getattr(scene, field.name)) for field in dataclasses.fields(scene) if field.metadata}
 
 
 @pytest.mark.parametrize("name", hand_derived.HAND_DERIVED)
@@ -94,7 +89,7 @@ def test_dense_equations_give_the_rates_of_the_engine(name, rates):
 
 def test_the_dense_scripts_have_the_parameters_of_the_models():
     for name, parameters in (("tilting-disc", dense.DISC_PARAMETERS), ("whipple-bicycle", dense.BICYCLE_PARAMETERS)):
-        assert parameters == {key: float(value) for key, value, _ in parameters_of(jj.models.MODELS[name]())}
+        assert parameters == _parameters(jj.models.MODELS[name]())
 
 
 def test_dense_and_flat_equations_run_the_disc_to_the_same_end():

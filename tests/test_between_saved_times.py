@@ -5,10 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 from moving_linkages import NarrowPendulum, Parallelogram, SliderCrank, pendulum_angles, slider_crank_motion
 
 import jourdain_jax as jj
-from jourdain_jax.motion.trajectories import results
 
 SPEEDS = np.linspace(5.0, 10.0, 16)  # of the pendulum's x, m/s: some swing beyond the horizontal, some go round
 ENDS = {"one save": np.array([2.0]), "many saves": np.linspace(0.1, 2.0, 20)}

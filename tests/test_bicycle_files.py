@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.bicycle.parameter_files import measured_bicycle, read_bicycle, shipped_bicycles
+from jourdain_jax.bicycle import interval, measured_bicycle, read_bicycle, sample_parameters, shipped_bicycles
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, PARAMETERS
-from jourdain_jax.bicycle.uncertainty import interval, sample_parameters
 
 jax.config.update("jax_enable_x64", True)
 

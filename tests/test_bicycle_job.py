@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 from oracles import whipple_bicycle as oracle
 
-from jourdain_jax.bicycle.job import Refused, run, table, write_results
-from jourdain_jax.bicycle.linear import linear_matrices
-from jourdain_jax.bicycle.parameter_files import shipped_bicycles
+from jourdain_jax.bicycle import Refused, linear_matrices, run, shipped_bicycles, table, write_results
 from jourdain_jax.cli import main
 from jourdain_jax.cli.bicycle_verbs import prefixes
 

@@ -7,11 +7,10 @@ import pytest
 from oracles import whipple_bicycle as oracle
 from tolerances import tolerance
 
+from jourdain_jax.bicycle import eigenvalues, interval, read_bicycle, sample_parameters, shipped_bicycles, stability_speeds
 from jourdain_jax.bicycle.characteristic import BicycleMatrices
-from jourdain_jax.bicycle.parameter_files import read_bicycle, shipped_bicycles
 from jourdain_jax.bicycle.polynomial_roots import real_roots
-from jourdain_jax.bicycle.stability import characteristic_polynomial, eigenvalues, stability_speeds
-from jourdain_jax.bicycle.uncertainty import interval, sample_parameters
+from jourdain_jax.bicycle.stability import characteristic_polynomial
 
 jax.config.update("jax_enable_x64", True)
 

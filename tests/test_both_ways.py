@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jourdain_jax import DifferentiationModeError
 from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as
-from jourdain_jax.calculus.guards import DifferentiationModeError
 
 
 def plain(numbers, shift):

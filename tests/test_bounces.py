@@ -5,23 +5,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
+from machine_code import BACKENDS
+from small_scenes import Upright
 
 import jourdain_jax as jj
-from jourdain_jax.motion.trajectories import results
-from jourdain_jax.native import ffi
 
-BACKENDS = ("xla", *(() if ffi.reason_against() else ("native",)))
 G = 9.81
 
 
-class Ball(jj.Scene):
+class Ball(Upright):
     """A ball above a floor at `level`, between walls."""
 
     level: float = jj.parameter(0.0)
-    coordinates = jj.coordinates("x z")
-
-    def bodies(self, t, q):
-        return {"ball": jj.Particle(0.5, jnp.stack([q.x, 0.0 * q.x, q.z]))}
+    mass = 0.5
 
     def loads(self, motion):
         return (jj.gravity(motion, G),)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from code_map import MOST_FILES
+from small_scenes import OnPlane
 
 import jourdain_jax as jj
 from jourdain_jax.motion import input_programs
@@ -19,15 +20,11 @@ from jourdain_jax.motion.inputs import as_inputs
 K = 2.0
 
 
-class Pushed(jj.Scene):
+class Pushed(OnPlane):
     """A mass that two inputs push, on a spring."""
 
     stiffness: jnp.ndarray = jj.parameter(4.0, unit="N/m")
-    coordinates = jj.coordinates("x y")
     inputs = jj.inputs("f g")
-
-    def bodies(self, t, q):
-        return {"mass": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=motion.inputs.f - self.stiffness * motion.q.x, y_rate=motion.inputs.g),)

@@ -9,8 +9,7 @@ from scipy.special import ellipk
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.models.pendulum_chain import PendulumChain
-from jourdain_jax.models.trailer_chain import TrailerChain
+from jourdain_jax.models import PendulumChain, TrailerChain
 
 LENGTH, SPEED, TURN = oracle.RUN["length"], oracle.RUN["v"], oracle.RUN["w"]
 WEIGHTLESS = {"trailer_mass": 0.0, "trailer_inertia": 0.0}  # then the car's speed is constant too

@@ -10,7 +10,7 @@ import pytest
 
 import jourdain_jax as jj
 from jourdain_jax.cli import main
-from jourdain_jax.models.registry import MODELS
+from jourdain_jax.models import MODELS
 
 
 def run(capsys, *arguments):

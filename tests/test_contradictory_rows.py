@@ -5,33 +5,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
+from small_scenes import OnPlane
 
 import jourdain_jax as jj
-from jourdain_jax.motion.trajectories import results
 
 
-class TwoBelts(jj.Scene):
+class TwoBelts(OnPlane):
     """A block on two belts, which must run equally fast."""
 
-    coordinates = jj.coordinates("x y")
     inputs = jj.inputs("first second")
     mass: float = jj.parameter(1.0, unit="kg", positive=True)
-
-    def bodies(self, t, q):
-        return {"block": jj.Particle(self.mass, jnp.stack([q.x, q.y, 0.0 * q.x]))}
 
     def velocity_constraints(self, motion):
         return {"first": motion.u.x_rate - motion.inputs.first, "second": 10.0 * (motion.u.x_rate - motion.inputs.second)}
 
 
-class Circling(jj.Scene):
+class Circling(OnPlane):
     """A point whose speed is held twice: at one, and at what an input says."""
 
-    coordinates = jj.coordinates("x y")
     inputs = jj.inputs("speed")
-
-    def bodies(self, t, q):
-        return {"point": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
 
     def velocity_constraints(self, motion):
         squared = motion.u.x_rate**2 + motion.u.y_rate**2

@@ -10,13 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
+from machine_code import BACKENDS
+from small_scenes import OnPlane
 
 import jourdain_jax as jj
-from jourdain_jax.lowering.lower import lowered
-from jourdain_jax.motion.trajectories import results
-from jourdain_jax.native import ffi
-
-BACKENDS = ("xla", *(() if ffi.reason_against() else ("native",)))
 
 
 class Sliding(jj.Scene):
@@ -175,7 +173,7 @@ class Guarded(Sliding):
 
 
 def test_guards_and_smooth_functions_do_not_count():
-    assert lowered(Guarded()).relations == ()
+    assert jj.lower(Guarded()).relations == ()
     assert int(motion(Guarded(), {"x": -1.0, "x_rate": 1.5}).crossings) == 0
 
 
@@ -204,11 +202,7 @@ def test_a_motion_that_burns_its_steps_names_the_load_that_jumps():
     assert "the force along `x_rate` jumps, or has a kink, at the last state" in stuck.message
 
 
-class Ring(jj.Scene):
-    coordinates = jj.coordinates("x y")
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(1.0, jnp.stack([q.x, q.y, 0 * q.x]))}
+class Ring(OnPlane):
 
     def geometric_constraints(self, pose):
         return {"ring": pose.q.x**2 + pose.q.y**2 - 1.0}

@@ -3,8 +3,7 @@
 import pytest
 
 from jourdain_jax.dynamics.reduced import cyclic_coordinates, ignorable_coordinates
-from jourdain_jax.models import ChaplyginSleigh, Suslov, TiltingDisc, TwoWheelAxleCoordinates, TwoWheelAxleFree, TwoWheelAxleQuasi
-from jourdain_jax.models.whipple_bicycle import WhippleBicycle
+from jourdain_jax.models import ChaplyginSleigh, Suslov, TiltingDisc, TwoWheelAxleCoordinates, TwoWheelAxleFree, TwoWheelAxleQuasi, WhippleBicycle
 
 
 def test_positions_and_the_second_wheels_angle_of_the_axle_are_cyclic():

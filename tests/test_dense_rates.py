@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_scenes import OnPlane
 
 import jourdain_jax as jj
-from jourdain_jax.build.structure import structure_of
+from jourdain_jax import structure_of
 from jourdain_jax.lowering.dense_rates import _null_space, dense_rates
 
 STATES = 4
@@ -50,13 +51,9 @@ def test_they_are_nan_where_a_speed_has_no_inertia():
     np.testing.assert_allclose(found.ydot[1], [2.0 * 0.5**2, -2 * 1.0 * 0.5 / 2.0], rtol=1e-12)
 
 
-class SaidTwice(jj.Scene):
+class SaidTwice(OnPlane):
     """A particle on a circle, by two rows that depend on each other on the circle alone."""
 
-    coordinates = jj.coordinates("x y")
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(1.0, jnp.stack([q.x, q.y, 0 * q.x]))}
 
     def geometric_constraints(self, pose):
         circle = (pose.q.x**2 + pose.q.y**2 - 1.0) / 2

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.ensembles.samplers import permuted
 
 TWO = {"mass": jj.Normal(12.0, 0.3), "radius": jj.Uniform(0.3, 0.4)}
 SAMPLERS = ("random", "latin-hypercube", "sobol", "saltelli")
@@ -26,18 +25,11 @@ def test_more_samples_begin_with_the_same_ones(sampler):
     np.testing.assert_array_equal(few, many)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 63, 64, 65, 1000])
-def test_strata_are_permuted(count):
-    found = [permuted(5, number, np.arange(count), count) for number in range(2)]
-    for one in found:
-        np.testing.assert_array_equal(np.sort(one), np.arange(count))
-    assert count < 63 or not np.array_equal(*found)
-
-
-def test_a_latin_hypercube_has_one_sample_in_each_stratum():
-    at = jj.Design(TWO, sampler="latin-hypercube", samples=777, seed=1).values()
-    np.testing.assert_array_equal(np.sort(np.floor((at["radius"] - 0.3) / 0.1 * 777)), np.arange(777))
-    assert abs(np.mean(at["mass"]) - 12.0) < 1e-4
+@pytest.mark.parametrize("count", [1, 2, 3, 63, 64, 65, 777])
+def test_a_latin_hypercube_has_one_sample_in_each_stratum(count):
+    at = jj.Design(TWO, sampler="latin-hypercube", samples=count, seed=1).values()
+    np.testing.assert_array_equal(np.sort(np.floor((at["radius"] - 0.3) / 0.1 * count)), np.arange(count))
+    assert count < 777 or abs(np.mean(at["mass"]) - 12.0) < 1e-4
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,7 @@ from solved_states import solved_at_random_states, solved_by_every_reduction
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.models.tilting_disc import TiltingDisc
-from jourdain_jax.models.tilting_disc_quaternion import TiltingDiscQuaternion
-from jourdain_jax.models.vertical_disc import VerticalDisc
+from jourdain_jax.models import TiltingDisc, TiltingDiscQuaternion, VerticalDisc
 
 ROUND_OFF, CLOSED_FORM = tolerance("round_off"), tolerance("closed_form")
 RUN = rolling_disc.RUN
@@ -155,7 +152,7 @@ def test_the_free_disc_has_the_accelerations_of_the_disc_in_angles():
     angles, free = TiltingDisc(mass=1.3, radius=0.4), TiltingDiscQuaternion(mass=1.3, radius=0.4)
     _, q, u = (jnp.asarray(x) for x in jj.sample_states(angles, 20))
 
-    @eval_numpy
+    @jax.jit
     @jax.vmap
     def both(q, u):
         values = _free_body(*q[2:], *u[2:], 0.4)

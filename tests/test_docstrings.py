@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import pytest
 
 import jourdain_jax as jj
+from jourdain_jax import Contact
 from jourdain_jax.analysis.verification import Check
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions
 from jourdain_jax.motion.trajectories.diagnostics import Diagnostics, Energies
-from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.coordinates import Coordinates, Names
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose, Motion, Point, Pose
 from jourdain_jax.scene.names import Named

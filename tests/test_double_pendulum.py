@@ -7,9 +7,7 @@ from oracles import double_pendulum as oracle
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.models.double_pendulum_angles import DoublePendulumAngles
-from jourdain_jax.models.double_pendulum_rods import DoublePendulumRods
-from jourdain_jax.models.pendulum_chain import PendulumChain
+from jourdain_jax.models import DoublePendulumAngles, DoublePendulumRods, PendulumChain
 
 ANGLES, RODS = DoublePendulumAngles(), DoublePendulumRods()
 CHAIN = PendulumChain(links=2, mass=jnp.array([1.0, 0.7]), length=jnp.array([1.0, 0.8]))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jourdain_jax.eager.lanes import uncompiled_lanes
+from jourdain_jax.eager.lanes import uncompiled, uncompiled_lanes
 
 CONSTANT = np.arange(12.0).reshape(3, 4)
 
@@ -22,8 +22,8 @@ def _products(x, A):
 
 
 def _shapes(x, A):
-    stacked = jnp.stack([x, 2.0 * x, CONSTANT[0]], axis=1)
-    return stacked[::-1], jnp.concatenate([A, CONSTANT], 0)[1:5:2], A.T.reshape(2, 6), jnp.pad(x, (1, 2)), jnp.split(A, 2, axis=1), jnp.where(x[0] > 0, A, 1.0)
+    stacked, apart = jnp.stack([x, 2.0 * x, CONSTANT[0]], axis=1), (jnp.split(A, 2, axis=1), jnp.unstack(x))
+    return stacked[::-1], apart, jnp.concatenate([A, CONSTANT], 0)[1:5:2], A.T.reshape(2, 6), jnp.pad(x, (1, 2)), jnp.where(x[0] > 0, A, 1.0)
 
 
 def _places(x, A):
@@ -77,3 +77,45 @@ def test_what_no_result_needs_is_not_worked_out():
 
     assert uncompiled_lanes(lambda x: both(x)[1])(np.ones(3)).tolist() == [2.0, 2.0, 2.0]
     assert not asked
+
+
+def test_indexing_and_linear_systems_run_uncompiled_give_what_jax_gives():
+    def f(A, b):
+        entries, k = jnp.array([2, 0, 2]), jnp.array([1, 0])
+        put = jnp.zeros((4, 3)).at[jnp.array([3, 1])].set(A[:2]).at[:, k].set(1.5)
+        LU, swaps, order = jax.lax.linalg.lu(A)
+        clipped = A[jnp.array([0, 7])]  # out of bounds: left to JAX
+        window = jax.lax.dynamic_slice(A, (1, 0), (2, 2))
+        taken = A[entries], A[:, k], A[entries[:2], k], jnp.diag(A), clipped, window, A[order, 1], A.at[order].set(2 * A)
+        return taken, put, LU, swaps, order, jnp.linalg.solve(A, b), jnp.linalg.det(A)
+
+    rng = np.random.default_rng(1)
+    A, b = rng.normal(size=(5, 3, 3)), rng.normal(size=(5, 3))
+    A[1, 0] = 0.0  # singular
+    for transform, given in ((lambda f: f, (A[0], b[0])), (jax.vmap, (A, b))):
+        expected = transform(f)(*map(jnp.asarray, given))
+        for x, y in zip(jax.tree.leaves(uncompiled(transform(f))(*given)), jax.tree.leaves(expected), strict=True):
+            assert x.dtype == y.dtype
+            good = np.isfinite(y)
+            np.testing.assert_allclose(x[good], np.asarray(y)[good], rtol=1e-11, atol=1e-12)
+
+
+def test_a_singular_matrix_run_uncompiled_gives_nan_as_jax_does():
+    f = jax.vmap(jnp.linalg.cholesky)
+    A = np.stack([np.eye(2), -np.eye(2)])
+    np.testing.assert_array_equal(np.isnan(uncompiled(f)(A)), np.isnan(f(A)))
+
+
+def test_integers_and_rounding_run_uncompiled_are_those_of_jax():
+    n, flags = np.array([5, 6, -7]), np.array([True, False, True])
+    x = np.array([0.5, 1.5, 2.5, -0.5, -2.5, 0.49999999999999994, 3.2, -3.7])
+
+    def f(n, flags, x):
+        m = n[::-1]
+        of_integers = n & m, n | m, n ^ m, ~n, jnp.bitwise_and.reduce(n), jnp.bitwise_or.reduce(n)
+        of_flags = flags & flags[::-1], flags | flags[::-1], flags ^ flags[::-1], ~flags, jnp.all(flags), jnp.any(flags)
+        return of_integers, of_flags, jax.lax.round(x), jnp.round(x)
+
+    for found, expected in zip(jax.tree.leaves(uncompiled(f)(n, flags, x)), jax.tree.leaves(f(n, flags, x)), strict=True):
+        assert found.dtype == expected.dtype
+        np.testing.assert_array_equal(found, expected)

@@ -4,18 +4,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 from generated_robots import BeadOnCurve, PlanarRobot, drawn
 
 import jourdain_jax as jj
-from jourdain_jax.build.structure import structure_of
+from jourdain_jax import NullSpaceQR, structure_of
 from jourdain_jax.build.trace import named_values
 from jourdain_jax.dynamics.accelerations import bare_accelerations
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.minimal import accelerations_of, minimal_kinematics
-from jourdain_jax.equations.reductions import SMALLEST_PIVOT, NullSpaceQR
+from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.lowering.lower import lowered
-from jourdain_jax.models.trailer_chain import TrailerChain
-from jourdain_jax.motion.trajectories import results
+from jourdain_jax.models import TrailerChain
 from jourdain_jax.program.evaluate import Probes
 
 WEIGHTLESS = {"trailer_mass": 0.0, "trailer_inertia": 0.0}

@@ -4,34 +4,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
+from small_scenes import OnLine, OnPlane
 
 import jourdain_jax as jj
-from jourdain_jax.motion.trajectories import results
 
 
-class Step(jj.Scene):
+class Step(OnPlane):
     """A particle that flies over an edge of the potential, `height` (J) high and `width` (m) wide, at x = 1 m."""
 
-    coordinates = jj.coordinates("x y")
     height: float = jj.parameter(2.0, unit="J")
     width: float = jj.parameter(1e-9, unit="m")
-
-    def bodies(self, t, q):
-        return {"ball": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
 
     def potential(self, pose):
         return self.height * jax.nn.sigmoid((pose.q.x - 1.0) / self.width)
 
 
-class Spring(jj.Scene):
+class Spring(OnLine):
     """An oscillator."""
 
-    coordinates = jj.coordinates("x")
     k: float = jj.parameter(4.0, unit="N/m")
     level: float = jj.parameter(0.0, unit="J")
-
-    def bodies(self, t, q):
-        return {"ball": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def potential(self, pose):
         return self.level + 0.5 * self.k * pose.q.x**2

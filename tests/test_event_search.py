@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 
 import jourdain_jax as jj
 from jourdain_jax.motion.integrators import erk_loop
 from jourdain_jax.motion.integrators.tableaus import method_of
-from jourdain_jax.motion.trajectories import results
 
 GRAVITY = 9.81
 

@@ -5,13 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
+from machine_code import BACKENDS
 
 import jourdain_jax as jj
-from jourdain_jax.lowering.lower import lowered
-from jourdain_jax.motion.trajectories import results
-from jourdain_jax.native import ffi
 
-BACKENDS = ("xla", *(() if ffi.reason_against() else ("native",)))
 A, W = 0.9, 0.006  # where a bead of 1 m/s that begins at 0 meets them; 0.3 % of the span
 
 # value of (x, t, a, w), and where it stops
@@ -54,7 +52,7 @@ def scene_of(kind: str):
 @pytest.mark.parametrize("kind", [kind if kind in USUAL else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS])
 def test_a_short_window_is_met(kind):
     scene, start = scene_of(kind)(), {"x": 0.0, "x_rate": 1.0}
-    assert lowered(scene).event_relations
+    assert jj.lower(scene).event_relations
     for backend in BACKENDS:
         motion = jj.simulate(scene, start, ts=[2.0], backend=backend)
         assert motion.event_names[int(motion.event)] == "met"
@@ -78,5 +76,5 @@ def test_values_with_a_peak_where_a_relation_changes_are_not_watched():
         def events(self, motion):
             return {"low": 1.5 - jnp.abs(motion.q.x), "walls": jnp.minimum(2.0 - motion.q.x, motion.q.x + 2.0)}
 
-    assert lowered(Leaning()).event_relations == ()
-    assert lowered(jj.models.TiltingDisc()).event_relations == lowered(jj.models.WhippleBicycle()).event_relations == ()
+    assert jj.lower(Leaning()).event_relations == ()
+    assert jj.lower(jj.models.TiltingDisc()).event_relations == jj.lower(jj.models.WhippleBicycle()).event_relations == ()

@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
+from small_scenes import OnLine
 
 import jourdain_jax as jj
-from jourdain_jax.motion.trajectories import results
 
 DIFFRAX = {"solver": diffrax.Dopri5(), "stepsize_controller": diffrax.PIDController(rtol=1e-9, atol=1e-9)}
 LOOPS = {"lean": {}, "diffrax": DIFFRAX}
@@ -116,18 +117,14 @@ def test_the_second_derivative_of_one_of_several_events_is_its_own(plane):
     np.testing.assert_allclose(jax.hessian(end)(place), jax.hessian(closed)(place), rtol=1e-6, atol=1e-9)
 
 
-class Bounded(jj.Scene):
+class Bounded(OnLine):
     """A particle without forces; event values that are no numbers beyond edges of their own."""
 
     arc: object = jj.parameter(1.0)
     root: object = jj.parameter(1e3)
     jump: object = jj.parameter(1e3)
     positive: object = jj.parameter(1e3)
-    coordinates = jj.coordinates("x")
     example = {"x_rate": 1.0}
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def events(self, motion):
         x = motion.q.x

@@ -9,20 +9,20 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import machine_code
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 from tolerances import tolerance
 
 import jourdain_jax as jj
+from jourdain_jax import Lowered
 from jourdain_jax.build.trace import named_values
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.lowering.lower import lowered
-from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.simulate import set_up
-from jourdain_jax.native import ffi
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.scene.parameters import parameters_of
 
@@ -31,7 +31,7 @@ QUICK = {"skate", "chaplygin-sleigh"}  # a full state with projection, a minimal
 SPAN = 0.4
 FORWARD = diffrax.ForwardMode()
 
-natively = pytest.mark.skipif(bool(ffi.reason_against()), reason=ffi.reason_against())
+natively = machine_code.needed
 
 
 def other_parameters(name: str, seed: int) -> jj.Scene:

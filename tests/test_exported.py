@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
+from jourdain_jax import DifferentiationModeError
 from jourdain_jax.calculus.elsewhere import or_elsewhere
-from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.native import ffi
 
 SKATE = jj.models.Skate()

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_scenes import OnLine
 
 import jourdain_jax as jj
 
@@ -22,17 +23,13 @@ LOOPS = {
 FAR = (1.7e9, -3.0e8, 86400.0)
 
 
-class Oscillator(jj.Scene):
+class Oscillator(OnLine):
     """An oscillator that a force of the clock drives, and that stops where it passes x = -0.999."""
 
     stiffness: object = jj.parameter(1e4)
     driven: object = jj.parameter(0.0)
     stops: object = jj.parameter(2.0)
-    coordinates = jj.coordinates("x")
     example = {"x": 1.0}
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=self.driven * jnp.cos(2.0 * motion.t) - self.stiffness * motion.q.x),)

@@ -15,12 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 from oracles import chaplygin_sleigh, skate
 from tolerances import relative_error
 
 import jourdain_jax as jj
 from jourdain_jax.models import MODELS
-from jourdain_jax.motion.trajectories import results
 
 NAMES = ("skate", "chaplygin-sleigh", "tilting-disc-quaternion")
 WITH_GRADIENT = ("chaplygin-sleigh",)

@@ -6,7 +6,6 @@ import pytest
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.scene.validated import visuals_of
 
 # every body has one geom, or principal moments: MuJoCo diagonalises the inertia of several with an error of 1e-10
 EVERYTHING = """
@@ -186,7 +185,7 @@ def test_two_rods_move_as_those_that_are_written_by_hand():
 
 def test_geoms_are_drawn():
     scene = jj.from_mjcf(DEGREES)()
-    looks = visuals_of(scene, jj.pose_at(scene, 0.0, jj.start(scene, **scene.example).q))
+    looks = scene.visuals(jj.pose_at(scene, 0.0, jj.start(scene, **scene.example).q))
     assert {name: [look.kind for look in found] for name, found in looks.items()} == {
         "base": ["box"],
         "upper": ["capsule"],

@@ -10,7 +10,6 @@ import pytest
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.scene.validated import visuals_of
 
 PAGE = Path(__file__).parents[1] / "docs" / "howto" / "from_other_tools.md"
 ROBOT = re.search(r":caption: robot.urdf\n\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL).group(1)
@@ -171,7 +170,7 @@ def test_joints_of_several_coordinates_move_as_a_free_body(kind, speeds):
 def test_shapes_are_drawn_where_the_file_has_them():
     scene = jj.from_urdf(ARM)()
     pose = jj.pose_at(scene, 0.0, [0.3, 0.2, 0.5])
-    looks = visuals_of(scene, pose)
+    looks = scene.visuals(pose)
     assert {name: [look.kind for look in found] for name, found in looks.items()} == {"": ["box", "ellipsoid"], "first": ["box"], "second": ["cylinder"]}
     first = looks["first"][0]
     assert (first.colour, first.opacity) == ("#ff8000", 0.5)
@@ -192,7 +191,7 @@ def test_meshes_are_found_in_packages_and_beside_the_file(tmp_path):
     link = LINK.format("b").replace("</link>", "".join(map(mesh.format, names)) + "</link>")
     (folder / "r.urdf").write_text(f'<robot name="r">{link}</robot>')
     scene = jj.from_urdf(folder / "r.urdf", base="free")()
-    looks = visuals_of(scene, jj.pose_at(scene, 0.0, scene.coordinates.reference()))["b"]
+    looks = scene.visuals(jj.pose_at(scene, 0.0, scene.coordinates.reference()))["b"]
     assert [look.kind for look in looks] == ["mesh", "mesh"]
     np.testing.assert_allclose(looks[0].size, [0.1, 0.1, 0.2])
 

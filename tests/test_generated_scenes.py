@@ -15,11 +15,11 @@ from generated_scenes import KINDS, Recipe, generated, recipe
 from tolerances import tolerance
 
 import jourdain_jax as jj
+from jourdain_jax import Lowered
 from jourdain_jax.build.trace import named_values
 from jourdain_jax.equations import instant, virtual_power
 from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.lowering.lower import lowered
-from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.program.evaluate import Probes
 
 STRUCTURES = range(25)

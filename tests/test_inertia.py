@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 from tolerances import tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.motion.trajectories import results
 
 
 class Weightless(jj.Scene):

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 
 import jourdain_jax as jj
-from jourdain_jax.motion.trajectories import results
 
 # the rate of the coordinate a for the speed w, and whether it becomes infinite between 1 and -1
 RATES = {

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from small_scenes import OnPlane
 
 import jourdain_jax as jj
 from jourdain_jax.models import ChaplyginSleigh
@@ -187,14 +188,10 @@ def test_potentials_that_depend_on_inputs_are_found_and_named():
 # Rows that depend on inputs. ------------------------------------------------------------------------------------------
 
 
-class Towed(jj.Scene):
+class Towed(OnPlane):
     """A particle on a belt at 45 degrees, which moves along y at the speed of an input."""
 
-    coordinates = jj.coordinates("x y")
     inputs = jj.inputs("speed")
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
 
     def velocity_constraints(self, motion):
         return {"belt": motion.u.y_rate - motion.u.x_rate - motion.inputs.speed}

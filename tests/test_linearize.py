@@ -9,12 +9,8 @@ from small_scenes import DrivenPendulum
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.linearize import linearize
-from jourdain_jax.models.double_pendulum_angles import DoublePendulumAngles
-from jourdain_jax.models.free_rigid_body import FreeRigidBody
-from jourdain_jax.models.tilting_disc import TiltingDisc
-from jourdain_jax.models.tilting_disc_quaternion import TiltingDiscQuaternion
-from jourdain_jax.models.whipple_bicycle import WhippleBicycle
+from jourdain_jax import linearize
+from jourdain_jax.models import DoublePendulumAngles, FreeRigidBody, TiltingDisc, TiltingDiscQuaternion, WhippleBicycle
 
 SPEEDS = np.arange(11.0)
 DISC = {"mass": 1.0, "radius": 0.5, "gravity": 9.81}

@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 from tolerances import tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.build.structure import LONG, structure_of
+from jourdain_jax import structure_of
+from jourdain_jax.build.structure import LONG
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.models import MODELS
-from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.vector_fields.choice import vector_field
 
 

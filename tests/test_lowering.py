@@ -12,7 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 from baselines.hand_derived import HAND_DERIVED, operations
+from small_scenes import OnLine, Upright
 
 import jourdain_jax as jj
 from jourdain_jax.build.trace import event_values
@@ -21,7 +23,6 @@ from jourdain_jax.equations.minimal import minimal_kinematics
 from jourdain_jax.lowering import lower as module
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.batches import lockstep
-from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.vector_fields.choice import vector_field
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.fused import fused
@@ -158,14 +159,10 @@ def test_a_notebook_shows_short_equations_and_the_summary_of_long_ones():
     assert long._repr_latex_() is None
 
 
-class Sloped(jj.Scene):
+class Sloped(OnLine):
     """A point that a number, no parameter, pushes along x."""
 
     push = 9.81 * np.sin(0.3)
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"point": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=self.push),)
@@ -285,15 +282,11 @@ def test_what_a_scene_has_not_costs_nothing():
     assert not needs_work(MODELS["tilting-disc"](), jj.structure_of(MODELS["tilting-disc"]()))  # nothing integrated but the motion
 
 
-class Falling(jj.Scene):
+class Falling(Upright):
     """A stone."""
 
     mass: jnp.ndarray = jj.parameter(1.3, unit="kg", positive=True)
     gravity: jnp.ndarray = jj.parameter(9.81, unit="m/s^2")
-    coordinates = jj.coordinates("x z")
-
-    def bodies(self, t, q):
-        return {"stone": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, q.z]))}
 
     def loads(self, motion):
         return (jj.gravity(motion, self.gravity),)

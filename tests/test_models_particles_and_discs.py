@@ -6,23 +6,22 @@ import pytest
 from tolerances import tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.models.ball_on_turntable import BallOnTurntable
-from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
-from jourdain_jax.models.heisenberg_particle import HeisenbergParticle
-from jourdain_jax.models.isokinetic_particle import IsokineticParticle
-from jourdain_jax.models.rosenberg_particle import RosenbergParticle
-from jourdain_jax.models.skate import Skate
-from jourdain_jax.models.spring_and_rod import SpringAndRod
-from jourdain_jax.models.tilting_disc import TiltingDisc
-from jourdain_jax.models.tilting_disc_quaternion import TiltingDiscQuaternion
-from jourdain_jax.models.two_wheel_axle import (
+from jourdain_jax.models import (
+    BallOnTurntable,
+    ChaplyginSleigh,
+    HeisenbergParticle,
+    IsokineticParticle,
+    RosenbergParticle,
+    Skate,
+    SpringAndRod,
+    TiltingDisc,
+    TiltingDiscQuaternion,
     TwoWheelAxleCoordinates,
     TwoWheelAxleFree,
     TwoWheelAxleQuasi,
     TwoWheelAxleRedundant,
+    VerticalDisc,
 )
-from jourdain_jax.models.vertical_disc import VerticalDisc
 
 # Scene, degrees of freedom.
 SCENES = [
@@ -61,7 +60,7 @@ def test_the_scene_has_its_degrees_of_freedom(scene, freedoms):
 def test_known_integrals_do_not_change_along_the_motion(scene):
     t, q, u = _states(scene, 20)
 
-    @eval_numpy
+    @jax.jit
     @jax.vmap
     def rates(t, q, u):
         udot = jj.accelerations(scene, t, q, u).udot

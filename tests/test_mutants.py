@@ -16,18 +16,18 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 from tolerances import tolerance
 
 import jourdain_jax as jj
+from jourdain_jax import Lowered
 from jourdain_jax.build.trace import named_values
 from jourdain_jax.dynamics.power import power
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.lowering import appell, kept_rows, lower
-from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.integrators import crossings, erk_loop, erk_step, event_search, recorded_adjoint, step_adjoint
 from jourdain_jax.motion.integrators.tableaus import method_of
-from jourdain_jax.motion.trajectories import results
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 

@@ -9,6 +9,7 @@ import warnings
 from itertools import permutations
 from types import SimpleNamespace
 
+import machine_code
 import pytest
 
 from jourdain_jax.native import disk, ffi, host
@@ -170,7 +171,7 @@ def _kept_by_a_process(folder, seed, names) -> set[str]:
     return {file.name for file in folder.iterdir()}
 
 
-@pytest.mark.skipif(bool(host.reason_against()), reason=host.reason_against())
+@machine_code.needed
 @pytest.mark.parametrize("names", [("tilting-disc",), pytest.param(("whipple-bicycle", "snakeboard", "trailer-chain", "rattleback"), marks=pytest.mark.slow)])
 def test_every_process_writes_the_same_programs(tmp_path, names):
     """Files are named by their programs' text: an order of sets of texts, which differs from process to process, would give others."""
@@ -188,7 +189,7 @@ def test_the_oldest_go_where_there_is_no_room(folder, monkeypatch):
     assert (folder / "c.o").exists()
 
 
-@pytest.mark.skipif(bool(host.reason_against()), reason=host.reason_against())
+@machine_code.needed
 def test_code_for_another_program_effort_machine_or_compiler_has_another_name(monkeypatch):
     class Asked(Exception):
         """With the name of a file."""

@@ -3,35 +3,29 @@
 import diffrax
 import jax
 import jax.numpy as jnp
+import machine_code
 import numpy as np
 import pytest
 from ends_of_models import end_of_model
+from small_scenes import OnLine
 
 import jourdain_jax as jj
-from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.motion.forward_mode import simulate_alongside, simulate_forward
-from jourdain_jax.motion.integrators import erk_loop
-from jourdain_jax.native import host
 from jourdain_jax.program import emit
 from jourdain_jax.program.derivative import cotangents, jacobian
 from jourdain_jax.program.graph import Graph
 
-pytestmark = pytest.mark.skipif(bool(host.reason_against()), reason=host.reason_against())
+pytestmark = machine_code.needed
 
 FORWARD = diffrax.ForwardMode()
 
 
-class Oscillator(jj.Scene):
+class Oscillator(OnLine):
     """A particle on a spring with a constant push, and a wall at x = -wall."""
 
     mass: object = jj.parameter(1.5, unit="kg", positive=True)
     stiffness: object = jj.parameter(6.0, unit="N/m", positive=True)
     wall: object = jj.parameter(0.8, unit="m")
-    coordinates = jj.coordinates("x")
     inputs = jj.inputs("push")
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=motion.inputs.push - self.stiffness * motion.q.x),)
@@ -142,15 +136,6 @@ def test_derivatives_pass_through_motions_one_after_the_other(adjoint):
     np.testing.assert_allclose(found, jax.jacfwd(lambda k: _exact(X.at[1].set(k))[2:4])(X[1]), rtol=1e-8)
 
 
-@pytest.mark.parametrize("adjoint", [None, FORWARD], ids=["reverse", "forward"])
-def test_the_loop_of_xla_is_not_traced(adjoint, monkeypatch):
-    monkeypatch.setattr(erk_loop, "integrate", lambda *a: pytest.fail("the loop of XLA was traced"))
-    mode = jax.grad if adjoint is None else jax.jacfwd
-    eval_numpy(mode(lambda x: _ends(x, adjoint=adjoint, max_steps=1234)[2]))(X)
-    slope = eval_numpy(mode(lambda t: _ends(X, adjoint=adjoint, max_steps=1234, ts=jnp.array([0.1, 0.3, 0.9]) * t, t1=3.0 * t)[2]))(1.0)
-    np.testing.assert_allclose(slope, 3.0 * _exact(X)[3], rtol=1e-8)
-
-
 @pytest.mark.parametrize("seed", range(6))
 def test_cotangents_of_a_program_are_its_jacobian_transposed(seed):
     random, graph = np.random.default_rng(seed), Graph()
@@ -213,23 +198,3 @@ def test_both_modes_of_a_model_agree(name):
 def test_tangents_of_a_model_are_those_of_xla(name):
     found, expected = (_slope(name, backend, FORWARD) for backend in ("native", "xla"))
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.max(np.abs(expected)))
-
-
-def test_values_and_all_directions_of_a_jacobian_come_from_one_run():
-    def places(simulate):
-        def of(x):
-            scene = jj.models.ChaplyginSleigh(inertia=x[0], offset=x[1])
-            q = simulate(scene, {"x_rate": x[2], "heading_rate": 0.9}, ts=jnp.linspace(0.0, 0.5, 6), events=False, work=False).q
-            return q, q
-
-        return jax.jacfwd(of, has_aux=True)
-
-    xs, runs = jnp.array([[0.4, 0.25, -0.6], [0.5, 0.2, 0.7]]), {}
-    for simulate in (simulate_alongside, simulate_forward):
-        runs[simulate] = str(jax.make_jaxpr(places(simulate))(xs[0])).count("jourdain_machine_code[")
-    assert runs[simulate_alongside] == runs[simulate_forward] - 1
-    expected = eval_numpy(jax.vmap(places(simulate_forward)))(xs)
-    along = places(simulate_alongside)
-    for found, theirs in ((eval_numpy(along)(xs[0]), [x[0] for x in expected]), (eval_numpy(jax.vmap(along))(xs), expected)):  # one motion, and lanes
-        for one, other in zip(found, theirs, strict=True):
-            np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)

@@ -1,20 +1,18 @@
 """Inputs that are functions of time, in machine code: motions and derivatives are those of closed forms and of XLA."""
 
-import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import diffrax
 import jax
 import jax.numpy as jnp
+import machine_code
 import numpy as np
 import pytest
+import result_codes as results
 
 import jourdain_jax as jj
-from jourdain_jax.motion.trajectories import results
-from jourdain_jax.native import disk, ffi, host
-from jourdain_jax.native.ir import Writer
 
-pytestmark = pytest.mark.skipif(bool(ffi.reason_against()), reason="no machine code is made here")
+pytestmark = machine_code.needed
 TS = np.array([0.3, 1.0, 1.7, 2.5])
 TIGHT = {"rtol": 1e-11, "atol": 1e-11, "work": False}
 ADJOINTS = {"reverse": (None, jax.jacrev), "forward": (diffrax.ForwardMode(), jax.jacfwd)}
@@ -119,22 +117,12 @@ def test_arrays_that_a_function_closes_over_have_derivatives_beside_one_that_clo
         np.testing.assert_allclose(column, position(TS, 0.0, 4.0, 1.0, b), rtol=0, atol=1e-8)
 
 
-def test_another_function_that_does_the_same_makes_no_other_machine_code():
-    def end(c):
-        return jj.simulate(Pushed(), {"x": 0.1}, ts=TS, inputs={"force": lambda t: c * t}, **TIGHT)["x"][-1]
+def test_threads_that_make_the_same_machine_code_at_once_all_get_it():
+    class Fresh(Pushed):
+        """A scene of which nothing is known yet."""
 
-    ends, made = [end(1.0)], ffi.registered.cache_info().misses
-    ends += [end(2.0), end(3.0)]
-    assert ffi.registered.cache_info().misses == made
-    np.testing.assert_allclose(ends[2] - ends[1], ends[1] - ends[0], rtol=1e-9)  # the motion is linear in the force
+    def end(_):
+        return np.asarray(jj.simulate(Fresh(), {"x": 0.1}, ts=TS, inputs={"force": lambda t: t}, **TIGHT)["x"])
 
-
-def test_threads_that_make_the_same_machine_code_at_once_all_get_it(monkeypatch):
-    writer, both = Writer(1, fused=False), threading.Barrier(2)
-    ffi.write_handler(writer, 1, 1, lambda given, found: None)
-    make = host.object_code
-    monkeypatch.setattr(disk, "kept", lambda name, made_by, find: find())
-    monkeypatch.setattr(host, "object_code", lambda text, effort: (both.wait(20), make(text, effort))[1])
     with ThreadPoolExecutor(2) as threads:
-        names = set(threads.map(ffi.registered, [f"{writer.text}; of this test alone"] * 2))
-    assert len(names) == 1
+        np.testing.assert_array_equal(*threads.map(end, range(2)))

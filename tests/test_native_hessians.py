@@ -3,17 +3,16 @@
 import diffrax
 import jax
 import jax.numpy as jnp
+import machine_code
 import numpy as np
 import pytest
 from ends_of_models import end_of_model
 from test_native_second import FORWARD, LANES, Falling, X, _seen, seconds_of_the_closed_form
 
 import jourdain_jax as jj
-from jourdain_jax.calculus.guards import DifferentiationModeError
-from jourdain_jax.motion.integrators import erk_loop
-from jourdain_jax.native import host
+from jourdain_jax import DifferentiationModeError
 
-pytestmark = pytest.mark.skipif(bool(host.reason_against()), reason=host.reason_against())
+pytestmark = machine_code.needed
 
 MODES = {
     "forward of reverse": lambda f: jax.jacfwd(jax.jacrev(f)),
@@ -25,9 +24,8 @@ MOTIONS = [*((mode, True, None) for mode in MODES), *((mode, False, None) for mo
 
 
 @pytest.mark.parametrize(("mode", "events", "solver"), MOTIONS)
-def test_all_modes_are_those_of_the_closed_form(mode, events, solver, monkeypatch):
+def test_all_modes_are_those_of_the_closed_form(mode, events, solver):
     """With respect to parameters, a start, an input, the start's time, a time saved and the end; or up to an event."""
-    monkeypatch.setattr(erk_loop, "integrate", lambda *a: pytest.fail("the loop of XLA was traced"))
     found = np.asarray(jax.jit(jax.vmap(MODES[mode](lambda x: _seen(x, events, solver=solver, adjoint=None, max_steps=1357))))(LANES))
     np.testing.assert_allclose(found, seconds_of_the_closed_form(events), rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(found, np.swapaxes(found, 2, 3), rtol=1e-9, atol=1e-9)

@@ -9,30 +9,27 @@ from collections.abc import Callable
 import diffrax
 import jax
 import jax.numpy as jnp
+import machine_code
 import numpy as np
 import pytest
+import result_codes as results
+from small_scenes import OnLine, OnPlane
 from test_mutants import Mutant
 
 import jourdain_jax as jj
 from jourdain_jax.motion import integration, put_on_rows
 from jourdain_jax.motion.native import back, crossings, functions, kernel, loop, native_motion, onto_rows, search, step
 from jourdain_jax.motion.simulate import set_up
-from jourdain_jax.motion.trajectories import results
-from jourdain_jax.native import ffi
 
-pytestmark = pytest.mark.skipif(bool(ffi.reason_against()), reason="no machine code is made here")
+pytestmark = machine_code.needed
 CLOSE = {"rtol": 0.0, "atol": 1e-8}
 
 
-class Pushed(jj.Scene):
+class Pushed(OnLine):
     """m x'' = t - k x; it stops at the level."""
 
     k: float = jj.parameter(4.0)
     level: float = jj.parameter(-0.1)
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(1.0, jnp.stack([q.x, 0 * q.x, 0 * q.x]))}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=motion.t - self.k * motion.q.x),)
@@ -41,39 +38,27 @@ class Pushed(jj.Scene):
         return {"low": motion.q.x - self.level}
 
 
-class Round(jj.Scene):
+class Round(OnPlane):
     """A bead on a circle of this radius, in coordinates of the plane."""
 
     radius: float = jj.parameter(1.0)
-    coordinates = jj.coordinates("x y")
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(1.0, jnp.stack([q.x, q.y, 0 * q.x]))}
 
     def geometric_constraints(self, pose):
         return {"circle": pose.q.x**2 + pose.q.y**2 - self.radius**2}
 
 
-class Dips(jj.Scene):
+class Dips(OnLine):
     """A bead at constant speed, and an event for a hundredth of a metre."""
 
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(1.0, jnp.stack([q.x, 0 * q.x, 0 * q.x]))}
 
     def events(self, motion):
         return {"dip": (motion.q.x - 0.52) ** 2 - 1e-4}
 
 
-class Strip(jj.Scene):
+class Strip(OnLine):
     """A bead that is braked within `width` of 0.7 m."""
 
     width: float = jj.parameter(0.02)
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(1.0, jnp.stack([q.x, 0 * q.x, 0 * q.x]))}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=jnp.where(jnp.abs(motion.q.x - 0.7) < self.width, -3.0, 0.0)),)

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import machine_code
 import numpy as np
 import pytest
 
 import jourdain_jax as jj
 from jourdain_jax.motion.native.called import nodes_called
-from jourdain_jax.native import ffi
 from jourdain_jax.program.graph import Graph
 
-pytestmark = pytest.mark.skipif(bool(ffi.reason_against()), reason=ffi.reason_against())
+pytestmark = machine_code.needed
 
 OPTIONS = {"ts": [0.2], "rtol": 1e-6, "atol": 1e-6, "backend": "native"}
 FORKED = """

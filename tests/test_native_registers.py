@@ -1,10 +1,11 @@
 """Which values of a long program are in registers: what is needed is at hand, and no bit depends on it."""
 
 import evaluated_natively
+import machine_code
 import numpy as np
 import pytest
 
-from jourdain_jax.native import ffi, host, scalar_program
+from jourdain_jax.native import host, scalar_program
 from jourdain_jax.native.registers import turns
 from jourdain_jax.program.graph import Graph
 
@@ -41,7 +42,7 @@ def test_values_go_to_memory_only_where_registers_are_few():
     assert turns(uses, range(-4, 0), 4)[1] > 0
 
 
-@pytest.mark.skipif(bool(ffi.reason_against()), reason="no machine code is made here")
+@machine_code.needed
 def test_no_bit_depends_on_which_values_wait_in_memory(monkeypatch):
     random, graph = np.random.default_rng(5), Graph()
     inputs = [graph.input(f"x{i}", True) for i in range(5)]

@@ -6,9 +6,9 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 
 import jourdain_jax as jj
-from jourdain_jax.motion.trajectories import results
 
 G = 9.81
 

@@ -20,16 +20,6 @@ def forces(scene, q=None, u=None, **values):
     return contact_forces(scene, 0.0, q, u, jj.accelerations(scene, 0.0, q, u))
 
 
-def rolling_state(cart, along, turn):
-    """Coordinates and speeds of a cart that runs at `along` (m/s) and turns at `turn` (rad/s), its balls rolling."""
-    values = {"x_rate": along[0], "y_rate": along[1], "heading_rate": turn}
-    for i in range(cart.balls):
-        x, y = np.asarray(cart.places)[i]
-        v = np.array([along[0] - turn * y, along[1] + turn * x])
-        values[f"ball{i}_omega"] = np.array([-v[1], v[0], 0.3]) / float(cart.radius)  # w = n x v/a, and some spin
-    return values
-
-
 def test_the_balls_of_a_cart_on_three_press_as_multipliers_of_height_rows_say():
     # the same cart with a free chassis: there the normal forces are multipliers
     random = np.random.default_rng(5)

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import machine_code
 import numpy as np
 import pytest
 
@@ -26,7 +27,7 @@ from jourdain_jax.native import disk, ffi, host
 from jourdain_jax.program.graph import Graph
 
 SOURCE = Path(jj.__file__).parent
-needs_machine_code = pytest.mark.skipif(bool(host.reason_against()), reason=host.reason_against() or "-")
+needs_machine_code = machine_code.needed
 
 
 def _no_library(name, *_):

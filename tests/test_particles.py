@@ -8,10 +8,7 @@ from oracles import heisenberg_particle, isokinetic_particle, rosenberg_particle
 from solved_states import solved_at_random_states, solved_by_every_reduction
 from tolerances import relative_error, tolerance
 
-from jourdain_jax.models.heisenberg_particle import HeisenbergParticle
-from jourdain_jax.models.isokinetic_particle import IsokineticParticle
-from jourdain_jax.models.rosenberg_particle import RosenbergParticle
-from jourdain_jax.models.spring_and_rod import SpringAndRod
+from jourdain_jax.models import HeisenbergParticle, IsokineticParticle, RosenbergParticle, SpringAndRod
 
 ROUND_OFF, CLOSED_FORM = tolerance("round_off"), tolerance("closed_form")
 

@@ -8,9 +8,9 @@ from timed_scenes import TIMED
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
+from jourdain_jax import coordinate_rates
 from jourdain_jax.dynamics.power import power, power_of_nonconservative
 from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.models import BallOnTurntable, ChaplyginSleigh, IsokineticParticle, TiltingDisc, TwoWheelAxleCoordinates
 
 

@@ -7,15 +7,14 @@ import pytest
 from jaxtyping import Array, Float
 
 import jourdain_jax as jj
+from jourdain_jax import coordinate_rates, motion_at, pose_at, position_residual, structure_of, velocity_residual
 from jourdain_jax.build.plausibility import numbers_of
 from jourdain_jax.build.probed import TIMED, generic_inputs
 from jourdain_jax.build.probed_on_graph import probed_on_graph, sampled_on_graph
 from jourdain_jax.build.sampling import random_states, symmetric_configurations
-from jourdain_jax.build.structure import structure_of
 from jourdain_jax.build.trace import explicit_rates, potentials_of
-from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at, pose_at, velocities
+from jourdain_jax.equations.kinematics import inertias, velocities
 from jourdain_jax.equations.projection import closure_residual, project_speeds
-from jourdain_jax.equations.rows import position_residual, velocity_residual
 from jourdain_jax.equations.virtual_power import mass_matrix_at
 
 MODELS = ["skate", "tilting-disc-quaternion", "ball-on-turntable", "snakeboard", "rattleback", "double-pendulum-rods", "isokinetic-particle", "trailer-chain"]

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from jourdain_jax.calculus.scalar_operations import TABLE
-from jourdain_jax.eager.lanes import uncompiled
 from jourdain_jax.program.derivative import derivatives, directional_derivative
 from jourdain_jax.program.emit import run, sine_and_cosine
 from jourdain_jax.program.evaluate import Probes
@@ -262,51 +261,6 @@ def test_jax_code_python_c_and_sympy_say_the_same(graph, tmp_path, example):
         pytest.skip("no C compiler")
     out = subprocess.run([str(tmp_path / "f")], check=True, capture_output=True, text=True).stdout
     np.testing.assert_allclose([float(v) for v in out.split()], expected, rtol=1e-14)
-
-
-def test_a_function_run_uncompiled_gives_what_jax_gives():
-    def f(A, x):
-        U, s, V = jnp.linalg.svd(A, full_matrices=False)
-        L = jnp.linalg.cholesky(A @ A.T + jnp.eye(3))
-        y = jax.lax.scan(lambda c, r: (c + r @ x, jnp.sin(c)), 0.0, A)
-        z = jax.lax.while_loop(lambda v: v[0] < 10.0, lambda v: (2 * v[0], v[1] + 1), (jnp.abs(x[0]) + 1.0, 0))
-        w = jax.scipy.linalg.solve_triangular(L, x, lower=True)
-        return (U * s) @ V, L, y, z, w, jax.lax.cond(x[0] > 0, lambda: 1.0, lambda: 2.0), jnp.max(x), jnp.argmax(x), jnp.flip(x).at[1].set(3.0)
-
-    rng = np.random.default_rng(0)
-    A, x = rng.normal(size=(3, 3)), rng.normal(size=3)
-    for found, expected in zip(jax.tree.leaves(uncompiled(f)(A, x)), jax.tree.leaves(f(A, x)), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
-    batch = uncompiled(jax.vmap(f))(np.stack([A, 2 * A]), np.stack([x, -x]))
-    for found, expected in zip(jax.tree.leaves(batch), jax.tree.leaves(jax.vmap(f)(np.stack([A, 2 * A]), np.stack([x, -x]))), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
-
-
-def test_indexing_and_linear_systems_run_uncompiled_give_what_jax_gives():
-    def f(A, b):
-        entries, k = jnp.array([2, 0, 2]), jnp.array([1, 0])
-        put = jnp.zeros((4, 3)).at[jnp.array([3, 1])].set(A[:2]).at[:, k].set(1.5)
-        LU, swaps, order = jax.lax.linalg.lu(A)
-        clipped = A[jnp.array([0, 7])]  # out of bounds: left to JAX
-        window = jax.lax.dynamic_slice(A, (1, 0), (2, 2))
-        taken = A[entries], A[:, k], A[entries[:2], k], jnp.diag(A), clipped, window, A[order, 1], A.at[order].set(2 * A)
-        return taken, put, LU, swaps, order, jnp.linalg.solve(A, b), jnp.linalg.det(A)
-
-    rng = np.random.default_rng(1)
-    A, b = rng.normal(size=(5, 3, 3)), rng.normal(size=(5, 3))
-    A[1, 0] = 0.0  # singular
-    for transform, given in ((lambda f: f, (A[0], b[0])), (jax.vmap, (A, b))):
-        expected = transform(f)(*map(jnp.asarray, given))
-        for x, y in zip(jax.tree.leaves(uncompiled(transform(f))(*given)), jax.tree.leaves(expected), strict=True):
-            assert x.dtype == y.dtype
-            good = np.isfinite(y)
-            np.testing.assert_allclose(x[good], np.asarray(y)[good], rtol=1e-11, atol=1e-12)
-
-
-def test_a_singular_matrix_run_uncompiled_gives_nan_as_jax_does():
-    f = jax.vmap(jnp.linalg.cholesky)
-    A = np.stack([np.eye(2), -np.eye(2)])
-    np.testing.assert_array_equal(np.isnan(uncompiled(f)(A)), np.isnan(f(A)))
 
 
 def test_operations_of_two_nodes_are_compared_by_what_they_do_not_share():

@@ -6,7 +6,8 @@ import pytest
 from linkages import Parallelogram, SliderCrank
 
 import jourdain_jax as jj
-from jourdain_jax.build.structure import plain_row_lengths, structure_of
+from jourdain_jax import structure_of
+from jourdain_jax.build.structure import plain_row_lengths
 from jourdain_jax.dynamics.reactions import _spare_multipliers
 
 SINGULAR = {

@@ -10,7 +10,7 @@ from oracles import rattleback as oracle
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.models.rattleback import Rattleback
+from jourdain_jax.models import Rattleback
 
 STONE = Rattleback()
 RUN = {name: oracle.RUN[name] for name in oracle.NAMES}

@@ -8,6 +8,7 @@ import small_scenes as small
 from tolerances import tolerance
 
 import jourdain_jax as jj
+from jourdain_jax import diagnose
 from jourdain_jax.dynamics.reactions import contact_forces, row_reactions
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.models import (
@@ -19,7 +20,6 @@ from jourdain_jax.models import (
     VerticalDisc,
     WhippleBicycle,
 )
-from jourdain_jax.motion.trajectories.diagnostics import diagnose
 
 SCENES = [
     TwoWheelAxleRedundant(),

@@ -1,14 +1,13 @@
 """The reduced Appell equations give the accelerations that all coordinates together give (row S9)."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from solved_states import over_states
 from tolerances import tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.dynamics.reduced import reduced_accelerations, reduced_coordinates
-from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.models import BallOnTurntable, ChaplyginSleigh, IsokineticParticle, TiltingDisc, TwoWheelAxleFree
 
 
@@ -43,13 +42,11 @@ def test_reduced_accelerations_are_those_of_the_whole_scene():
     scene = TiltingDisc()
     independent = list(jj.structure_of(scene).independent)
 
-    @eval_numpy
-    @jax.vmap
     def both(t, q, u):
         y = u[jnp.array(independent)]
         return reduced_accelerations(scene, t, q[3:4], y), jj.accelerations(scene, t, q, u).udot[jnp.array(independent)]
 
-    reduced, whole = both(*(jnp.asarray(x) for x in jj.sample_states(scene, 20)))
+    reduced, whole = over_states(both, *map(jnp.asarray, jj.sample_states(scene, 20)))
     assert jnp.max(jnp.abs(reduced - whole)) <= tolerance("round_off") * jnp.max(jnp.abs(whole))
 
 

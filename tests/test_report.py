@@ -4,9 +4,10 @@ import json
 
 import jax.numpy as jnp
 import pytest
+from small_scenes import OnLine, OnPlane
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.report import report
+from jourdain_jax import report
 from jourdain_jax.models import IsokineticParticle, Skate, Snakeboard, TwoWheelAxleFree, TwoWheelAxleRedundant
 
 
@@ -94,16 +95,12 @@ def test_privileged_speeds_may_stand_in_one_text():
     assert report(Free()).privileged_velocities == ("x_rate", "y_rate")
 
 
-class Drifting(jj.Scene):
+class Drifting(OnPlane):
     """A bead that is carried along x and free along y: a relation between coordinates that no row states."""
 
-    coordinates = jj.coordinates("x y")
     speeds = jj.speeds("across")
     domain = {"y": (-1.0, 2.0)}
     conventions = "x along the belt."
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
 
     def coordinate_rates(self, t, q, u):
         return jnp.stack([1.0 + 0.0 * u.across, u.across])
@@ -112,13 +109,9 @@ class Drifting(jj.Scene):
         return {"off the belt": 2.0 - motion.q.y}
 
 
-class Held(jj.Scene):
+class Held(OnLine):
     """A bead that is driven and has no freedom left."""
 
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def geometric_constraints(self, pose):
         return {"held": pose.q.x - 0.3 * jnp.sin(pose.t)}

@@ -7,8 +7,7 @@ from oracles import free_rigid_body, suslov
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.models.free_rigid_body import FreeRigidBody
-from jourdain_jax.models.suslov import Suslov
+from jourdain_jax.models import FreeRigidBody, Suslov
 
 MOMENTS = dict(zip(("i1", "i2", "i3"), free_rigid_body.RUN["inertia"], strict=True))
 TOP, HELD = FreeRigidBody(**MOMENTS), Suslov()

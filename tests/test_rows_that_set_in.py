@@ -4,22 +4,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
+from small_scenes import OnPlane
 
 import jourdain_jax as jj
-from jourdain_jax.motion.trajectories import results
 
 
-class Slider(jj.Scene):
+class Slider(OnPlane):
     """A mass in a plane under a constant push; `row` says what else holds it."""
 
-    coordinates = jj.coordinates("x y")
     domain = {"x": (-1.0, 1.0), "y": (-1.0, 1.0)}
     first = True
     row = None
     mass: jax.Array = jj.parameter(1.0)
-
-    def bodies(self, t, q):
-        return {"mass": jj.Particle(self.mass, jnp.stack([q.x, q.y, 0.0 * q.x]))}
 
     def loads(self, motion):
         return (jj.Load(generalized={"x_rate": 1.0 + 0.0 * motion.t, "y_rate": 0.5 + 0.0 * motion.t}),)

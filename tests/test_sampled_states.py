@@ -5,8 +5,8 @@ import pytest
 from linkages import Parallelogram, SliderCrank, Windows, bennett, bricard
 
 import jourdain_jax as jj
+from jourdain_jax import structure_of
 from jourdain_jax.build.domain import coordinate_bounds
-from jourdain_jax.build.structure import structure_of
 from jourdain_jax.equations.projection import closure_residual
 
 LINKAGES = {

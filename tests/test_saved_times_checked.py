@@ -5,10 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 from test_along_batches import Oscillator
 
 import jourdain_jax as jj
-from jourdain_jax.motion.trajectories import results
 
 START = {"x": 1.0}
 WRONG = {

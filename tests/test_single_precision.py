@@ -10,7 +10,6 @@ from small_scenes import AffineRows, DrivenPendulum
 from timed_scenes import DrivenOrientation, LosingMass
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.integrability import growth_vector
 from jourdain_jax.models import BallOnTurntable, DoublePendulumRods, IsokineticParticle, TiltingDiscQuaternion, TwoWheelAxleRedundant
 
 SCENES = (
@@ -30,7 +29,7 @@ import json, sys
 sys.path[:0] = {path!r}
 import jax, test_single_precision as here
 assert not jax.config.jax_enable_x64
-print(json.dumps([[here.facts(scene) for scene in here.SCENES], here.growth_vector(here.TwoWheelAxleRedundant()).vector]))
+print(json.dumps([[here.facts(scene) for scene in here.SCENES], here.jj.report(here.TwoWheelAxleRedundant()).growth_vector]))
 """
 
 
@@ -60,4 +59,4 @@ def test_a_scenes_structure_does_not_depend_on_the_precision(in_single_precision
 
 
 def test_the_growth_vector_of_dependent_rows_does_not_depend_on_the_precision(in_single_precision):
-    assert tuple(in_single_precision[1]) == growth_vector(TwoWheelAxleRedundant()).vector == (2, 3, 4)
+    assert tuple(in_single_precision[1]) == jj.report(TwoWheelAxleRedundant()).growth_vector == (2, 3, 4)

@@ -11,8 +11,7 @@ from solved_states import solved_at_random_states, solved_by_every_reduction
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
-from jourdain_jax.models.skate import Skate
+from jourdain_jax.models import ChaplyginSleigh, Skate
 
 ROUND_OFF = tolerance("round_off")
 

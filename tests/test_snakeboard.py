@@ -3,12 +3,12 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 from oracles import snakeboard as oracle
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.models.snakeboard import Snakeboard
-from jourdain_jax.motion.trajectories import results
+from jourdain_jax.models import Snakeboard
 
 BOARD = Snakeboard()
 START = {

@@ -4,20 +4,17 @@ import diffrax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
+from small_scenes import Upright
 
 import jourdain_jax as jj
 from jourdain_jax.models import MODELS
-from jourdain_jax.motion.trajectories import results
 
 
-class Falling(jj.Scene):
+class Falling(Upright):
     """A particle in the plane, under gravity."""
 
     mass: jnp.ndarray = jj.parameter(1.0, positive=True)
-    coordinates = jj.coordinates("x z")
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, q.z]))}
 
     def loads(self, motion):
         return (jj.gravity(motion, 9.81),)

@@ -5,13 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracles import rolling_disc
+from small_scenes import OnLine
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.steady import steady
-from jourdain_jax.models.double_pendulum_angles import DoublePendulumAngles
-from jourdain_jax.models.free_rigid_body import FreeRigidBody
-from jourdain_jax.models.tilting_disc import TiltingDisc
-from jourdain_jax.models.vertical_disc import VerticalDisc
+from jourdain_jax import steady
+from jourdain_jax.models import DoublePendulumAngles, FreeRigidBody, TiltingDisc, VerticalDisc
 
 DISC = {"mass": 1.0, "radius": 0.5, "gravity": 9.81}
 GUESS = {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0, "lean_rate": 0.3}
@@ -98,14 +96,10 @@ def test_a_motion_forbidden_to_move_comes_to_rest():
     assert float(found["lean"]) == pytest.approx(0.0, abs=1e-10)
 
 
-class Sprung(jj.Scene):
+class Sprung(OnLine):
     """A particle on a stiffening spring, pushed by an input and by a load that depends on time."""
 
-    coordinates = jj.coordinates("x")
     inputs = jj.inputs("push")
-
-    def bodies(self, t, q):
-        return {"block": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=motion.inputs.push + jnp.cos(motion.t) - 4.0 * motion.q.x - motion.q.x**3),)

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 from test_inputs import OnBelt
 
 import jourdain_jax as jj
 from jourdain_jax.models import ChaplyginSleigh, PendulumChain, TiltingDisc
-from jourdain_jax.motion.trajectories import results
 
 TS = jnp.linspace(0.0, 0.5, 3)
 

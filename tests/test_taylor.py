@@ -3,21 +3,21 @@
 import diffrax
 import jax
 import jax.numpy as jnp
+import machine_code
 import mpmath
 import numpy as np
 import pytest
+import result_codes as results
 from in_mpmath import in_mpmath
 
 import jourdain_jax as jj
 from jourdain_jax.calculus.scalar_operations import TABLE
-from jourdain_jax.motion.integrators.taylor import order_for
-from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native import ffi, host
 from jourdain_jax.native.ir import Writer
-from jourdain_jax.native.series import Series, reason_against
+from jourdain_jax.native.series import Series
 from jourdain_jax.program.graph import Graph
 
-pytestmark = pytest.mark.skipif(bool(host.reason_against()), reason=host.reason_against())
+pytestmark = machine_code.needed
 
 ORDER = 9
 UNARY = [name for name, f in TABLE.items() if f.kind in ("analytic", "flat") and name not in ("add", "sub", "mul", "div", "pow", "atan2")]
@@ -101,14 +101,6 @@ def _composed(h, *inner):
 
 def _guarded(op, f, g):
     return (lambda s: f(s) / (2 + g(s) ** 2)) if op == "div" else (lambda s: mpmath.sqrt(2 + g(s) ** 2))
-
-
-def test_branches_and_varying_exponents_have_no_series():
-    graph = Graph()
-    a, b = graph.input("a", True), graph.input("b", True)
-    assert "`abs`" in reason_against(graph, [graph.call("abs", a)])
-    assert "exponent" in reason_against(graph, [graph.call("pow", a, b)])
-    assert reason_against(graph, [graph.call("pow", a, graph.const(2.5))]) == ""
 
 
 # Motions. -------------------------------------------------------------------------------------------------------------
@@ -207,7 +199,3 @@ def test_lanes_of_a_rollout_end_each_for_itself():
 def test_series_that_do_not_serve_are_refused_with_the_reason(call, said):
     with pytest.raises(ValueError, match=said):
         call()
-
-
-def test_the_order_follows_from_the_tolerance():
-    assert [order_for(t) for t in (1e-2, 1e-6, 1e-8, 1e-12, 1e-300)] == [4, 8, 11, 15, 30]

@@ -11,11 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
+from small_scenes import OnPlane, Upright
 
 import jourdain_jax as jj
 from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.models import ChaplyginSleigh
-from jourdain_jax.motion.trajectories import results
 
 
 class TwoBlades(jj.Scene):
@@ -41,16 +42,12 @@ class TwoBlades(jj.Scene):
         return {name: jj.knife_edge(plate, plate.place(jnp.stack([a, 0.0 * a, 0.0 * a])), plate.orientation[:, 1]) for name, a in places.items()}
 
 
-class Slope(jj.Scene):
+class Slope(OnPlane):
     """A bead on a slope: level by default, where its place does not matter; a wind across, none by default."""
 
     mass: jnp.ndarray = jj.parameter(2.0, unit="kg", positive=True)
     slope: jnp.ndarray = jj.parameter(0.0, unit="1/m")
     wind: jnp.ndarray = jj.parameter(0.0, unit="m/s")
-    coordinates = jj.coordinates("x y")
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, q.y, 0.0 * q.x]))}
 
     def potential(self, pose):
         return 0.5 * self.mass * 9.81 * self.slope * pose.q.x**2
@@ -75,15 +72,12 @@ class Hanging(jj.Scene):
         return (jj.gravity(motion, 9.81),)
 
 
-class SmallLoop(jj.Scene):
+class SmallLoop(Upright):
     """A bead on a small ring, in a domain of the ring's size; its radius has no default."""
 
     radius: jnp.ndarray = jj.parameter(unit="m", positive=True)
-    coordinates = jj.coordinates("x z")
+    mass = 0.1
     domain = {"x": (-0.03, 0.03), "z": (-0.03, 0.03)}
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(0.1, jnp.stack([q.x, 0.0 * q.x, q.z]))}
 
     def geometric_constraints(self, pose):
         return {"ring": jnp.sqrt(jnp.maximum(0.0025 - pose.q.x**2 - pose.q.z**2, 0.0)) - jnp.sqrt(0.0025 - self.radius**2)}

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
-from jourdain_jax.models.tilting_disc import TiltingDisc
+from jourdain_jax.models import ChaplyginSleigh, TiltingDisc
 from jourdain_jax.motion.trajectories import over_times
 
 

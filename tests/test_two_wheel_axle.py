@@ -13,12 +13,7 @@ from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.dynamics.reactions import contact_forces
-from jourdain_jax.models.two_wheel_axle import (
-    TwoWheelAxleCoordinates,
-    TwoWheelAxleFree,
-    TwoWheelAxleQuasi,
-    TwoWheelAxleRedundant,
-)
+from jourdain_jax.models import TwoWheelAxleCoordinates, TwoWheelAxleFree, TwoWheelAxleQuasi, TwoWheelAxleRedundant
 
 ROUND_OFF = tolerance("round_off")
 PARAMETERS = {"radius": 0.27, "length": 0.9, "mass": 1.7, "rim_mass": 0.4, "slope": 0.35}

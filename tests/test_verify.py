@@ -6,8 +6,8 @@ import pytest
 from small_scenes import BeadOnTurningWire, DiscWithHeightRow, DrivenPendulum
 
 import jourdain_jax as jj
+from jourdain_jax import Verification
 from jourdain_jax.analysis.statements import statement_checks
-from jourdain_jax.analysis.verification import Verification
 
 
 class Sledge(jj.Scene):

@@ -13,7 +13,7 @@ import jourdain_jax as jj
 from jourdain_jax.dynamics.reactions import contact_forces
 from jourdain_jax.equations.minimal import minimal_kinematics
 from jourdain_jax.equations.projection import project_positions
-from jourdain_jax.models.whipple_bicycle import WhippleBicycle
+from jourdain_jax.models import WhippleBicycle
 
 BICYCLE = WhippleBicycle()
 NAMES = WhippleBicycle.coordinates.names.entries

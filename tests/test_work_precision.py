@@ -11,7 +11,7 @@ from oracles import chaplygin_sleigh
 from tolerances import tolerance
 
 pytest.importorskip("work_precision_cases", reason="the scripts of `bench/` are not here")
-from work_precision_cases import curve, disc_body, figures, measure, peer_exudyn, peer_heyoka, peer_mujoco, peer_sympy, record, tables
+from work_precision_cases import curve, disc_body, measure, peer_exudyn, peer_heyoka, peer_mujoco, peer_sympy, record
 from work_precision_cases.problems import PROBLEMS
 
 SLEIGH, DISC = PROBLEMS["chaplygin-sleigh"], PROBLEMS["tilting-disc"]
@@ -144,17 +144,6 @@ def test_sympys_equations_of_the_sleigh_compiled_from_c_are_chaplygins():
     k_squared = float(scene.inertia / scene.mass) + a**2
     expected = [v * np.cos(heading) - a * w * np.sin(heading), v * np.sin(heading) + a * w * np.cos(heading), w, a * w**2, -a / k_squared * v * w]
     assert np.max(np.abs(rates(0.0, y) - expected)) <= tolerance("round_off")
-
-
-def test_figures_take_the_cheapest_run_that_is_accurate_enough():
-    common = {"problem": "tilting-disc", "batch": 1, "method": "Dopri8"}
-    entries = [common | {"error": 1e-5, "seconds": 1.0}, common | {"error": 1e-7, "seconds": 3.0}, common | {"error": 5e-7, "seconds": 2.0}]
-    entries.append(common | {"error": None, "seconds": 0.1})
-    assert figures.cheapest(entries, lambda name: name == "Dopri8", 1e-6)["seconds"] == 2.0
-    assert figures.cheapest(entries, lambda name: name == "Tsit5", 1e-6) is None
-    (missing, *_) = figures.figures(entries, {})
-    assert (missing["value"], missing["met"]) == (None, False)
-    assert "not measured" in tables.summary([missing])
 
 
 def test_times_are_those_of_warm_runs():

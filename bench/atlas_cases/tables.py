@@ -6,18 +6,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from atlas_cases.cases import CASES
-from atlas_cases.methods import METHODS
 from atlas_cases.outcomes import FLAGGED, NAN, NOT_APPLICABLE, OUTCOMES, RIGHT, STALLED, WRONG
 
 KEYS = ("case", "method", "dtype", "outcome", "error", "tolerance", "mechanism")
-_SHORT = {RIGHT: "ok", FLAGGED: "flag", WRONG: "WRONG", NAN: "NaN", STALLED: "stall", NOT_APPLICABLE: ""}
-
-
 BEGIN, END = "<!-- from here on written by bench/atlas.py -->", "<!-- up to here -->"
 
 
 def write_tables(cells: list[dict], out: Path) -> None:
-    """`atlas.csv`, one line per cell; `atlas_cells.md`, all cells and the mechanisms of all failures to read; `atlas.md`, the summary.
+    """Write `atlas.csv`, one line per cell, and `atlas.md`, the summary.
 
     Of an `atlas.md` that is there, only what stands between `BEGIN` and `END` is replaced.
     """
@@ -25,39 +21,11 @@ def write_tables(cells: list[dict], out: Path) -> None:
         writer = csv.DictWriter(file, KEYS)
         writer.writeheader()
         writer.writerows(cells)
-    (out / "atlas_cells.md").write_text("\n".join([*_outcomes(cells), "", *_failures(cells), ""]), encoding="utf-8")
     path = out / "atlas.md"
     before, _, rest = (path.read_text(encoding="utf-8") if path.exists() else "").partition(BEGIN)
     after = rest.partition(END)[2] or "\n"
     written = "\n".join([BEGIN, "", *by_method(cells), "", *by_case(cells), "", *_reasons(cells), "", END])
     path.write_text(before + written + after, encoding="utf-8")
-
-
-def _outcomes(cells):
-    titles = {case.name: case for case in CASES}
-    for dtype in dict.fromkeys(cell["dtype"] for cell in cells):
-        here = [cell for cell in cells if cell["dtype"] == dtype]
-        methods = [m.name for m in METHODS if any(c["method"] == m.name for c in here)]
-        yield from (f"## {dtype}", "", "| case | what | tolerance | " + " | ".join(methods) + " |", "|" + "---|" * (3 + len(methods)))
-        for name in dict.fromkeys(cell["case"] for cell in here):
-            row = {cell["method"]: cell for cell in here if cell["case"] == name}
-            shown = " | ".join(_shown(row.get(method)) for method in methods)
-            yield f"| {name} | {titles[name].title} | {next(iter(row.values()))['tolerance']:.0e} ({titles[name].reason}) | {shown} |"
-        yield ""
-
-
-def _shown(cell) -> str:
-    if cell is None:
-        return ""
-    short = _SHORT[cell["outcome"]]
-    return f"{short} {cell['error']:.0e}" if cell["error"] is not None and cell["outcome"] in (RIGHT, WRONG) else short
-
-
-def _failures(cells):
-    yield from ("## Why", "", "| case | method | dtype | outcome | mechanism |", "|---|---|---|---|---|")
-    for cell in cells:
-        if cell["outcome"] not in (RIGHT, NOT_APPLICABLE):
-            yield f"| {cell['case']} | {cell['method']} | {cell['dtype']} | {cell['outcome']} | {cell['mechanism']} |"
 
 
 SHOWN = (RIGHT, FLAGGED, WRONG, NAN, STALLED)

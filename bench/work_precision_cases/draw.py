@@ -73,11 +73,6 @@ OWN_LOOKS = {
     "udwadia-kalaba reduction, Dopri8": Look("Udwadia-Kalaba", PURPLE, "<", "--"),
     "gibbs-appell reduction, Dopri8": Look("Gibbs-Appell", PURPLE, ">", ":"),
 }
-GRADIENT_LOOKS = {
-    "forward mode": Look("forward mode", BLUE, "o", width=2.0),
-    "reverse mode": Look("reverse mode", ORANGE, "s", width=2.0),
-    "central differences": Look("central differences", RED, "^", "--"),
-}
 BATCH_LOOKS = {
     "rollout, Dopri8": Look("jourdain-jax, Dopri8", BLUE, "o", width=2.4),
     "rollout, Taylor": Look("jourdain-jax, Taylor series", SKY, "D", width=2.0),
@@ -108,16 +103,9 @@ def draw(entries: list[dict], out: Path) -> None:
         _chart(single, problems, MAIN_LOOKS, lambda e: e["rhs_evaluations"], _EVALUATIONS, evaluations, out / "work_precision_evaluations")
         own = "Methods of this engine: solvers, forms of the state, reductions (dense unless lowered; Dopri8 unless said; lower left is better)"
         _chart(single, problems, OWN_LOOKS, _time, _TIME, own, out / "work_precision_methods")
-    gradients = [e for e in entries if e.get("kind") == "gradient"]
-    named = [name for name in TITLES if any(e["problem"] == name for e in gradients)]
-    if named:
-        title, error = "Gradient with respect to eight numbers through the whole motion (lower left is better)", "relative error of the gradient"
-        _chart(gradients, named, GRADIENT_LOOKS, _time, "time (ms)", title, out / "work_precision_gradients", error)
     batched = [e for e in entries if "batch" in e and e["note"].startswith("starts")]
     if batched:
         _batches(batched, out / "work_precision_batches")
-    if any("memory" in e for e in entries) and any("cold" in e for e in entries):
-        _fresh(entries, out / "work_precision_fresh")
 
 
 def _time(entry: dict) -> float:
@@ -200,31 +188,3 @@ def _batches(entries: list[dict], path: Path) -> None:
             _finish(ax, f"{TITLES[name]}, {many}", "largest error over the lanes" if k + 1 == len(problems) else "", "" if column else _TIME)
     looks = [look for method, look in BATCH_LOOKS.items() if method in drawn]
     _legend(figure, looks, "Batches with scattered starts: time per trajectory (lower left is better)", path, len(problems), len(sizes))
-
-
-def _fresh(entries: list[dict], path: Path) -> None:
-    """What a fresh process costs: peak memory, and the time to a first trajectory stage by stage."""
-    memory = {e["memory"]: e["peak_rss_mb"] for e in entries if "memory" in e}
-    cold = {f"{e['cold']}, {e['cache']}": e["seconds"] for e in entries if "cold" in e}
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11.5, 3.6))
-    bars = left.barh(list(memory), list(memory.values()), color=[GREY if what.startswith(("import", "the disc by")) else BLUE for what in memory], height=0.7)
-    left.bar_label(bars, fmt="%.0f", padding=3, fontsize=8)
-    left.set(title="Peak resident memory of a process (MB)", xlim=(0, 1.15 * max(memory.values())))
-    stages = [stage for stage in next(iter(cold.values())) if stage not in ("second", "total")]
-    at = dict.fromkeys(cold, 0.0)
-    for stage, colour in zip(stages, (GREY, SKY, GREEN, YELLOW, BLUE, RED, PURPLE, ORANGE, BLACK), strict=False):
-        right.barh(list(cold), [seconds[stage] for seconds in cold.values()], left=list(at.values()), color=colour, height=0.7, label=stage)
-        at = {name: at[name] + seconds[stage] for name, seconds in cold.items()}
-    for name, total in at.items():
-        right.annotate(f"{total:.1f}", (total, name), xytext=(3, 0), textcoords="offset points", va="center", fontsize=8)
-    right.set(title="Fresh process to the first trajectory (s)", xlim=(0, 1.12 * max(at.values())))
-    right.legend(fontsize=7.5, frameon=False, loc="lower center", bbox_to_anchor=(0.4, -0.42), ncols=4)
-    for ax in (left, right):
-        ax.invert_yaxis()
-        ax.tick_params(axis="y", labelsize=8, length=0)
-        for side in ("top", "right"):
-            ax.spines[side].set_visible(False)
-    figure.tight_layout()
-    for suffix in ("png", "svg"):
-        figure.savefig(path.with_suffix(f".{suffix}"), dpi=140, bbox_inches="tight")
-    plt.close(figure)

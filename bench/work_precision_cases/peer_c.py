@@ -23,7 +23,6 @@ from work_precision_cases.curve import TOLERANCES, Curve, NotApplicable, Prepare
 from work_precision_cases.peer_diffrax import BY_HAND
 from work_precision_cases.problem import Problem
 
-SIDE_BY_SIDE = 8
 FLAGS = ("-O3", "-march=native", "-ffast-math", "-fopenmp-simd", "-shared", "-fPIC")
 WIDE = "-mprefer-vector-width=512"  # of processors that have such registers
 MISSING = "SymPy cannot be imported, which writes the equations by hand as C; `pip install sympy`"

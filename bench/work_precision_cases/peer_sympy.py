@@ -8,7 +8,6 @@ import ctypes
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -84,13 +83,6 @@ def _equations(problem: Problem) -> tuple:
         equations = kane.SCENES[problem.name](problem.scene)
         _made[problem.name] = equations, compiled(c_source(equations))
     return _made[problem.name]
-
-
-def evaluations_alone(problem: Problem, count: float) -> Callable[[], None]:
-    """So many evaluations in one call: what a compiled loop over steps could not do without."""
-    equations, library = _equations(problem)
-    y, dy = equations.from_minimal(problem.minimal_start), np.empty(len(problem.minimal_start))
-    return lambda: library.repeat(int(count), len(y), y.ctypes.data, dy.ctypes.data)
 
 
 def callback(library, size: int):

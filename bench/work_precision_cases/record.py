@@ -6,8 +6,8 @@ from importlib.metadata import PackageNotFoundError, version
 KEYS = (
     "problem", "method", "kind", "setting", "setting_unit", "batch", "error", "seconds", "rhs_evaluations", "steps", "energy_drift", "slip", "note", "versions",
 )  # fmt: skip
-OURS, PEER, GRADIENT = "ours", "peer", "gradient"
-KINDS = (OURS, PEER, GRADIENT)
+OURS, PEER = "ours", "peer"
+KINDS = (OURS, PEER)
 PACKAGES = ("jourdain-jax", "jax", "jaxlib", "diffrax", "numpy", "scipy", "sympy", "heyoka", "mujoco", "mujoco-mjx", "exudyn")
 
 
