@@ -98,6 +98,16 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list:
     return figures
 
 
+@pytest.fixture
+def compilations() -> list:
+    """Programs that JAX compiles during a test, one entry each."""
+    import jax
+
+    found: list = []
+    jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: found.append(event) if event.endswith("backend_compile_duration") else None)
+    return found
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """In a process that runs tests: run-time checks, and compiled programs kept in pytest's cache, so that a second run does not compile again."""
     config.option.loadscopereorder = False  # pytest-xdist would hand out files by their number of tests, and not in the order above

@@ -7,7 +7,6 @@ import pytest
 from oracles import chaplygin_sleigh as sleigh_oracle
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.correlated_noise import lowest
 
 SIGMA, TAU = 0.02, 0.4  # m, rad; s: neighbours at 0.1 s correlate at 0.78
 TS = np.linspace(0.0, 8.0, 41)
@@ -155,11 +154,6 @@ def test_intervals_are_those_of_all_correlation_times_by_their_restricted_likeli
     best = int(np.argmax(logs))
     np.testing.assert_allclose(found.standard_errors, np.sqrt(variances[best]), rtol=0.01)
     np.testing.assert_allclose(found.high - found.values, 1.98 * np.sqrt(whole), rtol=0.02)
-
-
-def test_golden_section_finds_the_lowest_of_each():
-    at = np.array([0.3, -1.2, 4.0])
-    np.testing.assert_allclose(lowest(lambda x: (x - at) ** 2, np.full(3, -5.0), np.full(3, 5.0)), at, atol=1e-3)
 
 
 def one(correlation_time) -> jj.Experiment:

@@ -109,7 +109,7 @@ def test_a_channel_that_is_met_exactly_does_not_tell_its_sigma():
     y = np.full(20, np.nan)
     y[[3, 15]] = 0.1, 0.3
     found = jj.fit(Bead(), run(ts, {"x": x, "y": y}, None, (*BOTH, "y", "y_rate")))
-    assert "samples of `y` determine as many unknowns" in found.warning
+    assert "channel `y` has no degrees of freedom left" in found.warning
     assert np.isnan(found["run 0: y"].standard_error)
     X = np.stack([np.ones(20), ts], axis=1)
     _, (rss,), *_ = np.linalg.lstsq(X, x)
@@ -165,7 +165,7 @@ def test_a_repeat_without_samples_has_not_converged(sigma):
 def test_residuals_beyond_all_measure_are_not_called_a_motion_that_fails(value, sigma):
     ts, y = lines(5)
     y[2] = value
-    assert jj.fit(Bead(), run(ts, {"x": y}, sigma)).warning.startswith("residuals at the first guess are beyond all measure")
+    assert jj.fit(Bead(), run(ts, {"x": y}, sigma)).warning.startswith("residuals overflow at the first guess")
 
 
 def test_a_memory_needs_neighbours():

@@ -1,5 +1,7 @@
 """Parameters that follow from others in a fit, and numbers that follow from what was found."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -43,7 +45,7 @@ def test_a_tied_parameter_follows_and_its_interval_with_it(found):
 
 def test_the_page_of_a_fit_tells_tied_parameters(found, tmp_path):
     found.report(tmp_path / "fit.html")
-    assert f"<td>inertia (tied)</td><td>kg m^2</td><td>{found.scene.inertia:.6g}</td>" in (tmp_path / "fit.html").read_text()
+    assert re.search(rf"inertia +kg m\^2 +{found.scene.inertia:.6g} .*\(tied\)", (tmp_path / "fit.html").read_text())
 
 
 def test_the_fit_is_at_the_greatest_likelihood_along_the_tie(found, data):

@@ -1,38 +1,22 @@
-"""What a fit was asked, kept with its result, so that it can be taken up again: at its minimum, along a profile, and for other runs."""
+"""A fit taken up again: at its minimum, along a profile, and for other runs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
 
+from jourdain_jax.analysis.estimates import Asked, Estimates
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.information import Information, information
-from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Linearised
+from jourdain_jax.analysis.levenberg_marquardt import Limits, Linearised
 from jourdain_jax.analysis.likelihood import as_runs
-from jourdain_jax.analysis.losses import Loss
-from jourdain_jax.analysis.piecewise import Piecewise
-from jourdain_jax.analysis.predictions import Lanes
+from jourdain_jax.analysis.piecewise import Piecewise, problem_of
 from jourdain_jax.analysis.problem import Problem
-from jourdain_jax.analysis.shooting import MultipleShooting
 from jourdain_jax.analysis.unknowns import unknowns_of
-from jourdain_jax.motion.options import AllOptions
-from jourdain_jax.scene.scene import Scene
 
 _SAME = 0.01  # sigmas: between residuals of one fit, computed twice
-
-
-@dataclass(frozen=True, eq=False)
-class Asked:
-    """The arguments of a fit but for its data."""
-
-    scene: Scene  # with the first guesses
-    free: Mapping | tuple[str, ...]
-    options: AllOptions
-    loss: Loss
-    control: Control
-    shooting: MultipleShooting | None
 
 
 @dataclass
@@ -43,6 +27,7 @@ class TakenUp:
     problem: Problem
     theta: Float[np.ndarray, "1 places"]
     limits: Limits
+    pieces: Piecewise | None
 
     @cached_property
     def at(self) -> Linearised:
@@ -65,15 +50,15 @@ class TakenUp:
         return information(self.at.arrow, size, unknowns.estimated, bound, fails, self.asked.control.cutoff).only()
 
 
-def taken_up(fit, data: Experiment | Sequence[Experiment]) -> TakenUp:
+def taken_up(fit: Estimates, data: Experiment | Sequence[Experiment]) -> TakenUp:
     """A `Fit` of one experiment where it ended, with residuals and derivatives computed anew. ValueError where `data` are not what it was fitted to."""
     again = for_runs(fit, data, fitted=True)
     unknowns = again.problem.unknowns
     if unknowns.labels != fit.labels:
         raise ValueError(f"`data` have the unknowns {', '.join(unknowns.labels)}, expected those of the fit: {', '.join(fit.labels)}")
     again.theta[0, unknowns.estimated] = fit.values
-    if isinstance(again.problem.lanes, Piecewise):
-        again.problem.lanes.put_nodes(again.theta, fit.shooting)
+    if again.pieces is not None and fit.shooting is not None:
+        again.pieces.put_nodes(again.theta, fit.shooting)
     sigma = dict(zip(again.problem.estimated, again.at.sigma[0].tolist(), strict=True))  # as F has it; that of a fit allows for its unknowns
 
     def here(run: int, name: str) -> np.ndarray:
@@ -85,7 +70,7 @@ def taken_up(fit, data: Experiment | Sequence[Experiment]) -> TakenUp:
     return again
 
 
-def for_runs(fit, runs: Experiment | Sequence[Experiment], fitted: bool = False) -> TakenUp:
+def for_runs(fit: Estimates, runs: Experiment | Sequence[Experiment], fitted: bool = False) -> TakenUp:
     """The problem of a `Fit` for these runs, at the first guesses; ValueError where they do not fit the scene.
 
     `fitted`: they are those of the fit, in pieces where it was found so.
@@ -93,9 +78,7 @@ def for_runs(fit, runs: Experiment | Sequence[Experiment], fitted: bool = False)
     asked = fit.asked
     checked = as_runs(asked.scene, runs)
     unknowns = unknowns_of(asked.scene, checked, asked.free)
-    of_runs = asked.scene, checked, unknowns.layout, asked.options, None
-    lanes = Piecewise(*of_runs, unknowns, asked.shooting) if fitted and asked.shooting is not None else Lanes(*of_runs)
-    problem = Problem(asked.scene, checked, unknowns, lanes, asked.loss)
+    problem, pieces = problem_of(asked.scene, checked, unknowns, asked.options, None, asked.loss, asked.shooting if fitted else None)
     if problem.with_memory:
         problem.tau = np.array([[float(fit.correlation_time[name]) for name in problem.with_memory]])
-    return TakenUp(asked, problem, unknowns.guess[None].copy(), Limits(*unknowns.ends, unknowns.fixed.copy(), unknowns.sizes))
+    return TakenUp(asked, problem, unknowns.guess[None].copy(), Limits(*unknowns.ends, unknowns.fixed.copy(), unknowns.sizes), pieces)

@@ -10,12 +10,12 @@ from functools import lru_cache
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array
 
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.program.calls import description
+from jourdain_jax.program.calls import Call
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names_read import is_function, now_read_by
 from jourdain_jax.scene.scene import Scene
@@ -23,36 +23,16 @@ from jourdain_jax.scene.scene import Scene
 MOST = 256  # functions whose trace is kept
 
 
-class Operations:
-    """What a function does with the numbers of a motion and with those it closes over; equal to any other that does the same."""
-
-    def __init__(self, closed: ClosedJaxpr):
-        jaxpr = closed.jaxpr
-        self._closed = ClosedJaxpr(jaxpr.replace(constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars]), [])
-        self._key = description(self._closed)
-        self._hash = hash(self._key)
-
-    def __call__(self, held, numbers):
-        """The value of the channel."""
-        return jaxpr_as_fun(self._closed)(*held, *numbers)[0]
-
-    def __hash__(self):
-        return self._hash
-
-    def __eq__(self, other):
-        return self is other or (isinstance(other, Operations) and self._key == other._key)
-
-
 class Channel(eqx.Module):
     """A function of a motion as it was when it was given."""
 
-    operations: Operations = eqx.field(static=True)
+    operations: Call = eqx.field(static=True)  # on what it closes over and the numbers of a motion
     held: tuple[Array, ...]  # what it closes over
     shape: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, motion: Motion) -> Array:
         """The value of the channel at one instant."""
-        return self.operations(self.held, jax.tree.leaves(motion))
+        return self.operations.results(*self.held, *jax.tree.leaves(motion))[0]
 
 
 def channel(function: Callable, scene: Scene) -> Channel:
@@ -82,12 +62,9 @@ def _traced(function: Callable, scene: Scene) -> Channel:
         raise ValueError(f"a function of `sensors` cannot be called with a motion ({str(error).splitlines()[0]}); {advice}") from error
     if not hasattr(shape, "shape"):
         raise ValueError(f"a function of `sensors` returned {type(shape).__name__}, expected an array of numbers; return one array")
-    return Channel(_one_of_equals(Operations(closed)), tuple(jnp.asarray(x) for x in closed.consts), shape.shape)
-
-
-@lru_cache(maxsize=MOST)
-def _one_of_equals(operations: Operations) -> Operations:
-    return operations
+    jaxpr = closed.jaxpr
+    operations = ClosedJaxpr(jaxpr.replace(constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars]), [])
+    return Channel(Call(operations, ("a channel",)), tuple(jnp.asarray(x) for x in closed.consts), shape.shape)
 
 
 def motion_shape(scene: Scene) -> Motion:

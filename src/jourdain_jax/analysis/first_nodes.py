@@ -21,9 +21,9 @@ _SAMPLES = 5  # that a parabola goes through
 
 
 def first_nodes(
-    scene: Scene, run: Experiment, ends: Int[np.ndarray, "ends"], q: Float[np.ndarray, "coordinates"], u: Float[np.ndarray, "speeds"], member: int | None
+    scene: Scene, run: Experiment, ends: Int[np.ndarray, "ends"], q: Float[np.ndarray, "coordinates"], u: Float[np.ndarray, "speeds"]
 ) -> Float[np.ndarray, "pieces states"]:
-    """Nodes at the begin of all pieces of a run, the first one included; q, u: its start. `member`: which of the repeats."""
+    """Nodes at the begin of all pieces of a run, the first one included; q, u: its start."""
     ts = np.asarray(run.ts, float)
     at = np.concatenate([[float(run.t0)], ts[ends[1:-1]]])
     qs, us, rates = np.tile(q, (len(at), 1)), np.tile(u, (len(at), 1)), np.full((len(at), len(q)), np.nan)
@@ -34,7 +34,7 @@ def first_nodes(
         of_state = reading.operation is None and not np.any(gain == 0)
         if not (of_state or reading.has_filter):
             continue
-        y = ((np.asarray(values if member is None else values[member], float) - bias) / np.where(gain == 0, 1.0, gain)).reshape(len(ts), -1)
+        y = ((np.asarray(values, float) - bias) / np.where(gain == 0, 1.0, gain)).reshape(len(ts), -1)
         found = np.array([[_parabola(ts - delay, column, t) for column in y.T] for t in at])  # (nodes, entries, 2)
         if reading.has_filter:
             filters.append(np.nan_to_num(found[..., 0]))

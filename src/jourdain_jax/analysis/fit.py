@@ -2,7 +2,7 @@
 
     minimise sum r(theta)^2 + sum ((theta - mean) / s)^2,   r = (prediction - value) / sigma,   theta within its bounds;   mean, s: of priors
 
-by Levenberg-Marquardt. Jacobians come by forward mode through the simulation, run by run; initial values of the runs are eliminated run by run.
+by Levenberg-Marquardt. Jacobians come by forward mode through the options, run by run; initial values of the runs are eliminated run by run.
 Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), chapter 3.
 """
 
@@ -13,18 +13,17 @@ from typing import Unpack
 
 import numpy as np
 
-from jourdain_jax.analysis.asked import Asked
 from jourdain_jax.analysis.at_bounds import AtBounds
 from jourdain_jax.analysis.body_inertia import PossibleInertia
 from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.estimates import Asked
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.fit_statistics import statistics
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum
 from jourdain_jax.analysis.likelihood import as_fit_options, as_runs, in_all_or_none
 from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
-from jourdain_jax.analysis.piecewise import Piecewise, Shot
-from jourdain_jax.analysis.predictions import Lanes
+from jourdain_jax.analysis.piecewise import Shot, problem_of
 from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.analysis.ranges import Range
 from jourdain_jax.analysis.search import minimum, off_bounds, with_memory
@@ -34,7 +33,7 @@ from jourdain_jax.analysis.starts import check_first_guess, check_starts
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.calculus.reals import is_traced
-from jourdain_jax.motion.options import AllOptions, OptionFields, Options
+from jourdain_jax.motion.options import OptionFields, Options
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.scene import Scene
@@ -111,7 +110,8 @@ def fit(
     if isinstance(guesses, bool) or not isinstance(guesses, int | np.integer) or guesses < 1:
         raise ValueError(f"`guesses` is {guesses!r}, expected a whole number of at least 1: how many first guesses to begin from")
     settled = as_fit_options(options, by_name, "fit")
-    return _fit(scene, data, free, settled, Control(tolerance, max_iterations, cutoff), loss, errors, False, int(guesses), shooting)
+    least = _checked_choices(loss, errors, shooting)
+    return _fit(Asked(as_scene(scene), _named(free), settled, least, Control(tolerance, max_iterations, cutoff), errors, int(guesses), shooting), data)
 
 
 def fit_batch(
@@ -134,30 +134,26 @@ def fit_batch(
     `converged` False and harms no other, as does one with fewer samples than unknowns. **Raises** as `fit`.
     """
     settled = as_fit_options(options, by_name, "fit_batch")
-    return _fit(scene, data, free, settled, Control(tolerance, max_iterations, cutoff), loss, errors, True)
+    least = _checked_choices(loss, errors, None)
+    return _fit(Asked(as_scene(scene), _named(free), settled, least, Control(tolerance, max_iterations, cutoff), errors, 1, None), data, repeats=True)
 
 
-def _fit(scene, data, free, options: AllOptions, control: Control, loss: Loss | None, errors: str, repeats: bool, guesses: int = 1, shooting=None) -> Fit:
-    scene, data = as_scene(scene), tuple(data) if isinstance(data, Iterator) else data
-    if is_traced((scene, data, control.tolerance, control.cutoff, options)):
+def _fit(asked: Asked, data: Experiment | Sequence[Experiment], repeats: bool = False) -> Fit:
+    scene, control, data = asked.scene, asked.control, tuple(data) if isinstance(data, Iterator) else data
+    if is_traced((scene, data, control.tolerance, control.cutoff, asked.options)):
         raise DifferentiationModeError(
             "`fit` was called inside jit, vmap or a derivative, but its steps are chosen outside of compiled code. Call it with known numbers; "
             "for many repeats use `fit_batch`, for derivatives of the fit's objective `log_likelihood`."
         )
     _check_control(control)
     runs = as_runs(scene, data, repeats=repeats)
-    _check_choices(runs, loss, errors)
-    check_shooting(shooting)
-    free = free if isinstance(free, Mapping) else tuple(as_names(free))
-    unknowns = unknowns_of(scene, runs, free)
+    _check_noise(runs, asked)
+    unknowns = unknowns_of(scene, runs, asked.free)
     check_starts(scene, runs, unknowns)
     members = _repeats(runs) if repeats else None
     enough = _check_enough(runs, unknowns, repeats)
-    asked = Asked(scene, free, options, loss or LEAST_SQUARES, control, shooting)
-    of_runs = scene, runs, unknowns.layout, options, members
-    pieces = None if shooting is None else Piecewise(*of_runs, unknowns, shooting)
-    problem = Problem(scene, runs, unknowns, Lanes(*of_runs) if pieces is None else pieces, asked.loss)
-    theta = unknowns.first_guesses(guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
+    problem, pieces = problem_of(scene, runs, unknowns, asked.options, members, asked.loss, asked.shooting)
+    theta = unknowns.first_guesses(asked.guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
     limits = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
     if pieces is None:
         found = minimum(problem, theta, limits, control, one_will_do=members is None)
@@ -167,15 +163,15 @@ def _fit(scene, data, free, options: AllOptions, control: Control, loss: Loss | 
         check_first_guess(scene, runs, unknowns)
     same = np.zeros(members, int) if members else np.asarray(found.agreeing(_SAME))
     if pieces is not None:
-        if not members:
-            pieces.keep(int(np.argmin(found.at.cost)))
+        pieces.keep(int(np.argmin(found.at.cost)))
         control = replace(control, cutoff=cutoff_of(pieces, control, np.arange(len(pieces.at.theta))))
         asked = replace(asked, control=control)
-    found, at_bounds = off_bounds(problem, with_memory(problem, found if members else found.lowest(), limits, control), limits, control, pieces, errors)
+    found = with_memory(problem, found if members else found.lowest(), limits, control)
+    found, at_bounds = off_bounds(problem, found, limits, control, pieces, asked.errors)
     found.converged &= enough
     if pieces is not None:
         found.converged &= pieces.closed(np.arange(len(found.converged)))
-    return _result(problem, found, limits, at_bounds, asked, errors, guesses, same, None if pieces is None else pieces.told())
+    return _result(problem, found, limits, at_bounds, asked, same, None if pieces is None else pieces.told())
 
 
 def _check_control(control: Control) -> None:
@@ -187,20 +183,29 @@ def _check_control(control: Control) -> None:
         raise ValueError(f"`max_iterations` is {control.most_steps!r}, expected a whole number of steps")
 
 
-def _check_choices(runs: Sequence[Experiment], loss, errors) -> None:
+def _named(free: Mapping | Iterable[str]) -> Mapping | tuple[str, ...]:
+    return free if isinstance(free, Mapping) else tuple(as_names(free))
+
+
+def _checked_choices(loss, errors, shooting) -> Loss:
     if loss is not None and not isinstance(loss, Loss):
         raise ValueError(f"`loss` is {loss!r}, expected `huber()`, `student_t()`, or None for least squares")
     if errors not in ("sigmas", "runs"):
         raise ValueError(f'`errors` is {errors!r}, expected "sigmas" or "runs"')
-    if errors == "runs" and len(runs) < _FEWEST_RUNS:
+    check_shooting(shooting)
+    return LEAST_SQUARES if loss is None else loss
+
+
+def _check_noise(runs: Sequence[Experiment], asked: Asked) -> None:
+    if asked.errors == "runs" and len(runs) < _FEWEST_RUNS:
         raise ValueError(
             f'errors="runs" takes standard errors from how runs differ, but there are {len(runs)}; give {_FEWEST_RUNS} or more, or errors="sigmas"'
         )
-    unknown = in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma)
-    if unknown and loss is not None:
+    robust, unknown = asked.loss != LEAST_SQUARES, in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma)
+    if unknown and robust:
         raise ValueError(f"sigma of channel `{unknown[0]}` is None, but a robust loss needs to know what is far out; give a number")
     coloured = sorted({name for run in runs for name in run.correlation_time})
-    if coloured and loss is not None:
+    if coloured and robust:
         raise ValueError(f"the noise of channel `{coloured[0]}` has a correlation time, but a robust loss takes samples as independent; leave out either")
     in_all_or_none(runs, "the correlation time", lambda run: run.unknown_correlation)
 
@@ -227,10 +232,8 @@ def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool)
     return np.asarray(each >= len(unknowns.labels) + sigmas)
 
 
-def _result(
-    problem: Problem, found: Minimum, limits: Limits, at_bounds: AtBounds, asked: Asked, errors: str, guesses: int, agreeing: np.ndarray, how: Shot | None
-) -> Fit:
-    unknowns, single, control = problem.unknowns, problem.lanes.members is None, asked.control
+def _result(problem: Problem, found: Minimum, limits: Limits, at_bounds: AtBounds, asked: Asked, agreeing: np.ndarray, how: Shot | None) -> Fit:
+    unknowns, single, control = problem.unknowns, problem.single, asked.control
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
     places = unknowns.estimated
     told = Fit(
@@ -241,16 +244,16 @@ def _result(
         steps=one(found.steps),
         grown=one(found.grown),
         agreeing=agreeing,
-        guesses=guesses,
+        guesses=asked.guesses,
         labels=unknowns.labels,
         units=unknowns.units,
         cutoff=control.cutoff,
-        errors=errors,
+        errors=asked.errors,
         shooting=how,
         trace=found.trace[0] if single else (),
         asked=asked,
         layout=unknowns.layout,
-        work_out=partial(statistics, problem, found, limits, asked, errors, at_bounds),
+        work_out=partial(statistics, problem, found, limits, control, asked.errors, at_bounds, asked.options if single and how is None else None),
     )
     if problem.with_memory:  # its motions are needed, in the context that is here
         told.statistics  # noqa: B018

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jourdain_jax.analysis.estimates import Estimates
 from jourdain_jax.analysis.fit_pictures import autocorrelation, data_and_prediction, information_over_time, interval_widths, profile, way_to_the_minimum
 from jourdain_jax.analysis.fit_text import agreement
 from jourdain_jax.analysis.held_out import Prediction
@@ -45,7 +46,7 @@ class Section(NamedTuple):
 
 
 def fit_page(
-    fit,
+    fit: Estimates,
     *,
     fitted: Sequence[dict[str, Prediction]] = (),
     shares: Informed | None = None,
@@ -94,7 +95,7 @@ def _informed(shares: Informed) -> Section:
     return Section("What informs which unknown", about, lines, [information_over_time(shares, int(run)) for run in shown])
 
 
-def _correlations(fit) -> Section:
+def _correlations(fit: Estimates) -> Section:
     names = fit.labels[:_MOST_CORRELATED]
     found = fit.correlation[: len(names), : len(names)]
     rows = [("", *names), *((name, *(_number(c, ".2f") for c in row)) for name, row in zip(names, found, strict=True))]
@@ -115,7 +116,7 @@ def _predicted(title: str, about: str, runs: Sequence[dict[str, Prediction]], un
     return Section(title, about, lines, [data_and_prediction(*panel) for panel in panels[:_MOST_PANELS]])
 
 
-def _whiteness(fit, fitted: Sequence[dict[str, Prediction]]) -> Section:
+def _whiteness(fit: Estimates, fitted: Sequence[dict[str, Prediction]]) -> Section:
     about = "Of residuals from which the memory of the noise was taken out, where that was estimated or stated."
     rows, figures = [("channel", "correlation of neighbours", "white ones hardly exceed", "white", "correlation time", "intervals too narrow by")], []
     for name, (rho, limit) in fit.autocorrelation.items():
@@ -137,7 +138,7 @@ def _whiteness(fit, fitted: Sequence[dict[str, Prediction]]) -> Section:
     return Section("Are the residuals white?", about, table(rows), figures)
 
 
-def _way(fit) -> Section:
+def _way(fit: Estimates) -> Section:
     told = agreement(fit) if fit.guesses > 1 else "one first guess was tried; `guesses=30` would tell how many lead here"
     rows = [("what is minimised", "steps tried", "F at first", "F at last")]
     rows += [(what, str(len(costs) - 1), f"{costs[0]:.6g}", f"{costs[-1]:.6g}") for what, costs in fit.trace]

@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from jourdain_jax.analysis.estimates import Estimates
 from jourdain_jax.analysis.held_out import Prediction
 from jourdain_jax.analysis.informed import Informed
 from jourdain_jax.analysis.likelihood_profiles import RISE_95, Profile
@@ -44,7 +45,7 @@ def autocorrelation(name: str, found: np.ndarray, limit: float) -> str:
     return figure(draw, _WIDTH, _HEIGHT)
 
 
-def interval_widths(fit) -> str:
+def interval_widths(fit: Estimates) -> str:
     """Draw half the width of the 95 % interval of each unknown, in per cent of the estimate, on an axis of powers of ten."""
     names = fit.labels[:_MOST_ROWS]
     values = np.asarray(fit.values[: len(names)], float)

@@ -1,144 +1,30 @@
-"""The result of a fit: estimates with their uncertainty, residuals, the fitted scene, and what the measurements cannot tell."""
+"""The result of a fit: its estimates, why they should not be relied on, and what else can be asked of it."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
 
-from jourdain_jax.analysis.asked import Asked, taken_up
-from jourdain_jax.analysis.derived import derived, standard_errors
-from jourdain_jax.analysis.estimated import ChannelResiduals, Estimated, summary
+from jourdain_jax.analysis.asked import taken_up
+from jourdain_jax.analysis.estimates import Estimates
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.fit_page import fit_page
 from jourdain_jax.analysis.fit_pictures import interval_widths
-from jourdain_jax.analysis.fit_statistics import Statistics
 from jourdain_jax.analysis.fit_text import batch_text, text
 from jourdain_jax.analysis.fit_warnings import warnings_of
 from jourdain_jax.analysis.held_out import Prediction, of_fitted, of_held_out
-from jourdain_jax.analysis.information import hidden_combinations
 from jourdain_jax.analysis.informed import informed
-from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.likelihood_profiles import Profile, profiles
-from jourdain_jax.analysis.piecewise import Shot
-from jourdain_jax.analysis.weak_directions import CORRELATED, weak_combinations
-from jourdain_jax.build.plausibility import impossible_bodies
-from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
-from jourdain_jax.scene.parameters import parameters_of
-from jourdain_jax.scene.printing import Printed
-from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.names import as_names
 
-MOST_COMPARED = 1000  # unknowns
 MOST_INFORMED = 24  # unknowns of which the report says what informs them
 
 
-GONE = {
-    "bootstrap": "`Fit.profiles` gives intervals where the scene is not linear; of repeats, draw them about `simulate` of `scene` and `starts`, and give them "
-    "to `fit_batch`"
-}
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Fit(Printed):
+class Fit(Estimates):
     """Estimates by name (`fit["offset"].value`), with covariance, residuals and the fitted scene; `print(fit)` shows a table.
 
-    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too. What follows from the minimum is worked out when it is first asked
-    for; each part of it can be asked for here: `scene`, `starts`, `standard_errors`, `low`, `high`, `at_bound`, `residuals`, `whitened`, `sigma`,
-    `correlation_time`, `chi_square`, `samples`, `degrees_of_freedom` and all else of `Statistics`.
+    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too; what follows below is of one fit.
     """
-
-    values: Float[np.ndarray, "*repeats unknowns"]
-    beyond: Float[np.ndarray, "*repeats unknowns"]  # of estimates at a bound, by how many standard errors the data would put them beyond; NaN elsewhere
-    converged: Bool[np.ndarray, "*repeats"]
-    stuck: Bool[np.ndarray, "*repeats"]  # no step lowers the sum of squares, however short, and this is no minimum
-    steps: Int[np.ndarray, "*repeats"]  # tried
-    grown: Bool[np.ndarray, "*repeats"]  # whether the minimum was found over growing spans, far from where the first guess led to
-    agreeing: Int[np.ndarray, "*repeats"]  # first guesses that led to this minimum, of those tried; of a batch, which has one for each repeat, zero
-    guesses: int  # first guesses tried
-    labels: tuple[str, ...]  # names of the unknowns
-    units: tuple[str, ...]
-    cutoff: float
-    errors: str  # whence standard errors come: "sigmas" or "runs"
-    shooting: Shot | None  # how it was found by multiple shooting
-    trace: tuple[tuple[str, tuple[float, ...]], ...]  # what was minimised, and F at first and after each step tried; none of a batch
-    asked: Asked  # the arguments of `fit`
-    layout: Layout
-    work_out: Callable[[], Statistics]
-
-    @cached_property
-    def statistics(self) -> Statistics:
-        """What follows from the minimum."""
-        return self.work_out()
-
-    def __getstate__(self) -> dict:
-        return vars(self) | {"statistics": self.statistics, "work_out": None}  # what was compiled stays in its process
-
-    def __getattr__(self, name: str) -> Any:
-        """A part of `statistics`, such as `standard_errors`."""
-        if name in Statistics.__dataclass_fields__:
-            return getattr(self.statistics, name)
-        raise AttributeError(f"`{name}` has gone: {GONE[name]}" if name in GONE else f"`Fit` has no `{name}`; {nearest(name, dir(self))}")
-
-    def __getitem__(self, name: str) -> Estimated:
-        if name not in self.labels:
-            raise UnknownNameError(f"`{name}` was not estimated; {nearest(name, self.labels)}")
-        i = self.labels.index(name)
-        return Estimated(self.values[..., i], self.standard_errors[..., i], self.low[..., i], self.high[..., i], self.units[i])
-
-    @property
-    def estimates(self) -> dict[str, Estimated]:
-        """All estimates by name."""
-        return {name: self[name] for name in self.labels}
-
-    @property
-    def covariance(self) -> Float[np.ndarray, "*repeats unknowns unknowns"]:
-        """Covariance of the estimates in the order of `labels`, to first order; NaN where not identifiable."""
-        return self.information.covariance
-
-    @property
-    def correlation(self) -> Float[np.ndarray, "*repeats unknowns unknowns"]:
-        """Correlation of the estimates."""
-        return self.covariance / (self.standard_errors[..., :, None] * self.standard_errors[..., None, :])
-
-    @property
-    def reduced_chi_square(self) -> Float[np.ndarray, "*repeats"]:
-        """Sum of squared residuals per degree of freedom, near 1 where scene and sigmas are right; NaN where there are as many unknowns as samples."""
-        return np.asarray(self.chi_square / np.where(self.degrees_of_freedom > 0, self.degrees_of_freedom, np.nan))
-
-    # Of one fit, not of a batch. -----------------------------------------------------------------------------------
-
-    @property
-    def not_identifiable(self) -> tuple[str, ...]:
-        """What the measurements cannot tell, one sentence per combination of unknowns."""
-        if not np.isfinite(self.chi_square):
-            return ()
-        return hidden_combinations(self.information.hidden[0], self.information.least_part, self.sizes, self.values, self.labels)
-
-    @property
-    def correlated(self) -> tuple[str, ...]:
-        """Pairs of unknowns whose estimates correlate by `CORRELATED` or more in magnitude, strongest first, one sentence each."""
-        some = np.flatnonzero(np.isfinite(self.standard_errors))[:MOST_COMPARED]
-        found = np.triu(self.correlation[np.ix_(some, some)], 1)
-        pairs = sorted(zip(*np.nonzero(np.abs(found) >= CORRELATED), strict=True), key=lambda ij: -abs(found[ij]))
-        return tuple(
-            f"`{self.labels[some[i]]}` and `{self.labels[some[j]]}` correlate at {np.sign(found[i, j]) * min(abs(found[i, j]), 0.9999):.4g}: "
-            "the data tell a combination of them far better than either"
-            for i, j in pairs
-        )
-
-    @property
-    def weak(self) -> tuple[str, ...]:
-        """Shared unknowns, and combinations of them, that the data tell with a relative standard error of 0.1 or more, weakest first, one sentence each."""
-        return weak_combinations(self.covariance, self.values, self.sizes, self.labels)
-
-    @property
-    def impossible(self) -> tuple[str, ...]:
-        """Bodies of the fitted scene that no distribution of mass can make, one sentence each."""
-        q, _, _ = self.scene.named(**self.starts[0])
-        return impossible_bodies(self.scene, q)
 
     @property
     def warning(self) -> str:
@@ -149,50 +35,6 @@ class Fit(Printed):
     def warnings(self) -> tuple[str, ...]:
         """Why estimates or intervals should not be relied on, the most serious reason first, one sentence each."""
         return warnings_of(self)
-
-    @property
-    def autocorrelation(self) -> dict[str, tuple[float, float]]:
-        """For each channel, the correlation of neighbouring whitened residuals over all runs, and what white ones hardly exceed (3.5 / sqrt(pairs))."""
-        found = {}
-        for name in dict.fromkeys(name for run in self.whitened for name in run):
-            runs = [np.asarray(run[name]).reshape(len(run[name]), -1) for run in self.whitened if name in run]
-            products = np.concatenate([np.ravel(r[1:] * r[:-1]) for r in runs])
-            squares = np.concatenate([np.ravel(r) ** 2 for r in runs])
-            pairs, size = np.isfinite(products).sum(), np.nanmean(squares) if np.isfinite(squares).any() else 0.0
-            if pairs and size > 0:
-                found[name] = float(np.nanmean(products) / size), 3.5 / float(np.sqrt(pairs))
-        return found
-
-    def residual_summary(self) -> tuple[ChannelResiduals, ...]:
-        """Count, mean, rms and largest residual per run and channel."""
-        return tuple(summary(run, name, np.asarray(r)) for run, found in enumerate(self.residuals) for name, r in found.items())
-
-    def derived(self, function: Callable[[Scene], Array], unit: str = "") -> Estimated:
-        """A number, or an array of them, that follows from the parameters, with its standard error and 95 % interval.
-
-            found.derived(lambda scene: scene.mass * scene.offset**2, "kg m^2")
-
-        y = f(scene), var(y) = g' C g with g = d y / d theta and C the covariance of the estimates: to first order (the delta method). So a combination is
-        told whose parts the data do not tell apart. NaN where it depends on a direction that does not show, or on an unknown at its bound.
-
-        - `function`: plain JAX, of a scene; it returns an array of any shape. `unit`: of the result, for print.
-
-        **Returns** value, standard error and ends of the interval in that shape, of a batch with a leading axis `repeats`. **Raises** ValueError where the
-        function returns no numbers. Source: C. R. Rao, Linear Statistical Inference and Its Applications, 2nd ed. (1973), section 6a.2.
-        """
-        shared = self.layout.sizes[0]
-        value, slopes = derived(self.asked.scene, self.layout, function, self.values[..., :shared])
-        sizes, at_bound, quantiles = (x[..., :shared] for x in (self.sizes, self.at_bound, self.statistics.quantiles))
-        error = standard_errors(self.information, slopes, sizes, at_bound, self.cutoff)
-        of_numbers = quantiles.reshape(*quantiles.shape[:-1], *(1,) * (slopes.ndim - quantiles.ndim), shared)
-        reach = error * np.max(np.where(slopes != 0, of_numbers, 0.0), axis=-1, initial=0.0)
-        return Estimated(value, error, np.asarray(value - reach), np.asarray(value + reach), unit)
-
-    @property
-    def tied(self) -> dict[str, Estimated]:
-        """The parameters that follow from unknowns, by the functions and the possible inertias in `free`, as `derived` tells them."""
-        units = {name: about["unit"] for name, _, about in parameters_of(self.asked.scene)}
-        return {name: self.derived(lambda scene, name=name: getattr(scene, name), units[name]) for name in self.layout.following}
 
     def profiles(self, data: Experiment | Sequence[Experiment], names: str | Iterable[str] = ()) -> dict[str, Profile]:
         """The profile likelihood of the unknowns in `names` (default: all that are not of one run alone), by name: how far each may be moved, all others

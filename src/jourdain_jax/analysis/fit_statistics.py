@@ -11,15 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jourdain_jax.analysis.asked import Asked
 from jourdain_jax.analysis.at_bounds import Around, AtBounds, moved_from_bounds, too_narrow_near_bounds
 from jourdain_jax.analysis.events_met import events_met
 from jourdain_jax.analysis.information import Information, variances
-from jourdain_jax.analysis.levenberg_marquardt import Limits, Minimum
+from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum
 from jourdain_jax.analysis.oddities import oddities
 from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.analysis.spread import spread
 from jourdain_jax.analysis.unknowns import Unknowns
+from jourdain_jax.motion.options import AllOptions
 from jourdain_jax.scene.scene import Scene
 
 
@@ -52,9 +52,12 @@ class Statistics:
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of unknowns that no bound kept from growing beyond all measure
-def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, errors: str, at_bounds: AtBounds) -> Statistics:
-    """Statistics of the minimum of each member; without the axis of members where the problem has none."""
-    control, unknowns, theta, single = asked.control, problem.unknowns, found.theta, problem.lanes.members is None
+def statistics(problem: Problem, found: Minimum, limits: Limits, control: Control, errors: str, at_bounds: AtBounds, options: AllOptions | None) -> Statistics:
+    """Statistics of the minimum of each member; without the axis of members where the problem has none.
+
+    `options`: those of a look at the events of the fitted motion; None: there is no look.
+    """
+    unknowns, theta, single = problem.unknowns, found.theta, problem.single
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
     low, high = limits.low[places], limits.high[places]
@@ -98,7 +101,7 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, e
         of_rise=one(np.where(bound[:, places], at_bounds.if_free.of_rise[:, places], about.of_rise)),
         from_prior=(values - unknowns.prior_mean[places]) / unknowns.prior_sigma[places],
         oddities=oddities(problem.scene, problem.runs, not single),
-        events_met=events_met(problem, theta[0], asked.options) if single and asked.shooting is None else (),
+        events_met=() if options is None else events_met(problem, theta[0], options),
         too_narrow=tuple(too_narrow),
     )
 

@@ -2,19 +2,21 @@
 
 import numpy as np
 
+from jourdain_jax.analysis.estimates import Estimates
+from jourdain_jax.analysis.fit_warnings import warnings_of
 from jourdain_jax.analysis.table import table
 
 MOST_NAMED = 8  # combinations of unknowns that are told poorly, pairs that correlate
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def text(fit) -> str:
+def text(fit: Estimates) -> str:
     """The text of a fit of one experiment: estimates with their intervals, warnings, what the data do not tell, residuals by channel."""
     lines = [
         f"Fit of {type(fit.scene).__name__}: {'converged' if fit.converged else 'NOT CONVERGED'} in {int(fit.steps)} steps; "
         f"{int(fit.samples)} samples, {len(fit.labels)} unknowns, reduced chi-square {float(fit.reduced_chi_square):.4g}"
     ]
-    lines += [f"WARNING: {sentence}" for sentence in fit.warnings]
+    lines += [f"WARNING: {sentence}" for sentence in warnings_of(fit)]
     if fit.grown:
         lines.append("found over growing spans: the first guess led elsewhere")
     if fit.shooting is not None:
@@ -48,7 +50,7 @@ def _row(name: str, e, remark: str) -> tuple[str, ...]:
     return name, e.unit, f"{e.value:.6g}", error, interval + remark
 
 
-def batch_text(fit) -> str:
+def batch_text(fit: Estimates) -> str:
     """The text of many fits: mean and spread of the estimates that converged."""
     good = np.asarray(fit.converged)
     rows = [("unknown", "unit", "mean", "std. deviation", "mean std. error")]
@@ -61,6 +63,6 @@ def batch_text(fit) -> str:
     return "\n".join([f"{good.size} fits of {type(fit.scene).__name__}: {good.sum()} converged", *table(rows)])
 
 
-def agreement(fit) -> str:
+def agreement(fit: Estimates) -> str:
     """How many first guesses led to the minimum."""
     return f"{int(fit.agreeing) or 'none'} of {fit.guesses} first guesses led to {'this' if fit.agreeing else 'a'} minimum"

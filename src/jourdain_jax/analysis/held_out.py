@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.analysis.asked import for_runs
+from jourdain_jax.analysis.estimates import Estimates
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.levenberg_marquardt import minimise
 from jourdain_jax.scene.names import nearest
@@ -48,12 +49,12 @@ class Prediction(Printed, eqx.Module):
         return f"{np.isfinite(self.error).sum()} samples from {self.ts[0]:.6g} to {self.ts[-1]:.6g} s, predicted to an {told}"
 
 
-def of_fitted(fit, runs: Sequence[Experiment]) -> tuple[dict[str, Prediction], ...]:
+def of_fitted(fit: Estimates, runs: Sequence[Experiment]) -> tuple[dict[str, Prediction], ...]:
     """Predictions of the runs that a `Fit` was fitted to."""
     return tuple(_by_channel(fit, run, residuals) for run, residuals in zip(runs, fit.residuals, strict=True))
 
 
-def of_held_out(fit, runs: Experiment | Sequence[Experiment]) -> tuple[dict[str, Prediction], ...]:
+def of_held_out(fit: Estimates, runs: Experiment | Sequence[Experiment]) -> tuple[dict[str, Prediction], ...]:
     """Predictions of other runs; ValueError where they do not fit the scene, or share unknowns that the fit did not estimate."""
     runs = (runs,) if isinstance(runs, Experiment) else tuple(runs)
     other = for_runs(fit, runs)
@@ -77,7 +78,7 @@ def of_held_out(fit, runs: Experiment | Sequence[Experiment]) -> tuple[dict[str,
     return tuple(found)
 
 
-def _by_channel(fit, data: Experiment, residuals: dict[str, np.ndarray]) -> dict[str, Prediction]:
+def _by_channel(fit: Estimates, data: Experiment, residuals: dict[str, np.ndarray]) -> dict[str, Prediction]:
     found = {}
     for name, r in residuals.items():
         values, ts = np.asarray(data.values[name]), np.asarray(data.ts)

@@ -7,7 +7,6 @@ It allows for all other unknowns being estimated, too. The shares of all samples
 Source: R. D. Cook and S. Weisberg, Residuals and Influence in Regression (1982), section 2.2.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,26 +59,20 @@ def informed(fitted: TakenUp, most: int) -> Informed:
     places, labels = unknowns.estimated[some], tuple(unknowns.labels[i] for i in some)
     variance = variances(known.shared, known.own, known.follow)[places]
     found: list[dict[str, np.ndarray]] = [{}] * len(problem.runs)
-    for run, own, shared in _derivatives(fitted):
-        a_shared = known.shared @ (shared - own @ known.follow[run]).T  # own unknowns of a run follow the shared ones, x = - G s
-        a_own = -np.einsum("kij,js->kis", known.follow, a_shared)
-        a_own[run] += known.own[run] @ own.T
-        share = np.concatenate([a_shared, a_own.reshape(-1, len(own))])[places] ** 2 / variance[:, None]
-        by_channel = problem.lanes.by_channel(run, share)
-        found[run] = {name: np.nansum(x, axis=tuple(range(2, x.ndim))) for name, x in by_channel.items()}
-    return Informed(labels, tuple(found), tuple(np.asarray(run.ts) for run in problem.runs))
-
-
-def _derivatives(fitted: TakenUp) -> Iterator[tuple[int, Float[np.ndarray, "samples own"], Float[np.ndarray, "samples shared"]]]:
-    """J of each run: with respect to its own unknowns, and to those that count as shared."""
-    problem, (_, m) = fitted.problem, fitted.problem.unknowns.layout.sizes
-    lanes, taus = problem.lanes, problem.taus(np.array([0]))
-    for b, j, plain in lanes.evaluate(*problem.unknowns.split(fitted.theta), np.array([0])):
-        white = lanes.whitened(j, b, plain, {name: np.broadcast_to(tau, len(j)) for name, tau in taus.items()})
-        for run, r_run, J_run in zip(j.tolist(), white[..., -1], white[..., :-1], strict=True):
-            rows = np.sqrt(problem.loss.weight(r_run))[:, None] * J_run
+    m, taus = unknowns.layout.sizes[1], problem.taus(np.array([0]))
+    for b, j, plain in problem.evaluate(*unknowns.split(fitted.theta), np.array([0])):
+        group = problem.lanes.group_of(int(j[0]))
+        white = group.whitened(j, b, plain, {name: np.broadcast_to(tau, len(j)) for name, tau in taus.items()})
+        for run, r, J in zip(j.tolist(), white[..., -1], white[..., :-1], strict=True):
+            rows = np.sqrt(problem.loss.weight(r))[:, None] * J
             for k, name in enumerate(problem.estimated):
                 if name in problem.runs[run].values:
-                    rows[lanes.channels(run)[name]] /= fitted.at.sigma[0, k]
+                    rows[group.channels[name]] /= fitted.at.sigma[0, k]
             # those of a single run count as shared, and come last
-            yield run, *((rows[:, :0], np.roll(rows, -m, axis=1)) if len(problem.runs) == 1 else (rows[:, :m], rows[:, m:]))
+            own, shared = (rows[:, :0], np.roll(rows, -m, axis=1)) if len(problem.runs) == 1 else (rows[:, :m], rows[:, m:])
+            a_shared = known.shared @ (shared - own @ known.follow[run]).T  # own unknowns of a run follow the shared ones, x = - G s
+            a_own = -np.einsum("kij,js->kis", known.follow, a_shared)
+            a_own[run] += known.own[run] @ own.T
+            share = np.concatenate([a_shared, a_own.reshape(-1, len(own))])[places] ** 2 / variance[:, None]
+            found[run] = {name: np.nansum(x, axis=tuple(range(2, x.ndim))) for name, x in group.by_channel(run, share).items()}
+    return Informed(labels, tuple(found), tuple(np.asarray(run.ts) for run in problem.runs))

@@ -40,12 +40,14 @@ class Linearised:
 
     cost: Float[np.ndarray, "members"]  # F; not finite where the motion fails
     arrow: Arrow  # J and residuals with J'r = dF/dtheta
-    rows: np.ndarray  # (members, runs) of [J r] with the run's own unknowns first, (samples, width); None where another run had failed
+    residuals: np.ndarray  # (members, runs) of those of all samples, not whitened; None where another run had failed
     sigma: Float[np.ndarray, "members channels"]  # of channels whose noise is estimated
+    triangles: Float[np.ndarray, "members runs kinds width width"]  # of [J r]: of channels whose sigma is known, then of each other
+    squares: Float[np.ndarray, "members kinds"]  # sums of squared residuals of these
 
     def at(self, members) -> "Linearised":
         """That of some members."""
-        return Linearised(self.cost[members], self.arrow.at(members), self.rows[members], self.sigma[members])
+        return Linearised(self.cost[members], self.arrow.at(members), *(x[members] for x in self._arrays[1:5]))
 
     def replaced(self, members: Int[np.ndarray, "some"], new: "Linearised", chosen: Bool[np.ndarray, "some"]) -> "Linearised":
         """All members, with what is `new` of these where it is `chosen`."""
@@ -58,7 +60,7 @@ class Linearised:
 
     @property
     def _arrays(self) -> tuple[np.ndarray, ...]:
-        return self.cost, self.rows, self.sigma, *self.arrow.arrays
+        return self.cost, self.residuals, self.sigma, self.triangles, self.squares, *self.arrow.arrays
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,11 @@ Biometrics 53 (1997) 983.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jourdain_jax.analysis.arrow import triangle
 from jourdain_jax.analysis.information import Information, variances
 from jourdain_jax.analysis.levenberg_marquardt import Linearised
 from jourdain_jax.analysis.losses import LEAST_SQUARES
@@ -47,49 +46,32 @@ def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: C
     doubt, untold = np.zeros((len(theta), len(places))), np.zeros((len(theta), count), bool)
     if count == 1 and problem.loss == LEAST_SQUARES:
         return NoiseLevels(at, known, doubt, 0 * doubt, untold[:, 1:])
-    good = np.flatnonzero(np.isfinite(at.cost))
-    triangles, squares, samples, residuals = _by_kind(problem, at, good)
+    by_run = [problem.by_channel(run, at, lambda x: x) for run in range(len(problem.runs))]
+    residuals = [r[np.isfinite(r)] for r in np.concatenate([r.reshape(len(theta), -1) for of in by_run for r in of.values()], axis=1)]
+    samples = np.concatenate([[[r.size] for r in residuals], problem.lanes.counted(problem.estimated, members)], axis=1)
     (determined, widths), unsure = np.zeros((2, len(theta), count)), problem.loss != LEAST_SQUARES
     for _ in range(_TURNS):
         left, before = samples - determined, widths.copy()
         untold[:, 1:] |= left[:, 1:] < LEFT
-        widths[:, 1:] = np.maximum(np.sqrt(squares[:, 1:] / np.maximum(left[:, 1:], LEFT)), problem.least_sigma)
+        widths[:, 1:] = np.maximum(np.sqrt(at.squares[:, 1:] / np.maximum(left[:, 1:], LEFT)), problem.least_sigma)
         widths[:, 0] = [np.sqrt(of_loss(r, p)) if r.size else 1.0 for r, p in zip(residuals, determined[:, 0].tolist(), strict=True)] if unsure else 1.0
         widths[untold] = np.inf
         if np.allclose(widths, before, rtol=_SETTLED, atol=0):
             break
-        arrow = problem.joined(theta, members, triangles, widths)[0]
+        arrow = problem.joined(theta, at.triangles, widths)[0]
         known = told_by(arrow)
-        determined, added = _told_by_kind(known, triangles / widths[:, None, :, None, None])
+        determined, added = _told_by_kind(known, at.triangles / widths[:, None, :, None, None])
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = added[..., places] / variances(known.shared, known.own, known.follow)[:, None, places]
     counts = np.s_[:, 0 if unsure else 1 :]
     doubt = 2 * np.sum(np.nan_to_num(shares[counts]) ** 2 / np.maximum(left[counts], LEFT)[..., None], axis=1)
-    at = Linearised(at.cost, arrow, at.rows, np.where(untold[:, 1:], at.sigma, widths[:, 1:]))
+    at = replace(at, arrow=arrow, sigma=np.where(untold[:, 1:], at.sigma, widths[:, 1:]))
     more = 0 * doubt
     for k in range(1, count):
         other = [widths * np.sqrt(1 + step * (np.arange(count) == k)) for step in (-_STEP, _STEP)]
-        ends = [(told_by(problem.joined(theta, members, triangles, some)[0]).standard_errors / known.standard_errors) ** 2 for some in other]
+        ends = [(told_by(problem.joined(theta, at.triangles, some)[0]).standard_errors / known.standard_errors) ** 2 for some in other]
         more -= 2 / np.maximum(left[:, k : k + 1], 1.0) * (sum(ends) - 2) / _STEP**2
     return NoiseLevels(at, known, doubt, np.maximum(np.nan_to_num(more), 0.0), untold[:, 1:])
-
-
-def _by_kind(problem: Problem, at: Linearised, good: np.ndarray):
-    """Triangles of [J r] (members, runs, kinds, width, width), squares, samples: of channels whose sigma is known, then of each other; and all residuals."""
-    count, runs = at.rows.shape
-    width, kinds = sum(problem.unknowns.layout.sizes) + 1, 1 + len(problem.estimated)
-    triangles, squares = np.zeros((count, runs, kinds, width, width)), np.zeros((count, kinds))
-    taus = problem.taus(good)
-    for run in range(runs if good.size else 0):
-        rows = problem.lanes.whitened(np.full(good.size, run), good, np.stack(list(at.rows[good, run])), taus)
-        for k, some in enumerate(problem.kinds(run, rows)):
-            triangles[good, run, k] = triangle(problem.loss.weighted(some, some[..., -1]))
-            squares[good, k] += np.sum(some[..., -1] ** 2, axis=1)
-    by_run = [problem.by_channel(run, at, lambda x: x) for run in range(runs)]
-    flat = np.concatenate([r.reshape(count, -1) for of in by_run for r in of.values()], axis=1)
-    residuals = [r[np.isfinite(r)] for r in flat]
-    samples = np.concatenate([[[r.size] for r in residuals], problem.lanes.counted(problem.estimated, np.arange(count))], axis=1)
-    return triangles, squares, samples, residuals
 
 
 def _told_by_kind(known: Information, T: Float[np.ndarray, "members runs kinds width width"]) -> tuple[np.ndarray, np.ndarray]:

@@ -7,19 +7,20 @@
 Once pieces join (c = 0), residuals and derivatives are those of the whole run. Source: H. G. Bock, in: Modelling of Chemical Reaction Systems (1981) 102.
 """
 
+import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from jourdain_jax.analysis.experiment import Experiment
-from jourdain_jax.analysis.layout import Layout, Place
+from jourdain_jax.analysis.layout import Place
 from jourdain_jax.analysis.levenberg_marquardt import Linearised
 from jourdain_jax.analysis.losses import Loss
 from jourdain_jax.analysis.nodes import NODE
-from jourdain_jax.analysis.predictions import Lanes
+from jourdain_jax.analysis.predictions import Lanes, Some
 from jourdain_jax.analysis.problem import Problem, closed
 from jourdain_jax.analysis.ranges import Range, unbounded
 from jourdain_jax.analysis.shooting import MultipleShooting, ends_of_pieces, in_pieces, numbers_of_filters, owned
@@ -36,32 +37,9 @@ class Shot:
     """How a fit was found by multiple shooting."""
 
     pieces: tuple[int, ...]  # of each run
-    continuity: Float[np.ndarray, "*repeats"]  # the largest jump from one piece to the next, in tolerances of the simulation, atol + rtol |x|
+    continuity: Float[np.ndarray, ""]  # the largest jump from one piece to the next, in tolerances of the options, atol + rtol |x|
     sizes: Float[np.ndarray, "states"]  # of coordinates, speeds, and what low-passes of sensors give
-    nodes: tuple[Float[np.ndarray, "*repeats nodes states"], ...]  # states (q, u, y) at which the pieces of each run meet
-
-
-class PieceLanes:
-    """Lanes of all pieces, which keep the states at their ends aside. `states`: how many numbers each piece ends at."""
-
-    def __init__(self, lanes: Lanes, states: Int[np.ndarray, "pieces"]):
-        self._lanes, self._states, pieces = lanes, states, len(states)
-        self.members, self.counted, self.whitened, self.channels = lanes.members, lanes.counted, lanes.whitened, lanes.channels
-        self.within, self.log_widths, self.by_channel = lanes.within, lanes.log_widths, lanes.by_channel
-        self.rows = np.empty((0, pieces), object)  # (members, pieces) of [J r]
-        self.ends = np.zeros((0, pieces, max(states), 0))  # [J x] of the states at the ends
-
-    def evaluate(self, shared, local, members):
-        """As of `Lanes`."""
-        self.rows = np.empty((len(members), len(self._states)), object)
-        self.ends = np.full((len(members), len(self._states), max(self._states), local.shape[-1] + shared.shape[-1] + 1), np.nan)
-        for b, j, plain in self._lanes.evaluate(shared, local, members):
-            rows, ends = np.split(plain, [-self._states[j[0]]], axis=1)
-            self.ends[b, j] = 0.0
-            self.ends[b, j, : ends.shape[1]] = ends
-            for place, one in zip(zip(b.tolist(), j.tolist(), strict=True), rows, strict=True):
-                self.rows[place] = one
-            yield b, j, rows
+    nodes: tuple[Float[np.ndarray, "nodes states"], ...]  # states (q, u, y) at which the pieces of each run meet
 
 
 @dataclass
@@ -70,17 +48,17 @@ class _Standing:
 
     local: Float[np.ndarray, "members pieces states_and_own"]  # unknowns of each piece, with its node
     theta: Float[np.ndarray, "members places"]  # those of the whole runs
-    rows: np.ndarray  # (members, pieces) of [J r]
+    rows: np.ndarray  # (members, runs) of [J g r] of the whole runs: r will have changed by g, to first order, once pieces join
     slopes: Float[np.ndarray, "members pieces states_and_own unknowns"]  # L
     gaps: Float[np.ndarray, "members pieces states_and_own"]  # g
     jumps: Float[np.ndarray, "members pieces states"]  # from the piece before
 
     @staticmethod
-    def of(local: np.ndarray, theta: np.ndarray, unknowns: int, states: int) -> "_Standing":
+    def of(local: np.ndarray, theta: np.ndarray, runs: int, unknowns: int, states: int) -> "_Standing":
         """Before anything was found. `unknowns`: of a run and shared; `states`: of a node."""
         members, pieces, width = local.shape
         jumps = np.full((members, pieces, states), np.inf)
-        return _Standing(local, theta, np.empty((members, pieces), object), np.zeros((members, pieces, width, unknowns)), np.zeros(local.shape), jumps)
+        return _Standing(local, theta, np.empty((members, runs), object), np.zeros((members, pieces, width, unknowns)), np.zeros(local.shape), jumps)
 
     def only(self, members) -> "_Standing":
         """A copy of that of some members."""
@@ -88,23 +66,14 @@ class _Standing:
 
 
 class Piecewise:
-    """Lanes of whole runs that are worked out in pieces; what `Lanes` offers, and the same with nodes as unknowns."""
+    """Whole runs that are worked out in pieces, `evaluate`, and the problem with nodes as unknowns."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        runs: tuple[Experiment, ...],
-        layout: Layout,
-        options: AllOptions,
-        members: int | None,
-        unknowns: Unknowns,
-        shooting: MultipleShooting,
-    ):
-        self.scene, self.runs, self.unknowns = scene, runs, unknowns
-        of_runs = [len(scene.coordinate_names) + len(scene.speed_names) + numbers_of_filters(run, members is not None) for run in runs]
+    def __init__(self, scene: Scene, runs: tuple[Experiment, ...], unknowns: Unknowns, options: AllOptions, shooting: MultipleShooting):
+        self.scene, self.runs, self.unknowns, layout = scene, runs, unknowns, unknowns.layout
+        of_runs = [len(scene.coordinate_names) + len(scene.speed_names) + numbers_of_filters(run) for run in runs]
         self.states = max(of_runs)  # of a node; zero where a run has fewer low-passes than another
         self.ends_of = [ends_of_pieces(run, shooting, index) for index, run in enumerate(runs)]
-        parts = [in_pieces(run, ends, self.states, members is not None) for run, ends in zip(runs, self.ends_of, strict=True)]
+        parts = [in_pieces(run, ends, self.states) for run, ends in zip(runs, self.ends_of, strict=True)]
         self.parts = tuple(piece for of_run in parts for piece in of_run)
         if all(len(of_run) == 1 for of_run in parts):
             raise ValueError("`shooting` leaves each run in one piece only; give a shorter `duration`, or leave out `shooting`")
@@ -114,22 +83,35 @@ class Piecewise:
         self.own, self.shared = m, p
         self.layout = replace(layout, local=(*layout.local, Place(NODE, (self.states,), m)))
         self._carried = np.array([k for place in layout.local if place.of_sensor for k in range(place.begin, place.end)], int)  # the same in all pieces
-        self.lanes = PieceLanes(Lanes(scene, self.parts, self.layout, options, members), np.array(of_runs)[self.run_of])
-        self._whole = Lanes(scene, runs, layout, options, members)
-        self.members, self.lengths = members, self._whole.lengths
-        self.counted, self.whitened, self.channels = self._whole.counted, self._whole.whitened, self._whole.channels
-        self.within, self.log_widths, self.by_channel = self._whole.within, self._whole.log_widths, self._whole.by_channel
+        self.lanes, self.whole = Lanes(scene, self.parts, self.layout, options, None), Lanes(scene, runs, layout, options, None)
+        self._states_of = np.array(of_runs)[self.run_of]
+        self.rows = np.empty((0, len(self.parts)), object)  # (members, pieces) of [J r], where they were evaluated last
+        self.ends = np.zeros((0, len(self.parts), self.states, 0))  # [J x] of the states at the ends
+        samples = [max(where.stop for where in self.whole.group_of(run).channels.values()) for run in range(len(runs))]
+        self._shapes = [(count, m + p + 2) for count in samples]  # of [J g r] of each run
         self._places = [self._places_of(i) for i in range(len(self.parts))]
         self.node_sizes = np.ones(self.states)
         self.tolerance = float(options.rtol), float(options.atol)
-        self.at = _Standing.of(np.zeros((0, len(self.parts), m + self.states)), np.zeros((0, p + len(runs) * m)), m + p, self.states)
+        self.at = _Standing.of(np.zeros((0, len(self.parts), m + self.states)), np.zeros((0, p + len(runs) * m)), len(runs), m + p, self.states)
         self.closing, self.share = True, np.ones(0)  # whether pieces are joined at each evaluation; else what share of their gaps goes, by member
 
     # With nodes as unknowns. ----------------------------------------------------------------------------------------
 
     def problem(self, loss: Loss) -> Problem:
         """The problem of pieces whose starts have nothing to do with each other."""
-        return Problem(self.scene, self.parts, self._unknowns_of_pieces(), self.lanes, loss)
+        return Problem(self.scene, self.parts, self._unknowns_of_pieces(), self.lanes, loss, self.evaluate_parts)
+
+    def evaluate_parts(self, shared, local, members) -> Iterator[Some]:
+        """As `evaluate` of `Lanes`, of all pieces; what they end at is kept aside."""
+        self.rows = np.empty((len(members), len(self.parts)), object)
+        self.ends = np.full((len(members), len(self.parts), self.states, local.shape[-1] + shared.shape[-1] + 1), np.nan)
+        for b, j, plain in self.lanes.evaluate(shared, local, members):
+            rows, ends = np.split(plain, [-self._states_of[j[0]]], axis=1)
+            self.ends[b, j] = 0.0
+            self.ends[b, j, : ends.shape[1]] = ends
+            for place, one in zip(zip(b.tolist(), j.tolist(), strict=True), rows, strict=True):
+                self.rows[place] = one
+            yield b, j, rows
 
     def _unknowns_of_pieces(self) -> Unknowns:
         whole, m, p, count = self.unknowns, self.own, self.shared, len(self.parts)
@@ -173,7 +155,7 @@ class Piecewise:
         joins = np.zeros((count, pieces, self.states + carried.size, 2 * M + self.shared + 1))
         with np.errstate(invalid="ignore"):
             for i in np.flatnonzero(self.follows):
-                end, join = self.lanes.ends[:, i - 1], joins[:, i]
+                end, join = self.ends[:, i - 1], joins[:, i]
                 join[:, : self.states, M:-1] = end[..., :-1]
                 join[:, : self.states, -1] = end[..., -1] - local[:, i, m:]
                 join[:, range(self.states), range(m, M)] = -1.0
@@ -193,7 +175,9 @@ class Piecewise:
         """Puts the pieces of all members where they are here; the unknowns of the whole runs."""
         shared, local = theta[:, : self.shared], theta[:, self.shared :].reshape(len(theta), len(self.parts), -1)
         own = local[:, ~self.follows, : self.own].reshape(len(theta), -1)
-        self.at, self.share = _Standing.of(local.copy(), np.concatenate([shared, own], axis=1), self.own + self.shared, self.states), np.ones(len(theta))
+        whole = np.concatenate([shared, own], axis=1)
+        self.at = _Standing.of(local.copy(), whole, len(self.runs), self.own + self.shared, self.states)
+        self.share = np.ones(len(theta))
         return self.at.theta.copy()
 
     def put_nodes(self, theta: Float[np.ndarray, "members places"], found: Shot) -> None:
@@ -206,22 +190,23 @@ class Piecewise:
 
     def told(self) -> Shot:
         """How the pieces join where they are."""
-        single, members = self.members is None, np.arange(len(self.at.local))
-        one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
-        nodes = self.at.local[..., self.own :]
+        nodes = self.at.local[0, :, self.own :]
         return Shot(
             pieces=tuple(np.bincount(self.run_of).tolist()),
-            continuity=one(self.continuity(members)),
+            continuity=np.asarray(self.continuity(np.array([0]))[0]),
             sizes=self.node_sizes,
-            nodes=tuple(one(nodes[:, (self.run_of == run) & self.follows]) for run in range(len(self.runs))),
+            nodes=tuple(nodes[(self.run_of == run) & self.follows] for run in range(len(self.runs))),
         )
 
     def keep(self, member: int) -> None:
         """Keeps this one of all members alone."""
         self.at, self.share = self.at.only([member]), self.share[[member]]
 
-    def evaluate(self, shared, local, members):
-        """As of `Lanes`; pieces move along with the unknowns, to first order. Unless `closing`, rows are [J g r]: r will have changed by g once pieces join."""
+    def evaluate(self, shared, local, members) -> Iterator[Some]:
+        """As of `Lanes`, of whole runs; pieces move along with the unknowns, to first order.
+
+        Unless `closing`, rows are [J g r]: r will have changed by g once pieces join.
+        """
         theta = np.concatenate([shared, local.reshape(len(shared), -1)], axis=1)
         here, failed = np.arange(len(members)), np.zeros(len(members), bool)
         for _ in range(_CLOSINGS if self.closing else 1):
@@ -232,22 +217,21 @@ class Piecewise:
                 break
             failed[some] = ~self._move(theta[some], members[some])
         for run in range(len(self.runs)):
-            rows = self._condensed(run, members, failed)
+            rows = np.full((len(here), *self._shapes[run]), np.nan)
+            for b in here[~failed]:
+                rows[b] = self.at.rows[members[b], run]
             yield here, np.full(len(here), run), closed(rows, self.own + self.shared) if self.closing else rows
 
     def change(self, problem: Problem, sigma: np.ndarray, d: np.ndarray, members: np.ndarray) -> Float[np.ndarray, "members"]:
-        """How much a step with its gaps closed changes all residuals, |J ds_i + S dtheta|, in units of sigma."""
+        """How much a step with its gaps closed changes all residuals, |J d + g|, in units of sigma."""
         d_shared, d_own = self.unknowns.split(d)
-        whole = np.concatenate([d_own[:, self.run_of], np.broadcast_to(d_shared[:, None], (len(d), len(self.parts), self.shared))], axis=2)
-        ds = (self.at.slopes[members] @ whole[..., None])[..., 0] + self.at.gaps[members]
         squares = np.zeros(len(d))
-        for b, member in enumerate(members.tolist()):
-            for i in range(len(self.parts)):
-                rows = self.at.rows[member, i]
-                moved = rows[:, :-1] @ np.concatenate([ds[b, i], d_shared[b]])
-                for name, where in self.lanes.channels(i).items():
-                    by = sigma[b, problem.estimated.index(name)] if name in problem.estimated else 1.0
-                    squares[b] += np.sum((moved[where] / by) ** 2)
+        for (b, member), run in itertools.product(enumerate(members.tolist()), range(len(self.runs))):
+            rows = self.at.rows[member, run]
+            moved = rows[:, :-2] @ np.concatenate([d_own[b, run], d_shared[b]]) + rows[:, -2]
+            for name, where in self.whole.group_of(run).channels.items():
+                by = sigma[b, problem.estimated.index(name)] if name in problem.estimated else 1.0
+                squares[b] += np.sum((moved[where] / by) ** 2)
         return np.sqrt(squares)
 
     def growth(self, members: np.ndarray) -> Float[np.ndarray, "members"]:
@@ -270,7 +254,7 @@ class Piecewise:
         return self.continuity(members) <= 1.0
 
     def continuity(self, members: np.ndarray) -> Float[np.ndarray, "members"]:
-        """The largest jump from one piece to the next, in tolerances of the simulation, `atol + rtol |x|`."""
+        """The largest jump from one piece to the next, in tolerances of the options, `atol + rtol |x|`."""
         rtol, atol = self.tolerance
         allowed = atol + rtol * np.maximum(np.abs(self.at.local[members][..., self.own :]), self.node_sizes)
         return np.max(np.abs(self.at.jumps[members]) / allowed, axis=(1, 2), initial=0.0)
@@ -283,9 +267,9 @@ class Piecewise:
         d = np.concatenate([d_own[:, self.run_of], np.broadcast_to(d_shared[:, None], (len(theta), len(self.parts), p))], axis=2)
         local = self.at.local[members] + (self.at.slopes[members] @ d[..., None])[..., 0] + self.share[members][:, None, None] * self.at.gaps[members]
         local[:, ~self.follows, :m] = own
-        for _ in self.lanes.evaluate(shared, local, members):
+        for _ in self.evaluate_parts(shared, local, members):
             pass
-        rows_of, ends = self.lanes.rows, self.lanes.ends
+        rows_of, ends = self.rows, self.ends
         slopes, gaps, jumps = np.zeros((len(theta), len(self.parts), M, m + p)), np.zeros(local.shape), np.zeros((*local.shape[:2], self.states))
         with np.errstate(over="ignore", invalid="ignore"):
             for i in range(len(self.parts)):
@@ -302,26 +286,25 @@ class Piecewise:
                 gaps[:, i, self._carried] = gaps[:, i - 1, self._carried] + local[:, i - 1, self._carried] - local[:, i, self._carried]
             good = np.isfinite(slopes.sum(axis=(1, 2, 3)) + gaps.sum(axis=(1, 2)))
         for b in np.flatnonzero(good):
-            good[b] = all(np.isfinite(rows.sum()) for rows in rows_of[b])
+            rows = [self._condensed(run, rows_of[b], slopes[b], gaps[b]) for run in range(len(self.runs))]
+            good[b] = all(np.isfinite(x.sum()) for x in rows)
+            for run, x in enumerate(rows if good[b] else []):
+                self.at.rows[members[b], run] = x
         here = members[good]
         self.at.local[here], self.at.theta[here], self.at.slopes[here], self.at.gaps[here] = local[good], theta[good], slopes[good], gaps[good]
-        self.at.jumps[here], self.at.rows[here] = jumps[good], rows_of[good]
+        self.at.jumps[here] = jumps[good]
         return good
 
-    def _condensed(self, run: int, members: np.ndarray, failed: np.ndarray) -> Float[np.ndarray, "members samples width"]:
-        p, m, M = self.shared, self.own, self.own + self.states
-        length = max(where.stop for where in self.channels(run).values())
-        found = np.zeros((len(members), length, m + p + 2))
+    def _condensed(self, run: int, rows_of: np.ndarray, slopes: np.ndarray, gaps: np.ndarray) -> Float[np.ndarray, "samples width"]:
+        """[J g r] of a whole run from [J r], slopes and gaps of all pieces."""
+        m, M = self.own, self.own + self.states
+        found = np.zeros(self._shapes[run])
         for i in np.flatnonzero(self.run_of == run):
             of_piece, of_run = self._places[i]
-            for b, member in enumerate(members.tolist()):
-                if failed[b]:
-                    found[b] = np.nan
-                    continue
-                rows = self.at.rows[member, i][of_piece]
-                J = rows[:, :M] @ self.at.slopes[member, i]
-                J[:, m:] += rows[:, M:-1]
-                found[b, of_run] = np.concatenate([J, (rows[:, :M] @ self.at.gaps[member, i])[:, None], rows[:, -1:]], axis=1)
+            rows = rows_of[i][of_piece]
+            J = rows[:, :M] @ slopes[i]
+            J[:, m:] += rows[:, M:-1]
+            found[of_run] = np.concatenate([J, (rows[:, :M] @ gaps[i])[:, None], rows[:, -1:]], axis=1)
         return found
 
     def _places_of(self, piece: int) -> tuple[np.ndarray, np.ndarray]:
@@ -330,10 +313,20 @@ class Piecewise:
         before = piece - int(np.flatnonzero(self.run_of == run)[0])
         first, firsts = self.ends_of[run][before], owned(self.runs[run], self.ends_of[run])
         of_piece, of_run = [], []
-        for name, where in self.lanes.channels(piece).items():
-            width = int(np.prod(self.runs[run].values[name].shape[1 if self.members is None else 2 :]))
+        for name, where in self.lanes.group_of(piece).channels.items():
+            width = int(np.prod(self.runs[run].values[name].shape[1:]))
             begin, end = firsts[name][before : before + 2]
             samples = np.arange(width * begin, width * end)
             of_piece.append(where.start + samples - width * first)
-            of_run.append(self.channels(run)[name].start + samples)
+            of_run.append(self.whole.group_of(run).channels[name].start + samples)
         return np.concatenate(of_piece), np.concatenate(of_run)
+
+
+def problem_of(
+    scene: Scene, runs: tuple[Experiment, ...], unknowns: Unknowns, options: AllOptions, members: int | None, loss: Loss, shooting: MultipleShooting | None
+) -> tuple[Problem, Piecewise | None]:
+    """Return the problem of these runs; where `shooting` says so, what works them out in pieces, too."""
+    if shooting is None:
+        return Problem(scene, runs, unknowns, Lanes(scene, runs, unknowns.layout, options, members), loss), None
+    pieces = Piecewise(scene, runs, unknowns, options, shooting)
+    return Problem(scene, runs, unknowns, pieces.whole, loss, pieces.evaluate), pieces

@@ -6,8 +6,8 @@ sigma^2 = mean w^2 of each channel whose sigma is not known; mean, s: of priors;
 """
 
 import math
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -17,6 +17,7 @@ from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits,
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Linearised, Minimum, minimise
 from jourdain_jax.analysis.losses import Loss
+from jourdain_jax.analysis.predictions import Lanes, Some
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.scene.scene import Scene
 
@@ -24,63 +25,77 @@ _LEAST_SIGMA = 1e-10  # of the largest value of a channel: one that is met exact
 _NODES = np.linspace(-3.2, 3.2, 9)  # of arcsin rho, in its standard deviations: 1 / sqrt(samples) without unknowns
 
 
-class Problem:
-    """Residuals with their derivatives, of any members at any numbers. `lanes`: `Lanes`, or what predicts runs as they do (`Piecewise`)."""
+@dataclass(frozen=True)
+class Span:
+    """The first part of all runs. The first guess is a weak prior, known to its own size: what so few samples do not tell stays there."""
 
-    def __init__(self, scene: Scene, runs: tuple[Experiment, ...], unknowns: Unknowns, lanes: Any, loss: Loss):
+    shares: Float[np.ndarray, "members"]  # of the span of each run, from its start: samples beyond do not count
+    begun: Float[np.ndarray, "members places"]  # first guesses
+
+    def at(self, members: np.ndarray) -> "Span":
+        """Those of some members."""
+        return Span(self.shares[members], self.begun[members])
+
+
+class Problem:
+    """Residuals with their derivatives, of any members at any numbers. `evaluate`: as that of the lanes, where runs are worked out in pieces."""
+
+    def __init__(
+        self, scene: Scene, runs: tuple[Experiment, ...], unknowns: Unknowns, lanes: Lanes, loss: Loss, evaluate: Callable[..., Iterator[Some]] | None = None
+    ):
         self.scene, self.runs, self.unknowns, self.lanes, self.loss = scene, runs, unknowns, lanes, loss
+        self.evaluate = lanes.evaluate if evaluate is None else evaluate
+        self.single = lanes.members is None
         self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))  # channels whose sigma is
         largest = [max(float(np.nanmax(np.abs(run.values[name]))) for run in runs if name in run.values) for name in self.estimated]
         self.least_sigma = _LEAST_SIGMA * np.array([x or 1.0 for x in largest])  # sigma of each of these
-        self.shares: np.ndarray | None = None  # of each run's span, from its start, by member: samples beyond do not count
-        self.begun = np.zeros((0, 0))  # first guesses of the members, where spans grow
-        self.prior_mean = np.tile(unknowns.prior_mean, (lanes.members or 1, 1))  # by member
         self.with_memory = tuple(sorted({name for run in runs for name in run.unknown_correlation}))  # channels whose correlation time is estimated
         self.tau = np.zeros((lanes.members or 1, len(self.with_memory)))  # s, of these: at first as if their noise were white
         self._counted = lanes.counted(self.estimated, np.arange(lanes.members or 1))  # samples of channels whose sigma is estimated, of each member
+
+    def _own(self, members: np.ndarray) -> np.ndarray:
+        """Where numbers of these members are in what is kept by member: in the first place, if the runs have no repeats."""
+        return 0 * members if self.single else members
 
     def taus(self, members: np.ndarray) -> dict[str, np.ndarray]:
         """Correlation times of some members, by channel, s."""
         if not self.with_memory:
             return {}
-        found = self.tau[members if self.lanes.members else np.zeros(len(members), int)]
+        found = self.tau[self._own(members)]
         return dict(zip(self.with_memory, found.T, strict=True))
 
-    def linearised(self, theta: np.ndarray, members: np.ndarray) -> Linearised:
-        """What is minimised, with its arrow, of some members."""
-        evaluated = self.lanes.evaluate(*self.unknowns.split(theta), members)
-        return self._assembled(theta, members, evaluated, self.taus(members), self._share(members))
+    def linearised(self, theta: np.ndarray, members: np.ndarray, span: Span | None = None) -> Linearised:
+        """Return what is minimised, with its arrow, of some members, over all of the runs or a span of them."""
+        evaluated = self.evaluate(*self.unknowns.split(theta), members)
+        return self._assembled(theta, members, evaluated, self.taus(members), span)
 
-    def _share(self, members: np.ndarray) -> np.ndarray | None:
-        """The share of the span that each of these members takes; None: all of it."""
-        return None if self.shares is None else self.shares[members]
-
-    def minimum(self, theta: np.ndarray, members: np.ndarray, limits: Limits, control: Control, what: str) -> Minimum:
+    def minimum(self, theta: np.ndarray, members: np.ndarray, limits: Limits, control: Control, what: str, span: Span | None = None) -> Minimum:
         """Return the minimum of some members, from theta."""
-        return minimise(lambda x, here: self.linearised(x, members[here]), theta, limits, control, what)
+        return minimise(lambda x, here: self.linearised(x, members[here], span and span.at(here)), theta, limits, control, what)
 
-    def _assembled(self, theta: np.ndarray, members: np.ndarray, evaluated: Iterable, taus: dict[str, np.ndarray], shares=None) -> Linearised:
-        """What is minimised, from what was evaluated; `taus`: correlation times by channel, and shares of the span that count, of these members."""
+    def _assembled(self, theta: np.ndarray, members: np.ndarray, evaluated: Iterable, taus: dict[str, np.ndarray], span: Span | None = None) -> Linearised:
+        """What is minimised, from what was evaluated; `taus`: correlation times by channel."""
         (p, m), count, runs, kinds = self.unknowns.layout.sizes, len(theta), self.unknowns.runs, 1 + len(self.estimated)
         triangles = np.zeros((count, runs, kinds, m + p + 1, m + p + 1))
-        costs, squares = np.zeros((count, runs)), np.zeros((count, runs, kinds))
+        costs, squares = np.zeros((count, runs)), np.zeros((count, kinds))
         kept, sigma = np.empty((count, runs), object), np.zeros((count, 0))
         with np.errstate(over="ignore", invalid="ignore"):
             for b, j, plain in evaluated:
                 if runs == 1:  # all unknowns are shared
                     plain = plain[..., [*range(m, m + p), *range(m), *range(m + p, plain.shape[-1])]]
-                whole = self.lanes.whitened(j, members[b], plain, {name: tau[b] for name, tau in taus.items()})
-                if shares is not None:
-                    whole = np.where(self.lanes.within(j, shares[b])[..., None], whole, 0.0)
+                group = self.lanes.group_of(int(j[0]))
+                whole = group.whitened(j, members[b], plain, {name: tau[b] for name, tau in taus.items()})
+                if span is not None:
+                    whole = np.where(group.within(j, span.shares[b])[..., None], whole, 0.0)
                 for k, rows in enumerate(self.kinds(int(j[0]), whole)):
                     r = rows[..., -1]
                     triangles[b, j, k] = triangle(closed(self.loss.weighted(rows, r), m + p))
                     if k:
-                        squares[b, j, k] = np.sum(r**2, axis=1)
+                        np.add.at(squares[:, k], b, np.sum(r**2, axis=1))
                     else:
                         costs[b, j] = self.loss.value(r)
                 for place, one in zip(zip(b.tolist(), j.tolist(), strict=True), plain, strict=True):
-                    kept[place] = one if one.shape[-1] == m + p + 1 else np.delete(one, m + p, axis=1)
+                    kept[place] = one[:, -1]
                 if count == 1 and runs > 1 and not math.isfinite(triangles[b, j].sum()):  # whatever the other runs say
                     triangles.fill(np.nan)
                     break
@@ -89,23 +104,26 @@ class Problem:
                 failed = ~np.isfinite(triangles.sum(axis=(1, 2, 3, 4)) + cost)
                 triangles[failed], cost[failed] = 0.0, np.inf
         if kinds > 1:
-            samples = self._counted[members if self.lanes.members else np.zeros(count, int)]
-            sigma = np.sqrt(np.maximum(squares.sum(axis=1)[:, 1:] / np.maximum(samples, 1), self.least_sigma**2))
+            samples = self._counted[self._own(members)]
+            sigma = np.sqrt(np.maximum(squares[:, 1:] / np.maximum(samples, 1), self.least_sigma**2))
             cost = cost + np.sum(samples * np.log(sigma), axis=1)
-        whole, of_priors = self.joined(theta, members, triangles, np.concatenate([np.ones((count, 1)), sigma], axis=1), shares)
+        whole, of_priors = self.joined(theta, triangles, np.concatenate([np.ones((count, 1)), sigma], axis=1), span)
         cost = cost + of_priors
-        return Linearised(cost, whole, kept, sigma)
+        return Linearised(cost, whole, kept, sigma, triangles, squares)
 
-    def joined(self, theta: np.ndarray, members: np.ndarray, triangles: np.ndarray, sigma: np.ndarray, shares=None) -> tuple[Arrow, np.ndarray | float]:
+    def joined(self, theta: np.ndarray, triangles: np.ndarray, sigma: np.ndarray, span: Span | None = None) -> tuple[Arrow, np.ndarray | float]:
         """The arrow of triangles (members, runs, kinds, width, width) with these sigmas (members, kinds) and all priors; what priors add to F."""
         (p, m), (count, runs, kinds, *_) = self.unknowns.layout.sizes, triangles.shape
         together = triangles[:, :, 0]
         if kinds > 1 or np.any(sigma != 1):
             together = np.linalg.qr((triangles / sigma[:, None, :, None, None]).reshape(count, runs, -1, m + p + 1), mode="r")
         whole = arrow(together, m if runs > 1 else 0)
-        if shares is None and not self.unknowns.with_prior.size:
+        if span is None and not self.unknowns.with_prior.size:
             return whole, 0.0
-        mean, spread = self._known_before(theta, members, shares)
+        mean, spread = (np.broadcast_to(x, theta.shape) for x in (self.unknowns.prior_mean, self.unknowns.prior_sigma))
+        if span is not None:
+            none = ~np.isfinite(mean) & ~self.unknowns.fixed
+            mean, spread = np.where(none, span.begun, mean), np.where(none, self.unknowns.sizes(span.begun), spread)
         r, M = np.where(np.isfinite(mean), (theta - mean) / spread, 0.0), self.unknowns.whitening
         return with_prior(whole, r, mean, spread, M), 0.5 * (np.sum((r[:, :p] @ M.T) ** 2, axis=1) + np.sum(r[:, p:] ** 2, axis=1))
 
@@ -114,31 +132,19 @@ class Problem:
         good = np.isfinite(at.cost)
         squares, counted = np.zeros((2, good.sum(), len(shares)))
         for run in range(len(self.runs) if good.any() else 0):
-            within = self.lanes.within(np.full(len(shares), run), shares)
-            r = np.where(within, np.stack([rows[:, -1] for rows in at.rows[good, run]])[:, None], 0.0)
-            for name, where in self.lanes.channels(run).items():
+            group = self.lanes.group_of(run)
+            within = group.within(np.full(len(shares), run), shares)
+            r = np.where(within, np.stack(list(at.residuals[good, run]))[:, None], 0.0)
+            for name, where in group.channels.items():
                 if name not in self.estimated:
                     squares, counted = squares + np.sum(r[..., where] ** 2, axis=-1), counted + np.count_nonzero(r[..., where], axis=-1)
         found = np.zeros((good.size, len(shares)), bool)
         found[good] = squares <= most * counted
         return found
 
-    def _known_before(self, theta: np.ndarray, members: np.ndarray, shares: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and standard deviation of priors, (members, unknowns); NaN where there is none.
-
-        Over part of the span the first guess is a weak prior, known to its own size: what so few samples do not tell stays there.
-        """
-        mean = self.prior_mean[members if self.lanes.members else np.zeros(len(members), int)]
-        spread = np.broadcast_to(self.unknowns.prior_sigma, theta.shape)
-        if shares is None:
-            return mean, spread
-        begun = self.begun[members]
-        none = ~np.isfinite(mean) & ~self.unknowns.fixed
-        return np.where(none, begun, mean), np.where(none, self.unknowns.sizes(begun), spread)
-
     def restrict(self, theta: np.ndarray, members: np.ndarray) -> np.ndarray:
         """Puts correlation times that are not known to where the restricted likelihood is largest; by how much rho over one shortest interval changed."""
-        evaluated = list(self.lanes.evaluate(*self.unknowns.split(theta), members))
+        evaluated = list(self.evaluate(*self.unknowns.split(theta), members))
         ends = {name: correlation_limits([np.asarray(run.ts) for run in self.runs if name in run.values]) for name in self.with_memory}
         taus, changed = {name: np.maximum(tau, ends[name][0]) for name, tau in self.taus(members).items()}, np.zeros(len(members))
         for name, (low, high) in ends.items():
@@ -147,14 +153,14 @@ class Problem:
             found, interval = np.exp(lowest(tried, *edges)), low / SHORTEST
             changed = np.maximum(changed, np.abs(np.exp(-interval / found) - np.exp(-interval / taus[name])))
             taus[name] = found
-        self.tau[members if self.lanes.members else np.zeros(len(members), int)] = np.stack(list(taus.values()), axis=1)
+        self.tau[self._own(members)] = np.stack(list(taus.values()), axis=1)
         return changed
 
     def _restricted(self, theta, members: np.ndarray, evaluated: list, taus: dict[str, np.ndarray]) -> tuple[np.ndarray, Linearised]:
         """What the restricted likelihood is made of, to be as low as possible."""
         at, logs = self._assembled(theta, members, evaluated, taus), np.zeros(len(members))
         for b, j, _ in evaluated:
-            np.add.at(logs, b, self.lanes.log_widths(j, members[b], {n: tau[b] for n, tau in taus.items()}))
+            np.add.at(logs, b, self.lanes.group_of(int(j[0])).log_widths(j, members[b], {n: tau[b] for n, tau in taus.items()}))
         return at.cost + logs + half_log_determinant(at.arrow, self.unknowns.sizes(theta)), at
 
     def doubt(self, theta: np.ndarray, of: Callable[[Arrow], tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
@@ -166,7 +172,7 @@ class Problem:
         members, more, spread = np.arange(len(theta)), np.zeros((1, 1)), np.zeros((1, 1))
         if not self.with_memory:
             return more, spread
-        evaluated, taus = list(self.lanes.evaluate(*self.unknowns.split(theta), members)), self.taus(members)
+        evaluated, taus = list(self.evaluate(*self.unknowns.split(theta), members)), self.taus(members)
         for name in self.with_memory:
             low, high = correlation_limits([np.asarray(run.ts) for run in self.runs if name in run.values])
             interval, counted = low / SHORTEST, self.lanes.counted([name], members)[:, 0]
@@ -192,20 +198,21 @@ class Problem:
     def samples(self) -> int:
         """How many samples there are of channels whose sigma is known, in one repeat."""
         channels = [(run, name) for i, run in enumerate(self.runs) for name in run.values if name not in self.estimated]
-        return sum(math.prod(np.shape(run.values[name])[int(self.lanes.members is not None) :]) for run, name in channels)
+        return sum(math.prod(np.shape(run.values[name])[int(not self.single) :]) for run, name in channels)
 
     def by_channel(self, run: int, at: Linearised, one: Callable, white: bool = False) -> dict[str, np.ndarray]:
         """Residuals of a run in units of sigma by channel; NaN where a sample is missing, or they were not worked out since another run had failed.
 
         `white`: whitened ones.
         """
-        flat = [np.zeros(0) if rows is None else rows[:, -1] for rows in at.rows[:, run]]
+        group = self.lanes.group_of(run)
+        flat = [np.zeros(0) if r is None else r for r in at.residuals[:, run]]
         longest = max(map(len, flat))
         whole = np.stack([np.full(longest, np.nan) if len(r) < longest else r for r in flat])
         members = np.arange(len(whole))
         if white and longest:
-            whole = self.lanes.whitened(np.full(len(whole), run), members, whole[..., None], self.taus(members))[..., 0]
-        parts = self.lanes.by_channel(run, one(whole))
+            whole = group.whitened(np.full(len(whole), run), members, whole[..., None], self.taus(members))[..., 0]
+        parts = group.by_channel(run, one(whole))
         for k, name in enumerate(self.estimated):
             if name in parts:
                 sigma = one(at.sigma[:, k])
@@ -216,7 +223,7 @@ class Problem:
         """[J r] of lanes of a run: of channels whose sigma is known, then of each other channel."""
         if not self.estimated:
             return [whole]
-        channels = self.lanes.channels(run)
+        channels = self.lanes.group_of(run).channels
         known = [whole[:, where] for name, where in channels.items() if name not in self.estimated]
         return [np.concatenate([whole[:, :0], *known], axis=1), *(whole[:, channels.get(name, slice(0))] for name in self.estimated)]
 

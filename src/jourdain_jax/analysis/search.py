@@ -8,7 +8,7 @@ import numpy as np
 from jourdain_jax.analysis.at_bounds import Around, AtBounds, limits_at_bounds
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum
 from jourdain_jax.analysis.piecewise import Piecewise
-from jourdain_jax.analysis.problem import Problem
+from jourdain_jax.analysis.problem import Problem, Span
 from jourdain_jax.analysis.spread import if_free
 
 _POOR = 10.0  # times the sum of squares that noise alone leaves, one for each sample
@@ -36,8 +36,8 @@ def minimum(problem: Problem, theta: np.ndarray, limits: Limits, control: Contro
     found = problem.minimum(theta, np.arange(len(theta)), limits, few if in_parts else control, _WHOLE)
     unfinished = ~found.converged & ~found.stuck & in_parts & (rest.most_steps > 0)
 
-    def of(members: np.ndarray, begin: np.ndarray, how: Control) -> Minimum:
-        return problem.minimum(begin, members, limits, how, _WHOLE)
+    def of(members: np.ndarray, begin: np.ndarray, how: Control, span: Span | None = None) -> Minimum:
+        return problem.minimum(begin, members, limits, how, _WHOLE, span)
 
     def far() -> np.ndarray:
         return found.at.cost > 0.5 * _POOR * samples
@@ -49,10 +49,9 @@ def minimum(problem: Problem, theta: np.ndarray, limits: Limits, control: Contro
         return found
     ended, begin, steps, place = found.theta.copy(), theta[poor], found.steps[poor], np.zeros(len(poor), int)
     trace = found.trace[poor]
-    problem.begun, problem.shares = theta, np.ones(len(theta))
     while (some := np.flatnonzero(place < len(_SPANS))).size:
-        problem.shares[poor[some]] = np.array(_SPANS)[place[some]]
-        grown = of(poor[some], begin[some], replace(few, tolerance=_ROUGHLY, patience=None))
+        span = Span(np.array(_SPANS)[place[some]], theta[poor[some]])
+        grown = of(poor[some], begin[some], replace(few, tolerance=_ROUGHLY, patience=None), span)
         begin[some], steps[some] = grown.theta, steps[some] + grown.steps
         for i, (_, costs), k in zip(some.tolist(), (of_one[0] for of_one in grown.trace), place[some].tolist(), strict=True):
             trace[i] += ((f"the first {_SPANS[k]:.3g} of each run", costs),)
@@ -60,7 +59,6 @@ def minimum(problem: Problem, theta: np.ndarray, limits: Limits, control: Contro
         followed = problem.is_followed(grown.at, np.array(_SPANS), _FOLLOWED)
         for k in range(1, len(_SPANS)):
             place[some] += (place[some] == k) & followed[:, k]  # the next one is followed, and left out
-    problem.shares = None
     grown = of(poor, begin, control)
     steps, trace = steps + grown.steps, trace + grown.trace
     found = found.lowered(poor, replace(grown, steps=steps, trace=trace, grown=np.ones(len(poor), bool)))

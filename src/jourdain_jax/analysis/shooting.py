@@ -73,9 +73,9 @@ def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> I
     return np.unique([0, *nearest[(nearest > 0) & (nearest < count)], count])
 
 
-def numbers_of_filters(run: Experiment, repeats: bool) -> int:
+def numbers_of_filters(run: Experiment) -> int:
     """How many numbers the low-passes of the sensors of a run that was `checked` have."""
-    return sum(math.prod(x.shape[1 + repeats :]) for name, x in run.values.items() if name in run.readings and run.readings[name].has_filter)
+    return sum(math.prod(x.shape[1:]) for name, x in run.values.items() if name in run.readings and run.readings[name].has_filter)
 
 
 def owned(run: Experiment, ends: Int[np.ndarray, "ends"]) -> dict[str, Int[np.ndarray, "ends"]]:
@@ -91,7 +91,7 @@ def owned(run: Experiment, ends: Int[np.ndarray, "ends"]) -> dict[str, Int[np.nd
     return found
 
 
-def in_pieces(run: Experiment, ends: Int[np.ndarray, "ends"], states: int, repeats: bool) -> list[Experiment]:
+def in_pieces(run: Experiment, ends: Int[np.ndarray, "ends"], states: int) -> list[Experiment]:
     """The pieces of a run that was `checked`; all but the first begin at a node of so many numbers. Each goes on to the last sample that belongs to it."""
     found, firsts = [], owned(run, ends)
     for k, (first, end) in enumerate(pairwise(ends)):
@@ -101,8 +101,8 @@ def in_pieces(run: Experiment, ends: Int[np.ndarray, "ends"], states: int, repea
         for name, x in run.values.items():
             of_piece = np.arange(first, last + 1)
             counts = (of_piece >= firsts[name][k]) & (of_piece < firsts[name][k + 1])
-            part = np.asarray(x[:, here] if repeats else x[here], float)
-            values[name] = np.where(counts.reshape(-1, *[1] * (part.ndim - 1 - repeats)), part, np.nan)
+            part = np.asarray(x[here], float)
+            values[name] = np.where(counts.reshape(-1, *[1] * (part.ndim - 1)), part, np.nan)
         begins = first == ends[0]
         piece = object.__new__(type(run))
         t0 = run.t0 if begins else np.asarray(run.ts[first])

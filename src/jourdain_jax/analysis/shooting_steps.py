@@ -52,23 +52,22 @@ def shot(problem: Problem, lanes: Piecewise, theta: Float[np.ndarray, "members p
 
 def _begun(problem: Problem, lanes: Piecewise, theta: np.ndarray) -> tuple[Problem, np.ndarray]:
     """The problem of pieces with all their starts as unknowns, and first guesses of these."""
-    m, single, count, coordinates = lanes.own, lanes.members is None, len(theta), len(problem.scene.coordinate_names)
+    m, count, coordinates = lanes.own, len(theta), len(problem.scene.coordinate_names)
     places = np.arange(lanes.states)
     of_q, of_y = places < coordinates, places >= coordinates + len(problem.scene.speed_names)
     nodes, starts = np.zeros((count, len(lanes.parts), lanes.states)), np.zeros((len(lanes.parts), lanes.states))
     for run, data in enumerate(problem.runs):
         q, u = _start(problem, data, theta[0], run)
         starts[lanes.run_of == run, : q.size + u.size] = np.concatenate([q, u])
-        for b in range(1 if single else count):
-            found = first_nodes(problem.scene, data, lanes.ends_of[run], q, u, None if single else b)
-            nodes[slice(None) if single else b, lanes.run_of == run, : found.shape[1]] = found
+        found = first_nodes(problem.scene, data, lanes.ends_of[run], q, u)
+        nodes[:, lanes.run_of == run, : found.shape[1]] = found
     guess = lanes.spread(theta)
     local = guess[:, lanes.shared :].reshape(count, len(lanes.parts), -1)  # a view
     local[:, lanes.follows, m:] = nodes[:, lanes.follows]
     _put_starts(problem, lanes, local, nodes)
-    for _ in lanes.lanes.evaluate(guess[:, : lanes.shared], local, np.arange(count)):
+    for _ in lanes.evaluate_parts(guess[:, : lanes.shared], local, np.arange(count)):
         pass
-    changes = lanes.lanes.ends[..., -1] - nodes
+    changes = lanes.ends[..., -1] - nodes
     failed = ~np.isfinite(changes).all(axis=2)
     changes[failed] = 0.0
     for run in range(len(problem.runs)):
