@@ -27,7 +27,7 @@ from jourdain_jax.motion.integrators.solver_choice import time_origin
 from jourdain_jax.motion.native import seen
 from jourdain_jax.motion.row_check import rows_violated
 from jourdain_jax.motion.setup import Begun, Setup, Solved
-from jourdain_jax.motion.start import State
+from jourdain_jax.motion.start import State, projected
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
@@ -45,6 +45,8 @@ def integrate(setup: Setup) -> Trajectory:
 def _one_motion(setup: Setup) -> Trajectory:
     given = _with_machine_code(_prepared(setup))
     setup, asked = _entered(given)
+    if setup.usual is not None:
+        setup = setup._replace(start=projected(setup.scene, setup.t0, setup.start, setup.inputs(setup.t0), setup.usual))
     begun, fitting = _begin(setup), setup.fitting()
     return _finish(given, fitting, asked, begun, setup.integrator.solved(fitting, begun))
 

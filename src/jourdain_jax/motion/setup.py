@@ -20,6 +20,7 @@ from jourdain_jax.motion.integrators.knots import knots_between
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.integrators.solver_choice import steps_are_given
 from jourdain_jax.motion.integrators.tableaus import Method
+from jourdain_jax.motion.put_on_rows import Usual
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
@@ -98,6 +99,7 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     dt0: Float[Array | np.ndarray, "*lanes"] | float
     longest: Float[Array | np.ndarray, "*lanes"] | float  # step, s
     integrator: Integrator
+    usual: Usual | None  # sizes by which the start is projected; None where it is on its constraints
 
     def fitting(self) -> "Setup":
         """The setup with times that serve any loop, also where its own do not go together."""

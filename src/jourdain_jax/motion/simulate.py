@@ -8,12 +8,13 @@ import warnings
 from functools import partial
 from typing import TYPE_CHECKING, Any, Unpack
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.on_first_use import module_on_first_use
-from jourdain_jax.calculus.reals import Number, as_array, is_traced
+from jourdain_jax.calculus.reals import Number, as_array, is_traced, nothing_is_traced
 from jourdain_jax.motion.arguments import as_state, span_and_times
 from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.inputs_in_rows import check_inputs_in_rows
@@ -26,6 +27,7 @@ from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.own_steps import own_steps, reason_against_series
+from jourdain_jax.motion.put_on_rows import Usual, usual_sizes
 from jourdain_jax.motion.retries import retried
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
 from jourdain_jax.motion.setup import LONGEST, Setup
@@ -33,7 +35,7 @@ from jourdain_jax.motion.start import State, nearest_state
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.choice import as_formulation, vector_field
-from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_scene, as_speeds
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines, users_level
 
@@ -133,7 +135,7 @@ def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, in
     native = options.backend in ("auto", "native")
     inputs = as_inputs(scene, inputs)
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
-    start = _start(scene, start, t0, inputs, native, formulation.projects)
+    start, usual = _start(scene, start, t0, inputs, native, formulation.projects)
     field = fitted(solver, scene, vector_field(scene, formulation, options.work, options.backend, inputs), formulation.state)
     if not inputs.constant:
         check_inputs_in_rows(scene, inputs, t0, t1)
@@ -149,7 +151,7 @@ def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, in
     tolerances = tuple(as_array(x, start.q.dtype) for x in (options.rtol, options.atol))  # arrays: another tolerance is no other program
     first_step = _first_step(dt0, t0, t1)  # diffrax's own guess costs two more copies of the vector field to compile
     longest = as_array(LONGEST * abs(t1 - t0) if max_step is None else max_step, start.q.dtype)
-    setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, longest, integrator)
+    setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, longest, integrator, usual)
     if options.backend == "native" and (reason := setup.reason_against_machine_code):
         raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
     if order is not None and (reason := reason_against_series(setup, order)):
@@ -177,11 +179,15 @@ def _check_adjoint(adjoint) -> None:
         )
 
 
-def _start(scene: Scene, given, t0, inputs: Inputs, native: bool, projects: bool) -> State:
-    """Return the start, on its constraints where the formulation `projects`."""
-    if projects and isinstance(given, State):
-        return nearest_state(scene, t0, given.q, given.u, inputs_at(inputs, t0), native=native)
-    return as_state(scene, given, t0=t0, inputs=inputs_at(inputs, t0), native=native)
+def _start(scene: Scene, given, t0, inputs: Inputs, native: bool, projects: bool) -> tuple[State, Usual | None]:
+    """Return the start on its constraints; or a `State` as it is, and the sizes by which the program that integrates projects it."""
+    if not (projects and isinstance(given, State)):
+        return as_state(scene, given, t0=t0, inputs=inputs_at(inputs, t0), native=native), None
+    if nothing_is_traced():
+        q, u = as_coordinates(scene, given.q), as_speeds(scene, given.u)
+        as_given = q is given.q and u is given.u
+        return given if as_given else eqx.tree_at(lambda s: (s.q, s.u), given, (q, u)), usual_sizes(scene, False, native)
+    return nearest_state(scene, t0, given.q, given.u, inputs_at(inputs, t0), native=native), None
 
 
 def default_solver(rtol: Number) -> Method:

@@ -99,8 +99,14 @@ def nearest_state(scene: Scene, t, q, u, inputs, *, held: tuple[str, ...] = (), 
         if name not in coordinates + speeds:
             raise ValueError(f"`held` names `{name}`, which is no coordinate or speed; {nearest(name, coordinates + speeds)}")
     free_q, free_u = (_free(names, tuple(held)) for names in (coordinates, speeds))
-    guess = _Guess(q, u, free_q, free_u, _free(coordinates, coordinates), usual_sizes(scene, False, native))
-    return _consistent(scene, t, guess, _as_input_vector(scene, inputs, q.dtype), lambda: np.zeros((0, q.shape[0]), q.dtype))
+    guess = _Guess(q, u, free_q, free_u, ~_free(coordinates, ()), usual_sizes(scene, False, native))
+    return _consistent(scene, t, guess, _as_input_vector(scene, inputs, q.dtype))
+
+
+def projected(scene: Scene, t, start: State, inputs, usual: Usual) -> State:
+    """Project a state as `consistent` does, as a part of a larger compiled function."""
+    every_q, every_u = (_free(names, ()) for names in (scene.coordinate_names.entries, scene.speed_names.entries))
+    return _put_onto_constraints(scene, t, _Guess(start.q, start.u, every_q, every_u, ~every_q, usual), inputs, None)[0]
 
 
 class _Guess(NamedTuple):
@@ -125,15 +131,15 @@ def _free(names: tuple[str, ...], held: tuple[str, ...]) -> Bool[np.ndarray, "en
     return np.array([name not in held for name in names], bool)
 
 
-def _consistent(scene: Scene, t, start: _Guess, inputs, guesses: Callable) -> State:
-    """The nearest state; where Newton's method does not arrive, what a damped search finds from q, and then from other configurations, `guesses()`."""
+def _consistent(scene: Scene, t, start: _Guess, inputs, guesses: Callable | None = None) -> State:
+    """Return the nearest state; where Newton's method does not arrive, what a damped search finds from q, and then from other configurations, `guesses()`."""
     given = scene, t, start, inputs
     if not nothing_is_traced() and is_traced(given):
-        return _compiled_projection(*given, guesses())[0]
+        return _compiled_projection(*given, None if guesses is None else guesses())[0]
     # numbers are put onto the rows at once, also where a function around this call is being traced; elsewhere that would compile constants one by one
     with nullcontext() if nothing_is_traced() else jax.ensure_compile_time_eval():
         state, arrived = _compiled_projection(*given, None)
-        if not np.asarray(arrived) and len(start.usual.closures):  # rare, and long to compile
+        if guesses is not None and not np.asarray(arrived) and len(start.usual.closures):  # rare, and long to compile
             by_xla = start._replace(usual=replace(start.usual, program=None))
             state = jax.tree.map(jnp.asarray, _uncompiled_projection(scene, t, by_xla, inputs, guesses())[0])
     return state
