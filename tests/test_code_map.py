@@ -13,16 +13,16 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 470_000,
+    "code tokens of src": 468_500,
     "code tokens of tests": 386_500,
     "code tokens of bench": 120_300,
     "code tokens of docs": 11_442,
     "code tokens of notebooks": 7_444,
     "caches": 113,
-    "named numbers": 676,
+    "named numbers": 660,
     "tests for a tracer": 135,
-    "functions with more than 8 parameters": 14,
-    "test files that reach private names": 87,
+    "functions with more than 8 parameters": 12,
+    "test files that reach private names": 83,
 }
 
 

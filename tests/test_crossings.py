@@ -203,7 +203,6 @@ def test_a_motion_that_burns_its_steps_names_the_load_that_jumps():
 
 
 class Ring(OnPlane):
-
     def geometric_constraints(self, pose):
         return {"ring": pose.q.x**2 + pose.q.y**2 - 1.0}
 

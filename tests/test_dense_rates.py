@@ -54,7 +54,6 @@ def test_they_are_nan_where_a_speed_has_no_inertia():
 class SaidTwice(OnPlane):
     """A particle on a circle, by two rows that depend on each other on the circle alone."""
 
-
     def geometric_constraints(self, pose):
         circle = (pose.q.x**2 + pose.q.y**2 - 1.0) / 2
         return {"circle": circle, "once more": (2.0 + pose.q.x + 3.0 * pose.q.y) * circle}

@@ -5,16 +5,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 from jax.flatten_util import ravel_pytree
 from linkages import Parallelogram, SliderCrank, Windows, bennett, bricard
 from small_scenes import DiscWithHeightRow
 
 import jourdain_jax as jj
+from jourdain_jax import structure_of
 from jourdain_jax.build.sampling import NoStateFoundError
-from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus import damped
 from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.motion.trajectories import results
 
 SCENES = {
     "disc with quaternion": jj.models.TiltingDiscQuaternion(),

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import result_codes as results
 from hunting import judging, linkages, oscillators
 from hunting.families import FAMILIES, family
 from hunting.family import Ask, Family, Truth, together
@@ -12,7 +13,6 @@ from hunting.reference import integrate
 from hunting.table import as_markdown, figures, losses
 
 import jourdain_jax as jj
-from jourdain_jax.motion.trajectories import results
 
 # Family and seeds, each wrong or flagged at some time; seeds that differ by the number of a family's ways ask alike, and share a program.
 SHORT = (

@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 
 import jourdain_jax as jj
 from jourdain_jax.build.plausibility import CHECKS
-from jourdain_jax.motion.trajectories import results
 
 
 class Spinning(jj.Scene):

@@ -50,7 +50,6 @@ class Round(OnPlane):
 class Dips(OnLine):
     """A bead at constant speed, and an event for a hundredth of a metre."""
 
-
     def events(self, motion):
         return {"dip": (motion.q.x - 0.52) ** 2 - 1e-4}
 

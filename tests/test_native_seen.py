@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
+from jourdain_jax import Lowered
 from jourdain_jax.build.plausibility import faults_at
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.lowering.lower import lowered
-from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.native import seen
 from jourdain_jax.native import ffi

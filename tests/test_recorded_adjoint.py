@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 
 import jourdain_jax as jj
 from jourdain_jax.motion.integrators import erk_loop, recorded_adjoint
 from jourdain_jax.motion.integrators.tableaus import method_of
-from jourdain_jax.motion.trajectories import results
 
 LANES = 3
 AT_FOUR_SAVED_TIMES = jnp.array([0.0, 0.7, 1.5, 4.0, 4.0])  # the first is the start, the last comes twice

@@ -112,7 +112,6 @@ class Drifting(OnPlane):
 class Held(OnLine):
     """A bead that is driven and has no freedom left."""
 
-
     def geometric_constraints(self, pose):
         return {"held": pose.q.x - 0.3 * jnp.sin(pose.t)}
 

@@ -5,16 +5,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 from jax.flatten_util import ravel_pytree
 
 import jourdain_jax as jj
+from jourdain_jax import structure_of
 from jourdain_jax.build.held_values import may_contradict
 from jourdain_jax.build.row_program import row_program
-from jourdain_jax.build.structure import structure_of
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.projection import BY_AUTODIFF
 from jourdain_jax.motion.row_functions import row_functions
-from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native import ffi
 from jourdain_jax.program import interpret
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import result_codes as results
 from in_mpmath import in_mpmath
+from small_scenes import OnLine
 
 import jourdain_jax as jj
 from jourdain_jax.calculus.scalar_operations import TABLE
@@ -108,6 +109,13 @@ def _guarded(op, f, g):
 DISC, SLEIGH = jj.models.TiltingDisc(), jj.models.ChaplyginSleigh()
 
 
+class Power(OnLine):
+    """A mass under a force whose exponent varies."""
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=-((2.0 + motion.q.x**2) ** motion.q.x)),)
+
+
 def test_errors_of_a_sleigh_fall_with_the_tolerance_and_steps_with_the_order():
     start = jj.start(SLEIGH, **SLEIGH.example)
 
@@ -193,6 +201,7 @@ def test_lanes_of_a_rollout_end_each_for_itself():
         (lambda: jj.simulate(DISC, t1=1.0, solver=jj.Taylor(), adjoint=diffrax.DirectAdjoint()), "adjoint of diffrax"),
         (lambda: jj.simulate(jj.models.MODELS["ball-on-turntable"](), t1=1.0, solver=jj.Taylor(30)), "products, more than"),
         (lambda: jj.simulate(jj.models.MODELS["spring-and-rod"](), t1=1.0, solver=jj.Taylor()), "has no Taylor series"),
+        (lambda: jj.simulate(Power(), {"x": 0.3}, t1=1.0, solver=jj.Taylor()), "an exponent varies"),
         (lambda: jj.Taylor(2), "`order` is 2, expected a whole number from 4 to 30"),
     ],
 )
