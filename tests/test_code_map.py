@@ -15,7 +15,7 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 CEILINGS = {
     "code tokens of src": 468_500,
     "code tokens of tests": 386_500,
-    "code tokens of bench": 120_300,
+    "code tokens of bench": 120_800,
     "code tokens of docs": 11_442,
     "code tokens of notebooks": 7_444,
     "caches": 113,
