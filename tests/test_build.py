@@ -2,7 +2,6 @@
 
 import pickle
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -88,21 +87,6 @@ def test_a_motion_and_its_diagnosis_are_bit_equal_however_often_they_are_asked_f
             assert np.array_equal(first.q, other.q)
             assert np.array_equal(first.u, other.u)
     assert len({str(motion) for motion in motions for _ in range(10)}) == 1
-
-
-def test_checkpoints_that_are_asked_for_are_used():
-    sleigh = ChaplyginSleigh()
-
-    def end(speed, adjoint):
-        motion = jj.simulate(sleigh, {"x_rate": speed, "heading_rate": 0.3}, ts=jnp.array([1.0]), adjoint=adjoint)
-        return motion.q_end[0], motion.last_step
-
-    by_record, by_checkpoints = (
-        jax.value_and_grad(end, has_aux=True)(0.5, adjoint) for adjoint in (diffrax.RecursiveCheckpointAdjoint(), diffrax.RecursiveCheckpointAdjoint(8))
-    )
-    assert np.isfinite(by_record[0][1])
-    assert np.isnan(by_checkpoints[0][1])  # diffrax keeps its last step to itself
-    np.testing.assert_allclose(by_record[1], by_checkpoints[1], rtol=1e-6)
 
 
 def test_a_function_that_takes_scenes_only_says_what_to_pass(disc):

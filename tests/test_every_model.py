@@ -110,7 +110,7 @@ def end_of_two_steps(name: str, *, with_start: bool):
     t, q, u = (jnp.asarray(x[0]) for x in jj.sample_states(scene, 1))
     start = jj.State(t, q, u, *jnp.zeros(3), (scene.coordinate_names, scene.speed_names))
     flat, unravel = ravel_pytree(({key: value for key, value, _ in parameters_of(scene)}, q, u))
-    options = {"ts": t + jnp.array([0.02]), "rtol": 1e3, "atol": 1e3, "dt0": 0.008, "work": False, "events": False}
+    options = {"ts": t + jnp.array([0.02]), "rtol": 1e3, "atol": 1e3, "max_step": 0.008, "work": False, "events": False}
 
     known = {} if with_start else {adjoint: set_up(scene, start, adjoint=adjoint, **options) for adjoint in (None, FORWARD)}
     assert not any(setup.reason_against_machine_code for setup in known.values())

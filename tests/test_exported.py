@@ -59,7 +59,7 @@ def test_second_derivatives_are_exported():
 
 
 def test_an_exported_program_says_that_it_has_no_hessian_by_the_default_adjoint():
-    with pytest.raises(DifferentiationModeError, match=r"exported programs.* pass `adjoint=diffrax\.DirectAdjoint"):
+    with pytest.raises(DifferentiationModeError, match=r"exported programs.* pass `adjoint=diffrax\.ForwardMode"):
         _exported(jax.hessian(_total), 1.0)
 
 

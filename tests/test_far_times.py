@@ -17,7 +17,7 @@ import jourdain_jax as jj
 
 LOOPS = {
     "lean": {},
-    "diffrax": {"solver": diffrax.Dopri5(), "stepsize_controller": diffrax.PIDController(rtol=1e-8, atol=1e-8)},
+    "diffrax": {"solver": diffrax.Bosh3(), "rtol": 1e-5, "atol": 1e-5, "work": False},
     "equal steps": {"solver": jj.ImplicitMidpoint(step=1e-3)},
 }
 FAR = (1.7e9, -3.0e8, 86400.0)

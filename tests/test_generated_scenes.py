@@ -5,7 +5,6 @@ coordinates, speeds, units and orders take most of the time: the normal set has 
 invariant, reduction and seed.
 """
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -119,8 +118,7 @@ def test_halving_the_step_divides_the_error_by_two_to_the_order(number):
     start = jj.consistent(scene, 0.0, q, u)
 
     def end(h):
-        options = {"solver": diffrax.Bosh3(), "stepsize_controller": diffrax.ConstantStepSize(), "dt0": h}
-        motion = jj.simulate(scene, start, ts=jnp.array([0.4]), work=False, adjoint=diffrax.ForwardMode(), backend="dense", **options)
+        motion = jj.simulate(scene, start, ts=jnp.array([0.4]), work=False, backend="dense", solver=jj.ImplicitMidpoint(step=h))
         return jnp.concatenate([motion.q_end, motion.u_end])
 
     steps = 0.4 / 2.0 ** np.arange(2, 7)
@@ -128,7 +126,7 @@ def test_halving_the_step_divides_the_error_by_two_to_the_order(number):
     errors = np.max(np.abs(ends[:-1] - ends[1:]), axis=1)
     orders = np.log2(errors[:-1] / errors[1:])
     assert errors[-1] > 1e3 * np.finfo(float).eps
-    assert abs(orders[-1] - 3.0) < 0.2, orders
+    assert abs(orders[-1] - 2.0) < 0.2, orders
 
 
 # Deliberate errors in the engine, each of which some invariant must show: otherwise the tests above could not fail.

@@ -1,6 +1,5 @@
 """Inputs: what they are at the start counts in the start, and their rates in the balance of energy."""
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -141,8 +140,8 @@ def work_by_quadrature():
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"backend": "dense"}, pytest.param({"solver": diffrax.Kvaerno5()}, marks=pytest.mark.slow), {"formulation": jj.Formulation("full")}],
-    ids=["lowered", "dense", "diffrax", "full state"],
+    [{}, {"backend": "dense"}, {"formulation": jj.Formulation("full")}],
+    ids=["lowered", "dense", "full state"],
 )
 def test_the_work_of_a_sampled_input_in_a_potential_is_that_of_a_quadrature(options):
     inputs = {"hand": jj.Sampled(KNOTS, PLACES), "push": 0.7}
@@ -199,8 +198,8 @@ class Towed(OnPlane):
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"formulation": jj.Formulation("full")}, pytest.param({"solver": diffrax.Kvaerno5()}, marks=pytest.mark.slow)],
-    ids=["minimal", "full state", "diffrax"],
+    [{}, {"formulation": jj.Formulation("full")}],
+    ids=["minimal", "full state"],
 )
 def test_rates_of_inputs_in_rows_accelerate_and_do_work(options):
     motion = jj.simulate(Towed(), {"x_rate": 1.0}, t1=2.0, rtol=1e-9, atol=1e-9, inputs={"speed": lambda t: t**2}, **options).raise_if_failed()

@@ -76,15 +76,16 @@ TIMES = np.array([0.2, 0.5, 0.55, 1.3, 1.9])
 START = {"x": 0.7, "v": 0.4, "k": 4.0}
 
 
-def motion(scene: jj.Scene, values: dict, **options):
+def motion(scene: jj.Scene, values: dict, *, first: float | None = None, **options):
     """What machine code returns of a motion, and its start as a state."""
     setup = jax.tree.map(jnp.asarray, set_up(scene, values, work=False, **options))
     assert not setup.reason_against_machine_code, setup.reason_against_machine_code
+    setup = setup if first is None else setup._replace(dt0=jnp.asarray(first) * jnp.sign(setup.t1 - setup.t0))
     return setup.integrator.solved(setup.fitting(), integration._begin(setup))
 
 
 def pushed(x, v, k, level=-0.1, events=False, **options):
-    options = {"ts": TIMES, "rtol": 1e-10, "atol": 1e-10, "dt0": 1.0, "max_step": jnp.inf} | options
+    options = {"ts": TIMES, "rtol": 1e-10, "atol": 1e-10, "first": 1.0, "max_step": jnp.inf} | options
     return motion(Pushed(k, level), {"x": x, "x_rate": v}, events=events, **options)
 
 
@@ -111,13 +112,13 @@ def an_event_is_found():
 
 
 def an_event_within_a_step_is_found():
-    found = jax.jit(lambda: motion(Dips(), {"x": 0.0, "x_rate": 1.0}, ts=[2.0], dt0=1.0, max_step=jnp.inf))()
+    found = jax.jit(lambda: motion(Dips(), {"x": 0.0, "x_rate": 1.0}, ts=[2.0], first=1.0, max_step=jnp.inf))()
     assert int(found.code) == results.EVENT, "the event was passed over"
     assert abs(found.t_end - 0.51) < 1e-9, "time of the event"
 
 
 def steps_are_no_longer_than_allowed():
-    found = jax.jit(lambda: motion(Dips(), {"x": 0.0, "x_rate": -1.0}, ts=[2.0], dt0=1.0, max_step=0.25))()
+    found = jax.jit(lambda: motion(Dips(), {"x": 0.0, "x_rate": -1.0}, ts=[2.0], first=1.0, max_step=0.25))()
     assert int(found.accepted) == 8, "the longest step"
 
 
@@ -147,7 +148,7 @@ def a_strip_is_met():
 
 
 def a_motion_below_an_event_has_none():
-    below = jax.jit(lambda: motion(Pushed(4.0, 0.7), {"x": 0.699, "x_rate": 5.0}, ts=TIMES, dt0=0.01))()
+    below = jax.jit(lambda: motion(Pushed(4.0, 0.7), {"x": 0.699, "x_rate": 5.0}, ts=TIMES, first=0.01))()
     assert float(below.t_end) == 0.0, "starts below"
 
 
@@ -162,7 +163,7 @@ def an_event_where_a_relation_changes_is_found():
 
 
 def a_bead_stays_on_its_circle():
-    found = jax.jit(lambda: motion(Round(), {"x": 1.0, "y": 0.0, "y_rate": 2.0}, ts=TIMES, rtol=1e-4, atol=1e-4, dt0=0.1))()
+    found = jax.jit(lambda: motion(Round(), {"x": 1.0, "y": 0.0, "y_rate": 2.0}, ts=TIMES, rtol=1e-4, atol=1e-4, first=0.1))()
     np.testing.assert_allclose(jnp.sum(found.ys.q**2, axis=1), 1.0, atol=1e-13, err_msg="circle")
     assert int(found.accepted) < 60, "too many steps"
 
@@ -283,7 +284,7 @@ def reverse_mode_back_over_projections():
     @jax.jit
     @functools.partial(jax.value_and_grad, has_aux=True)
     def weighed(rate):
-        found = motion(Round(), {"x": 1.0, "y": 0.0, "y_rate": rate}, ts=[2.0, 4.0], rtol=1e3, atol=1e3, dt0=100.0, max_step=jnp.inf)
+        found = motion(Round(), {"x": 1.0, "y": 0.0, "y_rate": rate}, ts=[2.0, 4.0], rtol=1e3, atol=1e3, first=100.0, max_step=jnp.inf)
         return jnp.sum(found.ys.q @ jnp.array([0.4, 0.9])) + found.y_end.v[0], found.accepted
 
     h = 1e-3

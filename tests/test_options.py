@@ -44,6 +44,13 @@ def test_an_option_without_meaning_for_a_function_is_refused_with_the_reason(nam
         CALLS[name](**options)
 
 
+@pytest.mark.parametrize("name", ["saveat", "stepsize_controller", "dt0"])
+def test_an_option_that_went_names_what_serves(name):
+    for call in CALLS.values():
+        with pytest.raises(TypeError, match=f"`{name}` is no option any more: (give .* call `diffrax.diffeqsolve|the first step is)"):
+            call(**{name: None})
+
+
 def test_an_object_and_its_fields_by_name_ask_for_the_same_and_names_replace_fields():
     coarse = jj.Options(rtol=1e-4, atol=1e-4, max_step=np.inf)
     by_name = jj.simulate(SLEIGH, START, ts=TS, rtol=1e-4, atol=1e-4, max_step=np.inf)

@@ -26,10 +26,10 @@ def test_a_step_that_ends_a_little_before_a_saved_time_leaves_no_sliver():
     assert float(motion.t_end) == 10.0
 
 
-@pytest.mark.parametrize("controller", [diffrax.ConstantStepSize(), diffrax.PIDController(rtol=1e-9, atol=1e-9)])
-def test_any_controller_lands_on_the_saved_times(controller):
+@pytest.mark.parametrize("solver", [diffrax.Bosh3(), jj.ImplicitMidpoint(step=0.01)])
+def test_any_solver_lands_on_the_saved_times(solver):
     ts = jnp.array([0.11, 0.123, 0.3])
-    motion = jj.simulate(Falling(), {"x_rate": 2.0}, ts=ts, stepsize_controller=controller, dt0=0.01)
+    motion = jj.simulate(Falling(), {"x_rate": 2.0}, ts=ts, solver=solver)
     assert int(motion.result) == results.SUCCESS
     np.testing.assert_allclose(motion["x"], 2.0 * ts, rtol=1e-12)
 
@@ -40,12 +40,6 @@ def test_an_implicit_solver_serves_a_projected_scene():
     implicit, explicit = jj.simulate(scene, solver=diffrax.Kvaerno5(), **options), jj.simulate(scene, **options)
     assert int(implicit.result) == results.SUCCESS
     np.testing.assert_allclose(implicit.q_end, explicit.q_end, atol=1e-6)
-
-
-def test_the_first_step_has_a_length_whichever_way_time_runs():
-    ends = [jj.simulate(Falling(), {"x_rate": 0.5}, t0=2.0, t1=1.0, dt0=dt0, solver=jj.RadauIIA()).q_end for dt0 in (0.01, -0.01)]
-    np.testing.assert_allclose(ends[0], [-0.5, -0.5 * 9.81], rtol=1e-9)
-    assert np.array_equal(*ends)
 
 
 def test_a_motion_starts_at_the_time_of_its_state():

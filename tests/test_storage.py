@@ -3,7 +3,6 @@
 import dataclasses
 import json
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -95,9 +94,8 @@ def test_inputs_come_back_as_samples_at_the_saved_times(tmp_path):
     np.testing.assert_allclose(loaded.lane(0).inputs(0.125), [1.125, 0.25], rtol=1e-15)
 
 
-def test_a_motion_saved_at_its_steps_comes_back_with_its_inputs(tmp_path):
-    steps = jj.simulate(OnBelt(), {"y": 0.1}, t1=0.5, saveat=diffrax.SaveAt(t0=True, ts=[0.0, 0.2], steps=True), inputs={"speed": 1.0}, max_steps=400)
-    assert not np.all(np.isfinite(steps.ts))  # room for more steps than were taken
+def test_a_motion_of_equal_steps_comes_back_with_its_inputs(tmp_path):
+    steps = jj.simulate(OnBelt(), {"y": 0.1}, t1=0.5, ts=[0.0, 0.2], inputs={"speed": 1.0}, solver=jj.ImplicitMidpoint(step=0.1))
     jj.save(steps, tmp_path / "steps.npz")
     loaded = jj.load_trajectory(tmp_path / "steps.npz", OnBelt)
     np.testing.assert_array_equal(loaded.q, steps.q)

@@ -198,7 +198,6 @@ def test_lanes_of_a_rollout_end_each_for_itself():
     ("call", "said"),
     [
         (lambda: jj.simulate(DISC, t1=1.0, solver=jj.Taylor(), backend="xla"), "jj.Taylor\\(\\) cannot integrate `TiltingDisc`: another backend"),
-        (lambda: jj.simulate(DISC, t1=1.0, solver=jj.Taylor(), adjoint=diffrax.DirectAdjoint()), "adjoint of diffrax"),
         (lambda: jj.simulate(jj.models.MODELS["ball-on-turntable"](), t1=1.0, solver=jj.Taylor(30)), "products, more than"),
         (lambda: jj.simulate(jj.models.MODELS["spring-and-rod"](), t1=1.0, solver=jj.Taylor()), "has no Taylor series"),
         (lambda: jj.simulate(Power(), {"x": 0.3}, t1=1.0, solver=jj.Taylor()), "an exponent varies"),

@@ -70,8 +70,7 @@ def through_loss_of_rank() -> DerivativeOfMotion:
     ts = np.array([0.0, end / 2, end])
     known = snakeboard.motion(ts, **snakeboard.RUN)["th"][-1]
     begin = lambda v: (scene, SNAKE_START | {"x_rate": v})  # noqa: E731
-    skip = {"direct adjoint": "asked in E4 gradient"}
-    return DerivativeOfMotion(begin, 1.0, ts, lambda m: m.q_end[2], known, naive_value=lambda q, u: q[2], steps=1600, skip=skip)
+    return DerivativeOfMotion(begin, 1.0, ts, lambda m: m.q_end[2], known, naive_value=lambda q, u: q[2], steps=1600)
 
 
 def through_projected_start() -> DerivativeOfMotion:
@@ -86,7 +85,7 @@ def through_projected_start() -> DerivativeOfMotion:
         q, u, _ = scene.named(heading=heading, heading_rate=1.3)
         return scene, jj.consistent(scene, 0.0, q, u.at[1].set(v))
 
-    skip = {"rollout": "asked in E4 gradient", "direct adjoint": "asked in E4 gradient"}
+    skip = {"rollout": "asked in E4 gradient"}
     return DerivativeOfMotion(begin, 0.5, ts, lambda m: m.q_end[0], slope(known, 0.5), skip=skip)
 
 
@@ -98,7 +97,7 @@ def along_the_norm() -> DerivativeOfMotion:
     def begin(size):
         return scene, jj.consistent(scene, 0.0, jnp.concatenate([q[:3], size * q[3:]]), u)
 
-    skip = {"rollout": "asked in E4 gradient", "direct adjoint": "asked in E4 gradient", "reductions": "no rows", "naive": "no rows"}
+    skip = {"rollout": "asked in E4 gradient", "reductions": "no rows", "naive": "no rows"}
     return DerivativeOfMotion(begin, 1.0, np.array([0.0, 2.0]), lambda m: m.q_end[4], 0.0, scale=1.0, skip=skip)
 
 
@@ -110,7 +109,7 @@ def through_a_long_motion(t_end: float) -> DerivativeOfMotion:
         return rattleback.motion(ts, w3=w)["w3"][-1]
 
     begin = lambda w: (scene, scene.example | {"w3": w})  # noqa: E731
-    skip = {"reductions": "one is enough", "rollout": "asked in E4 gradient", "direct adjoint": "asked in E4 gradient"}
+    skip = {"reductions": "one is enough", "rollout": "asked in E4 gradient"}
     skip |= {"Kvaerno5": "minutes; asked over 2 s"} if t_end > 2 else {}
     return DerivativeOfMotion(begin, -5.0, ts, lambda m: m.u_end[4], slope(known, -5.0, 1e-5), rtol=1e-11, atol=1e-11, skip=skip)
 
@@ -119,7 +118,7 @@ def through_an_event() -> DerivativeOfMotion:
     """A disc at rest falls to its stop at 1.5 rad: d t* / d lean."""
     scene = jj.models.TiltingDisc()
     begin = lambda lean: (scene, {"lean": lean})  # noqa: E731
-    skip = {"direct adjoint": "asked in E4 gradient", "rollout": "asked in E4 gradient"}
+    skip = {"rollout": "asked in E4 gradient"}
     return DerivativeOfMotion(begin, 0.3, np.array([0.0, 2.0]), lambda m: m.t_end, fall_time_slope(0.3), skip=skip)
 
 

@@ -31,8 +31,6 @@ USUAL = {
     "DLA": "order 2: the discrete Lagrangian is conserved, not the energy; a gauge term, which changes no motion, changes its errors",
     "discrete gradient": "order 2: the energy is kept to round-off, every other integral and the path itself only to the size of the step squared",
     "forward mode": "the derivative is exact for steps that are off by the tolerance: a motion that amplifies errors spoils it, too",
-    "direct adjoint": "the derivative is exact for steps that are off by the tolerance: a motion that amplifies errors spoils it, too",
-    "backsolve adjoint": "it would solve the motion backwards, off the constraints and against its contraction: refused",
     "MuJoCo": "constraints and contacts are springs with regularised friction: rods stretch, discs sink in and creep; steps have one length",
     "default": "the tolerance is met per step, and errors are amplified by the motion",
     "rollout": "the tolerance is met per step, and errors are amplified by the motion",

@@ -115,7 +115,7 @@ def curves(problem: Problem, quick: bool) -> list[Curve]:
     if quick:
         return [*found, given, full]
     if not problem.large:
-        found.append(_tolerance("Kvaerno5", "solver", diffrax.Kvaerno5(), IMPLICIT_TOLERANCES))
+        found.append(_tolerance("Kvaerno5", "solver", diffrax.Kvaerno5(), IMPLICIT_TOLERANCES, work=False))
     if problem.structure_preserving:
         found += [_step("discrete Lagrange-d'Alembert", problem, jj.DiscreteLagrangeDAlembert), _step("discrete gradient", problem, jj.DiscreteGradient)]
     loose = _tolerance("full state, not projected, Dopri8", "state", diffrax.Dopri8(), COARSE, formulation=jj.Formulation("full", stabilisation=None))

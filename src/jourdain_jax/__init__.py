@@ -114,6 +114,7 @@ if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.importers.sympy_scene import from_sympy
     from jourdain_jax.importers.urdf import from_urdf
     from jourdain_jax.motion.batches.rollout import Rollout, rollout
+    from jourdain_jax.motion.diffrax_steps import diffrax_term
     from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
     from jourdain_jax.motion.integrators.discrete_lagrange_dalembert import DiscreteLagrangeDAlembert
     from jourdain_jax.motion.integrators.implicit_midpoint import ImplicitMidpoint
@@ -161,6 +162,7 @@ _ON_FIRST_USE = {
     "importers.sympy_scene": "from_sympy",
     "importers.urdf": "from_urdf",
     "motion.batches.rollout": "Rollout rollout",
+    "motion.diffrax_steps": "diffrax_term",
     "motion.integrators.discrete_gradient": "DiscreteGradient",
     "motion.integrators.discrete_lagrange_dalembert": "DiscreteLagrangeDAlembert",
     "motion.integrators.implicit_midpoint": "ImplicitMidpoint",
@@ -265,6 +267,7 @@ __all__ = [
     "damper",
     "derivative_exists",
     "diagnose",
+    "diffrax_term",
     "disc_contact",
     "ellipsoid_contact",
     "energy",

@@ -26,7 +26,7 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import users_level
 
 _STATED = "each `Experiment` states start, times and inputs, and its motion ends with its last sample"
-_REFUSED = dict.fromkeys(("start", "t0", "t1", "ts", "saveat", "inputs", "events", "work"), _STATED)
+_REFUSED = dict.fromkeys(("start", "t0", "t1", "ts", "inputs", "events", "work"), _STATED)
 _REFUSED["retry"] = "its motions are compiled, in one way"
 _FORWARD = {"adjoint": "derivatives come by forward mode; leave it out"}
 

@@ -17,13 +17,12 @@ from jourdain_jax.calculus.identities import identity
 FORWARD_MESSAGE = (
     "`simulate` was differentiated in forward mode (jvp, jacfwd, hessian), but its adjoint is reverse-only. "
     'Leave `adjoint` at its default for both modes where machine code integrates (not with `backend="xla"` or in exported programs); elsewhere '
-    "pass `adjoint=diffrax.ForwardMode()` for forward mode (cheapest for up to about 30 parameters), or "
-    "`adjoint=diffrax.DirectAdjoint()` for both modes and second derivatives; or use reverse mode (jax.grad, jax.vjp)."
+    "pass `adjoint=diffrax.ForwardMode()` for forward mode (cheapest for up to about 30 parameters), or use reverse mode (jax.grad, jax.vjp)."
 )
 SECOND_ORDER_MESSAGE = (
     "`simulate` was differentiated twice, but its adjoint supports first derivatives in reverse mode only. "
     'Leave `adjoint` at its default for second derivatives in any mode where machine code integrates (not with `backend="xla"` or in exported programs); pass '
-    "`adjoint=diffrax.DirectAdjoint()` for them elsewhere, or `adjoint=diffrax.ForwardMode()` for forward-over-forward (jax.jacfwd(jax.jacfwd(f)))."
+    "`adjoint=diffrax.ForwardMode()` for forward-over-forward (jax.jacfwd(jax.jacfwd(f))) elsewhere."
 )
 SECOND_ORDER_BY_XLA_MESSAGE = (
     "`simulate` was differentiated twice, first or last in reverse mode, where XLA has to differentiate it: with respect to samples of an input, or of a "
@@ -35,7 +34,7 @@ THIRD_ORDER_MESSAGE = (
 )
 REVERSE_MESSAGE = (
     "`simulate` was differentiated in reverse mode (grad, vjp, jacrev), but its adjoint is forward-only. "
-    "Leave `adjoint` at its default, or pass `diffrax.RecursiveCheckpointAdjoint()`, for reverse mode; `diffrax.DirectAdjoint()` serves both."
+    "Leave `adjoint` at its default, or pass `diffrax.RecursiveCheckpointAdjoint()`, for reverse mode."
 )
 
 

@@ -1,38 +1,75 @@
-"""diffrax as an integrator: for every solver, controller and adjoint but those of our own loop.
+"""Solvers of diffrax: `diffrax.diffeqsolve` of a scene's rates as it is, with its step-size control, its events and its adjoint.
 
-An implicit solver tries steps into states where rates are not numbers: beyond a stop event, or out of the domain of a program. The step is refused and its
-derivative dropped; but the derivative of its inner solve would have been an error, or 0 * NaN in reverse mode. Where a value f is not finite,
-
-    df := 0,   linearised at a reference state instead, so that no NaN arises on the way back either
-
-and f itself stays as it is, so that what fails shows.
+Steps end at the saved times (`step_ts`) and at knots of the inputs (`jump_ts`), and are no longer than `max_step` (`dtmax`). States are put onto the rows where
+they are saved, not after each step; one that has left them by more than errors of its steps explain ends in a result code. A stop event is one that has
+happened at the end of a step, located by the dense output: a value that falls and rises again within a step is none.
 """
 
-from collections.abc import Callable
+import warnings
 from typing import ClassVar, Literal
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+import optimistix as optx
+from jaxtyping import Array, Bool, PyTree
 
+from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.integrators import event_search, integrands
-from jourdain_jax.motion.integrators.event_location import Remembering, locate, with_tolerances
-from jourdain_jax.motion.integrators.guarded_solver import GuardedSolver
-from jourdain_jax.motion.integrators.step_to_times import merged, step_to_times
-from jourdain_jax.motion.integrators.wrapping_solver import for_adjoint
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
+from jourdain_jax.motion.vector_fields.choice import Formulation, vector_field
+from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
+from jourdain_jax.motion.watched import reason_against_watching
+from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.tracebacks import shown_from_users_lines, users_level
+
+
+class _Rates(eqx.Module):
+    """Rates of coordinates and all speeds, as diffrax takes them."""
+
+    field: VectorField
+    scene: Scene
+    inputs: Inputs
+    fixed: tuple
+
+    def __call__(self, t, y, args) -> tuple:
+        q, u = y
+        found = self.field.rates(self.scene, self.fixed, t, Integrated(q, u, None), self.field.now(self.inputs, t))
+        return found.q, found.v
+
+
+@shown_from_users_lines
+def diffrax_term(scene: Scene | BuiltFor, inputs=None) -> diffrax.ODETerm:
+    """Return the rates of a scene for `diffrax.diffeqsolve`: of the state (q, u), coordinates and all speeds.
+
+    For what `simulate` does not do: step-size control, saving, adjoints and events of diffrax. Nothing keeps the state on the rows but their accelerations;
+    `jj.consistent` puts states back onto them. `inputs`: as of `simulate`. Differentiable in the scene and its inputs.
+
+    **Examples**
+
+        import diffrax
+
+        disc = jj.models.TiltingDisc()
+        start = jj.start(disc, lean=0.3, spin_rate=-3.0)
+        control = diffrax.PIDController(rtol=1e-8, atol=1e-8)
+        found = diffrax.diffeqsolve(
+            jj.diffrax_term(disc), diffrax.Tsit5(), 0.0, 2.0, None, (start.q, start.u), stepsize_controller=control, adjoint=diffrax.ForwardMode()
+        )
+        q, u = found.ys
+    """
+    scene = as_scene(scene)
+    inputs = as_inputs(scene, inputs)
+    field = vector_field(scene, Formulation("full"), work=False, backend="auto", inputs=inputs)
+    return diffrax.ODETerm(_Rates(field, scene, inputs, field.fixed(scene)))
 
 
 class Diffrax(Integrator):
     """`diffrax.diffeqsolve`."""
 
     solver: diffrax.AbstractSolver
-    controller: diffrax.AbstractStepSizeController | None
-    adjoint: diffrax.AbstractAdjoint
-    saveat: diffrax.SaveAt | None
     max_steps: int = eqx.field(static=True)
     event_names: tuple[str, ...] = eqx.field(static=True)
     projects_saved: ClassVar[bool] = False
@@ -43,116 +80,92 @@ class Diffrax(Integrator):
         return type(self.solver).__name__
 
     def mode(self, setup: Setup) -> Literal["forward", "reverse", "any"]:
-        if isinstance(self.adjoint, diffrax.RecursiveCheckpointAdjoint):
-            return "reverse"
-        return "forward" if isinstance(self.adjoint, diffrax.ForwardMode) else "any"
+        return "reverse"
 
     def reason_against_machine_code(self, setup: Setup) -> str:
         """It has none."""
-        return "a solver, a controller or an adjoint of diffrax was asked for"
+        return "a solver of diffrax was asked for"
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
-        field, args, y0 = setup.field, begun.args, begun.y0
-        origin = args[4]
-        t0, t1, ts, knots = setup.t0 - origin, setup.t1 - origin, setup.ts - origin, setup.knots
-        names, (rtol, atol) = self.event_names, setup.tolerances
-        landings = jnp.append(ts if self.saveat is None else ts[:0], t1)
-        landings = landings if knots is None else merged(landings, knots + t0, jnp.sign(t1 - t0))
-        by_tolerance = diffrax.PIDController(rtol=rtol, atol=atol, norm=integrands.state_norm, dtmin=setup.shortest, dtmax=setup.longest, force_dtmin=False)
-        controller = by_tolerance if self.controller is None else self.controller
-        to_times = step_to_times(landings, controller) if self.saveat is None or knots is not None else controller
-        saveat = diffrax.SaveAt(ts=ts) if self.saveat is None else self.saveat
-        if self.saveat is not None and saveat.subs.ts is not None:
-            saveat = eqx.tree_at(lambda saveat: saveat.subs.ts, saveat, saveat.subs.ts - origin)
-        solver = for_adjoint(self.solver, self.adjoint)
-        implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
-        rates, project = (ZeroTangentIfNonfinite(f, t0, y0) if implicit else f for f in (integrands.rates, integrands.project))
-        args, within = (args, None) if knots is None else (integrands.within(jnp.inf, args), integrands.within)
-        pivots = integrands.pivots if field.has_pivots else None
-        solver = GuardedSolver(with_tolerances(solver, controller), project if field.projects else None, pivots, within)
-        term = diffrax.ODETerm(rates)
+        origin, knots = begun.args[4], setup.knots
+        t0, t1, ts = setup.t0 - origin, setup.t1 - origin, setup.ts - origin
+        rtol, atol = setup.tolerances
+        control = diffrax.PIDController(rtol=rtol, atol=atol, norm=integrands.state_norm, dtmin=setup.shortest, dtmax=setup.longest, force_dtmin=False)
+        control = diffrax.ClipStepSizeController(control, step_ts=ts, jump_ts=None if knots is None else knots)
+        event = diffrax.Event(_lowest, optx.Bisection(rtol=1e-14, atol=1e-14 * jnp.abs(t1 - t0)), direction=False)
         solution = diffrax.diffeqsolve(
-            term,
-            Remembering(solver, integrands.events) if names else solver,
+            diffrax.ODETerm(integrands.rates),
+            self.solver,
             t0,
             t1,
             setup.dt0,
-            y0,
-            args,
-            saveat=diffrax.SaveAt(subs=[saveat.subs, diffrax.SubSaveAt(t1=True)], solver_state=True),
-            stepsize_controller=to_times,
-            adjoint=self.adjoint,
-            event=diffrax.Event(_an_event) if names else None,
+            begun.y0,
+            begun.args,
+            saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)]),
+            stepsize_controller=control,
+            event=event if self.event_names else None,
             max_steps=setup.most_steps(knots),
             throw=False,
         )
-        t_end, y_end = solution.ts[1][0], jax.tree.map(lambda x: x[0], solution.ys[1])
-        code = jnp.where(solution.result == diffrax.RESULTS.max_steps_reached, results.MAX_STEPS, results.STEP_TOO_SMALL)
-        code = jnp.where(solution.result == diffrax.RESULTS.successful, results.SUCCESS, code)
-        unsolved = (solution.result == diffrax.RESULTS.nonlinear_divergence) | (solution.result == diffrax.RESULTS.nonlinear_max_steps_reached)
-        # a step that was not solved is no step: the times at its end were not reached
-        reached = jnp.isfinite(solution.ts[0]) & ~(unsolved & ((solution.ts[0] - t_end) * jnp.sign(t1 - t0) >= 0))
-        seen = (solution.solver_state[2] if names else solution.solver_state)[1]
-        if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):  # others cannot reject a step
-            code = jnp.where((seen.projected > results.MOST_PROJECTED) & (code == results.SUCCESS), results.OFF_CONSTRAINTS, code)
-        code, event = jnp.where(unsolved, results.UNSOLVED_STEP, code), jnp.full_like(code, -1, jnp.int32)
-        if names:
-            happened = solution.event_mask
-            t_last, y_last, _ = solution.solver_state
-            located = locate(solver, term, integrands.events, (t_last * jnp.sign(t1 - t0), y_last), t_end, y_end, args, happened)
-            t_end, y_end, event = located.t, located.y, located.event
-            code = jnp.where(happened, jnp.where(located.solved, results.EVENT, results.UNSOLVED_STEP), code)
+        (found_ts, (t_end,)), (ys, last) = solution.ts, solution.ys
+        y_end = jax.tree.map(lambda x: x[0], last)
+        code = jnp.asarray(results.STEP_TOO_SMALL)
+        for told, own in (
+            (diffrax.RESULTS.successful, results.SUCCESS),
+            (diffrax.RESULTS.event_occurred, results.EVENT),
+            (diffrax.RESULTS.max_steps_reached, results.MAX_STEPS),
+            (diffrax.RESULTS.nonlinear_divergence, results.UNSOLVED_STEP),
+            (diffrax.RESULTS.nonlinear_max_steps_reached, results.UNSOLVED_STEP),
+        ):
+            code = jnp.where(solution.result == told, own, code)
+        code, event_index = code.astype(jnp.int32), jnp.asarray(-1, jnp.int32)
+        reached = jnp.isfinite(found_ts)
+        if self.event_names:
+            first = jnp.argmin(integrands.events(t_end, y_end, begun.args)).astype(jnp.int32)
+            event_index = jnp.where(code == results.EVENT, first, event_index)
+            over = _over_at_start(begun, t0, t1)
+            happened = jnp.any(over)
+            t_end, y_end = jax.tree.map(lambda first, last: jnp.where(happened, first, last), (t0, begun.y0), (t_end, y_end))
+            reached, code = reached & (~happened | (found_ts == t0)), jnp.where(happened, results.EVENT, code)
+            event_index = jnp.where(happened, jnp.argmax(over).astype(jnp.int32), event_index)
         return Solved(
-            ts=solution.ts[0],
-            ys=solution.ys[0],
+            ts=found_ts,
+            ys=ys,
             reached=reached,
             t_end=t_end,
             y_end=y_end,
             code=code,
-            event=event,
+            event=event_index,
             accepted=solution.stats["num_accepted_steps"],
             rejected=solution.stats["num_rejected_steps"],
             last_step=jnp.full_like(t_end, jnp.nan),
-            pivot=seen.pivot,
-            crossings=jnp.zeros_like(event),
+            pivot=jnp.full_like(t_end, jnp.inf),
+            crossings=jnp.zeros_like(event_index),
             together=jnp.full_like(t_end, jnp.inf),
         )
 
 
-def _an_event(t, y, args, *, terms, t0, t1, **kwargs) -> Bool[Array, ""]:
-    """Whether any event has happened, in the signature of diffrax; a state that is lost is none, nor is at the start a value that rises from zero."""
+def check(setup: Setup) -> None:
+    """ValueError where the scene does work that solvers of diffrax do not integrate; a warning where it has relations that they do not watch."""
+    name, solver = type(setup.scene).__name__, setup.integrator.name
+    if setup.field.with_work:
+        raise ValueError(
+            f"solver=diffrax.{solver}() does not integrate the work that no potential of `{name}` accounts for; "
+            "give work=False, or leave `solver` away for the default one, which does"
+        )
+    if reason_against_watching(setup):
+        text = f"diffrax.{solver} does not watch the relations that loads or events of `{name}` have: it may step over them; the default solver does"
+        warnings.warn(text, stacklevel=users_level())
+
+
+def _over_at_start(begun: Begun, t0, t1) -> Bool[Array, "events"]:
+    """Which events have happened at the start, which diffrax does not ask."""
+    rates = integrands.rates(t0, begun.y0, begun.args)
+    values, along = jax.jvp(lambda t, y: integrands.events(t, y, begun.args), (t0, begun.y0), (jnp.ones_like(t0), rates))
+    return event_search.at_start(values, jnp.sign(t1 - t0) * along, values, jnp.abs(t1 - t0))[0]
+
+
+def _lowest(t, y: PyTree, args, *, terms, **kwargs):
+    """The lowest value of all stop events: the first of several in one step, of which diffrax would take the first in their order."""
     direction = terms.contr(0.0, 1.0)  # diffrax counts time along the direction of the motion
-    known = jnp.all(jnp.stack([jnp.all(jnp.isfinite(part)) for part in jax.tree.leaves((y.q, y.v))]))
-
-    def at_start():
-        along = direction, jax.tree.map(lambda f: direction * f, integrands.rates(t * direction, y, args))
-        values, rates = jax.jvp(lambda t, y: integrands.events(t, y, args), (t * direction, y), along)
-        return jnp.any(event_search.at_start(values, rates, values, jnp.abs(t1 - t0))[0])
-
-    return known & jax.lax.cond(t == t0, at_start, lambda: ~event_search.no_event(integrands.events(t * direction, y, args)))
-
-
-class ZeroTangentIfNonfinite(eqx.Module):
-    """`function(t, y, args)`, with derivative zero where its value is not finite; `t`, `y`: a state at which it is."""
-
-    function: Callable
-    t: Float[Array, ""]
-    y: PyTree
-
-    def __call__(self, t, y, args):
-        return _flat(t, y, args, jax.lax.stop_gradient((self.t, self.y)), self.function)
-
-
-@eqx.filter_custom_jvp
-def _flat(t, y, args, reference, function):
-    return function(t, y, args)
-
-
-@_flat.def_jvp
-def _flat_jvp(primals, tangents):
-    t, y, args, reference, function = primals
-    value = function(t, y, args)
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(value)]))
-    at = jax.tree.map(lambda x, safe: jnp.where(finite, x, safe), (t, y), reference)
-    _, slope = eqx.filter_jvp(function, (*at, args), tangents[:3])
-    return value, jax.tree.map(lambda d: jnp.where(finite, d, jnp.zeros_like(d)), slope)
+    return jnp.min(integrands.events(t * direction, y, args))

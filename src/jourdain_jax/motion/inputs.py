@@ -21,8 +21,7 @@ class Sampled(eqx.Module):
 
     Steps end at its knots, so that no feature is passed over, however short: a blow of 1 ms in a motion of 10 s is felt at any tolerance. Knots at which the
     values are on a straight line, to within a tenth of `rtol` (at most 1e-5) of their range, do not count. Samples of something rough cost a step each.
-    Functions of time are seen at the times of steps only, also those that interpolate themselves; so are samples with `diffrax.StepTo`, where the steps
-    are yours.
+    Functions of time are seen at the times of steps only, also those that interpolate themselves.
     """
 
     ts: Float[Array, "samples"] = eqx.field(converter=as_real)  # s, increasing

@@ -20,10 +20,9 @@ from jourdain_jax.calculus.nan_where import entered, left
 from jourdain_jax.calculus.reals import in_default_precision
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.arguments import times_fit
-from jourdain_jax.motion.energy_check import conserves, energies_near, energy_lost
+from jourdain_jax.motion.energy_check import MOST_STEP_ERRORS, conserves, energies_near, energy_lost
 from jourdain_jax.motion.input_programs import for_programs
 from jourdain_jax.motion.integrators import integrands
-from jourdain_jax.motion.integrators.solver_choice import time_origin
 from jourdain_jax.motion.native import seen
 from jourdain_jax.motion.row_check import rows_violated
 from jourdain_jax.motion.setup import Begun, Setup, Solved
@@ -103,7 +102,7 @@ def _begin(setup: Setup) -> Begun:
     timely = times_fit(setup.ts, setup.t0, setup.t1)
     right, start = _without_faults(setup)
     field, scene = setup.field, setup.scene
-    args = field, scene, setup.inputs, field.fixed(scene), time_origin(setup.integrator.controller, setup.t0)
+    args = field, scene, setup.inputs, field.fixed(scene), setup.t0
     return Begun(right, timely, start, args, field.pack(start.q, start.u))
 
 
@@ -113,7 +112,7 @@ def _finish(given: Setup, setup: Setup, asked: Float[Array, ""], begun: Begun, s
     _, scene, inputs, fixed, origin = args
     if integrator.mode(given) == "forward":
         solved = eqx.tree_at(lambda s: (s.ys, s.y_end, s.t_end), solved, forward_only((solved.ys, solved.y_end, solved.t_end)))
-    moving = field.projects
+    puts_back = field.projects and not integrator.projects_saved
     stored_first = field.stored(scene, t0, start.q, inputs(t0))
     direction = jnp.sign(setup.t1 - t0)
     valid = solved.reached & (solved.ts * direction <= solved.t_end * direction) & begun.timely
@@ -121,16 +120,16 @@ def _finish(given: Setup, setup: Setup, asked: Float[Array, ""], begun: Begun, s
     def saved_state(tau, y, valid):
         # what was never reached holds anything: compute at the end state instead, then mark
         tau, y = jnp.where(valid, tau, solved.t_end), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, solved.y_end)
-        y = integrands.project(tau, y, args) if moving and not integrator.projects_saved else y
+        free, y = y, integrands.project(tau, y, args) if puts_back else y
         t = origin + tau
         u, pivot = field.speeds_and_pivot(scene, fixed, t, y, inputs(t))
         work = None if y.work is None else y.work + field.stored(scene, t, y.q, inputs(t)) - stored_first
-        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (y.q, u, work)), pivot, (t, y)
+        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (y.q, u, work)), pivot, (t, y), _step_errors(setup, free, y) if puts_back else None
 
     # start and end as two more saved states, so that all this is compiled once
     start_and_end = (jnp.zeros_like(solved.t_end), begun.y0, begun.timely), (solved.t_end, solved.y_end, begun.timely)
     all_states = jax.tree.map(lambda saved, first, last: jnp.concatenate([first[None], saved, last[None]]), (solved.ts, solved.ys, valid), *start_and_end)
-    found, pivots, states = jax.vmap(saved_state)(*all_states)
+    found, pivots, states, moved_by = jax.vmap(saved_state)(*all_states)
     found = jax.tree.map(lambda x: jnp.where(begun.right, x, jnp.nan), found)
     # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
     # without rows all are one, which XLA would go through while it compiles, for seconds, were it to know them
@@ -139,7 +138,9 @@ def _finish(given: Setup, setup: Setup, asked: Float[Array, ""], begun: Begun, s
     pivot = jnp.fmin(pivot, jnp.asarray(solved.pivot, pivots.dtype))
     lost = energy_lost(energies_near(setup, args, *states), solved.accepted) if conserves(setup) else False
     violated = rows_violated(setup, states[0], *found[:2]) if field.rows_may_contradict else False
-    code = jnp.where(results.is_success(solved.code) & lost, results.ENERGY_LOST, solved.code)
+    drifted = jnp.nanmax(moved_by) > MOST_STEP_ERRORS * (1 + solved.accepted) if puts_back else False
+    code = jnp.where(results.is_success(solved.code) & drifted, results.OFF_CONSTRAINTS, solved.code)
+    code = jnp.where(results.is_success(code) & lost, results.ENERGY_LOST, code)
     code = jnp.where(results.is_success(code) & violated, results.CONTRADICTORY_ROWS, code)
     unwatched = reason_against_watching(setup)
     result = results.with_causes(
@@ -163,7 +164,7 @@ def _finish(given: Setup, setup: Setup, asked: Float[Array, ""], begun: Begun, s
     t_end = jnp.where(solved.t_end == setup.t1 - origin, setup.t1, origin + solved.t_end)
     return Trajectory(
         scene=given.scene,
-        ts=given.ts if integrator.saveat is None else origin + solved.ts,
+        ts=given.ts,
         q=q[:-1],
         u=u[:-1],
         work=None if work is None else work[:-1],
@@ -185,10 +186,17 @@ def _finish(given: Setup, setup: Setup, asked: Float[Array, ""], begun: Begun, s
         state_form=field.name,
         reduction=field.reduction_name if setup.reason_against_machine_code else f"{field.reduction_name} to machine code",
         solver=integrator.name,
-        projected=moving,
+        projected=field.projects,
         unwatched=unwatched,
         event_names=integrator.event_names,
     )
+
+
+def _step_errors(setup: Setup, free: Integrated, y: Integrated) -> Float[Array, ""]:
+    """How many times what a step may be off by a projection moved a state from `free` to `y`."""
+    rtol, atol = setup.tolerances
+    parts = jax.lax.stop_gradient(((free.q, y.q), (free.v, y.v)))
+    return jnp.max(jnp.stack([jnp.max(jnp.abs(a - b) / (atol + rtol * jnp.abs(b)), initial=0.0) for a, b in parts]))
 
 
 def _without_faults(setup: Setup):

@@ -26,8 +26,9 @@ class Options:
     """How motions are integrated.
 
     - `rtol`, `atol`: tolerances of a step, relative and absolute.
-    - `solver`: a solver of diffrax, or one of `jj.Taylor`, `jj.RadauIIA`, `jj.ImplicitMidpoint`, `jj.DiscreteLagrangeDAlembert`, `jj.DiscreteGradient`;
-      the last three take equal steps of at most their `step` between saved times. None: Tsit5 for rtol >= 1e-6, Dopri8 below.
+    - `solver`: a solver of diffrax, which runs `diffrax.diffeqsolve` (but Tsit5, Dopri5 and Dopri8 are our own), or one of `jj.Taylor`, `jj.RadauIIA`,
+      `jj.ImplicitMidpoint`, `jj.DiscreteLagrangeDAlembert`, `jj.DiscreteGradient`; the last three take equal steps of at most their `step` between saved
+      times. None: Tsit5 for rtol >= 1e-6, Dopri8 below.
     - `max_steps`: the most steps; `max_step`: the longest one (s). None: 1/16 of the span, so that a load that acts on a part of the way, or a dip of an event,
       is not stepped over where nothing else keeps steps short; inf: no bound.
     - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.
@@ -61,10 +62,7 @@ class AllOptions(Options):
     solver: "diffrax.AbstractSolver | ImplicitMethod | Taylor | Method | None" = None
     formulation: "Formulation | None" = None
     backend: str = "auto"
-    saveat: "diffrax.SaveAt | None" = None
-    stepsize_controller: "diffrax.AbstractStepSizeController | None" = None
     adjoint: "diffrax.AbstractAdjoint | None" = None
-    dt0: Number | None = None
 
 
 class OptionFields(TypedDict, total=False):
@@ -80,10 +78,7 @@ class OptionFields(TypedDict, total=False):
     retry: bool
     formulation: "Formulation | None"
     backend: str
-    saveat: "diffrax.SaveAt | None"
-    stepsize_controller: "diffrax.AbstractStepSizeController | None"
     adjoint: "diffrax.AbstractAdjoint | None"
-    dt0: Number | None
 
 
 class MotionFields(OptionFields, total=False):
@@ -121,9 +116,13 @@ _register(AllOptions)
 _DEFAULT = AllOptions()
 _KINDS = {  # of diffrax, and an example
     "solver": ("AbstractSolver", "diffrax.Dopri8()"),
-    "adjoint": ("AbstractAdjoint", "diffrax.DirectAdjoint()"),
-    "stepsize_controller": ("AbstractStepSizeController", "diffrax.PIDController(rtol=1e-8, atol=1e-8)"),
-    "saveat": ("SaveAt", "diffrax.SaveAt(ts=...)"),
+    "adjoint": ("AbstractAdjoint", "diffrax.ForwardMode()"),
+}
+_BY_DIFFRAX = "call `diffrax.diffeqsolve(jj.diffrax_term(scene), ...)` with it"
+GONE = {  # options that there were once -> what serves now
+    "dt0": "the first step is 1e-4 of the span; structure-preserving solvers carry theirs, as in solver=jj.ImplicitMidpoint(step=0.01)",
+    "saveat": f"give times to save at as `ts`; for values between steps, or at each step, {_BY_DIFFRAX}",
+    "stepsize_controller": f"give `rtol`, `atol` and `max_step`, or solver=jj.ImplicitMidpoint(step=0.01); for another control {_BY_DIFFRAX}",
 }
 
 
@@ -140,6 +139,8 @@ def as_options(options: Options | None, by_name: Mapping[str, Any], function: st
     for name in by_name:
         if name in refused:
             raise TypeError(f"{function}() takes no `{name}`: {refused[name]}")
+        if name in GONE:
+            raise TypeError(f"`{name}` is no option any more: {GONE[name]}")
         if name not in OPTION_NAMES:
             known = [option for option in (*SPAN, *OPTION_NAMES) if option not in refused]
             raise TypeError(f"{function}() got an unexpected keyword argument '{name}'; {nearest(name, known)}")
@@ -157,11 +158,6 @@ _POSITIVE = lambda x: 0 < x < np.inf, "a positive finite number; give a toleranc
 _NUMBERS = {  # what fits, what is expected, and what to give
     "rtol": _POSITIVE,
     "atol": _POSITIVE,
-    "dt0": (
-        lambda x: 0 < abs(x) < np.inf,
-        "a finite first step in s that is not zero; or None for 1e-4 of the span",
-        "give the first step in s, or None for 1e-4 of the span",
-    ),
     "max_step": (
         lambda x: x > 0,
         "a positive time in s; None bounds steps by the span, inf does not bound them",
@@ -174,7 +170,7 @@ def _check(options: AllOptions) -> None:
     """ValueError for numbers that do not fit, and for objects that are not of their kind."""
     for name, (fits, expected, advice) in _NUMBERS.items():
         value = getattr(options, name)
-        if (type(value) is float and fits(value)) or (value is None and name in ("dt0", "max_step")):
+        if (type(value) is float and fits(value)) or (value is None and name == "max_step"):
             continue
         number = checked_unless_traced(value, f"`{name}`", (), advice=advice)
         if not is_traced(number) and not fits(float(number)):
@@ -185,7 +181,7 @@ def _check(options: AllOptions) -> None:
     most = options.max_steps
     if not isinstance(most, int | np.integer) or isinstance(most, bool) or most < 1:
         raise ValueError(f"`max_steps` is {most!r}, expected a whole number of at least 1; give the number of steps after which to stop")
-    for name in ("solver", "adjoint", "stepsize_controller", "saveat"):
+    for name in ("solver", "adjoint"):
         if (value := getattr(options, name)) is not None and not isinstance(value, Taylor | Method | ImplicitMethod):
             _check_kind(name, value)
 

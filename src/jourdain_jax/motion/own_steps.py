@@ -40,8 +40,6 @@ class OwnSteps(Integrator):
     event_names: tuple[str, ...] = eqx.field(static=True)
     native: bool = eqx.field(static=True)  # whether machine code may integrate
     order: int | None = eqx.field(static=True)  # of Taylor series, by which machine code steps in place of the solver's tableau
-    controller: ClassVar[None] = None
-    saveat: ClassVar[None] = None
     projects_saved: ClassVar[bool] = True
     watches: ClassVar[bool] = True
 
@@ -83,22 +81,14 @@ class OwnSteps(Integrator):
 _once: Callable[..., OwnSteps] = lru_cache(maxsize=64)(OwnSteps)
 
 
-def own_steps(solver, stepsize_controller, adjoint, saveat, **static) -> OwnSteps | None:
-    """Our own loop, where it has such a solver and such an adjoint (None: the default one), and nothing else is stated."""
-    own = isinstance(solver, Method | ImplicitMethod)
-    method = solver if own else method_of(solver)
-    method = method.without_step() if isinstance(method, FixedStepMethod) else method
-    kind = "both" if adjoint is None else _kind(adjoint)
-    if stepsize_controller is not None or saveat is not None or method is None or kind is None:
+def own_steps(solver, adjoint, **static) -> OwnSteps | None:
+    """Our own loop, where it has such a solver; None where diffrax has."""
+    method = solver if isinstance(solver, Method | ImplicitMethod) else method_of(solver)
+    if method is None:
         return None
+    method = method.without_step() if isinstance(method, FixedStepMethod) else method
+    kind = "both" if adjoint is None else "reverse" if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint) else "forward"
     return _once(method, kind, adjoint is not None and type(adjoint) is alongside.Alongside, **static)
-
-
-def _kind(adjoint) -> Mode | None:
-    """The mode of derivatives of an adjoint of diffrax; None where ours has no such one."""
-    if type(adjoint) is diffrax.RecursiveCheckpointAdjoint:
-        return "reverse" if adjoint.checkpoints is None else None
-    return "forward" if type(adjoint) in (diffrax.ForwardMode, alongside.Alongside) else None
 
 
 def reason_against_series(setup: Setup, order: int) -> str:

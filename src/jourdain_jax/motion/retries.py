@@ -21,8 +21,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
 from jourdain_jax.motion.integrators.radau import RadauIIA
-from jourdain_jax.motion.integrators.solver_choice import may_be_full
 from jourdain_jax.motion.integrators.tableaus import DOPRI8
 from jourdain_jax.motion.integrators.taylor import Taylor
 from jourdain_jax.motion.options import AllOptions
@@ -100,10 +100,11 @@ def _next_retry(field: VectorField, motion: Trajectory, t0, options: AllOptions)
     if np.asarray(motion.result) in (results.SUCCESS, results.EVENT):
         return results.AS_ASKED
     tried, solver, backend = int(motion.fallback), options.solver, options.backend
-    lost = as_formulation(options.formulation).state in may_be_another_form(field) and may_be_full(solver) and int(motion.result) in lost_codes(field)
+    lost = as_formulation(options.formulation).state in may_be_another_form(field) and int(motion.result) in lost_codes(field)
+    lost = lost and not isinstance(solver, DiscreteGradient)
     if lost and backend in ("auto", "dense") and not tried & results.FULL_STATE:
         return tried | results.FULL_STATE
-    free = solver is None and backend != "native" and options.stepsize_controller is None
+    free = solver is None and backend != "native"
     if free and not tried & results.IMPLICIT and _is_stiff(field, motion, t0):
         return tried | results.IMPLICIT
     return results.AS_ASKED

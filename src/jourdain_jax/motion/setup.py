@@ -18,7 +18,6 @@ from jourdain_jax.motion.arguments import fitting_times
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
 from jourdain_jax.motion.integrators.knots import knots_between
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
-from jourdain_jax.motion.integrators.solver_choice import steps_are_given
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.put_on_rows import Usual
 from jourdain_jax.motion.start import State
@@ -55,8 +54,6 @@ class Integrator(eqx.Module):
     max_steps: eqx.AbstractVar[int]
     event_names: eqx.AbstractVar[tuple[str, ...]]
     solver: eqx.AbstractVar["diffrax.AbstractSolver | Method | ImplicitMethod"]
-    controller: eqx.AbstractVar["diffrax.AbstractStepSizeController | None"]  # None: the default one
-    saveat: eqx.AbstractVar["diffrax.SaveAt | None"]  # None: at the times asked for, at each of which a step ends
     watches: eqx.AbstractClassVar[bool]  # whether steps watch relations (`crossings.py`)
     projects_saved: eqx.AbstractClassVar[bool]  # whether the states that it returns are on the rows
 
@@ -123,8 +120,6 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     @property
     def knots(self) -> Float[Array, "knots"] | None:
         """Times since the start at which steps must end for the inputs' sake."""
-        if steps_are_given(self.integrator.controller):
-            return None
         return knots_between((self.inputs, self.scene), self.tolerances[0], self.t0, self.t1, self.ts)
 
 

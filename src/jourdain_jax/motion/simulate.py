@@ -6,11 +6,10 @@ domain and the rows are linear or affine; otherwise the full one (coordinates an
 
 import warnings
 from functools import partial
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import TYPE_CHECKING, Any, Unpack, cast
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.on_first_use import module_on_first_use
@@ -19,10 +18,9 @@ from jourdain_jax.motion.arguments import as_state, span_and_times
 from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.inputs_in_rows import check_inputs_in_rows
 from jourdain_jax.motion.integration import integrate
-from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod
+from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
-from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted
-from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method, as_solver
+from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
@@ -71,13 +69,8 @@ def simulate(
     - `backend`: "native", the scene's scalar program (`jj.lower`) as machine code made for it, on CPUs, where llvmlite is installed and the solver is a
       default one; "xla", that program compiled by XLA, as third derivatives, those with respect to samples, and programs that are exported (`jax.export`)
       or for other devices are in any case; "dense", the dense matrices; "auto" (default), the first of these that serves. The first two take the same steps.
-    - `saveat`: a `diffrax.SaveAt` in place of `ts`. Values between steps come from the solver's dense output: fewer steps, but
-      its error can be far above the tolerance where steps are long (Dopri8 on a pendulum: 100 times at 1e-12; on a sleigh at 1e-11: 1e-6).
-    - `stepsize_controller`, `adjoint`: as in `diffrax.diffeqsolve`; for a controller of your own, give that its `dtmax` in place of `max_step`.
-      Default adjoint: forward and reverse mode, to the second order (`jax.hessian`), where machine code integrates; otherwise
-      `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order, by recorded steps; with `checkpoints=`, that of diffrax);
-      `diffrax.ForwardMode()` for forward mode of any order; `diffrax.DirectAdjoint()` for all.
-    - `dt0`: the first step (s; default: 1e-4 of the span).
+    - `adjoint`: the default one serves forward and reverse mode, to the second order (`jax.hessian`), where machine code integrates; otherwise
+      reverse mode of first order, by recorded steps. `diffrax.ForwardMode()` serves forward mode of any order.
 
     **Returns** a `Trajectory`, with a result code instead of an exception, whose message says what to do; `trajectory.raise_if_failed()` raises
     `SimulationError`.
@@ -124,34 +117,34 @@ def _integrated(setup: Setup) -> Trajectory:
 def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, inputs=None, options: Options | None = None, **by_name) -> Setup:
     """Return what `simulate` integrates for its arguments."""
     options = as_options(options, by_name)
-    solver, adjoint, saveat, dt0, max_step = options.solver, options.adjoint, options.saveat, options.dt0, options.max_step
-    controller: Any = options.stepsize_controller
+    solver, max_step = options.solver, options.max_step
     scene, formulation = as_scene(scene), as_formulation(options.formulation)
     order, solver = (solver.order or order_for(options.rtol), None) if isinstance(solver, Taylor) else (None, solver)
-    _check_adjoint(adjoint)
-    check_solver(solver, controller, dt0, saveat, max_step, adjoint)
+    _check_adjoint(options.adjoint)
     if isinstance(solver, FixedStepMethod):
-        dt0 = max_step = solver.step
+        if max_step is not None:
+            raise ValueError(f"`max_step` does not go with `{solver.name}`, whose steps are at most as long as its `step`: jj.{solver.name}(step=...)")
+        max_step = solver.step
     native = options.backend in ("auto", "native")
     inputs = as_inputs(scene, inputs)
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
     start, usual = _start(scene, start, t0, inputs, native, formulation.projects)
-    field = fitted(solver, scene, vector_field(scene, formulation, options.work, options.backend, inputs), formulation.state)
+    field = vector_field(scene, formulation, options.work, options.backend, inputs)
+    field = solver.fitted(scene, field, formulation.state) if isinstance(solver, ImplicitMethod) else field
     if not inputs.constant:
         check_inputs_in_rows(scene, inputs, t0, t1)
     warn_float32(start.q.dtype, options.rtol)
     if solver is None:
         solver = default_solver(options.rtol) if order is None else DOPRI8
     static: dict[str, Any] = {"max_steps": options.max_steps, "event_names": field.event_names if options.events else ()}
-    integrator = own_steps(solver, controller, adjoint, saveat, **static, native=native, order=order)
-    if integrator is None:
-        adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
-        saveat = None if saveat is None else _checked_saveat(saveat)
-        integrator = diffrax_steps.Diffrax(as_solver(solver), controller, adjoint, saveat, **static)
+    own = own_steps(solver, options.adjoint, **static, native=native, order=order)
+    integrator = diffrax_steps.Diffrax(solver=cast(Any, solver), **static) if own is None else own
     tolerances = tuple(as_array(x, start.q.dtype) for x in (options.rtol, options.atol))  # arrays: another tolerance is no other program
-    first_step = _first_step(dt0, t0, t1)  # diffrax's own guess costs two more copies of the vector field to compile
+    first_step = 1e-4 * (t1 - t0)  # diffrax's own guess costs two more copies of the vector field to compile
     longest = as_array(LONGEST * abs(t1 - t0) if max_step is None else max_step, start.q.dtype)
     setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, longest, integrator, usual)
+    if own is None:
+        diffrax_steps.check(setup)
     if options.backend == "native" and (reason := setup.reason_against_machine_code):
         raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
     if order is not None and (reason := reason_against_series(setup, order)):
@@ -159,23 +152,11 @@ def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, in
     return setup
 
 
-def _first_step(dt0, t0, t1):
-    if dt0 is None:
-        return 1e-4 * (t1 - t0)
-    return jnp.abs(dt0) * jnp.sign(t1 - t0)  # its length counts: the span says which way
-
-
-def _checked_saveat(saveat: "diffrax.SaveAt") -> "diffrax.SaveAt":
-    if not isinstance(saveat.subs, diffrax.SubSaveAt) or saveat.subs.fn is not diffrax.SubSaveAt(t1=True).fn or saveat.dense:
-        raise ValueError("`saveat` must be a plain `diffrax.SaveAt(t0=, t1=, ts=, steps=)`: a trajectory holds whole states; take what you need from it")
-    return saveat
-
-
 def _check_adjoint(adjoint) -> None:
-    if adjoint is not None and isinstance(adjoint, diffrax.BacksolveAdjoint):
+    if adjoint is not None and not isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint | diffrax.ForwardMode):
         raise ValueError(
-            "`adjoint` is a diffrax.BacksolveAdjoint, which solves the motion backwards: it leaves the constraints and loses digits; use "
-            "the default one, diffrax.RecursiveCheckpointAdjoint(), diffrax.ForwardMode() or diffrax.DirectAdjoint()"
+            f"`adjoint` is a {type(adjoint).__name__}; use the default one, diffrax.RecursiveCheckpointAdjoint() or diffrax.ForwardMode(), or call "
+            "diffrax.diffeqsolve(jj.diffrax_term(scene), ...) with it"
         )
 
 

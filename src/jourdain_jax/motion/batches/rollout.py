@@ -264,7 +264,7 @@ def _with_arrays(options: AllOptions) -> AllOptions:
         solver = default_solver(options.rtol)
     elif isinstance(solver, Taylor):
         solver = Taylor(solver.order or order_for(options.rtol))
-    numbers = {name: getattr(options, name) for name in ("rtol", "atol", "dt0", "max_step")}
+    numbers = {name: getattr(options, name) for name in ("rtol", "atol", "max_step")}
     arrays = {name: jnp.asarray(value, real) for name, value in numbers.items() if value is not None}
     return dataclasses.replace(options, solver=solver, **arrays)
 

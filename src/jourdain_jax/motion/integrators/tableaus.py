@@ -123,8 +123,3 @@ def method_of(solver) -> Method | None:
     """The method of a solver of diffrax; None where our own loop has no such one."""
     method = _ALL.get(type(solver).__name__)
     return method if method is not None and type(solver) is getattr(diffrax, method.name) else None
-
-
-def as_solver(solver):
-    """A method as a solver of diffrax; solvers stay as they are."""
-    return getattr(diffrax, solver.name)() if isinstance(solver, Method) else solver

@@ -25,8 +25,8 @@ MESSAGES = {
     SHRANK: "ran out of steps, which had shrunk to less than a hundredth of their average: a singularity, a discontinuity or a stiff force near the last time",
     STIFF: "stiff: ran out of steps that stability, not accuracy, keeps short, and an implicit solver did not reach the end either; "
     "put a row in the place of a stiff spring or damper, or loosen the tolerances",
-    OFF_CONSTRAINTS: "a step of constant length ended so far from the constraints that the projection moved it by more than half of its change: take shorter "
-    "steps, step-size control (`stepsize_controller`), or look for rows that lose rank",
+    OFF_CONSTRAINTS: "a step of constant length ended so far from the constraints that the projection moved it by more than half of its change, or a solver of "
+    "diffrax left them by more than errors of its steps explain: take shorter steps, the default solver, or look for rows that lose rank",
     BAD_TIMES: "the times to save at leave the span or are not in order, or the span is empty or not finite; give increasing `ts` between `t0` and `t1`",
     ENERGY_LOST: "the energy, which nothing changes, changed by more than the steps' tolerances explain: the motion left its branch at a singular position, "
     "missed a short feature of a load, or a load's potential is not that of its force (`verify`)",
