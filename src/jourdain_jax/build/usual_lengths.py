@@ -5,12 +5,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.build.probed import generic_inputs
 from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.build.structure import TRACED, closure_lengths, structure_whatever_its_faults, usual_rows
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.equations.kinematics import rates_by_own_speeds
-from jourdain_jax.equations.rows import UsualRows
+from jourdain_jax.equations.listed import names_of_position_rows
+from jourdain_jax.equations.rows import UsualRows, velocity_residual
+from jourdain_jax.equations.scaling import speed_scale
+from jourdain_jax.equations.virtual_power import mass_matrix_at
 from jourdain_jax.scene.scene import Scene
+
+STATES = 12  # at which traced parameters are looked at
 
 
 class UsualLengths(eqx.Module):
@@ -22,9 +28,35 @@ class UsualLengths(eqx.Module):
 
 
 def usual_lengths(scene: Scene) -> UsualLengths:
-    """The usual lengths as `usual_rows` and `closure_lengths` have them; no derivative passes through them."""
+    """The usual lengths for the parameters of `scene`; no derivative passes through them."""
     with jax.ensure_compile_time_eval():  # they are kept from one call to the next, whether inside `jit` or not
-        return UsualLengths(jax.tree.map(jnp.asarray, usual_rows(scene)), jnp.asarray(closure_lengths(scene)), _of_own_speeds(scene))
+        own_speeds = _of_own_speeds(scene)
+        if not is_traced(scene):
+            return UsualLengths(jax.tree.map(jnp.asarray, usual_rows(scene)), jnp.asarray(closure_lengths(scene)), own_speeds)
+    return UsualLengths(*_of_traced(scene), own_speeds)
+
+
+def _of_traced(scene: Scene) -> tuple[UsualRows, Float[Array, "closures"]]:
+    """Lengths of rows at states that were probed with numbers near the class's defaults, worked out while the motion runs."""
+    known, still = structure_whatever_its_faults(scene), jax.lax.stop_gradient(scene)
+    count = min(STATES, known.random)
+    t, q, inputs = jnp.asarray(known.times[:count]), jnp.asarray(known.coordinates[:count]), jnp.asarray(generic_inputs(scene))
+    u = jnp.ones(len(scene.speed_names), q.dtype)
+
+    def lengths(t, q):
+        A = jax.jacfwd(lambda u: velocity_residual(still, t, q, u, inputs.astype(q.dtype)))(u)
+        return jnp.linalg.norm(A * speed_scale(mass_matrix_at(still, t, q)), axis=1), jnp.linalg.norm(A, axis=1)
+
+    scaled, plain = (_usual(x) for x in jax.vmap(lengths)(t, q))
+    norms = jnp.ones(len(scene.coordinates.quaternions), plain.dtype)
+    rank = jnp.asarray(known.rank, jnp.int32)
+    return UsualRows(scaled, rank), jnp.concatenate([plain[: len(names_of_position_rows(scene))], norms])
+
+
+def _usual(sizes: Float[Array, "states rows"]) -> Float[Array, "rows"]:
+    """The median over states, or the largest for what vanishes at half of them; what is no number does not count."""
+    median = jnp.nanmedian(sizes, axis=0)
+    return jax.lax.stop_gradient(jnp.where(median > 0, median, jnp.nanmax(sizes, axis=0, initial=0.0)))
 
 
 def _of_own_speeds(scene: Scene) -> Float[Array, "own_speeds"]:
