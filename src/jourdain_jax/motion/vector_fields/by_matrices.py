@@ -6,7 +6,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.usual_lengths import UsualLengths, usual_lengths
-from jourdain_jax.calculus.pseudo_inverse import undecided
 from jourdain_jax.dynamics.accelerations import Baumgarte, bare_accelerations, reduced_at
 from jourdain_jax.dynamics.power import rate_of_work
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
@@ -91,7 +90,8 @@ class MinimalByMatrices(ByMatrices):
 class FullByMatrices(ByMatrices):
     """Coordinates and all speeds."""
 
-    may_branch: bool = eqx.field(static=True)  # where geometric rows lose rank, a cut-off leaves one out, and branches cross
+    # where rows lose rank, a cut-off leaves one out, and branches cross: of their usual size, what round-off decides; None: nothing branches
+    undecided: float | None = eqx.field(static=True)
     own_equations: str = eqx.field(static=True, default="")  # of a solver that takes no accelerations: what it solves instead
 
     @property
@@ -108,7 +108,7 @@ class FullByMatrices(ByMatrices):
     @property
     def has_pivots(self) -> bool:
         """Whether round-off might decide on which branch a motion goes on."""
-        return self.may_branch or bool(self.nonlinear_rows) or len(self.usual.own_speeds) > 0
+        return self.undecided is not None or bool(self.nonlinear_rows) or len(self.usual.own_speeds) > 0
 
     def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "speeds"]:
         return y.v
@@ -122,8 +122,8 @@ class FullByMatrices(ByMatrices):
         """As `rates`; what is left of rows; and 1 where the rows say on which branch the motion goes on, -1 where round-off does."""
         motion, found, directions = self.solved(scene, t, y.q, y.v, inputs)
         rates = Integrated(motion.qdot.array, found.udot, self.power(scene, motion, found))
-        branch = jnp.where(found.pivot > undecided(found.pivot.dtype), 1.0, -1.0).astype(found.pivot.dtype)[None]
-        return self.watched(scene, t, y, rates, branch if self.may_branch else branch[:0], directions)
+        branch = jnp.zeros(0) if self.undecided is None else jnp.where(found.pivot > self.undecided, 1.0, -1.0)[None]
+        return self.watched(scene, t, y, rates, branch.astype(y.q.dtype), directions)
 
 
 def _left_by_elimination(A: Float[Array, "rows speeds"]) -> Float[Array, "rows speeds"]:
@@ -149,6 +149,6 @@ def full_without_projection(field: VectorField, scene: Scene, own_equations: str
         usual=usual_lengths(scene),
         inputs_in_rows=isinstance(field, ByMatrices) and field.inputs_in_rows,
         cutoff=None,
-        may_branch=False,
+        undecided=None,
         own_equations=own_equations,
     )
