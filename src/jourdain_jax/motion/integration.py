@@ -1,4 +1,4 @@
-"""One motion from start to end as one compiled program, by one of two integrators: our own explicit Runge-Kutta steps, or diffrax.
+"""One motion from start to end as one compiled program, by one of two integrators: our own loop over steps, or diffrax.
 
 Both give states at the saved times, which of those were reached, and where and why the motion ended; then speeds are worked out, and all is put into a
 `Trajectory`.

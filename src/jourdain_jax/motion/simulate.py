@@ -1,4 +1,4 @@
-"""Simulation: a scene and a start in, a `Trajectory` out, by any diffrax solver.
+"""Simulation: a scene and a start in, a `Trajectory` out, by our own loop over steps or by a solver of diffrax.
 
 The default state is the minimal one (coordinates and privileged speeds) where the privileged velocities are well conditioned over the scene's
 domain and the rows are linear or affine; otherwise the full one (coordinates and all speeds), projected after every step.
@@ -140,7 +140,7 @@ def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, in
     own = own_steps(solver, options.adjoint, **static, native=native, order=order)
     integrator = diffrax_steps.Diffrax(solver=cast(Any, solver), **static) if own is None else own
     tolerances = tuple(as_array(x, start.q.dtype) for x in (options.rtol, options.atol))  # arrays: another tolerance is no other program
-    first_step = 1e-4 * (t1 - t0)  # diffrax's own guess costs two more copies of the vector field to compile
+    first_step = (1.0 if isinstance(solver, FixedStepMethod) else 1e-4) * (t1 - t0)  # diffrax's own guess costs two more copies of the vector field to compile
     longest = as_array(LONGEST * abs(t1 - t0) if max_step is None else max_step, start.q.dtype)
     setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, longest, integrator, usual)
     if own is None:
