@@ -23,6 +23,10 @@ CEILINGS = {
     "tests for a tracer": 135,
     "functions with more than 8 parameters": 12,
     "test files that reach private names": 83,
+    "ways: state put onto its constraints": 3,
+    "ways: state put back onto its constraints within a step": 1,
+    "ways: rows and their slopes for a projection": 2,
+    "ways: damped least squares": 3,
 }
 
 
@@ -77,7 +81,7 @@ def test_the_drawing_of_the_packages_shows_the_steps_that_the_page_tells():
     drawing = runpy.run_path(str(PAGE.with_name("draw_architecture.py")))
     assert tuple(name for name, _, part in reversed(drawing["ROOMS"]) if not part) == LAYERS
     told = [re.findall(r"^\d+\. \*\*([\w/]+)\.\*\*", section, re.MULTILINE) for section in PAGE.read_text(encoding="utf-8").split("\n## ")[1:]]
-    assert told == [[room for room, _ in steps] for _, _, steps in drawing["CALLS"]]
+    assert [steps for steps in told if steps] == [[room for room, _ in steps] for _, _, steps in drawing["CALLS"]]
 
 
 def names_in(file: str) -> set[str]:

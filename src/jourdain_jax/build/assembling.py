@@ -8,25 +8,20 @@ only a configuration on the rows to round-off shows their rank: directions whose
 Source: J. Nocedal and S. Wright, Numerical Optimization (2006), section 10.3.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from jourdain_jax.build.row_lengths import usual_lengths_of
+from jourdain_jax.calculus.gauss_newton import Look, nearest_root
 from jourdain_jax.calculus.sparse_slopes import Pattern
 
-ITERATIONS = 25  # of Gauss-Newton, at most
 _DAMPED_ITERATIONS = 60
-_NEARLY_DEPENDENT = 1e-6  # of the triangular factor's diagonal: below, singular values decide
 _FARTHEST = 0.25  # of the width of the domain, in one damped step
 _ON_ROWS = 1e4  # units of round-off, of what a row changes by when a coordinate changes by its own size
 _AT_REST = 1e-7  # last correction of the coordinates, relative to their size: more is no configuration on the rows
 _INSIDE = 1e-6  # of the width of the domain
 _ATTEMPTS = 4
-
-# coordinates of some states, and their numbers -> residuals, and the entries of a pattern of slopes
-Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -111,16 +106,10 @@ def typical_lengths(lengths: np.ndarray) -> np.ndarray:
 
 
 def _newton(rows: _Rows, q: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Newton at the states `which`, until nothing moves any more; and the last corrections, relative to the coordinates."""
-    q, last, moving = np.array(q, float), np.full(len(q), np.inf), which
-    for _ in range(ITERATIONS):
-        residual, G = rows.look(q[moving], moving)
-        shift = rows.pattern.shortest(G, residual, lambda G, g: shortest(G, g, rows.typical), rows.typical)
-        q[moving] -= shift
-        last[moving] = np.max(np.abs(shift), axis=1, initial=0.0) / (1 + np.max(np.abs(q[moving]), axis=1, initial=0.0))
-        moving = moving[~(last[moving] <= 4 * np.finfo(float).eps) & np.isfinite(last[moving])]
-        if not moving.size:
-            break
+    """Gauss-Newton at the states `which`; also the last corrections, relative to the coordinates."""
+    q, last, typical = np.array(q, float), np.full(len(q), np.inf), rows.typical
+    solve = lambda G, g: rows.pattern.shortest(G, g, typical)  # noqa: E731
+    q[which], last[which] = nearest_root(lambda q, k: rows.look(q, which[k]), solve, q[which])
     return q, last
 
 
@@ -164,27 +153,3 @@ def _damped_step(pattern: Pattern, J: np.ndarray, f: np.ndarray, damping: np.nda
     system, diagonal = J @ np.swapaxes(J, 1, 2), np.arange(J.shape[1])
     system[:, diagonal, diagonal] += damping[:, None]
     return -np.einsum("smn,sm->sn", J, np.linalg.solve(system, f[..., None])[..., 0])
-
-
-def shortest(G: np.ndarray, residual: np.ndarray, typical: np.ndarray) -> np.ndarray:
-    """The shortest x with `G x = residual`, at every state; least squares where the rows are (nearly) dependent, or shorter than they typically are."""
-    d = 1 / np.maximum(np.linalg.norm(G, axis=2), typical)
-    G, residual = d[..., None] * G, d * residual
-    finite = np.all(np.isfinite(G), axis=(1, 2)) & np.all(np.isfinite(residual), axis=1)
-    x = np.full((len(G), G.shape[2]), np.nan)
-    Q, R = np.linalg.qr(np.swapaxes(G[finite], 1, 2))  # G = R' Q'
-    diagonal = np.abs(np.diagonal(R, axis1=1, axis2=2))
-    regular = np.min(diagonal, axis=1, initial=1.0) > _NEARLY_DEPENDENT if G.shape[1] <= G.shape[2] else np.zeros(len(R), bool)
-    places = np.flatnonzero(finite)
-    if regular.any():
-        x[places[regular]] = (Q[regular] @ np.linalg.solve(np.swapaxes(R[regular], 1, 2), residual[places[regular], :, None]))[..., 0]
-    for k in places[~regular]:
-        x[k] = _least_squares(G[k], residual[k])
-    return x
-
-
-def _least_squares(G: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    try:
-        return np.linalg.lstsq(G, residual, rcond=_NEARLY_DEPENDENT**1.5)[0]
-    except np.linalg.LinAlgError:  # numbers too far apart for a decomposition
-        return np.full(G.shape[1], np.nan)

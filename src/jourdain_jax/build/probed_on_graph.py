@@ -14,11 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.build.assembling import ITERATIONS, Assembled, assemble, shortest, typical_lengths, without_rows
+from jourdain_jax.build.assembling import Assembled, assemble, typical_lengths, without_rows
 from jourdain_jax.build.domain import coordinate_bounds
 from jourdain_jax.build.probed import Probed, generic_inputs
 from jourdain_jax.build.row_lengths import speed_scales
 from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
+from jourdain_jax.calculus.gauss_newton import nearest_root, shortest
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.equations.virtual_power import mass_matrix
 from jourdain_jax.program.analyticity import CALLS, NONANALYTIC, decided_by, depend_on, passes
@@ -223,19 +224,18 @@ class _AtStates:
             return u
         M = self._mass_matrix()
         c = speed_scales(M)
-        metric = np.stack([_inverse_root(m) for m in c[:, :, None] * M * c[:, None]])  # L'^-1
-        moving, typical = np.arange(len(u)), None
-        for _ in range(ITERATIONS):
-            probes = self._probes(self.q[moving], u[moving], moving)
-            weighted = self._row_matrices(probes) * c[moving, None] @ metric[moving]
-            typical = typical_lengths(np.linalg.norm(weighted, axis=2)) if typical is None else typical
-            x = shortest(weighted, _values(probes, at.phi), typical)
-            shift = c[moving] * np.einsum("sij,sj->si", metric[moving], x)
-            u[moving] -= shift
-            moving = moving[np.max(np.abs(shift), axis=1) > 4 * np.finfo(float).eps * (1 + np.max(np.abs(u[moving]), axis=1))]
-            if not moving.size:
-                break
-        return u
+        metric = c[:, :, None] * np.stack([_inverse_root(m) for m in c[:, :, None] * M * c[:, None]])  # C L'^-1
+
+        def moved(x, which):
+            return u[which] + np.einsum("sij,sj->si", metric[which], x)
+
+        def look(x, which):
+            probes = self._probes(self.q[which], moved(x, which), which)
+            return _values(probes, at.phi), self._row_matrices(probes) @ metric[which]
+
+        still, every = np.zeros(u.shape), np.arange(len(u))
+        typical = typical_lengths(np.linalg.norm(look(still, every)[1], axis=2))
+        return moved(nearest_root(look, lambda G, g: shortest(G, g, typical), still)[0], every)
 
     def _assembled(self, q) -> Assembled:
         """Coordinates on geometric rows and unit norms, inside the domain where that can be."""

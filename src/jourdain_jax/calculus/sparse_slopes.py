@@ -6,11 +6,13 @@ Dense matrices take a time that grows with the cube of the rows, a band one that
 narrow band, matrices are dense. Source: E. Cuthill and J. McKee, Proc. 24th Nat. Conf. ACM (1969) 157, for the order.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+
+from jourdain_jax.calculus.gauss_newton import shortest
 
 FEWEST_ROWS, NARROW = 64, 8  # on NumPy: with fewer rows, and with so many times the width of the band or fewer, matrices are dense
 REGULAR = 1e8  # the largest inverse of G G', rows of length one, of which nothing is lost that a second step does not make good
@@ -41,20 +43,20 @@ class Pattern:
         """The lengths of all rows, (states, rows)."""
         return np.linalg.norm(self.dense(values), axis=2) if self.band is None else np.sqrt(summed(self.rows, self.shape[0], values**2))
 
-    def shortest(self, values: np.ndarray, right: np.ndarray, solved: Callable, typical: np.ndarray | float = 0.0) -> np.ndarray:
-        """The shortest x with `G x = right` at every state; within the band where rows are surely independent, or `solved(G, right)` of dense matrices.
+    def shortest(self, values: np.ndarray, right: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndarray:
+        """Return the shortest x with `G x = right` at every state, within the band where rows are surely independent.
 
         `typical`: lengths of the rows, where one may be shorter.
         """
         if self.band is None:
-            return solved(self.dense(values), right)
+            return shortest(self.dense(values), right, typical)
         lengths = np.maximum(self.lengths(values), typical)
         d = 1 / np.where(lengths > 0, lengths, 1.0)
         scaled = d[:, self.rows] * values
         y, size = self.band.solved(scaled, np.zeros(len(values)), d * right)
         found, others = self.transposed_times(scaled, y), ~(size < REGULAR)
         if others.any():
-            found[others] = solved(self.dense(values[others]), right[others])
+            found[others] = shortest(self.dense(values[others]), right[others], typical)
         return found
 
     @cached_property

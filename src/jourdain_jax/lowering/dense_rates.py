@@ -16,10 +16,11 @@ import jax
 import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
-from jourdain_jax.build.assembling import shortest, typical_lengths
+from jourdain_jax.build.assembling import typical_lengths
 from jourdain_jax.build.row_lengths import speed_scales
 from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import VelocityQuantities, jaxpr_of_scene
+from jourdain_jax.calculus.gauss_newton import shortest
 from jourdain_jax.calculus.jaxprs import needed_only
 from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 from jourdain_jax.eager.lanes import uncompiled_lanes

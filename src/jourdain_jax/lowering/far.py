@@ -9,13 +9,12 @@ import numpy as np
 
 from jourdain_jax.build.trace import TracedScene
 from jourdain_jax.lowering.pivots import turns
-from jourdain_jax.program.derivative import columns
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.identity_test import slopes_by_entries
+from jourdain_jax.program.onto_rows import onto_rows
 
 MANY, FEW = 96, 24  # probes; the latter where there are more coordinates than
 LARGE = 16
-STEPS, CLOSED = 12, 1e-9  # of Newton's method
+STEPS, CLOSED = 12, 1e-9  # of Gauss-Newton
 
 
 def full_turns(probes: Probes, traced: TracedScene) -> Callable[[], Probes]:
@@ -44,30 +43,12 @@ def _at_full_turns(probes: Probes, traced: TracedScene) -> Probes:
 
 
 def _on_rows(probes: Probes, rows: list[int], coordinates: list[int]) -> Probes:
-    """The probes with coordinates on rows = 0, by Newton's method; not numbers where it does not arrive."""
-    needed = set(probes.graph.reachable(rows))
-    moved = {f"q_{i}": n for i, n in enumerate(coordinates) if n in needed}
-    if not moved:
-        return probes
-    pattern, slopes = slopes_by_entries(probes.graph, rows, list(moved.values()))
-    q = np.stack([probes.inputs[name] for name in moved])
-    for _ in range(STEPS):
-        here = probes.with_inputs(dict(zip(moved, q, strict=True)))
-        values, J = np.nan_to_num(here(rows)), np.nan_to_num(here(slopes))
-        q = q - pattern.shortest(J.T, values.T, lambda J, g: (np.linalg.pinv(J, rcond=1e-9) @ g[..., None])[..., 0]).T
-        if np.median(np.max(np.abs(values), axis=0)) < CLOSED:
-            break
-    left = np.max(np.abs(probes.with_inputs(dict(zip(moved, q, strict=True)))(rows)), axis=0)
-    q[:, ~(left <= CLOSED)] = np.nan
-    return probes.with_inputs(dict(zip(moved, q, strict=True)))
+    """The probes with coordinates on rows = 0; not numbers where Gauss-Newton does not arrive."""
+    found = onto_rows(probes, rows, {f"q_{i}": n for i, n in enumerate(coordinates)}, most=STEPS)
+    off = ~(np.max(np.abs(found.probes(rows)), axis=0, initial=0.0) <= CLOSED)
+    return found.probes.with_inputs({name: np.where(off, np.nan, found.probes.inputs[name]) for name in found.moved})
 
 
-def on_velocity_rows(probes: Probes, traced: TracedScene, affine: bool) -> Probes:
-    """The probes with speeds on the rows, as near as they can be; `affine`: rows are."""
-    phi, u = traced.at.phi.tolist(), traced.u.tolist()
-    slopes = [n for column in columns(traced.graph, phi, u) for n in column]
-    for _ in range(2 if affine else 8):
-        values, A = np.nan_to_num(probes(phi)), np.nan_to_num(probes(slopes)).reshape(len(u), len(phi), -1)
-        change = np.einsum("pus,sp->up", np.linalg.pinv(A.transpose(2, 1, 0), rcond=1e-9), values)
-        probes = probes.with_inputs({f"u_{k}": probes.inputs[f"u_{k}"] - step for k, step in enumerate(change)})
-    return probes
+def on_velocity_rows(probes: Probes, traced: TracedScene) -> Probes:
+    """The probes with speeds on the rows, as near as they can be."""
+    return onto_rows(probes, traced.at.phi.tolist(), {f"u_{k}": n for k, n in enumerate(traced.u.tolist())}).probes

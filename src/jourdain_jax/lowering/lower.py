@@ -161,7 +161,7 @@ def _built(key: _Key) -> Lowered:
         _check_calls(traced)
         probes = _probes(scene, structure, traced)
         if every_speed and len(structure.row_names) > structure.rank:  # elsewhere they contradict each other
-            probes = on_velocity_rows(probes, traced, structure.affine)
+            probes = on_velocity_rows(probes, traced)
         far = full_turns(probes, traced)
         kept = KeptRows(traced.graph, structure, key.massless, probes, far) if every_speed and structure.row_names else None
         return _best(scene, structure, AppellOnGraph(traced, structure, kept, probes, far, scene.coordinates.reference()))

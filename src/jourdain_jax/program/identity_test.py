@@ -13,24 +13,27 @@ written as c = m R^j, R = 2^40, with |m| between 2^-20 and 2^20, and R is drawn 
 import math
 import zlib
 from collections.abc import Callable, Collection, Mapping, Sequence
+from types import MappingProxyType
 from typing import Self
 
 import numpy as np
 
+from jourdain_jax.calculus.gauss_newton import pseudo_inverses
 from jourdain_jax.calculus.round_off import EPS, halves, with_bound
 from jourdain_jax.calculus.scalar_operations import TABLE
-from jourdain_jax.calculus.sparse_slopes import Pattern
-from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.onto_rows import onto_rows
 
 STEPS, CLOSED = 30, 1e3  # of Newton's method; bounds of round-off that rows may be off
 FAR = 10.0  # half of the probes lie so much further out
 DIGITS = 40  # binary ones, that numbers in the code of a scene may span among themselves
 RADIX = 1.5, 3.0  # in the place of 2^DIGITS
 SURE = 16.0  # bounds of round-off that equal values may differ by: bounds are of first order
-NEARLY_DEPENDENT = 1e-9  # singular values beside the largest, that count as zero
 FEWEST = 6  # probes at which an expression is a number
+
+
+_KEPT: Mapping[str, float] = MappingProxyType({})
 
 
 class Bounded(np.ndarray):
@@ -57,7 +60,7 @@ class IdentityProbes:
         found.error = np.where(np.isfinite(values), np.where(np.isnan(errors), np.inf, errors), 0.0)
         return found
 
-    def with_inputs(self, changes: Mapping[str, np.ndarray], errors: Mapping[str, np.ndarray]) -> Self:
+    def with_inputs(self, changes: Mapping[str, np.ndarray], errors: Mapping[str, np.ndarray | float] = _KEPT) -> Self:
         """Probes at which some inputs, and the bounds of their round-off, are changed and all others are kept."""
         return type(self)(self.graph, self.inputs | dict(changes), self._errors | dict(errors))
 
@@ -168,52 +171,23 @@ def identity_probes(probes: Probes, unchanged: Collection[str]) -> IdentityProbe
 
 
 def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinates: Mapping[str, int]) -> IdentityProbes:
-    """Generic `probes` with `coordinates` (names of inputs, their nodes) on rows = 0, by Newton's method from `near`; nothing is said where it does not arrive.
+    """Generic `probes` with `coordinates` (names of inputs, their nodes) on rows = 0, by Gauss-Newton from `near`; nothing is said where it does not arrive.
 
     The probes unchanged where the rows hold another function than the known ones, of which nothing can be solved.
     """
     graph = probes.graph
-    needed = set(graph.reachable(rows))
-    moved = {name: n for name, n in coordinates.items() if n in needed}
-    if not moved or any(graph.op[n] not in _KNOWN for n in needed):
+    if any(graph.op[n] not in _KNOWN for n in graph.reachable(rows)):
         return probes
-    pattern, slopes = slopes_by_entries(graph, rows, list(moved.values()))
-    q = np.stack([np.broadcast_to(near.inputs[name], probes.count) for name in moved])
-    exact = dict.fromkeys(moved, np.zeros(()))
-    moving = np.arange(probes.count)
-    for turn in range(STEPS + 1):
-        here = probes.with_inputs(dict(zip(moved, q, strict=True)), exact)
-        found = here(rows)
-        values, J = np.nan_to_num(np.asarray(found)), np.nan_to_num(np.asarray(here(slopes))).T
-        step = pattern.shortest(J[moving], values.T[moving], lambda J, g: (_pseudo_inverses(J) @ g[..., None])[..., 0]).T
-        moves = np.any(np.abs(step) > EPS * np.max(np.abs(q[:, moving]), axis=0), axis=0)
-        if turn == STEPS or not moves.any():
-            break
-        moving = moving[moves]
-        q[:, moving] -= step[:, moves] / np.maximum(1.0, np.max(np.abs(step[:, moves]), axis=0))
-    errors = np.einsum("pqr,rp->qp", np.abs(_pseudo_inverses(pattern.dense(J))), np.abs(values) + found.error) + EPS * np.abs(q)
-    errors[:, ~np.all(np.abs(values) <= CLOSED * found.error, axis=0)] = np.inf
-    return probes.with_inputs(dict(zip(moved, q, strict=True)), dict(zip(moved, errors, strict=True)))
-
-
-def slopes_by_entries(graph: Graph, rows: Sequence[int], variables: Sequence[int]) -> tuple[Pattern, list[int]]:
-    """Derivatives of rows with respect to variables: where they are not zero by structure, and their nodes."""
-    place = {n: k for k, n in enumerate(variables)}
-    entries = [(i, place[n], slope) for i, row in enumerate(jacobian(graph, rows, variables)) for n, slope in row.items() if slope != graph.zero]
-    return Pattern.of([(i, k) for i, k, _ in entries], (len(rows), len(place))), [slope for *_, slope in entries]
-
-
-def _pseudo_inverses(J: np.ndarray) -> np.ndarray:
-    """`J+` at every probe; by J' = Q R where all rows of J are surely independent, which takes a tenth of the time of singular values."""
-    if J.shape[1] > J.shape[2]:
-        return np.linalg.pinv(J, rcond=NEARLY_DEPENDENT)
-    Q, R = np.linalg.qr(J.transpose(0, 2, 1))
-    diagonal = np.abs(np.diagonal(R, axis1=1, axis2=2))
-    regular = diagonal.min(axis=1) > np.sqrt(NEARLY_DEPENDENT) * diagonal.max(axis=1)
-    found = np.empty(Q.shape)
-    found[regular] = Q[regular] @ np.linalg.inv(R[regular]).transpose(0, 2, 1)
-    found[~regular] = np.linalg.pinv(J[~regular], rcond=NEARLY_DEPENDENT)
-    return found
+    begun = probes.with_inputs({name: near.inputs[name] for name in coordinates}, dict.fromkeys(coordinates, 0.0))
+    found = onto_rows(begun, rows, coordinates, most=STEPS, longest=1.0)
+    if not found.moved:
+        return probes
+    values, J = found.probes(rows), np.asarray(found.probes(found.slopes)).T
+    q = np.stack([found.probes.inputs[name] for name in found.moved])
+    off = np.abs(np.asarray(values))
+    errors = np.einsum("pqr,rp->qp", np.abs(pseudo_inverses(found.pattern.dense(J))), off + values.error) + EPS * np.abs(q)
+    errors[:, ~np.all(off <= CLOSED * values.error, axis=0)] = np.inf
+    return probes.with_inputs(dict(zip(found.moved, q, strict=True)), dict(zip(found.moved, errors, strict=True)))
 
 
 def _moderate(value: float, radix: np.ndarray) -> np.ndarray:

@@ -1,0 +1,68 @@
+"""Gauss-Newton on NumPy, at many states at once: what is nearest to x among the roots of g.
+
+    x <- x - G+ g(x),   G = dg/dx
+
+Rows count as dependent where the triangular factor of the scaled rows says so; then small singular values are left out.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+MOST_STEPS = 25
+AT_REST = 4 * float(np.finfo(float).eps)  # last correction, relative to 1 + |x|: nothing moves any more
+NEARLY_DEPENDENT = 1e-6  # of the triangular factor's diagonal: below, singular values decide
+SMALL = 1e-9  # beside the largest singular value: counts as zero
+
+# x of some states, and their numbers -> g, G in the form that `solve` takes
+Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def nearest_root(look: Look, solve: Callable, x: np.ndarray, *, most: int = MOST_STEPS, longest: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
+    """Return x with g(x) = 0 near the given x, shape (states, unknowns), and the last corrections relative to 1 + |x|, infinite where they are no numbers.
+
+    `solve`: from G and g to the shortest d with G d = g. No step is longer than `longest` in an entry.
+    """
+    x, last, moving = np.array(x, float), np.full(len(x), np.inf), np.arange(len(x))
+    for _ in range(most):
+        g, G = look(x[moving], moving)
+        step = solve(G, g)
+        size = np.max(np.abs(step), axis=1, initial=0.0)
+        moves = np.isfinite(size)
+        last[moving[~moves]] = np.inf
+        step, size, moving = step[moves], size[moves], moving[moves]
+        x[moving] -= step / np.maximum(1.0, size / longest)[:, None]
+        last[moving] = size / (1 + np.max(np.abs(x[moving]), axis=1, initial=0.0))
+        moving = moving[last[moving] > AT_REST]
+        if not moving.size:
+            break
+    return x, last
+
+
+def shortest(G: np.ndarray, g: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndarray:
+    """Return the shortest d with G d = g at every state; least squares where the rows are (nearly) dependent, or shorter than they typically are."""
+    return (pseudo_inverses(G, typical) @ g[..., None])[..., 0]
+
+
+def pseudo_inverses(G: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndarray:
+    """Return G+ at every state, with rows scaled to a length of one, or to less where they are shorter than they typically are; NaN where G is no number."""
+    lengths = np.maximum(np.linalg.norm(G, axis=2), typical)
+    d = 1 / np.where(lengths > 0, lengths, 1.0)
+    found, finite = np.full(np.swapaxes(G, 1, 2).shape, np.nan), np.all(np.isfinite(G), axis=(1, 2))
+    scaled = d[..., None] * G
+    places = np.flatnonzero(finite)
+    if G.shape[1] <= G.shape[2]:
+        Q, R = np.linalg.qr(np.swapaxes(scaled[finite], 1, 2))  # D G = R' Q'
+        regular = np.min(np.abs(np.diagonal(R, axis1=1, axis2=2)), axis=1, initial=1.0) > NEARLY_DEPENDENT
+        found[places[regular]] = Q[regular] @ np.swapaxes(np.linalg.inv(R[regular]), 1, 2)
+        places = places[~regular]
+    for k in places:
+        found[k] = _by_singular_values(scaled[k])
+    return found * d[:, None]
+
+
+def _by_singular_values(G: np.ndarray) -> np.ndarray:
+    try:
+        return np.linalg.pinv(G, rcond=SMALL)
+    except np.linalg.LinAlgError:  # numbers too far apart for a decomposition
+        return np.full(G.shape[::-1], np.nan)

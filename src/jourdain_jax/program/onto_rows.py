@@ -1,0 +1,48 @@
+"""Probes put onto rows of a graph: inputs move by Gauss-Newton until the rows vanish."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jourdain_jax.calculus.gauss_newton import MOST_STEPS, nearest_root
+from jourdain_jax.calculus.sparse_slopes import Pattern
+from jourdain_jax.program.derivative import jacobian
+from jourdain_jax.program.graph import Graph
+
+
+class Projected(NamedTuple):
+    """Probes on rows, or as near as they came."""
+
+    probes: Any  # as they were given: `Probes` or `IdentityProbes`
+    moved: list[str]  # names of the inputs that rows depend on
+    pattern: Pattern  # of the derivatives of rows with respect to these
+    slopes: list[int]  # their nodes
+
+
+def onto_rows(probes, rows: Sequence[int], inputs: Mapping[str, int], *, most: int = MOST_STEPS, longest: float = np.inf) -> Projected:
+    """Return the probes with `inputs` (names, their nodes) on rows = 0, nearest to where they are; steps as of `nearest_root`."""
+    graph = probes.graph
+    needed = set(graph.reachable(rows))
+    moved = {name: n for name, n in inputs.items() if n in needed}
+    pattern, slopes = _slopes_by_entries(graph, rows, list(moved.values()))
+    given = np.stack([np.broadcast_to(probes.inputs[name], probes.count) for name in moved], axis=1) if moved else np.zeros((probes.count, 0))
+
+    def at(x, which):
+        every = given.copy()
+        every[which] = x
+        return probes.with_inputs(dict(zip(moved, every.T, strict=True)))
+
+    def look(x, which):
+        here = at(x, which)
+        return np.asarray(here(rows)).T[which], np.asarray(here(slopes)).T[which]
+
+    x = nearest_root(look, pattern.shortest, given, most=most, longest=longest)[0] if moved else given
+    return Projected(at(x, slice(None)), list(moved), pattern, slopes)
+
+
+def _slopes_by_entries(graph: Graph, rows: Sequence[int], variables: Sequence[int]) -> tuple[Pattern, list[int]]:
+    """Derivatives of rows with respect to variables: where they are not zero by structure, and their nodes."""
+    place = {n: k for k, n in enumerate(variables)}
+    entries = [(i, place[n], slope) for i, row in enumerate(jacobian(graph, rows, variables)) for n, slope in row.items() if slope != graph.zero]
+    return Pattern.of([(i, k) for i, k, _ in entries], (len(rows), len(place))), [slope for *_, slope in entries]
