@@ -29,7 +29,7 @@ def test_what_is_built_is_there_part_by_part(disc):
     assert disc.program.operations == jj.lower(TiltingDisc()).operations
     assert (disc.state, disc.not_lowered) == ("minimal", "")
     assert not disc.warnings
-    assert all(word in str(disc) for word in ("TiltingDisc, built", "privileged speeds", "27 operations", "conserved"))
+    assert all(word in str(disc) for word in ("Model of TiltingDisc", "machine code", "privileged speeds", "27 operations", "conserved"))
 
 
 def test_warnings_say_where_rank_is_lost():
@@ -63,6 +63,38 @@ def test_what_was_built_stands_wherever_its_scene_does():
     assert fits[0].estimates == fits[1].estimates
 
 
+def test_a_model_says_each_choice_with_its_reason():
+    sleigh, rods = ChaplyginSleigh(), DoublePendulumRods()
+    assert jj.build(sleigh).way == "machine code"
+    assert jj.build(sleigh, backend="xla").way == "XLA: as asked"
+    dense = jj.build(rods, jj.Formulation("full", reduction="kkt"))
+    assert (dense.state, dense.way) == ("full", "dense matrices: as asked")
+    assert "full: as asked" in str(jj.build(sleigh, jj.Formulation("full")))
+    with pytest.raises(ValueError, match="a reduction"):
+        jj.build(sleigh, jj.Formulation(reduction="kkt"), backend="xla")
+    with pytest.raises(TypeError, match=r"a model has its own; give it to `jj\.build`"):
+        jj.simulate(dense, t1=0.1, backend="dense")
+    with pytest.raises(AttributeError, match="`Model`"):
+        jj.Built  # noqa: B018
+
+
+def test_a_model_with_other_parameters_keeps_its_choices_and_is_differentiated_under_jit_and_vmap():
+    start, ts = {"x_rate": 0.5, "heading_rate": 0.3}, jnp.array([0.5, 1.0])
+    model = jj.build(ChaplyginSleigh(), jj.Formulation("full"), backend="xla")
+
+    def end(model, offset):
+        motion = jj.simulate(model.replace(offset=offset), start, ts=ts)
+        assert (motion.state_form, "machine code" in motion.reduction) == ("full", False)
+        return motion.q_end[0]
+
+    offsets = jnp.array([0.2, 0.3])
+    slopes = jax.jit(jax.vmap(jax.grad(end, argnums=1), (None, 0)))(model, offsets)
+    expected = [jax.grad(lambda offset: jj.simulate(ChaplyginSleigh(offset=offset), start, ts=ts).q_end[0])(x) for x in offsets]
+    np.testing.assert_allclose(slopes, expected, rtol=1e-6)
+    assert len(jax.tree.leaves(model)) == len(jax.tree.leaves(model.scene))
+    np.testing.assert_allclose(jj.start(model, **start).u, jj.start(model.scene, **start).u, rtol=0, atol=1e-14)
+
+
 @pytest.mark.parametrize("name", MODELS)
 def test_a_start_and_a_diagnosis_are_bit_equal_however_often_they_are_asked_for(name):
     scene = MODELS[name]()
@@ -90,7 +122,7 @@ def test_a_motion_and_its_diagnosis_are_bit_equal_however_often_they_are_asked_f
 
 
 def test_a_function_that_takes_scenes_only_says_what_to_pass(disc):
-    with pytest.raises(AttributeError, match=r"`Built` has no `bodies`; where a scene is asked for, pass its `\.scene`"):
+    with pytest.raises(AttributeError, match=r"`Model` has no `bodies`; where a scene is asked for, pass its `\.scene`"):
         disc.bodies  # as a function of scenes would ask  # noqa: B018
 
 

@@ -18,7 +18,7 @@ from test_mutants import Mutant
 
 import jourdain_jax as jj
 from jourdain_jax.motion import integration, put_on_rows
-from jourdain_jax.motion.native import back, crossings, functions, kernel, loop, native_motion, onto_rows, search, step
+from jourdain_jax.motion.native import back, crossings, functions, kernel, loop, native_motion, onto_rows, pulled, search, step
 from jourdain_jax.motion.simulate import set_up
 
 pytestmark = machine_code.needed
@@ -389,7 +389,7 @@ MUTANTS = [
     ),
 ]
 CHECKS = list(dict.fromkeys(mutant.check for mutant in MUTANTS))
-KEPT = (kernel.kernel, kernel.kernel_back, kernel.kernel_of_rates, kernel.kernel_of_pulled_rates, put_on_rows._kernel, native_motion.reason_against_derivatives)
+KEPT = (kernel.kernel, kernel.kernel_back, kernel.kernel_of_rates, kernel.kernel_of_pulled_rates, put_on_rows._kernel, pulled.reason_against_derivatives)
 
 
 @pytest.fixture(autouse=True)

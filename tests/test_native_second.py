@@ -83,7 +83,7 @@ def test_second_derivatives_of_falls_are_those_of_their_closed_form(events, solv
 def test_what_machine_code_does_not_serve_is_left_to_xla(which):
     def height(x):
         wind = jj.Sampled([0.0, 0.5, 2.0], jnp.stack([x, 0.3 * x, x**2])) if which == "samples" else x
-        start, options = {"z": 2.0, "z_rate": 1.0 + x}, {"adjoint": FORWARD, "events": False, "max_steps": 99, "rtol": 1e-10, "atol": 1e-10}
+        start, options = {"z": 2.0, "z_rate": 1.0 + x}, {"adjoint": FORWARD, "events": False, "max_steps": 99, "rtol": 1e-10, "atol": 1e-10, "backend": "xla"}
         return jj.simulate(Falling(drag=0.4 * x), start, ts=[0.4], inputs={"wind": wind}, **options).q_end[0]
 
     lower = jax.jit(jax.jacfwd(jax.jacfwd(height) if which == "a third time" else height))

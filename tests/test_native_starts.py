@@ -159,7 +159,10 @@ def test_second_derivatives_and_derivatives_of_batches():
 def test_where_machine_code_is_not_taken():
     scene = jj.models.TiltingDisc()
     started = jax.jit(lambda lean: jj.start(scene, lean=lean, spin_rate=-3.0).u)
-    exported = jax.export.export(started)(jax.ShapeDtypeStruct((), jnp.float64))
+    model = jj.build(scene, backend="xla")
+    exported = jax.export.export(jax.jit(lambda lean: jj.start(model, lean=lean, spin_rate=-3.0).u))(jax.ShapeDtypeStruct((), jnp.float64))
+    with pytest.raises(RuntimeError, match=r'to be exported.*backend="xla"'):
+        jax.export.export(started)(jax.ShapeDtypeStruct((), jnp.float64))
     assert "jourdain_jax_" in started.lower(0.3).as_text()
     assert "jourdain_jax_" not in exported.mlir_module()
     np.testing.assert_allclose(exported.call(0.3), jj.start(scene, lean=0.3, spin_rate=-3.0).u, atol=1e-14)

@@ -140,8 +140,6 @@ def test_a_motion_that_left_its_domain_is_run_again_where_that_is_asked_for_and_
     assert "retry=True" in told.message
     again = jj.simulate(TurnedSkate(), TURNED, ts=ts, retry=True)
     assert int(again.raise_if_failed().fallback) == results.FULL_STATE
-    kept = jj.simulate(TurnedSkate(), TURNED, ts=ts, retry=True, formulation=jj.Formulation("minimal"))
-    assert (int(kept.result), int(kept.fallback)) == (results.SINGULAR_PARTITION, results.AS_ASKED)
     inside = jax.jit(lambda rate: jj.simulate(TurnedSkate(), TURNED | {"heading_rate": rate}, ts=ts, retry=True))(1.3)
     assert (int(inside.result), int(inside.fallback)) == (results.SINGULAR_PARTITION, results.AS_ASKED)
 

@@ -47,11 +47,11 @@ from jourdain_jax.equations.virtual_power import (
     unconstrained_equations,
     virtual_power,
 )
-from jourdain_jax.lowering.built import Built, build
 from jourdain_jax.lowering.lower import lower
 from jourdain_jax.lowering.lowered import Lowered, NotLowered
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators.taylor import Taylor
+from jourdain_jax.motion.model import Model, build
 from jourdain_jax.motion.options import Options
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import simulate
@@ -172,7 +172,10 @@ _ON_FIRST_USE = {
     "plotting.quantities": "plot",
     "plotting.show": "View show",
 }
-_GONE = {"MuntheKaas": "the default solvers renormalise quaternions after each step, are as accurate and take half of its time"}
+_GONE = {
+    "Built": "it is `Model`, which `build` returns",
+    "MuntheKaas": "the default solvers renormalise quaternions after each step, are as accurate and take half of its time",
+}
 _pictures = _module_on_first_use("jourdain_jax.plotting.scene_picture")
 _show_scenes_with(lambda scene: _pictures.scene_svg(scene))
 __getattr__, __dir__ = _names_on_first_use(globals(), {name: module for module, names in _ON_FIRST_USE.items() for name in names.split()}, _GONE)
@@ -183,7 +186,6 @@ __all__ = [
     "Accelerometer",
     "Actuator",
     "Baumgarte",
-    "Built",
     "Checked",
     "Contact",
     "Cylinder",
@@ -216,6 +218,7 @@ __all__ = [
     "LogUniform",
     "Lowered",
     "MeanGradients",
+    "Model",
     "MultipleShooting",
     "Multipliers",
     "Normal",

@@ -73,8 +73,8 @@ def filtered_log_likelihood(
 
         jj.filtered_log_likelihood(sleigh, run, process_noise={"heading_rate": 0.01})      # (rad/s)^2 / s
     """
+    settled = replace(as_fit_options(scene, options, by_name, "filtered_log_likelihood"), events=False)
     scene = as_scene(scene)
-    settled = replace(as_fit_options(options, by_name, "filtered_log_likelihood"), events=False)
     runs = as_runs(scene, data)
     _check_supported(scene, runs)
     speeds = privileged_speeds(scene)

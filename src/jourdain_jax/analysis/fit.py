@@ -109,7 +109,7 @@ def fit(
     """
     if isinstance(guesses, bool) or not isinstance(guesses, int | np.integer) or guesses < 1:
         raise ValueError(f"`guesses` is {guesses!r}, expected a whole number of at least 1: how many first guesses to begin from")
-    settled = as_fit_options(options, by_name, "fit")
+    settled = as_fit_options(scene, options, by_name, "fit")
     least = _checked_choices(loss, errors, shooting)
     return _fit(Asked(as_scene(scene), _named(free), settled, least, Control(tolerance, max_iterations, cutoff), errors, int(guesses), shooting), data)
 
@@ -133,7 +133,7 @@ def fit_batch(
     `max_iterations`, `loss`, `errors`, `options` and `by_name` as in `fit`. **Returns** a `Fit` whose arrays have the leading axis; a repeat that fails has
     `converged` False and harms no other, as does one with fewer samples than unknowns. **Raises** as `fit`.
     """
-    settled = as_fit_options(options, by_name, "fit_batch")
+    settled = as_fit_options(scene, options, by_name, "fit_batch")
     least = _checked_choices(loss, errors, None)
     return _fit(Asked(as_scene(scene), _named(free), settled, least, Control(tolerance, max_iterations, cutoff), errors, 1, None), data, repeats=True)
 

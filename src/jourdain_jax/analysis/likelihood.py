@@ -21,7 +21,7 @@ from jourdain_jax.analysis.runs import Run, equal_runs
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.simulate import simulate
-from jourdain_jax.scene.arguments import as_scene
+from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import users_level
 
@@ -31,9 +31,9 @@ _REFUSED["retry"] = "its motions are compiled, in one way"
 _FORWARD = {"adjoint": "derivatives come by forward mode; leave it out"}
 
 
-def as_fit_options(options: Options | None, by_name: Mapping, function: str, forward: bool = True) -> AllOptions:
+def as_fit_options(scene: Scene | BuiltFor, options: Options | None, by_name: Mapping, function: str, forward: bool = True) -> AllOptions:
     """Return the options of the motions of a fit, or of a likelihood. `forward`: its derivatives come by forward mode."""
-    found = as_options(options, by_name, function, _REFUSED | _FORWARD if forward else _REFUSED)
+    found = as_options(options, by_name, function, _REFUSED | _FORWARD if forward else _REFUSED, scene)
     return replace(found, work=False, retry=False)
 
 
@@ -74,7 +74,7 @@ def check_known(runs: Sequence[Experiment], what: str) -> None:
 
 
 def log_likelihood(
-    scene: Scene, data: Experiment | Sequence[Experiment], *, options: Options | None = None, **by_name: Unpack[OptionFields]
+    scene: Scene | BuiltFor, data: Experiment | Sequence[Experiment], *, options: Options | None = None, **by_name: Unpack[OptionFields]
 ) -> Float[Array, ""]:
     """Logarithm of the probability density of the measurements `data` (one run or several): `- sum r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 
@@ -86,7 +86,8 @@ def log_likelihood(
 
     **Raises** ValueError for measurements that do not fit the scene.
     """
-    settled = as_fit_options(options, by_name, "log_likelihood", forward=False)
+    settled = as_fit_options(scene, options, by_name, "log_likelihood", forward=False)
+    scene = as_scene(scene)
     runs = as_runs(scene, data)
     if unknown := sorted({name for run in runs for name in run.unknown_correlation}):
         raise ValueError(f"the correlation time of channel `{unknown[0]}` is None, but a likelihood needs to know it; give a number in s, or 0 for white noise")

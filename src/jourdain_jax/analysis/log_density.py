@@ -217,8 +217,8 @@ def log_density(
         sampler = blackjax.nuts(density, step_size=0.8, inverse_mass_matrix=jnp.ones(density.initial.size))
         draws = density.named(positions)["radius"]                               # m, of the positions (draws, unknowns) that were sampled
     """
+    settled = as_fit_options(scene, options, by_name, "log_density", forward=False)
     scene = as_scene(scene)
-    settled = as_fit_options(options, by_name, "log_density", forward=False)
     runs = as_runs(scene, data)
     sigmas = in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma)
     with_memory = in_all_or_none(runs, "the correlation time", lambda run: run.unknown_correlation)

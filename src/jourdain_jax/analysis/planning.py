@@ -134,8 +134,8 @@ def planned_information(
 
         slope = jax.jacfwd(told)(-3.0)
     """
+    settled = as_fit_options(scene, options, by_name, "planned_information")
     scene = as_scene(scene)
-    settled = as_fit_options(options, by_name, "planned_information")
     runs = as_runs(scene, plan)
     for run in runs:
         for name in run.unknown_sigma:

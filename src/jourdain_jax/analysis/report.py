@@ -10,9 +10,9 @@ from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.figures import MODEL, QUIET, figure
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reduced import cyclic_coordinates, ignorable_coordinates
-from jourdain_jax.lowering.built import Built, build
 from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.inputs import as_inputs
+from jourdain_jax.motion.model import Model, build
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.vector_fields.choice import vector_field
@@ -225,7 +225,7 @@ def _wrapped(label: str, text: str) -> list[str]:
     return [f"  {label if i == 0 else '':<{_LABEL - 2}}{line}" for i, line in enumerate(lines)]
 
 
-def _lowering(built: Built) -> str:
+def _lowering(built: Model) -> str:
     found = built.program
     if found is None:
         return f"not lowered: {built.not_lowered}"

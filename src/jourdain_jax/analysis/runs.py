@@ -48,6 +48,8 @@ class Run(NamedTuple):
         inputs = self.inputs
         for drive in self.drives.values():
             inputs = eqx.tree_at(lambda i, k=drive.index: i.channels[k], inputs, drive.signal())
+        if options.backend == "auto" and any(drive.unknown for drive in self.drives.values()):
+            options = replace(options, backend="xla")  # which differentiates with respect to samples
         return simulate(scene, begin(scene, self.start, self.t0), t0=self.t0, ts=ts, inputs=inputs, options=options)
 
     def residuals(self, scene: Scene, simulate: Callable, options: AllOptions) -> dict[str, Float[Array | np.ndarray, "..."]]:

@@ -31,13 +31,13 @@ class Reference:
         return _of_values(Values(leaves, treedef)) or Reference(scene)
 
     def __init__(self, scene: Scene):
-        self._scene = with_reference_parameters(scene)
-        self._key = jax.tree.structure(scene), structure_whatever_its_faults(self._scene).decisions, jax.config.jax_enable_x64
+        self.scene = with_reference_parameters(scene)
+        self._key = jax.tree.structure(scene), structure_whatever_its_faults(self.scene).decisions, jax.config.jax_enable_x64
 
     @contextmanager
     def stands_in(self) -> Iterator[None]:
         """Inside, its numbers stand in."""
-        with reference_parameters(self._scene):
+        with reference_parameters(self.scene):
             yield
 
     def __hash__(self):

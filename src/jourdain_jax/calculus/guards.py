@@ -24,13 +24,9 @@ SECOND_ORDER_MESSAGE = (
     'Leave `adjoint` at its default for second derivatives in any mode where machine code integrates (not with `backend="xla"` or in exported programs); pass '
     "`adjoint=diffrax.ForwardMode()` for forward-over-forward (jax.jacfwd(jax.jacfwd(f))) elsewhere."
 )
-SECOND_ORDER_BY_XLA_MESSAGE = (
-    "`simulate` was differentiated twice, first or last in reverse mode, where XLA has to differentiate it: with respect to samples of an input, or of a "
-    "scene whose derivatives are too large for machine code. Pass `adjoint=diffrax.ForwardMode()` for forward-over-forward (jax.jacfwd(jax.jacfwd(f)))."
-)
 THIRD_ORDER_MESSAGE = (
-    "`simulate` was differentiated three times, and not in forward mode alone. Pass `adjoint=diffrax.ForwardMode()` for forward mode of any order "
-    "(jax.jacfwd(jax.jacfwd(jax.jacfwd(f))))."
+    "`simulate` was differentiated three times, and not in forward mode alone. Pass `backend='xla'` and `adjoint=diffrax.ForwardMode()` for forward mode of "
+    "any order (jax.jacfwd(jax.jacfwd(jax.jacfwd(f))))."
 )
 REVERSE_MESSAGE = (
     "`simulate` was differentiated in reverse mode (grad, vjp, jacrev), but its adjoint is forward-only. "
@@ -43,6 +39,13 @@ class DifferentiationModeError(TypeError):
 
     Raised where the derivative is taken, evaluated or compiled; and by functions that need numbers, such as `fit`, inside `jit`, `vmap` or a derivative.
     """
+
+
+class OtherDeviceError(RuntimeError):
+    """Machine code was to be part of a program that does not run in this process, or not on a device that it is made for."""
+
+    def __init__(self, program: str) -> None:
+        super().__init__(f'machine code of this process cannot be part of a program {program}; give `backend="xla"` to `jj.simulate`, or to `jj.build`')
 
 
 def _raise_forward(*args, **kwargs):

@@ -10,7 +10,6 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr
 
 from jourdain_jax.calculus.jaxprs import called, evaluated, parts_of_scan
 from jourdain_jax.calculus.scalar_operations import VALUES
@@ -101,11 +100,6 @@ def _linear_solve(params, inputs) -> list[np.ndarray]:
     return evaluated(params["jaxprs"].solve, [*of_solve, *inputs[sum(lengths) :]], applied)
 
 
-def _here(params, inputs) -> list[np.ndarray]:
-    count = len(params["here"].constvars)
-    return evaluated(ClosedJaxpr(params["here"], inputs[:count]), inputs[count:], applied)
-
-
 def _linear_map(params, inputs) -> list[np.ndarray]:
     closed = jax.make_jaxpr(params["linear"].apply)(inputs[: params["count"]], inputs[params["count"] :])
     return evaluated(closed, inputs, applied)
@@ -115,7 +109,6 @@ _LOOPS: dict[str, Callable] = {"scan": _scan, "while": _while}
 _CONTROL: dict[str, Callable] = {
     "cond": lambda params, inputs: evaluated(params["branches"][int(inputs[0])], inputs[1:], applied),
     "jourdain_linear_map": _linear_map,
-    "jourdain_or_elsewhere": _here,
     "custom_lin": lambda params, inputs: inputs,
     "custom_linear_solve": _linear_solve,
 }

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any, Unpack
 
@@ -55,8 +55,10 @@ class Study(Printed):
     samples: int | None = None
     seed: int = 0
     correlation: Any = None
+    _given: Any = field(init=False, repr=False, compare=False)  # the scene, or its model
 
     def __post_init__(self):
+        object.__setattr__(self, "_given", self.scene)
         object.__setattr__(self, "scene", as_scene(self.scene))
         _ = self.design  # says what is wrong
 
@@ -107,7 +109,7 @@ class Study(Printed):
             raise ValueError(f"`save` is {save!r}; {nearest(str(save), SAVES)}")
         if isinstance(every, bool) or not isinstance(every, int | np.integer) or every < 1 or (every > 1 and save != "trajectories"):
             raise ValueError(f"`every` is {every!r}, expected a whole number of at least 1; it says of which lanes save='trajectories' keeps the trajectory")
-        options = as_options(options, by_name, "Study.run", REFUSED)
+        options = as_options(options, by_name, "Study.run", REFUSED, self._given)
         known = as_outputs(self.scene, outputs)
         first, times, last = span_and_times(self.scene, None, t0, t1, ts)
         if ts is None and save != "trajectories" and not any(output.over_times for output in known.values()):

@@ -13,6 +13,7 @@ from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.integrators.taylor import Taylor
+from jourdain_jax.scene.arguments import BuiltFor
 from jourdain_jax.scene.names import nearest
 
 if TYPE_CHECKING:
@@ -32,8 +33,8 @@ class Options:
     - `max_steps`: the most steps; `max_step`: the longest one (s). None: 1/16 of the span, so that a load that acts on a part of the way, or a dip of an event,
       is not stepped over where nothing else keeps steps short; inf: no bound.
     - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.
-    - `retry`: run a motion again that left the domain of its privileged speeds (with the full state), or that is stiff (by an implicit solver), unless
-      `formulation` or `solver` is chosen so; `trajectory.fallback` and its summary say so. Inside your own `jit` or `vmap`, and without it, the result code
+    - `retry`: run a motion again that left the domain of its privileged speeds (with the full state), or that is stiff (by an implicit solver, unless
+      `solver` is given); `trajectory.fallback` and its summary say so. Inside your own `jit` or `vmap`, and without it, the result code
       stays.
 
     `simulate` and its kin take an `Options`, or its fields by name, which replace those of the object.
@@ -126,25 +127,29 @@ GONE = {  # options that there were once -> what serves now
 }
 
 
-def as_options(options: Options | None, by_name: Mapping[str, Any], function: str = "simulate", refused: Mapping[str, str] | None = None) -> AllOptions:
+def as_options(
+    options: Options | None, by_name: Mapping[str, Any], function: str = "simulate", refused: Mapping[str, str] | None = None, scene=None
+) -> AllOptions:
     """Return the options of a call of `function`: those of the object, replaced by what is given by name.
 
-    `refused`: names that have no meaning for this function, and why. Raises TypeError for these and for unknown names, ValueError for wrong values.
+    `refused`: names that have no meaning for this function, and why; `scene`: a model brings its formulation and backend. Raises TypeError for these and for
+    unknown names, ValueError for wrong values.
     """
-    if not by_name and (options is None or type(options) is AllOptions):
+    of_model = {"formulation": scene.formulation, "backend": scene.backend} if isinstance(scene, BuiltFor) else {}
+    if not (by_name or of_model) and (options is None or type(options) is AllOptions):
         return _DEFAULT if options is None else options
     if options is not None and not isinstance(options, Options):
         raise ValueError(f"`options` is {described(options)}, expected `jj.Options(...)`")
-    refused = refused or {}
+    refusals = dict.fromkeys(of_model, "a model has its own; give it to `jj.build`") | dict(refused or {})
     for name in by_name:
-        if name in refused:
-            raise TypeError(f"{function}() takes no `{name}`: {refused[name]}")
+        if name in refusals:
+            raise TypeError(f"{function}() takes no `{name}`: {refusals[name]}")
         if name in GONE:
             raise TypeError(f"`{name}` is no option any more: {GONE[name]}")
         if name not in OPTION_NAMES:
-            known = [option for option in (*SPAN, *OPTION_NAMES) if option not in refused]
+            known = [option for option in (*SPAN, *OPTION_NAMES) if option not in refusals]
             raise TypeError(f"{function}() got an unexpected keyword argument '{name}'; {nearest(name, known)}")
-    found = AllOptions(**({} if options is None else vars(options)) | dict(by_name))
+    found = AllOptions(**({} if options is None else vars(options)) | of_model | dict(by_name))
     _check(found)
     return found
 

@@ -12,9 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jourdain_jax.calculus.differentiated_as import Rules, derivatives_of, differentiated_as
-from jourdain_jax.calculus.elsewhere import or_elsewhere
-from jourdain_jax.calculus.guards import reverse_only
+from jourdain_jax.calculus.differentiated_as import Rules, with_rules
+from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.motion.batches.lockstep import in_blocks, width
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators import erk_loop, integrands
@@ -23,6 +22,8 @@ from jourdain_jax.motion.integrators.of_diffrax import alongside, diffrax
 from jourdain_jax.motion.integrators.problem import Problem
 from jourdain_jax.motion.integrators.tableaus import Method, method_of
 from jourdain_jax.motion.native import native_motion
+from jourdain_jax.motion.native.flow import OF_SAMPLES
+from jourdain_jax.motion.native.pulled import reason_against_derivatives
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.watched import watched
@@ -60,22 +61,16 @@ class OwnSteps(Integrator):
         return native_motion.reason_against(setup.field, setup.scene, setup.inputs, bool(self.event_names))
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
-        return self._by_either(lambda mode: partial(_by_xla, mode), lambda f: f, setup, begun)
+        if not setup.reason_against_machine_code:
+            return with_rules(_by_machine_code, _rules(setup, self.alongside))(setup, begun)
+        return _by_xla("forward" if self.kind == "forward" else "reverse", setup, begun)
 
     def lanes_solved(self, setups: Setup, begun: Begun) -> Solved:
-        if (program := setups.field.lowered) is None or not isinstance(self.solver, Method):
+        serves = not setups.reason_against_machine_code
+        if (program := setups.field.lowered) is None or serves or not isinstance(self.solver, Method):
             return super().lanes_solved(setups, begun)
-        return self._by_either(lambda mode: partial(in_blocks, partial(_lanes_by_xla, mode), width(program)), eqx.filter_vmap, setups, begun)
-
-    def _by_either(self, by_xla: Callable, mapped: Callable, setup: Setup, begun: Begun) -> Solved:
-        """A motion by machine code where that serves; `mapped`: of a function of one motion, that of all lanes."""
-        forward, reverse = by_xla("forward"), by_xla("reverse")
-        if setup.reason_against_machine_code:
-            return (forward if self.kind == "forward" else reverse)(setup, begun)
-        by = reverse if self.kind == "reverse" else forward
-        quick = or_elsewhere(mapped(_by_machine_code), by)
-        rules = _rules(setup, quick, mapped, self.alongside)
-        return differentiated_as(by, quick, self.kind, rules, lambda *given: reverse(*reverse_only(given)))(setup, begun)
+        mode: Mode = "forward" if self.kind == "forward" else "reverse"
+        return in_blocks(partial(_lanes_by_xla, mode), width(program), setups, begun)
 
 
 _once: Callable[..., OwnSteps] = lru_cache(maxsize=64)(OwnSteps)
@@ -152,24 +147,26 @@ def _own(setup: Setup) -> OwnSteps:
     return setup.integrator
 
 
-def _rules(setup: Setup, quick: Callable, mapped: Callable, alongside: bool) -> Rules:
-    """Derivatives of `quick` by machine code; `mapped`: of a function of one motion, that of all lanes."""
-
+def _rules(setup: Setup, alongside: bool) -> Rules:
+    """Derivatives of `_by_machine_code`."""
     form = native_motion.form_of(setup.field, setup.inputs, bool(setup.integrator.event_names))
 
-    def serve(order: int, varies: Setup, begun: Begun) -> bool:
-        of_samples = [channel for channel in (*varies.inputs.channels, *begun.args[2].channels) if isinstance(channel, Sampled)]
-        return not any(jax.tree.leaves(of_samples)) and not native_motion.reason_against_derivatives(form, order)
+    def push(arguments, tangents):
+        moving, fixed = eqx.partition(arguments, jax.tree.map(lambda d: d is not None, tangents, is_leaf=lambda d: d is None))
+        return jax.jvp(lambda moving: _by_machine_code(*eqx.combine(moving, fixed)), (moving,), (tangents,))
 
     def pull(perturbed, arguments, found, g):
-        return mapped(partial(_pulled, perturbed))(*arguments, found, g)
+        return _pulled(perturbed, *arguments, found, g)
 
-    return Rules(serve, derivatives_of(quick).push, pull, alongside)
+    return Rules(push, pull, lambda *_: reason_against_derivatives(form, 2), alongside)
 
 
 def _pulled(perturbed: tuple, setup: Setup, begun: Begun, found: Solved, g: Solved) -> tuple:
     """Cotangents of what varies, from those of the motion that was found."""
     motion = _motion(setup, begun)
+    sampled = [channel for channel in (*perturbed[0].inputs.channels, *perturbed[1].args[2].channels) if isinstance(channel, Sampled)]
+    if any(jax.tree.leaves(sampled)):
+        raise DifferentiationModeError(OF_SAMPLES)
     states = jax.tree.map(lambda g: jnp.concatenate([g, jnp.zeros((1, *g.shape[1:]))]), g.ys)  # nobody asks for the last one: it is that of the end
     varies, asked = perturbed[0], [bool(varies) for varies in native_motion.known_of(perturbed[1].args)]
     ys, reached = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), (found.ys, found.reached), (found.y_end, found.t_end == motion.goals[-1]))

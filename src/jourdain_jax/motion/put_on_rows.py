@@ -17,8 +17,7 @@ from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.row_program import RowProgram, row_program
 from jourdain_jax.build.sampling import NEARLY_INSIDE
 from jourdain_jax.build.structure import closure_lengths, plain_row_lengths, rows_are_affine, usual_rows
-from jourdain_jax.calculus.differentiated_as import derivatives_of, differentiated_as
-from jourdain_jax.calculus.elsewhere import or_elsewhere
+from jourdain_jax.calculus.differentiated_as import differentiated_as
 from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
@@ -91,7 +90,7 @@ def put_positions(scene: Scene, t, q, free, usual: Usual, known: tuple | None = 
     def of_known(_, *given):
         return by_xla(functions_of_rows(usual), *given)
 
-    return differentiated_as(of_known, lambda known, *_: known, "forward", derivatives_of(of_known))(known, *given)
+    return differentiated_as(of_known, lambda known, *_: known)(known, *given)
 
 
 def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Float[Array, "speeds"], Float[Array, "rows"]]:
@@ -117,7 +116,7 @@ def _by_either(usual: Usual, kind, affine: bool, by_xla):
     of_rows = partial(by_xla, functions_of_rows(usual))
     if usual.program is None or _reason_against(rows := Rows(usual.program, kind, affine)):
         return of_rows
-    return differentiated_as(of_rows, or_elsewhere(partial(_put, rows), of_rows), "forward")
+    return differentiated_as(of_rows, partial(_put, rows))
 
 
 @lru_cache(maxsize=MOST_KERNELS)

@@ -100,8 +100,7 @@ def _next_retry(field: VectorField, motion: Trajectory, t0, options: AllOptions)
     if np.asarray(motion.result) in (results.SUCCESS, results.EVENT):
         return results.AS_ASKED
     tried, solver, backend = int(motion.fallback), options.solver, options.backend
-    lost = as_formulation(options.formulation).state in may_be_another_form(field) and int(motion.result) in lost_codes(field)
-    lost = lost and not isinstance(solver, DiscreteGradient)
+    lost = _has_another_form(field) and not isinstance(solver, DiscreteGradient) and int(motion.result) in lost_codes(field)
     if lost and backend in ("auto", "dense") and not tried & results.FULL_STATE:
         return tried | results.FULL_STATE
     free = solver is None and backend != "native"
@@ -128,9 +127,9 @@ def _marked(motion: Motions, retries: int) -> Motions:
     return eqx.tree_at(lambda m: (m.result, m.fallback), motion, (code, jnp.full_like(motion.fallback, retries)))
 
 
-def may_be_another_form(field: VectorField) -> tuple[str, ...]:
-    """The values of `state` that let a motion that was lost in this form run again, with the full state and dense matrices."""
-    return ("auto", "full") if field.name == "full" and field.lowered is not None else ("auto",) if field.name == "minimal" else ()
+def _has_another_form(field: VectorField) -> bool:
+    """Whether a motion that was lost may run again with the full state and dense matrices."""
+    return field.name == "minimal" or field.lowered is not None
 
 
 def lost_codes(field: VectorField) -> tuple[int, ...]:

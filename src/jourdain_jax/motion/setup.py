@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jourdain_jax.build.reference import Reference
 from jourdain_jax.motion.arguments import fitting_times
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
 from jourdain_jax.motion.integrators.knots import knots_between
@@ -97,6 +98,7 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     longest: Float[Array | np.ndarray, "*lanes"] | float  # step, s
     integrator: Integrator
     usual: Usual | None  # sizes by which the start is projected; None where it is on its constraints
+    reference: Reference | None = None  # of a model: what is compiled for one serves those that decide alike
 
     def fitting(self) -> "Setup":
         """The setup with times that serve any loop, also where its own do not go together."""

@@ -5,6 +5,7 @@ domain and the rows are linear or affine; otherwise the full one (coordinates an
 """
 
 import warnings
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, Unpack, cast
 
@@ -91,8 +92,15 @@ def simulate(
 
         slope = jax.grad(lean_at_end)(0.5)
     """
-    options = as_options(options, by_name)
+    options = as_options(options, by_name, scene=scene)
     run = partial(_run, scene, start, {"t0": t0, "t1": t1, "ts": ts, "inputs": inputs})
+    if isinstance(scene, BuiltFor):
+        with scene.reference.stands_in():
+            return _simulated(run, options)
+    return _simulated(run, options)
+
+
+def _simulated(run: Callable[[AllOptions], tuple[Setup, Trajectory]], options: AllOptions) -> Trajectory:
     setup, motion = run(options)
     return retried(run, setup, motion, options) if options.retry else motion
 
@@ -116,7 +124,8 @@ def _integrated(setup: Setup) -> Trajectory:
 
 def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, inputs=None, options: Options | None = None, **by_name) -> Setup:
     """Return what `simulate` integrates for its arguments."""
-    options = as_options(options, by_name)
+    options = as_options(options, by_name, scene=None if type(options) is AllOptions else scene)
+    reference = scene.reference if isinstance(scene, BuiltFor) else None
     solver, max_step = options.solver, options.max_step
     scene, formulation = as_scene(scene), as_formulation(options.formulation)
     order, solver = (solver.order or order_for(options.rtol), None) if isinstance(solver, Taylor) else (None, solver)
@@ -142,7 +151,7 @@ def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, in
     tolerances = tuple(as_array(x, start.q.dtype) for x in (options.rtol, options.atol))  # arrays: another tolerance is no other program
     first_step = (1.0 if isinstance(solver, FixedStepMethod) else 1e-4) * (t1 - t0)  # diffrax's own guess costs two more copies of the vector field to compile
     longest = as_array(LONGEST * abs(t1 - t0) if max_step is None else max_step, start.q.dtype)
-    setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, longest, integrator, usual)
+    setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, longest, integrator, usual, reference)
     if own is None:
         diffrax_steps.check(setup)
     if options.backend == "native" and (reason := setup.reason_against_machine_code):

@@ -251,15 +251,17 @@ def start(scene: Scene | BuiltFor, given=None, *, near=None, t0: Number = 0.0, i
     Privileged speeds that are not given stay zero and the dependent speeds follow from the rows;
     where dependent speeds are given, all others are solved for: the smallest change that meets the constraints, in the metric of the mass matrix.
     `inputs`: as in `simulate`, name -> number, function of time, or `Sampled`; what they are at `t0` counts where velocity rows depend on them.
+    In a program that is exported, pass `jj.build(scene, backend="xla")` in the place of the scene.
     ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints or that no state of the
     domain has; where they are not, `residual` is infinite, and a motion from there ends with a code.
     """
+    native = not isinstance(scene, BuiltFor) or scene.backend in ("auto", "native")
     scene = as_scene(scene)
     if given is not None and not isinstance(given, Mapping):
         raise ValueError(f"`start` was given {described(given)}, expected named values: `jj.start(scene, lean=0.3)`, or a dictionary of them")
     if near is not None and not isinstance(near, Mapping):
         raise ValueError(f'`near` is {described(near)}, expected a dictionary of coordinates: near={{"z": -0.4}}')
-    return named_start(scene, {**(given or {}), **values}, t0, inputs_at(as_inputs(scene, inputs), _as_time(t0)), near=near or {})
+    return named_start(scene, {**(given or {}), **values}, t0, inputs_at(as_inputs(scene, inputs), _as_time(t0)), near=near or {}, native=native)
 
 
 def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, *, near: Mapping = _NOTHING, native: bool = True) -> State:

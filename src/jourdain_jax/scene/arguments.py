@@ -6,7 +6,7 @@ Kinds and shapes are known while a function is traced: no compiled program conta
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from functools import wraps
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -23,9 +23,12 @@ F = TypeVar("F", bound=Callable)
 
 
 class BuiltFor:
-    """What was found about a scene; functions that ask for `as_scene` take it in the place of that scene."""
+    """A scene with what was settled about it (`motion/model.py: Model`); functions that ask for `as_scene` take it in the place of that scene."""
 
     scene: Scene
+    formulation: Any
+    backend: str
+    reference: Any
 
     def __getattr__(self, name: str):
         raise AttributeError(f"`{type(self).__name__}` has no `{name}`; where a scene is asked for, pass its `.scene`")

@@ -178,9 +178,9 @@ def rollout(
         lanes["lean"].shape, lanes.quantiles("lean").shape        # (16, 201) and (3, 201)
         lanes.failed, lanes.lane(3).energies().balance            # numbers of failed lanes; one lane as a trajectory
     """
-    scene = as_scene(scene)
     span = {name: by_name.pop(name, None) for name in SPAN}
-    options = as_options(options, by_name, "rollout")
+    options = as_options(options, by_name, "rollout", scene=scene)
+    reference, scene = scene.reference if isinstance(scene, BuiltFor) else Reference(as_scene(scene)), as_scene(scene)
     starts = dict(scene.example) if starts is None else starts
     for what, given in (("starts", starts), ("parameters", parameters)):
         if given is not None and not isinstance(given, Mapping) and not (what == "starts" and isinstance(given, State)):
@@ -194,7 +194,7 @@ def rollout(
     times = {name: None if span[name] is None else checked_real(span[name], f"`{name}`").astype(jnp.result_type(float)) for name in ("t0", "t1", "ts")}
 
     def run(options: AllOptions, varied, parameters) -> Trajectory:
-        return _run_lanes(scene, fixed, span | times, _with_arrays(options), varied, parameters)
+        return _run_lanes(reference, scene, fixed, span | times, _with_arrays(options), varied, parameters)
 
     if is_traced((scene, fixed, varied, parameters, span, options)):
         lanes = run(options, varied, parameters)  # being differentiated or batched: one piece, no host loop
@@ -239,9 +239,9 @@ def _form(scene: Scene, options: AllOptions, inputs: Inputs) -> VectorField:
     return vector_field(scene, options.formulation, options.work, options.backend, inputs)
 
 
-def _run_lanes(scene, fixed, span, options: AllOptions, varied, parameters) -> Trajectory:
+def _run_lanes(reference: Reference, scene, fixed, span, options: AllOptions, varied, parameters) -> Trajectory:
     """All given lanes in lockstep; compiled once for scenes and lanes of one shape."""
-    return _compiled(span["inputs"].programs)(Reference(scene), scene, fixed, span, options, varied, parameters)
+    return _compiled(span["inputs"].programs)(reference, scene, fixed, span, options, varied, parameters)
 
 
 def _lanes_in_lockstep(reference: Reference, scene, fixed, span, options: AllOptions, varied, parameters) -> Trajectory:

@@ -13,13 +13,12 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
-from jourdain_jax.calculus.elsewhere import PLATFORMS, or_elsewhere
+from jourdain_jax.calculus.guards import OtherDeviceError
 from jourdain_jax.calculus.lanes_first import with_lanes_first
 from jourdain_jax.native import ffi, gpu, host, nvidia
 from jourdain_jax.native.ir import Writer
 from jourdain_jax.native.scalar_program import as_real, written_in_turn
 from jourdain_jax.native.threads import write_rows
-from jourdain_jax.program import emit
 from jourdain_jax.program.graph import Graph
 
 ALONE = 2  # places for the lanes of one motion; measured: 64 us with 2, 66 with 1 or 4, 99 with 8 (10 s of a disc at 1e-8)
@@ -71,7 +70,29 @@ def _compiled(**how) -> Callable:
 
 def on_cpu(ctx: mlir.LoweringRuleContext, *arguments, handler: Callable, lanes: int, threads: int, **_):
     """The call in a program for the CPU."""
+    _check_here(ctx)
     return jax.ffi.ffi_lowering(handler(lanes, threads))(ctx, *arguments)
+
+
+def _on_nvidia(ctx: mlir.LoweringRuleContext, *arguments, kernel: Callable, **_):
+    """The call in a program for an NVIDIA GPU."""
+    _check_here(ctx)
+    if reason := nvidia.reason_against():
+        raise OtherDeviceError(f"for JAX's platform cuda, and {reason}")
+    return gpu.lowered(ctx, arguments, kernel())
+
+
+def _nowhere(ctx: mlir.LoweringRuleContext, *_, **__):
+    """The error of a program for any other device."""
+    raise OtherDeviceError(f"for JAX's platforms {', '.join(ctx.module_context.platforms)}")
+
+
+def _check_here(ctx: mlir.LoweringRuleContext) -> None:
+    """Raise an error for a program that may run in another process."""
+    if ctx.module_context.lowering_parameters.for_export:
+        raise OtherDeviceError("to be exported")
+    if len(ctx.module_context.platforms) > 1:
+        _nowhere(ctx)
 
 
 # The call itself: machine code is made where a program is lowered that holds it, not for what is only traced.
@@ -79,9 +100,9 @@ _call_p = Primitive("jourdain_machine_code")
 _call_p.multiple_results = True
 _call_p.def_impl(lambda *arguments, **how: _compiled(**how)(*arguments))
 _call_p.def_abstract_eval(_results)
+mlir.register_lowering(_call_p, _nowhere)
 mlir.register_lowering(_call_p, on_cpu, platform="cpu")
-mlir.register_lowering(_call_p, lambda ctx, *arguments, kernel, **_: gpu.lowered(ctx, arguments, kernel()), platform="cuda")
-PLATFORMS["cuda"] = lambda: jax.default_backend() == "gpu" and not nvidia.reason_against()
+mlir.register_lowering(_call_p, _on_nvidia, platform="cuda")
 batching.primitive_batchers[_call_p] = lambda values, axes, **how: (found := _call_p.bind(*with_lanes_first(values, axes), **how), [0] * len(found))
 
 
@@ -97,11 +118,7 @@ def nodes_called(graph: Graph, nodes: Sequence[int], variables: Sequence[int], e
         write_rows(w, len(variables), len(nodes))
 
     kernel = called(write, lambda *_: ((len(nodes),),), effort=effort)
-
-    def by_xla(x):
-        return jnp.stack([jnp.asarray(value, x.dtype) for value in emit.run(graph, nodes, dict(zip(variables, x, strict=True)))])
-
-    return or_elsewhere(lambda x: kernel(x)[0], by_xla)
+    return lambda x: kernel(x)[0]
 
 
 def unless_batched(times: int, function: Callable, by_xla: Callable) -> Callable:

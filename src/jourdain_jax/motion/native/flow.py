@@ -23,9 +23,11 @@ from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.kernel import Found, Start, kernel, kernel_of_rates
+from jourdain_jax.motion.native.pulled import check_derivatives
 from jourdain_jax.motion.native.taylor import products
 from jourdain_jax.motion.trajectories import results
 
+OF_SAMPLES = 'machine code does not differentiate with respect to samples of an input; `jj.simulate(..., backend="xla")` does'
 MOST_PRODUCTS = 36_000  # of coefficients in a step by Taylor series of second derivatives; where there are more, steps are those of the tableau
 
 
@@ -38,7 +40,8 @@ def flow(form: Form, method: Method, order: int | None) -> Callable[[Start], Fou
     def rule(primals, tangents):
         (start,), (along,) = primals, tangents
         if not all(map(is_zero, along.of_samples[:1])):
-            raise DifferentiationModeError('machine code does not differentiate with respect to samples; `backend="xla"` does')
+            raise DifferentiationModeError(OF_SAMPLES)
+        check_derivatives(replace(form, moving=(), time_moves=False), (len(form.moving) + 1).bit_length())
         raised, more = with_tangents(form, start, along)
         times = None if is_zero(along.goals) and is_zero(along.origin) else (filled(along.goals), filled(along.origin))
         if times is not None:

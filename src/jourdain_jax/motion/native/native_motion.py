@@ -1,7 +1,6 @@
 """One motion by machine code, and when: the rows of its lane from what `erk_loop.integrate` is given, and what that returns from the rows of the end."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -21,11 +20,11 @@ from jourdain_jax.motion.integrators.erk_step import Progress
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.native.flow import Stopped, flow, on_times, rates, scaled, slopes_of
 from jourdain_jax.motion.native.flow_back import flow_back
-from jourdain_jax.motion.native.functions import Form, event_program, outputs_of
+from jourdain_jax.motion.native.functions import Form, event_program
 from jourdain_jax.motion.native.functions_of_time import numbers_of, parts_from, with_functions
 from jourdain_jax.motion.native.kernel import MOST_KERNELS, Found, Start
 from jourdain_jax.motion.native.layout import Layout
-from jourdain_jax.motion.native.pulled import pulled_program, steps_of
+from jourdain_jax.motion.native.pulled import check_derivatives
 from jourdain_jax.motion.native.taylor import rates_of
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
@@ -36,8 +35,6 @@ from jourdain_jax.program.graph import Unsupported
 # Operations of all that is evaluated. Measured: they are compiled in a time that grows with them, 15,000 of a chain of 128 trailers in 2.8 s (XLA: 40 s),
 # 18,000 of a chain of 23 joint angles in 1.2 s.
 LARGEST_PROGRAM = 60_000
-LARGEST_DERIVATIVE = 10_000, 40_000  # operations of one of the first order, of which reverse mode keeps some on the stack, and of the second
-
 MOST_PRODUCTS = 12_000  # of coefficients in a step by Taylor series, which is written out
 
 
@@ -118,22 +115,6 @@ def _reason_against_series(form: Form, order: int) -> str:
     return f"its series take {count} products, more than {MOST_PRODUCTS}" if count > MOST_PRODUCTS else ""
 
 
-@lru_cache(maxsize=MOST_KERNELS)
-def reason_against_derivatives(form: Form, order: int) -> str:
-    """Why machine code that integrates a form cannot differentiate it so many times, in words; empty where it can."""
-    if order > len(LARGEST_DERIVATIVE):
-        return f"machine code has no derivatives of order {order}"
-    for nodes in steps_of(form).values():
-        along = outputs_of(replace(form, moving=((),) * (2**order - 1)), nodes, len(nodes))
-        back = pulled_program(replace(form, moving=((),) * (order - 1)), nodes, (), len(nodes))
-        for graph, of_it in ((along.graph, [*along.values, *(n for part in along.tangents for n in part)]), (back.graph, back.found)):
-            if reason := unsupported(graph, of_it):
-                return reason
-            if (operations := graph.operations(of_it)) > (most := LARGEST_DERIVATIVE[order - 1]):
-                return f"a derivative of a part of it takes {operations} operations, more than {most}"
-    return ""
-
-
 def driven(program: Lowered, inputs: Inputs) -> Lowered | str:
     """The program that takes numbers and samples alone, or why there is none."""
     if not inputs.programs:
@@ -172,6 +153,7 @@ def cotangents(motion: Motion, asked: Sequence[bool], found: Stopped, ys: Integr
     """Cotangents of the start, and of each of the numbers that the rates are given, where it is `asked` for, from those of the states and of the end."""
     which = tuple(i for i, is_asked in enumerate(asked) if is_asked)
     form, start = _form_of(motion), _start(motion)
+    check_derivatives(form, 1)
     ends = jnp.concatenate([_packed(y_end), t_end[None]])
     found = flow_back(form, motion.method, which)(start, found, jax.vmap(_packed)(ys), ends)
     known = dict(zip(which, entries_of(found[form.layout.y :]), strict=True))

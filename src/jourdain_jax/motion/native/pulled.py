@@ -6,15 +6,21 @@ A tangent that is pushed along belongs to the state: cotangents of a motion with
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
+from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.lowering.jacobian import on_its_own
 from jourdain_jax.motion.native.functions import Form, Outputs, given_values, known_values, outputs_of
 from jourdain_jax.native.ir import Writer
-from jourdain_jax.native.scalar_program import as_real, written_in_turn
+from jourdain_jax.native.scalar_program import as_real, unsupported, written_in_turn
 from jourdain_jax.program.derivative import cotangents, directional_derivative
 from jourdain_jax.program.graph import Graph
 
+# Operations of a derivative of the first order, of which reverse mode keeps some on the stack, and of the second.
+LARGEST_DERIVATIVE = 10_000, 40_000
+MOST_FORMS = 64
 _ARGUMENTS = ("state", "tau", "y", "g", "to_y", "to_known")
 
 
@@ -29,6 +35,28 @@ class Pulled(NamedTuple):
     def graph(self) -> Graph:
         """Where the nodes are."""
         return self.own.graph
+
+
+def check_derivatives(form: Form, order: int) -> None:
+    """Raise a DifferentiationModeError where machine code that integrates a form has no derivatives of an order."""
+    if reason := reason_against_derivatives(form, order):
+        raise DifferentiationModeError(f'{reason}; `jj.simulate(..., backend="xla")` has them')
+
+
+@lru_cache(maxsize=MOST_FORMS)
+def reason_against_derivatives(form: Form, order: int) -> str:
+    """Return why machine code that integrates a form cannot differentiate it so many times, in words; empty where it can."""
+    if order > len(LARGEST_DERIVATIVE):
+        return "`simulate` was differentiated three times, and machine code has derivatives of the first two orders"
+    for nodes in steps_of(form).values():
+        along = outputs_of(replace(form, moving=((),) * (2**order - 1)), nodes, len(nodes))
+        back = pulled_program(replace(form, moving=((),) * (order - 1)), nodes, (), len(nodes))
+        for graph, of_it in ((along.graph, [*along.values, *(n for part in along.tangents for n in part)]), (back.graph, back.found)):
+            if reason := unsupported(graph, of_it):
+                return f"machine code cannot differentiate the motion: {reason}"
+            if (operations := graph.operations(of_it)) > (most := LARGEST_DERIVATIVE[order - 1]):
+                return f"a derivative of a part of the motion takes {operations} operations, more than the {most} that machine code is made for"
+    return ""
 
 
 def rates_of(form: Form) -> list[int]:

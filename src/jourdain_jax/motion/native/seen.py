@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.row_program import RowProgram
-from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as
-from jourdain_jax.calculus.elsewhere import or_elsewhere
+from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as, with_rules
 from jourdain_jax.calculus.entries import entries_of
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
@@ -80,11 +79,7 @@ def _of_parameters(program: Lowered) -> Callable[[Array], Array]:
 def _usual(program: Lowered) -> Callable[[Array], Array]:
     """What is usual at the states that were probed, as a function of those parameters that are needed; JAX does not differentiate it."""
     kernel = called(partial(_write_usual, program), lambda *_: ((len(program.usual),),), effort=1)
-
-    def by_xla(x):
-        return jnp.stack(list(program.usual_values(dict(zip(_places_of(program), x, strict=True))).values()))
-
-    return or_elsewhere(lambda x: kernel(x)[0], by_xla)
+    return lambda x: kernel(x)[0]
 
 
 def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
@@ -109,12 +104,8 @@ def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Ar
         parts = jnp.split(found, np.cumsum([jnp.size(x) for x in arguments])[:-1])
         return tuple(jnp.reshape(part, jnp.shape(x)) for x, part in zip(arguments, parts, strict=True))
 
-    quick = or_elsewhere(unless_batched(1, by_machine_code, by_xla), by_xla)
-    if _has_many_operations(program):
-        rules = Rules(lambda order, *_: _derivatives_of_speeds(program).serve(order), push, pull)
-        values = differentiated_as(by_xla, quick, "both", rules, by_xla)
-    else:
-        values = differentiated_as(by_xla, quick, "forward")
+    run = unless_batched(1, by_machine_code, by_xla)
+    values = with_rules(run, Rules(push, pull)) if _has_many_operations(program) else differentiated_as(by_xla, run)
     return values(_stacked(fixed), jnp.asarray(t, real_type()), q, y, inputs)
 
 
@@ -137,8 +128,10 @@ def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
     def by_xla(fixed, t, q, y, inputs):
         return program.energy_values(entries_of(fixed), t, tuple(q), tuple(y), inputs)
 
-    by_machine_code = or_elsewhere(unless_batched(1, lambda *state: _kernel_of_seen(program)(_in_a_row(*state))[0][-2:], by_xla), by_xla)
-    return differentiated_as(by_xla, by_machine_code, "forward")(*jax.lax.stop_gradient((_stacked(fixed), t, q, y, inputs)))
+    def by_machine_code(*state):
+        return _kernel_of_seen(program)(_in_a_row(*state))[0][-2:]
+
+    return differentiated_as(by_xla, unless_batched(1, by_machine_code, by_xla))(*jax.lax.stop_gradient((_stacked(fixed), t, q, y, inputs)))
 
 
 def is_right(program: RowProgram, scene: Scene, t, q) -> Bool[Array, ""]:

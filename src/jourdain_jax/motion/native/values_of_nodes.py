@@ -2,8 +2,8 @@
 
     o = f(x),    f'(x) v,    g f'(x),    f''(x) w v,    g f''(x) v         o: values of the nodes, x: of the variables
 
-Each is machine code of its own, made when it is asked for: derivatives are taken on the graph. Those of an order above the second, and those of programs that
-are too large, are JAX's derivatives of the program as XLA runs it.
+Each is machine code of its own, made when it is asked for: derivatives are taken on the graph. Those of programs that are too large are JAX's derivatives of
+the program as XLA runs it.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,7 +15,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
-from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as
+from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as, with_rules
 from jourdain_jax.lowering.jacobian import on_its_own
 from jourdain_jax.motion.native.called import nodes_called
 from jourdain_jax.native.scalar_program import unsupported
@@ -29,7 +29,6 @@ LARGEST_PROGRAM = 20_000  # operations of a derivative; machine code of so many 
 def values_of_nodes(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array]:
     """Values of nodes, at their places among so many numbers that are zero otherwise, as a function of the values of the variables."""
     program = Derivatives(graph, places, size, variables)
-    by_xla, quick = _by_xla_and_machine_code(program.graph, program.places, size, program.variables)
 
     def push(arguments, tangents):
         return values(*arguments), program.along(*arguments, *tangents)
@@ -37,7 +36,7 @@ def values_of_nodes(graph: Graph, places: dict[int, int], size: int, variables: 
     def pull(perturbed, arguments, found, g):
         return (program.back(*arguments, g),)
 
-    values = differentiated_as(by_xla, quick, "both", Rules(program.serve, push, pull), by_xla)
+    values = with_rules(program.values, Rules(push, pull))
     return values
 
 
@@ -51,12 +50,9 @@ class Derivatives:
         places = dict(sorted(places.items()))
         self.graph, nodes, self.variables = on_its_own(graph, list(places.values()), variables)
         self.places, self.size = dict(zip(places, nodes, strict=True)), size
+        self._by_xla, self.values = _by_xla_and_machine_code(self.graph, self.places, size, self.variables)
         self._function = cache(self._made)
         self.along, self.back = self._linear(back=False), self._linear(back=True)
-
-    def serve(self, order: int, *_) -> bool:
-        """Whether there is machine code of this order."""
-        return order <= 2 and self._function(False, 1) is not None and self._function(True, 1) is not None
 
     def _linear(self, back: bool) -> Callable[[Array, Array], Array]:
         """A function of x and v, or (`back`) g; its derivative along x is machine code where that serves."""
@@ -65,9 +61,9 @@ class Derivatives:
             return v[np.array(list(self.places), int)] if back else v
 
         def first(x, v):
-            function = self._function(back, 1)
-            assert function is not None
-            return function(jnp.concatenate([x, taken(v)]))
+            if (function := self._function(back, 1)) is not None:
+                return function(jnp.concatenate([x, taken(v)]))
+            return jax.vjp(self._by_xla, x)[1](v)[0] if back else jax.jvp(self._by_xla, (x,), (v,))[1]
 
         linear = jax.custom_jvp(first)
 
@@ -104,7 +100,7 @@ class Derivatives:
         if unsupported(graph, found.values()) or graph.operations(found.values()) > LARGEST_PROGRAM:
             return None
         given = [*variables, *weights, *(w if order == 2 else ())]
-        return differentiated_as(*_by_xla_and_machine_code(graph, found, len(variables) if back else self.size, given), "forward")
+        return differentiated_as(*_by_xla_and_machine_code(graph, found, len(variables) if back else self.size, given))
 
 
 def _by_xla_and_machine_code(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> tuple[Callable, Callable]:
