@@ -36,7 +36,7 @@ def followed(height, x):
     return x * np.exp(-end) + end / 2 * np.sum(weights * np.exp(t - end) * np.sin(height - t**2 / 2))
 
 
-SOLVERS = {"default": {}, "RadauIIA": {"solver": jj.RadauIIA()}}
+SOLVERS = {"default": {"retry": True}, "RadauIIA": {"solver": jj.RadauIIA()}}
 
 
 @pytest.mark.parametrize("options", SOLVERS.values(), ids=SOLVERS)

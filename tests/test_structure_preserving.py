@@ -164,7 +164,7 @@ def test_derivatives_through_fifty_steps_are_right_in_both_modes(solver):
     start = jj.start(scene, **scene.example)
 
     def end(value, **options):
-        motion = run(scene.replace(**{parameter: value}), start, solver, t1=5.0, step=0.1, **options)
+        motion = jj.simulate(scene.replace(**{parameter: value}), start, ts=[5.0], solver=solver(step=0.1), **options)
         return jnp.sum(jnp.sin(jnp.arange(1.0, scene.coordinates.reference().size + 1) * motion.q_end)) + motion.u_end[-1]
 
     step = 1e-4
