@@ -70,6 +70,7 @@ class Diffrax(Integrator):
     """`diffrax.diffeqsolve`."""
 
     solver: diffrax.AbstractSolver
+    adjoint: diffrax.AbstractAdjoint
     max_steps: int = eqx.field(static=True)
     event_names: tuple[str, ...] = eqx.field(static=True)
     projects_saved: ClassVar[bool] = False
@@ -80,7 +81,9 @@ class Diffrax(Integrator):
         return type(self.solver).__name__
 
     def mode(self, setup: Setup) -> Literal["forward", "reverse", "any"]:
-        return "reverse"
+        if isinstance(self.adjoint, diffrax.ForwardMode):
+            return "forward"
+        return "reverse" if isinstance(self.adjoint, diffrax.RecursiveCheckpointAdjoint) else "any"
 
     def reason_against_machine_code(self, setup: Setup) -> str:
         """It has none."""
@@ -103,6 +106,7 @@ class Diffrax(Integrator):
             begun.args,
             saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)]),
             stepsize_controller=control,
+            adjoint=self.adjoint,
             event=event if self.event_names else None,
             max_steps=setup.most_steps(knots),
             throw=False,

@@ -68,10 +68,11 @@ def simulate(
     By name alone:
     - `formulation`: which equations are integrated, a `jj.Formulation(state, reduction, stabilisation)` (default: what serves the scene).
     - `backend`: "native", the scene's scalar program (`jj.lower`) as machine code made for it, on CPUs, where llvmlite is installed and the solver is a
-      default one; "xla", that program compiled by XLA, as third derivatives, those with respect to samples, and programs that are exported (`jax.export`)
-      or for other devices are in any case; "dense", the dense matrices; "auto" (default), the first of these that serves. The first two take the same steps.
+      default one; "xla", that program compiled by XLA: also for third derivatives, derivatives with respect to samples, `jax.export` and other devices, which
+      machine code refuses; "dense", the dense matrices; "auto" (default), the first of these that serves. The first two take the same steps.
     - `adjoint`: the default one serves forward and reverse mode, to the second order (`jax.hessian`), where machine code integrates; otherwise
-      reverse mode of first order, by recorded steps. `diffrax.ForwardMode()` serves forward mode of any order.
+      reverse mode of first order, by recorded steps. `diffrax.ForwardMode()` serves forward mode of any order. Solvers of diffrax that our own loop does not
+      have take all of diffrax's (default: `diffrax.RecursiveCheckpointAdjoint()`).
 
     **Returns** a `Trajectory`, with a result code instead of an exception, whose message says what to do; `trajectory.raise_if_failed()` raises
     `SimulationError`.
@@ -129,7 +130,6 @@ def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, in
     solver, max_step = options.solver, options.max_step
     scene, formulation = as_scene(scene), as_formulation(options.formulation)
     order, solver = (solver.order or order_for(options.rtol), None) if isinstance(solver, Taylor) else (None, solver)
-    _check_adjoint(options.adjoint)
     if isinstance(solver, FixedStepMethod):
         if max_step is not None:
             raise ValueError(f"`max_step` does not go with `{solver.name}`, whose steps are at most as long as its `step`: jj.{solver.name}(step=...)")
@@ -147,13 +147,15 @@ def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, in
         solver = default_solver(options.rtol) if order is None else DOPRI8
     static: dict[str, Any] = {"max_steps": options.max_steps, "event_names": field.event_names if options.events else ()}
     own = own_steps(solver, options.adjoint, **static, native=native, order=order)
-    integrator = diffrax_steps.Diffrax(solver=cast(Any, solver), **static) if own is None else own
+    integrator = diffrax_steps.Diffrax(cast(Any, solver), options.adjoint or diffrax.RecursiveCheckpointAdjoint(), **static) if own is None else own
     tolerances = tuple(as_array(x, start.q.dtype) for x in (options.rtol, options.atol))  # arrays: another tolerance is no other program
     first_step = (1.0 if isinstance(solver, FixedStepMethod) else 1e-4) * (t1 - t0)  # diffrax's own guess costs two more copies of the vector field to compile
     longest = as_array(LONGEST * abs(t1 - t0) if max_step is None else max_step, start.q.dtype)
     setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, longest, integrator, usual, reference)
     if own is None:
         diffrax_steps.check(setup)
+    else:
+        _check_adjoint(options.adjoint)
     if options.backend == "native" and (reason := setup.reason_against_machine_code):
         raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
     if order is not None and (reason := reason_against_series(setup, order)):
@@ -164,8 +166,8 @@ def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, in
 def _check_adjoint(adjoint) -> None:
     if adjoint is not None and not isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint | diffrax.ForwardMode):
         raise ValueError(
-            f"`adjoint` is a {type(adjoint).__name__}; use the default one, diffrax.RecursiveCheckpointAdjoint() or diffrax.ForwardMode(), or call "
-            "diffrax.diffeqsolve(jj.diffrax_term(scene), ...) with it"
+            f"`adjoint` is a {type(adjoint).__name__}; use the default one, diffrax.RecursiveCheckpointAdjoint() or diffrax.ForwardMode(), or a `solver` "
+            "of diffrax that is not one of our own, such as diffrax.Kvaerno5(), which goes with all of diffrax's"
         )
 
 
