@@ -218,7 +218,7 @@ class _AtStates:
         return mass_matrix(mass, inertia, *np.moveaxis(partial.reshape(len(partial), 2, *self.traced.at.v.shape, -1), 1, 0))
 
     def speeds_on_rows(self) -> np.ndarray:
-        """`u <- u - M^-1 A' (A M^-1 A')+ phi`, in scaled speeds."""
+        """Return speeds on the rows, `u <- u - M^-1 A' (A M^-1 A')+ phi` in scaled speeds; NaN where rows are no numbers."""
         at, u = self.traced.at, np.array(self.u, float)
         if not at.phi.size:
             return u
@@ -235,7 +235,8 @@ class _AtStates:
 
         still, every = np.zeros(u.shape), np.arange(len(u))
         typical = typical_lengths(np.linalg.norm(look(still, every)[1], axis=2))
-        return moved(nearest_root(look, lambda G, g: shortest(G, g, typical), still)[0], every)
+        x, last = nearest_root(look, lambda G, g: shortest(G, g, typical), still)
+        return moved(np.where(np.isfinite(last)[:, None], x, np.nan), every)
 
     def _assembled(self, q) -> Assembled:
         """Coordinates on geometric rows and unit norms, inside the domain where that can be."""
