@@ -167,7 +167,7 @@ from jourdain_jax.bicycle.parameters import PARAMETERS
 
 figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
 axis.barh(np.arange(8)[::-1], of_weave.total[order], xerr=of_weave.total_half_width[order], capsize=2, color="#b3470f")
-axis.set_yticks(np.arange(8)[::-1], [PARAMETERS[of_weave.names[k]][0] for k in order])
+axis.set_yticks(np.arange(8)[::-1], [PARAMETERS[of_weave.names[k]]["about"] for k in order])
 axis.set_xlabel("total Sobol' index of the weave speed")
 axis.spines[["top", "right"]].set_visible(False)
 

@@ -4,8 +4,6 @@ Straight and upright, a push F gives F / (m + I_R/r_R^2 + I_F/r_F^2). At 1 to 3 
 Source of the equations: J. P. Meijaard et al., Proc. R. Soc. A 463 (2007) 1955; the numbers are those of an adult's scooter, estimated.
 """
 
-import jax.numpy as jnp
-
 import jourdain_jax as jj
 
 LOOK = "One kick, and nobody steers: at this speed it leans ever more while the front wheel turns into the fall, too little and too late."
@@ -58,7 +56,8 @@ class KickScooter(jj.models.WhippleBicycle):
 
 
 # for drawing only, m: hub, deck, leg, trunk, head, arm; and the fork with its handlebar
-RIDER = jnp.array(
-    [[-0.35, 0, -0.85], [-0.2, 0, -0.87], [0.45, 0, -0.8], [0.0, 0, -0.85], [0.0, 0, 0.05], [0.08, 0, 0.45], [0.08, 0, 0.65], [0.08, 0, 0.4], [0.34, 0, 0.0]]
-)
-FORK = jnp.array([[0.1, 0, -0.45], [-0.07, 0, 0.4], [-0.07, 0.22, 0.4], [-0.07, -0.22, 0.4]])
+RIDER = (
+    (-0.35, 0.0, -0.85), (-0.2, 0.0, -0.87), (0.45, 0.0, -0.8), (0.0, 0.0, -0.85), (0.0, 0.0, 0.05),
+    (0.08, 0.0, 0.45), (0.08, 0.0, 0.65), (0.08, 0.0, 0.4), (0.34, 0.0, 0.0),
+)  # fmt: skip
+FORK = ((0.1, 0.0, -0.45), (-0.07, 0.0, 0.4), (-0.07, 0.22, 0.4), (-0.07, -0.22, 0.4))

@@ -35,8 +35,8 @@ class RollerRacer(jj.Scene):
         bar = seat @ jj.rot_z(q.handlebar)
         casters = axle + self.ahead * seat[:, 0] - self.behind * bar[:, 0]
         return {
-            "seat": jj.RigidBody(self.seat_mass, self.seat_inertia * jnp.ones(3), axle, seat, SEAT * jnp.stack([self.ahead, 1.0, 1.0])),
-            "handlebar": jj.RigidBody(self.bar_mass, self.bar_inertia * jnp.ones(3), casters, bar, BAR + jnp.stack([self.behind, 0.0, 0.0])),
+            "seat": jj.RigidBody(self.seat_mass, self.seat_inertia * jnp.ones(3), axle, seat, jnp.array(SEAT) * jnp.stack([self.ahead, 1.0, 1.0])),
+            "handlebar": jj.RigidBody(self.bar_mass, self.bar_inertia * jnp.ones(3), casters, bar, jnp.array(BAR) + jnp.stack([self.behind, 0.0, 0.0])),
         }
 
     def loads(self, motion):
@@ -47,5 +47,5 @@ class RollerRacer(jj.Scene):
         return {name: jj.knife_edge(motion[name], motion[name].position, motion[name].orientation[:, 1]) for name in ("seat", "handlebar")}
 
 
-SEAT = jnp.array([[1.0, 0.03, 0.0], [0.3, 0.16, 0.0], [-0.3, 0.16, 0.0], [-0.3, -0.16, 0.0], [0.3, -0.16, 0.0], [1.0, -0.03, 0.0], [1.0, 0.03, 0.0]])
-BAR = jnp.array([[0.05, 0.28, 0.0], [-0.05, 0.28, 0.0], [-0.14, 0.06, 0.0], [-0.14, -0.06, 0.0], [-0.05, -0.28, 0.0], [0.05, -0.28, 0.0], [0.05, 0.28, 0.0]])
+SEAT = ((1.0, 0.03, 0.0), (0.3, 0.16, 0.0), (-0.3, 0.16, 0.0), (-0.3, -0.16, 0.0), (0.3, -0.16, 0.0), (1.0, -0.03, 0.0), (1.0, 0.03, 0.0))
+BAR = ((0.05, 0.28, 0.0), (-0.05, 0.28, 0.0), (-0.14, 0.06, 0.0), (-0.14, -0.06, 0.0), (-0.05, -0.28, 0.0), (0.05, -0.28, 0.0), (0.05, 0.28, 0.0))
