@@ -73,5 +73,5 @@ def test_work_is_refused_with_what_integrates_it():
         def loads(self, motion):
             return (jj.generalized_force(motion, x_rate=-motion.u.x_rate),)
 
-    with pytest.raises(ValueError, match=r"diffrax.Heun\(\) does not integrate the work .* of `Dragged` .* give work=False, or leave `solver` away"):
+    with pytest.raises(ValueError, match=r"diffrax.Heun\(\) does not integrate the work .* of `Dragged` .* give work=False, or omit `solver`"):
         jj.simulate(Dragged(), t1=1.0, solver=diffrax.Heun())

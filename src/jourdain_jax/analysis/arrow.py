@@ -69,7 +69,7 @@ class Arrow:
         )
 
     def split(self, x: Shaped[np.ndarray, "members unknowns"]) -> tuple[np.ndarray, np.ndarray]:
-        """Return shared unknowns (members, shared), and those of the pieces (members, pieces, local)."""
+        """Return shared unknowns (members, shared), and unknowns of the pieces (members, pieces, local)."""
         pieces, local, shared = self.counts
         return x[:, :shared], x[:, shared:].reshape(len(x), pieces, local)
 
@@ -162,7 +162,7 @@ def with_prior(
 
 
 def eliminated(local: np.ndarray, below: Float[np.ndarray, "members pieces local"], joins: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows that give own unknowns in terms of those of the piece before and the shared ones, and the rows that are left for the latter.
+    """Return the rows that give own unknowns in terms of shared unknowns and of the piece before, and the rows that are left for these.
 
     `below`: the diagonal of the rows that are added. The rows that are left stand one after another.
     """

@@ -1,4 +1,4 @@
-"""A fit taken up again: at its minimum, along a profile, and for other runs."""
+"""A fit that is resumed: at its minimum, along a profile, and for other runs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

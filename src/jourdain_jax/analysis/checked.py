@@ -1,4 +1,4 @@
-"""Guesses at mistakes of a scene, in one table: what can be computed, but is hardly meant.
+"""Likely mistakes of a scene in one table: it can be computed, but is hardly meant.
 
 smoothness        poses, rows and rates of coordinates that jump, or whose velocities do, on lines through states of the domain
 grounds           what the ground of a contact does, and what is stated of it
@@ -21,14 +21,14 @@ from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 @dataclass(frozen=True, repr=False)
 class Checked(Printed):
-    """What was looked at of a scene -> what looks wrong there, in sentences; nothing where all is plausible. `print` shows it as a table."""
+    """Findings of `check`: subject -> sentences on what looks wrong, none where all is plausible. Printed as a table."""
 
     scene: str
     found: dict[str, tuple[str, ...]]
 
     @property
     def passed(self) -> bool:
-        """Whether nothing looks wrong."""
+        """True where nothing looks wrong."""
         return not any(self.found.values())
 
     def _text(self) -> str:
@@ -39,12 +39,12 @@ class Checked(Printed):
 @shown_from_users_lines
 @of_known_numbers
 def check(scene: Scene | BuiltFor) -> Checked:
-    """Guess at mistakes of a scene: kinks and jumps, grounds that other bodies carry, bodies that cannot be, a program that differs from JAX.
+    """Look for likely mistakes of a scene: kinks and jumps, grounds that other bodies carry, impossible bodies, a program that differs from JAX.
 
         print(jj.check(scene))
 
-    All findings at once, of some states of the domain: what lies between these, and is narrow, is not seen. The first of them is an error where the scene is
-    built or moves, but for a program that differs (dense matrices are taken), and moments of inertia of which the largest exceeds the sum of the others.
+    Looks at some states of the domain; a narrow feature between them is not seen. When the scene is built or moves, the first finding is raised as an error,
+    except a program that differs (dense matrices serve) and a moment of inertia above the sum of the others.
     ValueError where no admissible state is found, or a motion that the rows leave free has no inertia.
     """
     scene = as_scene(scene)

@@ -36,7 +36,7 @@ GONE = {
 
 @dataclass(frozen=True, eq=False)
 class Asked:
-    """The arguments of a fit but for its data, kept with its result, so that it can be taken up again."""
+    """Arguments of a fit, without its data, stored with the result so that it can be resumed."""
 
     scene: Scene  # with the first guesses
     free: Mapping | tuple[str, ...]
@@ -187,6 +187,6 @@ class Estimates(Printed):
 
     @property
     def tied(self) -> dict[str, Estimated]:
-        """The parameters that follow from unknowns, by the functions and the possible inertias in `free`, as `derived` tells them."""
+        """Return the parameters that follow from unknowns by functions and possible inertias in `free`, as from `derived`."""
         units = {name: about["unit"] for name, _, about in parameters_of(self.asked.scene)}
         return {name: self.derived(lambda scene, name=name: getattr(scene, name), units[name]) for name in self.layout.following}

@@ -1,4 +1,4 @@
-"""The result of a fit: its estimates, why they should not be relied on, and what else can be asked of it."""
+"""Results of fits: estimates, the reasons to doubt them, and further calls (profiles, predictions, plans)."""
 
 import os
 from collections.abc import Iterable, Mapping, Sequence

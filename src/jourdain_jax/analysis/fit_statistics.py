@@ -55,7 +55,7 @@ class Statistics:
 def statistics(problem: Problem, found: Minimum, limits: Limits, control: Control, errors: str, at_bounds: AtBounds, options: AllOptions | None) -> Statistics:
     """Statistics of the minimum of each member; without the axis of members where the problem has none.
 
-    `options`: those of a look at the events of the fitted motion; None: there is no look.
+    `options`: for the motions whose events are looked at; None: they are not.
     """
     unknowns, theta, single = problem.unknowns, found.theta, problem.single
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)

@@ -128,12 +128,12 @@ class _Size(NamedTuple):
 
 
 def _coloured(fit: Estimates) -> dict[str, float]:
-    """Correlations of neighbours, of channels whose residuals are not white."""
+    """Return correlations of neighbouring residuals, for channels whose residuals are not white."""
     return {name: rho for name, (rho, limit) in fit.autocorrelation.items() if abs(rho) > limit}
 
 
 def _too_small(fit: Estimates) -> list[_Size]:
-    """Sizes that are too small to be chance; residuals with a correlation rho of neighbours tell (1 + rho)/(1 - rho) times less."""
+    """Return which values are too small to be chance; residuals with a correlation rho of neighbours tell (1 + rho)/(1 - rho) times less."""
     coloured = _coloured(fit)
 
     def larger(channels: list[str]) -> float:

@@ -223,7 +223,7 @@ class Piecewise:
             yield here, np.full(len(here), run), closed(rows, self.own + self.shared) if self.closing else rows
 
     def change(self, problem: Problem, sigma: np.ndarray, d: np.ndarray, members: np.ndarray) -> Float[np.ndarray, "members"]:
-        """How much a step with its gaps closed changes all residuals, |J d + g|, in units of sigma."""
+        """Return the change of all residuals by a step that closes the gaps, |J d + g|, in units of sigma."""
         d_shared, d_own = self.unknowns.split(d)
         squares = np.zeros(len(d))
         for (b, member), run in itertools.product(enumerate(members.tolist()), range(len(self.runs))):
@@ -254,7 +254,7 @@ class Piecewise:
         return self.continuity(members) <= 1.0
 
     def continuity(self, members: np.ndarray) -> Float[np.ndarray, "members"]:
-        """The largest jump from one piece to the next, in tolerances of the options, `atol + rtol |x|`."""
+        """Return the largest jump from one piece to the next, in tolerances of the options, `atol + rtol |x|`."""
         rtol, atol = self.tolerance
         allowed = atol + rtol * np.maximum(np.abs(self.at.local[members][..., self.own :]), self.node_sizes)
         return np.max(np.abs(self.at.jumps[members]) / allowed, axis=(1, 2), initial=0.0)

@@ -63,7 +63,7 @@ class Lanes:
 
 
 class Group:
-    """Runs of equal structure, filled up to one length. Lanes are told by their runs, which are numbers among those of the problem, and members."""
+    """Runs of equal structure, padded to one length. A lane is a run, by its number in the problem, and a member."""
 
     def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, options: AllOptions, members: int | None):
         self.runs, self._members, self._lengths = np.array(indices), members, [run.ts.shape[0] for run in runs]
@@ -93,7 +93,7 @@ class Group:
         self._kept: dict[int, list] = {}
 
     def places(self, runs: np.ndarray) -> np.ndarray:
-        """Where these runs are among those of the group."""
+        """Return the places of these runs in the group."""
         return np.searchsorted(self.runs, runs)
 
     def evaluate(self, shared, local, members) -> Iterator[Some]:
@@ -163,7 +163,7 @@ _BY_MEMBER = ("values", "weights")  # of a run, which differ by member where the
 
 
 def _row(tree, count: int, by_member: bool = False) -> Float[np.ndarray, "members numbers"]:
-    """All numbers of a tree one after another, as `ravel_pytree` has them; of a run those of each of so many members."""
+    """Return all numbers of a tree in the order of `ravel_pytree`; for a run, of each of so many members."""
     own = {id(x) for name in _BY_MEMBER for x in getattr(tree, name).values()} if by_member else set()
     parts = [np.asarray(x).reshape(count if id(x) in own else 1, -1) for x in jax.tree.leaves(tree) if is_array(x)]
     found, end = np.empty((count, sum(part.shape[1] for part in parts))), 0

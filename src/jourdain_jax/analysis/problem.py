@@ -33,12 +33,12 @@ class Span:
     begun: Float[np.ndarray, "members places"]  # first guesses
 
     def at(self, members: np.ndarray) -> "Span":
-        """Those of some members."""
+        """Return the numbers of some members."""
         return Span(self.shares[members], self.begun[members])
 
 
 class Problem:
-    """Residuals with their derivatives, of any members at any numbers. `evaluate`: as that of the lanes, where runs are worked out in pieces."""
+    """Residuals with their derivatives, of any members at any numbers. `evaluate`: as `Lanes.evaluate`, where runs are computed in pieces."""
 
     def __init__(
         self, scene: Scene, runs: tuple[Experiment, ...], unknowns: Unknowns, lanes: Lanes, loss: Loss, evaluate: Callable[..., Iterator[Some]] | None = None

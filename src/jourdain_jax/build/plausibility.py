@@ -1,4 +1,4 @@
-"""Whether the numbers that a scene gives for its bodies and contacts can be those of bodies and contacts.
+"""Checks of the numbers that a scene gives for its bodies, contacts and gravity.
 
 m >= 0,   I = I' >= 0,   R' R = 1,   det R = 1
 n.n = 1,   e.e = 1 of gravity,   gap = 0 where the coordinates keep a body on the ground,   0 < r of what rolls and of its ground,   0 <= tyre < r
@@ -40,10 +40,10 @@ _ROWS_INSTEAD = "write its rows in `velocity_constraints`: tangents @ (rolling.v
 
 
 class Stated(eqx.Module):
-    """What the table judges, by names of bodies and contacts, at one state or, with a leading axis, at many; numbers, or nodes of a graph."""
+    """Numbers that the table judges, by names of bodies and contacts, at one state or, with a leading axis, at many; or nodes of a graph."""
 
     mass: dict[str, Float[Array, "*states"]]
-    inertia: dict[str, Float[Array, "*states 4 3"]]  # of rigid bodies only; and, as a fourth row, what those of a point of their mass may be
+    inertia: dict[str, Float[Array, "*states 4 3"]]  # of rigid bodies only; the fourth row is the round-off that a point of their mass may have
     orientation: dict[str, Float[Array, "*states 3 3"]]
     normal: dict[str, Float[Array, "*states 2"]]  # squares of the lengths of the normals of contacts; and how far out the contact is, m
     gap: dict[str, Float[Array, "*states 2"]]  # where the coordinates keep them closed; and the distance of the contact from the mass centre, m
@@ -73,7 +73,7 @@ def numbers_of(scene: Scene, motion: Motion) -> PoseNumbers:
 
 
 def stated_of(scene: Scene, pose: Pose, loads: tuple[Load, ...] = ()) -> Stated:
-    """What the table judges of known poses and loads."""
+    """Return the numbers that the table judges, for known poses and loads."""
     bodies, contacts = {name: body.body for name, body in pose.bodies.items()}, contacts_of(scene, pose)
     rigid = {name: body for name, body in bodies.items() if isinstance(body, RigidBody)}
     away = 1e6 * jnp.finfo(pose.q.array.dtype).eps  # of round-off in the places of contacts that are far out
@@ -96,7 +96,7 @@ def stated_of(scene: Scene, pose: Pose, loads: tuple[Load, ...] = ()) -> Stated:
 
 
 def _lengths(contact: Contact) -> dict[str, Float[Array, ""]]:
-    """Lengths (m) that must be positive."""
+    """Return the lengths (m) that must be positive."""
     found, shape, ground = {}, contact.shape, contact.ground
     if isinstance(shape, Ball | Wheel):
         found["the radius"] = shape.radius
@@ -111,7 +111,7 @@ def _lengths(contact: Contact) -> dict[str, Float[Array, ""]]:
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the table: of which numbers, whether they are wrong (axes of states and names first), and what is said of them at one state."""
+    """One line of the table: a field of `Stated`, a label, the test (axes of states and names first), and the sentence for one state."""
 
     of: str
     label: str
@@ -129,7 +129,7 @@ def _lopsided(x):
 
 
 def _negative(x):
-    """Whether an eigenvalue of a symmetric inertia is below zero: by its principal minors, relative to its largest entry, or that of a point."""
+    """Return whether an eigenvalue of a symmetric inertia is negative, by its principal minors, relative to its largest entry or to a point's."""
     I, size = x[..., :3, :], _size(x)
     I = (I + I.swapaxes(-1, -2)) / (2 * (size + (size == 0)))[..., None, None]
     at = lambda i, k: I[..., i, k] + (TOLERANCE if i == k else 0.0)  # noqa: E731
@@ -213,7 +213,7 @@ CHECKS = (
 
 
 def faults_at(scene: Scene, t, q, u, inputs) -> dict[str, Bool[Array, ""]]:
-    """Fault by the table -> whether the scene has it at this state, under jit and vmap as well. What is NaN is none."""
+    """Return fault -> whether the scene has it at this state; also under jit and vmap. NaN is no fault."""
     motion = motion_at(scene, t, q, u, inputs)
     stated = stated_of(scene, motion.pose(), loads_of(scene, motion))
     return {f"{check.label}: {name}": check.wrong(x) for check in CHECKS for name, x in getattr(stated, check.of).items()}
@@ -223,7 +223,7 @@ known_faults_at = eval_numpy(faults_at)
 
 
 def any_wrong(stacked: dict[str, Array]) -> Bool[Array, ""]:
-    """Whether the table finds a fault in numbers that are stacked along a first axis, by the names of the fields of `Stated`."""
+    """Return whether the table finds a fault in numbers stacked along a first axis, by the names of the fields of `Stated`."""
     return jnp.any(jnp.concatenate([jnp.zeros(1, bool), *(check.wrong(stacked[check.of]) for check in CHECKS if check.of in stacked)]))
 
 
@@ -291,7 +291,7 @@ def _bodies_stated(scene: Scene, q) -> Stated:
 
 
 def _sentences(who: str, stated: Stated, checks: Iterable[Check]) -> list[str]:
-    """What the table finds at many states, one sentence for each fault, about the state where it is found first."""
+    """Return one sentence for each fault that the table finds at many states, about the first state that has it."""
     found = []
     for check in checks:
         for name, x in getattr(stated, check.of).items():
@@ -347,7 +347,7 @@ def _of_carried(what: str, speeds: np.ndarray) -> str:
     if np.any(stated > 0) or not np.any(moves > TOLERANCE * bodies + 1e-12):
         return ""
     return (
-        f"{what} moves with another body, but its `velocity` and `angular_velocity` are zero; where it is a body of the scene, leave the contact away and "
+        f"{what} moves with another body, but its `velocity` and `angular_velocity` are zero; where it is a body of the scene, omit the contact and "
         f"{_ROWS_INSTEAD}"
     )
 

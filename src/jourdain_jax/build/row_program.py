@@ -87,9 +87,9 @@ def row_program(scene: Scene) -> RowProgram | None:
 
 
 def _right(scene: Scene, traced: TracedScene) -> int:
-    """The node of a truth value: every parameter is finite and has its sign, and `plausibility.CHECKS` finds no fault in what parameters decide.
+    """Return the node of a truth value: every parameter is finite and has its sign, and `plausibility.CHECKS` finds no fault that parameters decide.
 
-    What they do not decide is judged where the scene is probed, and what speeds or inputs decide, there alone.
+    Numbers that no parameter decides, and numbers that speeds or inputs decide, are judged where the scene is probed.
     """
     g, known = traced.graph, [n for part in (traced.u, traced.inputs) for n in part.tolist()]
     of_parameters = [n for leaf in traced.parameters for n in leaf.ravel().tolist()]

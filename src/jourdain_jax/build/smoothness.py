@@ -73,7 +73,7 @@ def _at(scene: Scene, nodes: LookedAt, points: np.ndarray, u: np.ndarray) -> Pro
 
 
 def _jumps(scene: Scene, nodes: LookedAt, wanted: list[int], u, a: np.ndarray, b: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Which node jumps, and the points before and behind it, for every interval with a jump between the points `a` and `b`."""
+    """Return which node jumps, and the points before and behind it, for every interval with a jump between the points `a` and `b`."""
     for k, before, behind in jumps(lambda points: _at(scene, nodes, points, u)(wanted).T, a, b):
         yield wanted[k], before, behind
 
@@ -107,7 +107,7 @@ def _across(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sets_in(scene: Scene, nodes: LookedAt, points: np.ndarray, u: np.ndarray) -> bool:
-    """Whether rows become others between these points: a state may meet both."""
+    """Return whether rows change between these points: a state may meet both."""
     before, behind = _at(scene, nodes, points, u)([node for row in nodes.rows for node in row.values()]).T
     return not np.allclose(before, behind, rtol=1e-6, atol=1e-9)
 

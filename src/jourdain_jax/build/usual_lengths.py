@@ -37,7 +37,7 @@ def usual_lengths(scene: Scene) -> UsualLengths:
 
 
 def _of_traced(scene: Scene) -> tuple[UsualRows, Float[Array, "closures"]]:
-    """Lengths of rows at states that were probed with numbers near the class's defaults, worked out while the motion runs."""
+    """Return lengths of rows at states probed with numbers near the class's defaults; computed while the motion runs."""
     known, still = structure_whatever_its_faults(scene), jax.lax.stop_gradient(scene)
     count = min(STATES, known.random)
     t, q, inputs = jnp.asarray(known.times[:count]), jnp.asarray(known.coordinates[:count]), jnp.asarray(generic_inputs(scene))
@@ -54,13 +54,13 @@ def _of_traced(scene: Scene) -> tuple[UsualRows, Float[Array, "closures"]]:
 
 
 def _usual(sizes: Float[Array, "states rows"]) -> Float[Array, "rows"]:
-    """The median over states, or the largest for what vanishes at half of them; what is no number does not count."""
+    """Return the median over states, or the largest where half of them are zero; NaN does not count."""
     median = jnp.nanmedian(sizes, axis=0)
     return jax.lax.stop_gradient(jnp.where(median > 0, median, jnp.nanmax(sizes, axis=0, initial=0.0)))
 
 
 def _of_own_speeds(scene: Scene) -> Float[Array, "own_speeds"]:
-    """The median over probed states; a thousand times as much where parameters are traced, so that only what is longer than that counts as infinite."""
+    """Return the median over probed states; a thousand times as much where parameters are traced, so that only longer rates count as infinite."""
     known, reference = structure_whatever_its_faults(scene), with_reference_parameters(scene)
     t, q = jnp.asarray(known.times), jnp.asarray(known.coordinates)
     lengths = jnp.nanmedian(jax.vmap(lambda t, q: jnp.linalg.norm(rates_by_own_speeds(reference, t, q), axis=1))(t, q), axis=0)

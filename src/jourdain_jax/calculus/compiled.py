@@ -1,4 +1,4 @@
-"""Functions compiled at a tenth of the costs per call of `equinox.filter_jit`, and with options of XLA where compiling takes longer than running."""
+"""Compiled functions with a tenth of the overhead of `equinox.filter_jit`, and with options of XLA where compiling takes longer than running."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -18,10 +18,10 @@ MOST_STRUCTURES = 1024  # of arguments, arrays left out, for which one function 
 
 
 def compiled(f: Callable, options: dict | Callable | None = None) -> Callable:
-    """As `equinox.filter_jit`; what was compiled is dropped with the function that is returned.
+    """Compile as `equinox.filter_jit` does; compiled programs live as long as the returned function.
 
-    `options`: those of XLA on a CPU, or a function that chooses them, called once for arguments of one structure with a mark in place of each array. They
-    do not count in calls inside another transformation: JAX takes options of whole programs only.
+    `options`: for XLA on a CPU, or a function that chooses them, called once for arguments of one structure with a mark in place of each array. They have
+    no effect in calls inside another transformation: JAX takes options of whole programs only.
     """
 
     @lru_cache(maxsize=MOST_STRUCTURES)
@@ -44,7 +44,7 @@ def compiled(f: Callable, options: dict | Callable | None = None) -> Callable:
 
 
 class _Kept(eqx.Module):
-    """What is no array in what a compiled function returns."""
+    """The parts of a result that are no arrays."""
 
     value: tuple = eqx.field(static=True)
 
@@ -53,12 +53,12 @@ _AN_ARRAY = object()
 
 
 def _parted(tree) -> tuple[list, tuple]:
-    """The arrays of a tree, and what is left of it."""
+    """Split a tree into its arrays and the rest."""
     leaves, treedef = jax.tree.flatten(tree)
     return [x for x in leaves if is_array_type(type(x))], (treedef, tuple([_AN_ARRAY if is_array_type(type(x)) else x for x in leaves]))
 
 
 def _whole(arrays, treedef, rest):
-    """The tree of these parts."""
+    """Put a tree together from its parts."""
     left = iter(arrays)
     return jax.tree.unflatten(treedef, [next(left) if x is _AN_ARRAY else x for x in rest])

@@ -29,13 +29,13 @@ class Rules(NamedTuple):
 
 
 class _Leaves(NamedTuple):
-    """The arrays of the arguments of a function, and what is left of these."""
+    """The arguments of a function, split into arrays and the rest."""
 
     treedef: jax.tree_util.PyTreeDef
     rest: tuple
 
     def whole(self, leaves: Sequence):
-        """The arguments with these arrays."""
+        """Return the arguments with these arrays."""
         return eqx.combine(jax.tree.unflatten(self.treedef, leaves), self.rest)
 
 

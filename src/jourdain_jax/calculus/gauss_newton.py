@@ -1,4 +1,4 @@
-"""Gauss-Newton on NumPy, at many states at once: what is nearest to x among the roots of g.
+"""Gauss-Newton on NumPy, at many states at once: the root of g nearest to x.
 
     x <- x - G+ g(x),   G = dg/dx
 

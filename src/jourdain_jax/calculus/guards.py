@@ -42,7 +42,7 @@ class DifferentiationModeError(TypeError):
 
 
 class OtherDeviceError(RuntimeError):
-    """Machine code was to be part of a program that does not run in this process, or not on a device that it is made for."""
+    """Raised where machine code would become part of a program for another process, or for a device without machine code."""
 
     def __init__(self, program: str) -> None:
         super().__init__(f'machine code of this process cannot be part of a program {program}; give `backend="xla"` to `jj.simulate`, or to `jj.build`')

@@ -43,9 +43,7 @@ def needed(module: str, purpose: str, extra: str = "") -> Any:
         raise ImportError(f"{purpose} needs the package `{package}`, which is not installed; install it with: pip install {install}") from error
 
 
-def names_on_first_use(
-    package: dict[str, Any], where: Mapping[str, str], gone: Mapping[str, str]
-) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+def names_on_first_use(package: dict[str, Any], where: Mapping[str, str], gone: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """`__getattr__` and `__dir__` of a package, given its globals, for names that are defined in modules below it: name -> module, such as "analysis.fit".
 
     `gone`: names that there were once -> what serves now.

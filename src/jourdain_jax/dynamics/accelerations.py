@@ -157,7 +157,7 @@ def bare_accelerations(
 
 
 def reduced_at(scene: Scene, t, q, u, inputs, reduction, stabilisation, usual) -> tuple[Reduced, UnconstrainedEquations, ConstraintRows]:
-    """Accelerations with the equations and rows that they solve; as `accelerations`, whose `usual` is not optional here."""
+    """Return accelerations with the equations and rows that they solve; arguments as of `accelerations`, but `usual` is not optional."""
     q, u = as_coordinates(scene, q), as_speeds(scene, u)
     reduction = as_reduction(scene, reduction)
     equations, rows = equations_and_rows(scene, t, q, u, inputs)

@@ -96,7 +96,7 @@ class Task:
         return dict(self.constants) | starts, {name: column for name, column in values.items() if not name.endswith(AT_START)}
 
     def simulated(self, lane: int, **by_name) -> Trajectory:
-        """The motion of one lane alone; span, inputs and options by name replace those of the study."""
+        """Return the motion of one sample alone; span, inputs and options by name replace the study's."""
         starts, parameters = self.arguments(lane, lane + 1)
         own = self.scene.replace(**{name: column[0] for name, column in parameters.items()}) if parameters else self.scene
         first = {name: value if name in self.constants else value[0] for name, value in starts.items()}
@@ -140,7 +140,7 @@ class Task:
 
     @property
     def settled(self) -> dict[str, Any]:
-        """Span, inputs and options that were stated, by name."""
+        """Return the stated span, inputs and options by name."""
         return {name: value for name, value in self.span.items() if value is not None} | stated(self.options)
 
     def columns(self) -> dict[str, Column]:

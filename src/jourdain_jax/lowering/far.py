@@ -43,12 +43,12 @@ def _at_full_turns(probes: Probes, traced: TracedScene) -> Probes:
 
 
 def _on_rows(probes: Probes, rows: list[int], coordinates: list[int]) -> Probes:
-    """The probes with coordinates on rows = 0; not numbers where Gauss-Newton does not arrive."""
+    """Return the probes with coordinates on rows = 0; NaN where Gauss-Newton does not converge."""
     found = onto_rows(probes, rows, {f"q_{i}": n for i, n in enumerate(coordinates)}, most=STEPS)
     off = ~(np.max(np.abs(found.probes(rows)), axis=0, initial=0.0) <= CLOSED)
     return found.probes.with_inputs({name: np.where(off, np.nan, found.probes.inputs[name]) for name in found.moved})
 
 
 def on_velocity_rows(probes: Probes, traced: TracedScene) -> Probes:
-    """The probes with speeds on the rows, as near as they can be."""
+    """Return the probes with the nearest speeds on the rows."""
     return onto_rows(probes, traced.at.phi.tolist(), {f"u_{k}": n for k, n in enumerate(traced.u.tolist())}).probes

@@ -20,13 +20,13 @@ NEAR = 1e-6  # off a state, relative to entries larger than one
 
 
 def loads_have_relations(scene: Scene) -> bool:
-    """Whether relations decide between branches of loads or masses."""
+    """Return whether relations decide between branches of loads or masses."""
     traced = looked_at(scene).traced
     return bool(switches(traced.graph, _loads(scene, traced)))
 
 
 def loads_may_jump(scene: Scene) -> bool:
-    """Whether loads or masses jump where the state or parameters say so: where time alone does, no derivative misses anything."""
+    """Return whether loads or masses jump at a state or parameter; a jump at a fixed time leaves derivatives right."""
     scene = with_reference_parameters(scene)
     traced = looked_at(scene).traced
     graph, loads = traced.graph, list(_loads(scene, traced))
@@ -36,7 +36,7 @@ def loads_may_jump(scene: Scene) -> bool:
 
 
 def bent_load(scene: Scene, t, q, u, inputs) -> str:
-    """Which of the loads or masses has no derivative with respect to the state at a state, in words; empty where none is seen."""
+    """Return in words which load or mass has no derivative with respect to the state at a state; empty where none is seen."""
     try:
         traced = looked_at(scene).traced
     except Unsupported:
@@ -58,7 +58,7 @@ def bent_load(scene: Scene, t, q, u, inputs) -> str:
 
 
 def _probes(scene: Scene, traced: TracedScene) -> Probes:
-    """States at which the structure of the scene was found, with any speeds and inputs."""
+    """Return the states at which the structure of the scene was found, with random speeds and inputs."""
     known, generator = structure_whatever_its_faults(scene), np.random.default_rng(7)
     u, inputs = (generator.normal(size=(len(known.times), len(names))) for names in (scene.speed_names.entries, scene.inputs))
     values = named_values(scene, known.times, known.coordinates, u, inputs)
@@ -66,7 +66,7 @@ def _probes(scene: Scene, traced: TracedScene) -> Probes:
 
 
 def _loads(scene: Scene, traced: TracedScene) -> dict[int, str]:
-    """The nodes of loads and masses, and what each belongs to."""
+    """Return the nodes of loads and masses, with the name of each."""
     bodies, at = names_of_bodies(scene), traced.at
     named = {f"the {what} body `{name}`": x for what, of in _OF_BODIES.items() for name, x in zip(bodies, getattr(at, of), strict=True)}
     named |= {f"the force along `{name}`": x for name, x in zip(scene.speed_names.entries, at.direct, strict=True)}

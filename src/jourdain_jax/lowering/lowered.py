@@ -62,7 +62,7 @@ class Lowered:
     energies: tuple[int, ...]  # kinetic and potential
     relations: tuple[int, ...]  # numbers whose signs decide between branches of the rates (`lowering/relations.py`)
     event_relations: tuple[int, ...]  # and those that do so in stop events besides
-    jumps: tuple[int, ...]  # those of the former at whose zeros rates may jump
+    jumps: tuple[int, ...]  # of the relations, those at whose zeros rates may jump
     projected_q: tuple[int, ...]  # coordinates put back onto norms and geometric rows, one step of Gauss-Newton
     projected_u: tuple[int, ...]  # all speeds put back onto the rows; none where dependent speeds are eliminated
     by_partition: bool  # all speeds are in the state, but the accelerations come from privileged ones
@@ -131,7 +131,7 @@ class Lowered:
         return tuple(jnp.asarray(x) for x in run(self.graph, self.fixed, known | self.usual_values(known)))
 
     def usual_values(self, parameters: dict) -> dict[int, Float[Array, ""]]:
-        """What stands for usual magnitudes: geometric means over `states`, for these parameters. Numbers to differentiation."""
+        """Return usual magnitudes for these parameters, geometric means over `states`; constants to differentiation."""
         if not self.usual:
             return {}
         parameters = jax.lax.stop_gradient(parameters)
@@ -253,7 +253,7 @@ class Lowered:
 
 
 def _usual(sizes: Float[Array, "states"]) -> Float[Array, ""]:
-    """The geometric mean of those that are numbers and not zero, or 1; no derivative passes through."""
+    """Return the geometric mean of the finite entries that are not zero, or 1; constant to differentiation."""
     counts = (sizes > 0) & jnp.isfinite(sizes)
     total = jnp.sum(jnp.where(counts, jnp.log(jnp.where(counts, sizes, 1.0)), 0.0))
     return jax.lax.stop_gradient(jnp.exp(total / jnp.maximum(jnp.sum(counts), 1)))

@@ -104,7 +104,7 @@ def _may_dip(values, above, below, least) -> bool:
 
 
 def jumps(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: Probes) -> tuple[int, ...]:
-    """Those of the numbers at whose zeros, between probes, an output jumps."""
+    """Return the numbers at whose zeros, between probes, an output jumps."""
     size = np.nanmax(np.abs(probes(outputs)), axis=1, initial=0.0)
 
     def change(pair: tuple[Probes, Probes]) -> np.ndarray:

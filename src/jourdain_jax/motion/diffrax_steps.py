@@ -87,7 +87,7 @@ class Diffrax(Integrator):
 
     def reason_against_machine_code(self, setup: Setup) -> str:
         """It has none."""
-        return "a solver of diffrax was asked for"
+        return "the solver is one of diffrax"
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
         origin, knots = begun.args[4], setup.knots
@@ -150,12 +150,12 @@ class Diffrax(Integrator):
 
 
 def check(setup: Setup) -> None:
-    """ValueError where the scene does work that solvers of diffrax do not integrate; a warning where it has relations that they do not watch."""
+    """Raise ValueError where the scene does work, which solvers of diffrax do not integrate; warn where it has relations, which they do not watch."""
     name, solver = type(setup.scene).__name__, setup.integrator.name
     if setup.field.with_work:
         raise ValueError(
             f"solver=diffrax.{solver}() does not integrate the work that no potential of `{name}` accounts for; "
-            "give work=False, or leave `solver` away for the default one, which does"
+            "give work=False, or omit `solver`: the default one integrates it"
         )
     if reason_against_watching(setup):
         text = f"diffrax.{solver} does not watch the relations that loads or events of `{name}` have: it may step over them; the default solver does"
@@ -163,13 +163,13 @@ def check(setup: Setup) -> None:
 
 
 def _over_at_start(begun: Begun, t0, t1) -> Bool[Array, "events"]:
-    """Which events have happened at the start, which diffrax does not ask."""
+    """Return which events have happened at the start, which diffrax does not check."""
     rates = integrands.rates(t0, begun.y0, begun.args)
     values, along = jax.jvp(lambda t, y: integrands.events(t, y, begun.args), (t0, begun.y0), (jnp.ones_like(t0), rates))
     return event_search.at_start(values, jnp.sign(t1 - t0) * along, values, jnp.abs(t1 - t0))[0]
 
 
 def _lowest(t, y: PyTree, args, *, terms, **kwargs):
-    """The lowest value of all stop events: the first of several in one step, of which diffrax would take the first in their order."""
+    """Return the lowest value of all stop events: of several in one step, diffrax would take the first in their order, not in time."""
     direction = terms.contr(0.0, 1.0)  # diffrax counts time along the direction of the motion
     return jnp.min(integrands.events(t * direction, y, args))

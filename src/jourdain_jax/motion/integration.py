@@ -193,14 +193,14 @@ def _finish(given: Setup, setup: Setup, asked: Float[Array, ""], begun: Begun, s
 
 
 def _step_errors(setup: Setup, free: Integrated, y: Integrated) -> Float[Array, ""]:
-    """How many times what a step may be off by a projection moved a state from `free` to `y`."""
+    """Return how far a projection moved a state from `free` to `y`, in tolerances of a step."""
     rtol, atol = setup.tolerances
     parts = jax.lax.stop_gradient(((free.q, y.q), (free.v, y.v)))
     return jnp.max(jnp.stack([jnp.max(jnp.abs(a - b) / (atol + rtol * jnp.abs(b)), initial=0.0) for a, b in parts]))
 
 
 def _without_faults(setup: Setup):
-    """Whether all parameters are right, and the bodies and contacts they make; and the start: NaN where they are not, so that such a lane ends at once."""
+    """Return whether parameters, bodies and contacts are right, and the start: NaN where they are not, so that such a lane ends at once."""
     scene, t0, start, field = setup.scene, setup.t0, setup.start, setup.field
     program = row_program(scene) if isinstance(field, ByProgram) and field.native else None
     if program is None or unsupported(program.graph, [program.right]):

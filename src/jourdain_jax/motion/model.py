@@ -1,4 +1,4 @@
-"""Models: scenes with all that is settled once about their motions. `simulate` and its kin take a model in the place of a scene."""
+"""Models: scenes with the choices that `build` made for their motions. `simulate` and its kin take a model in place of a scene."""
 
 from dataclasses import dataclass, replace
 
@@ -80,7 +80,7 @@ class Model(BuiltFor, Printed):
 
     scene: Scene
     formulation: Formulation  # its state is settled
-    backend: str  # as asked for
+    backend: str  # the argument of `build`
     reference: Reference  # the scene whose numbers decided
 
     def replace(self, **parameters) -> "Model":
@@ -89,7 +89,7 @@ class Model(BuiltFor, Printed):
 
     @property
     def structure(self) -> Structure:
-        """What was found by probing."""
+        """The findings of probing."""
         return structure_of(self.reference.scene)
 
     @property
@@ -141,7 +141,7 @@ class Model(BuiltFor, Printed):
 
     @property
     def way(self) -> str:
-        """What integrates motions whose inputs are constant: machine code, XLA or dense matrices, and why not what comes before."""
+        """How motions with constant inputs are integrated, machine code, XLA or dense matrices, and why no faster way serves."""
         scene = self.reference.scene
         field = vector_field(scene, self.formulation, backend=self.backend)
         if field.lowered is None:
@@ -151,7 +151,7 @@ class Model(BuiltFor, Printed):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the user should look at."""
+        """Sentences on what to look at."""
         said, rows = [], self.rows
         if rows.rank_losses:
             said.append(f"the rows lose rank at {len(rows.rank_losses)} of the probed configurations, first at {rows.rank_losses[0]}")

@@ -37,7 +37,7 @@ class Options:
       `solver` is given); `trajectory.fallback` and its summary say so. Inside your own `jit` or `vmap`, and without it, the result code
       stays.
 
-    `simulate` and its kin take an `Options`, or its fields by name, which replace those of the object.
+    `simulate` and its kin take an `Options`, or its fields by name, which take precedence.
 
     **Examples**
 
@@ -91,13 +91,13 @@ class MotionFields(OptionFields, total=False):
     inputs: Any
 
 
-SPAN = ("t0", "t1", "ts", "inputs")  # what is said of a motion by name besides its options
+SPAN = ("t0", "t1", "ts", "inputs")  # arguments of a motion by name besides its options
 _STATIC = ("max_steps", "events", "work", "retry", "backend")
 OPTION_NAMES = tuple(field.name for field in fields(AllOptions))
 
 
 def _register(kind: type[Options]) -> None:
-    """Make options of a kind a tree, in which anything may stand in the place of numbers."""
+    """Register a kind of options as a pytree whose leaves may be anything."""
     names = [field.name for field in fields(kind)]
     leaves, static = [name for name in names if name not in _STATIC], [name for name in names if name in _STATIC]
 
@@ -130,7 +130,7 @@ GONE = {  # options that there were once -> what serves now
 def as_options(
     options: Options | None, by_name: Mapping[str, Any], function: str = "simulate", refused: Mapping[str, str] | None = None, scene=None
 ) -> AllOptions:
-    """Return the options of a call of `function`: those of the object, replaced by what is given by name.
+    """Return the options of a call of `function`: the fields of the object, replaced by options by name.
 
     `refused`: names that have no meaning for this function, and why; `scene`: a model brings its formulation and backend. Raises TypeError for these and for
     unknown names, ValueError for wrong values.
@@ -172,7 +172,7 @@ _NUMBERS = {  # what fits, what is expected, and what to give
 
 
 def _check(options: AllOptions) -> None:
-    """ValueError for numbers that do not fit, and for objects that are not of their kind."""
+    """Raise ValueError for numbers out of range and for objects of another kind."""
     for name, (fits, expected, advice) in _NUMBERS.items():
         value = getattr(options, name)
         if (type(value) is float and fits(value)) or (value is None and name == "max_step"):
@@ -192,14 +192,14 @@ def _check(options: AllOptions) -> None:
 
 
 def _check_kind(name: str, value) -> None:
-    """ValueError where an option is no object of its kind, with the one that a text or a class may stand for."""
+    """Raise ValueError where an option is no object of its kind; suggest the one that a text or a class may mean."""
     kind, example = getattr(diffrax, _KINDS[name][0]), _KINDS[name][1]
     if not isinstance(value, kind):
         raise ValueError(f"`{name}` is {described(value)}, expected an object of diffrax; write `{_meant(value, kind) or example}`")
 
 
 def _meant(value, kind: type) -> str:
-    """The object that a text or a class may stand for."""
+    """Return the object that a text or a class may mean."""
     if isinstance(value, type) and issubclass(value, kind | ImplicitMethod | Taylor):
         return f"{'jj' if value.__module__.startswith('jourdain_jax') else 'diffrax'}.{value.__name__}()"
     if not isinstance(value, str):

@@ -1,4 +1,4 @@
-"""Our own loop over steps as an integrator: as machine code where that serves, its derivatives too, and as a loop of XLA where not.
+"""Our own loop over steps as an integrator, with its derivatives: machine code where it serves, otherwise a loop of XLA.
 
 One motion, or lanes side by side: those of a scalar program in blocks of `lockstep.width`.
 """
@@ -57,7 +57,7 @@ class OwnSteps(Integrator):
         if not self.native:
             return "another backend was asked for"
         if not isinstance(self.solver, Method):
-            return "a solver with equations in each step was asked for"
+            return "the solver is implicit"
         return native_motion.reason_against(setup.field, setup.scene, setup.inputs, bool(self.event_names))
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
@@ -77,7 +77,7 @@ _once: Callable[..., OwnSteps] = lru_cache(maxsize=64)(OwnSteps)
 
 
 def own_steps(solver, adjoint, **static) -> OwnSteps | None:
-    """Our own loop, where it has such a solver; None where diffrax has."""
+    """Return our own loop where it has the solver; None for solvers of diffrax."""
     method = solver if isinstance(solver, Method | ImplicitMethod) else method_of(solver)
     if method is None:
         return None

@@ -1,4 +1,4 @@
-"""What is tried again after a motion failed, with `retry=True`, and how: one rule for single motions and for the lanes of rollouts.
+"""Retries of failed motions, with `retry=True`: one rule for single motions and for the lanes of rollouts.
 
 FULL_STATE    it left the domain in which its privileged speeds, or its program, serve: the full state, dense matrices
 IMPLICIT      an explicit solver ran out of steps that stability kept short: Radau's method
@@ -52,7 +52,7 @@ def retried(run: Callable[[AllOptions], tuple[Setup, Trajectory]], setup: Setup,
 def lanes_retried(
     run: Callable[[AllOptions, np.ndarray], Trajectory], form: Callable[[AllOptions], VectorField], lanes: Trajectory, begun, options: AllOptions, chunk: int
 ):
-    """Return the lanes, of which those that failed were run again as single motions are, and for each way of retrying the `RERUN_FIELDS` of its lanes.
+    """Run failed lanes again as single motions are; return all lanes, and for each way of retrying the `RERUN_FIELDS` of its lanes.
 
     `run`: the motions of lanes with these numbers, with these options; `form`: what is integrated of them; `begun`: their start times; `chunk`: of `rollout`.
     """
@@ -68,7 +68,7 @@ def lanes_retried(
 
 
 def _next_retries(form: Callable[[AllOptions], VectorField], lanes: Trajectory, begun, options: AllOptions) -> Int[np.ndarray, "lanes"]:
-    """How each lane is run again, all earlier changes of its run included; AS_ASKED: it is not."""
+    """Return how each lane is run again, with all earlier changes of its run; AS_ASKED: it is not."""
     begun = np.broadcast_to(np.asarray(begun), lanes.result.shape)
     found = np.full(lanes.result.shape, results.AS_ASKED)
     for tried in np.unique(lanes.fallback).tolist():
@@ -79,12 +79,12 @@ def _next_retries(form: Callable[[AllOptions], VectorField], lanes: Trajectory, 
 
 
 def _round_up(count: int) -> int:
-    """The next power of two, at least 8: few programs to compile."""
+    """Round up to a power of two, at least 8, so that few programs are compiled."""
     return max(8, 1 << (count - 1).bit_length())
 
 
 def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajectory:
-    """`lanes` with those at `index` from another run."""
+    """Replace the lanes at `index` by those of another run."""
     leaves, treedef = jax.tree.flatten(lanes)
     new = [np.array(x) for x in leaves]
     for old, y in zip(new, jax.tree.leaves(again), strict=True):
@@ -110,7 +110,7 @@ def _next_retry(field: VectorField, motion: Trajectory, t0, options: AllOptions)
 
 
 def _with_retries(retries: int, options: AllOptions) -> AllOptions:
-    """The options with what makes these retries."""
+    """Return the options that make these retries."""
     if retries & results.FULL_STATE:
         solver = DOPRI8 if isinstance(options.solver, Taylor) else options.solver  # dense matrices have no series
         options = replace(options, formulation=replace(as_formulation(options.formulation), state="full"), backend="dense", solver=solver)
@@ -128,7 +128,7 @@ def _marked(motion: Motions, retries: int) -> Motions:
 
 
 def _has_another_form(field: VectorField) -> bool:
-    """Whether a motion that was lost may run again with the full state and dense matrices."""
+    """Return whether a lost motion may run again with the full state and dense matrices."""
     return field.name == "minimal" or field.lowered is not None
 
 

@@ -146,7 +146,7 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
 
 
 def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -> None:
-    """A warning where one of the `motions`, which are differentiated, crossed relations at which rates jump; nothing where that is not known."""
+    """Warn where one of the differentiated `motions` crossed relations at which rates jump; do nothing where that is not known."""
     crossings = _known(motions.crossings)
     if crossings is None or not np.any(crossings):
         return

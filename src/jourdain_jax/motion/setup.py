@@ -25,7 +25,7 @@ from jourdain_jax.motion.start import State
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
-LONGEST = 1 / 16  # of the span: the longest step, where nothing else is asked for
+LONGEST = 1 / 16  # of the span: the longest step, by default
 
 
 class Solved(eqx.Module):

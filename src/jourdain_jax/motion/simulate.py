@@ -63,7 +63,7 @@ def simulate(
     - `t0`, `t1`: ends of the span (s; defaults: the time of a `State`, otherwise 0; the last of `ts`, or the scene's
       `example_span` after t0); `ts`: times to save at (default: 201 even ones), at each of which a step ends.
     - `inputs`: name -> number, function of time, or `Sampled`.
-    - `options`: a `jj.Options`: tolerances, solver, steps, events, work, retries. `by_name`: its fields, as `rtol=1e-10`, which replace those of `options`.
+    - `options`: a `jj.Options`: tolerances, solver, steps, events, work, retries. `by_name`: its fields, as `rtol=1e-10`, which take precedence.
 
     By name alone:
     - `formulation`: which equations are integrated, a `jj.Formulation(state, reduction, stabilisation)` (default: what serves the scene).
@@ -107,7 +107,7 @@ def _simulated(run: Callable[[AllOptions], tuple[Setup, Trajectory]], options: A
 
 
 def _run(scene, start, span: dict, options: AllOptions) -> tuple[Setup, Trajectory]:
-    """What was integrated, and its motion."""
+    """Return the setup and its motion."""
     setup = set_up(scene, start, **span, options=options)
     return setup, warn_if_ill_conditioned(setup, _integrated)
 
@@ -124,7 +124,7 @@ def _integrated(setup: Setup) -> Trajectory:
 
 
 def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, inputs=None, options: Options | None = None, **by_name) -> Setup:
-    """Return what `simulate` integrates for its arguments."""
+    """Return the setup that `simulate` integrates for its arguments."""
     options = as_options(options, by_name, scene=None if type(options) is AllOptions else scene)
     reference = scene.reference if isinstance(scene, BuiltFor) else None
     solver, max_step = options.solver, options.max_step
@@ -159,7 +159,7 @@ def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, in
     if options.backend == "native" and (reason := setup.reason_against_machine_code):
         raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
     if order is not None and (reason := reason_against_series(setup, order)):
-        raise ValueError(f"solver=jj.Taylor() cannot integrate `{type(scene).__name__}`: {reason}; leave `solver` away, or use solver=diffrax.Dopri8()")
+        raise ValueError(f"solver=jj.Taylor() cannot integrate `{type(scene).__name__}`: {reason}; omit `solver`, or use solver=diffrax.Dopri8()")
     return setup
 
 

@@ -43,7 +43,7 @@ def reason_against_watching(setup: Setup) -> str:
 
 
 def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies: bool) -> bool:
-    """Whether rates may jump at a time that moves with the state or with what is differentiated: parameters where the `scene_varies`, and numbers of inputs."""
+    """Return whether rates may jump at a time that depends on the state, on numbers of inputs, or, where the `scene_varies`, on parameters."""
     if field.lowered is None:
         return loads_may_jump(scene)
     program, _ = _relations(field.lowered, inputs, False)

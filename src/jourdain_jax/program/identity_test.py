@@ -171,7 +171,7 @@ def identity_probes(probes: Probes, unchanged: Collection[str]) -> IdentityProbe
 
 
 def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinates: Mapping[str, int]) -> IdentityProbes:
-    """Generic `probes` with `coordinates` (names of inputs, their nodes) on rows = 0, by Gauss-Newton from `near`; nothing is said where it does not arrive.
+    """Generic `probes` with `coordinates` (names of inputs, their nodes) on rows = 0, by Gauss-Newton from `near`; silent where it does not converge.
 
     The probes unchanged where the rows hold another function than the known ones, of which nothing can be solved.
     """

@@ -23,7 +23,7 @@ F = TypeVar("F", bound=Callable)
 
 
 class BuiltFor:
-    """A scene with what was settled about it (`motion/model.py: Model`); functions that ask for `as_scene` take it in the place of that scene."""
+    """A scene with its choices (`motion/model.py: Model`); functions that call `as_scene` take it in place of the scene."""
 
     scene: Scene
     formulation: Any

@@ -57,7 +57,7 @@ class Contact(eqx.Module):
         if ground is not None:
             _checked_ground(ground, self.body)
         if shape is not None and not isinstance(shape, get_args(Shape)):
-            advice = "leave it away, and state the body's look in `visuals`"
+            advice = "omit it, and state the body's look in `visuals`"
             raise ValueError(f"`shape` of the contact of `{self.body}` is {described(shape)}, expected what `ball_contact` and its like fill in; {advice}")
         self.point = checked_real(point, f"point of the contact of `{self.body}`", (3,), advice="give three components in the inertial frame, m")
         self.plane = plane if plane is not None else Plane() if ground is None else ground.plane_at(self.point)

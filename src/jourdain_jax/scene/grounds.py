@@ -46,7 +46,7 @@ class Plane(eqx.Module):
     def __init__(self, origin=(0.0, 0.0, 0.0), tilt=None, velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0), *, normal=None, along=None):
         """The plane z = 0, turned by `tilt` (rad, about y; or a rotation matrix); or the one with this `normal`, and its first tangent `along`."""
         if tilt is not None and normal is not None:
-            raise ValueError("a plane has both a `tilt` and a `normal`, expected one of them; leave one away")
+            raise ValueError("a plane has both a `tilt` and a `normal`, expected one of them; omit one")
         if normal is None:
             axes = _turned(0.0 if tilt is None else tilt)
             self.normal, tangents = axes[:, 2], axes[:, :2].T

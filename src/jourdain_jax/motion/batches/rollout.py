@@ -163,8 +163,8 @@ def rollout(
     - `starts`: name -> number or array of shape (lanes,) (as in `jj.start`; the rest is solved for), or a `State` with a leading axis of lanes.
     - `parameters`: parameter name -> array with a leading axis of lanes, where lanes differ in parameters.
     - `chunk`: lanes that run together (default: 512, less where saved states would pass 1 GiB); `progress`: a bar (default: with several chunks).
-    - `options`: a `jj.Options`; `by_name`: its fields, and `t0`, `t1`, `ts`, `inputs`, as in `simulate`. Inputs are those of all lanes; where lanes differ in
-      inputs, take `jax.vmap` of `simulate`.
+    - `options`: a `jj.Options`; `by_name`: its fields, and `t0`, `t1`, `ts`, `inputs`, as in `simulate`. All lanes have the same inputs; where they are to
+      differ, use `jax.vmap` of `simulate`.
 
     Raises ValueError for unknown names and unequal lengths. Lanes never raise: see `Rollout.failed` and `print(rollout)`. Derivatives of
     what lies after a failure are NaN; `jnp.where(rollout.lanes.succeeded, ..., 0.0)` leaves such lanes out of a loss, and of its derivatives.
@@ -257,7 +257,7 @@ _compiled = for_programs(_lanes_in_lockstep)
 
 
 def _with_arrays(options: AllOptions) -> AllOptions:
-    """Options with their numbers as arrays: another tolerance or first step is no other program."""
+    """Return options with their numbers as arrays, so that another tolerance or first step compiles nothing."""
     real, solver = jnp.result_type(float), options.solver
     warn_float32(real, options.rtol)
     if solver is None:

@@ -168,7 +168,7 @@ def _tried(problem: Problem, method: Method | ImplicitMethod, p: Progress, goal,
 
 
 def _by_equations(problem: Problem, method: ImplicitMethod, p: Progress, h) -> tuple[Solution, list[PyTree], "Pivots | None"]:
-    """A step from `p` by an implicit method; the slopes at both ends where events need them; what the pivots were, where there are any."""
+    """Take a step from `p` by an implicit method; return also slopes at both ends where events need them, and pivots, where there are any."""
     inside = problem.in_step(p.t, h)
     found = method.solve(inside, p.t, p.y, h)
     if p.search is not None:
@@ -187,7 +187,7 @@ def _by_equations(problem: Problem, method: ImplicitMethod, p: Progress, h) -> t
 
 
 def _relative(free: PyTree, y_0: PyTree, y_1: PyTree) -> Float[Array, ""]:
-    """How far a projection moved a state, from `free` to `y_1`, relative to the change from `y_0`: the largest ratio of any part of the state."""
+    """Return how far a projection moved a state from `free` to `y_1`, relative to the change from `y_0`: the largest ratio of any part of the state."""
     ratios = []
     for given, before, after in zip(*map(jax.tree.leaves, (free, y_0, y_1)), strict=True):
         change = jnp.max(jnp.abs(after - before), initial=0.0) + _REST * (1 + jnp.max(jnp.abs(after), initial=0.0))

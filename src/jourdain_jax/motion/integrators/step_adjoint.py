@@ -1,4 +1,4 @@
-"""One step gone back over, in what follows of an explicit Runge-Kutta method: cotangents of its start from those of its end.
+"""Adjoint of one step, below for an explicit Runge-Kutta method: from cotangents of its end to cotangents of its start.
 
 Y_i = y_0 + h sum_j a_ij k_j,   k_i = f(t_0 + c_i h, Y_i, args),   y_1 = y_0 + h sum b_i k_i
 v_i = b_i g_1 + sum_l a_li G_l,   (tau_i, G_i) = (df/dt, df/dy)' h v_i              from the last stage to the first
@@ -61,7 +61,7 @@ def step_vjp(problem_of: Callable[[PyTree], Problem], shared: PyTree, method: Me
 
 
 def _by_jax(problem_of: Callable[[PyTree], Problem], shared: PyTree, method: ImplicitMethod, t_0, t_1, y: PyTree, g: PyTree) -> StepCotangents:
-    """Cotangents of a step of an implicit method, which JAX takes through the equations of the step; none of a lane that stands still."""
+    """Return cotangents of a step of an implicit method, by JAX through the equations of the step; zero for a lane that stands still."""
 
     def end(t_0, t_1, y, shared):
         problem, h = problem_of(shared), t_1 - t_0

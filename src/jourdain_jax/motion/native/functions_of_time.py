@@ -84,7 +84,7 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
 
 
 def _random(graph: Graph, nodes: Iterable[int]) -> Probes:
-    """Any times and any numbers in functions."""
+    """Return random times and numbers for functions."""
     generator = np.random.default_rng(11)
     return Probes(graph, {str(graph.value[n]): generator.uniform(-1.0, 3.0, STATES) for n in graph.reachable(nodes) if graph.op[n] == "input"})
 

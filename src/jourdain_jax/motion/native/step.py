@@ -206,7 +206,7 @@ def _stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value, t: Value,
 
 
 def _turns_round(w: Writer, form: Form, first: list[Value], now: list[Value]) -> Value:
-    """Whether a direction of a row makes no acute angle with what it was at first."""
+    """Return whether the angle between a direction of a row and its first direction is not acute."""
     acute = [reduce(operator.add, (first[k] * now[k] for k in row)) > 0.0 for row in form.directions]
     return ~reduce(operator.and_, acute) if acute else w.literal(0, w.truth)
 

@@ -2,7 +2,7 @@
 
     o = f(x),    f'(x) v,    g f'(x),    f''(x) w v,    g f''(x) v         o: values of the nodes, x: of the variables
 
-Each is machine code of its own, made when it is asked for: derivatives are taken on the graph. Those of programs that are too large are JAX's derivatives of
+Each is machine code of its own, made when it is asked for: derivatives are taken on the graph. For programs that are too large these are JAX's derivatives of
 the program as XLA runs it.
 """
 

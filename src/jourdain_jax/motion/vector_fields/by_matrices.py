@@ -33,12 +33,12 @@ class ByMatrices(VectorField):
         return inputs.near(t) if self.inputs_in_rows else inputs(t)
 
     def solved(self, scene: Scene, t, q, u, inputs) -> tuple[Motion, Reduced, Float[Array, "rows speeds"]]:
-        """The motion with these speeds, its accelerations by the reduction, and what it leaves of rows that are nonlinear in the speeds."""
+        """Return the motion with these speeds, its accelerations, and the eliminated rows that are nonlinear in the speeds."""
         found, equations, rows = reduced_at(scene, t, q, u, inputs, self.reduction, self.stabilisation, self.usual.rows)
         return motion_at(scene, t, q, u, inputs), found, _left_by_elimination(scaled(equations, rows).A[jnp.array(self.nonlinear_rows, int)])
 
     def watched(self, scene: Scene, t, y: Integrated, rates: Integrated, pivots, rows) -> Watched:
-        """These rates, pivots and rows; and rates of coordinates by each speed of the scene's own, which must not become infinite."""
+        """Add the rates of coordinates by each speed of the scene's own, which must not become infinite, to these rates, pivots and rows."""
         N = jax.lax.stop_gradient(rates_by_own_speeds(scene, t, y.q))
         width = max(rows.shape[1], N.shape[1])
         padded = [jnp.pad(x, ((0, 0), (0, width - x.shape[1]))) for x in (rows, N)]
@@ -119,7 +119,7 @@ class FullByMatrices(ByMatrices):
         return y.v, bare_accelerations(scene, t, y.q, y.v, inputs, reduction=self.reduction).pivot
 
     def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Watched:
-        """As `rates`; what is left of rows; and 1 where the rows say on which branch the motion goes on, -1 where round-off does."""
+        """Return `rates`, eliminated rows, and 1 where the rows decide on which branch the motion continues, -1 where round-off does."""
         motion, found, directions = self.solved(scene, t, y.q, y.v, inputs)
         rates = Integrated(motion.qdot.array, found.udot, self.power(scene, motion, found))
         branch = jnp.zeros(0) if self.undecided is None else jnp.where(found.pivot > self.undecided, 1.0, -1.0)[None]
@@ -127,7 +127,7 @@ class FullByMatrices(ByMatrices):
 
 
 def _left_by_elimination(A: Float[Array, "rows speeds"]) -> Float[Array, "rows speeds"]:
-    """What is left of each row orthogonal to those before it."""
+    """Return the part of each row that is orthogonal to the rows before it."""
     Q, R = jnp.linalg.qr(jax.lax.stop_gradient(A).T)
     return (Q * jnp.diagonal(R)).T
 

@@ -37,7 +37,7 @@ class ByProgram(VectorField):
 
     @property
     def pivots(self) -> int:
-        """How many are monitored: all; where multipliers keep all speeds on the rows, those of the coordinate rates alone."""
+        """Return how many are monitored: all, or with multipliers only those of the coordinate rates."""
         return self.program.divisors if self.independent is None and not self.program.by_partition else len(self.program.pivots)
 
     def fixed(self, scene: Scene) -> tuple:
@@ -64,7 +64,7 @@ class ByProgram(VectorField):
         return super().events(scene, fixed, t, y, inputs)
 
     def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Watched:
-        """As `rates`, the pivots of the elimination relative to their usual sizes, and what is left of rows by it."""
+        """Return `rates`, the pivots of the elimination relative to their usual sizes, and the eliminated rows."""
         qdot, vdot, power, pivots, directions = self.program.rates_and_pivots(fixed, t, tuple(y.q), tuple(y.v), inputs, self.with_work)
         pivots = pivots[: self.pivots]
         monitored = jnp.stack(pivots) if pivots else jnp.zeros((0, *y.q.shape[1:]))

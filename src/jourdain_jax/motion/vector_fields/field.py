@@ -33,7 +33,7 @@ class Integrated(eqx.Module):
 
 
 class Watched(NamedTuple):
-    """Rates, what must keep its sign, and rows that must not turn round: where these are nonlinear in the speeds."""
+    """Rates, pivots that must keep their signs, and directions of rows nonlinear in the speeds, which must not turn round."""
 
     rates: Integrated
     pivots: Float[Array, "pivots *lanes"]
@@ -136,7 +136,7 @@ class VectorField(eqx.Module):
 
     @abc.abstractmethod
     def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Watched:
-        """As `rates`, and what is watched at all stages of a step."""
+        """Return `rates` with what is watched at all stages of a step."""
 
     @abc.abstractmethod
     def project(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
