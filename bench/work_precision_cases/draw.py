@@ -99,9 +99,9 @@ def draw(entries: list[dict], out: Path) -> None:
         title = "Error against time, one trajectory at a time on one core, warm (lower left is better)"
         _chart(single, main, MAIN_LOOKS, _time, _TIME, title, out / "work_precision", columns=2)
         _chart(single, problems, MAIN_LOOKS, _time, _TIME, title, out / "work_precision_all")
-        evaluations = "Error against evaluations of the right-hand side (lower left is better; implicit methods and heyoka do not count them)"
+        evaluations = "Error against evaluations of the right-hand side (not counted: implicit methods, heyoka)"
         _chart(single, problems, MAIN_LOOKS, lambda e: e["rhs_evaluations"], _EVALUATIONS, evaluations, out / "work_precision_evaluations")
-        own = "Methods of this engine: solvers, forms of the state, reductions (dense unless lowered; Dopri8 unless said; lower left is better)"
+        own = "Methods of this engine, by Dopri8 and dense matrices where nothing else is stated (lower left is better)"
         _chart(single, problems, OWN_LOOKS, _time, _TIME, own, out / "work_precision_methods")
     batched = [e for e in entries if "batch" in e and e["note"].startswith("starts")]
     if batched:
