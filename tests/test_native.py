@@ -236,7 +236,7 @@ def test_a_scene_is_integrated_without_llvmlite(monkeypatch):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"backend": "native", "solver": diffrax.Heun()}, "'native' cannot integrate `TiltingDisc`: a solver"),
+        ({"backend": "native", "solver": diffrax.Heun()}, "'native' cannot integrate `TiltingDisc`: the solver is"),
         ({"backend": "native", "formulation": jj.Formulation(reduction="kkt")}, "'native' cannot integrate `TiltingDisc`: a reduction"),
         ({"backend": "xla", "formulation": jj.Formulation(reduction="kkt")}, "'xla' cannot integrate `TiltingDisc`: a reduction"),
         ({"backend": "nativ"}, "unknown backend `nativ`.*native"),
