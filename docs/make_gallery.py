@@ -256,10 +256,10 @@ def page_of(entry: Entry, out: Path) -> str:
     shown = entry.source.relative_to(ROOT).as_posix()
     where = " in the folder `docs/gallery`" if entry.import_line else ""
     included = f"\n## The scene\n\n```{{literalinclude}} {link}\n:language: python\n```\n" if entry.import_line else ""
-    module = inspect.getdoc(sys.modules[entry.kind.__module__]) or ""
+    told = "\n\n".join(filter(None, map(inspect.getdoc, (inspect.getmodule(entry.kind), entry.kind))))
     return f"""# {entry.title}
 
-{prose_of(module)}
+{prose_of(told)}
 
 ![{entry.title}: the motion, earlier times paler]({entry.name}.png)
 

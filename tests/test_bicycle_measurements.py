@@ -7,8 +7,8 @@ import pytest
 from oracles.hang_lines import mean_of_intersections
 
 from jourdain_jax.bicycle import Refused, benchmark_from_measurements, measured_bicycle, sample_parameters, shipped_bicycles, shipped_measurements, study
+from jourdain_jax.bicycle.from_measurements import SwungPart, TwistedPart, period
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
-from jourdain_jax.bicycle.pendulums import SwungPart, TwistedPart, period
 from jourdain_jax.bicycle.readings import read_readings
 from jourdain_jax.cli import main
 

@@ -13,13 +13,13 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 462_300,
+    "code tokens of src": 460_300,
     "code tokens of tests": 384_100,
     "code tokens of bench": 120_600,
-    "code tokens of docs": 11_442,
+    "code tokens of docs": 11_441,
     "code tokens of notebooks": 7_444,
-    "caches": 110,
-    "named numbers": 650,
+    "caches": 109,
+    "named numbers": 638,
     "tests for a tracer": 134,
     "functions with more than 8 parameters": 11,
     "test files that reach private names": 82,

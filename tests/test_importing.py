@@ -26,7 +26,7 @@ assert jax.device_count() == 3
 
 disc = jj.models.TiltingDisc()
 assert jj.simulate(disc, jj.start(disc, lean=0.3, spin_rate=-3.0), t1=0.1).result == 0
-left = {"diffrax", "optimistix", "lineax", "tqdm", "jourdain_jax.analysis", "jourdain_jax.ensembles", "jourdain_jax.plotting", "jourdain_jax.models.skate"}
+left = {"diffrax", "optimistix", "lineax", "tqdm", "jourdain_jax.analysis", "jourdain_jax.ensembles", "jourdain_jax.plotting", "jourdain_jax.models.blades"}
 imported = left & sys.modules.keys()
 assert not imported, imported
 from jourdain_jax import fit
@@ -49,7 +49,7 @@ def _imports(package) -> dict[str, str]:
 @pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.__name__)
 def test_public_names_are_there_and_those_that_static_tools_see(package):
     public, imports = set(package.__all__), _imports(package)
-    assert public == {name for name in imports if not name.startswith("_") and name not in ("names_on_first_use", "PLACES")}
+    assert public == {name for name in imports if not name.startswith("_") and name not in ("names_on_first_use", "CLASSES")}
     assert public <= set(dir(package))
     for name in public:
         module = import_module(imports[name])

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
-from jourdain_jax.models.tilting_disc import TiltingDisc
+from jourdain_jax.models import ChaplyginSleigh, TiltingDisc
 from jourdain_jax.motion.trajectories import results
 
 OPTIONS = {"t1": 2.0, "ts": jnp.linspace(0.0, 2.0, 5), "rtol": 1e-9, "atol": 1e-9}

@@ -8,9 +8,7 @@ import pytest
 
 import jourdain_jax as jj
 from jourdain_jax.calculus.guards import DifferentiationModeError
-from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
-from jourdain_jax.models.double_pendulum_rods import DoublePendulumRods
-from jourdain_jax.models.skate import Skate
+from jourdain_jax.models import ChaplyginSleigh, DoublePendulumRods, Skate
 from jourdain_jax.motion import integration
 from jourdain_jax.motion.trajectories import results
 

@@ -3,7 +3,7 @@
 from oracles import ball_on_turntable, chaplygin_sleigh, rattleback, rolling_disc, snakeboard, two_wheel_axle
 
 import jourdain_jax as jj
-from jourdain_jax.models.trailer_chain import TrailerChain
+from jourdain_jax.models import TrailerChain
 from work_precision_cases import references
 from work_precision_cases.problem import Problem
 

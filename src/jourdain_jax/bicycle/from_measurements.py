@@ -3,13 +3,18 @@
     y: readings with standard deviations s;   theta(y): parameters, defined by conditions F(theta, y) = 0
     covariance of theta = J diag(s^2) J',     J = d theta / d y = - F_theta^-1 F_y      (implicit function theorem)
 
-F says that the scenes of `pendulums.py` have the periods that were timed, and that the mass centre of a hung part lies below the rod. Of more than
+F says that the scenes at the end of this file have the periods that were timed, and that the mass centre of a hung part lies below the rod. Of more than
 three hangings, and of three upright lines through one point, the sum of squares is smallest. Readings are independent; parameters that come of the same
 readings are not: all inertias share the stiffness of the rod, and the place of a mass centre its moment of inertia about y.
+
+    swung on a level axle       (I + m l^2) angle'' + m g l sin angle = 0        T = 2 pi sqrt((I + m l^2) / (m g l))
+    twisted on an upright rod   (n . I n) twist'' + k twist = 0                  T = 2 pi sqrt((n . I n) / k)
+
+n is the direction of the rod in axes of the part. Periods come from the scenes, not from these formulas, which the tests compare them with.
 Source: J. D. G. Kooijman, M.Sc. thesis, Delft (2006), chapter 3; J. K. Moore, Human control of a bicycle, Ph.D. thesis, Davis (2012), chapter 4.
 """
 
-from functools import lru_cache
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -19,16 +24,19 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, shipped_measurements
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, doubts, violations
-from jourdain_jax.bicycle.pendulums import SwungPart, TwistedPart, period
 from jourdain_jax.bicycle.readings import Readings, read_readings
 from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.calculus.newton import newton_root
+from jourdain_jax.calculus.rotations import rot_y, rot_z
+from jourdain_jax.equations.virtual_power import generalized_forces, mass_matrix_at
+from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.coordinates import coordinates
+from jourdain_jax.scene.loads import generalized_force, gravity
 from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.parameters import Scalar, parameter
+from jourdain_jax.scene.scene import Scene
 
-Scalar = Float[Array, ""]
 Values = dict[str, Scalar]
-
-_FAR = 3.0  # standard deviations, by which upright lines may miss a mass centre without a word
 
 
 def benchmark_from_measurements(path: str | Path) -> MeasuredBicycle:
@@ -51,7 +59,8 @@ def benchmark_from_measurements(path: str | Path) -> MeasuredBicycle:
             raise ValueError(f"there are no measurements of a bicycle `{path}`, and no such file; {nearest(path, known)}")
         path = known[path]
     readings = read_readings(path)
-    found, slopes = _with_slopes(readings)
+    means = {name: jnp.asarray(value, jnp.result_type(float)) for name, value in readings.means.items()}
+    found, slopes = _with_slopes(means, tuple(readings.hangings.items()), readings.by_table)
     sigmas = np.array([readings.sigmas[name] for name in readings.means])
     jacobian = np.array([slopes[name] for name in (*PARAMETER_NAMES, *_misses(readings))]) * sigmas
     values = {name: float(found[name]) for name in PARAMETER_NAMES}
@@ -85,7 +94,7 @@ def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> tup
         # where sigmas are zero, so is the scale
         ratio = np.divide(distance, sigma, out=np.where(np.array(distance) > 1e-12, np.inf, 0.0), where=sigma > 0)
         worst = int(np.argmax(ratio))
-        if ratio[worst] > _FAR:
+        if ratio[worst] > 3:  # standard deviations, by which lines may miss a mass centre without a word
             warnings.append(
                 f"upright lines through the hung part {part} miss its mass centre by up to {1e3 * max(distance):.1f} mm, {ratio[worst]:.0f} sigmas: "
                 "these sigmas are too small, or a reading is wrong"
@@ -93,22 +102,11 @@ def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> tup
     return tuple(warnings)
 
 
-def _with_slopes(readings: Readings) -> tuple[Values, dict[str, Float[Array, "readings"]]]:
+@partial(compiled, options=RUN_SELDOM)
+def _with_slopes(means: Values, hangings: tuple[tuple[str, tuple[int, ...]], ...], by_table: bool) -> tuple[Values, dict[str, Float[Array, "readings"]]]:
     """Parameters and distances of upright lines, and their derivatives with respect to each reading, in the order of its means."""
-    means = {name: jnp.asarray(value, jnp.result_type(float)) for name, value in readings.means.items()}
-    return _program(tuple(readings.hangings.items()), readings.by_table)(means)
-
-
-@lru_cache(maxsize=8)
-def _program(hangings: tuple[tuple[str, tuple[int, ...]], ...], by_table: bool):
-    """The compiled function of readings with these names."""
-
-    def run(means: Values):
-        found, slope = jax.linearize(lambda y: _parameters(y, dict(hangings), by_table), means)  # compiles in half the time of `jacfwd`
-        by = [{name: jnp.asarray(float(name == one)) for name in means} for one in means]
-        return found, jax.vmap(slope)(jax.tree.map(lambda *x: jnp.stack(x), *by))
-
-    return compiled(run, options=RUN_SELDOM)
+    found, slope = jax.linearize(lambda y: _parameters(y, dict(hangings), by_table), means)  # compiles in half the time of `jacfwd`
+    return found, jax.vmap(slope)(dict(zip(means, jnp.eye(len(means)), strict=True)))
 
 
 def _parameters(y: Values, hangings: dict[str, tuple[int, ...]], by_table: bool) -> Values:
@@ -222,3 +220,51 @@ def _of_whole_bicycle(found: Values) -> Values:
         apart = {"xx": m * dz**2, "yy": m * (dx**2 + dz**2), "zz": m * dx**2, "xz": -m * dx * dz}
         moments = {axes: moments[axes] + found[f"I{part}{axes}"] + apart[axes] for axes in moments}
     return {"mH": mass, "xH": x, "zH": z} | {f"IH{axes}": moment for axes, moment in moments.items()}
+
+
+class SwungPart(Scene):
+    """A part hung on a level axle, `length` away from its mass centre: a compound pendulum."""
+
+    mass: Scalar = parameter(5.0, unit="kg", positive=True)
+    inertia: Scalar = parameter(0.5, unit="kg m^2", positive=True)  # about an axis along the axle, through the mass centre
+    length: Scalar = parameter(0.3, unit="m", positive=True)
+    gravity: Scalar = parameter(9.81, unit="m/s^2")
+
+    coordinates = coordinates("angle")
+    conventions = "x horizontal, z up; the axle lies along y through the origin; angle from hanging straight down."
+
+    def bodies(self, t, q):
+        centre = self.length * jnp.stack([jnp.sin(q.angle), jnp.zeros_like(q.angle), -jnp.cos(q.angle)])
+        return {"part": RigidBody(self.mass, jnp.full(3, self.inertia), centre, rot_y(-q.angle))}
+
+    def loads(self, motion):
+        return (gravity(motion, self.gravity),)
+
+
+class TwistedPart(Scene):
+    """A part clamped to an upright rod that twists, its mass centre below the rod: a torsional pendulum."""
+
+    Ixx: Scalar = parameter(0.5, unit="kg m^2")
+    Izz: Scalar = parameter(0.5, unit="kg m^2")
+    Ixz: Scalar = parameter(0.0, unit="kg m^2")
+    tilt: Scalar = parameter(0.0, unit="rad")  # of the part about its y axis, from where its z axis lies along the rod
+    stiffness: Scalar = parameter(5.0, unit="N m/rad", positive=True)
+
+    coordinates = coordinates("twist")
+    conventions = "The rod lies along z; x and z of the part are in the plane of symmetry of the bicycle that it belongs to."
+
+    def bodies(self, t, q):
+        zero = jnp.zeros(())
+        # Iyy does not matter to turns about a direction in the plane of x and z; nor does the mass
+        inertia = jnp.stack([jnp.stack([self.Ixx, zero, self.Ixz]), jnp.array([0.0, 1.0, 0.0]), jnp.stack([self.Ixz, zero, self.Izz])])
+        return {"part": RigidBody(1.0, inertia, jnp.zeros(3), rot_z(q.twist) @ rot_y(self.tilt))}
+
+    def loads(self, motion):
+        return (generalized_force(motion, twist_rate=-self.stiffness * motion.q.twist),)
+
+
+def period(pendulum: SwungPart | TwistedPart) -> Scalar:
+    """Period of small motions about rest, s: 2 pi sqrt(M / K), M the mass in the scene's equation, K by how much its force falls with the coordinate."""
+    zero, rest = jnp.zeros(()), jnp.zeros(1)
+    force = lambda q: generalized_forces(pendulum, zero, q, rest)[0]  # noqa: E731
+    return 2 * jnp.pi * jnp.sqrt(mass_matrix_at(pendulum, zero, rest)[0, 0] / -jax.jvp(force, (rest,), (jnp.ones(1),))[1])

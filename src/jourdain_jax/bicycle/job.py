@@ -14,14 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.bicycle.from_measurements import benchmark_from_measurements
-from jourdain_jax.bicycle.linear import linear_matrices
+from jourdain_jax.bicycle.linear import linear_matrices, upright_running
 from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, read_bicycle
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
 from jourdain_jax.bicycle.readings import holds_readings
-from jourdain_jax.bicycle.rides import Rides, ride, ride_speeds
 from jourdain_jax.bicycle.stability import eigenvalues, stability_speeds
 from jourdain_jax.bicycle.uncertainty import interval, sample_parameters
 from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
+from jourdain_jax.models.whipple_bicycle import WhippleBicycle
+from jourdain_jax.motion.batches.rollout import Rollout, rollout
+from jourdain_jax.motion.start import State
 from jourdain_jax.motion.trajectories.results import EVENT
 
 SPEEDS = ("weave_speed", "capsize_speed", "double_root_speed")
@@ -31,7 +33,6 @@ CAVEAT = (
     "independent, because files of parameters carry no covariance; of raw measurements, `*Measured.txt`, it is known, and used.\n"
     f"A missing sigma counts as zero. Speeds above {MAX_SPEED:g} m/s count as none."
 )
-_GRID = 81
 
 
 class Refused(eqx.Module):
@@ -43,6 +44,14 @@ class Refused(eqx.Module):
     def as_dict(self) -> dict:
         """One object of `result.json`."""
         return {"file": self.path, "bicycle": None, "error": self.error} | dict.fromkeys(SPEEDS)
+
+
+class Rides(eqx.Module):
+    """Three rides, by label."""
+
+    labels: tuple[str, ...] = eqx.field(static=True)
+    speeds: np.ndarray  # m/s
+    lanes: Rollout
 
 
 class Study(eqx.Module):
@@ -98,8 +107,7 @@ def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Re
     values = jnp.concatenate([nominal[None], jnp.where(drawn.physical[:, None], drawn.values, nominal)])
     found, matrices = _speeds(values)
     weave, capsize = float(found.weave_speed[0]), float(found.capsize_speed[0])
-    grid = _speeds_to_draw(_top_speed(weave, capsize), float(found.double_root_speed[0]))
-    labels, ridden = ride_speeds(weave, capsize, bool(found.stable_range_exists[0]))
+    grid = _speeds_to_draw(weave, capsize, float(found.double_root_speed[0]))
     return Study(
         path=str(path),
         bicycle=bicycle,
@@ -108,8 +116,34 @@ def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Re
         grid=grid,
         eigenvalues=np.asarray(_modes(matrices, jnp.asarray(grid))),
         physical=physical,
-        rides=ride(bicycle.values, labels, ridden),
+        rides=ride(bicycle.values, ride_speeds(weave, capsize, bool(found.stable_range_exists[0]))),
     )
+
+
+def ride_speeds(weave: float, capsize: float, stable: bool) -> dict[str, float]:
+    """Speeds (m/s) by label: below, inside and above the stable range; fixed ones, and so labelled, where there is no range."""
+    if not stable or not np.isfinite(weave):
+        return {f"no stable range, {v:.1f} m/s": v for v in (3.0, 5.0, 8.0)}
+    if not np.isfinite(capsize) or capsize <= weave:  # stable from the weave speed on
+        return {"below the stable range": 0.75 * weave, "inside it, near its start": 1.2 * weave, "inside it, faster (it has no end)": 2.0 * weave}
+    return {"below the stable range": 0.75 * weave, "inside the stable range": (weave + capsize) / 2, "above the stable range": 1.3 * capsize}
+
+
+def ride(values: dict[str, float], by_label: dict[str, float]) -> Rides:
+    """Simulate the rides of the bicycle with these parameters: a kick in lean rate from upright running, no hands, until it falls."""
+    speeds = np.array(list(by_label.values()))
+    parameters = {name: jnp.full(len(speeds), value) for name, value in values.items()}
+    bicycle = WhippleBicycle.from_values(values)
+    kicked = jax.vmap(lambda speed: _kicked(bicycle, speed))(jnp.asarray(speeds))
+    lanes = rollout(WhippleBicycle(), kicked, parameters=parameters, ts=np.linspace(0.0, 6.0, 301), progress=False, work=False)
+    return Rides(tuple(by_label), speeds, lanes)
+
+
+def _kicked(bicycle: WhippleBicycle, speed) -> State:
+    """Upright running with 0.1 rad/s of lean, which leaves the rows alone: at zero lean and steer they do not contain it."""
+    running = upright_running(bicycle, speed)
+    lean = bicycle.speed_names.index("lean_rate", "speed")
+    return eqx.tree_at(lambda state: state.u, running, running.u.at[lean].set(0.1))
 
 
 def _speeds_and_matrices(values):
@@ -130,20 +164,15 @@ def _interval(values, physical) -> dict | None:
     if np.isnan(values).all():
         return None
     limits = interval(values[1:], nominal=values[0], counted=jnp.asarray(physical))
-    numbers = {"value": limits.value, "low": limits.low, "high": limits.high, "fraction": limits.fraction}
-    return {name: None if np.isnan(x) else float(x) for name, x in numbers.items()}
+    return {name: None if np.isnan(x) else float(x) for name, x in vars(limits).items()}
 
 
-def _speeds_to_draw(top: float, double_root: float) -> np.ndarray:
-    """Even speeds up to `top`, and closer ones about the double root, where two eigenvalues leave each other like a square root."""
-    middle = double_root if np.isfinite(double_root) else 0.0
-    close = middle + 0.1 * top * np.linspace(-1.0, 1.0, _GRID // 4) ** 3
-    return np.sort(np.concatenate([np.linspace(0.0, top, _GRID), np.clip(close, 0.0, top)]))
-
-
-def _top_speed(weave: float, capsize: float) -> float:
+def _speeds_to_draw(weave: float, capsize: float, double_root: float) -> np.ndarray:
+    """Even speeds beyond those that are known, and closer ones about the double root, where two eigenvalues leave each other like a square root."""
     known = [v for v in (weave, capsize) if np.isfinite(v)]
-    return float(np.clip(1.6 * max(known, default=6.0), 8.0, 20.0))
+    top = float(np.clip(1.6 * max(known, default=6.0), 8.0, 20.0))
+    close = np.nan_to_num(double_root) + 0.1 * top * np.linspace(-1.0, 1.0, 20) ** 3
+    return np.sort(np.concatenate([np.linspace(0.0, top, 81), np.clip(close, 0.0, top)]))
 
 
 def run(paths: Sequence[str | Path], *, samples: int = 2000, seed: int = 0, progress=lambda text: None) -> list[Study | Refused]:

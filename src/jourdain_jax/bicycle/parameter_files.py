@@ -8,7 +8,7 @@ files carry no covariance: sigmas are those of independent errors.
 import dataclasses
 import difflib
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib import resources
 from pathlib import Path
 
@@ -25,13 +25,9 @@ from jourdain_jax.scene.names import nearest
 
 from .parameters import PARAMETER_NAMES, doubts, violations
 
-_LARGEST_FILE = 1_000_000  # bytes; a parameter file has about a thousand
 _FORMAT = "`name = value` or `name = value+/-sigma`, for example `rF = 0.35+/-0.001`"
-_HANDLEBAR_FORK_SPLIT = re.compile(r"m[GS]|[xyz][GS]|I[GS](xx|yy|zz|xz)")  # bodies G and S together are H
 _REPEATED = {"IRzz": "IRxx", "IFzz": "IFxx"}  # a wheel is symmetric
 _OUT_OF_PLANE = ("yB", "yH")  # a Whipple bicycle is symmetric: zero
-_NOT_OF_THE_BICYCLE = ("v",)
-_PARAMETERIZATIONS = ("benchmark", "Meijaard2007")
 
 
 class MeasuredBicycle(eqx.Module):
@@ -83,8 +79,7 @@ def measured_bicycle(name: str) -> MeasuredBicycle:
 
 def shipped_bicycles() -> dict[str, Path]:
     """The parameter files that come with the package, name -> path (`Tms` is among them, and is degenerate)."""
-    folder = Path(str(resources.files("jourdain_jax") / "data" / "bicycles"))
-    return {_bicycle_name(path): path for path in sorted(folder.glob("*Benchmark.txt"))}
+    return _shipped("Benchmark")
 
 
 def shipped_measurements() -> dict[str, Path]:
@@ -92,8 +87,12 @@ def shipped_measurements() -> dict[str, Path]:
 
     Those of `Silver` hold none of its parts; those of `Gyro`, `Rigidcl` and `Stratos` have no published parameters.
     """
+    return _shipped("Measured")
+
+
+def _shipped(ending: str) -> dict[str, Path]:
     folder = Path(str(resources.files("jourdain_jax") / "data" / "bicycles"))
-    return {path.stem.removesuffix("Measured"): path for path in sorted(folder.glob("*Measured.txt"))}
+    return {path.stem.removesuffix(ending) or path.stem: path for path in sorted(folder.glob(f"*{ending}.txt"))}
 
 
 def read_bicycle(path: str | Path) -> MeasuredBicycle:
@@ -107,17 +106,13 @@ def read_bicycle(path: str | Path) -> MeasuredBicycle:
     negative sigma; a degenerate bicycle (radius, mass, wheelbase or gravity not positive, negative moment of inertia).
     """
     path = Path(path)
+    text = read_lines(path)
+    lines = _yaml_lines(text, path) if path.suffix.lower() in (".yml", ".yaml") else text_lines(text)
     values: dict[str, float] = {}
     sigmas: dict[str, float] = {}
-    lines: dict[str, int] = {}
-    text = read_lines(path)
-    for number, line in _yaml_lines(text, path) if path.suffix.lower() in (".yml", ".yaml") else text_lines(text):
-        where = f"{path}, line {number}"
-        name, value, sigma = _read_line(line, where)
-        if name in lines:
-            raise ValueError(f"{where}: `{name}` was already given in line {lines[name]}. Keep one of the two lines.")
-        lines[name] = number
-        values[name] = value
+    for where, name, right in entries(path, lines, _FORMAT, "Keep one of the two lines."):
+        _check_known(name, where)
+        values[name], sigma = with_sigma(right, name, where, "value")
         if sigma is not None:
             sigmas[name] = sigma
 
@@ -133,7 +128,7 @@ def read_bicycle(path: str | Path) -> MeasuredBicycle:
             f"give their true radii, masses and moments of inertia (SI units, radians), or leave this bicycle out."
         )
     return MeasuredBicycle(
-        name=_bicycle_name(path),
+        name=path.stem.removesuffix("Benchmark") or path.stem,
         values=known,
         sigmas={name: sigmas.get(name, 0.0) for name in PARAMETER_NAMES},
         path=str(path),
@@ -143,13 +138,9 @@ def read_bicycle(path: str | Path) -> MeasuredBicycle:
     )
 
 
-def _bicycle_name(path: Path) -> str:
-    return path.stem.removesuffix("Benchmark") or path.stem
-
-
 def read_lines(path: Path) -> str:
     """The text of a file of parameters or readings, which is not empty."""
-    text = read_text(path, _LARGEST_FILE, f"a bicycle parameter file with lines {_FORMAT}")
+    text = read_text(path, 1_000_000, f"a bicycle parameter file with lines {_FORMAT}")
     if not text.strip():
         raise ValueError(f"{path}: the file is empty. Expected lines {_FORMAT}.")
     return text
@@ -175,7 +166,7 @@ def _yaml_lines(text: str, path: Path) -> Iterator[tuple[int, str]]:
             continue
         if has_section and not is_indented:
             inside = name == "values"
-            if name == "parameterization" and value.strip("\"'") not in _PARAMETERIZATIONS:
+            if name == "parameterization" and value.strip("\"'") not in ("benchmark", "Meijaard2007"):
                 raise ValueError(f"{path}, line {number}: parameterization `{shortened(value)}`, expected that of the benchmark: {' '.join(PARAMETER_NAMES)}")
         elif inside and not value:
             raise ValueError(f"{path}, line {number}: got `{shortened(line.strip())}`, expected `name: value`, for example `rF: 0.35`")
@@ -183,34 +174,39 @@ def _yaml_lines(text: str, path: Path) -> Iterator[tuple[int, str]]:
             yield number, f"{name} = {value}"
 
 
-def _read_line(line: str, where: str) -> tuple[str, float, float | None]:
-    """Name, value and sigma (None where not given) of one line without comment."""
-    name, equals, right = (part.strip() for part in line.partition("="))
-    if not equals or not name or not right:
-        raise ValueError(f"{where}: got `{shortened(line)}`, expected {_FORMAT}")
-    if not _is_known(name):
-        lower_case = {known.lower(): known for known in reversed(PARAMETER_NAMES)}
-        near = difflib.get_close_matches(name.lower(), lower_case, 1, cutoff=0.0)
-        nearest = lower_case[near[0]] if near else PARAMETER_NAMES[0]
-        raise ValueError(f"{where}: unknown parameter `{shortened(name)}`; the nearest valid name is `{nearest}`. Valid names: {' '.join(PARAMETER_NAMES)}.")
-    value_text, separator, sigma_text = right.replace("±", "+/-").partition("+/-")
-    value = read_number(value_text, f"value of `{name}`", where)
-    if not separator:
-        return name, value, None
-    sigma = read_number(sigma_text, f"sigma of `{name}`", where)
-    if sigma < 0:
+def entries(path: Path, lines: Iterable[tuple[int, str]], form: str, again: str) -> Iterator[tuple[str, str, str]]:
+    """Yield for each line where it stands, its name and what is right of `=`. ValueError for another `form`, and for a name that was given before."""
+    given: dict[str, int] = {}
+    for number, line in lines:
+        where = f"{path}, line {number}"
+        name, _, right = (part.strip() for part in line.partition("="))
+        if not name or not right:
+            raise ValueError(f"{where}: got `{shortened(line)}`, expected {form}")
+        if name in given:
+            raise ValueError(f"{where}: `{name}` was already given in line {given[name]}. {again}")
+        given[name] = number
+        yield where, name, right
+
+
+def with_sigma(text: str, name: str, where: str, what: str) -> tuple[float, float | None]:
+    """The finite number in `text` and its sigma (None where not given); `what`: a value or a reading, of the name."""
+    parts = text.replace("±", "+/-").split("+/-", 1)
+    advice = f"; form: {_FORMAT}. Measure it, or leave this bicycle out."
+    value, *rest = (reading.number(part, f"{where}: {kind} of `{name}`", advice=advice) for part, kind in zip(parts, (what, "sigma"), strict=False))
+    sigma = rest[0] if rest else None
+    if sigma is not None and sigma < 0:
         raise ValueError(f"{where}: sigma of `{name}` is {sigma:g}, expected a standard deviation >= 0. Give its size, or leave `+/-` out if it is not known.")
-    return name, value, sigma
+    return value, sigma
 
 
-def read_number(text: str, what: str, where: str) -> float:
-    """The finite number that `text` is."""
-    return reading.number(text, f"{where}: {what}", advice=f"; form: {_FORMAT}. Measure it, or leave this bicycle out.")
-
-
-def _is_known(name: str) -> bool:
-    ignored = (*_REPEATED, *_OUT_OF_PLANE, *_NOT_OF_THE_BICYCLE)
-    return name in PARAMETER_NAMES or name in ignored or _HANDLEBAR_FORK_SPLIT.fullmatch(name) is not None
+def _check_known(name: str, where: str) -> None:
+    ignored = (*_REPEATED, *_OUT_OF_PLANE, "v")  # v is not of the bicycle
+    if name in PARAMETER_NAMES or name in ignored or re.fullmatch(r"m[GS]|[xyz][GS]|I[GS](xx|yy|zz|xz)", name):  # bodies G and S together are H
+        return
+    lower_case = {known.lower(): known for known in reversed(PARAMETER_NAMES)}
+    near = difflib.get_close_matches(name.lower(), lower_case, 1, cutoff=0.0)
+    closest = lower_case[near[0]] if near else PARAMETER_NAMES[0]
+    raise ValueError(f"{where}: unknown parameter `{shortened(name)}`; the nearest valid name is `{closest}`. Valid names: {' '.join(PARAMETER_NAMES)}.")
 
 
 def _ignored_but_telling(values: dict[str, float]) -> tuple[str, ...]:

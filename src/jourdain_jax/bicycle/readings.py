@@ -22,7 +22,7 @@ from pathlib import Path
 
 import equinox as eqx
 
-from jourdain_jax.bicycle.parameter_files import listed, read_lines, read_number, text_lines
+from jourdain_jax.bicycle.parameter_files import entries, listed, read_lines, text_lines, with_sigma
 
 _FORM = "`name = reading+/-sigma`, or several readings with commas between, for example `TcB1 = 1.7173+/-0.0001`"
 _FRAME, _TABLE = ("w", "gamma", "f"), ("h1", "h2", "h3", "h4", "h5", "d1", "d2", "d3", "d4", "d")
@@ -60,21 +60,9 @@ def read_readings(path: str | Path) -> Readings:
     """
     path = Path(path)
     means: dict[str, float] = {}
-    sigmas: dict[str, float] = {}
-    lines: dict[str, int] = {}
-    without: list[str] = []
-    for number, line in text_lines(read_lines(path)):
-        where = f"{path}, line {number}"
-        name, _, right = (part.strip() for part in line.partition("="))
-        if not right or not re.fullmatch(r"\w+", name):
-            raise ValueError(f"{where}: got `{line[:60]}`, expected {_FORM}")
-        if name in lines:
-            raise ValueError(f"{where}: `{name}` was already given in line {lines[name]}. Write several readings in one line, with commas between.")
-        lines[name] = number
-        means[name], sigma = _mean(right, name, where)
-        sigmas[name] = sigma or 0.0
-        if sigma is None:
-            without.append(name)
+    sigmas: dict[str, float | None] = {}
+    for where, name, right in entries(path, text_lines(read_lines(path)), _FORM, "Write several readings in one line, with commas between."):
+        means[name], sigmas[name] = _mean([with_sigma(one, name, where, "reading") for one in right.split(",")])
     split = "mS" in means or "mG" in means
     needed = [*_ALWAYS, *(_SPLIT_FORK if split else _WHOLE_FORK), *(_FRAME if "w" in means else _TABLE)]
     hangings = {part: _hangings(means, part) for part in ("BGS" if split else "BH")}
@@ -89,9 +77,9 @@ def read_readings(path: str | Path) -> Readings:
     return Readings(
         path=str(path),
         means={name: means[name] for name in sorted(used)},
-        sigmas={name: sigmas[name] for name in sorted(used)},
+        sigmas={name: sigmas[name] or 0.0 for name in sorted(used)},
         hangings=hangings,
-        without_sigma=tuple(name for name in without if name in used and not name.startswith("n")),
+        without_sigma=tuple(name for name, sigma in sigmas.items() if sigma is None and name in used and not name.startswith("n")),
         unused=tuple(name for name in means if name not in used),
     )
 
@@ -102,15 +90,7 @@ def _hangings(means: dict[str, float], part: str) -> tuple[int, ...]:
     return tuple(k for k in numbers if f"alpha{part}{k}" in means and f"a{part}{k}" in means)
 
 
-def _mean(text: str, name: str, where: str) -> tuple[float, float | None]:
+def _mean(readings: list[tuple[float, float | None]]) -> tuple[float, float | None]:
     """Mean of the readings in a line, and its standard deviation (None where none of them has one)."""
-    values, squares, known = [], 0.0, False
-    for reading in text.replace("±", "+/-").split(","):
-        value, separator, sigma_text = reading.partition("+/-")
-        values.append(read_number(value, f"reading of `{name}`", where))
-        if separator:
-            sigma = read_number(sigma_text, f"sigma of `{name}`", where)
-            if sigma < 0:
-                raise ValueError(f"{where}: sigma of `{name}` is {sigma:g}, expected a standard deviation >= 0")
-            squares, known = squares + sigma**2, True
-    return math.fsum(values) / len(values), math.sqrt(squares) / len(values) if known else None
+    squares = [sigma**2 for _, sigma in readings if sigma is not None]
+    return math.fsum(value for value, _ in readings) / len(readings), math.sqrt(math.fsum(squares)) / len(readings) if squares else None

@@ -13,12 +13,10 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Key, UInt32
 
+from jourdain_jax.scene.parameters import Scalar
+
 from .parameter_files import MeasuredBicycle
 from .parameters import PARAMETER_NAMES, violations
-
-Scalar = Float[Array, ""]
-
-LIMITS = (0.025, 0.975)  # quantiles
 
 
 class ParameterSamples(eqx.Module):
@@ -93,7 +91,7 @@ def interval(
     counted = jnp.ones(values.shape, bool) if counted is None else counted
     has = counted & jnp.isfinite(values)
     present = jnp.where(has, values, jnp.nan)
-    low, median, high = jnp.nanquantile(present, jnp.array([LIMITS[0], 0.5, LIMITS[1]], values.dtype))
+    low, median, high = jnp.nanquantile(present, jnp.array([0.025, 0.5, 0.975], values.dtype))
     return Interval(
         value=median if nominal is None else jnp.asarray(nominal, values.dtype),
         low=low,

@@ -7,45 +7,32 @@ from importlib import import_module
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
-PLACES = {  # of the classes: modules of this package, which are imported on first use
-    "two-wheel-axle-free": ("two_wheel_axle", "TwoWheelAxleFree"),
-    "two-wheel-axle-coordinates": ("two_wheel_axle", "TwoWheelAxleCoordinates"),
-    "two-wheel-axle-quasi": ("two_wheel_axle", "TwoWheelAxleQuasi"),
-    "two-wheel-axle-redundant": ("two_wheel_axle", "TwoWheelAxleRedundant"),
-    "skate": ("skate", "Skate"),
-    "chaplygin-sleigh": ("chaplygin_sleigh", "ChaplyginSleigh"),
-    "vertical-disc": ("vertical_disc", "VerticalDisc"),
-    "tilting-disc": ("tilting_disc", "TiltingDisc"),
-    "tilting-disc-quaternion": ("tilting_disc_quaternion", "TiltingDiscQuaternion"),
-    "rosenberg-particle": ("rosenberg_particle", "RosenbergParticle"),
-    "heisenberg-particle": ("heisenberg_particle", "HeisenbergParticle"),
-    "ball-on-turntable": ("ball_on_turntable", "BallOnTurntable"),
-    "suslov": ("suslov", "Suslov"),
-    "snakeboard": ("snakeboard", "Snakeboard"),
-    "rattleback": ("rattleback", "Rattleback"),
-    "whipple-bicycle": ("whipple_bicycle", "WhippleBicycle"),
-    "double-pendulum-rods": ("double_pendulum_rods", "DoublePendulumRods"),
-    "double-pendulum-angles": ("double_pendulum_angles", "DoublePendulumAngles"),
-    "free-rigid-body": ("free_rigid_body", "FreeRigidBody"),
-    "spring-and-rod": ("spring_and_rod", "SpringAndRod"),
-    "isokinetic-particle": ("isokinetic_particle", "IsokineticParticle"),
-    "trailer-chain": ("trailer_chain", "TrailerChain"),
-    "pendulum-chain": ("pendulum_chain", "PendulumChain"),
+PLACES = {  # models by the module of this package that holds their classes, which is imported on first use
+    "two_wheel_axle": ("two-wheel-axle-free", "two-wheel-axle-coordinates", "two-wheel-axle-quasi", "two-wheel-axle-redundant"),
+    "blades": ("skate", "chaplygin-sleigh", "snakeboard", "trailer-chain"),
+    "discs": ("vertical-disc", "tilting-disc", "tilting-disc-quaternion"),
+    "particles": ("rosenberg-particle", "heisenberg-particle", "isokinetic-particle"),
+    "rolling_solids": ("ball-on-turntable", "rattleback"),
+    "turning_bodies": ("suslov", "free-rigid-body"),
+    "whipple_bicycle": ("whipple-bicycle",),
+    "pendulums": ("double-pendulum-rods", "double-pendulum-angles", "spring-and-rod", "pendulum-chain"),
 }
+CLASSES = {"".join(map(str.capitalize, name.split("-"))): module for module, names in PLACES.items() for name in names}
+_CLASS_OF = dict(zip((name for names in PLACES.values() for name in names), CLASSES, strict=True))
 
 
 class _Models(Mapping[str, type[Scene]]):
     """The classes by the names of the models; read-only."""
 
     def __getitem__(self, name: str) -> type[Scene]:
-        module, kind = PLACES[name]
-        return getattr(import_module(f"{__package__}.{module}"), kind)
+        kind = _CLASS_OF[name]
+        return getattr(import_module(f"{__package__}.{CLASSES[kind]}"), kind)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(PLACES)
+        return iter(_CLASS_OF)
 
     def __len__(self) -> int:
-        return len(PLACES)
+        return len(_CLASS_OF)
 
 
 MODELS = _Models()

@@ -15,14 +15,13 @@ Source: Wang and Pao, Am. J. Phys. 71 (2003) 72, section VI, eqs. (57)-(67).
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import rot_x, rot_y, rot_z
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contacts import disc_contact
 from jourdain_jax.scene.coordinates import coordinates, speeds
 from jourdain_jax.scene.loads import gravity
-from jourdain_jax.scene.parameters import parameter
+from jourdain_jax.scene.parameters import Scalar, parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 
@@ -33,12 +32,12 @@ _ANGLES = {"psi1": _TURN, "psi2": _TURN}
 class _TwoWheelAxle(Scene):
     """What the four scenes share: the parameters, a wheel, the weight, the known integrals."""
 
-    radius: Float[Array, ""] = parameter(0.3, unit="m", positive=True, about="a, of the wheels")
-    length: Float[Array, ""] = parameter(0.8, unit="m", positive=True, about="l, of the axle")
-    mass: Float[Array, ""] = parameter(1.2, unit="kg", positive=True, about="M, of a wheel with its load, at its centre")
-    rim_mass: Float[Array, ""] = parameter(0.5, unit="kg", positive=True, about="m': a wheel's moments are m'a^2 and m'a^2/2")
-    slope: Float[Array, ""] = parameter(0.2, unit="rad", about="alpha, of the incline")
-    gravity: Float[Array, ""] = parameter(9.81, unit="m/s^2")
+    radius: Scalar = parameter(0.3, unit="m", positive=True, about="a, of the wheels")
+    length: Scalar = parameter(0.8, unit="m", positive=True, about="l, of the axle")
+    mass: Scalar = parameter(1.2, unit="kg", positive=True, about="M, of a wheel with its load, at its centre")
+    rim_mass: Scalar = parameter(0.5, unit="kg", positive=True, about="m': a wheel's moments are m'a^2 and m'a^2/2")
+    slope: Scalar = parameter(0.2, unit="rad", about="alpha, of the incline")
+    gravity: Scalar = parameter(9.81, unit="m/s^2")
 
     conventions = (
         "x down the slope, y across it, z along its normal; heading phi from x towards y, theta about the heading, psi about the "

@@ -22,7 +22,7 @@ from jourdain_jax.scene.contacts import disc_contact
 from jourdain_jax.scene.coordinates import coordinates, inputs
 from jourdain_jax.scene.loads import generalized_force, gravity
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.parameters import parameter, parameters_of
+from jourdain_jax.scene.parameters import Scalar, parameter, parameters_of
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 
@@ -36,32 +36,32 @@ class WhippleBicycle(Scene):
     contact; `steer_torque` on the front frame about the steer axis, with its reaction on the rear frame.
     """
 
-    w: Float[Array, ""] = parameter(1.02, unit="m", positive=True, about="wheelbase")
-    c: Float[Array, ""] = parameter(0.08, unit="m", about="trail")
-    lam: Float[Array, ""] = parameter(math.pi / 10, unit="rad", about="steer axis tilt, backwards from the vertical")
-    g: Float[Array, ""] = parameter(9.81, unit="m/s^2", about="gravity")
-    rR: Float[Array, ""] = parameter(0.3, unit="m", positive=True, about="rear wheel radius")
-    mR: Float[Array, ""] = parameter(2.0, unit="kg", positive=True, about="rear wheel mass")
-    IRxx: Float[Array, ""] = parameter(0.0603, unit="kg m^2", non_negative=True, about="rear wheel diametral moment of inertia")
-    IRyy: Float[Array, ""] = parameter(0.12, unit="kg m^2", non_negative=True, about="rear wheel axial moment of inertia")
-    xB: Float[Array, ""] = parameter(0.3, unit="m", about="rear frame centre of mass, forward")
-    zB: Float[Array, ""] = parameter(-0.9, unit="m", about="rear frame centre of mass, down")
-    mB: Float[Array, ""] = parameter(85.0, unit="kg", positive=True, about="rear frame and rider mass")
-    IBxx: Float[Array, ""] = parameter(9.2, unit="kg m^2", non_negative=True, about="rear frame moment of inertia about x")
-    IByy: Float[Array, ""] = parameter(11.0, unit="kg m^2", non_negative=True, about="rear frame moment of inertia about y")
-    IBzz: Float[Array, ""] = parameter(2.8, unit="kg m^2", non_negative=True, about="rear frame moment of inertia about z")
-    IBxz: Float[Array, ""] = parameter(2.4, unit="kg m^2", about="rear frame product of inertia")
-    xH: Float[Array, ""] = parameter(0.9, unit="m", about="fork centre of mass, forward")
-    zH: Float[Array, ""] = parameter(-0.7, unit="m", about="fork centre of mass, down")
-    mH: Float[Array, ""] = parameter(4.0, unit="kg", positive=True, about="fork mass")
-    IHxx: Float[Array, ""] = parameter(0.05892, unit="kg m^2", non_negative=True, about="fork moment of inertia about x")
-    IHyy: Float[Array, ""] = parameter(0.06, unit="kg m^2", non_negative=True, about="fork moment of inertia about y")
-    IHzz: Float[Array, ""] = parameter(0.00708, unit="kg m^2", non_negative=True, about="fork moment of inertia about z")
-    IHxz: Float[Array, ""] = parameter(-0.00756, unit="kg m^2", about="fork product of inertia")
-    rF: Float[Array, ""] = parameter(0.35, unit="m", positive=True, about="front wheel radius")
-    mF: Float[Array, ""] = parameter(3.0, unit="kg", positive=True, about="front wheel mass")
-    IFxx: Float[Array, ""] = parameter(0.1405, unit="kg m^2", non_negative=True, about="front wheel diametral moment of inertia")
-    IFyy: Float[Array, ""] = parameter(0.28, unit="kg m^2", non_negative=True, about="front wheel axial moment of inertia")
+    w: Scalar = parameter(1.02, unit="m", positive=True, about="wheelbase")
+    c: Scalar = parameter(0.08, unit="m", about="trail")
+    lam: Scalar = parameter(math.pi / 10, unit="rad", about="steer axis tilt, backwards from the vertical")
+    g: Scalar = parameter(9.81, unit="m/s^2", about="gravity")
+    rR: Scalar = parameter(0.3, unit="m", positive=True, about="rear wheel radius")
+    mR: Scalar = parameter(2.0, unit="kg", positive=True, about="rear wheel mass")
+    IRxx: Scalar = parameter(0.0603, unit="kg m^2", non_negative=True, about="rear wheel diametral moment of inertia")
+    IRyy: Scalar = parameter(0.12, unit="kg m^2", non_negative=True, about="rear wheel axial moment of inertia")
+    xB: Scalar = parameter(0.3, unit="m", about="rear frame centre of mass, forward")
+    zB: Scalar = parameter(-0.9, unit="m", about="rear frame centre of mass, down")
+    mB: Scalar = parameter(85.0, unit="kg", positive=True, about="rear frame and rider mass")
+    IBxx: Scalar = parameter(9.2, unit="kg m^2", non_negative=True, about="rear frame moment of inertia about x")
+    IByy: Scalar = parameter(11.0, unit="kg m^2", non_negative=True, about="rear frame moment of inertia about y")
+    IBzz: Scalar = parameter(2.8, unit="kg m^2", non_negative=True, about="rear frame moment of inertia about z")
+    IBxz: Scalar = parameter(2.4, unit="kg m^2", about="rear frame product of inertia")
+    xH: Scalar = parameter(0.9, unit="m", about="fork centre of mass, forward")
+    zH: Scalar = parameter(-0.7, unit="m", about="fork centre of mass, down")
+    mH: Scalar = parameter(4.0, unit="kg", positive=True, about="fork mass")
+    IHxx: Scalar = parameter(0.05892, unit="kg m^2", non_negative=True, about="fork moment of inertia about x")
+    IHyy: Scalar = parameter(0.06, unit="kg m^2", non_negative=True, about="fork moment of inertia about y")
+    IHzz: Scalar = parameter(0.00708, unit="kg m^2", non_negative=True, about="fork moment of inertia about z")
+    IHxz: Scalar = parameter(-0.00756, unit="kg m^2", about="fork product of inertia")
+    rF: Scalar = parameter(0.35, unit="m", positive=True, about="front wheel radius")
+    mF: Scalar = parameter(3.0, unit="kg", positive=True, about="front wheel mass")
+    IFxx: Scalar = parameter(0.1405, unit="kg m^2", non_negative=True, about="front wheel diametral moment of inertia")
+    IFyy: Scalar = parameter(0.28, unit="kg m^2", non_negative=True, about="front wheel axial moment of inertia")
 
     coordinates = coordinates("x y yaw lean pitch steer rear_spin front_spin")
     inputs = inputs("lean_torque steer_torque")
@@ -96,7 +96,7 @@ class WhippleBicycle(Scene):
             raise ValueError(f"bicycle parameters missing: {', '.join(f'`{name}`' for name in missing)}; give all {len(names)}")
         return cls(**values)
 
-    def upright(self, speed) -> dict[str, Float[Array, ""]]:
+    def upright(self, speed) -> dict[str, Scalar]:
         """Speeds of running straight and upright at `speed` (m/s), the steady motion of the linear model; all else is zero."""
         speed = jnp.asarray(speed, jnp.result_type(float))
         return {"x_rate": speed, "rear_spin_rate": speed / self.rR, "front_spin_rate": speed / self.rF}

@@ -7,9 +7,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.reals import as_real, described, has_unit
+
+Scalar = Float[Array, ""]
 
 
 def _as_leaf(value):

@@ -1,0 +1,139 @@
+"""Discs that roll without slip on a level plane."""
+
+import math
+
+import jax.numpy as jnp
+
+from jourdain_jax.calculus.rotations import quaternion_to_matrix, rot_x, rot_y, rot_z
+from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.contacts import disc_contact
+from jourdain_jax.scene.coordinates import coordinates, quaternion
+from jourdain_jax.scene.loads import gravity
+from jourdain_jax.scene.parameters import Scalar, parameter
+from jourdain_jax.scene.scene import Scene
+
+
+class VerticalDisc(Scene):
+    """An upright disc that rolls and turns on a level plane: both rates are constant, the path is a circle or a straight line.
+
+        xdot = R cos(heading) rolldot,   ydot = R sin(heading) rolldot
+
+    Source: A. M. Bloch, Nonholonomic Mechanics and Control (2003), section 1.4.
+
+    x, y of the contact point (and of the centre), heading about the vertical, roll about the axle.
+    """
+
+    mass: Scalar = parameter(1.0, unit="kg", positive=True)
+    radius: Scalar = parameter(1.0, unit="m", positive=True)
+    roll_inertia: Scalar = parameter(1.0, unit="kg m^2", positive=True, about="about the axle")
+    turn_inertia: Scalar = parameter(1.0, unit="kg m^2", positive=True, about="about a diameter")
+    gravity: Scalar = parameter(9.81, unit="m/s^2")
+
+    coordinates = coordinates("x y heading roll")
+    privileged = ("heading_rate", "roll_rate")
+    domain = {"heading": (-3.2, 3.2), "roll": (-3.2, 3.2)}
+    conventions = "z up; heading from x towards y; axle along body y; positive roll moves forwards."
+    example = {"heading_rate": 2.0, "roll_rate": 1.0}
+    example_span = 1.0
+
+    def bodies(self, t, q):
+        disc = RigidBody.thin_disc(
+            self.mass,
+            self.radius,
+            axis="y",
+            position=jnp.stack([q.x, q.y, self.radius]),
+            orientation=rot_z(q.heading) @ rot_y(q.roll),
+            axial=self.roll_inertia,
+            diametral=self.turn_inertia,
+        )
+        return {"disc": disc}
+
+    def loads(self, motion):
+        return (gravity(motion, self.gravity),)
+
+    def contacts(self, pose):
+        return {"rim": disc_contact(pose["disc"], self.radius)}
+
+    def invariants(self, motion):
+        return {"turn rate": motion.u.heading_rate, "roll rate": motion.u.roll_rate}
+
+
+class TiltingDisc(Scene):
+    """A thin disc rolling without slip on a level plane, in angles: the classic of Appell and Korteweg.
+
+    Contact and height are built into the coordinates (x, y: contact point). Two no-slip rows, three degrees of freedom.
+    Singular where the disc lies flat (lean = +-pi/2); `TiltingDiscQuaternion` is the scene for that neighbourhood.
+    Source: Wang and Pao (2003), section V; J. I. Neimark and N. A. Fufaev, Dynamics of Nonholonomic Systems (1972).
+
+    Uniform thin disc: yaw about z, lean about the heading, spin about the axle; x, y of the contact point.
+    """
+
+    mass: Scalar = parameter(1.0, unit="kg", positive=True)
+    radius: Scalar = parameter(0.5, unit="m", positive=True)
+    gravity: Scalar = parameter(9.81, unit="m/s^2")
+
+    coordinates = coordinates("x y yaw lean spin")
+    domain = {"yaw": (-3.2, 3.2), "lean": (-1.2, 1.2), "spin": (-3.2, 3.2)}
+    conventions = "z up; upright at lean = 0, heading along x at yaw = 0; axle along body y; positive spin rolls forward."
+    example = {"lean": 0.3, "yaw_rate": 0.5, "lean_rate": 0.2, "spin_rate": -3.0}
+    example_span = 10.0
+
+    def bodies(self, t, q):
+        frame = rot_z(q.yaw) @ rot_x(q.lean)
+        centre = jnp.stack([q.x, q.y, 0.0 * q.x]) + self.radius * frame[:, 2]
+        return {"disc": RigidBody.thin_disc(self.mass, self.radius, axis="y", position=centre, orientation=frame @ rot_y(q.spin))}
+
+    def loads(self, motion):
+        return (gravity(motion, self.gravity),)
+
+    def contacts(self, pose):
+        return {"rim": disc_contact(pose["disc"], self.radius, axis="y", height="coordinates")}
+
+    def events(self, motion):
+        return {"fallen": 1.5 - jnp.abs(motion.q.lean)}
+
+
+_LEAN, _YAW_RATE, _LEAN_RATE, _SPIN_RATE = 0.3, 0.5, 0.2, -3.0  # the example of `TiltingDisc`
+_FLAT = 45.0  # units of round-off of the squared angle to the ground (1e-7 rad in double precision): nearer the contact point is undefined
+
+
+class TiltingDiscQuaternion(Scene):
+    """A thin disc rolling without slip on a level plane, as a free body: position, quaternion, and the contact as rows.
+
+    One height row and two no-slip rows on six speeds: three degrees of freedom, the motion of `TiltingDisc`. The coordinates fail
+    nowhere, so that the scene holds down to the neighbourhood of the flat disc, where the contact point itself is undefined.
+    Source: Wang and Pao (2003), section V; R. Cushman and J. J. Duistermaat, Regular and Chaotic Dynamics 11 (2006) 31.
+
+    Uniform thin disc: x, y, z of the centre, attitude as a quaternion, body angular velocity; the axle is body y.
+    """
+
+    mass: Scalar = parameter(1.0, unit="kg", positive=True)
+    radius: Scalar = parameter(0.5, unit="m", positive=True)
+    gravity: Scalar = parameter(9.81, unit="m/s^2")
+
+    coordinates = coordinates("x y z", quaternion("attitude"))
+    domain = {"z": (0.05, 0.5), **{f"attitude_omega_{axis}": (-3.0, 3.0) for axis in "xyz"}}
+    conventions = "z up; x, y, z of the centre; upright and heading along x at identity attitude; axle along body y."
+    example = {
+        "y": -0.5 * math.sin(_LEAN),
+        "attitude_w": math.cos(_LEAN / 2),
+        "attitude_x": math.sin(_LEAN / 2),
+        "attitude_omega_x": _LEAN_RATE,
+        "attitude_omega_y": _SPIN_RATE + _YAW_RATE * math.sin(_LEAN),
+        "attitude_omega_z": _YAW_RATE * math.cos(_LEAN),
+    }
+    example_span = 10.0
+
+    def bodies(self, t, q):
+        centre, turned = jnp.stack([q.x, q.y, q.z]), quaternion_to_matrix(q.attitude)
+        return {"disc": RigidBody.thin_disc(self.mass, self.radius, axis="y", position=centre, orientation=turned)}
+
+    def loads(self, motion):
+        return (gravity(motion, self.gravity),)
+
+    def contacts(self, pose):
+        return {"rim": disc_contact(pose["disc"], self.radius, height="row")}
+
+    def events(self, motion):
+        axle = motion["disc"].orientation[:, 1]
+        return {"flat": axle[0] ** 2 + axle[1] ** 2 - _FLAT * jnp.finfo(axle.dtype).eps}

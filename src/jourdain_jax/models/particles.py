@@ -1,0 +1,118 @@
+"""Single particles under one row: sheets that bend paths, and a row that is nonlinear in the velocities."""
+
+import jax.numpy as jnp
+
+from jourdain_jax.scene.bodies import Particle
+from jourdain_jax.scene.coordinates import coordinates
+from jourdain_jax.scene.grounds import tangents_of
+from jourdain_jax.scene.loads import gravity
+from jourdain_jax.scene.parameters import Scalar, parameter
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.visuals import Visual
+
+
+class _OnSheets(Scene):
+    """A free particle whose row allows the velocities in one plane through each point."""
+
+    mass: Scalar = parameter(1.0, unit="kg", positive=True)
+
+    coordinates = coordinates("x y z")
+    privileged = ("x_rate", "y_rate")
+
+    def bodies(self, t, q):
+        return {"particle": Particle(self.mass, jnp.stack([q.x, q.y, q.z]))}
+
+    def _with_plane(self, normal) -> dict:
+        """The particle, and the plane of the velocities that the row allows, drawn from its normal."""
+        normal = normal / jnp.sqrt(normal @ normal)
+        turn = jnp.concatenate([tangents_of(normal), normal[None]]).T
+        return {"particle": [Visual.ball(0.05), Visual.box((0.6, 0.6, 0.01), turn=turn, opacity=0.5)]}
+
+
+class RosenbergParticle(_OnSheets):
+    """Rosenberg's particle: free but for the row `zdot = y xdot`, the smallest nonholonomic system that bends a path.
+
+        ydot = const,   xdot sqrt(1 + y^2) = const
+
+    Source: R. M. Rosenberg, Analytical Dynamics of Discrete Systems (1977), ch. 15.
+
+    Lengths in units of the length that makes the row `zdot = y xdot`.
+    """
+
+    conventions = "Right-handed inertial frame without gravity; y counts in metres in the row zdot = y xdot."
+    example = {"y": -1.0, "x_rate": 1.1 / 2**0.5, "y_rate": 0.8}
+    example_span = 5.0
+
+    def velocity_constraints(self, motion):
+        return {"sheet": motion.u.z_rate - motion.q.y * motion.u.x_rate}
+
+    def visuals(self, pose):
+        return self._with_plane(jnp.stack([-pose.q.y, 0.0 * pose.q.y, 1.0 + 0.0 * pose.q.y]))
+
+    def invariants(self, motion):
+        return {"y rate": motion.u.y_rate, "speed in the sheet": motion.u.x_rate * jnp.sqrt(1 + motion.q.y**2)}
+
+
+class HeisenbergParticle(_OnSheets):
+    """The Heisenberg system: a free particle under the row `zdot = y xdot - x ydot` moves in straight lines, free of force.
+
+    The variational ("vakonomic") reading of the same row would give helices: the sharpest test of which principle an engine follows.
+    Source: A. M. Bloch, Nonholonomic Mechanics and Control (2003), section 1.8.
+
+    Lengths in units of the length that makes the row `zdot = y xdot - x ydot`.
+    """
+
+    conventions = "Right-handed inertial frame without gravity; x, y count in metres in the row zdot = y xdot - x ydot."
+    example = {"x": 0.3, "y": -0.2, "x_rate": 0.7, "y_rate": 0.4}
+    example_span = 10.0
+
+    def velocity_constraints(self, motion):
+        q, u = motion.q, motion.u
+        return {"contact form": u.z_rate - q.y * u.x_rate + q.x * u.y_rate}
+
+    def visuals(self, pose):
+        return self._with_plane(jnp.stack([-pose.q.y, pose.q.x, 1.0 + 0.0 * pose.q.x]))
+
+    def invariants(self, motion):
+        return {"x rate": motion.u.x_rate, "y rate": motion.u.y_rate, "z rate": motion.u.z_rate}
+
+
+class IsokineticParticle(Scene):
+    """A particle kept at constant speed c under gravity: a row *nonlinear* in the velocities.
+
+        (v.v - c^2)/(2 c) = 0,     A = v/c,     virtual velocities obey v.dv = 0
+
+    The multiplier is the force along the velocity, in N; it does no virtual power but real power: energy is not conserved.
+    With `tau = g t/c` from level flight: sin(theta) = -tanh(tau), x = (c^2/g) gd(tau), z = -(c^2/g) ln cosh(tau).
+    Source: D. J. Evans, W. G. Hoover and others, Phys. Rev. A 28 (1983) 1016 (the Gaussian isokinetic thermostat).
+
+    Motion in a vertical plane, x horizontal and z up.
+    """
+
+    mass: Scalar = parameter(1.0, unit="kg", positive=True)
+    speed: Scalar = parameter(1.7, unit="m/s", positive=True, about="c, which the row keeps")
+    gravity: Scalar = parameter(9.81, unit="m/s^2")
+
+    coordinates = coordinates("x z")
+    domain = {"x_rate": (0.3, 2.0), "z_rate": (-2.0, 2.0)}
+    conventions = "x horizontal, z up; the direction of flight is measured from x upwards."
+    example_span = 2.0
+
+    @property
+    def example(self):
+        """Level flight at the speed of the row."""
+        return {"x_rate": self.speed}
+
+    def bodies(self, t, q):
+        return {"particle": Particle(self.mass, jnp.stack([q.x, jnp.zeros_like(q.x), q.z]))}
+
+    def loads(self, motion):
+        return (gravity(motion, self.gravity),)
+
+    def velocity_constraints(self, motion):
+        v = motion["particle"].velocity
+        return {"constant speed": (v @ v - self.speed**2) / (2 * self.speed)}
+
+    def invariants(self, motion):
+        # x = (c^2/g) gd(tau) and theta = -gd(tau)
+        return {"x and direction": self.gravity * motion.q.x + self.speed**2 * jnp.arctan2(motion.u.z_rate, motion.u.x_rate)}

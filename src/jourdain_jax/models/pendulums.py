@@ -1,0 +1,206 @@
+"""Pendulums of particles in a vertical plane: in angles, or in Cartesian coordinates with rods as geometric rows."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.scene.bodies import Particle
+from jourdain_jax.scene.constraints import rod
+from jourdain_jax.scene.coordinates import coordinates
+from jourdain_jax.scene.loads import damper, gravity, spring
+from jourdain_jax.scene.motion_state import fixed_point
+from jourdain_jax.scene.parameters import Scalar, parameter
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.visuals import Visual
+
+
+class _DoublePendulum(Scene):
+    """Two particles on massless rods, one below the other."""
+
+    mass1: Scalar = parameter(1.0, unit="kg", positive=True)
+    mass2: Scalar = parameter(0.7, unit="kg", positive=True)
+    length1: Scalar = parameter(1.0, unit="m", positive=True)
+    length2: Scalar = parameter(0.8, unit="m", positive=True)
+    gravity: Scalar = parameter(9.81, unit="m/s^2")
+
+    example_span = 5.0
+
+    def loads(self, motion):
+        return (gravity(motion, self.gravity),)
+
+    def visuals(self, pose):
+        return {"": Visual.line(jnp.zeros(3), pose["first"].position, pose["second"].position, radius=0.012 * self.length1)}
+
+
+class DoublePendulumAngles(_DoublePendulum):
+    """Planar double pendulum of two particles on massless rods, in the angles of the rods: no rows, two degrees of freedom.
+
+        (m1 + m2) l1 th1'' + m2 l2 cos(th1 - th2) th2'' + m2 l2 sin(th1 - th2) th2'^2 + (m1 + m2) g sin(th1) = 0
+        l2 th2'' + l1 cos(th1 - th2) th1'' - l1 sin(th1 - th2) th1'^2 + g sin(th2) = 0
+
+    The same system as `DoublePendulumRods`.
+    Source: L. D. Landau and E. M. Lifshitz, Mechanics, section 5, problem 1.
+
+    Angles of the upper and the lower rod from straight down; pivot at the origin.
+    """
+
+    coordinates = coordinates("theta1 theta2")
+    domain = {"theta1": (-3.2, 3.2), "theta2": (-3.2, 3.2), "theta1_rate": (-3.0, 3.0), "theta2_rate": (-3.0, 3.0)}
+    conventions = "x horizontal, z up; pivot at the origin; angles from straight down, positive towards +x."
+    example = {"theta1": 0.8, "theta2": -0.4, "theta1_rate": 0.3, "theta2_rate": 0.5}
+
+    def bodies(self, t, q):
+        first = self.length1 * _along(q.theta1)
+        return {"first": Particle(self.mass1, first), "second": Particle(self.mass2, first + self.length2 * _along(q.theta2))}
+
+
+def _along(angle) -> Float[Array, "3"]:
+    """Unit vector at `angle` from straight down, in the x-z plane."""
+    return jnp.stack([jnp.sin(angle), jnp.zeros_like(angle), -jnp.cos(angle)])
+
+
+class DoublePendulumRods(_DoublePendulum):
+    """Planar double pendulum of two particles on massless rods, in Cartesian coordinates with the rods as geometric rows.
+
+        |r1|^2 = l1^2,   |r2 - r1|^2 = l2^2
+
+    The same system as `DoublePendulumAngles`, which knows no rods. Multipliers are the thrusts in the rods, N (negative: tension).
+
+    Cartesian coordinates of both particles; pivot at the origin.
+    """
+
+    coordinates = coordinates("x1 z1 x2 z2")
+    domain = {"x2": (-1.5, 1.5), "z2": (-1.5, 1.5)}
+    conventions = "x horizontal, z up; pivot at the origin."
+    example = {"x1": 0.6, "z1": -0.8, "x2": 0.6, "z2": -1.6, "x1_rate": 0.4, "z1_rate": 0.3, "x2_rate": 0.4, "z2_rate": 0.3}
+
+    def bodies(self, t, q):
+        return _in_plane(self, q)
+
+    def geometric_constraints(self, pose):
+        first, second = pose["first"].position, pose["second"].position
+        return {"upper rod": rod(jnp.zeros(3), first, self.length1), "lower rod": rod(first, second, self.length2)}
+
+
+def _in_plane(scene: "DoublePendulumRods | SpringAndRod", q) -> dict[str, Particle]:
+    """Two particles at Cartesian coordinates in the x-z plane."""
+    level = jnp.zeros_like(q.x1)
+    first, second = jnp.stack([q.x1, level, q.z1]), jnp.stack([q.x2, level, q.z2])
+    return {"first": Particle(scene.mass1, first), "second": Particle(scene.mass2, second)}
+
+
+class SpringAndRod(Scene):
+    """Two particles in a vertical plane: a spring holds the first to the origin, a rod holds the second to the first.
+
+    The spring is an impressed force, known from the positions; the rod is a constraint, its force known only by what it enforces,
+    `|r2 - r1| = l`. The rod's multiplier is its thrust (negative: tension), in N.
+    Source: Wang and Pao (2003), section I.
+
+    Cartesian coordinates of both particles; origin - spring (and damper) - first - rod - second.
+    """
+
+    mass1: Scalar = parameter(1.0, unit="kg", positive=True)
+    mass2: Scalar = parameter(0.6, unit="kg", positive=True)
+    stiffness: Scalar = parameter(40.0, unit="N/m", non_negative=True)
+    natural_length: Scalar = parameter(0.5, unit="m", non_negative=True, about="of the spring")
+    damping: Scalar = parameter(0.0, unit="N s/m", non_negative=True, about="along the spring")
+    rod_length: Scalar = parameter(0.6, unit="m", positive=True)
+    gravity: Scalar = parameter(9.81, unit="m/s^2")
+
+    coordinates = coordinates("x1 z1 x2 z2")
+    domain = {"x2": (-1.5, 1.5), "z2": (-1.5, 1.5)}
+    conventions = "x horizontal, z up; the spring's fixed end is the origin."
+    example_span = 5.0
+
+    @property
+    def example(self):
+        """The rod level and turning."""
+        places = {"x1": 0.3, "z1": -0.6, "x2": 0.3 + self.rod_length, "z2": -0.6}
+        return places | {"x1_rate": 0.4, "z1_rate": 0.1, "x2_rate": 0.4, "z2_rate": 0.7}
+
+    def bodies(self, t, q):
+        return _in_plane(self, q)
+
+    def loads(self, motion):
+        anchor, first = fixed_point(jnp.zeros(3)), motion["first"].point()
+        return (
+            gravity(motion, self.gravity),
+            spring(anchor, first, self.stiffness, self.natural_length),
+            damper(anchor, first, self.damping),
+        )
+
+    def geometric_constraints(self, pose):
+        return {"rod": rod(pose["first"].position, pose["second"].position, self.rod_length)}
+
+    def visuals(self, pose):
+        first, second = pose["first"].position, pose["second"].position
+        return {"": [Visual.coil(jnp.zeros(3), first, 0.06 * self.rod_length), Visual.line(first, second, radius=0.02 * self.rod_length)]}
+
+
+class PendulumChain(Scene):
+    """A chain of particles joined by massless rods, hanging from a pivot in a vertical plane: n particles, n geometric rows.
+
+        |r_i - r_{i-1}|^2 = l_i^2,   r_0 = 0
+
+    In Cartesian coordinates each row holds two neighbours only: `A M^-1 A'` is tridiagonal, where the mass matrix in angles would be
+    dense. n = 2 is the double pendulum. Multipliers are the thrusts in the rods, N (negative: tension).
+
+    Cartesian coordinates of all particles, from the pivot down; masses and lengths are one number, or one per link.
+    """
+
+    links: int = eqx.field(static=True, default=5)
+    mass: Float[Array, "*links"] = parameter(0.2, unit="kg", positive=True)
+    length: Float[Array, "*links"] = parameter(0.3, unit="m", positive=True)
+    gravity: Scalar = parameter(9.81, unit="m/s^2")
+
+    conventions = "x horizontal, z up; pivot at the origin; particle 1 hangs from the pivot."
+    example_span = 3.0
+
+    def __check_init__(self):
+        if not isinstance(self.links, int) or self.links < 1:
+            raise ValueError(f"`links` of `PendulumChain` is {self.links!r}, expected a whole number of particles >= 1")
+
+    @property
+    def coordinates(self):
+        """x and z of every particle."""
+        return coordinates(*(f"x{i} z{i}" for i in range(1, self.links + 1)))
+
+    @property
+    def domain(self):
+        """Within the reach of the chain."""
+        return {f"{axis}{i}": (-0.3 * i, 0.3 * i) for i in range(1, self.links + 1) for axis in "xz"}
+
+    @property
+    def example(self):
+        """Straight, 60 degrees from hanging, at rest."""
+        return self.hanging([jnp.pi / 3] * self.links)
+
+    def hanging(self, angles) -> dict[str, Scalar]:
+        """Coordinates of the chain whose rods hang at these angles (rad) from straight down, positive towards +x."""
+        angles, lengths = jnp.asarray(angles), self._per_link(self.length)
+        x, z = jnp.cumsum(lengths * jnp.sin(angles)), -jnp.cumsum(lengths * jnp.cos(angles))
+        return {f"x{i + 1}": x[i] for i in range(self.links)} | {f"z{i + 1}": z[i] for i in range(self.links)}
+
+    def bodies(self, t, q):
+        masses = self._per_link(self.mass)
+        level = jnp.zeros_like(q.x1)
+        places = {i: jnp.stack([q[f"x{i}"], level, q[f"z{i}"]]) for i in range(1, self.links + 1)}
+        return {f"particle {i}": Particle(masses[i - 1], place) for i, place in places.items()}
+
+    def loads(self, motion):
+        return (gravity(motion, self.gravity),)
+
+    def geometric_constraints(self, pose):
+        lengths = self._per_link(self.length)
+        places = self._joints(pose)
+        return {f"rod {i + 1}": rod(places[i], places[i + 1], lengths[i]) for i in range(self.links)}
+
+    def visuals(self, pose):
+        places = self._joints(pose)
+        return {"": Visual.line(*places, radius=0.02 * jnp.min(self.length))}
+
+    def _joints(self, pose) -> list[Float[Array, "3"]]:
+        return [jnp.zeros(3), *(body.position for body in pose.bodies.values())]
+
+    def _per_link(self, value) -> Float[Array, "links"]:
+        return jnp.broadcast_to(value, (self.links,))
