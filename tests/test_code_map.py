@@ -13,7 +13,7 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 460_300,
+    "code tokens of src": 459_000,
     "code tokens of tests": 384_100,
     "code tokens of bench": 120_600,
     "code tokens of docs": 11_441,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.weak_directions import weak_combinations
+from jourdain_jax.analysis.information import weak_combinations
 
 START = {"x_rate": -0.6, "heading_rate": 0.9}
 TS = jnp.linspace(0.0, 4.0, 41)

@@ -54,7 +54,7 @@ def test_a_frequency_far_from_the_guess_is_found_over_growing_spans(factor):
 
 def test_spans_that_a_motion_follows_already_are_left_out(monkeypatch):
     quick = jj.fit(Oscillator(stiffness=54.0), data(0), FREE)
-    monkeypatch.setattr("jourdain_jax.analysis.search._FOLLOWED", 0.0)
+    monkeypatch.setattr("jourdain_jax.analysis.fit._FOLLOWED", 0.0)
     every = jj.fit(Oscillator(stiffness=54.0), data(0), FREE)
     assert quick.grown
     assert every.grown
@@ -64,7 +64,7 @@ def test_spans_that_a_motion_follows_already_are_left_out(monkeypatch):
 
 def test_whole_runs_that_lead_nowhere_are_given_up_soon(monkeypatch):
     quick = jj.fit(Oscillator(stiffness=54.0), data(0), FREE)
-    monkeypatch.setattr("jourdain_jax.analysis.search._PATIENCE", None)
+    monkeypatch.setattr("jourdain_jax.analysis.fit._PATIENCE", None)
     patient = jj.fit(Oscillator(stiffness=54.0), data(0), FREE)
     assert quick.grown
     assert patient.grown
@@ -74,9 +74,9 @@ def test_whole_runs_that_lead_nowhere_are_given_up_soon(monkeypatch):
 
 def test_a_fit_that_is_far_off_goes_on_where_growing_spans_do_not_help(monkeypatch):
     measured = data(0, more=0.05)  # no parameters give this
-    monkeypatch.setattr("jourdain_jax.analysis.search._STEPS", 1)
+    monkeypatch.setattr("jourdain_jax.analysis.fit._STEPS", 1)
     found = jj.fit(Oscillator(stiffness=18.9), measured, FREE)
-    monkeypatch.setattr("jourdain_jax.analysis.search._STEPS", 50)
+    monkeypatch.setattr("jourdain_jax.analysis.fit._STEPS", 50)
     at_once = jj.fit(Oscillator(stiffness=18.9), measured, FREE)
     assert found.chi_square < at_once.chi_square * (1 + 1e-6)
 

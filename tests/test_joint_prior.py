@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.joint_prior import whitening
+from jourdain_jax.analysis.estimate import whitening
 from jourdain_jax.bicycle import benchmark_from_measurements, measured_bicycle
 
 TS = np.linspace(0.1, 3.0, 16)

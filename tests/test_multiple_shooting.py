@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.analysis import grids
 from jourdain_jax.analysis.arrow import Arrow
-from jourdain_jax.analysis.lagged import read
+from jourdain_jax.analysis.sensors import read
 
 FREE = ("mass2", "length1", "length2")
 TIGHT = {"rtol": 1e-8, "atol": 1e-8}
@@ -217,7 +216,7 @@ def test_a_chaotic_motion_is_found_from_afar_through_late_sensors(monkeypatch):
     found = jj.fit(guess, run, FREE, shooting=jj.MultipleShooting(duration=0.5), **TIGHT)
     assert found.converged
     assert not found.warnings
-    monkeypatch.setattr(grids, "FEWEST_INTERVALS", 640)  # so that the whole run is read between times as close as those of ten pieces
+    monkeypatch.setattr("jourdain_jax.analysis.sensors.FEWEST_INTERVALS", 640)  # so that the whole run is read between times as close as those of ten pieces
     begin = jj.Experiment(run.ts, run.values, run.sigma, start=found.starts[0], unknown_start=tuple(run.start), sensors=sensors, t0=0.0)
     near = jj.fit(found.scene, begin, FREE, **TIGHT)
     assert near.converged

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.lagged import filtered, read
+from jourdain_jax.analysis.sensors import filtered, read
 from jourdain_jax.native import host
 
 REPEATS = 200

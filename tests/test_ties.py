@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.ties import tied_by
+from jourdain_jax.analysis.layout import tied_by
 
 Sleigh = jj.models.ChaplyginSleigh
 START, TIMES = {"x_rate": 0.6, "heading_rate": 0.9}, np.linspace(0.0, 2.0, 21)

@@ -77,26 +77,24 @@ from jourdain_jax.scene.spline import Spline
 from jourdain_jax.scene.visuals import Visual
 
 if _typing.TYPE_CHECKING:  # what else there is, for static tools
-    from jourdain_jax.analysis.body_inertia import possible_inertia
     from jourdain_jax.analysis.checked import Checked, check
     from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
-    from jourdain_jax.analysis.estimate import Estimate
+    from jourdain_jax.analysis.estimate import Estimate, bounds, joint_normal, positive, unbounded
     from jourdain_jax.analysis.experiment import Experiment
     from jourdain_jax.analysis.filtering import filtered_log_likelihood
     from jourdain_jax.analysis.fit import fit, fit_batch
     from jourdain_jax.analysis.fit_result import Fit
-    from jourdain_jax.analysis.gradients import derivative_exists
-    from jourdain_jax.analysis.instruments import Accelerometer, LoadCell
-    from jourdain_jax.analysis.joint_prior import joint_normal
+    from jourdain_jax.analysis.layout import possible_inertia
     from jourdain_jax.analysis.likelihood import log_likelihood
     from jourdain_jax.analysis.linearize import Linearization, linearize
     from jourdain_jax.analysis.log_density import LogDensity, log_density
     from jourdain_jax.analysis.losses import huber, student_t
     from jourdain_jax.analysis.planning import PlannedInformation, planned_information
-    from jourdain_jax.analysis.ranges import bounds, positive, unbounded
+    from jourdain_jax.analysis.quantities import Accelerometer, LoadCell
     from jourdain_jax.analysis.report import Report, report
     from jourdain_jax.analysis.sensors import Actuator, Sensor
     from jourdain_jax.analysis.shooting import MultipleShooting
+    from jourdain_jax.analysis.statements import derivative_exists
     from jourdain_jax.analysis.steady import SteadyMotion, steady
     from jourdain_jax.analysis.verification import Verification
     from jourdain_jax.analysis.verify import verify
@@ -125,26 +123,24 @@ if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.plotting.show import View, show
 
 _ON_FIRST_USE = {
-    "analysis.body_inertia": "possible_inertia",
+    "analysis.checked": "Checked check",
     "analysis.energy": "Energy EnergyBalance energy energy_balance",
-    "analysis.estimate": "Estimate",
+    "analysis.estimate": "Estimate bounds joint_normal positive unbounded",
     "analysis.experiment": "Experiment",
     "analysis.filtering": "filtered_log_likelihood",
     "analysis.fit": "fit fit_batch",
     "analysis.fit_result": "Fit",
-    "analysis.gradients": "derivative_exists",
-    "analysis.instruments": "Accelerometer LoadCell",
-    "analysis.joint_prior": "joint_normal",
+    "analysis.layout": "possible_inertia",
     "analysis.likelihood": "log_likelihood",
     "analysis.linearize": "Linearization linearize",
     "analysis.log_density": "LogDensity log_density",
     "analysis.losses": "huber student_t",
     "analysis.planning": "PlannedInformation planned_information",
-    "analysis.checked": "Checked check",
-    "analysis.ranges": "bounds positive unbounded",
+    "analysis.quantities": "Accelerometer LoadCell",
     "analysis.report": "Report report",
     "analysis.sensors": "Actuator Sensor",
     "analysis.shooting": "MultipleShooting",
+    "analysis.statements": "derivative_exists",
     "analysis.steady": "SteadyMotion steady",
     "analysis.verification": "Verification",
     "analysis.verify": "verify",

@@ -2,15 +2,168 @@
 
 With a prior of mean m and standard deviation s, (theta - m) / s is one residual more: the estimate is the most probable value (maximum a posteriori).
 Source: G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), section 2.7.
+
+The numbers that an unknown may take: low <= theta <= high, and what counts as a large change of it.
+
+Steps are taken in theta itself and end at a bound, so that an unknown can lie at its bound exactly.
+
+Numbers that were measured together: priors whose errors are correlated.
+
+    r = M S^-1 (theta - mean),     M C M' = 1       S: standard deviations, C: correlations;     r: residuals more, so that |r|^2 = d' (S C S)^-1 d
+
+C = V diag(e) V' gives M = diag(e)^-1/2 V'. Of numbers of which only some are free, S C S is the part of the covariance that belongs to these (the marginal).
+
+Unknowns within bounds as vectors x of any real numbers, with the factor by which densities change.
+
+    unbounded  theta = x
+    positive   theta = exp x                                  log |d theta / dx| = x
+    bounds     theta = low + (high - low) / (1 + exp(-x))     log |d theta / dx| = log(high - low) - log(1 + exp(-x)) - log(1 + exp(x))
+
+Source: B. Carpenter et al., Journal of Statistical Software 76 (2017) 1, section 35 of the Stan reference manual of that year.
 """
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.ranges import Range
-from jourdain_jax.calculus.reals import checked_known, described
+from jourdain_jax.calculus.reals import Number, checked_known, described
+
+_FAR = 5.0  # a factor by which a first guess may be off
+
+
+@dataclass(frozen=True)
+class Range:
+    """Bounds of an unknown (infinite where there is none), and a typical change of it."""
+
+    kind: Literal["bounds", "positive", "unbounded"]
+    low: float = -np.inf
+    high: float = np.inf
+    scale: float | None = None
+
+    def least_size(self, guess: float) -> float:
+        """What counts as a large change of an unknown that is near zero: the typical change, or a hundredth of the first guess or of the width."""
+        if self.kind == "unbounded":
+            return self.scale or abs(guess) or 1.0
+        return self.scale or 0.01 * (self.high - self.low if self.kind == "bounds" else abs(guess)) or 1.0
+
+    def spread(self, guess, share) -> Float[np.ndarray, "*shape"]:
+        """Other first guesses: for `share` from 0 to 1 all numbers between the bounds; without bounds a factor of five to either side, or a typical change."""
+        if self.kind == "bounds":
+            return np.asarray(self.low + share * (self.high - self.low))
+        if self.kind == "positive":
+            return guess * _FAR ** (2 * share - 1)
+        return guess + (2 * share - 1) * max(abs(guess), self.least_size(guess))
+
+    def not_below(self, low: float) -> "Range":
+        """The part of the range that is not below this number, zero or a little more."""
+        return replace(self, kind="positive" if self.kind == "unbounded" else self.kind, low=max(self.low, low))
+
+    def refusal(self, guess: np.ndarray) -> str:
+        """Why a first guess cannot be taken; empty where it can."""
+        if self.low < float(guess) < self.high if guess.ndim == 0 else ((guess > self.low) & (guess < self.high)).all():
+            return ""
+        if self.kind == "positive":
+            return "expected a first guess above zero; or leave it free to change sign with `unbounded()`"
+        return f"expected a first guess between its bounds {self.low} and {self.high}; move the guess or widen the bounds"
+
+
+def positive() -> Range:
+    """The unknown is not below zero: `free={"mass": jj.positive()}`. The default of parameters declared positive or non-negative."""
+    return Range("positive", low=0.0)
+
+
+def bounds(low: Number, high: Number) -> Range:
+    """The unknown stays between `low` and `high`, in its own unit: `free={"mass": jj.bounds(0.1, 10)}`.
+
+    Raises ValueError unless both are finite and low < high.
+    """
+    for name, end in (("low end", low), ("high end", high)):
+        checked_known(end, f"{name} of `bounds`", ())
+    if not (np.isfinite(low) and np.isfinite(high) and low < high):
+        raise ValueError(f"bounds({low}, {high}): expected finite numbers low < high; for one bound at zero use `positive()`, for none `unbounded()`")
+    return Range("bounds", float(low), float(high))
+
+
+def unbounded(scale: Number | None = None) -> Range:
+    """The unknown may be any number, but for a parameter that is declared positive or non-negative, which stays so. `scale`, in its unit, is a typical change:
+    state it where the first guess is zero.
+
+    Raises ValueError unless the scale is positive and finite.
+    """
+    if scale is not None:
+        checked_known(scale, "`scale` of `unbounded`", ())
+    if scale is not None and not (np.isfinite(scale) and scale > 0):
+        raise ValueError(f"unbounded({scale}): expected a positive scale, a typical change in the unit of the unknown")
+    return Range("unbounded", scale=None if scale is None else float(scale))
+
+
+_LEAST = 1e-8  # eigenvalue of correlations: a combination that is known exactly counts as known to a ten thousandth of the sigmas
+_ROUND_OFF = 1e-9  # of correlations
+
+
+@dataclass(frozen=True, eq=False)
+class Correlated:
+    """The prior of one of several numbers that were measured together (`joint_normal`): its mean, its standard deviation, and its place among them."""
+
+    mean: float
+    sigma: float
+    place: int
+    covariance: np.ndarray  # of all of them
+
+
+def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]:
+    """Priors of several parameters whose errors are correlated: `free=jj.joint_normal({"mass": 20.9, "inertia": 1.64}, covariance)`.
+
+    **Arguments**
+    - `mean`: name -> mean, in the unit of the parameter, of one number each.
+    - `covariance`: (n, n), in the order of the names. It may be singular: a combination that it says is known exactly is taken as known to a ten thousandth of
+      the standard deviations.
+
+    **Returns** name -> prior, for `free` of `fit`, alone or together with others: `free=jj.joint_normal(...) | {"gain": None}`. Where only some of the names
+    are free, the covariance is that of these. `jj.Estimate(range=..., prior=joint["mass"])` adds a range.
+
+    **Raises** ValueError for numbers that are not finite, another shape, a matrix that is not symmetric or no covariance, and a variance that is zero.
+    Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), chapter 14 (prior information as further data).
+    """
+    if not isinstance(mean, Mapping) or not mean:
+        raise ValueError(f'`mean` of `joint_normal` is {described(mean)}, expected a dictionary of name -> mean, such as {{"mass": 20.9, "inertia": 1.64}}')
+    means = [float(checked_known(x, f"the mean of `{name}`", (), advice="give one number")) for name, x in mean.items()]
+    n, names = len(means), list(mean)
+    C = checked_known(covariance, "`covariance` of `joint_normal`", (n, n), advice=f"one row and one column for each of {', '.join(names)}")
+    if not (np.all(np.isfinite(C)) and np.all(np.isfinite(means))):
+        raise ValueError("mean and covariance of `joint_normal` must be finite; leave out what is not known")
+    variances = np.diag(C)
+    if np.any(variances <= 0):
+        first = names[int(np.argmax(variances <= 0))]
+        raise ValueError(f"the variance of `{first}` is {variances[names.index(first)]:g}, expected one above zero; a number that is known needs no estimate")
+    sigma = np.sqrt(variances)
+    correlations = C / np.outer(sigma, sigma)
+    if np.max(np.abs(correlations - correlations.T)) > _ROUND_OFF:
+        raise ValueError("`covariance` of `joint_normal` is not symmetric; give cov(a, b) = cov(b, a)")
+    if (least := np.linalg.eigvalsh(correlations)[0]) < -n * _ROUND_OFF:
+        raise ValueError(f"`covariance` of `joint_normal` is no covariance: its correlations have the eigenvalue {least:.3g}, expected none below zero")
+    return {name: Correlated(means[k], float(sigma[k]), k, C) for k, name in enumerate(names)}
+
+
+def whitening(priors: Sequence) -> Float[np.ndarray, "numbers numbers"]:
+    """M of numbers with these priors (None, or what has a mean and a sigma); the identity but for those that were measured together."""
+    M = np.eye(len(priors))
+    together: dict[int, list[int]] = {}
+    for k, prior in enumerate(priors):
+        if isinstance(prior, Correlated):
+            together.setdefault(id(prior.covariance), []).append(k)
+    for places in together.values():
+        which, sigma = [priors[k].place for k in places], np.array([priors[k].sigma for k in places])
+        C = priors[places[0]].covariance[np.ix_(which, which)] / np.outer(sigma, sigma)
+        e, V = np.linalg.eigh(C)
+        M[np.ix_(places, places)] = V.T / np.sqrt(np.maximum(e, _LEAST))[:, None]
+    return M
 
 
 @dataclass(frozen=True)
@@ -59,3 +212,38 @@ def _check_prior(prior) -> None:
         raise ValueError(f"`prior` of `Estimate` is {described(prior)}, expected `jj.Normal(mean, sigma)`") from None
     if not (np.isfinite(mean) and np.isfinite(sigma) and sigma > 0):
         raise ValueError(f"`prior` of `Estimate` is {prior}, expected a standard deviation above zero; a number that is known needs no estimate")
+
+
+class Transforms(eqx.Module):
+    """One transform for each unknown."""
+
+    kinds: tuple[str, ...] = eqx.field(static=True)
+    low: Float[np.ndarray, "unknowns"]  # zero and one where there are no bounds
+    high: Float[np.ndarray, "unknowns"]
+
+    def __init__(self, ranges: Sequence[Range]):
+        self.kinds = tuple(one.kind for one in ranges)
+        self.low = np.array([one.low if one.kind == "bounds" else 0.0 for one in ranges])
+        self.high = np.array([one.high if one.kind == "bounds" else 1.0 for one in ranges])
+
+    def _are(self, kind: str) -> np.ndarray:
+        return np.array([one == kind for one in self.kinds], bool)
+
+    def constrain(self, x: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch unknowns"]:
+        """The unknowns in their units."""
+        positive, between = self._are("positive"), self._are("bounds")
+        share = jax.nn.sigmoid(jnp.where(between, x, 0.0))
+        return jnp.where(positive, jnp.exp(jnp.where(positive, x, 0.0)), jnp.where(between, self.low + (self.high - self.low) * share, x))
+
+    def log_slopes(self, x: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch unknowns"]:
+        """`log |d theta / dx|` of each."""
+        positive, between = self._are("positive"), self._are("bounds")
+        inside = jnp.where(between, x, 0.0)
+        logs = jnp.log(self.high - self.low) + jax.nn.log_sigmoid(inside) + jax.nn.log_sigmoid(-inside)
+        return jnp.where(positive, x, jnp.where(between, logs, 0.0))
+
+    def unconstrain(self, theta: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch unknowns"]:
+        """The inverse of `constrain`; infinite at a bound, NaN beyond it."""
+        positive, between = self._are("positive"), self._are("bounds")
+        share = jnp.where(between, (theta - self.low) / (self.high - self.low), 0.5)
+        return jnp.where(positive, jnp.log(jnp.where(positive, theta, 1.0)), jnp.where(between, jnp.log(share) - jnp.log1p(-share), theta))

@@ -10,12 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.channels import channel
-from jourdain_jax.analysis.estimate import Estimate
-from jourdain_jax.analysis.instruments import Instrument
-from jourdain_jax.analysis.ranges import Range
+from jourdain_jax.analysis.estimate import Estimate, Range
+from jourdain_jax.analysis.quantities import Instrument, StopEvent, channel, cut
 from jourdain_jax.analysis.sensors import Actuator, Drive, Reading, Sensor, ideal, latest, numbers_of
-from jourdain_jax.analysis.stop_events import StopEvent, cut
 from jourdain_jax.calculus.reals import Number, checked_unless_traced, described, is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled, as_inputs
 from jourdain_jax.scene.names import as_names, nearest

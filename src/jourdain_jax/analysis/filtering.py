@@ -21,15 +21,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.channels import Channel
-from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.estimate import Correlated, Estimate
 from jourdain_jax.analysis.experiment import Experiment
-from jourdain_jax.analysis.instruments import Instrument
-from jourdain_jax.analysis.joint_prior import Correlated
 from jourdain_jax.analysis.likelihood import as_fit_options, as_runs, check_known, mapped
+from jourdain_jax.analysis.quantities import Channel, Instrument, StopEvent
 from jourdain_jax.analysis.runs import Run, equal_runs
 from jourdain_jax.analysis.sensors import Reading, ideal
-from jourdain_jax.analysis.stop_events import StopEvent
 from jourdain_jax.analysis.tangent import dependent_coordinates, others, privileged_speeds
 from jourdain_jax.calculus.reals import checked_unless_traced, is_traced
 from jourdain_jax.equations.kinematics import motion_at

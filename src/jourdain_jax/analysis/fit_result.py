@@ -5,16 +5,11 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from jourdain_jax.analysis.asked import taken_up
 from jourdain_jax.analysis.estimates import Estimates
 from jourdain_jax.analysis.experiment import Experiment
-from jourdain_jax.analysis.fit_page import fit_page
-from jourdain_jax.analysis.fit_pictures import interval_widths
-from jourdain_jax.analysis.fit_text import batch_text, text
-from jourdain_jax.analysis.fit_warnings import warnings_of
-from jourdain_jax.analysis.held_out import Prediction, of_fitted, of_held_out
-from jourdain_jax.analysis.informed import informed
-from jourdain_jax.analysis.likelihood_profiles import Profile, profiles
+from jourdain_jax.analysis.fit_page import fit_page, interval_widths
+from jourdain_jax.analysis.fit_text import batch_text, text, warnings_of
+from jourdain_jax.analysis.resumed import Prediction, Profile, informed, of_fitted, of_held_out, profiles, taken_up
 from jourdain_jax.scene.names import as_names
 
 MOST_INFORMED = 24  # unknowns of which the report says what informs them

@@ -9,17 +9,35 @@
 An unknown with a part in the remaining directions V_0 has no standard error and no interval: one that moves by sqrt(cutoff) of its size, or by a tenth of what
 would be its standard error, while all unknowns move along V_0 by about their sizes.
 Source: G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), sections 2.1 and 3.4; G. H. Golub and V. Pereyra, Inverse Problems 19 (2003) R1.
+
+Numbers that follow from what a fit found: their estimates, standard errors and intervals, to first order.
+
+    y = f(scene),     var(y) = g' C g,     g = d y / d theta,     interval y -+ q sqrt(var(y))      C: covariance of the estimates
+
+A number can be told although its parts cannot: it has a standard error where g has no part in the directions that do not show.
+Source: C. R. Rao, Linear Statistical Inference and Its Applications, 2nd ed. (1973), section 6a.2 (the delta method).
+
+Combinations of unknowns that the data tell, but poorly ("sloppy" directions), in words.
+
+C_rel = C_ij / (size_i size_j),      C_rel v = s^2 v:      the unknowns may change together along d theta_i/size_i = s v_i, s being one standard error
+
+The size of an unknown is its magnitude; near zero, its typical change (`Range`). Source: R. N. Gutenkunst et al., PLoS Computational Biology 3 (2007) e189.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.analysis.arrow import Arrow
+from jourdain_jax.analysis.layout import Layout
+from jourdain_jax.calculus.reals import described
+from jourdain_jax.scene.scene import Scene
 
 _ARRAYS = ["singular_values", "hidden", "least_part", "rank", "identifiable", "standard_errors", "shared", "own", "follow"]
 _WHOLE = 0.01  # how far from a multiple of one half an exponent may be, to be taken as that, and two changes from being equal
@@ -210,3 +228,93 @@ def _reduced(rows: np.ndarray, least_part) -> np.ndarray:
         rows[others] -= np.outer(rows[others, k], rows[i])
         free.remove(i)
     return np.where(np.abs(rows) > least_part * np.linalg.norm(rows, axis=1, keepdims=True), rows, 0.0)
+
+
+def derived(scene: Scene, layout: Layout, function: Callable[[Scene], Array], shared: Float[np.ndarray, "*repeats shared"]):
+    """y and d y / d (shared unknowns), of one fit or of each of a batch. ValueError where the function does not return numbers."""
+
+    def of(shared):
+        value = function(layout.scene(scene, shared))
+        try:
+            return jnp.asarray(value, jnp.result_type(float))
+        except (TypeError, ValueError):
+            raise ValueError(f"the function returns {described(value)}, expected a number or an array of numbers") from None
+
+    def with_slopes(shared):
+        return of(shared), jax.jacfwd(of)(shared)
+
+    for _ in shared.shape[:-1]:
+        with_slopes = jax.vmap(with_slopes)
+    value, slopes = with_slopes(jnp.asarray(shared))
+    return np.asarray(value), np.asarray(slopes)
+
+
+def standard_errors(
+    known: Information,
+    slopes: Float[np.ndarray, "*numbers shared"],
+    sizes: Float[np.ndarray, "*repeats shared"],
+    at_bound: Bool[np.ndarray, "*repeats shared"],
+    cutoff: float,
+) -> Float[np.ndarray, "*numbers"]:
+    """Standard errors of numbers with these slopes, which have an axis of repeats in front where the information has.
+
+    NaN for those that depend on a direction that does not show, or on an unknown at a bound.
+    """
+    shared = slopes.shape[-1]
+    covariance, largest = known.whole_covariance[..., :shared, :shared], np.max(known.singular_values, axis=-1, initial=0.0)
+
+    def of_one(C, hidden, rank, largest, slopes, sizes, at_bound):
+        error = np.sqrt(np.einsum("...i,ij,...j->...", slopes, C, slopes))
+        scaled = slopes * sizes  # with respect to theta / size
+        part = np.linalg.norm(scaled @ hidden[:, :shared].T, axis=-1)
+        told = (part <= np.minimum(np.sqrt(cutoff) * np.linalg.norm(scaled, axis=-1), error * least_move(cutoff, largest))) & ~np.any(
+            (slopes != 0) & (at_bound | (rank == 0)), axis=-1
+        )
+        return np.where(told, error, np.nan)
+
+    if sizes.ndim == 1:
+        return of_one(covariance, known.hidden[0], known.rank, largest, slopes, sizes, at_bound)
+    return np.stack([of_one(*one) for one in zip(covariance, known.hidden, known.rank, largest, slopes, sizes, at_bound, strict=True)])
+
+
+WEAK = 0.1  # relative standard error from which a direction is named
+CORRELATED = 0.98  # from which a pair is
+_PART = 0.1  # of the largest entry of a direction: what is less is left out
+_MOST = 400  # unknowns that are looked at
+
+
+def weak_combinations(
+    covariance: Float[np.ndarray, "unknowns unknowns"], values: Float[np.ndarray, "unknowns"], sizes: Float[np.ndarray, "unknowns"], labels: tuple[str, ...]
+) -> tuple[str, ...]:
+    """The directions with a relative standard error of `WEAK` or more, weakest first, one sentence each.
+
+    They are those of the unknowns that runs share, where there are any.
+    """
+    some = np.flatnonzero(np.isfinite(np.diagonal(covariance)))[:_MOST]
+    shared = [i for i in some if not labels[i].startswith("run ")]
+    some = np.array(shared) if shared else some
+    if not some.size:
+        return ()
+    is_relative = np.abs(values[some]) > 1e-3 * np.abs(sizes[some])
+    scale = np.abs(sizes[some])
+    squares, directions = np.linalg.eigh(covariance[np.ix_(some, some)] / (scale * scale[:, None]))
+    found = []
+    for k in range(some.size)[::-1]:
+        spread = float(np.sqrt(max(squares[k], 0.0)))
+        if spread < WEAK:
+            break
+        change = spread * directions[:, k] * scale / np.where(is_relative, np.abs(values[some]), 1.0)  # d theta / |theta|, or d theta
+        parts = np.flatnonzero(np.abs(directions[:, k]) > _PART * np.max(np.abs(directions[:, k])))
+        parts = parts[np.argsort(-np.abs(directions[parts, k]))]
+        told = [_by(labels[some[i]], change[i] * np.sign(change[parts[0]]), bool(is_relative[i])) for i in parts]
+        if len(told) == 1:
+            found.append(f"{told[0]} is one standard error: the data tell it poorly")
+        else:
+            found.append(f"{', '.join(told[:-1])} and {told[-1]} together are one standard error: the data tell this combination poorly")
+    return tuple(found)
+
+
+def _by(name: str, change: float, is_relative: bool) -> str:
+    if not is_relative:
+        return f"a change of `{name}` by {change:.2g}"
+    return f"a change of `{name}` by {100 * change:.2g} %" if abs(change) < 0.995 else f"a change of `{name}` by {change:.2g} times its value"

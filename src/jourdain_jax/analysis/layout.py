@@ -2,9 +2,24 @@
 
 Shared unknowns are parameters of the scene, second moments and shears of bodies (`body_inertia`), and numbers of sensors. Parameters may follow from them
 (`ties`).
+
+The inertia of one body by second moments that are not negative, in a scene that has a parameter for each of its moments of inertia.
+
+    I_ij = c_k p_k                                    every entry of the body's inertia matrix is a parameter p_k, times a constant c_k, or zero
+    I = tr(S) 1 - S,   S = L diag(D) L',   D >= 0     S: second moments of the mass about its centre;    L = [1 l12 l13; 0 1 l23; 0 0 1]
+
+A body has such an inertia, and every body's inertia is one. I is linear in D, so that a flat body, which has a D of zero, is at a bound like any other. Moments
+of inertia about two axes that have one parameter are equal, and so are two of D. Which parameters these are is found by differentiating the inertia matrix.
+
+Parameters that follow from others in a fit: two equal wheels, an inertia that a shape and a mass give.
+
+    p = f(scene)      f: plain JAX, of the scene with the unknowns in their places and the parameters tied before this one
+
+A function is traced when it is handed over, and ties are compared by what they compute: a new lambda in every call is the same tie.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Literal
@@ -14,9 +29,211 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.body_inertia import BodyInertia
-from jourdain_jax.analysis.ties import Tie
+from jourdain_jax.calculus.reals import described
+from jourdain_jax.eager.eager import eval_numpy
+from jourdain_jax.equations.kinematics import pose_at
+from jourdain_jax.program.calls import Call
+from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
+
+_DIAGONAL, _PRODUCTS = ((0, 0), (1, 1), (2, 2)), ((0, 1), (1, 2), (0, 2))
+_ROUND_OFF = 1e-9
+_OTHERWISE = "give its parameters ranges or ties of their own, or make its inertia of `jj.log_cholesky` numbers in the scene"
+
+
+@dataclass(frozen=True)
+class PossibleInertia:
+    """What `possible_inertia` returns."""
+
+
+def possible_inertia() -> PossibleInertia:
+    """The inertia of a body is unknown, and is always one that a body can have: `free={"rear frame": jj.possible_inertia()}`, with the name of the body.
+
+        I = tr(S) 1 - S,   S = L diag(D) L',   D >= 0,   L = [1 l12 l13; 0 1 l23; 0 0 1]
+
+    In place of the moments and products of inertia (kg m^2, about the mass centre) the fit has second moments D (kg m^2) and shears l as unknowns,
+    `"rear frame second moment[0]"` and `"rear frame shear[0]"`. Principal moments of inertia are then positive, and each is at most the sum of the other two.
+    `Fit.tied` tells moments and products themselves, with standard errors and intervals to first order; none where D is at its bound, which means that the
+    body is flat as far as the data tell. Where two axes have one parameter, as those of a wheel do, they have one D.
+
+    It is for scenes that have a parameter for each of the three moments, and for none, one or all of the products; ValueError, from `fit`, for others, and
+    where the first guess is no inertia of a body with a thickness. Source: P. M. Wensing, S. Kim and J.-J. E. Slotine, IEEE Robotics and Automation Letters 3
+    (2018) 60, for what inertias bodies have.
+    """
+    return PossibleInertia()
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A parameter that is an entry of an inertia matrix, but for a constant."""
+
+    name: str
+    index: tuple[int, ...]  # in the parameter, where that is an array
+    row: int
+    column: int
+    factor: float  # entry = factor * parameter
+
+
+@dataclass(frozen=True)
+class BodyInertia:
+    """Which parameters of a scene are the inertia of a body; hashable."""
+
+    body: str
+    entries: tuple[Entry, ...]  # the first of each parameter
+    axes: tuple[int, ...]  # which of D belongs to an axis
+    products: tuple[int, ...]  # which of l12, l23, l13 there are
+
+    @property
+    def labels(self) -> tuple[str, str]:
+        """Names of the entries of D and of l."""
+        return f"{self.body} second moment", f"{self.body} shear"
+
+    def numbers(self, scene: Scene) -> tuple[Float[Array, "moments"], Float[Array, "shears"]]:
+        """D and l of a scene's parameters; NaN where no body with a thickness has such moments."""
+        value = {(entry.row, entry.column): entry.factor * getattr(scene, entry.name)[entry.index] for entry in self.entries}
+        of_axis = {self.axes[entry.row]: value[entry.row, entry.row] for entry in self.entries if entry.row == entry.column}
+        I = jnp.diag(jnp.stack([of_axis[k] for k in self.axes]))
+        for i, j in (_PRODUCTS[k] for k in self.products):
+            I = I.at[i, j].set(value[i, j]).at[j, i].set(value[i, j])
+        S = jnp.trace(I) / 2 * jnp.eye(3, dtype=I.dtype) - I
+        # L diag(D)^1/2, from the last row up, since it is upper triangular: the factor of S with its rows and columns the other way round
+        A = jnp.linalg.cholesky(S[::-1, ::-1])[::-1, ::-1]
+        D = jnp.diag(A) ** 2
+        l = [A[i, j] / A[j, j] for i, j in (_PRODUCTS[k] for k in self.products)]
+        return D[np.array([self.axes.index(k) for k in range(max(self.axes) + 1)])], jnp.stack(l) if l else jnp.zeros(0, D.dtype)
+
+    def values(self, D: Float[Array | np.ndarray, "*members moments"], l: Float[Array | np.ndarray, "*members shears"]) -> list[Float[Array, "*members"]]:
+        """The parameter of every entry."""
+
+        def inertia(D, l):
+            L = jnp.eye(3, dtype=D.dtype)
+            for k, product in enumerate(self.products):
+                L = L.at[_PRODUCTS[product]].set(l[k])
+            S = L @ jnp.diag(D[np.array(self.axes)]) @ L.T
+            return jnp.trace(S) * jnp.eye(3, dtype=S.dtype) - S
+
+        for _ in D.shape[:-1]:
+            inertia = jax.vmap(inertia)
+        I = inertia(jnp.asarray(D), jnp.asarray(l))
+        return [I[..., entry.row, entry.column] / entry.factor for entry in self.entries]
+
+
+def inertia_of_body(scene: Scene, name: str) -> BodyInertia:
+    """Which parameters are the inertia of the body of this name. ValueError where there is no such body, or its inertia is not made of parameters so."""
+    diagonal, products = _found(scene, name)
+    axes: list[int] = []
+    entries: list[Entry] = []
+    seen: dict[tuple, tuple[int, float]] = {}
+    for i, entry in enumerate(diagonal):
+        what = entry.name, entry.index
+        if what not in seen:
+            seen[what] = len(seen), entry.factor
+            entries.append(entry)
+        number, factor = seen[what]
+        if factor != entry.factor:
+            raise ValueError(_refusal(scene, name, f"moments about axes {entries[number].row + 1} and {i + 1} are different multiples of `{entry.name}`"))
+        axes.append(number)
+    there = tuple(k for k, entry in enumerate(products) if entry is not None)
+    entries += [entry for entry in products if entry is not None]
+    if len({(entry.name, entry.index) for entry in entries}) < len(entries):
+        raise ValueError(_refusal(scene, name, "one parameter is a moment and a product, or two products"))
+    if len(there) == 2 or (there and len(seen) < 3):
+        what = f"it has {len(there)} products of inertia and {len(seen)} moments that differ, expected no, one or three products, and three moments with any"
+        raise ValueError(_refusal(scene, name, what))
+    found = BodyInertia(name, tuple(entries), tuple(axes), there)
+    if not np.all(np.isfinite(found.numbers(scene)[0])):
+        moments = ", ".join(f"{entry.factor * float(np.asarray(getattr(scene, entry.name))[entry.index]):.4g}" for entry in diagonal)
+        raise ValueError(
+            f"body `{name}` of `{type(scene).__name__}` has the moments of inertia {moments} kg m^2, which with its products no body with a thickness has: "
+            "principal ones must be positive, each less than the sum of the other two; of a flat body, give the largest a little less than that sum"
+        )
+    return found
+
+
+def _found(scene: Scene, name: str) -> tuple[list[Entry], list[Entry | None]]:
+    """Entries of the diagonal, and of the products 12, 23, 13."""
+    known = {of: placed.body for of, placed in pose_at(scene, 0.0, scene.named()[0]).bodies.items()}
+    if name not in known:
+        raise ValueError(f"`free` asks for a possible inertia of `{name}`, which is no body of `{type(scene).__name__}`; {nearest(name, known)}")
+    if not isinstance(known[name], RigidBody):
+        raise ValueError(f"`free` asks for a possible inertia of `{name}`, but that is a particle, which has none; name a rigid body")
+    names = [of for of, value, _ in parameters_of(scene) if np.issubdtype(np.asarray(value).dtype, np.floating)]
+    values = {of: np.asarray(getattr(scene, of), float) for of in names}
+    generator = np.random.default_rng(0)
+    elsewhere = {of: x * (1 + 0.1 * generator.uniform(size=x.shape)) + 0.01 * generator.uniform(size=x.shape) for of, x in values.items()}
+    slopes_of = _slopes(name)
+    (I, slopes), (I_there, slopes_there) = slopes_of(scene, values), slopes_of(scene, elsewhere)
+    size = np.max(np.abs(I))
+
+    def entry(i: int, j: int) -> Entry | None:
+        where = [(of, index) for of in names for index in np.ndindex(values[of].shape) if slopes[of][(i, j, *index)] or slopes_there[of][(i, j, *index)]]
+        if not where:
+            if i != j and abs(I[i, j]) <= _ROUND_OFF * size:
+                return None
+            raise ValueError(_refusal(scene, name, f"entry {i + 1}{j + 1} of its inertia, {I[i, j]:.4g} kg m^2, is no parameter"))
+        of, index = where[0]
+        factor = float(slopes[of][(i, j, *index)])
+        straight = all(abs(M[i, j] - factor * x[of][index]) <= _ROUND_OFF * abs(M[i, j]) for M, x in ((I, values), (I_there, elsewhere)))
+        if len(where) > 1 or not straight:
+            parts = ", ".join(f"`{of}`" for of in dict.fromkeys(of for of, _ in where))
+            raise ValueError(_refusal(scene, name, f"entry {i + 1}{j + 1} of its inertia is made of {parts}, expected one parameter times a constant"))
+        return Entry(of, index, i, j, factor)
+
+    return [entry(i, j) for i, j in _DIAGONAL], [entry(i, j) for i, j in _PRODUCTS]
+
+
+def _slopes(name: str) -> Callable:
+    @eval_numpy
+    def of(scene: Scene, values: dict):
+        def inertia(values):
+            moved = scene.replace(**values)
+            return pose_at(moved, 0.0, moved.named()[0]).bodies[name].body.inertia
+
+        return inertia(values), jax.jacfwd(inertia)(values)
+
+    return of
+
+
+def _refusal(scene: Scene, name: str, why: str) -> str:
+    return f"the inertia of body `{name}` of `{type(scene).__name__}` cannot be told by `possible_inertia`: {why}; {_OTHERWISE}"
+
+
+@dataclass(frozen=True)
+class Tie:
+    """A parameter, and what it is of the leaves of the scene."""
+
+    name: str
+    function: Call
+
+    def value(self, leaves: list) -> Array:
+        """The parameter of a scene with these leaves."""
+        return self.function.results(*leaves)[0]
+
+
+def tied_by(name: str, function: Callable, scene: Scene) -> Tie:
+    """A parameter as a function of the scene, which has the first guesses. ValueError where the function gives no value that the parameter may have."""
+    leaves, treedef = jax.tree.flatten(scene)
+    expected = jnp.shape(getattr(scene, name))
+
+    def of_leaves(*leaves):
+        value = function(jax.tree.unflatten(treedef, leaves))
+        try:
+            found = jnp.asarray(value, jnp.result_type(float))
+        except (TypeError, ValueError):
+            raise ValueError(f"the function in `free` of `{name}` returns {described(value)}, expected a number or an array of shape {expected}") from None
+        if found.shape != expected:
+            raise ValueError(f"the function in `free` of `{name}` returns an array of shape {found.shape}, expected {expected}, that of the parameter")
+        return found
+
+    found = Tie(name, Call(jax.make_jaxpr(of_leaves)(*leaves), ("a tied parameter",)))
+    try:
+        scene.replace(**{name: found.value(leaves)})
+    except ValueError as error:
+        raise ValueError(f"at the first guess the function in `free` of `{name}` gives a value that is not allowed: {error}") from None
+    return found
+
 
 Kind = Literal["scene", "sensor", "inertia"]
 

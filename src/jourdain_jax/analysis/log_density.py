@@ -17,18 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.body_inertia import PossibleInertia
 from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits
-from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.estimate import Estimate, Range, Transforms, bounds, positive
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.fit_result import Fit
-from jourdain_jax.analysis.layout import Layout
+from jourdain_jax.analysis.layout import Layout, PossibleInertia
 from jourdain_jax.analysis.likelihood import as_fit_options, as_runs, in_all_or_none, mapped, of_run
-from jourdain_jax.analysis.ranges import Range, bounds, positive
 from jourdain_jax.analysis.runs import Run, equal_runs
-from jourdain_jax.analysis.starts import check_starts
-from jourdain_jax.analysis.transforms import Transforms
-from jourdain_jax.analysis.unknowns import unknowns_of
+from jourdain_jax.analysis.unknowns import check_starts, unknowns_of
 from jourdain_jax.build.reference import Reference
 from jourdain_jax.build.reference_parameters import reference_parameters
 from jourdain_jax.calculus.compiled import compiled

@@ -15,15 +15,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jourdain_jax.analysis.estimate import Range, unbounded
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.layout import Place
 from jourdain_jax.analysis.levenberg_marquardt import Linearised
 from jourdain_jax.analysis.losses import Loss
-from jourdain_jax.analysis.nodes import NODE
-from jourdain_jax.analysis.predictions import Lanes, Some
 from jourdain_jax.analysis.problem import Problem, closed
-from jourdain_jax.analysis.ranges import Range, unbounded
-from jourdain_jax.analysis.shooting import MultipleShooting, ends_of_pieces, in_pieces, numbers_of_filters, owned
+from jourdain_jax.analysis.runs import Lanes, Some
+from jourdain_jax.analysis.shooting import NODE, MultipleShooting, ends_of_pieces, in_pieces, numbers_of_filters, owned
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.motion.options import AllOptions
 from jourdain_jax.scene.scene import Scene

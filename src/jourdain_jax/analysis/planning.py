@@ -15,13 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.body_inertia import PossibleInertia
-from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.estimate import Estimate, Range
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.information import hidden_combinations
-from jourdain_jax.analysis.layout import Layout
+from jourdain_jax.analysis.layout import Layout, PossibleInertia
 from jourdain_jax.analysis.likelihood import as_fit_options, as_runs
-from jourdain_jax.analysis.ranges import Range
 from jourdain_jax.analysis.runs import Run, run_of
 from jourdain_jax.analysis.table import table
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of

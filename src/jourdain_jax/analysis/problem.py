@@ -17,7 +17,7 @@ from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits,
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Linearised, Minimum, minimise
 from jourdain_jax.analysis.losses import Loss
-from jourdain_jax.analysis.predictions import Lanes, Some
+from jourdain_jax.analysis.runs import Lanes, Some
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.scene.scene import Scene
 

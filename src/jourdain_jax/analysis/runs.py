@@ -1,26 +1,36 @@
 """Runs made ready: measurements with weights, the motion of a scene and the residuals that it leaves; grouped by structure, and filled up to one length.
 
 r = (reading - value) / sigma, zero where a sample is missing
+
+What a scene predicts for the measurements of many runs, against what was measured, with derivatives, in one compiled program.
+
+A lane is one run of one member (a repeat of the experiment, or a first guess of its own). Some lanes at a time go through one program, which is
+compiled once for runs of equal structure, whatever their number: memory does not grow with it. Short runs are filled up to the length of the longest.
 """
 
-from collections.abc import Callable, Sequence
+import math
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.analysis.channels import Channel
+from jourdain_jax.analysis.correlated_noise import Chains, whitened
 from jourdain_jax.analysis.experiment import Experiment
-from jourdain_jax.analysis.grids import grid, intervals
 from jourdain_jax.analysis.layout import Layout
-from jourdain_jax.analysis.nodes import LAST, NODE, begin, ended
-from jourdain_jax.analysis.sensors import Drive, Reading, ideal, with_numbers
-from jourdain_jax.analysis.stop_events import StopEvent
+from jourdain_jax.analysis.quantities import Channel, StopEvent
+from jourdain_jax.analysis.sensors import Drive, Reading, grid, ideal, intervals, with_numbers
+from jourdain_jax.analysis.shooting import LAST, NODE, begin, ended
+from jourdain_jax.build.reference import Reference
+from jourdain_jax.motion.forward_mode import simulate_alongside
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.options import AllOptions
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -170,3 +180,185 @@ def filled_up(run: Run, times: int, knots: list[int], axis: int) -> Run:
     pad = lambda x: np.concatenate([x, np.zeros((*x.shape[:axis], more, *x.shape[axis + 1 :]))], axis=axis)  # noqa: E731
     ts = np.concatenate([run.ts, run.ts[-1] + FILLED * (run.ts[-1] - run.t0) * np.arange(1, more + 1)])
     return run._replace(ts=ts, values={n: pad(x) for n, x in run.values.items()}, weights={n: pad(x) for n, x in run.weights.items()})
+
+
+TOUCHED = 2**18  # bytes of saved states with their tangents in one loop: far below what XLA compiles into one function (see `jourdain_jax`)
+MOST_LANES = 64
+AHEAD = 4  # groups of lanes that are begun before the first is read
+Some = tuple[np.ndarray, np.ndarray, np.ndarray]  # members (among those asked for), runs, and [J r] (lanes, samples, unknowns + 1), own unknowns first
+
+
+class Lanes:
+    """All lanes of a problem; `evaluate` gives their weighted residuals with derivatives."""
+
+    def __init__(self, scene: Scene, data: Sequence[Experiment], layout: Layout, options: AllOptions, members: int | None):
+        self.members = members
+        ready = lambda i: run_of(data[i], repeats=members is not None)  # noqa: E731
+        self.groups = [Group(scene, indices, list(map(ready, indices)), layout, options, members) for indices in grouped(data)]
+        self._of_run = {run: group for group in self.groups for run in group.runs.tolist()}
+
+    def evaluate(self, shared: Float[np.ndarray, "members shared"], local: Float[np.ndarray, "members runs local"], members: np.ndarray) -> Iterator[Some]:
+        """Yield [J r] of all lanes, some at a time."""
+        for group in self.groups:
+            yield from group.evaluate(shared, local, members)
+
+    def group_of(self, run: int) -> "Group":
+        """The runs of equal structure that this one belongs to."""
+        return self._of_run[run]
+
+    def counted(self, names: Sequence[str], members: np.ndarray) -> Float[np.ndarray, "members names"]:
+        """Samples of each of these channels that are not missing, in all runs."""
+        found = np.zeros((len(members), len(names)))
+        for k, name in enumerate(names):
+            for group in self.groups:
+                weights = group.weights.get(name)
+                if weights is not None:
+                    here = np.count_nonzero(weights, axis=tuple(range(2, weights.ndim))) if self.members is not None else np.count_nonzero(weights)
+                    found[:, k] += here.sum(axis=0)[members] if self.members is not None else here
+        return found
+
+
+class Group:
+    """Runs of equal structure, padded to one length. A lane is a run, by its number in the problem, and a member."""
+
+    def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, options: AllOptions, members: int | None):
+        self.runs, self._members, self._lengths = np.array(indices), members, [run.ts.shape[0] for run in runs]
+        times, knots, count = max(self._lengths), most_knots(runs), members or 1
+        equal = runs if runs[0].grid is None or len(runs) == 1 else on_equal_grids(runs)
+        filled = [filled_up(run, times, knots, 0 if members is None else 1) for run in equal]
+        first = filled[0]
+        self.weights = {name: np.array([run.weights[name] for run in filled]) for name in first.weights}  # (runs, *members, times, *channel)
+        self._t0, self._ts = np.array([run.t0 for run in filled]), np.array([run.ts for run in filled])
+        self.channels, end = {}, 0
+        for name, weight in sorted(first.weights.items()):
+            begin, end = end, end + math.prod(weight.shape[0 if members is None else 1 :])
+            self.channels[name] = slice(begin, end)
+        taus = {name: np.stack([run.correlation_time[name] for run in filled]) for name in first.correlation_time}
+        self._chains = Chains.of(self.weights, self._ts, taus, self.channels, members is not None) if taus else None
+        # numbers of a run in one row, since each array that is handed over costs as much as some of the steps of a motion
+        self._common = _row((scene, options), 1)[0]
+        self._rows = np.stack([_row(run, count, members is not None) for run in filled])
+        if members is not None:
+            first = first._replace(**{name: {n: x[0] for n, x in getattr(first, name).items()} for name in _BY_MEMBER})
+        leaves, treedef = jax.tree.flatten(((scene, options), first))
+        shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if is_array(x) else x for x in leaves)
+        self._run = _program(Reference.where_free(scene, layout.parameters), treedef, shapes, layout)
+        saved = times if first.grid is None else first.grid.shape[0]
+        states = saved * (len(scene.coordinate_names) + len(scene.speed_names)) * 8 * (1 + sum(layout.sizes))
+        self._width = int(min(MOST_LANES, max(1, TOUCHED // states)))
+        self._kept: dict[int, list] = {}
+
+    def places(self, runs: np.ndarray) -> np.ndarray:
+        """Return the places of these runs in the group."""
+        return np.searchsorted(self.runs, runs)
+
+    def evaluate(self, shared, local, members) -> Iterator[Some]:
+        """As of `Lanes`."""
+        if len(members) not in self._kept:
+            self._kept = {len(members): self._chunks(len(members))}
+        first, *chunks = self._kept[len(members)]
+
+        def lanes(kept: int, b: np.ndarray, j: np.ndarray) -> Some:
+            rows = self._rows[j, members[b] if self._members is not None else 0]
+            found = self._run(self._common, np.concatenate([rows, local[b, self.runs[j]], shared[b]], axis=1))
+            return b[:kept], self.runs[j[:kept]], np.asarray(found)[:kept]
+
+        yield lanes(*first)  # compiles, where that is needed
+        waiting: list[Future] = []
+        try:
+            for chunk in chunks:
+                waiting.append(_threads().submit(lanes, *chunk))
+                if len(waiting) == AHEAD:
+                    yield waiting.pop(0).result()
+            while waiting:
+                yield waiting.pop(0).result()
+        finally:
+            for future in waiting:
+                future.cancel()
+
+    def _chunks(self, members: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
+        """How many lanes at a time, with positions of their members and runs; these are filled up with copies of the last."""
+        count = members * len(self.runs)
+        width = min(self._width, 1 << (count - 1).bit_length())
+        lanes = np.minimum(np.arange(-(-count // width) * width), count - 1).reshape(-1, width)
+        return [(min(width, count - k * width), *np.divmod(some, len(self.runs))) for k, some in enumerate(lanes)]
+
+    def whitened(self, runs: np.ndarray, members: np.ndarray, rows: Float[np.ndarray, "lanes samples width"], taus: dict[str, np.ndarray]) -> np.ndarray:
+        """Rows of lanes, whitened; `taus`: correlation times (lanes,) that are estimated, s."""
+        if self._chains is None:
+            return rows
+        before, rho = self._chains.at(self.places(runs), None if self._members is None else members, taus)
+        return whitened(rows, np.take_along_axis(rows, before[..., None], axis=1), rho[..., None])
+
+    def log_widths(self, runs: np.ndarray, members: np.ndarray, taus: dict[str, np.ndarray]) -> Float[np.ndarray, "lanes"]:
+        """`sum log sqrt(1 - rho^2)` of lanes."""
+        if self._chains is None:
+            return np.zeros(len(runs))
+        _, rho = self._chains.at(self.places(runs), None if self._members is None else members, taus)
+        return 0.5 * np.sum(np.log1p(-(rho**2)), axis=1)
+
+    def within(self, runs: np.ndarray, share: Float[np.ndarray, "lanes"]) -> Bool[np.ndarray, "lanes samples"]:
+        """Which samples of these runs lie in the first `share` of the span."""
+        ts, t0 = self._ts[self.places(runs)], self._t0[self.places(runs)]
+        early = np.abs(ts - t0[:, None]) <= (share * np.abs(ts[:, -1] - t0))[:, None]
+        counts = [(where.stop - where.start) // early.shape[1] for where in self.channels.values()]
+        return np.concatenate([np.repeat(early, count, axis=1) for count in counts], axis=1)
+
+    def by_channel(self, run: int, flat: Float[np.ndarray, "*members samples"]) -> dict[str, np.ndarray]:
+        """Weighted residuals of a run by channel, NaN where a sample is missing; all NaN where `flat` is empty, since they were not worked out."""
+        place, found = int(np.searchsorted(self.runs, run)), {}
+        for name, where in self.channels.items():
+            weight = self.weights[name][place]
+            shape = weight.shape if self._members is None else weight.shape[1:]
+            part = flat[..., where].reshape((*flat.shape[:-1], *shape)) if flat.shape[-1] else np.full((*flat.shape[:-1], *shape), np.nan)
+            found[name] = np.where(weight > 0, part, np.nan)[(slice(None),) * (flat.ndim - 1) + (slice(self._lengths[place]),)]
+        return found
+
+
+_BY_MEMBER = ("values", "weights")  # of a run, which differ by member where there are any
+
+
+def _row(tree, count: int, by_member: bool = False) -> Float[np.ndarray, "members numbers"]:
+    """Return all numbers of a tree in the order of `ravel_pytree`; for a run, of each of so many members."""
+    own = {id(x) for name in _BY_MEMBER for x in getattr(tree, name).values()} if by_member else set()
+    parts = [np.asarray(x).reshape(count if id(x) in own else 1, -1) for x in jax.tree.leaves(tree) if is_array(x)]
+    found, end = np.empty((count, sum(part.shape[1] for part in parts))), 0
+    for part in parts:
+        begin, end = end, end + part.shape[1]
+        found[:, begin:end] = part
+    return found
+
+
+@lru_cache(maxsize=1)
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="jourdain_fit")
+
+
+@lru_cache(maxsize=16)
+def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Callable:
+    """Compile [J r] of lanes, shape (lanes, samples, local + shared + 1), from numbers that all share and rows of runs with their unknowns.
+
+    `reference`: of the scene; `treedef`, `leaves`: of scene, options and run, with shapes in place of arrays.
+    """
+    own, unknowns = layout.sizes[1], sum(layout.sizes)
+    zeros = [np.zeros(x.shape, jax.dtypes.canonicalize_dtype(x.dtype)) if isinstance(x, jax.ShapeDtypeStruct) else x for x in leaves]
+    arrays, rest = eqx.partition(jax.tree.unflatten(treedef, zeros), is_array)
+    (_, of_all), (_, of_run) = map(ravel_pytree, arrays)
+
+    def lane(common: Float[Array, "shared"], row: Float[Array, "own"], x: Float[Array, "unknowns"]) -> Float[Array, "samples width"]:
+        (scene, options), run = eqx.combine((of_all(common), of_run(row)), rest)
+
+        def flat(x):
+            residuals = run.at(layout, x[own:], x[:own]).residuals(layout.scene(scene, x[own:]), simulate_alongside, options)
+            return jnp.concatenate([jnp.ravel(residuals[name]) for name in sorted(residuals)])
+
+        with reference.stands_in():
+            r, J = jax.vmap(lambda e: jax.jvp(flat, (x,), (e,)), out_axes=(None, 1))(np.eye(unknowns, dtype=x.dtype))
+        return jnp.concatenate([J, r[:, None]], axis=1)
+
+    each = jax.vmap(lane, (None, 0, 0))
+
+    def lanes(common: Float[Array, "shared"], rows: Float[Array, "lanes own"]) -> Float[Array, "lanes samples width"]:
+        return each(common, *jnp.split(rows, [rows.shape[1] - unknowns], axis=1))
+
+    return jax.jit(lanes)

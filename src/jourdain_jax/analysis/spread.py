@@ -6,21 +6,275 @@ by profile   2 (F - F_min) <= 3.84 f,   3.84 f = w^2 n log(1 + q^2 / n)      n: 
                                                                              from all samples, without allowing for the unknowns
 With one channel of unknown sigma, no prior and a linear motion both are the interval of Student's t of regression.
 Source: F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110; D. M. Bates and D. G. Watts, Nonlinear Regression Analysis (1988), section 6.1.
+
+Unknowns at a bound: how far from it each may be, a one-sided limit by profile likelihood; and intervals that bounds make too narrow.
+
+p(delta) = min over all other unknowns of (F - F_min), theta = bound + delta;      the limit is where 2 p = 3.84 f      f: see `spread`; 1 where noise is known
+p is close to g delta + h delta^2 / 2, g: slope of F there, 1 / h: variance of the unknown if it were free
+p < 0: F is lower away from the bound. So it is where another unknown does the same at the bound, as a delay does at a lag of zero: F is level there, a saddle
+beyond      d = b / sqrt(w^2 - b^2 / n),  b = g e:   standard errors that the data would put it beyond its bound      e: as F foretells; w, n: see `spread`
+
+What a bound adds to the residuals counts as noise where sigmas are estimated: with N samples, b stays below sqrt(N) however far the bound is; d does not.
+The rise is that at the ends of other intervals. With that of a one-sided limit, 2.71 f, data would choose between two kinds of interval, which together hold a
+truth that is 1.6 standard errors from its bound in 92.5 % of repeats.
+Source: D. J. Venzon and S. H. Moolgavkar, Applied Statistics 37 (1988) 87; G. J. Feldman and R. D. Cousins, Physical Review D 57 (1998) 3873, section IV.
+
+How large noise is that nobody stated: what sigmas are estimated to be, once it is allowed for that their samples determined unknowns as well.
+
+    sigma_c^2 = sum w^2 / (n_c - p_c),    p_c = tr(C A_c),   A_c = J_c' J_c / sigma_c^2       n_c samples of channel c; C: covariance of all unknowns
+    degrees of freedom of the variance C_ii:   1 / sum_c v_ic^2 / (n_c - p_c),    v_ic = (C A_c C)_ii / C_ii: what channel c adds to it
+    variance of the estimate:   C_ii - sum_c 2 / (n_c - p_c) sigma_c^4 d^2 C_ii / d (sigma_c^2)^2,    as the weights of channels and priors are estimated, too
+
+With one channel and no prior n - p is left, and intervals are those of Student's t. Under a robust loss the same holds of all samples together, and the factor
+by which their variance is to be multiplied takes the place of sigma^2. Priors and channels whose sigma is given are taken as they are.
+Source: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545; F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110; M. G. Kenward and J. H. Roger,
+Biometrics 53 (1997) 983.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jourdain_jax.analysis.arrow import Arrow
-from jourdain_jax.analysis.at_bounds import RISE_95, IfFree
-from jourdain_jax.analysis.information import Information, information, students_t_95
-from jourdain_jax.analysis.levenberg_marquardt import LEAST, Control, Limits, Minimum
+from jourdain_jax.analysis.information import Information, information, students_t_95, variances
+from jourdain_jax.analysis.levenberg_marquardt import LEAST, Control, Limits, Linearised, Minimum, minimum_beside
 from jourdain_jax.analysis.losses import LEAST_SQUARES
-from jourdain_jax.analysis.noise_levels import NoiseLevels, noise_levels
 from jourdain_jax.analysis.problem import Problem
+
+RISE_95 = 3.841458820694124  # of 2 F
+FAR_BEYOND = 3.0  # standard errors: an estimate that is held at its bound by more is no chance
+CLOSE = 0.02  # of p at the limit: its error there, and by how much F is to be lower elsewhere to count as lower
+MOST = 16  # evaluations of p
+FURTHER = 4.0  # factor of delta where p does not rise
+NARROW = 0.5  # of the rise that a standard error foretells: with less, the interval is too narrow
+MOST_LOOKED_AT = 8  # unknowns whose intervals are compared with the rise at their ends
+ADVICE = "`Fit.profiles` gives intervals that hold"
+
+
+@dataclass(frozen=True)
+class IfFree:
+    """What is known of unknowns at a bound, as if they were free."""
+
+    of_rise: Float[np.ndarray, "members unknowns"]  # f
+    wider: Float[np.ndarray, "members unknowns"]  # w
+    degrees: Float[np.ndarray, "members unknowns"]  # n
+
+
+@dataclass
+class AtBounds:
+    """What is known of unknowns at a bound, of fits that have converged; NaN for all others."""
+
+    limit: Float[np.ndarray, "members unknowns"]  # infinite where the data give none
+    beyond: Float[np.ndarray, "members unknowns"]  # by how many standard errors the data would put it beyond its bound
+    if_free: IfFree
+    lower: dict[int, tuple[float, np.ndarray]] = field(default_factory=dict)  # by member: F and all unknowns where it is lower, one being off its bound
+    at_limit: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)  # by member and unknown at a bound: all unknowns with that one at its limit
+
+
+@dataclass(frozen=True)
+class Around:
+    """A minimum, and how much worse the best fit is where one unknown is elsewhere."""
+
+    evaluate: Callable  # as `minimise` asks for
+    found: Minimum
+    limits: Limits
+    control: Control
+
+    @property
+    def at_bound(self) -> Bool[np.ndarray, "members unknowns"]:
+        """Which unknowns lie at a bound."""
+        theta, limits = self.found.theta, self.limits
+        return ((theta <= limits.low) | (theta >= limits.high)) & ~limits.fixed
+
+    def rise(self, b: int, place: int, step: float) -> tuple[float, Minimum]:
+        """How much F of member `b` rises when one unknown is moved by a step and held there (infinite where the motion fails), and the minimum there."""
+        theta = self.found.theta[b : b + 1]
+        at = minimum_beside(lambda x, _: self.evaluate(x, np.array([b])), theta, place, theta[0, place] + step, self.limits, self.control)
+        return float(at.at.cost[0] - self.found.at.cost[b]), at
+
+    def if_free(self, b: int, place: int) -> tuple[float, float]:
+        """The standard error that an unknown at its bound had if it were free, infinite where it does not show, and the size of the slope of F."""
+        others, estimated, arrow = self.at_bound[b : b + 1], np.flatnonzero(~self.limits.fixed), self.found.at.arrow.at([b])
+        others[0, place] = False
+        known = information(arrow, self.limits.size(self.found.theta[b : b + 1]), estimated, others, np.zeros(1, bool), self.control.cutoff)
+        error = float(known.standard_errors[0, np.searchsorted(estimated, place)])
+        return error if np.isfinite(error) else np.inf, abs(float(arrow.gradient[0, place]))
+
+
+def limits_at_bounds(around: Around, if_free: IfFree) -> AtBounds:
+    """Each unknown at a bound is moved away from it, all others following."""
+    theta = around.found.theta
+    told = AtBounds(np.full(theta.shape, np.nan), np.full(theta.shape, np.nan), if_free)
+    for b, place in np.argwhere(around.at_bound & around.found.converged[:, None]).tolist():
+        _look_inward(around, told, b, place)
+    return told
+
+
+def _look_inward(around: Around, told: AtBounds, b: int, place: int) -> None:
+    """Tells what one unknown at its bound shows when it is moved away from it."""
+    bound, limits = around.found.theta[b, place], around.limits
+    inward = 1.0 if bound <= limits.low[place] else -1.0
+    (error, slope), end = around.if_free(b, place), RISE_95 / 2 * told.if_free.of_rise[b, place]
+    if np.isfinite(error):
+        left = told.if_free.wider[b, place] ** 2 - (slope * error) ** 2 / told.if_free.degrees[b, place]
+        told.beyond[b, place] = np.inf if left <= 0 else slope * error / np.sqrt(left)
+    if told.beyond[b, place] > FAR_BEYOND:  # the bound decides: the slope alone gives the limit
+        told.limit[b, place] = bound + inward * _root(slope, 1 / error**2, end)
+        return
+    room = float(limits.high[place] - limits.low[place])
+    first = min(_root(slope, 1 / error**2, end) if np.isfinite(error) else float(limits.size(around.found.theta[b : b + 1])[0, place]), room)
+    delta, at = _limit(partial(around.rise, b, place), inward, first, room, end)
+    if at is not None and np.isfinite(delta):
+        told.at_limit[b, place] = at.theta[0]
+    elif at is not None and (b not in told.lower or at.at.cost[0] < told.lower[b][0]):
+        told.lower[b] = at.at.cost[0], at.theta[0]
+    told.limit[b, place] = np.clip(bound + inward * delta, limits.low[place], limits.high[place])
+
+
+def moved_from_bounds(told: AtBounds, theta: np.ndarray, reach: np.ndarray, places: np.ndarray, labels: tuple[str, ...]) -> list[str]:
+    """Says which unknowns of the first member move further than the `reach` of their interval while one at its bound moves to its limit, one sentence each."""
+    sentences = []
+    for (_, place), there in told.at_limit.items():
+        far = [f"`{name}`" for name, shift, most in zip(labels, np.abs(there - theta)[places], reach, strict=True) if shift > most]
+        if far:
+            bounded = labels[int(np.searchsorted(places, place))]
+            sentences.append(f"{_too_narrow(far)}: with `{bounded}` away from its bound, though within its interval, the best fit lies outside; {ADVICE}")
+    return sentences
+
+
+def too_narrow_near_bounds(around: Around, told: AtBounds, errors: Float[np.ndarray, "unknowns"], labels: tuple[str, ...]) -> list[str]:
+    """Says which intervals of the first member are too narrow, since the squares rise less than `errors` foretell, those of all unknowns that are not fixed.
+
+    Looked at are bounds that an interval reaches, and where an unknown at its bound may leave it, the ends of the intervals of what runs share.
+    """
+    limits, theta, places = around.limits, around.found.theta[0], np.flatnonzero(~around.limits.fixed)
+
+    def named(some: Iterable[int], steps: Callable[[int], list[float]]) -> list[str]:
+        return [f"`{labels[k]}`" for k in some if any(2 * around.rise(0, int(places[k]), step)[0] < NARROW * (step / errors[k]) ** 2 for step in steps(k))]
+
+    def to_bounds(k: int) -> list[float]:
+        steps = [float((end - theta)[places[k]]) for end in (limits.low, limits.high)]
+        return [step for step in steps if 1 < (step / errors[k]) ** 2 < 2 * RISE_95]
+
+    def to_ends(k: int) -> list[float]:
+        at, reach = theta[places[k]], float(np.sqrt(RISE_95) * errors[k])
+        return [step for step in (-reach, reach) if limits.low[places[k]] < at + step < limits.high[places[k]]]
+
+    sentences = []
+    if names := named(range(len(labels)), to_bounds):
+        why = "and so may be those of others: up to a bound nearby, the squares rise less than standard errors foretell"
+        sentences.append(f"{_too_narrow(names)}, {why}; {ADVICE}")
+    bounded = ", ".join(f"`{labels[k]}`" for k in np.flatnonzero(told.beyond[0, places] <= FAR_BEYOND))
+    shared = [k for k, name in enumerate(labels) if bounded and np.isfinite(errors[k]) and not name.startswith("run ")]
+    if names := named(shared[:MOST_LOOKED_AT], to_ends):
+        sentences.append(f"{_too_narrow(names)}: where {bounded} may leave a bound, the squares rise less to the ends than standard errors foretell; {ADVICE}")
+    return sentences
+
+
+def _too_narrow(names: list[str]) -> str:
+    return f"the {'intervals' if len(names) > 1 else 'interval'} of {', '.join(names)} {'are' if len(names) > 1 else 'is'} too narrow"
+
+
+def _limit(profile: Callable[[float], tuple[float, Minimum]], inward: float, delta: float, room: float, end: float) -> tuple[float, Minimum | None]:
+    """How far `inward` (1 or -1) the profile reaches `end`, looked for from `delta` on, and the minimum there; infinite and None where it does not.
+
+    Infinite with a minimum: that one is lower than at the bound.
+    """
+    inner, outer = (0.0, 0.0), (np.inf, np.inf)  # delta and rise on either side
+    for _ in range(MOST):
+        rise, at = profile(inward * delta)
+        if rise < -CLOSE * end:
+            return np.inf, at
+        if abs(rise / end - 1) < CLOSE:
+            return delta, at
+        if rise < end:
+            inner = delta, max(rise, 0.0)
+        else:
+            outer = delta, rise
+        if inner[0] >= room:
+            return np.inf, None
+        if np.isfinite(outer[1]):  # the root of p is nearly straight
+            low, high = np.sqrt(inner[1]), np.sqrt(outer[1])
+            delta = inner[0] + (outer[0] - inner[0]) * (np.sqrt(end) - low) / (high - low)
+        elif np.isfinite(outer[0]):  # the motion fails there
+            delta = (inner[0] + outer[0]) / 2
+        else:
+            delta = min(delta * min(np.sqrt(end / inner[1]) * (1 + CLOSE) if inner[1] else FURTHER, FURTHER), room)
+    return (delta, at) if np.isfinite(outer[0]) else (np.inf, None)
+
+
+def _root(slope: float, curvature: float, end: float) -> float:
+    """delta > 0 with slope delta + curvature delta^2 / 2 = end."""
+    return float(2 * end / (slope + np.sqrt(slope**2 + 2 * curvature * end)))
+
+
+LEFT = 0.5  # degrees of freedom: with fewer, a channel does not tell its sigma
+_STEP = 0.03  # of sigma^2, for the second derivative of C
+_TURNS, _SETTLED = 50, 1e-8  # of sigmas and covariance; relative change of sigmas that ends them
+
+
+@dataclass(frozen=True)
+class NoiseLevels:
+    """A linearised problem with these sigmas, and what is known of them."""
+
+    at: Linearised
+    known: Information
+    doubt: Float[np.ndarray, "members unknowns"]  # variance of log C_ii, 2 over its degrees of freedom
+    more: Float[np.ndarray, "members unknowns"]  # what weights that are estimated add to C_ii, relative to it
+    untold: Bool[np.ndarray, "members channels"]  # which channels do not tell their sigma: nothing is taken from them
+
+
+def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: Callable, of_loss: Callable[[np.ndarray, float], float]) -> NoiseLevels:
+    """What is known at theta. `told_by`: the information of an arrow; `of_loss`: the factor by which a loss multiplies variances, of the residuals of one
+    member and the number of unknowns that they determined.
+    """
+    members, places, count = np.arange(len(theta)), problem.unknowns.estimated, 1 + len(problem.estimated)
+    known = told_by(at.arrow)
+    doubt, untold = np.zeros((len(theta), len(places))), np.zeros((len(theta), count), bool)
+    if count == 1 and problem.loss == LEAST_SQUARES:
+        return NoiseLevels(at, known, doubt, 0 * doubt, untold[:, 1:])
+    by_run = [problem.by_channel(run, at, lambda x: x) for run in range(len(problem.runs))]
+    residuals = [r[np.isfinite(r)] for r in np.concatenate([r.reshape(len(theta), -1) for of in by_run for r in of.values()], axis=1)]
+    samples = np.concatenate([[[r.size] for r in residuals], problem.lanes.counted(problem.estimated, members)], axis=1)
+    (determined, widths), unsure = np.zeros((2, len(theta), count)), problem.loss != LEAST_SQUARES
+    for _ in range(_TURNS):
+        left, before = samples - determined, widths.copy()
+        untold[:, 1:] |= left[:, 1:] < LEFT
+        widths[:, 1:] = np.maximum(np.sqrt(at.squares[:, 1:] / np.maximum(left[:, 1:], LEFT)), problem.least_sigma)
+        widths[:, 0] = [np.sqrt(of_loss(r, p)) if r.size else 1.0 for r, p in zip(residuals, determined[:, 0].tolist(), strict=True)] if unsure else 1.0
+        widths[untold] = np.inf
+        if np.allclose(widths, before, rtol=_SETTLED, atol=0):
+            break
+        arrow = problem.joined(theta, at.triangles, widths)[0]
+        known = told_by(arrow)
+        determined, added = _told_by_kind(known, at.triangles / widths[:, None, :, None, None])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = added[..., places] / variances(known.shared, known.own, known.follow)[:, None, places]
+    counts = np.s_[:, 0 if unsure else 1 :]
+    doubt = 2 * np.sum(np.nan_to_num(shares[counts]) ** 2 / np.maximum(left[counts], LEFT)[..., None], axis=1)
+    at = replace(at, arrow=arrow, sigma=np.where(untold[:, 1:], at.sigma, widths[:, 1:]))
+    more = 0 * doubt
+    for k in range(1, count):
+        other = [widths * np.sqrt(1 + step * (np.arange(count) == k)) for step in (-_STEP, _STEP)]
+        ends = [(told_by(problem.joined(theta, at.triangles, some)[0]).standard_errors / known.standard_errors) ** 2 for some in other]
+        more -= 2 / np.maximum(left[:, k : k + 1], 1.0) * (sum(ends) - 2) / _STEP**2
+    return NoiseLevels(at, known, doubt, np.maximum(np.nan_to_num(more), 0.0), untold[:, 1:])
+
+
+def _told_by_kind(known: Information, T: Float[np.ndarray, "members runs kinds width width"]) -> tuple[np.ndarray, np.ndarray]:
+    """p_c (members, kinds), and (C A_c C)_ii (members, kinds, places), from triangles in units of sigma."""
+    m, S, G, own = known.follow.shape[-2], known.shared[:, None, None], known.follow[:, :, None], known.own[:, :, None]
+    T_o, T_s = T[..., :m], T[..., m:-1]
+    X = T_s - T_o @ G  # own unknowns of a run follow the shared ones, x = - G s
+    p = np.einsum("brkij,brkij->bk", X @ S, X) + np.einsum("brkij,brkij->bk", T_o @ own, T_o)
+    Q = np.sum(S @ np.swapaxes(X, -1, -2) @ X @ S, axis=1)  # of all runs
+    direct, through = T_o @ own, X @ S @ np.swapaxes(G, -1, -2)
+    of_own = np.einsum("brij,bkjl,bril->bkri", known.follow, Q, known.follow) + np.swapaxes(np.sum(direct**2 - 2 * direct * through, axis=-2), 1, 2)
+    return p, np.concatenate([np.diagonal(Q, axis1=-2, axis2=-1), of_own.reshape(*of_own.shape[:2], -1)], axis=-1)
+
 
 NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
 _FEWEST_DEGREES = 4  # of freedom, that an estimated correlation time leaves

@@ -19,8 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.gradients import by_reduction, gradient_checks
-from jourdain_jax.analysis.statements import statement_checks
+from jourdain_jax.analysis.statements import by_reduction, gradient_checks, statement_checks
 from jourdain_jax.analysis.verification import Check, Verification, check
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import plain_row_lengths, structure_of, usual_rows

@@ -16,7 +16,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.analysis.joint_prior import Correlated, joint_normal
+from jourdain_jax.analysis.estimate import Correlated, joint_normal
 from jourdain_jax.calculus import reading
 from jourdain_jax.calculus.reading import read_text, shortened
 from jourdain_jax.ensembles.distributions import Normal

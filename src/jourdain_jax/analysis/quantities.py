@@ -1,0 +1,258 @@
+"""Channels that are functions of a `Motion`: every fit traces them anew, and two are equal that compute the same.
+
+A function is traced where it is handed over. What it closes over becomes arguments, what is left, the operations, is compared by value: a new lambda that
+does the same in every run is one channel, batched and compiled once; a function whose globals have changed is another one.
+
+What shows accelerations and forces: accelerometers on bodies, load cells under contacts.
+
+    f = R' (a_P - g),     a_P = d/dt (v + omega x (P - r)) along (1, qdot, udot)
+
+Source: D. H. Titterton and J. L. Weston, Strapdown Inertial Navigation Technology, 2nd ed. (2004), section 3.
+
+The stop event that ended a run, at a time that was observed: one measured value more.
+
+r = (t_event - value) / sigma        t_event: when the motion stops there; its derivatives are those of `simulate`
+
+The events of a scene stop its motion, so that a run has one. It is kept as a channel whose only value is at the last sample of the run: the first one that is
+not before the event.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr
+from jaxtyping import Array, Float
+
+from jourdain_jax.build.reference_parameters import once_per_values
+from jourdain_jax.build.sampling import sample_states
+from jourdain_jax.calculus.reals import checked_known, checked_real, described, is_traced
+from jourdain_jax.dynamics.accelerations import accelerations
+from jourdain_jax.dynamics.reactions import contact_forces
+from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
+from jourdain_jax.equations.listed import names_of_events
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.program.calls import Call
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names_read import is_function, now_read_by
+from jourdain_jax.scene.scene import Scene
+
+MOST = 256  # functions whose trace is kept
+
+
+class Channel(eqx.Module):
+    """A function of a motion as it was when it was given."""
+
+    operations: Call = eqx.field(static=True)  # on what it closes over and the numbers of a motion
+    held: tuple[Array, ...]  # what it closes over
+    shape: tuple[int, ...] = eqx.field(static=True)
+
+    def __call__(self, motion: Motion) -> Array:
+        """The value of the channel at one instant."""
+        return self.operations.results(*self.held, *jax.tree.leaves(motion))[0]
+
+
+def channel(function: Callable, scene: Scene) -> Channel:
+    """A function of a motion of this scene as a channel; it is traced again where it is new, or what it reads has changed."""
+    now = now_read_by(function) if is_function(function) else None
+    if now is None:
+        return _traced(function, scene)
+    kept, key = _kept(function), (now, _kind(scene))
+    if kept.get("key") == key:
+        return kept["channel"]
+    found = _traced(function, scene)
+    if not is_traced(found.held):
+        kept["key"], kept["channel"] = key, found
+    return found
+
+
+@lru_cache(maxsize=MOST)
+def _kept(function: Callable) -> dict:
+    return {}
+
+
+def _traced(function: Callable, scene: Scene) -> Channel:
+    try:
+        closed, shape = jax.make_jaxpr(lambda motion: function(motion), return_shape=True)(motion_shape(scene))
+    except TypeError as error:
+        advice = "write it with `jax.numpy`, without `if` of numbers of the motion, and return one array of numbers"
+        raise ValueError(f"a function of `sensors` cannot be called with a motion ({str(error).splitlines()[0]}); {advice}") from error
+    if not hasattr(shape, "shape"):
+        raise ValueError(f"a function of `sensors` returned {type(shape).__name__}, expected an array of numbers; return one array")
+    jaxpr = closed.jaxpr
+    operations = ClosedJaxpr(jaxpr.replace(constvars=[], invars=[*jaxpr.constvars, *jaxpr.invars]), [])
+    return Channel(Call(operations, ("a channel",)), tuple(jnp.asarray(x) for x in closed.consts), shape.shape)
+
+
+def motion_shape(scene: Scene) -> Motion:
+    """A motion of this scene with shapes in place of numbers."""
+    return _motion_shape(*_kind(scene))
+
+
+def _kind(scene: Scene):
+    leaves, treedef = jax.tree.flatten(scene)
+    return treedef, tuple((x.shape, x.dtype) for x in leaves)
+
+
+@lru_cache(maxsize=64)
+def _motion_shape(treedef, shapes) -> Motion:
+    scene = jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes])
+    q, u = (jax.ShapeDtypeStruct((len(names.entries),), jnp.result_type(float)) for names in (scene.coordinate_names, scene.speed_names))
+    return jax.eval_shape(lambda scene, q, u: motion_at(scene, 0.0, q, u), scene, q, u)
+
+
+class Instrument(eqx.Module):
+    """What shows three components that depend on the accelerations of a scene."""
+
+    @abstractmethod
+    def check(self, scene: Scene, channel: str, where: str) -> None:
+        """ValueError, which names the channel and the run, where the scene has nothing that it could show."""
+
+    @abstractmethod
+    def over_times(self, motion: Trajectory) -> Float[Array, "times 3"]:
+        """What it shows at all times of one motion."""
+
+
+class Accelerometer(Instrument):
+    """Three accelerometers at a point of a body, along its axes: the specific force `R' (a - g)` in m/s^2, at rest upwards by g.
+
+        imu = jj.Sensor(jj.Accelerometer("frame", (0.3, 0.0, 0.1)), bias=jj.Estimate((0.0, 0.0, 0.0)))
+        jj.Experiment(ts, {"imu": a}, 0.1, start=start, sensors={"imu": imu})                        # a: (times, 3), m/s^2
+
+    - `body`: its name. `point`: where it sits, in m, in the body's frame, from its mass centre.
+    - `gravity`: g in m/s^2, in the inertial frame.
+
+    A channel of shape (times, 3). Its accelerations are those of the scene at the states of the motion, not differences.
+
+    **Raises** ValueError for what is no name, or no three components.
+    """
+
+    body: str = eqx.field(static=True)
+    point: Float[Array, "3"]  # m
+    gravity: Float[Array, "3"]  # m/s^2
+
+    def __init__(self, body, point=(0.0, 0.0, 0.0), gravity=(0.0, 0.0, -9.81)):
+        if not isinstance(body, str):
+            raise ValueError(f"`body` of `Accelerometer` is {described(body)}, expected the name of a body")
+        self.body = body
+        self.point = checked_real(point, "`point` of `Accelerometer`", (3,), advice="give three components in the body's frame, m")
+        self.gravity = checked_real(gravity, "`gravity` of `Accelerometer`", (3,), advice="give three components in the inertial frame, m/s^2")
+
+    def check(self, scene: Scene, channel: str, where: str) -> None:
+        """ValueError, which names the `channel` and the run, where the scene has no such body."""
+        bodies = motion_shape(scene).bodies
+        if self.body not in bodies:
+            raise ValueError(f"the accelerometer `{channel}` of {where} sits on body `{self.body}`, which is not there; {nearest(self.body, bodies)}")
+
+    def over_times(self, motion: Trajectory) -> Float[Array, "times 3"]:
+        """What it feels at all times of one motion."""
+        return jax.vmap(lambda *state: self._felt(motion.scene, *state))(motion.ts, motion.q, motion.u, motion.accelerations().udot)
+
+    def _felt(self, scene: Scene, t, q, u, udot) -> Float[Array, "3"]:
+        def velocity(t, q, u):
+            body = motion_at(scene, t, q, u)[self.body]
+            return body.velocity_at(body.place(self.point)), body.orientation
+
+        along = jnp.ones_like(t), coordinate_rates(scene, t, q, u), udot
+        (_, orientation), (acceleration, _) = jax.jvp(velocity, (t, q, u), along)
+        return orientation.T @ (acceleration - self.gravity.astype(q.dtype))
+
+
+class LoadCell(Instrument):
+    """A load cell under a rolling contact: the force of the ground on the body, in N.
+
+        jj.Experiment(ts, {"plate": force}, 2.0, start=start, sensors={"plate": jj.LoadCell("front")})                # force: (times, 3), N
+
+    - `contact`: its name.
+
+    A channel of shape (times, 3): two components along the tangents of the ground, then the one along its normal, as `Trajectory.contact_forces` has them.
+
+    **Raises** ValueError for what is no name; with a scene, for a contact that is not there, or whose force the rows do not determine.
+    """
+
+    contact: str = eqx.field(static=True)
+
+    def __init__(self, contact):
+        if not isinstance(contact, str):
+            raise ValueError(f"`contact` of `LoadCell` is {described(contact)}, expected the name of a contact")
+        self.contact = contact
+
+    def check(self, scene: Scene, channel: str, where: str) -> None:
+        """ValueError, which names the `channel` and the run, where the scene has no such contact, or does not determine its force."""
+        determined = _determined(scene)
+        if self.contact not in determined:
+            raise ValueError(f"the load cell `{channel}` of {where} is under contact `{self.contact}`, which is not there; {nearest(self.contact, determined)}")
+        if not determined[self.contact]:
+            raise ValueError(
+                f"the load cell `{channel}` of {where} is under contact `{self.contact}`, whose force is not determined: others share it; leave the channel out"
+            )
+
+    def over_times(self, motion: Trajectory) -> Float[Array, "times 3"]:
+        """What it shows at all times of one motion."""
+        force = motion.contact_forces()[self.contact]
+        return jnp.concatenate([force.tangential, force.normal[..., None]], axis=-1)
+
+
+@once_per_values
+def _determined(scene: Scene) -> dict[str, bool]:
+    """Contact -> whether its force is determined at a state of the scene."""
+    t, q, u = (x[0] for x in sample_states(scene, 1))
+    return {name: bool(force.determined) for name, force in contact_forces(scene, t, q, u, accelerations(scene, t, q, u)).items()}
+
+
+LATEST = 4.0  # times the observed time: where a motion meets the event later than that, or another one before, it fails
+
+
+class StopEvent(eqx.Module):
+    """An event of a scene by name, for whose time there is a measured value."""
+
+    name: str = eqx.field(static=True)
+
+    @staticmethod
+    def of(scene: Scene, name: str, where: str) -> "StopEvent":
+        """ValueError where the scene has no such event."""
+        if name not in (names := names_of_events(scene)):
+            has = nearest(name, names) if names else "it has no stop events."
+            raise ValueError(f"`events` of {where} names `{name}`, which is no event of the scene; {has}")
+        return StopEvent(name)
+
+    def time(self, motion: Callable, t0, span) -> Float[Array, ""]:
+        """When the motion stops at it, NaN where it does not. `motion`: of times, with its events; `span`: from the start to the observed time."""
+        found = motion((t0 + LATEST * span)[None])
+        return jnp.where(found.event == found.event_names.index(self.name), found.t_end, jnp.nan)
+
+
+def cut(events: Mapping, t0, ts, values: dict, sigma: dict) -> tuple:
+    """Times, values and sigmas of a run up to its event, whose time is one channel more; a vector of times: of repeats. ValueError for what is no such time."""
+    if len(events) > 1:
+        raise ValueError(f"`events` names {', '.join(f'`{name}`' for name in events)}, but a motion stops at the first of its events; give that one")
+    ((name, given),) = events.items()
+    if name in values:
+        raise ValueError(f"`{name}` is both a channel and an event; give the channel another name, with a sensor")
+    if not isinstance(given, tuple | list) or len(given) != 2:
+        raise ValueError(f"event `{name}` was given {given!r}, expected (time, sigma), both in s, such as (1.83, 0.005)")
+    at, spread = (checked_known(x, f"{what} of event `{name}`", advice="give a number in s") for x, what in zip(given, ("the time", "sigma"), strict=True))
+    if is_traced((ts, t0)) or at.ndim > 1 or not np.all(at > t0):
+        raise ValueError(f"the time of event `{name}` is {at} s, expected one after the start at t0 = {t0} s (of `fit_batch` a vector, one of each repeat)")
+    last = min(int(np.searchsorted(ts, at.max())), len(ts) - 1)
+    kept, axis = slice(last + 1), at.ndim
+    after = ts[kept] > at[..., None]
+
+    def until(x):
+        if x.ndim <= axis or x.shape[axis] != len(ts):  # of another shape: that is said once the scene is known
+            return x
+        part = x[:, kept] if axis else x[kept]
+        return (jnp if is_traced(x) else np).where(after.reshape(after.shape + (1,) * (x.ndim - after.ndim)), np.nan, part)
+
+    of_event = np.full((*at.shape, last + 1), np.nan)
+    of_event[..., -1] = at
+    return (
+        ts[kept],
+        {channel: until(x) for channel, x in values.items()} | {name: of_event},
+        {channel: x[kept] if x.ndim and x.shape[0] == len(ts) else x for channel, x in sigma.items()} | {name: spread},
+    )
