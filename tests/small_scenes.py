@@ -140,6 +140,24 @@ class AffineRows(jj.Scene):
         return {"growing": u.x_rate + q.x, "sheet": u.y_rate - self.strength * q.z * u.x_rate}
 
 
+class Cart(jj.Scene):
+    """`m x'' = push - c x' - k x`."""
+
+    mass: jnp.ndarray = jj.parameter(2.0, unit="kg", positive=True)
+    damping: jnp.ndarray = jj.parameter(0.6, unit="N s/m", non_negative=True)
+    stiffness: jnp.ndarray = jj.parameter(5.0, unit="N/m")
+
+    coordinates = jj.coordinates("x")
+    inputs = jj.inputs("push")
+
+    def bodies(self, t, q):
+        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        force = motion.inputs.push - self.damping * motion.u.x_rate - self.stiffness * motion.q.x
+        return (jj.generalized_force(motion, x_rate=force),)
+
+
 class Oscillator(jj.Scene):
     """`m x'' = - c x' - k x`: mass and stiffness show only in their ratio where nothing else is known."""
 

@@ -112,18 +112,6 @@ def test_a_slider_crank_of_equal_lengths_passes_the_axis_on_its_branch_or_is_fla
         assert np.max(error) < 1e-5, f"a_rate = {w[lane]}"
 
 
-def test_a_loss_of_energy_is_warned_of():
-    pendulum = NarrowPendulum()
-    crude = {
-        "solver": jj.ImplicitMidpoint(step=0.1),
-        "ts": np.linspace(0.0, 2.0, 21),
-        "formulation": jj.Formulation("full"),
-    }
-    crude = jj.simulate(pendulum, dict(zip(["x", "z", "x_rate"], (0.3, -np.sqrt(0.91), 1.0), strict=True)), **crude)
-    assert any("which is constant for a right motion, drifts" in text for text in crude.warnings)
-    assert not jj.simulate(pendulum, pendulum.example, t1=1.0).warnings
-
-
 @pytest.mark.parametrize("backend", ["auto", "dense"])
 def test_a_row_is_compared_with_its_usual_length_for_the_parameters_of_the_motion(backend):
     def motion(scene):

@@ -7,7 +7,7 @@ import pytest
 from oracles import whipple_bicycle as oracle
 from tolerances import tolerance
 
-from jourdain_jax.bicycle import eigenvalues, interval, read_bicycle, sample_parameters, shipped_bicycles, stability_speeds
+from jourdain_jax.bicycle import eigenvalues, read_bicycle, shipped_bicycles, stability_speeds
 from jourdain_jax.bicycle.characteristic import BicycleMatrices
 from jourdain_jax.bicycle.polynomial_roots import real_roots
 from jourdain_jax.bicycle.stability import characteristic_polynomial
@@ -163,19 +163,6 @@ def test_derivatives_of_the_speeds_are_their_central_differences(quantity):
         np.testing.assert_allclose(forward[k], difference, rtol=tolerance("gradient_fd"))
 
 
-@pytest.mark.slow
-def test_second_derivatives_of_a_speed_are_differences_of_the_first():
-    parameters = _parameters("Benchmark")
-
-    def weave(trail):
-        return stability_speeds(*_matrices({**parameters, "c": trail})).weave_speed
-
-    slope = jax.jit(jax.grad(weave))
-    difference = (slope(0.08 + 1e-5) - slope(0.08 - 1e-5)) / 2e-5
-    np.testing.assert_allclose(jax.jit(jax.jacfwd(jax.grad(weave)))(0.08), difference, rtol=tolerance("gradient_fd"))
-    np.testing.assert_allclose(jax.jit(jax.grad(jax.grad(weave)))(0.08), difference, rtol=tolerance("gradient_fd"))
-
-
 def test_a_missing_speed_does_not_spoil_the_derivatives_of_the_others():
     parameters = _parameters("Yellowrev")
 
@@ -186,23 +173,6 @@ def test_a_missing_speed_does_not_spoil_the_derivatives_of_the_others():
     found, pull_back = jax.vjp(jax.jit(speeds), parameters)
     assert np.isnan(found[1])
     assert all(np.isfinite(derivative) for derivative in pull_back(jnp.array([1.0, 0.0]))[0].values())
-
-
-def test_two_thousand_measured_bicycles_give_limits_on_the_speeds():
-    bicycle = read_bicycle(shipped_bicycles()["Browser"])
-    samples = sample_parameters(bicycle, jax.random.key(0), 2000)
-    batch = jax.jit(jax.vmap(lambda parameters: stability_speeds(*_matrices(parameters))))
-    found, nominal = batch(samples.by_name()), speeds_of(*_matrices(bicycle.values))
-    one = speeds_of(*_matrices({name: column[7] for name, column in samples.by_name().items()}))
-    np.testing.assert_allclose(found.weave_speed[7], one.weave_speed, rtol=1e-12)
-    np.testing.assert_allclose(found.capsize_speed[7], one.capsize_speed, rtol=1e-12)
-    weave = interval(found.weave_speed, nominal=nominal.weave_speed, counted=samples.physical)
-    assert float(weave.fraction) == 1.0
-    assert float(weave.low) < float(weave.value) < float(weave.high)
-    # Linear propagation: half the width of the interval is 1.96 standard deviations.
-    slopes = jax.jit(jax.grad(lambda parameters: stability_speeds(*_matrices(parameters)).weave_speed))(bicycle.values)
-    sigma = np.sqrt(sum((slopes[name] * bicycle.sigmas[name]) ** 2 for name in slopes))
-    np.testing.assert_allclose((weave.high - weave.low) / 2, 1.96 * sigma, rtol=0.08)
 
 
 def test_all_real_roots_in_an_interval_are_found_and_no_others():

@@ -1,7 +1,6 @@
 """What a call of `simulate` with functions of time costs: nothing is compiled twice, what is compiled is dropped again, and numbers stay numbers."""
 
 import functools
-import gc
 import subprocess
 import sys
 
@@ -121,25 +120,6 @@ def test_programs_that_differ_are_told_apart():
             np.testing.assert_allclose(traced(t), f(t), rtol=1e-15)
     programs = {input_programs.traced(f, real)[0].program for f in functions}
     assert len(programs) == len(functions)
-
-
-def test_what_is_compiled_for_functions_is_dropped_when_others_are_used():
-    client, most, x = jax.devices()[0].client, input_programs.MOST_COMPILED, jnp.ones(3)
-    compiled = input_programs.for_programs(lambda x: jnp.sin(x) + jnp.sum(x))
-
-    def alive(programs):
-        for n in programs:
-            compiled((n,))(x)
-        gc.collect()
-        return len(client.live_executables())
-
-    none, full = alive(()), alive(range(most))
-    assert full >= none + most
-    assert alive(range(most, 3 * most)) <= full
-    kept = input_programs.traced(lambda t: t**2, jnp.result_type(float))[0].program
-    for n in range(3, 4 + input_programs.MOST_PROGRAMS):
-        input_programs.traced(lambda t, n=n: t**n, jnp.result_type(float))
-    assert input_programs.traced(lambda t: t**2, jnp.result_type(float))[0].program == kept
 
 
 def test_a_function_of_time_serves_outside_of_jit_and_inside_in_turn():

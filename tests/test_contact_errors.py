@@ -11,40 +11,6 @@ from rolling_scenes import BallInBowl, Rolls
 
 import jourdain_jax as jj
 
-BODY = jj.pose_at(Rolls(make_ground=lambda scene, pose: None), 0.0, jnp.array([0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0]))["body"]
-
-
-@pytest.mark.parametrize(
-    ("make", "sentence"),
-    [
-        (lambda: jj.Plane(normal=(0.0, 0.0, 2.0)), "normal of a plane has length 2, expected a unit vector; divide it by its length"),
-        (lambda: jj.Plane(normal=(0.0, 0.0, 1.0), tilt=0.1), "a plane has both a `tilt` and a `normal`"),
-        (lambda: jj.Plane(normal=(0.0, 0.0, 1.0), along=(0.0, 0.0, 3.0)), "`along` of a plane is normal to it"),
-        (lambda: jj.Plane(tilt=(0.1, 0.2)), r"tilt of a plane has shape \(2,\), expected one number; give one angle in rad, or a rotation matrix"),
-        (lambda: jj.Cylinder(0.3, (1.0, 1.0, 0.0), side="inside"), "axis of a cylinder has length 1.414, expected a unit vector"),
-        (lambda: jj.Cylinder(-0.3, (1.0, 0.0, 0.0), side="inside"), "radius of a cylinder is -0.3 m, expected a positive number"),
-        (lambda: jj.Sphere(0.3, side="within"), "side `within` is unknown; expected `inside` or `outside`"),
-        (lambda: jj.Surface(1.0), "a surface is given by a float, expected a function of numbers; write lambda x, y, z"),
-        (lambda: jj.HeightMap("hill"), "a height map is given by the text 'hill', expected a function of numbers"),
-        (lambda: jj.HeightMap(lambda x, y: jnp.stack([x, y])).plane_at((0.0, 0.0, 0.0)), r"h\(x, y\) of a height map has shape \(2,\), expected one number"),
-        (lambda: jj.ball_contact(BODY, 0.3, ground=jj.Sphere(0.25, side="inside")), "radius of the contact of `body` is 0.3 m inside a sphere of 0.25 m"),
-        (lambda: jj.ball_contact(BODY, 0.3, ground=jj.Cylinder(0.3, (1.0, 0.0, 0.0), side="inside")), "inside a cylinder of 0.3 m, expected a smaller one"),
-        (lambda: jj.ball_contact(BODY, -0.3), "radius of the contact of `body` is -0.3 m, expected a positive number"),
-        (lambda: jj.wheel_contact(BODY, 0.3, 0.4), "tyre of the contact of `body` is 0.4 m at a wheel of 0.3 m, expected 0 <= r < R"),
-        (lambda: jj.ellipsoid_contact(BODY, (0.1, 0.0, 0.2)), r"semi-axes of the contact of `body` are \[0.1, 0.0, 0.2\] m, expected positive"),
-        (lambda: jj.ball_contact(BODY, 0.3, height="rows"), "contact height `rows` is unknown; expected `coordinates`"),
-        (lambda: jj.Contact(BODY, (0.0, 0.0, 0.0), height="line"), "contact height `line` is unknown"),
-        (lambda: jj.Contact(BODY, (0.0, 0.0)), r"point of the contact of `body` has shape \(2,\), expected \(3,\)"),
-        (lambda: jj.Contact(3.0, (0.0, 0.0, 0.0)), "the body of a contact is a float, expected the pose of a body"),
-        (lambda: jj.Contact(BODY, (0.0, 0.0, 0.0), jj.Sphere(1.0, side="inside")), r"expected a `jj.Plane\(...\)`, .*write ground=\.\.\."),
-        (lambda: jj.Contact(BODY, (0.0, 0.0, 0.0), shape="ball"), "`shape` of the contact of `body` is the text 'ball', .*state the body's look in `visuals`"),
-        (lambda: jj.Contact(BODY, (0.0, 0.0, 0.0), ground=0.0), "`ground` of the contact of `body` is a float, expected a `jj.Plane"),
-    ],
-)
-def test_what_is_no_contact_is_refused_by_name(make, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        make()
-
 
 @pytest.mark.parametrize(
     ("ground", "sentence"),

@@ -1,6 +1,5 @@
 """Noise with a memory: whitening against the dense covariance, correlation times known and estimated, and advice on bad input."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -47,17 +46,6 @@ def test_the_likelihood_is_the_dense_normal_one_at_uneven_times_and_across_gaps(
     assert float(jj.log_likelihood(truth, data, rtol=1e-10, atol=1e-10)) == pytest.approx(expected, abs=1e-4 * abs(expected))
 
 
-def test_the_likelihood_has_finite_derivatives_in_a_correlation_time_with_missing_samples():
-    values = sleigh_run(0, 0.0, missing=(0, 5, 6)).values
-
-    def density(tau):
-        return jj.log_likelihood(GUESS, jj.Experiment(TS, values, SIGMA, start=START, correlation_time={"x": tau, "heading": 0.5}))
-
-    slope = float(jax.grad(density)(0.7))
-    assert slope == pytest.approx(float(density(0.7 + 1e-4) - density(0.7 - 1e-4)) / 2e-4, rel=1e-5)
-    assert np.isfinite(float(jax.grad(density)(0.0)))
-
-
 def test_a_known_correlation_time_gives_the_generalised_least_squares_of_the_dense_covariance():
     data = sleigh_run(1, TAU, missing=(3, 4, 17))
     found = jj.fit(GUESS, data, ("inertia", "offset"))
@@ -99,16 +87,6 @@ def test_a_memory_of_the_noise_is_found_and_the_warning_goes(sigma):
         assert found[name].standard_error > 1.5 * white[name].standard_error
     assert np.isnan(found.whitened[0]["x"][7:10]).all()
     assert np.isfinite(found.whitened[0]["x"][10])
-
-
-def test_white_noise_gets_a_correlation_time_far_below_the_intervals():
-    generator = np.random.default_rng(5)
-    ts = np.linspace(0.0, 8.0, 161)
-    motion = sleigh_oracle.motion(ts, mass=1.3, inertia=0.4, a=0.25, v0=-0.6, w0=0.9)
-    values = {"x": motion["x"] + SIGMA * generator.normal(size=161), "heading": motion["th"] + SIGMA * generator.normal(size=161)}
-    fits = [jj.fit(GUESS, jj.Experiment(ts, values, SIGMA, start=START, correlation_time=tau), ("inertia", "offset")) for tau in (0.0, None)]
-    assert max(float(tau) for tau in fits[1].correlation_time.values()) < 0.036  # neighbours at 0.05 s: a correlation of 0.25, three standard deviations
-    np.testing.assert_allclose(fits[1].values, fits[0].values, atol=0.5 * float(np.min(fits[0].standard_errors)))
 
 
 def test_intervals_cover_the_truth_where_noise_has_a_memory():
@@ -158,20 +136,3 @@ def test_intervals_are_those_of_all_correlation_times_by_their_restricted_likeli
 
 def one(correlation_time) -> jj.Experiment:
     return jj.Experiment(TS, {"x": np.zeros(41)}, SIGMA, start=START, correlation_time=correlation_time)
-
-
-@pytest.mark.parametrize(
-    ("call", "advice"),
-    [
-        (lambda: one({"y": 0.1}), "`correlation_time` names channel `y`, which has no values"),
-        (lambda: one(-0.1), "the correlation time of channel `x` is -0.1 s, expected zero or more"),
-        (lambda: one(np.inf), "the correlation time of channel `x` is inf s"),
-        (lambda: one(np.ones(41)), "correlation time of channel `x`"),
-        (lambda: jj.fit(GUESS, [one(None), one(0.1)], "offset"), "correlation time of channel `x` is None in one run and given in another"),
-        (lambda: jj.fit(GUESS, one(0.1), "offset", loss=jj.huber()), "a robust loss takes samples as independent"),
-        (lambda: jj.log_likelihood(GUESS, one(None)), "the correlation time of channel `x` is None, but a likelihood needs to know it"),
-    ],
-)
-def test_bad_input_gets_advice(call, advice):
-    with pytest.raises(ValueError, match=advice.replace("(", r"\(")):
-        call()

@@ -66,41 +66,6 @@ def test_a_grid_crosses_its_levels_and_a_table_is_taken_as_it_is():
     assert "3 values from 1 to 3" in str(table)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: jj.Normal(1.0, -0.1), "`sigma` of Normal is -0.1"),
-        (lambda: jj.Normal("heavy", 0.1), "`mean` of Normal"),
-        (lambda: jj.Uniform(1.0, 1.0), "expected low < high"),
-        (lambda: jj.LogUniform(0.0, 1.0), "expected a positive number"),
-        (lambda: jj.LogNormal(-1.0, 1.0), "positive median"),
-        (lambda: jj.Uniform(0.0, np.inf), "expected a finite number"),
-        (lambda: jj.Levels([]), "at least one"),
-        (lambda: jj.Design({}), "nothing varies"),
-        (lambda: jj.Design({"a": jj.Normal(0, 1), "b": [1.0, 2.0]}, samples=2), "columns and distributions at once"),
-        (lambda: jj.Design({"a": 3.0}), "`a` varies as"),
-        (lambda: jj.Design({"a": [1.0, np.nan]}), "not finite"),
-        (lambda: jj.Design({"a": [1.0], "b": [1.0, 2.0]}), "`a` has 1, `b` has 2"),
-        (lambda: jj.Design({"a": [1.0]}, samples=3), "leave `samples` out"),
-        (lambda: jj.Design(TWO), "`samples` is None"),
-        (lambda: jj.Design(TWO, sampler="sobel", samples=8), "did you mean `sobol`"),
-        (lambda: jj.Design(TWO, sampler="grid", samples=8), "a grid takes `jj.Levels`, but `mass` varies as"),
-        (lambda: jj.Design(TWO, samples=8, seed=-1), "`seed` is -1"),
-        (lambda: jj.Design(TWO, sampler="saltelli", samples=9), "a multiple of 4"),
-        (lambda: jj.Design(TWO, samples=8, correlation={("mass", "lenght"): 0.5}), "`lenght`, which does not vary"),
-        (lambda: jj.Design(TWO, samples=8, correlation={("mass", "radius"): 1.0}), "between -1 and 1"),
-        (lambda: jj.Design(TWO, samples=8, correlation={("mass", "radius"): "0.5"}), "expected real numbers"),
-        (lambda: jj.Design(TWO, samples=8, correlation={"mass": 0.5}), "expected pairs of names"),
-        (lambda: jj.Design({"a": [[1.0], [1.0, 2.0]]}), "`a` varies as"),
-        (lambda: jj.Design({f"a{i}": jj.Levels([0.0] * 10) for i in range(20)}), "cross to 100000000000000000000 samples"),
-        (lambda: jj.Design(TWO, samples=8).values(0, 9), "not among 0 to 8"),
-    ],
-)
-def test_a_wrong_design_says_what_is_wrong(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
-
-
 def test_impossible_correlations_are_refused():
     names = dict.fromkeys("abc", jj.Normal(0.0, 1.0))
     with pytest.raises(ValueError, match="not positive definite"):

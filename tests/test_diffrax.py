@@ -4,9 +4,9 @@ import diffrax
 import jax
 import numpy as np
 import pytest
+import result_codes as results
 
 import jourdain_jax as jj
-from jourdain_jax.motion.trajectories import results
 
 DISC = jj.models.TiltingDisc()
 START = {"lean": 0.3, "spin_rate": -3.0}

@@ -176,14 +176,3 @@ def test_the_disc_keeps_its_legendre_integrals_and_its_energy_for_100_s():
     trajectory = jj.simulate(TILTING, START, ts=times, rtol=1e-12, atol=1e-12).raise_if_failed()
     for constant in (*_legendre_constants(trajectory), np.asarray(trajectory.energies().balance)):
         assert np.ptp(constant) <= tolerance("drift") * np.max(np.abs(constant))
-
-
-@pytest.mark.slow  # 1e3 s of motion
-def test_the_free_disc_stays_on_its_rows_for_1000_s():
-    scene = TiltingDiscQuaternion(RUN["mass"], RUN["radius"], RUN["gravity"])
-    start = _free_body(0.0, RUN["lean"], 0.0, RUN["yaw_rate"], RUN["lean_rate"], RUN["spin_rate"], RUN["radius"])
-    times = jnp.linspace(0.0, 1e3, 201)
-    trajectory = jj.simulate(scene, start, ts=times, rtol=1e-10, atol=1e-10).raise_if_failed()
-    positions, velocities = trajectory.residuals()
-    assert jnp.max(jnp.abs(positions)) <= tolerance("residual")
-    assert jnp.max(jnp.abs(velocities)) <= tolerance("residual")

@@ -94,26 +94,6 @@ def test_rows_along_axes_at_any_angle_that_is_traced_are_served():
     np.testing.assert_allclose(ends.q_end, jnp.broadcast_to(ends.q_end[0], ends.q_end.shape), atol=1e-8)
 
 
-def test_every_lane_of_beads_on_a_ring_arrives():
-    scene = BeadOnCurve()
-    speeds = jnp.linspace(7.0, 11.0, 9)
-    starts = jax.vmap(lambda v: jj.start(scene, **{**scene.start(), "s_rate": v}))(speeds)
-    lanes = jj.rollout(scene, starts, ts=jnp.array([3.0]), rtol=1e-10, atol=1e-10, work=False)
-    assert np.all(np.asarray(lanes.result) == results.SUCCESS)
-    assert not np.any(np.asarray(lanes.lanes.fallback))
-    one = jj.simulate(
-        scene,
-        {**scene.start(), "s_rate": speeds[4]},
-        ts=jnp.array([3.0]),
-        formulation=jj.Formulation("full"),
-        backend="dense",
-        rtol=1e-11,
-        atol=1e-11,
-        work=False,
-    )
-    np.testing.assert_allclose(lanes.lanes.q_end[4], one.q_end, atol=1e-8)
-
-
 WEIGHTLESS_ROBOT = PlanarRobot(trailers=1, maximal=True, **WEIGHTLESS), PlanarRobot(trailers=1, maximal=True).start(**ROBOT)
 WEIGHTLESS_CAR = TrailerChain(trailers=1, **WEIGHTLESS), TrailerChain(trailers=1).towing([0.0, 0.3], forward=1.0, turn=0.8)
 

@@ -52,15 +52,6 @@ def test_a_fall_is_located_with_derivatives_up_to_the_third(solver):
         fall_time = jax.jacfwd(fall_time)
 
 
-def test_the_state_at_an_event_has_the_same_derivative_in_reverse_mode():
-    def landing(height):
-        return stopped(jnp.stack([height, 0.0 * height]), lambda t, y: y[0], rates=falling, kind="reverse").y
-
-    speed = np.sqrt(2 * GRAVITY * 2.0)
-    np.testing.assert_allclose(landing(2.0), [0.0, -speed], atol=1e-13)
-    np.testing.assert_allclose(jax.jacrev(landing)(2.0), [0.0, -GRAVITY / speed], atol=1e-10)
-
-
 def test_reverse_mode_to_an_event_does_not_depend_on_derivatives_beyond_it():
     depth, stiffness, height = 0.05, 5e-3, 2.0
     beyond = []
@@ -101,18 +92,6 @@ def test_an_event_is_found_in_its_step_whatever_its_shape(value, digits):
     assert int(end.code) == results.EVENT
     np.testing.assert_allclose(end.t, 0.7, atol=digits)
     np.testing.assert_allclose(end.y[0], end.t, rtol=1e-13)
-
-
-def test_lanes_stop_each_at_its_own_event_and_the_steps_to_it_do_not_count():
-    heights = jnp.array([0.5, 1.0, 2.0, 50.0])
-    y0 = jnp.stack([heights, jnp.zeros(4)])
-    lanes = stopped(y0, lambda t, y: y[0], rates=falling, lanes=(4,))
-    alone = [stopped(y0[:, k], lambda t, y: y[0], rates=falling) for k in range(4)]
-    np.testing.assert_array_equal(lanes.code, [results.EVENT] * 3 + [results.SUCCESS])
-    np.testing.assert_allclose(lanes.t[:3], np.sqrt(2 * heights[:3] / GRAVITY), rtol=1e-13)
-    np.testing.assert_array_equal(lanes.accepted, [int(end.accepted) for end in alone])
-    few = stopped(y0[:, 1], lambda t, y: y[0], rates=falling, kind="reverse", max_steps=int(alone[1].accepted) + 1)
-    np.testing.assert_allclose(few.t, np.sqrt(2 / GRAVITY), rtol=1e-13)
 
 
 class Flat(jj.Scene):

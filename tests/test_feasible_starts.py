@@ -13,7 +13,6 @@ from small_scenes import DiscWithHeightRow
 import jourdain_jax as jj
 from jourdain_jax import structure_of
 from jourdain_jax.build.sampling import NoStateFoundError
-from jourdain_jax.calculus import damped
 from jourdain_jax.eager.eager import eval_numpy
 
 SCENES = {
@@ -273,33 +272,3 @@ def test_a_state_that_newtons_method_does_not_bring_onto_the_rows_is_searched_fo
     sound = jj.simulate(scene, eqx.tree_at(lambda s: s.q, start, jnp.array([0.6, -0.8, 0.6, -1.7])), t1=0.1)  # the lower rod is too long
     assert int(sound.result) == results.SUCCESS
     assert 0.01 < float(sound.moved_q) < 0.1
-
-
-def _circle_and_line(x, squared=1.0):
-    return jnp.stack([x @ x - squared, x[0] - x[1]]), jnp.stack([2 * x, jnp.array([1.0, -1.0])])
-
-
-def test_guesses_that_are_tried_a_few_at_once_find_what_all_at_once_find(monkeypatch):
-    guesses, size = jnp.array([[0.0, 0.0], [-3.0, -1.0], [2.0, 1.0], [1.0, 1.0], [jnp.nan, 0.0]]), jnp.ones(2)
-    found = {}
-    for most in (1, 8, damped.MOST_ENTRIES):
-        monkeypatch.setattr(damped, "MOST_ENTRIES", most)
-        found[most] = damped.first_root(_circle_and_line, guesses, size, 1e-14, 1e-8)
-        nowhere = damped.first_root(lambda x: _circle_and_line(x, -1.0), guesses[3:], size, 1e-14, 1e-8)
-        assert int(nowhere[1]) == 0
-        assert float(nowhere[0].left) > 0.1
-    for root, number in found.values():
-        assert int(number) == 1  # at the first guess the slopes of the circle vanish
-        np.testing.assert_allclose(root.x, -np.sqrt([0.5, 0.5]), rtol=1e-12)
-
-
-def test_a_search_in_lanes_holds_the_slopes_of_a_few_guesses_at_once():
-    lanes, guesses, rows, unknowns = 16, 25, 100, 150
-    slopes = jnp.asarray(np.random.default_rng(0).normal(size=(rows, unknowns)))
-
-    def search(x):
-        root, number = damped.first_root(lambda x: (jnp.sin(slopes @ x), jnp.cos(slopes @ x)[:, None] * slopes), x, jnp.ones(unknowns), 1e-12, 1e-8)
-        return root.x, number
-
-    memory = jax.jit(jax.vmap(search)).lower(jnp.zeros((lanes, guesses, unknowns))).compile().memory_analysis()
-    assert memory.temp_size_in_bytes < 8 * lanes * 12 * damped.MOST_ENTRIES

@@ -1,6 +1,5 @@
 """Profiles of unknowns against fits with the unknown held; shares of information against variances with changed sigmas; predictions of other runs."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -52,48 +51,6 @@ def test_the_interval_ends_where_a_fit_with_the_unknown_held_is_that_much_worse(
             rise = sum(2 * len(ts) * np.log(likeliest[0][name] / likeliest[1][name]) for name in names) / fit.statistics.of_rise[0]
         assert rise == pytest.approx(RISE, rel=0.02)
     assert any(one.is_closed)
-
-
-def test_a_short_run_that_hardly_tells_an_inertia_ends_at_its_bound_with_intervals_that_are_named_as_too_narrow():
-    # along offset / (inertia + mass offset^2) nearly nothing shows; the best inertia is zero, which no scene can have
-    ts, noise = np.linspace(0.0, 0.5, 30), np.random.default_rng(1)
-    motion = jj.simulate(TRUTH, START, ts=ts)
-    values = {name: np.asarray(motion[name]) + 0.01 * noise.normal(size=30) for name in ("x", "heading")}
-    data = jj.Experiment(ts, values, 0.01, start=START, unknown_start=("x_rate", "heading_rate"))
-    fit = jj.fit(TRUTH.replace(offset=0.4), data, ("offset", "inertia"))
-    assert fit.converged
-    assert fit.steps < 15
-    assert fit["inertia"].low == fit["inertia"].value == pytest.approx(4e-7)
-    assert fit["offset"].low > 0.25  # which is the truth
-    assert any("interval of `offset` is too narrow" in warning for warning in fit.warnings)
-    (one,) = fit.profiles(data, "offset").values()
-    held = jj.fit(fit.scene.replace(offset=0.25), data, ("inertia",))
-    assert held.chi_square - fit.chi_square < 1.0
-    assert one.low < 0.05
-    assert "jumps" in str(one)
-
-
-def test_a_damping_of_zero_has_a_one_sided_profile():
-    class Oscillator(jj.Scene):
-        damping: jnp.ndarray = jj.parameter(0.3, non_negative=True)
-        coordinates = jj.coordinates("x")
-
-        def bodies(self, t, q):
-            return {"cart": jj.Particle(2.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
-
-        def loads(self, motion):
-            return (jj.generalized_force(motion, x_rate=-self.damping * motion.u.x_rate - 5.0 * motion.q.x),)
-
-    ts = np.linspace(0.0, 5.0, 51)
-    data = jj.Experiment(ts, {"x": 0.302 * np.cos(np.sqrt(2.5) * ts)}, 0.01, start={"x": 0.3})
-    fit = jj.fit(Oscillator(), data, ("damping",))
-    assert bool(fit.at_bound[0])
-    one = fit.profiles(data)["damping"]
-    assert one.kind == "one-sided"
-    assert one.is_closed == (False, True)
-    assert one.low == 0.0
-    at = lambda damping: -2 * float(jj.log_likelihood(Oscillator(damping=damping), data))  # noqa: E731
-    assert at(one.high) - at(0.0) == pytest.approx(RISE, rel=0.02)
 
 
 def test_what_does_not_show_has_a_flat_profile():

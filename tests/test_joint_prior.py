@@ -4,35 +4,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_scenes import Cart
 
 import jourdain_jax as jj
 from jourdain_jax.analysis.estimate import whitening
 from jourdain_jax.bicycle import benchmark_from_measurements, measured_bicycle
 
 TS = np.linspace(0.1, 3.0, 16)
+CART, PUSH = Cart(damping=0.0), {"push": 1.0}
 NAMES, MEAN = ("mass", "stiffness"), {"mass": 2.02, "stiffness": 4.95}
 COVARIANCE = np.array([[0.02**2, 0.9 * 0.02 * 0.05], [0.9 * 0.02 * 0.05, 0.05**2]])
 TOGETHER = jj.joint_normal(MEAN, COVARIANCE)
 APART = {name: jj.Normal(MEAN[name], float(np.sqrt(COVARIANCE[k, k]))) for k, name in enumerate(NAMES)}
 
 
-class Cart(jj.Scene):
-    """`m x'' = - k x + 1`."""
-
-    mass: jnp.ndarray = jj.parameter(2.0, positive=True)
-    stiffness: jnp.ndarray = jj.parameter(5.0, positive=True)
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
-
-    def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=1.0 - self.stiffness * motion.q.x),)
-
-
 def run():
-    x = np.asarray(jj.simulate(Cart(), {"x": 0.3}, t0=0.0, ts=TS)["x"])
-    return jj.Experiment(TS, {"x": x + 0.01 * np.random.default_rng(3).normal(size=len(TS))}, 0.01, start={"x": 0.3}, t0=0.0)
+    x = np.asarray(jj.simulate(CART, {"x": 0.3}, t0=0.0, ts=TS, inputs=PUSH)["x"])
+    return jj.Experiment(TS, {"x": x + 0.01 * np.random.default_rng(3).normal(size=len(TS))}, 0.01, start={"x": 0.3}, inputs=PUSH, t0=0.0)
 
 
 def planned(scene, data):
@@ -42,9 +30,9 @@ def planned(scene, data):
 
 def test_the_estimate_is_where_likelihood_and_prior_balance_and_its_information_is_their_sum():
     data, free = run(), dict(reversed(TOGETHER.items()))  # the order of the names does not matter
-    found = jj.fit(Cart(), data, free, tolerance=1e-7)
+    found = jj.fit(CART, data, free, tolerance=1e-7)
     at = jnp.array([found[name].value for name in NAMES])
-    slope = jax.jit(jax.grad(lambda x: jj.log_likelihood(Cart(mass=x[0], stiffness=x[1]), data)))(at)
+    slope = jax.jit(jax.grad(lambda x: jj.log_likelihood(CART.replace(mass=x[0], stiffness=x[1]), data)))(at)
     pull = np.linalg.solve(COVARIANCE, at - np.array(list(MEAN.values())))
     scale = np.array([found[name].standard_error for name in NAMES])
     assert np.max(np.abs(scale * pull)) > 0.1  # the prior does pull
@@ -58,9 +46,9 @@ def test_the_estimate_is_where_likelihood_and_prior_balance_and_its_information_
 def test_it_counts_beside_an_unknown_start_of_one_run_and_of_two():
     one = run()
     start = {"x": jj.Estimate(prior=jj.Normal(0.3, 0.01))}
-    data = [jj.Experiment(TS, one.values, 0.01, start={"x": 0.3}, unknown_start=start, t0=0.0)] * 2
+    data = [jj.Experiment(TS, one.values, 0.01, start={"x": 0.3}, unknown_start=start, inputs=PUSH, t0=0.0)] * 2
     for count in (1, 2):
-        found = jj.fit(Cart(), data[:count], TOGETHER)
+        found = jj.fit(CART, data[:count], TOGETHER)
         of_data, of_both = planned(found.scene, data[:count])
         np.testing.assert_allclose(found.covariance, np.linalg.inv(of_both), rtol=5e-3)
         np.testing.assert_allclose((of_both - of_data)[:2, :2], np.linalg.inv(COVARIANCE), rtol=1e-6)
@@ -68,19 +56,19 @@ def test_it_counts_beside_an_unknown_start_of_one_run_and_of_two():
 
 def test_without_correlation_it_is_a_prior_for_each():
     data, diagonal = run(), jj.joint_normal(MEAN, np.diag(np.diag(COVARIANCE)))
-    together, apart = jj.fit(Cart(), data, diagonal), jj.fit(Cart(), data, APART)
+    together, apart = jj.fit(CART, data, diagonal), jj.fit(CART, data, APART)
     np.testing.assert_allclose(together.values, apart.values, rtol=1e-10)
     np.testing.assert_allclose(together.standard_errors, apart.standard_errors, rtol=1e-8)
 
 
 def test_of_one_of_the_names_the_marginal_counts():
-    together, apart = (jj.fit(Cart(), run(), {"mass": prior["mass"]}) for prior in (TOGETHER, APART))
+    together, apart = (jj.fit(CART, run(), {"mass": prior["mass"]}) for prior in (TOGETHER, APART))
     np.testing.assert_allclose(together.values, apart.values, rtol=1e-12)
 
 
 def test_density_has_the_normal_density_of_all_names():
     data = run()
-    flat, density = (jj.log_density(Cart(), data, free) for free in (dict.fromkeys(NAMES, jj.unbounded()), TOGETHER))
+    flat, density = (jj.log_density(CART, data, free) for free in (dict.fromkeys(NAMES, jj.unbounded()), TOGETHER))
     points = ({"mass": 2.01, "stiffness": 5.02}, {"mass": 1.97, "stiffness": 4.96})
 
     def added(point):
@@ -113,44 +101,3 @@ def test_pendulum_readings_give_a_joint_prior():
     np.testing.assert_allclose(sigma[:, None] * (inverse @ inverse.T) * sigma, bicycle.covariance[np.ix_(which, which)], rtol=1e-9)
     published = measured_bicycle("Browser")
     assert published.joint_prior == published.prior
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: jj.joint_normal({}, [[1.0]]), "expected a dictionary of name -> mean"),
-        (lambda: jj.joint_normal({"a": 1.0}, [1.0]), r"has shape \(1,\), expected \(1, 1\)"),
-        (lambda: jj.joint_normal({"a": 1.0}, [[np.nan]]), "must be finite"),
-        (lambda: jj.joint_normal({"a": 1.0, "b": 1.0}, [[1.0, 0.0], [0.0, 0.0]]), "the variance of `b` is 0, expected one above zero"),
-        (lambda: jj.joint_normal({"a": 1.0, "b": 1.0}, [[1.0, 0.5], [0.4, 1.0]]), "is not symmetric"),
-        (lambda: jj.joint_normal({"a": 1.0, "b": 1.0}, [[1.0, 2.0], [2.0, 1.0]]), "its correlations have the eigenvalue -1"),
-        (lambda: jj.fit(Cart(), jj.Experiment(TS, {"x": TS}, 0.01, start={"x": 0.3}, unknown_start={"x": TOGETHER["mass"]}, t0=0.0)), "belongs to one run"),
-    ],
-)
-def test_what_is_no_joint_prior_is_refused(make, words):
-    with pytest.raises(ValueError, match=words):
-        make()
-
-
-def test_a_ride_and_the_pendulum_readings_of_a_bicycle_are_one_posterior_within_the_prior():
-    bicycle, ts, names = benchmark_from_measurements("Browser"), np.linspace(0.0, 2.0, 101), ("lean", "steer", "lean_rate", "steer_rate")
-    truth = bicycle.scene.replace(IBxx=1.02 * float(bicycle.scene.IBxx))
-    start = {"rear_spin_rate": 5.0 / float(truth.rR), "lean": 0.02, "lean_rate": 0.1, "steer": 0.0, "steer_rate": 0.0}
-    motion, generator = jj.simulate(truth, start, ts=ts, rtol=1e-8, atol=1e-8), np.random.default_rng(0)
-    values = {name: np.asarray(motion[name]) + 0.002 * generator.normal(size=101) for name in names}
-    ride = jj.Experiment(ts, values, 0.002, start=start, unknown_start=("lean", "lean_rate"))
-    joint = bicycle.joint_prior
-    found = jj.fit(bicycle.scene, ride, joint, rtol=1e-8, atol=1e-8)
-    assert found.converged
-    assert int(found.steps) < 15
-    assert 0.8 < found.reduced_chi_square < 1.3
-    sigma = np.array([prior.sigma for prior in joint.values()])
-    inverse = np.linalg.inv(whitening(list(joint.values())))
-    before = inverse @ inverse.T  # correlations
-    places = [found.labels.index(name) for name in joint]
-    after = found.covariance[np.ix_(places, places)] / np.outer(sigma, sigma)
-    eigenvalues = np.linalg.eigvalsh(before - after)
-    assert eigenvalues[0] > -1e-9  # no combination is told worse than before
-    assert eigenvalues[-1] > 0.5  # some are told far better
-    for name, prior in joint.items():
-        assert abs(float(found[name].value) - prior.mean) < 3 * prior.sigma, name

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.motion.integrators.knots import bends
 
 
 class Struck(jj.Scene):
@@ -81,18 +80,6 @@ def test_lanes_feel_blows_of_their_own_and_forwards_and_backwards():
 def test_lanes_of_a_rollout_feel_a_blow_that_they_share():
     lanes = jj.rollout(Struck(), parameters={"mass": np.array([1.0, 2.0, 4.0])}, ts=[10.0], inputs={"force": BLOW}, work=False, progress=False).lanes
     np.testing.assert_allclose(lanes.u_end[:, 0], [1.0, 0.5, 0.25], rtol=1e-9)
-
-
-@pytest.mark.parametrize("share", [1e-9, 1e-4, 1e-2])
-def test_straight_lines_between_the_knots_that_are_kept_are_as_near_as_stated(share):
-    random = np.random.default_rng(3)
-    ts = np.sort(random.uniform(0.0, 10.0, 400))
-    for values in (np.sin(ts), 1e3 + random.standard_normal(400), np.sign(np.sin(3 * ts)), 5.0 - 3.0 * ts, np.maximum(0.0, 1 - 50 * abs(ts - 4.0))):
-        kept = np.array(bends(jj.Sampled(ts, values), share))
-        kept[[0, -1]] = True
-        off = np.max(np.abs(np.interp(ts, ts[kept], values[kept]) - values))
-        assert off <= share * np.ptp(values) * (1 + 1e-9) + 1e-12 * np.max(np.abs(values))
-    assert np.sum(bends(jj.Sampled(ts, 5.0 - 3.0 * ts), share)) == 2
 
 
 CLOCK, FORCE, PUSH = np.linspace(0.0, 2.0, 6), np.array([0.3, -1.0, 0.8, 0.5, -0.7, 0.2]), np.array([-0.4, 0.6, 0.1, -0.9, 0.7, 0.5])

@@ -131,24 +131,6 @@ def test_failing_motion_has_no_density():
     assert density(density.initial) == -jnp.inf
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda d, f: d.unconstrain({"dampin": 0.1}), "`dampin` is not among the unknowns; did you mean `damping`"),
-        (lambda d, f: d.unconstrain({"damping": 2.0}), "`damping` is 2, which is at or beyond a bound"),
-        (lambda d, f: d(jnp.zeros(3)), r"the vector has shape \(3,\), expected \(4,\)"),
-        (lambda d, f: jj.log_density(Oscillator(), runs(), {"damping": None}).whitened(f), "give the fit of the same unknowns"),
-        (lambda d, f: jj.log_density(Oscillator(), [runs()[0], remembering()[1]], ("mass",)), "None in one run and given in another"),
-        (lambda d, f: jj.log_density(Oscillator(), [runs()[0], runs(None)[1]], ("mass",)), "None in one run and given in another"),
-        (lambda d, f: jj.log_density(Oscillator(), runs(None), ("damping",), max_steps=3), "the motion fails at the first guess"),
-    ],
-)
-def test_wrong_use_is_answered_by_name(make, message):
-    density = jj.log_density(Oscillator(), runs(), FREE)
-    with pytest.raises(ValueError, match=message):
-        make(density, jj.fit(Oscillator(), runs(), FREE))
-
-
 def test_unknown_without_a_standard_error_cannot_be_whitened():
     data, free = runs(), ("mass", "damping", "stiffness")
     with pytest.raises(ValueError, match="`mass` has no standard error in the fit"):

@@ -2,8 +2,6 @@
 
 import dataclasses
 
-import diffrax
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -47,22 +45,6 @@ def test_a_disc_held_by_a_quaternion_keeps_its_norm_by_the_program():
     ((first, _),) = scene.coordinates.quaternions
     assert abs(float(jnp.linalg.norm(jnp.stack(found)[first : first + 4])) - 1) <= tolerance("round_off")
     assert same == y
-
-
-def test_derivatives_of_the_skate_are_those_of_dense_matrices_at_any_heading():
-    def end(x, backend, adjoint=None):
-        scene = MODELS["skate"]().replace(slope=x[0], mass=x[1])
-        start = {"heading_rate": x[2], "heading": x[3]}
-        return ends(scene, start, 0.5, backend=backend, adjoint=adjoint)
-
-    direction, weights = jnp.array([0.3, -0.5, 1.0, 0.6]), jnp.cos(jnp.arange(6.0))
-    headings = jnp.array([0.0, jnp.pi / 2, 0.7])
-    x = jnp.stack([jnp.array([0.3, 1.2, 0.9, heading]) for heading in headings])
-    pushed = lambda x, backend: jax.jvp(lambda x: end(x, backend, diffrax.ForwardMode()), (x,), (direction,))[1]  # noqa: E731
-    along = [jax.jit(jax.vmap(lambda x, backend=backend: pushed(x, backend)))(x) for backend in ("auto", "dense")]
-    np.testing.assert_allclose(*along, atol=1e-9)
-    back = jax.jit(jax.vmap(jax.grad(lambda x: weights @ end(x, "auto"))))(x)
-    np.testing.assert_allclose(back @ direction, along[0] @ weights, atol=1e-9)
 
 
 def test_a_motion_through_a_loss_of_rank_is_right_or_continued_by_dense_matrices():

@@ -7,7 +7,6 @@ import ctypes
 import shutil
 import subprocess
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,12 +16,9 @@ from baselines.hand_derived import HAND_DERIVED, operations
 from small_scenes import OnLine, Upright
 
 import jourdain_jax as jj
-from jourdain_jax.build.trace import event_values
 from jourdain_jax.dynamics.power import needs_work
-from jourdain_jax.equations.minimal import minimal_kinematics
 from jourdain_jax.lowering import lower as module
 from jourdain_jax.models import MODELS
-from jourdain_jax.motion.batches import lockstep
 from jourdain_jax.motion.vector_fields.choice import vector_field
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.fused import fused
@@ -292,67 +288,6 @@ class Falling(Upright):
         return (jj.gravity(motion, self.gravity),)
 
 
-def test_derivatives_through_the_program_agree_with_the_dense_path_in_first_and_second_order():
-    scene = MODELS["tilting-disc"]()
-    program = jj.lower(scene)
-    t, q, u = (x[0] for x in jj.sample_states(scene, 1))
-    independent, rows = np.array(program.independent), jj.structure_of(scene).kept_rows
-
-    def by_program(x):
-        own = scene.replace(mass=x[0], radius=x[1], gravity=x[2])
-        qdot, ydot, _ = program.rates(program.fixed_values(own), t, list(x[3:8]), list(x[8:]), jnp.zeros(0))
-        return jnp.sin(jnp.stack([*qdot, *ydot])).sum()
-
-    def dense(x):
-        own = scene.replace(mass=x[0], radius=x[1], gravity=x[2])
-        u = minimal_kinematics(own, program.independent, rows, t, x[3:8], x[8:]).u
-        return jnp.sin(jnp.concatenate([jj.coordinate_rates(own, t, x[3:8], u), jj.accelerations(own, t, x[3:8], u).udot[independent]])).sum()
-
-    x = jnp.concatenate([jnp.array([1.1, 0.4, 9.7]), q, u[independent]])
-    direction = jnp.asarray(np.random.default_rng(0).normal(size=x.shape))
-    for derivative in (jax.grad, jax.jacfwd):
-        np.testing.assert_allclose(*(jax.jit(derivative(f))(x) for f in (by_program, dense)), rtol=1e-10, atol=1e-10)
-    second = [jax.jit(lambda x, f=f: jax.jvp(jax.grad(f), (x,), (direction,))[1])(x) for f in (by_program, dense)]
-    np.testing.assert_allclose(*second, rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", ["tilting-disc", "ball-on-turntable", "skate", "snakeboard", "isokinetic-particle", "pendulum-chain"])
-def test_the_lowered_motion_is_the_dense_one(name):
-    scene = MODELS[name]()
-    options = {"t1": 2.0, "rtol": 1e-10, "atol": 1e-10}
-    program, dense = jj.simulate(scene, **options), jj.simulate(scene, backend="dense", **options)
-    assert int(program.result) == int(dense.result) == results.SUCCESS
-    np.testing.assert_allclose(program.q, dense.q, atol=1e-8)
-    np.testing.assert_allclose(program.u, dense.u, atol=1e-7)
-    if dense.work is not None:
-        np.testing.assert_allclose(program.work, dense.work, atol=1e-8)
-
-
-def test_a_batch_written_for_batches_is_the_same_motion():
-    scene = MODELS["tilting-disc"]()
-    leans = np.linspace(0.1, 0.4, 3)
-    lanes = jj.rollout(scene, {"lean": leans, "spin_rate": -3.0}, t1=1.0, rtol=1e-10, atol=1e-10)
-    alone = jj.simulate(scene, {"lean": leans[1], "spin_rate": -3.0}, t1=1.0, rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(lanes.lanes.q[1], alone.q, atol=1e-9)
-
-
-def disc_ends(x):
-    """Final coordinates of discs whose starts and parameters are given, (lanes, 4)."""
-    starts = dict(zip(("lean", "yaw_rate", "spin_rate"), x.T[:3], strict=True))
-    options = {"ts": jnp.array([0.5, 1.0]), "events": False, "adjoint": diffrax.ForwardMode()}
-    return jj.rollout(MODELS["tilting-disc"](), starts, parameters={"radius": x[:, 3]}, **options).lanes.q[:, -1]
-
-
-def test_lanes_that_do_not_fill_a_block_move_as_they_do_alone_and_so_do_their_derivatives():
-    lanes = lockstep.TOGETHER + 3  # the second block holds three lanes and copies
-    x = jnp.asarray(np.array([0.3, 0.5, -3.0, 0.5]) * (1 + 0.1 * np.random.default_rng(1).normal(size=(lanes, 4))))
-    along = jnp.ones_like(x)
-    found, slope = jax.jit(lambda x: jax.jvp(disc_ends, (x,), (along,)))(x)
-    alone, slope_alone = (np.concatenate(part) for part in zip(*(jax.jvp(disc_ends, (x[i : i + 1],), (along[:1],)) for i in (0, lanes - 1)), strict=True))
-    np.testing.assert_allclose(found[np.array([0, lanes - 1])], alone, rtol=1e-9)
-    np.testing.assert_allclose(slope[np.array([0, lanes - 1])], slope_alone, rtol=1e-9)
-
-
 def test_values_computed_together_are_the_same_and_have_the_same_derivatives():
     both = lambda x: fused((jnp.sin(x) * 2.0, jnp.sin(x) + x))  # noqa: E731
     x = jnp.linspace(-2.0, 2.0, 7)
@@ -415,15 +350,6 @@ def test_derivatives_by_the_jacobian_on_the_graph_are_those_of_jax(order):
     np.testing.assert_allclose(second(by_rule), second(by_jax), rtol=1e-11, atol=1e-11)
     pull = lambda f: jax.grad(lambda x: jnp.vdot(jax.grad(lambda x: jnp.sum(jnp.sin(f(x))))(x), v))(x)  # noqa: E731
     np.testing.assert_allclose(pull(by_rule), pull(by_jax), rtol=1e-11, atol=1e-11)
-
-
-def test_stop_events_are_part_of_the_program():
-    scene = MODELS["tilting-disc"]()
-    program = jj.lower(scene)
-    (t,), (q,), (u,) = jj.sample_states(scene, 1)
-    y = u[np.array(program.independent)]
-    values = program.event_values(program.fixed_values(scene), t, tuple(q), tuple(y), jnp.zeros(0))
-    np.testing.assert_allclose(values, event_values(scene, jj.motion_at(scene, t, q, u)), rtol=1e-14)
 
 
 class OnNarrowEllipse(jj.Scene):

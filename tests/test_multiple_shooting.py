@@ -208,25 +208,6 @@ def test_sensors_are_late_in_pieces_as_in_whole_runs(case):
     same(Oscillator(stiffness=16.0, damping=0.2), runs, ("stiffness", "damping"))
 
 
-def test_a_chaotic_motion_is_found_from_afar_through_late_sensors(monkeypatch):
-    guess, truth, run = pendulum(5.0, seed=2)
-    sensors = {"theta1": jj.Sensor(delay=jj.Estimate(0.03, range=jj.bounds(0.0, 0.1))), "theta2": jj.Sensor(lag=jj.Estimate(0.03))}
-    true, start = {"theta1": ("theta1", 0.05, None), "theta2": ("theta2", 0.0, 0.06)}, {"theta1": 2.0, "theta2": 2.5}
-    run = shown_late(truth, start, np.asarray(run.ts)[2:], 0.0, true, sensors, run.start, sigma=0.05)
-    found = jj.fit(guess, run, FREE, shooting=jj.MultipleShooting(duration=0.5), **TIGHT)
-    assert found.converged
-    assert not found.warnings
-    monkeypatch.setattr("jourdain_jax.analysis.sensors.FEWEST_INTERVALS", 640)  # so that the whole run is read between times as close as those of ten pieces
-    begin = jj.Experiment(run.ts, run.values, run.sigma, start=found.starts[0], unknown_start=tuple(run.start), sensors=sensors, t0=0.0)
-    near = jj.fit(found.scene, begin, FREE, **TIGHT)
-    assert near.converged
-    assert not near.grown
-    assert np.max(np.abs(found.values - near.values) / near.standard_errors) < 1e-3
-    np.testing.assert_allclose(found.standard_errors, near.standard_errors, rtol=1e-3)
-    known = {name: float(getattr(truth, name)) for name in FREE} | {"theta1.delay": 0.05, "theta2.lag": 0.06}
-    assert all(abs(found[name].value - x) < 4 * found[name].standard_error for name, x in known.items())
-
-
 def test_an_actuator_is_estimated_in_pieces_too():
     command = jj.Sampled(np.linspace(-1.0, 5.0, 61), np.random.default_rng(0).normal(size=61))
     drive = jj.Actuator(command, gain=jj.Estimate(1.2), delay=jj.Estimate(0.02, range=jj.bounds(0.0, 0.2)))

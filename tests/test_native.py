@@ -151,13 +151,6 @@ def test_no_bit_depends_on_the_effort_spent_on_machine_code(disc_kernel, monkeyp
     assert all(ffi.registered(*asked) != name for asked, name in names.items())
 
 
-def test_a_hundred_thousand_lanes_are_those_of_a_hundred(disc_kernel):
-    kernel, _, starts, goals = disc_kernel
-    few, many = jax.vmap(kernel.run)(starts, goals), jax.vmap(kernel.run)(jnp.tile(starts, (1000, 1)), jnp.tile(goals, (1000, 1)))
-    for a, b in zip(few, many, strict=True):
-        np.testing.assert_array_equal(np.reshape(b, (1000, *a.shape)), np.broadcast_to(a, (1000, *a.shape)))
-
-
 def test_no_lanes_and_axes_of_lanes(disc_kernel):
     kernel, _, starts, goals = disc_kernel
     states, ends = jax.vmap(kernel.run)(starts[:0], goals[:0])
@@ -177,16 +170,6 @@ def test_lanes_of_a_rollout_are_those_of_xla():
     np.testing.assert_array_equal(ours.lanes.accepted, theirs.lanes.accepted)
     np.testing.assert_array_equal(ours.lanes.rejected, theirs.lanes.rejected)
     np.testing.assert_allclose(ours.lanes.q_end, theirs.lanes.q_end, rtol=1e-10, atol=1e-10)
-
-
-def test_the_same_call_gives_the_same_bits_eager_or_compiled():
-    disc = jj.models.TiltingDisc()
-
-    def run():
-        return jj.simulate(disc, {"lean": 0.3, "spin_rate": -3.0}, ts=[1.0]).q_end
-
-    first = run()
-    assert all(np.array_equal(run(), first) for _ in range(5))
 
 
 def test_it_is_said_why_machine_code_is_not_taken(monkeypatch):

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import machine_code
 import numpy as np
 import pytest
-from ends_of_models import end_of_model
 from small_scenes import OnLine
 
 import jourdain_jax as jj
@@ -67,23 +66,6 @@ def test_sensitivities_of_an_oscillator_are_those_of_its_closed_form(mode, event
 
 
 LANES = X * (1 + 0.05 * np.random.default_rng(0).normal(size=(11, 6)))
-
-
-@pytest.mark.parametrize(
-    ("derivative", "adjoint"),
-    [
-        (lambda f: jax.jit(jax.vmap(jax.grad(f)))(LANES), None),
-        (lambda f: jax.jit(jax.grad(lambda x: jnp.sum(jnp.sin(jax.vmap(f)(x)))))(LANES), None),
-        (lambda f: jax.jit(jax.vmap(jax.jacfwd(f)))(LANES), FORWARD),
-        (lambda f: jax.jit(jax.jacfwd(jax.jacfwd(f)))(X), FORWARD),
-        (lambda f: jax.jit(lambda x, v: jax.jvp(jax.vmap(f), (x,), (v,)))(LANES, LANES), FORWARD),
-    ],
-    ids=["vmap of grad", "grad of vmap", "vmap of jacfwd", "jacfwd of jacfwd", "jvp of vmap"],
-)
-def test_nested_derivatives_up_to_an_event_are_those_of_xla(derivative, adjoint):
-    ours, theirs = (derivative(lambda x, backend=backend: jnp.sum(_ends(x, backend, adjoint, True) ** 2)) for backend in ("native", "xla"))
-    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("adjoint", [None, FORWARD], ids=["reverse", "forward"])
@@ -166,35 +148,3 @@ def test_a_branch_that_is_not_taken_has_no_cotangent_however_steep_it_is():
     root = graph.call("select", graph.call("gt", x, graph.zero), graph.zero, graph.call("sqrt", x))
     (found,) = emit.run(graph, cotangents(graph, [root], [w], [x]), {x: jnp.zeros(()), w: jnp.ones(())})
     assert float(found) == 0.0
-
-
-CASES = {
-    "tilting-disc": ({"lean": 0.3, "spin_rate": -3.0}, {"t1": 1.0}, ["radius", "gravity"]),
-    "tilting-disc, falling": ({"lean": 0.6, "spin_rate": -0.1}, {"t1": 5.0}, ["radius", "mass"]),
-    "tilting-disc, at rest": ({"lean": 0.0}, {"t1": 0.5}, ["radius", "gravity"]),
-    "chaplygin-sleigh": (None, {"t1": 2.0}, ["mass", "inertia"]),
-    "tilting-disc-quaternion": (None, {"t1": 0.5, "formulation": jj.Formulation("full")}, ["radius"]),
-    "whipple-bicycle": (None, {"t1": 0.5, "formulation": jj.Formulation(stabilisation=None)}, ["w", "g", "mB"]),
-    "whipple-bicycle, projected": (None, {"t1": 0.5}, ["w", "g", "mB"]),
-    "double-pendulum-rods": (None, {"t1": 0.5}, []),
-}
-
-
-def _slope(name: str, backend: str, adjoint) -> np.ndarray:
-    """Of a number made of saved states and the end of a motion, with respect to parameters and two directions of the start."""
-    start, options, parameters = CASES[name]
-    end, x = end_of_model(name.split(",")[0], start, parameters, backend=backend, adjoint=adjoint, **options)
-    return np.asarray(jax.jit((jax.grad if adjoint is None else jax.jacfwd)(end))(x))
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_both_modes_of_a_model_agree(name):
-    found, expected = (_slope(name, "native", adjoint) for adjoint in (None, FORWARD))
-    assert np.any(expected != 0)
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.max(np.abs(expected)))
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_tangents_of_a_model_are_those_of_xla(name):
-    found, expected = (_slope(name, backend, FORWARD) for backend in ("native", "xla"))
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.max(np.abs(expected)))

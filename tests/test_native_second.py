@@ -1,4 +1,4 @@
-"""Second derivatives by machine code: against closed forms, those of XLA and differences of first ones, at events, under `vmap`, and when XLA takes them."""
+"""Second derivatives by machine code in all modes: closed forms, agreement of all modes, batches, what XLA takes, and what is refused."""
 
 import functools
 
@@ -11,14 +11,11 @@ import pytest
 from ends_of_models import end_of_model
 
 import jourdain_jax as jj
+from jourdain_jax import DifferentiationModeError
 
 pytestmark = machine_code.needed
 
 FORWARD = diffrax.ForwardMode()
-
-
-def twice(f):
-    return jax.jit(jax.jacfwd(jax.jacfwd(f)))
 
 
 class Falling(jj.Scene):
@@ -72,13 +69,6 @@ def seconds_of_the_closed_form(events):
     return np.asarray(jax.jit(jax.vmap(jax.jacfwd(jax.jacfwd(lambda x: _exact(x, events)))))(LANES))
 
 
-@pytest.mark.parametrize(("events", "solver"), [(False, None), (True, None), (True, jj.Taylor())], ids=["to a time", "to the ground", "by series"])
-def test_second_derivatives_of_falls_are_those_of_their_closed_form(events, solver):
-    found = np.asarray(jax.jit(jax.vmap(jax.jacfwd(jax.jacfwd(lambda x: _seen(x, events, solver=solver, max_steps=1357)))))(LANES))
-    np.testing.assert_allclose(found, seconds_of_the_closed_form(events), rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(found, np.swapaxes(found, 2, 3), rtol=1e-9, atol=1e-9)
-
-
 @pytest.mark.parametrize("which", ["samples", "a third time"])
 def test_what_machine_code_does_not_serve_is_left_to_xla(which):
     def height(x):
@@ -91,28 +81,109 @@ def test_what_machine_code_does_not_serve_is_left_to_xla(which):
     np.testing.assert_allclose(found, (lower(1.0 + h) - lower(1.0 - h)) / (2 * h), rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("name", "start", "parameters", "options"),
-    [
-        ("chaplygin-sleigh", None, ["mass", "inertia"], {"t1": 2.0}),
-        ("tilting-disc", {"lean": 0.6, "spin_rate": -0.1}, ["radius", "mass"], {"t1": 5.0}),
-        ("tilting-disc", {"lean": 0.0}, ["radius", "gravity"], {"t1": 0.5}),
-        ("rattleback", None, [], {"t1": 0.5}),
-        ("double-pendulum-rods", None, [], {"t1": 0.5}),
-        ("tilting-disc-quaternion", None, ["radius"], {"t1": 0.5, "formulation": jj.Formulation("full")}),
-    ],
-    ids=["sleigh", "falling disc", "disc at rest", "rattleback", "rods", "quaternion"],
-)
-def test_second_derivatives_of_a_model_are_those_of_xla(name, start, parameters, options):
-    ends = (end_of_model(name, start, parameters, backend=backend, adjoint=FORWARD, **options) for backend in ("native", "xla"))
-    found, expected = (np.asarray(twice(end)(x)) for end, x in ends)
-    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8 * np.max(np.abs(expected)))
+MODES = {
+    "forward of reverse": lambda f: jax.jacfwd(jax.jacrev(f)),
+    "reverse of forward": lambda f: jax.jacrev(jax.jacfwd(f)),
+    "reverse of reverse": lambda f: jax.jacrev(jax.jacrev(f)),
+    "forward of forward": lambda f: jax.jacfwd(jax.jacfwd(f)),
+}
+MOTIONS = [
+    *((mode, True, None) for mode in MODES),
+    *((mode, False, None) for mode in list(MODES)[::3]),
+    *((mode, True, jj.Taylor()) for mode in list(MODES)[::3]),
+]
+
+
+@pytest.mark.parametrize(("mode", "events", "solver"), MOTIONS)
+def test_all_modes_are_those_of_the_closed_form(mode, events, solver):
+    """With respect to parameters, a start, an input, the start's time, a time saved and the end; or up to an event."""
+    found = np.asarray(jax.jit(jax.vmap(MODES[mode](lambda x: _seen(x, events, solver=solver, adjoint=None, max_steps=1357))))(LANES))
+    np.testing.assert_allclose(found, seconds_of_the_closed_form(events), rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(found, np.swapaxes(found, 2, 3), rtol=1e-9, atol=1e-9)
+
+
+def _lowest(x, wind, **options):
+    """What is asked of one fall."""
+    motion = jj.simulate(Falling(mass=x[0], drag=x[1]), {"z": x[2], "z_rate": x[3]}, t1=9.0, inputs={"wind": wind}, rtol=1e-10, atol=1e-10, **options)
+    return motion.t_end**2 + motion.u_end[0] * x[0]
+
+
+def test_hessians_of_sums_over_lanes_that_share_parameters():
+    """Newton's and Laplace's: the Hessian of a loss over a batch, its product with a vector, and the same by `rollout`."""
+    heights = jnp.array([1.0, 2.0, 3.5])
+
+    def loss(x, adjoint=None):
+        return jnp.sum(jax.vmap(lambda height: _lowest(x.at[2].mul(height), x[4], ts=[0.1], adjoint=adjoint))(heights))
+
+    def by_rollout(x):
+        start = {"z": x[2] * heights, "z_rate": x[3]}
+        options = {"ts": [0.1], "t1": 9.0, "inputs": {"wind": x[4]}, "rtol": 1e-10, "atol": 1e-10}
+        lanes = jj.rollout(Falling(mass=x[0], drag=x[1]), start, **options).lanes
+        return jnp.sum(lanes.t_end**2 + lanes.u_end[:, 0] * x[0])
+
+    expected = np.asarray(jax.jit(jax.jacfwd(jax.jacfwd(lambda x: loss(x, FORWARD))))(X))
+    assert np.abs(expected[:5, :5]).min() > 0
+    close = {"rtol": 1e-9, "atol": 1e-9 * np.abs(expected).max()}
+    np.testing.assert_allclose(jax.jit(jax.hessian(loss))(X), expected, **close)
+    np.testing.assert_allclose(jax.jit(jax.hessian(by_rollout))(X), expected, **close)
+    v = jnp.cos(jnp.arange(7.0))
+    np.testing.assert_allclose(jax.jit(lambda x: jax.jvp(jax.grad(loss), (x,), (v,))[1])(X), expected @ v, **close)
+
+
+def test_hessians_under_an_input_that_is_samples():
+    """Up to an event whose time such an input moves."""
+    wind = jj.Sampled([0.0, 0.3, 0.8, 2.0], [0.0, 1.5, -2.0, 1.0])
+    found = jax.jit(jax.hessian(lambda x: _lowest(x, wind)))(X)
+    np.testing.assert_allclose(found, jax.jit(jax.jacfwd(jax.jacfwd(lambda x: _lowest(x, wind, adjoint=FORWARD))))(X), rtol=1e-9, atol=1e-9)
+    assert np.all(np.asarray(found)[:4, :4] != 0)
+
+
+MODELS = {
+    "chaplygin-sleigh": (None, ["mass", "inertia"], {"t1": 2.0}),
+    "tilting-disc, falling": ({"lean": 0.6, "spin_rate": -0.1}, ["radius", "mass"], {"t1": 5.0}),
+    "double-pendulum-rods": (None, [], {"t1": 0.5}),
+    "tilting-disc-quaternion": (None, ["radius"], {"t1": 0.5, "formulation": jj.Formulation("full")}),
+    "whipple-bicycle": (None, ["w", "g", "mB"], {"t1": 0.5}),
+}
+
+
+@pytest.mark.parametrize("mode", ["forward of reverse", "reverse of forward", "reverse of reverse"])
+@pytest.mark.parametrize("name", MODELS)
+def test_all_modes_of_a_model_agree(name, mode):
+    """Starts that are put onto their rows take part."""
+    start, parameters, options = MODELS[name]
+    ends = (end_of_model(name.split(",")[0], start, parameters, adjoint=adjoint, **options) for adjoint in (None, FORWARD))
+    found, expected = (np.asarray(jax.jit(MODES[of](end))(x)) for of, (end, x) in zip((mode, "forward of forward"), ends, strict=True))
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-9 * np.max(np.abs(expected)))
     assert np.any(expected != 0)
 
 
-@pytest.mark.parametrize("formulation", [jj.Formulation(), jj.Formulation(stabilisation=None)], ids=["projected", "not projected"])
-def test_second_derivatives_of_a_bicycle_are_differences_of_first_ones(formulation):
-    end, x = end_of_model("whipple-bicycle", None, ["w", "g", "mB"], t1=0.5, formulation=formulation, adjoint=FORWARD)
-    first, h = jax.jit(jax.jacfwd(end)), 1e-4
-    differences = [(8 * (first(x + h * e) - first(x - h * e)) - first(x + 2 * h * e) + first(x - 2 * h * e)) / (12 * h) for e in np.eye(5)]
-    np.testing.assert_allclose(twice(end)(x), differences, rtol=1e-5, atol=1e-6 * np.max(np.abs(differences)))
+def _height(x, **options):
+    wind = jj.Sampled([0.0, 0.5, 2.0], jnp.stack([x, 0.3 * x, x**2])) if options.pop("samples", False) else 0.3
+    options = {"rtol": 1e-8, "atol": 1e-8} | options
+    return jj.simulate(Falling(drag=0.4 * x), {"z": 2.0, "z_rate": 1.0 + x}, ts=[0.4], inputs={"wind": wind}, events=False, **options).q_end[0]
+
+
+@pytest.mark.parametrize(
+    ("of", "options", "says"),
+    [
+        ("forward of reverse", {"adjoint": diffrax.RecursiveCheckpointAdjoint()}, "reverse mode only"),
+        ("reverse of forward", {"adjoint": diffrax.RecursiveCheckpointAdjoint()}, "forward mode .* reverse-only"),
+        ("forward of reverse", {"adjoint": diffrax.ForwardMode()}, "reverse mode .* forward-only"),
+        ("reverse of forward", {"adjoint": diffrax.ForwardMode()}, "reverse mode .* forward-only"),
+        ("forward of reverse", {"backend": "xla"}, "machine code"),
+        ("reverse of reverse", {"backend": "xla"}, "machine code"),
+        ("forward of reverse", {"samples": True}, "samples"),
+        ("reverse of forward", {"samples": True}, "samples"),
+        ("reverse of reverse", {"samples": True}, "samples"),
+    ],
+)
+def test_what_is_not_there_is_refused_by_name(of, options, says):
+    with pytest.raises(DifferentiationModeError, match=says):
+        jax.jit(MODES[of](lambda x: _height(x, **options))).lower(1.0)
+
+
+def test_derivatives_of_the_third_order_are_refused_unless_forward_mode_takes_them():
+    for name in ("forward of reverse", "reverse of forward", "reverse of reverse"):
+        with pytest.raises(DifferentiationModeError, match="three times"):
+            jax.eval_shape(jax.grad(MODES[name](_height)), 1.0)

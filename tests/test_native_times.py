@@ -69,41 +69,6 @@ def test_derivatives_with_respect_to_times_are_differences(name):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_start_and_its_time_move_along_the_motion_together(mode):
-    """From any of its states, each at its own time, a motion ends in the same one: the flow's derivative of the rate at the start is that of its time."""
-    scene, options = Driven(), {"inputs": {"push": PUSH}, "events": False, "rtol": 1e-12, "atol": 1e-12, "adjoint": MODES[mode]}
-    on_the_way = jj.simulate(scene, Driven.example, t0=0.2, ts=[0.6], **options)
-    q, u = on_the_way.q[0, 0], on_the_way.u[0, 0]
-    rate = jnp.asarray(jj.accelerations(scene, 0.6, q[None], u[None], inputs={"push": PUSH(0.6)}).udot)[0]
-
-    def end(s):
-        motion = jj.simulate(scene, {"x": q + s * u, "x_rate": u + s * rate}, t0=0.6 + s, ts=[1.9], **options)
-        return motion.q_end[0], motion.u_end[0]
-
-    np.testing.assert_allclose(jax.jit(getattr(jax, mode)(end))(0.0), (0.0, 0.0), atol=1e-9)
-
-
-LANES = TIMES + 0.05 * np.random.default_rng(0).uniform(-1, 1, size=(11, 4))
-
-
-@pytest.mark.parametrize(
-    ("derivative", "adjoint"),
-    [
-        (lambda f: jax.jit(jax.vmap(jax.grad(f)))(LANES), None),
-        (lambda f: jax.jit(jax.grad(lambda x: jnp.sum(jnp.sin(jax.vmap(f)(x)))))(LANES), None),
-        (lambda f: jax.jit(jax.vmap(jax.jacfwd(f)))(LANES), FORWARD),
-        (lambda f: jax.jit(lambda x, v: jax.jvp(jax.vmap(f), (x,), (v,)))(LANES, LANES), FORWARD),
-        (lambda f: jax.jit(jax.jacfwd(jax.jacfwd(f)))(TIMES), FORWARD),
-    ],
-    ids=["vmap of grad", "grad of vmap", "vmap of jacfwd", "jvp of vmap", "jacfwd of jacfwd"],
-)
-def test_nested_derivatives_with_respect_to_times_are_those_of_xla(derivative, adjoint):
-    ours, theirs = (derivative(lambda t, b=backend: jnp.sum(_seen("driven, up to a wall", t, b, adjoint) ** 2)) for backend in ("native", "xla"))
-    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-8)
-
-
-@pytest.mark.parametrize("mode", MODES)
 def test_a_motion_that_fails_ends_at_a_number_after_its_start(mode):
     def end(t0, span, **options):
         motion = jj.simulate(Driven(), Driven.example, t0=t0, t1=t0 + span, ts=t0 + jnp.array([0.5, 1.0]) * span, events=False, adjoint=MODES[mode], **options)
@@ -123,14 +88,3 @@ def test_a_motion_that_starts_beyond_an_event_ends_where_and_when_it_starts(mode
 
     found = getattr(jax, mode)(end)(jnp.array([0.2, 0.5]))
     np.testing.assert_array_equal(found, [[0.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_parameters_and_times_vary_together(mode):
-    def f(x, backend):
-        scene = Driven(stiffness=x[0])
-        return jj.simulate(scene, {"x": x[1], "x_rate": 0.7}, t0=x[2], ts=x[3:], backend=backend, adjoint=MODES[mode], rtol=1e-11, atol=1e-11).q[:, 0]
-
-    x = jnp.array([6.0, 1.1, 0.1, 0.4, 0.9])
-    found, expected = (jax.jit(getattr(jax, mode)(lambda x, b=b: f(x, b)))(x) for b in ("native", "xla"))
-    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)

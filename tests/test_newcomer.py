@@ -6,7 +6,6 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import result_codes as results
 
 import jourdain_jax as jj
 
@@ -53,39 +52,6 @@ class RobotWithTrailer(jj.Scene):
         return jj.gravity(motion, G), *motors
 
 
-class Tricycle(jj.Scene):
-    """Two wheels behind, one in front that is steered and driven."""
-
-    wheelbase: object = jj.parameter(1.0, unit="m", positive=True)
-    half_track: object = jj.parameter(0.35, unit="m", positive=True)
-    radius: object = jj.parameter(0.25, unit="m", positive=True)
-
-    coordinates = jj.coordinates("x y heading steer front left right")
-    inputs = jj.inputs("pedals handlebar")
-    domain = {"steer": (-0.8, 0.8)}
-
-    def bodies(self, t, q):
-        R = jj.rot_z(q.heading)
-        rear = jnp.stack([q.x, q.y, self.radius])
-
-        def disc(place, turned, angle):
-            return jj.RigidBody.thin_disc(1.5, self.radius, axis="y", position=place, orientation=turned @ jj.rot_y(angle))
-
-        return {
-            "frame": jj.RigidBody.box(20.0, (1.0, 0.3, 0.4), position=rear + 0.4 * R[:, 0] + jnp.array([0.0, 0.0, 0.3]), orientation=R),
-            "front wheel": disc(rear + self.wheelbase * R[:, 0], R @ jj.rot_z(q.steer), q.front),
-            "left wheel": disc(rear + self.half_track * R[:, 1], R, q.left),
-            "right wheel": disc(rear - self.half_track * R[:, 1], R, q.right),
-        }
-
-    def contacts(self, pose):
-        return {wheel: jj.disc_contact(pose[wheel], self.radius) for wheel in ("front wheel", "left wheel", "right wheel")}
-
-    def loads(self, motion):
-        servo = 50.0 * (motion.inputs.handlebar - motion.q.steer) - 5.0 * motion.u.steer_rate
-        return jj.gravity(motion, G), jj.generalized_force(motion, steer_rate=servo, front_rate=motion.inputs.pedals)
-
-
 class Bowl(jj.Scene):
     """The page on contacts: a ball in a bowl; without a `domain`, as who has not read on writes it."""
 
@@ -107,40 +73,6 @@ class BowlInItsDomain(Bowl):
     """The ball in a bowl with the domain that the page states."""
 
     domain = {"x": (-0.15, 0.15), "y": (-0.15, 0.15)}
-
-
-class Scooter(jj.Scene):
-    """A kick scooter and a rider who stands on it; both wheels are kept on the ground by rows."""
-
-    radius: object = jj.parameter(0.1, unit="m", positive=True)
-    wheelbase: object = jj.parameter(0.85, unit="m", positive=True)
-    tilt: object = jj.parameter(0.2, unit="rad")
-
-    coordinates = jj.coordinates("x y z yaw lean pitch steer rear front")
-    inputs = jj.inputs("steer_torque")
-    domain = {"lean": (-0.6, 0.6), "pitch": (-0.3, 0.3), "steer": (-0.6, 0.6), "z": (0.05, 0.15)}
-
-    def bodies(self, t, q):
-        R = jj.rot_z(q.yaw) @ jj.rot_x(q.lean) @ jj.rot_y(q.pitch)
-        F = R @ jj.rot_y(-self.tilt) @ jj.rot_z(q.steer)
-        rear = jnp.stack([q.x, q.y, q.z])
-        front = rear + self.wheelbase * R[:, 0]
-        return {
-            "deck": jj.RigidBody.box(4.0, (0.6, 0.15, 0.05), position=rear + 0.4 * R[:, 0], orientation=R),
-            "rider": jj.RigidBody.box(70.0, (0.3, 0.4, 1.7), position=rear + 0.35 * R[:, 0] + R[:, 2], orientation=R),
-            "fork": jj.RigidBody.box(2.0, (0.1, 0.4, 0.9), position=front + 0.45 * F[:, 2], orientation=F),
-            "rear wheel": jj.RigidBody.thin_disc(0.5, self.radius, axis="y", position=rear, orientation=R @ jj.rot_y(q.rear)),
-            "front wheel": jj.RigidBody.thin_disc(0.5, self.radius, axis="y", position=front, orientation=F @ jj.rot_y(q.front)),
-        }
-
-    def contacts(self, pose):
-        return {wheel: jj.disc_contact(pose[wheel], self.radius, height="row") for wheel in ("rear wheel", "front wheel")}
-
-    def loads(self, motion):
-        return jj.gravity(motion, G), jj.generalized_force(motion, steer_rate=motion.inputs.steer_torque - 8.0 * motion.u.steer_rate)
-
-    def events(self, motion):
-        return {"fallen": 0.7 - jnp.abs(motion.q.lean)}
 
 
 def test_code_on_the_page_about_contacts_runs():
@@ -177,21 +109,6 @@ def test_a_trailer_that_is_carried_by_the_robot_lifts_a_wheel_and_the_summary_sa
     assert "carried" not in right
 
 
-def test_a_tricycle_turns_as_its_front_wheel_says():
-    tricycle = Tricycle()
-    motion = jj.simulate(tricycle, {"front_rate": 4.0, "steer": 0.2}, ts=jnp.linspace(0.0, 2.0, 5), inputs={"pedals": 2.0, "handlebar": 0.3}).raise_if_failed()
-    ahead = motion["x_rate"] * jnp.cos(motion["heading"]) + motion["y_rate"] * jnp.sin(motion["heading"])
-    np.testing.assert_allclose(motion["heading_rate"], ahead * jnp.tan(motion["steer"]) / tricycle.wheelbase, rtol=1e-9)
-    forces = motion.contact_forces()
-    np.testing.assert_allclose(sum(force.normal for force in forces.values()), (20.0 + 3 * 1.5) * G, rtol=1e-9)
-    # three wheels tell their normal forces; how the two behind share the sideways force is nobody's to know
-    assert all(np.all(force.normal_determined) for force in forces.values())
-    assert np.all(forces["front wheel"].determined)
-    assert not np.any(forces["left wheel"].determined)
-    assert str(motion).count("; the tangential force is not determined by the rows (minimum norm)") == 2
-    assert re.search(r"inputs +pedals = 2, handlebar = 0.3\n", str(motion))
-
-
 def test_a_ball_swings_in_a_bowl_as_fast_as_the_page_says():
     swings = np.sort(np.abs(jj.linearize(BowlInItsDomain(), {}).state_eigenvalues().imag))[-4:]
     np.testing.assert_allclose(swings, np.sqrt(5 * G / (7 * 0.35)), rtol=1e-9)
@@ -215,19 +132,6 @@ def test_a_scene_without_a_domain_starts_where_it_is_told():
     _, q, u = jj.sample_states(Fresh(), 4)
     assert np.all(np.isfinite(u))
     assert np.all(q[:, 0] ** 2 + q[:, 1] ** 2 < 0.35**2)
-
-
-def test_a_scooter_that_nobody_steers_falls():
-    scooter = Scooter()
-    start = jj.start(scooter, x_rate=4.0, lean_rate=0.1)
-    assert float(start["rear_rate"]) == pytest.approx(4.0 / 0.1)
-    motion = jj.simulate(scooter, start, ts=jnp.linspace(0.0, 5.0, 11))
-    assert int(motion.result) == results.EVENT
-    assert motion.event_names[int(motion.event)] == "fallen"
-    assert abs(float(motion.q_end[4])) == pytest.approx(0.7, abs=1e-8)
-    upright = jj.simulate(scooter, {"x_rate": 4.0}, ts=jnp.array([0.0, 0.1]))
-    pressed = sum(float(force.normal[0]) for force in upright.contact_forces().values())
-    assert pressed == pytest.approx((70.0 + 4.0 + 2.0 + 2 * 0.5) * G, rel=1e-9)
 
 
 class Stick(jj.Scene):

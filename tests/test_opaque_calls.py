@@ -1,12 +1,7 @@
 """Loads and stop events with a part that has no scalar form: that part stays a call of JAX, everything else is lowered."""
 
-import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.flatten_util
@@ -15,11 +10,11 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.build.trace import event_values, traced_scene
+from jourdain_jax.build.trace import event_values
 from jourdain_jax.equations.minimal import accelerations_of, minimal_kinematics
 from jourdain_jax.models import ChaplyginSleigh, TiltingDisc
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.interpret import Nodes, as_nodes
 from jourdain_jax.program.opaque_calls import interpret_with_calls
 
@@ -120,19 +115,6 @@ def rates_of(scene):
         return jnp.concatenate([motion.qdot.array, found.udot[np.array(program.independent)]])
 
     return by_program, dense
-
-
-def by_numbers(x, numbers):
-    """Hertz's law, a soft step, a sawtooth: functions of numbers, none of which need be kept."""
-    return numbers[0] * jnp.maximum(x, 0.0) ** 1.5 + jax.nn.sigmoid(x) + jnp.log1p(x**2) + jnp.mod(3 * x, 1.0)
-
-
-def test_functions_of_numbers_are_lowered():
-    scene = Acted(law=by_numbers, numbers=np.array([0.3]))
-    program = jj.lower(scene)
-    assert not program.calls
-    (by_program, dense), (q, y) = rates_of(scene), states_of(scene, 5)
-    np.testing.assert_allclose(*(jax.vmap(jax.jit(lambda q, y, f=f: f(scene, q, y)))(q, y) for f in (by_program, dense)), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -239,21 +221,6 @@ def test_motions_with_a_call_are_the_dense_ones_alone_and_in_lockstep(name):
     np.testing.assert_allclose(lanes.lanes.q[0], dense.q, atol=1e-8)
     np.testing.assert_allclose(lanes.lanes.q[10], jj.simulate(scene, START | {"heading_rate": 1.2}, **OPTIONS).q, atol=1e-8)
     assert np.all(np.diff(lanes.lanes.q_end[:, 2]) != 0)
-
-
-def test_a_networks_weights_have_gradients_through_a_motion_in_both_modes():
-    scene, step = LAWS["network"][0], 1e-5
-    weight = lambda scene: scene.numbers.layers[1].weight[3, 5]  # noqa: E731
-
-    def end(change, adjoint):
-        own = eqx.tree_at(lambda s: s.numbers.layers[1].weight, scene, scene.numbers.layers[1].weight.at[3, 5].add(change))
-        return jj.simulate(own, START, t1=0.5, rtol=1e-10, atol=1e-10, adjoint=adjoint).q_end[0]
-
-    assert weight(scene).shape == ()
-    forward, reverse = diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint()
-    by_differences = (end(step, forward) - end(-step, forward)) / (2 * step)
-    np.testing.assert_allclose(jax.jvp(lambda c: end(c, forward), (0.0,), (1.0,))[1], by_differences, rtol=1e-5)
-    np.testing.assert_allclose(jax.grad(lambda c: end(c, reverse))(0.0), by_differences, rtol=1e-5)
 
 
 class OnCam(jj.Scene):
@@ -382,34 +349,6 @@ def test_a_stop_event_without_a_scalar_form_is_a_call_and_leaves_the_program_as_
     np.testing.assert_allclose(lanes.lanes.t_end, found.t_end, rtol=1e-7)
 
 
-SINGLE = """
-import json, sys
-sys.path[:0] = {path!r}
-import jax, numpy as np, test_opaque_calls as here
-assert not jax.config.jax_enable_x64
-found = {{}}
-for name in ("network",):
-    both = [here.jj.simulate(here.LAWS[name][0], here.START, ts=here.OPTIONS["ts"], rtol=1e-5, atol=1e-6, backend=backend) for backend in ("auto", "dense")]
-    found[name] = [both[0].reduction, str(both[0].q.dtype), *(motion.q.tolist() for motion in both)]
-print(json.dumps(found))
-"""
-
-
-def test_calls_run_in_single_precision():
-    run = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", SINGLE.format(path=sys.path)],
-        env=os.environ | {"JAX_ENABLE_X64": "0"},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert run.returncode == 0, run.stderr
-    for reduction, dtype, q, dense in json.loads(run.stdout).values():
-        assert (reduction, dtype) == ("privileged, lowered", "float32")
-        np.testing.assert_allclose(q, dense, atol=1e-4)
-
-
 # On the graph.
 
 
@@ -450,14 +389,3 @@ def test_a_choice_that_is_known_is_made_and_numbers_stay_numbers():
     graph, (node,) = in_parts(f, 0.0)
     assert graph.calls([int(node)]) == []
     assert graph.operations([int(node)]) == 1
-
-
-def test_a_computation_of_too_many_scalars_is_refused_in_parts_too(monkeypatch):
-    monkeypatch.setattr("jourdain_jax.program.graph.MOST_NODES", 50)
-    with pytest.raises(Unsupported, match="more than 50 scalars"):
-        in_parts(lambda x: by_iteration(x[0], jnp.ones(1)) + jnp.prod(x + 1.0), np.zeros(40))
-
-
-def test_chains_and_the_bicycle_have_no_calls():
-    for scene in (jj.models.TrailerChain(trailers=16), jj.models.PendulumChain(links=16), jj.models.MODELS["whipple-bicycle"]()):
-        assert "opaque" not in traced_scene(scene).graph.op

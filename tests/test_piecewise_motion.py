@@ -185,15 +185,6 @@ def test_a_spline_exerts_the_force_of_inertia_of_what_it_goes_through(kind):
         assert float(found.udot[-1]) == pytest.approx(accelerations_at(t, angle, -0.9 * np.sin(3.0 * t)), abs=1e-3)
 
 
-def test_both_forms_of_the_state_move_alike_along_a_spline():
-    """Against a pendulum whose cart is stated as a sine."""
-    scene = Prescribed(curve=jj.Spline(TS, DRIVE))
-    exact = jj.simulate(Driven(curve=lambda t: 0.1 * jnp.sin(3.0 * t)), {"angle": 0.1}, t1=1.5)
-    for state in ("minimal", "full"):
-        motion = jj.simulate(scene, {"angle": 0.1}, ts=[1.5], formulation=jj.Formulation(state), rtol=1e-6, atol=1e-7, work=False).raise_if_failed()
-        assert float(motion.q_end[1]) == pytest.approx(float(exact.q_end[0]), abs=1e-5)
-
-
 @jax.jit
 def with_derivatives(spline, t):
     first = jax.grad(spline.__call__)

@@ -94,22 +94,6 @@ def test_a_fit_whose_moments_end_beyond_what_a_body_can_have_ends_at_a_body():
     np.testing.assert_allclose(np.sort(moments), np.sort(truth), atol=0.1)
 
 
-@pytest.mark.parametrize(
-    ("call", "told"),
-    [
-        (lambda: jj.log_cholesky([0.1, 0.1, 0.3]), "no body with a thickness has the principal moments"),
-        (lambda: jj.log_cholesky([-0.1, 0.1, 0.1]), "no body with a thickness"),
-        (lambda: jj.log_cholesky([1.0, 2.0]), r"has shape \(2,\), expected \(3, 3\) or \(3,\)"),
-        (lambda: jj.log_cholesky(np.array([[1.0, 0.1, 0.0], [0.2, 1.0, 0.0], [0.0, 0.0, 1.0]])), "not symmetric; give Ixy = Iyx"),
-        (lambda: jj.log_cholesky(np.array([[1.0, 0.1, 0.0], [0.1, 1.0, 0.0], [0.0, 0.0, 1.0]]), symmetric=True), "Ixy = 0.1 and Iyz = 0"),
-        (lambda: jj.inertia_from_log_cholesky([1.0, 2.0, 3.0]), r"has shape \(3,\), expected \(6,\), or \(4,\)"),
-    ],
-)
-def test_impossible_numbers_are_refused_by_name(call, told):
-    with pytest.raises(ValueError, match=told):
-        call()
-
-
 NUMBERS_OF = [
     (jj.models.WhippleBicycle(), "rear frame", {"IBxx", "IByy", "IBzz", "IBxz"}, 4),
     (jj.models.WhippleBicycle(), "rear wheel", {"IRxx", "IRyy"}, 2),

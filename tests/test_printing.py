@@ -108,22 +108,3 @@ def test_an_unknown_name_is_answered_without_quotes_around_the_answer():
     with pytest.raises(KeyError) as caught:
         motion["headin"]
     assert str(caught.value).startswith("a trajectory of `ChaplyginSleigh` has no `headin`; did you mean `heading`? Valid names:")
-
-
-def test_starts_inputs_and_names_are_given_alike_everywhere():
-    assert str(jj.start(SLEIGH, {"x_rate": 0.5, "heading": 9.0}, heading=0.3)) == str(jj.start(SLEIGH, x_rate=0.5, heading=0.3))
-    chain = TrailerChain(trailers=0)
-    named, vector = jj.verify(chain, chain.example, {"turn": 2.0}), jj.verify(chain, None, jnp.array([0.0, 2.0]))
-    assert str(named) == str(vector)
-    one, many = (jj.linearize(TiltingDisc(), {"spin_rate": -3.0}, names) for names in ("lean", ("lean",)))
-    np.testing.assert_array_equal(one.K, many.K)
-    by_name, by_vector = (jj.linearize(chain, None, (), inputs=inputs, privileged=("forward0", "turn0")) for inputs in ({"drive": 1.0}, jnp.array([1.0, 0.0])))
-    np.testing.assert_array_equal(by_name.A, by_vector.A)
-
-
-def test_a_motion_in_reversed_time_comes_back_from_its_file_with_its_inputs(tmp_path):
-    chain = TrailerChain(trailers=0)
-    back = jj.simulate(chain, {"forward0": 1.0}, t0=1.0, ts=[1.0, 0.5, 0.0], inputs={"turn": jj.Sampled([0, 1], [0, 2])})
-    jj.save(back, tmp_path / "back.npz")
-    loaded = jj.load_trajectory(tmp_path / "back.npz", TrailerChain)
-    np.testing.assert_allclose([loaded.inputs(t)[1] for t in (0.0, 0.25, 1.0)], [0.0, 0.5, 2.0])

@@ -5,10 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 
 import jourdain_jax as jj
-from jourdain_jax.models import ChaplyginSleigh, TiltingDisc
-from jourdain_jax.motion.trajectories import results
+from jourdain_jax.models import ChaplyginSleigh
 
 OPTIONS = {"t1": 2.0, "ts": jnp.linspace(0.0, 2.0, 5), "rtol": 1e-9, "atol": 1e-9}
 
@@ -63,13 +63,6 @@ def test_lanes_with_parameters_of_the_wrong_sign_end_at_once_and_say_which():
     np.testing.assert_allclose(lanes.lane(0).q, jj.simulate(ChaplyginSleigh(mass=1.0), **OPTIONS).q, atol=1e-9)
 
 
-def test_a_lane_that_falls_stops_at_its_event_and_the_others_go_on():
-    fallen = jj.rollout(TiltingDisc(), {"lean": np.array([0.3, 0.3]), "spin_rate": np.array([-6.0, -0.1])}, t1=2.0, ts=[0.0, 2.0], progress=False)
-    assert fallen.result.tolist() == [results.SUCCESS, results.EVENT]
-    assert fallen.failed.size == 0
-    assert "`fallen` 1" in str(fallen)
-
-
 def test_the_gradient_of_a_batch_is_the_sum_of_the_gradients_of_its_lanes():
     scene, options = ChaplyginSleigh(), OPTIONS | {"ts": [2.0]}
 
@@ -82,26 +75,6 @@ def test_the_gradient_of_a_batch_is_the_sum_of_the_gradients_of_its_lanes():
 
     each = sum(float(jax.grad(alone)(0.25, turning)) for turning in (0.4, 0.8))
     np.testing.assert_allclose(jax.grad(together)(0.25), each, rtol=1e-8)
-
-
-@pytest.mark.parametrize(
-    ("starts", "parameters", "sentence"),
-    [
-        ({"heading_rate": [1.0, 2.0]}, {"mass": [1.0, 2.0, 3.0]}, "lanes differ in number: parameter `mass` has 3, start `heading_rate` has 2"),
-        ({"heading_rate": 1.0}, None, "no lanes: give at least one"),
-        (None, {"masss": [1.0]}, "has no parameter `masss`; did you mean `mass`"),
-        (None, {"mass": 1.0}, "parameter `mass` has no axis of lanes"),
-        ({"headin": [1.0]}, None, "has no coordinate or speed `headin`; did you mean `heading`"),
-    ],
-)
-def test_wrong_lanes_are_refused_by_name(starts, parameters, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        jj.rollout(ChaplyginSleigh(), starts, parameters=parameters, progress=False, **OPTIONS)
-
-
-def test_a_lane_that_does_not_exist_is_refused(sleighs):
-    with pytest.raises(IndexError, match="lane 7 does not exist; this rollout has 7 lanes"):
-        sleighs[2].lane(7)
 
 
 def test_another_tolerance_longest_step_or_end_is_no_other_program():

@@ -134,21 +134,6 @@ def test_what_a_class_says_wrongly_is_named_when_a_scene_is_made_of_it(members, 
         described(**members)()
 
 
-@pytest.mark.parametrize(
-    ("build", "sentence"),
-    [
-        (lambda: Bead(mas=1.0), "scene `Bead` has no parameter `mas`; did you mean `mass`"),
-        (lambda: Bead(coordinates="x"), "scene `Bead` has no parameter `coordinates`"),
-        (lambda: Bead(mass="heavy"), "parameter `mass` of `Bead` is the text 'heavy', expected a number in kg"),
-        (lambda: Bead(mass=None), "parameter `mass` of `Bead` is `None`, expected a number in kg"),
-        (lambda: Bead().replace(mass="heavy"), "parameter `mass` of `Bead` is the text 'heavy'"),
-    ],
-)
-def test_a_scene_is_not_made_of_arguments_it_does_not_take(build, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        build()
-
-
 def test_a_scene_with_an_init_of_its_own_takes_its_own_arguments():
     class Heavy(Bead):
         def __init__(self, weight):

@@ -9,37 +9,19 @@ from pathlib import Path
 import diffrax
 import jax
 import jax.numpy as jnp
+import machine_code
 import numpy as np
 import pytest
+from small_scenes import Cart, OnLine
 
 import jourdain_jax as jj
 from jourdain_jax.analysis.sensors import filtered, read
-from jourdain_jax.native import host
 
-REPEATS = 200
 MASS, DAMPING, STIFFNESS = 2.0, 0.6, 5.0
 TS = np.linspace(0.0, 4.0, 81)
 SEEN = 0.2  # s: no sample is earlier
 TRUTH = {"gain": 1.2, "bias": 0.05, "delay": 0.07, "lag": 0.1}
 IDEAL = {"gain": 1.0, "bias": 0.0, "delay": 0.0, "lag": 0.0}
-
-
-class Cart(jj.Scene):
-    """`m x'' = push - c x' - k x`."""
-
-    mass: jnp.ndarray = jj.parameter(MASS, unit="kg", positive=True)
-    damping: jnp.ndarray = jj.parameter(DAMPING, unit="N s/m", non_negative=True)
-    stiffness: jnp.ndarray = jj.parameter(STIFFNESS, unit="N/m")
-
-    coordinates = jj.coordinates("x")
-    inputs = jj.inputs("push")
-
-    def bodies(self, t, q):
-        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
-
-    def loads(self, motion):
-        force = motion.inputs.push - self.damping * motion.u.x_rate - self.stiffness * motion.q.x
-        return (jj.generalized_force(motion, x_rate=force),)
 
 
 def shown(ts, mass=MASS, damping=DAMPING, *, gain=1.0, bias=0.0, delay=0.0, lag=0.0, order=1, x0=0.3):
@@ -99,26 +81,6 @@ def test_a_reading_through_delay_and_lag_is_the_closed_form(lag):
     assert np.abs(read(wave(grid), grid, inside, 0.123)[0] - wave(inside - 0.123)).max() < 0.005 * (3.0 * grid[1]) ** 6
 
 
-@pytest.mark.parametrize("lag", [0.0, 1e-5, 0.004, 0.0101, 0.3])
-def test_derivatives_of_a_reading_are_those_of_the_closed_form(lag):
-    ts, grid = np.linspace(0.3, 4.0, 173), np.linspace(0.0, 4.0, 1601)
-    by_delay, by_lag = jax.jacfwd(lambda d, l: read(wave(grid), grid, ts, d, l)[0], (0, 1))(0.123, lag)
-    step = 1e-5
-    expected = (lagged_wave(ts, 0.123 + step, lag) - lagged_wave(ts, 0.123 - step, lag)) / (2 * step)
-    np.testing.assert_allclose(by_delay, expected, atol=1e-8)
-    lags = [lag + step, lag + 2 * step] if lag < step else [lag + step, lag - step]
-    found = [lagged_wave(ts, 0.123, one) for one in lags]
-    # forward where there is no lag below: -3 f(0) + 4 f(1) - f(2)
-    expected = (4 * found[0] - found[1] - 3 * lagged_wave(ts, 0.123, lag)) / (2 * step) if lag < step else (found[0] - found[1]) / (2 * step)
-    np.testing.assert_allclose(by_lag, expected, atol=2e-8)
-
-
-def test_the_low_pass_of_a_reading_starts_at_rest():
-    grid = np.linspace(0.0, 1.0, 101)
-    ramp, _ = read(2.0 + 3.0 * grid, grid, grid, 0.0, 0.2)
-    np.testing.assert_allclose(ramp, 2.0 + 3.0 * (grid - 0.2 * (1 - np.exp(-grid / 0.2))), atol=1e-13)
-
-
 @pytest.mark.parametrize(("order", "inside", "at_the_ends"), [(1, 0.18, 0.26), (2, 0.032, 0.075)])
 def test_near_a_jump_of_a_derivative_a_reading_has_the_stated_error(order, inside, at_the_ends):
     h = 0.1
@@ -130,17 +92,6 @@ def test_near_a_jump_of_a_derivative_a_reading_has_the_stated_error(order, insid
     }
     assert max(error for c, error in errors.items() if c > 3) == pytest.approx(inside * h**order, rel=0.03)
     assert max(errors.values()) == pytest.approx(at_the_ends * h**order, rel=0.03)
-
-
-def test_vectors_are_read_component_by_component_and_single_precision_stays():
-    grid, ts = np.linspace(0.0, 4.0, 81), np.linspace(0.3, 4.0, 20)
-    both = np.stack([wave(grid), 2.0 - wave(grid)], axis=1)
-    found, _ = read(both, grid, ts, 0.1, 0.05)
-    np.testing.assert_allclose(found[:, 1], 2.0 - found[:, 0], atol=1e-14)
-    short = [jnp.asarray(x, jnp.float32) for x in (both, grid, ts, 0.1, 0.05)]
-    single, _ = read(*short)
-    assert single.dtype == jnp.float32
-    np.testing.assert_allclose(single, found, atol=5e-6)
 
 
 @pytest.mark.parametrize("lag", [0.0, 1e-4, 0.05, 2.0])
@@ -176,20 +127,6 @@ def test_numbers_of_a_sensor_are_found_with_the_parameters(names):
 
     J = np.stack([(residual(expected + h) - residual(expected - h)) / 2e-5 for h in 1e-5 * np.eye(len(expected))], axis=1)
     np.testing.assert_allclose(found.covariance, np.linalg.inv(J.T @ J), rtol=1e-3)
-
-
-def test_intervals_cover_gain_bias_and_delay():
-    found = jj.fit_batch(Cart(mass=1.8), run(1, (REPEATS,), gain=GAIN, bias=BIAS, delay=DELAY), ("mass", "damping"))
-    assert found.converged.all()
-    truth = {"mass": MASS, "damping": DAMPING, "gyro.gain": TRUTH["gain"], "run 0: gyro.bias": TRUTH["bias"], "gyro.delay": TRUTH["delay"]}
-    assert set(found.labels) == set(truth)
-    # binomial, 95 % of 200: 3.3 standard deviations (one case in a thousand) are 5 %
-    share = 3.3 * np.sqrt(0.95 * 0.05 / REPEATS)
-    for name, value in truth.items():
-        estimate = found[name]
-        covered = np.mean((estimate.low < value) & (value < estimate.high))
-        assert 0.95 - share <= covered <= 0.95 + share, (name, covered)
-        assert float(np.std(estimate.value)) == pytest.approx(float(np.mean(estimate.standard_error)), rel=0.2)
 
 
 def test_a_bias_of_each_run_and_a_delay_that_all_share():
@@ -330,15 +267,7 @@ def test_intervals_that_a_bound_makes_too_narrow_are_named():
     assert near.warning.startswith("the interval of `late.lag` is too narrow, and so may be those of others: up to a bound nearby")
 
 
-@pytest.mark.skipif(bool(host.reason_against()), reason="needs llvmlite")
-def test_machine_code_serves_sensors_and_gives_what_xla_gives():
-    data = run(4, gain=GAIN, delay=DELAY)
-    native, xla = (jj.fit(Cart(mass=1.8), data, ("mass",), backend=backend) for backend in ("native", "xla"))
-    np.testing.assert_allclose(native.values, xla.values, rtol=1e-6)
-    np.testing.assert_allclose(native.standard_errors, xla.standard_errors, rtol=1e-5)
-
-
-@pytest.mark.skipif(bool(host.reason_against()), reason="needs llvmlite")
+@machine_code.needed
 def test_a_likelihood_with_sensors_is_the_same_by_machine_code_and_by_xla():
     data = run(4, gain=1.2, delay=0.05)
 
@@ -444,14 +373,10 @@ def driven(truth: dict, **asked) -> jj.Experiment:
     return jj.Experiment(TS, {"x": motion["x"], "x_rate": motion["x_rate"]}, 0.001, start={"x": 0.3, "x_rate": 0.0}, inputs=inputs)
 
 
-class Mass(jj.Scene):
+class Mass(OnLine):
     """`x'' = push`, for closed forms."""
 
-    coordinates = jj.coordinates("x")
     inputs = jj.inputs("push")
-
-    def bodies(self, t, q):
-        return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=motion.inputs.push),)
@@ -541,20 +466,6 @@ def test_log_likelihood_knows_sensors_and_is_differentiable_in_them():
         assert float(slopes[name]) == pytest.approx(expected, rel=1e-3, abs=1e-2), name
 
 
-def test_a_likelihood_of_measurements_that_are_made_inside_jit_is_the_same():
-    # 21 samples a cycle over 57 cycles: 64 intervals would be about one a cycle
-    ts = np.linspace(0.0, 60.0, 1201)
-    scene, late = Cart(stiffness=STIFFNESS * 14), jj.Sensor("x_rate", delay=0.07)
-    motion = jj.simulate(scene, {"x": 0.3, "x_rate": 0.0}, ts=ts, rtol=1e-9, atol=1e-9)
-    seen = np.where(ts < SEEN, np.nan, np.asarray(motion["x_rate"]))
-
-    def value(stiffness):
-        data = jj.Experiment(ts, {"gyro": seen}, 0.05, start={"x": 0.3, "x_rate": 0.0}, sensors={"gyro": late})
-        return jj.log_likelihood(scene.replace(stiffness=stiffness), data, rtol=1e-9, atol=1e-9)
-
-    assert float(jax.jit(value)(scene.stiffness)) == pytest.approx(float(value(scene.stiffness)), rel=1e-3)
-
-
 def test_the_page_on_identification_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # it writes a report
     page = (Path(__file__).parents[1] / "docs" / "howto" / "identification.md").read_text(encoding="utf-8")
@@ -568,78 +479,3 @@ def test_the_page_on_identification_runs(tmp_path, monkeypatch):
 
 
 # Bad input. -----------------------------------------------------------------------------------------------------------------
-
-
-def fitted(**numbers):
-    return jj.fit(Cart(), run(**numbers), ("mass",))
-
-
-COMMAND = jj.Sampled([0.0, 4.0], [1.0, 1.0])
-
-
-def with_input(push) -> jj.Fit:
-    return jj.fit(Cart(), jj.Experiment(TS, {"x": TS}, 1.0, start={"x": 0.0}, inputs={"push": push}), ("mass",))
-
-
-@pytest.mark.parametrize(
-    ("call", "advice"),
-    [
-        (lambda: jj.Sensor(3), "`quantity` of `Sensor` is an int, expected a coordinate, a speed"),
-        (lambda: jj.Sensor(lag=-0.1), "`lag` of `Sensor` is -0.1 s, expected zero or more"),
-        (lambda: jj.Sensor(delay=-0.1), "`delay` of `Sensor` is -0.1 s, expected zero or more; where the clock of a channel is ahead, shift its times"),
-        (lambda: jj.Sensor(gain=np.nan), "`gain` of `Sensor` is nan, expected a finite number"),
-        (lambda: jj.Sensor(gain="one"), "`gain` of `Sensor` is the text 'one', expected real numbers; give a number, or an `Estimate`"),
-        (lambda: jj.Sensor(lag=[0.1, 0.2]), r"`lag` of `Sensor` has shape \(2,\), expected one number"),
-        (lambda: jj.Sensor(gain=jj.Estimate()), r"`gain` of `Sensor` is to be estimated, but has no first guess; give one: `jj.Estimate\(1.0\)`"),
-        (lambda: jj.Sensor(delay=jj.Estimate(0.1)), "`delay` of `Sensor` is to be estimated, but nothing says how long it may be; give `range=jj.bounds"),
-        (lambda: jj.Sensor(delay=jj.Estimate(0.1, range=jj.bounds(-1.0, 1.0))), "`delay` of `Sensor` may fall to -1 s, expected a range from zero"),
-        (lambda: jj.Sensor(lag=jj.Estimate((0.1, 0.2))), "`lag` of `Sensor` is to be estimated from 2 guesses, expected one number"),
-        (lambda: jj.Estimate(np.inf), "`guess` of `Estimate` is inf, expected a finite number"),
-        (lambda: jj.Estimate(1.0, range=(0.0, 1.0)), "`range` of `Estimate` is a tuple, expected `bounds"),
-        (lambda: jj.Estimate(1.0, per_run=1), "`per_run` of `Estimate` is an int, expected True or False"),
-        (lambda: jj.Estimate(1.0, prior=0.1), r"`prior` of `Estimate` is a float, expected `jj.Normal\(mean, sigma\)`"),
-        (lambda: jj.Estimate(1.0, prior=jj.Normal(1.0, 0.0)), "expected a standard deviation above zero; a number that is known needs no estimate"),
-        (lambda: jj.Actuator(1.0), "`command` of `Actuator` is a float, expected `jj.Sampled"),
-        (lambda: jj.Actuator(COMMAND, hold=1), "`hold` of `Actuator` is an? int.*expected True"),
-        (lambda: jj.Actuator(COMMAND, gain=[1.0, 2.0]), r"`gain` of `Actuator` has shape \(2,\), expected one number"),
-        (lambda: jj.Experiment(TS, {"x": TS}, 1.0, start={}, sensors={"y": "x"}), "sensor `y` has no measured values; Valid names: `x`"),
-        (
-            lambda: jj.fit(Cart(), jj.Experiment(TS, {"gyro": TS}, 1.0, start={"x": 0.0}, sensors={"gyro": "x_rte"}), ("mass",)),
-            "run 0 of `Cart` has channel `gyro`, whose sensor measures an unknown quantity `x_rte`; did you mean `x_rate`",
-        ),
-        (lambda: fitted(delay=0.3), "`gyro` of run 0 of `Cart` begins at 0.2 s, and less its delay of up to 0.3 s that is before the start at t0 = 0 s"),
-        (lambda: fitted(delay=jj.Estimate(0.1, range=jj.bounds(0.0, 0.5))), "give an earlier `t0` with the start there, or NaN for the first samples"),
-        (lambda: fitted(gain=jj.Estimate(3.0, range=jj.bounds(0.0, 2.0))), r"first guess of `gyro.gain` is 3.0; expected a first guess between its bounds"),
-        (lambda: fitted(gain=[1.0, 2.0]), r"`gain` of sensor `gyro` of run 0 of `Cart` has shape \(2,\), expected \(\) or \(\)"),
-        (lambda: fitted(lag=jj.Estimate(0.0)), "first guess of `gyro.lag` is 0.0; expected a first guess above zero"),
-        (
-            lambda: jj.fit(Cart(), [run(gain=GAIN), run(gain=jj.Estimate(2.0))], ("mass",)),
-            "run 0 and run 1 state `gyro.gain` differently, but share it .*; give both the same, or `per_run=True`",
-        ),
-        (lambda: jj.log_likelihood(Cart(), run(gain=GAIN)), "`gyro.gain` is to be estimated, but a likelihood needs its value"),
-        (lambda: with_input(jj.Actuator(jj.Sampled([0.0, 1.0], [0.0, 1.0]), lag=0.1)), "command of input `push` of run 0 of `Cart` ends at 1 s, before"),
-        (
-            lambda: with_input(jj.Sampled([1.7e9, 1.7e9 + 4.0], [0.0, 1.0])),
-            "is sampled from 1700000000 to 1700000004 s, and the run is from 0 to 4 s, where it",
-        ),
-        (lambda: jj.fit(Cart(), run(), {"mass": jj.Estimate(per_run=True)}), "`free` asks for a `mass` of each run, but all runs share the scene"),
-        (lambda: jj.fit(Cart(), run(), {"mass": jj.Estimate((1.0, 2.0))}), r"first guess of `mass` has shape \(2,\), expected \(\)"),
-        (
-            lambda: jj.fit(
-                Cart(),
-                jj.Experiment(
-                    TS,
-                    {"push": TS},
-                    1.0,
-                    start={"x": 0.0},
-                    sensors={"push": jj.Sensor("x", gain=GAIN)},
-                    inputs={"push": jj.Actuator(COMMAND, gain=GAIN)},
-                ),
-            ),
-            "has a channel and an input `push`, both with an estimated gain; give the channel another name",
-        ),
-    ],
-)
-def test_bad_input_gets_advice(call, advice):
-    with pytest.raises(ValueError, match=advice):
-        call()

@@ -249,23 +249,6 @@ def test_what_cannot_be_shown_is_refused_with_advice(motion, tmp_path):
         jj.show(motion, view=(1.0, 2.0, 3.0))
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: jj.Visual.ball(-1.0), "radius of a ball is -1.0, expected more than zero"),
-        (lambda: jj.Visual.ball(1.0, colour="red"), 'expected six hexadecimal digits, such as "#1f77b4"'),
-        (lambda: jj.Visual.ball(1.0, opacity=2.0), "opacity of a ellipsoid is 2.0"),
-        (lambda: jj.Visual.line((0.0, 0.0, 0.0)), "has 1 points, expected at least two"),
-        (lambda: jj.Visual.wheel(1.0, axis="w"), "body axis `w` is unknown"),
-        (lambda: jj.Visual.mesh(np.zeros((4, 2)), [(0, 1, 2)]), r"expected \(points, 3\)"),
-        (lambda: jj.Visual.mesh(np.zeros((4, 3)), [(0, 1, 4)]), "numbers from 0 to 3"),
-    ],
-)
-def test_a_shape_that_cannot_be_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
-
-
 def test_looks_of_bodies_that_do_not_exist_are_refused(motion):
     class Misnamed(Rolling):
         def visuals(self, pose):

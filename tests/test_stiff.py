@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 from oracles import skate
 from tolerances import tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.motion.trajectories import results
 
 TS = np.linspace(0.0, 2.0, 5)
 

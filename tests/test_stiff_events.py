@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 
 import jourdain_jax as jj
-from jourdain_jax.motion.trajectories import results
 
 RATE = 1e6
 

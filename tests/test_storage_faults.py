@@ -258,14 +258,6 @@ def test_a_parameter_whose_unit_changed_since_is_named(saved, tmp_path):
         READ[kind](new, Belt)
 
 
-def test_a_file_read_back_is_the_motion_to_the_bit(motions, tmp_path):
-    lanes = motions["rollout"]
-    jj.save(lanes, tmp_path / "lanes.npz")
-    read = jj.load_rollout(tmp_path / "lanes.npz", Belt)
-    for a, b in ((read.lanes.q, lanes.lanes.q), (read.lanes.u_end, lanes.lanes.u_end), (read.lanes.scene.drag, lanes.lanes.scene.drag)):
-        assert_equal_to_the_bit(a, b)
-
-
 @pytest.mark.parametrize("stage", ["savez_compressed", "fsync", "replace"])
 def test_an_interrupted_save_leaves_the_old_file_and_nothing_else(motions, tmp_path, monkeypatch, stage):
     path = tmp_path / "kept.npz"

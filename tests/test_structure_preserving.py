@@ -7,15 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import result_codes as results
 from long_runs_scenes import ContactOscillator, GaugeTwin
 from oracles import chaplygin_sleigh, skate
 from small_scenes import DrivenPendulum
 from tolerances import tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.calculus.newton import newton_root
 from jourdain_jax.models import MODELS
-from jourdain_jax.motion.trajectories import results
 
 MIDPOINT, DLA, GRADIENT = jj.ImplicitMidpoint, jj.DiscreteLagrangeDAlembert, jj.DiscreteGradient
 TRAPEZOIDAL = partial(DLA, "trapezoidal")
@@ -189,14 +188,6 @@ def test_a_rollout_solves_every_lane_and_names_those_whose_step_was_not_solved()
     assert np.isfinite(np.asarray(rolled.lanes.q_end)).all()
     alone = run(oscillator.replace(strength=0.6), jj.start(oscillator, x=1.0, y=1.0, z=0.5, y_rate=0.3), DLA, t1=4.0, step=0.2)
     np.testing.assert_allclose(rolled.lanes.q_end[2], alone.q_end, rtol=0, atol=tolerance("round_off"))
-
-
-def test_a_root_is_differentiated_twice_and_a_missing_one_is_flagged():
-    def root(a):
-        return newton_root(lambda x: x**2 - a, jnp.array([1.0]), jnp.ones(1)).x[0]
-
-    np.testing.assert_allclose([root(2.0), jax.grad(root)(2.0), jax.grad(jax.grad(root))(2.0)], [2**0.5, 0.5 * 2**-0.5, -0.25 * 2**-1.5], rtol=1e-14)
-    assert not newton_root(lambda x: x**2 + 1, jnp.array([1.0]), jnp.ones(1)).converged
 
 
 # Steps, time and errors. -----------------------------------------------------------------------------------------------

@@ -193,39 +193,6 @@ def test_a_study_shows_its_table_and_a_histogram_of_each_output_in_a_notebook(wh
     np.testing.assert_array_equal(bars.edges, edges)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda d: jj.Study(d, vary={"radios": jj.Normal(0.5, 0.1)}, samples=8), "did you mean `radius`"),
-        (lambda d: jj.Study(d, vary={"radius": 0.5}, samples=8), "set one value on the scene"),
-        (lambda d: jj.Study(d, vary=[1.0]), "`vary` is"),
-        (lambda d: jj.Study(d, start={"laen": jj.Normal(0.5, 0.1)}, samples=8), "did you mean `lean`"),
-        (lambda d: jj.Study(d, start={"lean": 0.2}, samples=8), "nothing varies"),
-        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(save="everything"), "`save` is 'everything'"),
-        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(every=2), "`every` is 2"),
-        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(t1=-np.inf), "t1"),
-        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"x": jj.End("leen")}), "did you mean `lean`"),
-        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"x": jj.EventTime("fell")}), "did you mean `fallen`"),
-        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"a/b": jj.End("lean")}), "without `/`"),
-        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"a\\b": jj.End("lean")}), "without `/`"),
-        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"x": jj.End}), "expected an output"),
-        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"x": jj.Integral("lean")}, ts=[0.5, 1.0]), "`x` would leave out"),
-        (lambda d: jj.Study(d, vary={"radius": [0.5]}).run("x", outputs={"lane": jj.End("lean")}), "would name two arrays"),
-        (lambda d: jj.Study(d, vary={"radius": [0.5]}).run("x", outputs={"run": jj.End("lean")}), "would name two arrays"),
-        (lambda d: jj.Study(d, vary={"radius": [0.5]}).run("x", outputs={"radius": jj.End("lean")}), "would name two arrays"),
-        (lambda d: jj.Study(d, vary={"radius": [0.5] * 9}).run("x", chunk=7), "a multiple of 16"),
-        (lambda d: jj.Study(d, vary={"radius": [0.5]}).run("x", shard=(3, 2)), "`shard` is"),
-        (lambda d: jj.Study(d, start={"lean": jj.Normal(0, 1)}, samples=2, correlation={3: 0.5}), "expected pairs of names"),
-        (lambda d: jj.Study(d, start={"lean": jj.Normal(0, 1)}, samples=2, correlation=np.eye(2)), "`correlation` is"),
-    ],
-)
-def test_a_wrong_study_says_what_is_wrong(make, message, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match=message):
-        make(jj.models.TiltingDisc())
-    assert not list(tmp_path.iterdir())
-
-
 def test_an_output_that_is_no_number_or_unknown_is_named(whole, tmp_path):
     with pytest.raises(ValueError, match="expected one real number for a motion"):
         discs().run(tmp_path / "discs.zarr", outputs={"all": lambda motion: motion.q_end}, **ASKED)

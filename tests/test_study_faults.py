@@ -550,16 +550,6 @@ def test_an_object_that_a_function_reads_counts_by_its_content(made):
     assert digest(output(made(2))) != digest(output(made(3)))
 
 
-@pytest.mark.parametrize("pair", [lambda x: [x, x], lambda x: deque([x, x]), lambda x: SimpleNamespace(a=x, b=x)])
-def test_an_object_that_is_met_in_very_many_places_is_looked_at_once(pair):
-    def nested(number):
-        for _ in range(16):
-            number = pair(number)
-        return number
-
-    assert digest(nested(1)) == digest(nested(1)) != digest(nested(2))
-
-
 PENDULUM = """<robot name="arm"><link name="base"/><link name="arm"><inertial><origin xyz="0 0 -0.5"/><mass value="1"/>
 <inertia ixx="0.1" iyy="0.1" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="pivot" type="continuous">
 <parent link="base"/><child link="arm"/><axis xyz="{}"/></joint></robot>"""

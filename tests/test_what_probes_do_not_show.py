@@ -178,31 +178,6 @@ def half_as_steep(x):
 half_as_steep.defjvp(lambda primals, tangents: (half_as_steep(*primals), 0.5 * tangents[0]))
 
 
-class Decreed(Plane):
-    """A spring whose stiffness has no derivative by decree, and a force with a rule of its own."""
-
-    stiffness: object = jj.parameter(2.0)
-
-    def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=-jax.lax.stop_gradient(self.stiffness) * motion.q.x, y_rate=-half_as_steep(motion.q.y)),)
-
-
-def test_derivatives_by_decree_are_those_of_the_dense_path():
-    def slopes(backend):
-        def end(stiffness, y):
-            scene = Decreed(stiffness=stiffness)
-            by = {"backend": backend, "formulation": jj.Formulation(stabilisation=None), "adjoint": diffrax.ForwardMode()}
-            return jj.simulate(scene, {"x": 1.0, "y": y}, t1=1.0, **by).q_end
-
-        return jax.jacfwd(end, argnums=(0, 1))(2.0, 0.7)
-
-    lowered, dense = slopes("auto"), slopes("dense")
-    np.testing.assert_allclose(lowered[0], 0.0, atol=1e-12)
-    np.testing.assert_allclose(lowered[1], dense[1], rtol=1e-6)
-    assert "half_as_steep" in jj.report(Decreed()).lowering
-    assert "stop_gradient" in jj.report(Decreed()).lowering
-
-
 class Called(Plane):
     """A callback that takes one state at a time."""
 

@@ -1,0 +1,64 @@
+"""Malformed designs and studies, as one table: see `malformed_inputs`."""
+
+PRELUDE = """
+import numpy as np
+import jourdain_jax as jj
+
+TWO = {"mass": jj.Normal(12.0, 0.3), "radius": jj.Uniform(0.3, 0.4)}
+disc = jj.models.TiltingDisc()
+by_radius = jj.Study(disc, vary={"radius": [0.5]})
+"""
+
+DESIGNS: dict[str, str] = {
+    "jj.Normal(1.0, -0.1)": "`sigma` of Normal is -0.1",
+    "jj.Normal('heavy', 0.1)": "`mean` of Normal",
+    "jj.Uniform(1.0, 1.0)": "expected low < high",
+    "jj.LogUniform(0.0, 1.0)": "expected a positive number",
+    "jj.LogNormal(-1.0, 1.0)": "positive median",
+    "jj.Uniform(0.0, np.inf)": "expected a finite number",
+    "jj.Levels([])": "at least one",
+    "jj.Design({})": "nothing varies",
+    "jj.Design({'a': jj.Normal(0, 1), 'b': [1.0, 2.0]}, samples=2)": "columns and distributions at once",
+    "jj.Design({'a': 3.0})": "`a` varies as",
+    "jj.Design({'a': [1.0, np.nan]})": "not finite",
+    "jj.Design({'a': [1.0], 'b': [1.0, 2.0]})": "`a` has 1, `b` has 2",
+    "jj.Design({'a': [1.0]}, samples=3)": "leave `samples` out",
+    "jj.Design(TWO)": "`samples` is None",
+    "jj.Design(TWO, sampler='sobel', samples=8)": "did you mean `sobol`",
+    "jj.Design(TWO, sampler='grid', samples=8)": "a grid takes `jj.Levels`, but `mass` varies as",
+    "jj.Design(TWO, samples=8, seed=-1)": "`seed` is -1",
+    "jj.Design(TWO, sampler='saltelli', samples=9)": "a multiple of 4",
+    "jj.Design(TWO, samples=8, correlation={('mass', 'lenght'): 0.5})": "`lenght`, which does not vary",
+    "jj.Design(TWO, samples=8, correlation={('mass', 'radius'): 1.0})": "between -1 and 1",
+    "jj.Design(TWO, samples=8, correlation={('mass', 'radius'): '0.5'})": "expected real numbers",
+    "jj.Design(TWO, samples=8, correlation={'mass': 0.5})": "expected pairs of names",
+    "jj.Design({'a': [[1.0], [1.0, 2.0]]})": "`a` varies as",
+    "jj.Design({f'a{i}': jj.Levels([0.0] * 10) for i in range(20)})": "cross to 100000000000000000000 samples",
+    "jj.Design(TWO, samples=8).values(0, 9)": "not among 0 to 8",
+}
+
+STUDIES: dict[str, str] = {
+    "jj.Study(disc, vary={'radios': jj.Normal(0.5, 0.1)}, samples=8)": "did you mean `radius`",
+    "jj.Study(disc, vary={'radius': 0.5}, samples=8)": "set one value on the scene",
+    "jj.Study(disc, vary=[1.0])": "`vary` is",
+    "jj.Study(disc, start={'laen': jj.Normal(0.5, 0.1)}, samples=8)": "did you mean `lean`",
+    "jj.Study(disc, start={'lean': 0.2}, samples=8)": "nothing varies",
+    "by_radius.task(save='everything')": "`save` is 'everything'",
+    "by_radius.task(every=2)": "`every` is 2",
+    "by_radius.task(t1=-np.inf)": "t1",
+    "by_radius.task(outputs={'x': jj.End('leen')})": "did you mean `lean`",
+    "by_radius.task(outputs={'x': jj.EventTime('fell')})": "did you mean `fallen`",
+    "by_radius.task(outputs={'a/b': jj.End('lean')})": "without `/`",
+    "by_radius.task(outputs={'a\\\\b': jj.End('lean')})": "without `/`",
+    "by_radius.task(outputs={'x': jj.End})": "expected an output",
+    "by_radius.task(outputs={'x': jj.Integral('lean')}, ts=[0.5, 1.0])": "`x` would leave out",
+    "by_radius.run('x', outputs={'lane': jj.End('lean')})": "would name two arrays",
+    "by_radius.run('x', outputs={'run': jj.End('lean')})": "would name two arrays",
+    "by_radius.run('x', outputs={'radius': jj.End('lean')})": "would name two arrays",
+    "jj.Study(disc, vary={'radius': [0.5] * 9}).run('x', chunk=7)": "a multiple of 16",
+    "by_radius.run('x', shard=(3, 2))": "`shard` is",
+    "jj.Study(disc, start={'lean': jj.Normal(0, 1)}, samples=2, correlation={3: 0.5})": "expected pairs of names",
+    "jj.Study(disc, start={'lean': jj.Normal(0, 1)}, samples=2, correlation=np.eye(2))": "`correlation` is",
+}
+
+TABLE = DESIGNS | STUDIES
