@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_scenes import OnLine
 from test_inputs import OnBelt
 
 import jourdain_jax as jj
@@ -106,14 +107,10 @@ def test_a_name_that_would_shadow_the_time_is_refused_where_it_is_stated(kind):
     assert "t" in jj.inputs("t")
 
 
-class Oscillator(jj.Scene):
+class Oscillator(OnLine):
     """A mass on a spring."""
 
     stiffness: jnp.ndarray = jj.parameter(4.0, unit="N/m")
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=-self.stiffness * motion.q.x),)

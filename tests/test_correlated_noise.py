@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracles import chaplygin_sleigh as sleigh_oracle
+from small_scenes import OnLine
 
 import jourdain_jax as jj
 
@@ -101,14 +102,10 @@ def test_intervals_cover_the_truth_where_noise_has_a_memory():
     assert np.all(np.abs(single.values - found.values[4]) < 0.02 * single.standard_errors)
 
 
-class Coasting(jj.Scene):
+class Coasting(OnLine):
     """`x = x0 + v t`: linear in what is unknown."""
 
     mass: object = jj.parameter(1.0, positive=True)
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
 
 def test_intervals_are_those_of_all_correlation_times_by_their_restricted_likelihood():

@@ -6,20 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_scenes import OnLine
 
 import jourdain_jax as jj
 
 
-class Slider(jj.Scene):
+class Slider(OnLine):
     """A mass on a spring, in a well that has no numbers below its edge."""
 
     stiffness: jnp.ndarray = jj.parameter(4.0, unit="N/m")
     mass: jnp.ndarray = jj.parameter(1.0, unit="kg", positive=True)
     edge: jnp.ndarray = jj.parameter(-50.0, unit="m")
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"mass": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def loads(self, motion):
         force = -self.stiffness * motion.q.x + jnp.sqrt(motion.q.x - self.edge)

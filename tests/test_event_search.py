@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from small_scenes import OnLine
 
 import jourdain_jax as jj
 from jourdain_jax.motion.integrators import erk_loop
@@ -94,15 +95,11 @@ def test_an_event_is_found_in_its_step_whatever_its_shape(value, digits):
     np.testing.assert_allclose(end.y[0], end.t, rtol=1e-13)
 
 
-class Flat(jj.Scene):
+class Flat(OnLine):
     """A particle that meets a wall; the value of the event has a root of three fold there, or one of one fold."""
 
     wall: object = jj.parameter(1.5)
     order: int = eqx.field(static=True, default=3)
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def events(self, motion):
         return {"wall": (self.wall - motion.q.x) ** self.order}

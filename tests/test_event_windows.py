@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import result_codes as results
 from machine_code import BACKENDS
+from small_scenes import OnLine
 
 import jourdain_jax as jj
 
@@ -35,13 +36,9 @@ USUAL = ("distance", "window", "clock")
 def scene_of(kind: str):
     value, _ = KINDS[kind]
 
-    class Passing(jj.Scene):
+    class Passing(OnLine):
         a: float = jj.parameter(A)
         w: float = jj.parameter(W)
-        coordinates = jj.coordinates("x")
-
-        def bodies(self, t, q):
-            return {"bead": jj.Particle(1.0, jnp.stack([q.x, 0 * q.x, 0 * q.x]))}
 
         def events(self, motion):
             return {"met": value(motion.q.x, motion.t, self.a, self.w), "far": 30.0 - jnp.abs(motion.q.x)}

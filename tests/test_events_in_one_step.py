@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
-from small_scenes import OnLine
+from small_scenes import OnLine, Upright
 
 import jourdain_jax as jj
 
@@ -17,18 +17,14 @@ LOOPS = {"lean": {}, "diffrax": {"solver": diffrax.Bosh3()}}
 GRAVITY = 9.81
 
 
-class Thrown(jj.Scene):
+class Thrown(Upright):
     """A particle under gravity between a floor, a wall and two more planes: all its coordinates are polynomials in time, which steps follow at any length."""
 
     floor: object = jj.parameter(0.0)
     wall: object = jj.parameter(2.0)
     roof: object = jj.parameter(9.0)
     slope: object = jj.parameter(9.0)
-    coordinates = jj.coordinates("x z")
     example = {"z": 1.0, "x_rate": 4.5}
-
-    def bodies(self, t, q):
-        return {"stone": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, q.z]))}
 
     def loads(self, motion):
         return (jj.gravity(motion, GRAVITY),)
@@ -208,7 +204,7 @@ def test_an_event_is_no_mistake_to_a_search_for_nan_and_a_mistake_still_is():
 
 WITH_MARKS = {
     "energies": lambda motion, path: motion.energies().balance,
-    "a point": lambda motion, path: motion.point("stone", jnp.zeros(3)),
+    "a point": lambda motion, path: motion.point("mass", jnp.zeros(3)),
     "a rollout": lambda motion, path: jj.rollout(Thrown(), {"x_rate": jnp.array([0.5, 1.0])}, t1=5.0).lanes.q,
     "a file": lambda motion, path: (jj.save(motion, path), jj.load_trajectory(path, Thrown).q)[1],
     "a derivative": lambda motion, path: jax.grad(lambda z: jj.simulate(Thrown(), {"z": z}, t1=5.0).t_end)(1.5),

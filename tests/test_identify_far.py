@@ -5,6 +5,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_scenes import OnLine
 
 import jourdain_jax as jj
 from jourdain_jax.analysis.unknowns import unknowns_of
@@ -12,14 +13,10 @@ from jourdain_jax.analysis.unknowns import unknowns_of
 TS, SIGMA = np.linspace(0.0, 40.0, 201), 0.01
 
 
-class Oscillator(jj.Scene):
+class Oscillator(OnLine):
     mass: object = jj.parameter(2.0, positive=True)
     damping: object = jj.parameter(0.1, positive=True)
     stiffness: object = jj.parameter(18.0, positive=True)
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=-self.stiffness * motion.q.x - self.damping * motion.u.x_rate),)
@@ -150,13 +147,8 @@ def test_an_unstable_motion_is_fitted_over_growing_spans(seed, monkeypatch):
         assert abs(found[name].value - float(getattr(exact, name))) < 4 * found[name].standard_error
 
 
-class Resting(jj.Scene):
+class Resting(OnLine):
     """A mass that stays where it is."""
-
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
 
 @pytest.mark.parametrize(("curvature", "large"), [(3.0, 100.0), (5.0, 4.0)])

@@ -5,19 +5,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_scenes import OnLine
 
 import jourdain_jax as jj
 
 
-class Struck(jj.Scene):
+class Struck(OnLine):
     """A mass without other forces that an input strikes."""
 
     mass: object = jj.parameter(2.0, positive=True)
-    coordinates = jj.coordinates("x")
     inputs = jj.inputs("force push")
-
-    def bodies(self, t, q):
-        return {"mass": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=motion.inputs.force + motion.inputs.push),)

@@ -10,21 +10,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_scenes import OnPlane
 
 import jourdain_jax as jj
 
 TS = jnp.linspace(0.0, 2.0, 9)
 
 
-class Pushed(jj.Scene):
+class Pushed(OnPlane):
     """A particle in a plane, pushed along y."""
 
     push: Callable = eqx.field(static=True)
     size: float = jj.parameter(0.4)
-    coordinates = jj.coordinates("x y")
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, y_rate=self.push(motion, self.size)),)

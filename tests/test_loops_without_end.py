@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import pytest
+from small_scenes import OnPlane
 
 import jourdain_jax as jj
 from jourdain_jax.eager import numpy_backend
@@ -51,13 +52,8 @@ def test_a_loop_that_ends_at_some_states_only_is_no_reason_to_refuse_the_scene(m
     assert jj.structure_of(Looped()).rank == 1
 
 
-class Kinked(jj.Scene):
+class Kinked(OnPlane):
     """A row with a magnitude, at whose kink a probe lies."""
-
-    coordinates = jj.coordinates("x y")
-
-    def bodies(self, t, q):
-        return {"mass": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
 
     def velocity_constraints(self, motion):
         return {"row": motion.u.y_rate - jnp.abs(motion.q.x) * motion.u.x_rate}

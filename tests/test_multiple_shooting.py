@@ -1,8 +1,8 @@
 """Fits by multiple shooting: they find what a fit without pieces finds where that works, and more."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_scenes import OnLine
 
 import jourdain_jax as jj
 from jourdain_jax.analysis.arrow import Arrow
@@ -24,15 +24,11 @@ def pendulum(span, seed=0, off=0.5):
     return guess, truth, jj.Experiment(ts, values, sigma, start=begin, unknown_start=tuple(begin))
 
 
-class Oscillator(jj.Scene):
+class Oscillator(OnLine):
     mass: object = jj.parameter(2.0, positive=True)
     damping: object = jj.parameter(0.1, positive=True)
     stiffness: object = jj.parameter(18.0, positive=True)
-    coordinates = jj.coordinates("x")
     inputs = jj.inputs("force")
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=motion.inputs.force - self.stiffness * motion.q.x - self.damping * motion.u.x_rate),)

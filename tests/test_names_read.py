@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_scenes import OnLine
 
 import jourdain_jax as jj
 
@@ -204,12 +205,7 @@ def test_what_is_a_constant_is_read_anew_after_the_caches_are_cleared(kind):
 def spring_around(gain):
     """A spring whose stiffness is a variable of this function, and what sets it."""
 
-    class Around(jj.Scene):
-        coordinates = jj.coordinates("x")
-
-        def bodies(self, t, q):
-            return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
-
+    class Around(OnLine):
         def loads(self, motion):
             return (jj.generalized_force(motion, x_rate=-gain * motion.q.x),)
 
@@ -243,16 +239,12 @@ def law(x):
     return GAIN * x
 
 
-class Pushed(jj.Scene):
+class Pushed(OnLine):
     """Functions in fields and inputs read names as well."""
 
-    coordinates = jj.coordinates("x")
     inputs = jj.inputs("push")
     static: object = eqx.field(static=True, default=law)
     held: object = law
-
-    def bodies(self, t, q):
-        return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=motion.inputs.push + self.static(motion.q.x) - self.held(motion.q.x)),)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from small_scenes import OnLine
 
 import jourdain_jax as jj
 from jourdain_jax.models import ChaplyginSleigh
@@ -121,12 +122,8 @@ def test_lanes_that_are_given_to_devices_move_as_those_of_vmap():
 
 
 def test_a_number_in_a_plain_field_is_a_leaf_of_every_lane():
-    class Oscillator(jj.Scene):
+    class Oscillator(OnLine):
         stiffness: float = 2.0
-        coordinates = jj.coordinates("x")
-
-        def bodies(self, t, q):
-            return {"bob": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
         def loads(self, motion):
             return (jj.generalized_force(motion, x_rate=-self.stiffness * motion.q.x),)

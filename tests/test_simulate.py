@@ -5,12 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from small_scenes import Upright
 
 import jourdain_jax as jj
 from jourdain_jax.models import ChaplyginSleigh, DoublePendulumRods, Skate
 
 
-class Falling(jj.Scene):
+class Falling(Upright):
     """A particle thrown up from the floor, with air drag if asked: the smallest scene with an event."""
 
     mass: object = jj.parameter(1.0, positive=True)
@@ -18,15 +19,11 @@ class Falling(jj.Scene):
     drag: object = jj.parameter(0.0)
     push: object = jj.parameter(0.0)
 
-    coordinates = jj.coordinates("x z")
     inputs = jj.inputs("force")
     example = {"z_rate": 5.0, "x_rate": 2.0}
 
-    def bodies(self, t, q):
-        return {"stone": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, q.z]))}
-
     def loads(self, motion):
-        drag = jj.point_force(motion["stone"].point(), -self.drag * motion["stone"].velocity)
+        drag = jj.point_force(motion["mass"].point(), -self.drag * motion["mass"].velocity)
         return (jj.gravity(motion, self.gravity), drag, jj.generalized_force(motion, x_rate=motion.inputs.force))
 
     def events(self, motion):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import result_codes as results
 from oracles import skate
+from small_scenes import OnLine
 from tolerances import tolerance
 
 import jourdain_jax as jj
@@ -16,28 +17,20 @@ import jourdain_jax as jj
 TS = np.linspace(0.0, 2.0, 5)
 
 
-class Damped(jj.Scene):
+class Damped(OnLine):
     """A particle of 1 kg that a damper drags behind a carriage moving as sin(t): `xddot = -rate (xdot - cos t) - sin t`, so that x = sin t."""
 
     rate: object = jj.parameter(1e7, unit="1/s", positive=True)
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=-self.rate * (motion.u.x_rate - jnp.cos(motion.t)) - jnp.sin(motion.t)),)
 
 
-class OnALine(jj.Scene):
+class OnALine(OnLine):
     """A particle of 1 kg on a line, V(x) given by its kind: falls towards an attracting centre, or off a ridge."""
 
     strength: object = jj.parameter(1.0)
-    coordinates = jj.coordinates("x")
     domain = {"x": (0.5, 1.5)}
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
 
 class Centre(OnALine):

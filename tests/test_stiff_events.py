@@ -5,20 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from small_scenes import OnPlane
 
 import jourdain_jax as jj
 
 RATE = 1e6
 
 
-class Following(jj.Scene):
+class Following(OnPlane):
     """x is drawn to sin y by a stiff spring and damper, in about 1e-6 s to a speed, in about 1 s to the place; y falls to the floor by 1 m/s^2."""
 
     rate: object = jj.parameter(RATE)
-    coordinates = jj.coordinates("x y")
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
 
     def loads(self, motion):
         q, u = motion.q, motion.u

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_scenes import OnLine
 
 import jourdain_jax as jj
 
@@ -68,13 +69,9 @@ KINDS = {
 }
 
 
-class Cart(jj.Scene):
-    coordinates = jj.coordinates("x")
+class Cart(OnLine):
     inputs = jj.inputs("push")
     mass: jax.Array = jj.parameter(1.0, unit="kg")
-
-    def bodies(self, t, q):
-        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def loads(self, motion):
         return jj.Load(generalized={"x_rate": motion.inputs.push})

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import pytest
-from small_scenes import BeadOnTurningWire, DiscWithHeightRow, DrivenPendulum
+from small_scenes import BeadOnTurningWire, DiscWithHeightRow, DrivenPendulum, OnLine
 
 import jourdain_jax as jj
 from jourdain_jax import Verification
@@ -131,12 +131,7 @@ def test_a_generalized_force_with_a_wrong_derivative_is_found_at_its_speed():
 def test_without_an_example_a_scene_is_checked_in_motion():
     brake = with_slope(lambda u: -jnp.tanh(u), lambda u, du: -du)  # right at rest
 
-    class Slider(jj.Scene):
-        coordinates = jj.coordinates("x")
-
-        def bodies(self, t, q):
-            return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
-
+    class Slider(OnLine):
         def loads(self, motion):
             return (jj.generalized_force(motion, x_rate=brake(motion.u.x_rate)),)
 

@@ -1,6 +1,7 @@
 """Small scenes in which something depends on time by itself, each with the closed form of the work that time does."""
 
 import jax.numpy as jnp
+from small_scenes import Upright
 
 import jourdain_jax as jj
 
@@ -96,16 +97,12 @@ class LosingMass(Bead):
         return 0.5 * self.mass * 1.5**2 * (jnp.exp(-self.loss * t) - 1)
 
 
-class Lifted(jj.Scene):
+class Lifted(Upright):
     """A weight whose height is prescribed, `height + rate t`: the winch does m g rate t."""
 
     mass: jnp.ndarray = jj.parameter(2.0, unit="kg", positive=True)
     rate: jnp.ndarray = jj.parameter(0.5, unit="m/s")
-    coordinates = jj.coordinates("x z")
     example = {"z": 2.0, "x_rate": 1.0}
-
-    def bodies(self, t, q):
-        return {"weight": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, q.z]))}
 
     def loads(self, motion):
         return (jj.gravity(motion, 9.81),)
