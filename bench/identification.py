@@ -21,7 +21,6 @@ import sys
 import time
 from pathlib import Path
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -91,13 +90,13 @@ def disc(repeats: int) -> list[Figure]:
 
     data, guess, free = disc_data(0), jj.models.TiltingDisc(radius=0.55, gravity=10.8), ("radius", "gravity")
 
-    def residual(theta, adjoint=None):
+    def residual(theta):
         scene = jj.models.TiltingDisc(radius=theta[0], gravity=theta[1])
-        motion = jj.simulate(scene, {"lean": theta[2], "spin_rate": theta[3]}, ts=data.ts, events=False, work=False, adjoint=adjoint)
+        motion = jj.simulate(scene, {"lean": theta[2], "spin_rate": theta[3]}, ts=data.ts, events=False, work=False)
         return jnp.concatenate([(motion[name] - data.values[name]) / SIGMA[name] for name in SIGMA])
 
     compiled, first = jax.jit(residual), np.array([0.55, 10.8, 0.31, -2.9])
-    slopes = jax.jit(jax.jacfwd(lambda theta: residual(theta, diffrax.ForwardMode())))
+    slopes = jax.jit(jax.jacfwd(residual))
     numbers = lambda f: lambda theta: np.asarray(f(jnp.asarray(theta)))  # noqa: E731
     found = {}
 

@@ -133,14 +133,14 @@ AT_MOST = {"tilting-disc": 4, "whipple-bicycle": 6}  # solves
 
 
 def final_losses(name: str) -> tuple[Callable, np.ndarray]:
-    """A loss of the final coordinates of every lane, as a function of eight numbers each and of an adjoint; the eight numbers."""
+    """A loss of the final coordinates of every lane, as a function of eight numbers each; the eight numbers."""
     scene = jj.models.MODELS[name]()
     span, parameters, of_q, of_u = BY_EIGHT[name]
     start = jj.start(scene, **({"lean": 0.3, "yaw_rate": 0.5, "spin_rate": -3.0} if name == "tilting-disc" else scene.example))
     values = np.array([*(float(getattr(scene, p)) for p in parameters), *start.q[jnp.array(of_q)], *start.u[jnp.array(of_u)]])
 
-    def losses(x, adjoint):
-        options = RUN | {"ts": jnp.array([span]), "rtol": 1e-9, "atol": 1e-9, "adjoint": adjoint}
+    def losses(x):
+        options = RUN | {"ts": jnp.array([span]), "rtol": 1e-9, "atol": 1e-9}
         starts = jax.tree.map(lambda y: jnp.broadcast_to(y, (len(x), *jnp.shape(y))), start)
         first, middle = len(parameters), len(parameters) + len(of_q)
         q, u = starts.q.at[:, jnp.array(of_q)].set(x[:, first:middle]), starts.u.at[:, jnp.array(of_u)].set(x[:, middle:])
@@ -156,18 +156,17 @@ def final_losses(name: str) -> tuple[Callable, np.ndarray]:
 
 def gradients(quick: bool) -> Iterator[Figure]:
     """Gradient of a final-state loss by 8 numbers, best mode, relative to one forward solve at the same tolerance; what each mode takes to compile."""
-    forward, reverse = diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint()
     for name in ("tilting-disc",) if quick else BY_EIGHT:
         losses, values = final_losses(name)
 
         def by_forward_mode(x, losses=losses):
             along = jnp.eye(8)[:, None, :] + jnp.zeros_like(x)
-            return jax.vmap(lambda v: jax.jvp(lambda x: losses(x, forward), (x,), (v,))[1])(along).T
+            return jax.vmap(lambda v: jax.jvp(losses, (x,), (v,))[1])(along).T
 
         ways = {
-            "solve": lambda x, losses=losses: losses(x, forward),
+            "solve": losses,
             "forward": by_forward_mode,
-            "reverse": jax.grad(lambda x, losses=losses: jnp.sum(losses(x, reverse))),
+            "reverse": jax.grad(lambda x, losses=losses: jnp.sum(losses(x))),
         }
         for where, lanes in (("alone", 1), ("batched", 1024))[: 1 if quick else 2]:
             x = jnp.asarray(values * (1 + 0.01 * np.random.default_rng(0).normal(size=(lanes, 8))))
@@ -195,19 +194,16 @@ def second_derivatives(quick: bool) -> Iterator[Figure]:
         losses, values = final_losses(name)
         x = jnp.asarray(values)
 
-        def forward(x, losses=losses):
-            return losses(x[None], diffrax.ForwardMode())[0]
+        def loss(x, losses=losses):
+            return losses(x[None])[0]
 
-        def both(x, losses=losses):
-            return losses(x[None], None)[0]
+        def with_vector(x, v, loss=loss):
+            return jax.jvp(jax.grad(loss), (x,), (v,))[1]
 
-        def with_vector(x, v, both=both):
-            return jax.jvp(jax.grad(both), (x,), (v,))[1]
-
-        slope, step = jax.jit(jax.jacfwd(forward)), 1e-4 * np.diag(np.maximum(np.abs(values), 0.1))
+        slope, step = jax.jit(jax.jacfwd(loss)), 1e-4 * np.diag(np.maximum(np.abs(values), 0.1))
         differences = np.stack([(slope(x + h) - slope(x - h)) / (2 * np.sum(h)) for h in step])
         runs, seconds = {}, {}
-        ways = {"solve": (forward, x), "jacfwd of jacfwd": (jax.jacfwd(jax.jacfwd(forward)), x), "hessian": (jax.hessian(both), x)}
+        ways = {"solve": (loss, x), "jacfwd of jacfwd": (jax.jacfwd(jax.jacfwd(loss)), x), "hessian": (jax.hessian(loss), x)}
         for way, (f, *arguments) in (ways | {"hessian times a vector": (with_vector, x, x)}).items():
             begin = time.process_time()
             run = jax.jit(f).lower(*arguments).compile()
@@ -234,15 +230,15 @@ def named_starts(quick: bool) -> Iterator[Figure]:
     for name, (given, free, seen) in list(NAMED.items())[: 1 if quick else 2]:
         scene, ts = jj.models.MODELS[name](), jnp.linspace(0.0, 2.0, 41)
 
-        def loss(x, adjoint, scene=scene, given=given, free=free, seen=seen, ts=ts):
-            return jnp.sum(jj.simulate(scene.replace(**dict(zip(free, x, strict=True))), given, ts=ts, adjoint=adjoint)[seen])
+        def loss(x, scene=scene, given=given, free=free, seen=seen, ts=ts):
+            return jnp.sum(jj.simulate(scene.replace(**dict(zip(free, x, strict=True))), given, ts=ts)[seen])
 
         x = jnp.stack([getattr(scene, one) for one in free])
         jax.block_until_ready(jj.simulate(scene, given, ts=ts).q)  # what is found of the scene is not counted
         found = {}
-        for way, derivative, adjoint in (("forward", jax.jacfwd, diffrax.ForwardMode()), ("reverse", jax.grad, None)):
+        for way, derivative in (("forward", jax.jacfwd), ("reverse", jax.grad)):
             begin = time.process_time()
-            run = jax.jit(lambda x, derivative=derivative, adjoint=adjoint: derivative(lambda x: loss(x, adjoint))(x)).lower(x).compile()
+            run = jax.jit(derivative(loss)).lower(x).compile()
             seconds = time.process_time() - begin
             found[way] = np.asarray(run(x))
             warm = least_processor_time({way: lambda run=run, x=x: jax.block_until_ready(run(x))}, 7)[way]
@@ -258,14 +254,14 @@ def all_parameters(quick: bool) -> Iterator[Figure]:
     for name, scene in scenes.items():
         start = jj.start(scene, **scene.example)
 
-        def loss(scene, adjoint, start=start):
-            return jnp.sum(jj.simulate(scene, start, ts=ts, adjoint=adjoint, work=False).u ** 2)
+        def loss(scene, start=start):
+            return jnp.sum(jj.simulate(scene, start, ts=ts, work=False).u ** 2)
 
-        jax.block_until_ready(loss(scene, None))  # what is found of the scene is not counted
+        jax.block_until_ready(loss(scene))  # what is found of the scene is not counted
         found = {}
-        for way, derivative, adjoint in (("forward", jax.jacfwd, diffrax.ForwardMode()), ("reverse", jax.grad, None)):
+        for way, derivative in (("forward", jax.jacfwd), ("reverse", jax.grad)):
             begin = time.process_time()
-            run = jax.jit(derivative(lambda scene, loss=loss, adjoint=adjoint: loss(scene, adjoint))).lower(scene).compile()
+            run = jax.jit(derivative(loss)).lower(scene).compile()
             seconds = time.process_time() - begin
             found[way] = np.concatenate([np.ravel(x) for x in jax.tree.leaves(run(scene))])
             warm = least_processor_time({way: lambda run=run, scene=scene: jax.block_until_ready(run(scene))}, 7)[way]

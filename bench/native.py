@@ -153,7 +153,7 @@ def records(quick: bool) -> Iterator[Figure]:
 
     def rates(backend, kind, parameters, torque):
         own = scene.replace(**dict(zip(("mB", "IBxx", "zB", "mH"), parameters, strict=True)))
-        options = {"ts": jnp.linspace(0.05, 2.0, 40), "rtol": scale, "atol": scale, "events": False, "adjoint": diffrax.ForwardMode(), "backend": backend}
+        options = {"ts": jnp.linspace(0.05, 2.0, 40), "rtol": scale, "atol": scale, "events": False, "backend": backend}
         return jj.simulate(own, start, inputs={"steer_torque": kinds[kind](torque)}, **options).u
 
     for kind, (what, function) in itertools.product(kinds, (("motion", lambda f: f), ("its derivatives", jax.jacfwd))):
@@ -181,10 +181,10 @@ def times(quick: bool) -> Iterator[Figure]:
     for name in ("tilting-disc",) if quick else ("tilting-disc", "whipple-bicycle"):
         scene = jj.models.MODELS[name]()
         start = jj.start(scene, **scene.example)
-        for mode, adjoint, differentiated in (("forward", diffrax.ForwardMode(), jax.jacfwd), ("reverse", None, jax.grad)):
+        for mode, differentiated in (("forward", jax.jacfwd), ("reverse", jax.grad)):
             runs, compiled = {}, {}
             for way, backend in WAYS.items():
-                slope = jax.jit(differentiated(partial(seen, scene, start, {"backend": backend, "adjoint": adjoint})))
+                slope = jax.jit(differentiated(partial(seen, scene, start, {"backend": backend})))
                 begin = time.process_time()
                 jax.block_until_ready(slope(0.013))
                 compiled[way], runs[way] = time.process_time() - begin, partial(lambda slope: jax.block_until_ready(slope(0.013)), slope)
@@ -277,16 +277,12 @@ def laws(quick: bool) -> Iterator[Figure]:
     lanes = 128 if quick else LANES
     for name, (scene, starts, span) in list(laws_of_force.cases(lanes).items())[: 1 if quick else None]:
         values = {key: jnp.asarray(x) for key, x in starts.items()}
-        for what, count, adjoint, of in (
-            ("motion", lanes, None, lambda f: f),
-            ("forward mode", 8, diffrax.ForwardMode(), jax.jacfwd),
-            ("reverse mode", 8, None, jax.jacrev),
-        ):
+        for what, count, of in (("motion", lanes, lambda f: f), ("forward mode", 8, jax.jacfwd), ("reverse mode", 8, jax.jacrev)):
             runs = {}
             for way, backend in WAYS.items():
 
-                def end(start, scene=scene, span=span, adjoint=adjoint, backend=backend):
-                    return jj.simulate(scene, start, ts=jnp.array([span]), rtol=1e-8, atol=1e-8, adjoint=adjoint, backend=backend).q_end
+                def end(start, scene=scene, span=span, backend=backend):
+                    return jj.simulate(scene, start, ts=jnp.array([span]), rtol=1e-8, atol=1e-8, backend=backend).q_end
 
                 run, given, begin = jax.jit(jax.vmap(of(end))), {key: x[:count] for key, x in values.items()}, time.process_time()
                 jax.block_until_ready(run(given))

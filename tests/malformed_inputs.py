@@ -363,7 +363,6 @@ MOTIONS: dict[str, Case] = {
     "jj.simulate(b, {}, t1=1.0, solver=diffrax.Tsit5)": "`solver` is the class `Tsit5`, expected an object of diffrax; write `diffrax.Tsit5()`",
     "jj.simulate(b, {}, t1=1.0, solver=jj.RadauIIA)": "`solver` is the class `RadauIIA`, expected an object of diffrax; write `jj.RadauIIA()`",
     "jj.simulate(b, {}, t1=1.0, solver=diffrax.ForwardMode())": "`solver` is a ForwardMode, expected an object of diffrax",
-    "jj.simulate(b, {}, t1=1.0, adjoint='forward')": "`adjoint` is the text 'forward', expected an object of diffrax; write `diffrax.ForwardMode()`",
     "jj.simulate(b, {}, t1=1.0, formulation=jj.Formulation('minimum'))": "unknown state form `minimum`; did you mean `minimal`?",
     "jj.simulate(b, {}, t1=1.0, formulation=jj.Formulation(None))": "unknown state form `None`; Valid names: `auto`, `minimal`, `full`.",
     "jj.simulate(held(a=lambda m: m.u.x_rate**2 + m.u.y_rate**2 - 1.0), {'x_rate': 1.0}, t1=1.0, formulation=jj.Formulation('minimal'))": (

@@ -81,5 +81,5 @@ def test_third_derivatives_name_the_mode_that_has_them(order):
 
     for name in reversed(order):
         function = MODES[name](function)
-    with pytest.raises(DifferentiationModeError, match=r"ForwardMode\(\).*jacfwd"):
+    with pytest.raises(DifferentiationModeError, match=r"forward mode of any order.*jacfwd"):
         jax.eval_shape(jax.vmap(function), LANES)

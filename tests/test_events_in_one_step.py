@@ -75,14 +75,14 @@ def test_the_first_of_several_events_in_one_long_step_ends_the_motion(options):
 
 
 def test_the_derivative_of_the_first_event_is_its_own():
-    def end(wall, adjoint):
-        motion = jj.simulate(Thrown(wall=wall), ts=[5.0], max_step=np.inf, adjoint=adjoint)
+    def end(wall):
+        motion = jj.simulate(Thrown(wall=wall), ts=[5.0], max_step=np.inf)
         return jnp.stack([motion.t_end, motion.q_end[1]])
 
     t, dt = 2.0 / 4.5, 1 / 4.5
     expected = [dt, -GRAVITY * t * dt]
-    np.testing.assert_allclose(jax.jacrev(lambda wall: end(wall, None))(2.0), expected, rtol=1e-10)
-    np.testing.assert_allclose(jax.jacfwd(lambda wall: end(wall, diffrax.ForwardMode()))(2.0), expected, rtol=1e-10)
+    np.testing.assert_allclose(jax.jacrev(end)(2.0), expected, rtol=1e-10)
+    np.testing.assert_allclose(jax.jacfwd(end)(2.0), expected, rtol=1e-10)
 
 
 # where a stone from z = 1 with the speeds 4.5 and 2 m/s meets a plane: its place, and the value a t^2 + b t + c
@@ -142,11 +142,11 @@ def test_an_event_that_is_no_number_beyond_its_boundary_stops_the_motion_there()
 
 
 def test_the_time_at_which_a_value_ends_has_the_derivative_of_its_boundary():
-    def end(edge, adjoint):
-        return jj.simulate(Bounded(arc=edge), {"x_rate": 1.3}, ts=[5.0], adjoint=adjoint).t_end
+    def end(edge):
+        return jj.simulate(Bounded(arc=edge), {"x_rate": 1.3}, ts=[5.0]).t_end
 
-    np.testing.assert_allclose(jax.grad(lambda edge: end(edge, None))(0.7), 1 / 1.3, rtol=1e-6)
-    np.testing.assert_allclose(jax.jacfwd(lambda edge: end(edge, diffrax.ForwardMode()))(0.7), 1 / 1.3, rtol=1e-6)
+    np.testing.assert_allclose(jax.grad(end)(0.7), 1 / 1.3, rtol=1e-6)
+    np.testing.assert_allclose(jax.jacfwd(end)(0.7), 1 / 1.3, rtol=1e-6)
 
 
 def test_a_start_whose_event_is_no_number_is_beyond_it_and_a_state_that_is_none_is_a_failure():

@@ -5,7 +5,6 @@ The whole set takes minutes; by default a part of it runs, all of it with `-m ''
 
 from typing import NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -29,7 +28,6 @@ from jourdain_jax.scene.parameters import parameters_of
 DRAWS, STATES = 5, 20
 QUICK = {"skate", "chaplygin-sleigh"}  # a full state with projection, a minimal state
 SPAN = 0.4
-FORWARD = diffrax.ForwardMode()
 
 natively = machine_code.needed
 
@@ -101,7 +99,7 @@ class OfAMotion(NamedTuple):
 
 
 def end_of_two_steps(name: str, *, with_start: bool):
-    """`(x, adjoint) -> q, u at the end of two steps`, where x holds all parameters and the state at the start; and x.
+    """`x -> q, u at the end of two steps`, where x holds all parameters and the state at the start; and x.
 
     Every step is accepted, whatever its error, and the first is shorter than half of the span: so the derivatives are those of the steps to round-off.
     `with_start`: all that `simulate` does; otherwise what it does once the start is on the rows.
@@ -112,16 +110,16 @@ def end_of_two_steps(name: str, *, with_start: bool):
     flat, unravel = ravel_pytree(({key: value for key, value, _ in parameters_of(scene)}, q, u))
     options = {"ts": t + jnp.array([0.02]), "rtol": 1e3, "atol": 1e3, "max_step": 0.008, "work": False, "events": False}
 
-    known = {} if with_start else {adjoint: set_up(scene, start, adjoint=adjoint, **options) for adjoint in (None, FORWARD)}
-    assert not any(setup.reason_against_machine_code for setup in known.values())
+    known = None if with_start else set_up(scene, start, **options)
+    assert known is None or not known.reason_against_machine_code
 
-    def end(x, adjoint):
+    def end(x):
         parameters, q, u = unravel(x)
         own, begun = scene.replace(**parameters), eqx.tree_at(lambda s: (s.q, s.u), start, (q, u))
-        if with_start:
-            motion = jj.simulate(own, begun, adjoint=adjoint, **options)
+        if known is None:
+            motion = jj.simulate(own, begun, **options)
         else:
-            motion = integrate(known[adjoint]._replace(scene=own, start=begun))
+            motion = integrate(known._replace(scene=own, start=begun))
         return jnp.concatenate([motion.q_end, motion.u_end])
 
     return end, np.where(flat == 0, 0.01, flat)
@@ -132,10 +130,10 @@ def derivatives_of(name: str, *, with_start: bool = False) -> OfAMotion:
     end, x = end_of_two_steps(name, with_start=with_start)
     generator = np.random.default_rng(0)
     direction = generator.normal(size=x.shape) * np.abs(x)
-    forward = eval_numpy(lambda x: jax.jvp(lambda x: end(x, FORWARD), (x,), (jnp.asarray(direction),)))
+    forward = eval_numpy(lambda x: jax.jvp(end, (x,), (jnp.asarray(direction),)))
     value, along = forward(x)
     weights = generator.normal(size=value.shape)
-    (gradient,) = eval_numpy(lambda x: jax.vjp(lambda x: end(x, None), x)[1](jnp.asarray(weights)))(x)
+    (gradient,) = eval_numpy(lambda x: jax.vjp(end, x)[1](jnp.asarray(weights)))(x)
     h = 3e-4
     by_step = [(forward(x + k * h * direction)[0] - forward(x - k * h * direction)[0]) / (2 * k * h) for k in (1, 2, 4)]
     better, worse = ((4 * by_step[i] - by_step[i + 1]) / 3 for i in (0, 1))
@@ -180,20 +178,20 @@ def test_derivatives_through_simulation_by_every_parameter(name):
     flat, unravel = ravel_pytree({key: value for key, value, _ in parameters_of(scene)})
     flat = jnp.where(flat == 0, 0.01, flat)  # differences need both sides, and some parameters may not be negative
 
-    def end(flat, adjoint):
+    def end(flat):
         own = scene.replace(**unravel(flat))
         start = jj.start(own, **scene.example)
-        motion = jj.simulate(own, start, ts=jnp.array([SPAN]), rtol=1e-11, atol=1e-11, adjoint=adjoint, work=False, events=False)
+        motion = jj.simulate(own, start, ts=jnp.array([SPAN]), rtol=1e-11, atol=1e-11, work=False, events=False)
         return jnp.concatenate([motion.q_end, motion.u_end])
 
-    forward = np.asarray(jax.jit(jax.jacfwd(lambda x: end(x, diffrax.ForwardMode())))(flat))
+    forward = np.asarray(jax.jit(jax.jacfwd(end))(flat))
     weights = jnp.asarray(np.random.default_rng(0).normal(size=forward.shape[0]))
-    reverse = np.asarray(jax.jit(jax.grad(lambda x: weights @ end(x, diffrax.RecursiveCheckpointAdjoint())))(flat))
+    reverse = np.asarray(jax.jit(jax.grad(lambda x: weights @ end(x)))(flat))
     # fourth-order central differences, all in one batch
     unit = np.where(np.asarray(flat) == 0, 1.0, np.abs(flat))
     steps = 1e-3 * unit
     points = jnp.stack([flat + k * np.diag(steps) for k in (-2, -1, 1, 2)])
-    ends = np.asarray(jax.jit(jax.vmap(jax.vmap(lambda x: end(x, diffrax.ForwardMode()))))(points))
+    ends = np.asarray(jax.jit(jax.vmap(jax.vmap(end)))(points))
     differences = ((ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * steps[:, None])).T
     size = np.max(np.abs(forward * unit)) + 1e-3 * np.max(np.abs(ends))
     assert np.max(np.abs((forward - differences) * unit)) <= tolerance("gradient_simulation") * size

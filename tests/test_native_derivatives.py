@@ -1,6 +1,5 @@
 """Derivatives by machine code of our own: against closed forms, against those of XLA, of lanes that end in all ways, and when they are left to XLA."""
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import machine_code
@@ -14,8 +13,6 @@ from jourdain_jax.program.derivative import cotangents, jacobian
 from jourdain_jax.program.graph import Graph
 
 pytestmark = machine_code.needed
-
-FORWARD = diffrax.ForwardMode()
 
 
 class Oscillator(OnLine):
@@ -36,11 +33,11 @@ class Oscillator(OnLine):
 X = jnp.array([1.5, 6.0, 0.8, 1.1, 0.7, 0.3])  # mass, stiffness, wall, x, its rate, push
 
 
-def _ends(x, backend="native", adjoint=None, events=False, **options):
+def _ends(x, backend="native", events=False, **options):
     """Two states on the way and at the end, the time of the end."""
     scene = Oscillator(mass=x[0], stiffness=x[1], wall=x[2])
     options = {"ts": jnp.array([0.0, 0.3, 0.9]), "t1": 3.0, "rtol": 1e-11, "atol": 1e-11} | options
-    motion = jj.simulate(scene, {"x": x[3], "x_rate": x[4]}, inputs={"push": x[5]}, backend=backend, adjoint=adjoint, events=events, **options)
+    motion = jj.simulate(scene, {"x": x[3], "x_rate": x[4]}, inputs={"push": x[5]}, backend=backend, events=events, **options)
     return jnp.stack([motion.q[1, 0], motion.u[2, 0], motion.q_end[0], motion.u_end[0], motion.t_end])
 
 
@@ -58,23 +55,21 @@ def _exact(x, events=False):
 
 @pytest.mark.parametrize("solver", [None, jj.Taylor()], ids=["Dopri8", "Taylor"])
 @pytest.mark.parametrize("events", [False, True])
-@pytest.mark.parametrize("mode", ["jacfwd", "jacrev"])
-def test_sensitivities_of_an_oscillator_are_those_of_its_closed_form(mode, events, solver):
-    adjoint = FORWARD if mode == "jacfwd" else None
-    found = jax.jit(getattr(jax, mode)(lambda x: _ends(x, adjoint=adjoint, events=events, solver=solver)))(X)
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+def test_sensitivities_of_an_oscillator_are_those_of_its_closed_form(derivative, events, solver):
+    found = jax.jit(derivative(lambda x: _ends(x, events=events, solver=solver)))(X)
     np.testing.assert_allclose(found, jax.jacfwd(lambda x: _exact(x, events))(X), rtol=1e-9, atol=1e-9)
 
 
 LANES = X * (1 + 0.05 * np.random.default_rng(0).normal(size=(11, 6)))
 
 
-@pytest.mark.parametrize("adjoint", [None, FORWARD], ids=["reverse", "forward"])
-def test_lanes_that_fail_or_are_no_numbers_do_not_touch_others(adjoint):
+@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
+def test_lanes_that_fail_or_are_no_numbers_do_not_touch_others(derivative):
     x = LANES.at[2, 3].set(jnp.nan).at[5, 4].set(jnp.inf).at[7].set(0.0).at[7, :2].set(1.0)
-    mode = jax.grad if adjoint is None else jax.jacfwd
     found = {}
     for backend in ("native", "xla"):  # 20 steps are enough for some
-        slope = mode(lambda x, backend=backend: jnp.sum(_ends(x, backend, adjoint, True, max_steps=20)[:4]))
+        slope = derivative(lambda x, backend=backend: jnp.sum(_ends(x, backend, True, max_steps=20)[:4]))
         found[backend] = np.asarray(jax.jit(jax.vmap(slope))(x))
     good = [i for i in range(11) if i not in (2, 5)]
     np.testing.assert_allclose(found["native"][good], found["xla"][good], rtol=1e-9, atol=1e-9)
@@ -102,10 +97,10 @@ def test_cotangents_reach_back_over_more_steps_than_there_is_memory_for_at_first
     np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
 
 
-@pytest.mark.parametrize("adjoint", [None, FORWARD], ids=["reverse", "forward"])
-def test_derivatives_pass_through_motions_one_after_the_other(adjoint):
+@pytest.mark.parametrize("derivative", [jax.jacrev, jax.jacfwd])
+def test_derivatives_pass_through_motions_one_after_the_other(derivative):
     """One compiled step, called with numbers of which other ones vary each time."""
-    step = jax.jit(lambda scene, state, until: jj.simulate(scene, state, t1=until, inputs={"push": X[5]}, rtol=1e-11, atol=1e-11, adjoint=adjoint).end)
+    step = jax.jit(lambda scene, state, until: jj.simulate(scene, state, t1=until, inputs={"push": X[5]}, rtol=1e-11, atol=1e-11).end)
 
     def late(stiffness):
         scene = Oscillator(mass=X[0], stiffness=stiffness, wall=10.0)
@@ -114,7 +109,7 @@ def test_derivatives_pass_through_motions_one_after_the_other(adjoint):
             state = step(scene, state, jnp.asarray(until))
         return jnp.concatenate([state.q, state.u])
 
-    found = (jax.jacrev if adjoint is None else jax.jacfwd)(late)(X[1])
+    found = derivative(late)(X[1])
     np.testing.assert_allclose(found, jax.jacfwd(lambda k: _exact(X.at[1].set(k))[2:4])(X[1]), rtol=1e-8)
 
 

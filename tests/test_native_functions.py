@@ -2,7 +2,6 @@
 
 from concurrent.futures import ThreadPoolExecutor
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import machine_code
@@ -15,7 +14,7 @@ import jourdain_jax as jj
 pytestmark = machine_code.needed
 TS = np.array([0.3, 1.0, 1.7, 2.5])
 TIGHT = {"rtol": 1e-11, "atol": 1e-11, "work": False}
-ADJOINTS = {"reverse": (None, jax.jacrev), "forward": (diffrax.ForwardMode(), jax.jacfwd)}
+both_modes = pytest.mark.parametrize("derivative", [jax.jacrev, jax.jacfwd])
 
 
 class Pushed(jj.Scene):
@@ -49,14 +48,13 @@ def motion(x, k, a, b, aside=0.0, wall=9.0, **options):
     return jj.simulate(Pushed(k, wall), {"x": x}, ts=TS, inputs=inputs, **TIGHT | options)
 
 
-@pytest.mark.parametrize("mode", ADJOINTS)
-def test_motions_and_derivatives_are_those_of_the_closed_form(mode):
-    adjoint, derivative = ADJOINTS[mode]
+@both_modes
+def test_motions_and_derivatives_are_those_of_the_closed_form(derivative):
     X0 = {name: jnp.asarray(value) for name, value in X.items()}
     found = motion(**X0)
     assert found.reduction.endswith("machine code")
     np.testing.assert_allclose(found["x"], position(TS, **X0), rtol=0, atol=1e-9)
-    slopes = jax.jit(lambda x: derivative(lambda x: motion(**x, adjoint=adjoint)["x"])(x))(X0)
+    slopes = jax.jit(lambda x: derivative(lambda x: motion(**x)["x"])(x))(X0)
     for name, expected in jax.jacfwd(lambda x: position(TS, **x))(X0).items():
         np.testing.assert_allclose(slopes[name], expected, rtol=0, atol=1e-8, err_msg=name)
 
@@ -71,27 +69,25 @@ def test_lanes_have_functions_of_their_own():
     np.testing.assert_allclose(lanes.q[..., 0], expected, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("mode", ADJOINTS)
-def test_functions_samples_and_numbers_stand_side_by_side(mode):
-    adjoint, derivative = ADJOINTS[mode]
+@both_modes
+def test_functions_samples_and_numbers_stand_side_by_side(derivative):
     record = jj.Sampled([0.0, 1.0, 3.0], [0.0, 0.6, 0.2])
     for aside in (record, jnp.asarray(0.7)):
         found = motion(**X, aside=aside)
         assert found.reduction.endswith("machine code")
         np.testing.assert_allclose(found["x"], position(TS, **X), rtol=0, atol=1e-9)
     np.testing.assert_allclose(found["y"], 0.35 * TS**2, rtol=0, atol=1e-10)
-    slope = jax.jit(lambda f: derivative(lambda f: motion(**X, aside=f, adjoint=adjoint)["y"])(f))(0.7)
+    slope = jax.jit(lambda f: derivative(lambda f: motion(**X, aside=f)["y"])(f))(0.7)
     np.testing.assert_allclose(slope, TS**2 / 2, rtol=0, atol=1e-9)
-    of_record = jax.jit(lambda a: derivative(lambda a: motion(**X | {"a": a}, aside=record, adjoint=adjoint)["x"])(a))(0.8)
+    of_record = jax.jit(lambda a: derivative(lambda a: motion(**X | {"a": a}, aside=record)["x"])(a))(0.8)
     np.testing.assert_allclose(of_record, position(TS, **X | {"a": 1.0}) - position(TS, **X | {"a": 0.0}), rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("mode", ADJOINTS)
-def test_an_event_may_depend_on_a_function_of_time(mode):
-    adjoint, derivative = ADJOINTS[mode]
+@both_modes
+def test_an_event_may_depend_on_a_function_of_time(derivative):
 
     def end(a):
-        return motion(-0.3, 4.0, a, 1.3, wall=0.2, adjoint=adjoint)
+        return motion(-0.3, 4.0, a, 1.3, wall=0.2)
 
     def gap(t, a):
         return 0.2 - position(t, -0.3, 4.0, a, 1.3) - 0.1 * a * jnp.sin(1.3 * t)

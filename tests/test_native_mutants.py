@@ -6,7 +6,6 @@ The checks know closed forms alone, of a bead on a spring that a growing force p
 import functools
 from collections.abc import Callable
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import machine_code
@@ -214,23 +213,17 @@ def _differentiated(mode: str, of: Callable, closed: Callable) -> None:
 
 
 def _at_saved_times(mode: str) -> None:
-    adjoint = None if mode == "reverse" else diffrax.ForwardMode()
-    _differentiated(mode, lambda x: WEIGHTS @ pushed(**x, adjoint=adjoint).ys.q[:, 0], saved_by_closed_form)
+    _differentiated(mode, lambda x: WEIGHTS @ pushed(**x).ys.q[:, 0], saved_by_closed_form)
 
 
-def _end(mode: str) -> Callable:
+def _end(x):
     """What `end_by_closed_form` says, of a motion."""
-    adjoint = None if mode == "reverse" else diffrax.ForwardMode()
-
-    def end(x):
-        found = pushed(**x, events=True, adjoint=adjoint)
-        return found.t_end + 0.3 * found.y_end.v[0]
-
-    return end
+    found = pushed(**x, events=True)
+    return found.t_end + 0.3 * found.y_end.v[0]
 
 
 def _at_an_event(mode: str) -> None:
-    _differentiated(mode, _end(mode), end_by_closed_form)
+    _differentiated(mode, _end, end_by_closed_form)
 
 
 def reverse_mode_through_saved_times():
@@ -257,11 +250,11 @@ def _differentiated_twice(of: Callable, end: Callable, closed: Callable, at: dic
 
 
 def forward_mode_to_an_event_twice():
-    _differentiated_twice(lambda f: jax.jacfwd(jax.jacfwd(f)), _end("forward"), end_by_closed_form, START)
+    _differentiated_twice(lambda f: jax.jacfwd(jax.jacfwd(f)), _end, end_by_closed_form, START)
 
 
 def a_hessian_to_an_event():
-    _differentiated_twice(jax.hessian, _end("reverse"), end_by_closed_form, START)
+    _differentiated_twice(jax.hessian, _end, end_by_closed_form, START)
 
 
 def a_hessian_with_respect_to_times():

@@ -2,7 +2,6 @@
 
 import functools
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import machine_code
@@ -15,7 +14,6 @@ from jourdain_jax import DifferentiationModeError
 
 pytestmark = machine_code.needed
 
-FORWARD = diffrax.ForwardMode()
 
 
 class Falling(jj.Scene):
@@ -41,7 +39,7 @@ X = jnp.array([1.5, 0.4, 2.0, 3.0, 0.7, 0.1, 0.5])  # mass, drag, height, speed,
 
 def _seen(x, events, **options):
     """States on the way, the end and its time."""
-    start, options = {"z": x[2], "z_rate": x[3]}, {"rtol": 1e-11, "atol": 1e-11, "adjoint": FORWARD} | options
+    start, options = {"z": x[2], "z_rate": x[3]}, {"rtol": 1e-11, "atol": 1e-11} | options
     options |= {"inputs": {"wind": x[4]}, "events": events, "t0": x[5], "ts": x[5] + jnp.stack([0.3, x[6]]), "t1": x[5] ** 2 + (9.0 if events else 1.0)}
     motion = jj.simulate(Falling(mass=x[0], drag=x[1]), start, **options)
     return jnp.concatenate([motion.q[:, 0], motion.u[1], motion.q_end, motion.u_end, motion.t_end[None]])
@@ -73,7 +71,7 @@ def seconds_of_the_closed_form(events):
 def test_what_machine_code_does_not_serve_is_left_to_xla(which):
     def height(x):
         wind = jj.Sampled([0.0, 0.5, 2.0], jnp.stack([x, 0.3 * x, x**2])) if which == "samples" else x
-        start, options = {"z": 2.0, "z_rate": 1.0 + x}, {"adjoint": FORWARD, "events": False, "max_steps": 99, "rtol": 1e-10, "atol": 1e-10, "backend": "xla"}
+        start, options = {"z": 2.0, "z_rate": 1.0 + x}, {"events": False, "max_steps": 99, "rtol": 1e-10, "atol": 1e-10, "backend": "xla"}
         return jj.simulate(Falling(drag=0.4 * x), start, ts=[0.4], inputs={"wind": wind}, **options).q_end[0]
 
     lower = jax.jit(jax.jacfwd(jax.jacfwd(height) if which == "a third time" else height))
@@ -97,7 +95,7 @@ MOTIONS = [
 @pytest.mark.parametrize(("mode", "events", "solver"), MOTIONS)
 def test_all_modes_are_those_of_the_closed_form(mode, events, solver):
     """With respect to parameters, a start, an input, the start's time, a time saved and the end; or up to an event."""
-    found = np.asarray(jax.jit(jax.vmap(MODES[mode](lambda x: _seen(x, events, solver=solver, adjoint=None, max_steps=1357))))(LANES))
+    found = np.asarray(jax.jit(jax.vmap(MODES[mode](lambda x: _seen(x, events, solver=solver, max_steps=1357))))(LANES))
     np.testing.assert_allclose(found, seconds_of_the_closed_form(events), rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(found, np.swapaxes(found, 2, 3), rtol=1e-9, atol=1e-9)
 
@@ -112,8 +110,8 @@ def test_hessians_of_sums_over_lanes_that_share_parameters():
     """Newton's and Laplace's: the Hessian of a loss over a batch, its product with a vector, and the same by `rollout`."""
     heights = jnp.array([1.0, 2.0, 3.5])
 
-    def loss(x, adjoint=None):
-        return jnp.sum(jax.vmap(lambda height: _lowest(x.at[2].mul(height), x[4], ts=[0.1], adjoint=adjoint))(heights))
+    def loss(x):
+        return jnp.sum(jax.vmap(lambda height: _lowest(x.at[2].mul(height), x[4], ts=[0.1]))(heights))
 
     def by_rollout(x):
         start = {"z": x[2] * heights, "z_rate": x[3]}
@@ -121,7 +119,7 @@ def test_hessians_of_sums_over_lanes_that_share_parameters():
         lanes = jj.rollout(Falling(mass=x[0], drag=x[1]), start, **options).lanes
         return jnp.sum(lanes.t_end**2 + lanes.u_end[:, 0] * x[0])
 
-    expected = np.asarray(jax.jit(jax.jacfwd(jax.jacfwd(lambda x: loss(x, FORWARD))))(X))
+    expected = np.asarray(jax.jit(jax.jacfwd(jax.jacfwd(loss)))(X))
     assert np.abs(expected[:5, :5]).min() > 0
     close = {"rtol": 1e-9, "atol": 1e-9 * np.abs(expected).max()}
     np.testing.assert_allclose(jax.jit(jax.hessian(loss))(X), expected, **close)
@@ -134,7 +132,7 @@ def test_hessians_under_an_input_that_is_samples():
     """Up to an event whose time such an input moves."""
     wind = jj.Sampled([0.0, 0.3, 0.8, 2.0], [0.0, 1.5, -2.0, 1.0])
     found = jax.jit(jax.hessian(lambda x: _lowest(x, wind)))(X)
-    np.testing.assert_allclose(found, jax.jit(jax.jacfwd(jax.jacfwd(lambda x: _lowest(x, wind, adjoint=FORWARD))))(X), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found, jax.jit(jax.jacfwd(jax.jacfwd(lambda x: _lowest(x, wind))))(X), rtol=1e-9, atol=1e-9)
     assert np.all(np.asarray(found)[:4, :4] != 0)
 
 
@@ -152,8 +150,8 @@ MODELS = {
 def test_all_modes_of_a_model_agree(name, mode):
     """Starts that are put onto their rows take part."""
     start, parameters, options = MODELS[name]
-    ends = (end_of_model(name.split(",")[0], start, parameters, adjoint=adjoint, **options) for adjoint in (None, FORWARD))
-    found, expected = (np.asarray(jax.jit(MODES[of](end))(x)) for of, (end, x) in zip((mode, "forward of forward"), ends, strict=True))
+    end, x = end_of_model(name.split(",")[0], start, parameters, **options)
+    found, expected = (np.asarray(jax.jit(MODES[of](end))(x)) for of in (mode, "forward of forward"))
     np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-9 * np.max(np.abs(expected)))
     assert np.any(expected != 0)
 
@@ -167,11 +165,8 @@ def _height(x, **options):
 @pytest.mark.parametrize(
     ("of", "options", "says"),
     [
-        ("forward of reverse", {"adjoint": diffrax.RecursiveCheckpointAdjoint()}, "reverse mode only"),
-        ("reverse of forward", {"adjoint": diffrax.RecursiveCheckpointAdjoint()}, "forward mode .* reverse-only"),
-        ("forward of reverse", {"adjoint": diffrax.ForwardMode()}, "reverse mode .* forward-only"),
-        ("reverse of forward", {"adjoint": diffrax.ForwardMode()}, "reverse mode .* forward-only"),
         ("forward of reverse", {"backend": "xla"}, "machine code"),
+        ("reverse of forward", {"backend": "xla"}, "machine code"),
         ("reverse of reverse", {"backend": "xla"}, "machine code"),
         ("forward of reverse", {"samples": True}, "samples"),
         ("reverse of forward", {"samples": True}, "samples"),

@@ -1,4 +1,4 @@
-"""Spans, saved times, controllers, solvers and adjoints of `simulate`; what stands in for traced parameters."""
+"""Spans, saved times, solvers of `simulate`; what stands in for traced parameters."""
 
 import diffrax
 import jax.numpy as jnp

@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -63,7 +62,7 @@ class DerivativeOfMotion:
                 motion = jj.simulate(scene, start, **options)
             return self.value(motion), motion.result
 
-        forward = isinstance(options.get("adjoint"), diffrax.ForwardMode)
+        forward = method.name == "forward mode"
         try:
             with warnings.catch_warnings(record=True) as given:
                 warnings.simplefilter("always")

@@ -22,9 +22,6 @@ INTEGRATORS: dict[str, Callable] = {
     "Radau IIA": jj.RadauIIA,
 }
 EVEN_STEPS = {"implicit midpoint": jj.ImplicitMidpoint, "DLA": jj.DiscreteLagrangeDAlembert, "discrete gradient": jj.DiscreteGradient}  # of a `step`
-ADJOINTS: dict[str, Callable[[], diffrax.AbstractAdjoint]] = {
-    "forward mode": diffrax.ForwardMode,
-}
 STABILISED = {"no projection": 0.0, "Baumgarte 5/s": 5.0, "Baumgarte 1e4/s": 1e4}  # rates; one program serves all
 
 
@@ -105,7 +102,7 @@ METHODS: tuple[Method, ...] = (
     *(_stabilised(name, rate) for name, rate in STABILISED.items()),
     *(Method(name, "integrators", lambda scene, make=make: {"solver": make(), "work": False}) for name, make in INTEGRATORS.items()),
     *(Method(name, "integrators") for name in EVEN_STEPS),
-    *(Method(name, "adjoints", lambda scene, make=make: {"adjoint": make()}) for name, make in ADJOINTS.items()),
+    Method("forward mode", "adjoints"),
     *(Method(name, "naive", naive=name) for name in NAIVE),
     Method("MuJoCo", "elsewhere", elsewhere=True),
 )

@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -52,11 +51,10 @@ class Slopes:
         names = [name for name in numbers[0] if name not in f.fixed]
         weights = np.cos(np.arange(len(f.names)))
         expected = np.array([[self._slope(one, name, weights) for name in names] for one in numbers])
-        adjoint = {"adjoint": diffrax.ForwardMode()} if mode == "forward" else {}
 
         def value(x, span):
             own = dict(zip(names, x, strict=True)) | {"span": span}
-            motion = jj.simulate(f.scene().replace(**f.parameters(own)), f.start(own), t1=span, ts=span[None], rtol=self.rtol, atol=self.rtol, **adjoint)
+            motion = jj.simulate(f.scene().replace(**f.parameters(own)), f.start(own), t1=span, ts=span[None], rtol=self.rtol, atol=self.rtol)
             ends = [motion.q_end[i] if kind == "q" else motion.u_end[i] for kind, i in _columns(f)]
             end = jnp.stack(ends) @ weights
             return end, (end, motion.result)

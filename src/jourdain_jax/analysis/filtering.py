@@ -30,9 +30,9 @@ from jourdain_jax.analysis.sensors import Reading, ideal
 from jourdain_jax.analysis.tangent import dependent_coordinates, others, privileged_speeds
 from jourdain_jax.calculus.reals import checked_unless_traced, is_traced
 from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.motion.forward_mode import simulate_forward
 from jourdain_jax.motion.inputs import Inputs, inputs_at
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
+from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
@@ -146,7 +146,7 @@ class _Filter:
         times = jnp.concatenate([t + span * jnp.asarray(_NODES), jnp.where(moves, t1, t + span)[None]])
 
         def later(x):
-            motion = simulate_forward(self.scene, self._state(t, q, x), t0=t, ts=times, inputs=self.run.inputs, options=self.options)
+            motion = simulate(self.scene, self._state(t, q, x), t0=t, ts=times, inputs=self.run.inputs, options=self.options)
             found = self._independent(motion.q, motion.u)
             return found, (found[-1], motion.q[-1])
 

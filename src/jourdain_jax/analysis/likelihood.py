@@ -90,12 +90,11 @@ def _of_angle(what: str, values: Float[np.ndarray, "times"], ts: Float[np.ndarra
 _STATED = "each `Experiment` states start, times and inputs, and its motion ends with its last sample"
 _REFUSED = dict.fromkeys(("start", "t0", "t1", "ts", "inputs", "events", "work"), _STATED)
 _REFUSED["retry"] = "its motions are compiled, in one way"
-_FORWARD = {"adjoint": "derivatives come by forward mode; leave it out"}
 
 
-def as_fit_options(scene: Scene | BuiltFor, options: Options | None, by_name: Mapping, function: str, forward: bool = True) -> AllOptions:
-    """Return the options of the motions of a fit, or of a likelihood. `forward`: its derivatives come by forward mode."""
-    found = as_options(options, by_name, function, _REFUSED | _FORWARD if forward else _REFUSED, scene)
+def as_fit_options(scene: Scene | BuiltFor, options: Options | None, by_name: Mapping, function: str) -> AllOptions:
+    """Return the options of the motions of a fit, or of a likelihood."""
+    found = as_options(options, by_name, function, _REFUSED, scene)
     return replace(found, work=False, retry=False)
 
 
@@ -148,7 +147,7 @@ def log_likelihood(
 
     **Raises** ValueError for measurements that do not fit the scene.
     """
-    settled = as_fit_options(scene, options, by_name, "log_likelihood", forward=False)
+    settled = as_fit_options(scene, options, by_name, "log_likelihood")
     scene = as_scene(scene)
     runs = as_runs(scene, data)
     if unknown := sorted({name for run in runs for name in run.unknown_correlation}):

@@ -203,7 +203,7 @@ def log_density(
       A flat prior without bounds has no integral: where the data do not tell an unknown, neither has the posterior, and a sampler runs away.
 
     **Returns** a `LogDensity`: call it with a vector; `initial`, `constrain`, `named` and `unconstrain` lead to and fro. The logarithms of the transforms'
-    derivatives are in it. It is a pure function: it works under `jit`, `vmap` and `grad` (reverse mode; forward mode with `adjoint=diffrax.ForwardMode()`).
+    derivatives are in it. It is a pure function: it works under `jit`, `vmap` and `grad`.
 
     **Raises** ValueError as `fit`.
 
@@ -213,7 +213,7 @@ def log_density(
         sampler = blackjax.nuts(density, step_size=0.8, inverse_mass_matrix=jnp.ones(density.initial.size))
         draws = density.named(positions)["radius"]                               # m, of the positions (draws, unknowns) that were sampled
     """
-    settled = as_fit_options(scene, options, by_name, "log_density", forward=False)
+    settled = as_fit_options(scene, options, by_name, "log_density")
     scene = as_scene(scene)
     runs = as_runs(scene, data)
     sigmas = in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma)

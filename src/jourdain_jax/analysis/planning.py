@@ -27,8 +27,8 @@ from jourdain_jax.build.reference import Reference
 from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.calculus.compiled import compiled
 from jourdain_jax.calculus.reals import is_traced
-from jourdain_jax.motion.forward_mode import simulate_forward
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
+from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
 from jourdain_jax.scene.printing import Printed
@@ -161,7 +161,7 @@ def _sensitivities(
     def residuals(free_ones: Float[Array, "unknowns"]):
         every = theta.at[some].set(free_ones)
         moved, local = layout.scene(scene, every[:count]), every[count:].reshape(len(runs), -1)
-        return tuple(run.at(layout, every[:count], own).residuals(moved, simulate_forward, options) for run, own in zip(runs, local, strict=True))
+        return tuple(run.at(layout, every[:count], own).residuals(moved, simulate, options) for run, own in zip(runs, local, strict=True))
 
     with reference.stands_in():
         J = jax.jacfwd(residuals)(theta[some])

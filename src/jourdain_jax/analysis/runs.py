@@ -30,9 +30,9 @@ from jourdain_jax.analysis.quantities import Channel, StopEvent
 from jourdain_jax.analysis.sensors import Drive, Reading, grid, ideal, intervals, with_numbers
 from jourdain_jax.analysis.shooting import LAST, NODE, begin, ended
 from jourdain_jax.build.reference import Reference
-from jourdain_jax.motion.forward_mode import simulate_alongside
 from jourdain_jax.motion.inputs import Inputs, Sampled
-from jourdain_jax.motion.options import AllOptions
+from jourdain_jax.motion.options import AllOptions, alongside
+from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.scene import Scene
 
@@ -349,7 +349,7 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
         (scene, options), run = eqx.combine((of_all(common), of_run(row)), rest)
 
         def flat(x):
-            residuals = run.at(layout, x[own:], x[:own]).residuals(layout.scene(scene, x[own:]), simulate_alongside, options)
+            residuals = run.at(layout, x[own:], x[:own]).residuals(layout.scene(scene, x[own:]), simulate, alongside(options))
             return jnp.concatenate([jnp.ravel(residuals[name]) for name in sorted(residuals)])
 
         with reference.stands_in():

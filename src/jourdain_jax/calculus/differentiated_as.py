@@ -25,7 +25,6 @@ class Rules(NamedTuple):
     push: Callable  # (arguments, tangents): the result and its tangents; JAX differentiates it forward
     pull: Callable  # (perturbed, arguments, result, cotangents): cotangents of those arguments that vary; JAX differentiates it forward
     reason_against_second: Callable[..., str] = lambda *_: ""  # (*perturbed): why JAX does not differentiate `pull`, in words; empty where it does
-    together: bool = False  # whether `push` gives the result as well where tangents are asked for, to the first order, by `jvp` and `jacfwd` alone
 
 
 class _Leaves(NamedTuple):
@@ -72,6 +71,30 @@ def differentiated_as(differentiable: Callable, run: Callable) -> Callable:
     return called
 
 
+def pushed_by_jax(run: Callable) -> Callable:
+    """Return the `push` of a function that JAX differentiates forward."""
+
+    def push(arguments: tuple, tangents: tuple):
+        moving, fixed = eqx.partition(arguments, jax.tree.map(lambda d: d is not None, tangents, is_leaf=lambda d: d is None))
+        return jax.jvp(lambda moving: run(*eqx.combine(moving, fixed)), (moving,), (tangents,))
+
+    return push
+
+
+def by_modes(forward: Callable, reverse: Callable, reason_against_second: str) -> Callable:
+    """Return `forward`, which JAX differentiates forward, with the reverse mode of `reverse`, which computes the same.
+
+    `reason_against_second`: why reverse mode takes part in no second derivative, in words.
+    """
+
+    def pull(perturbed: tuple, arguments: tuple, found, g):
+        moving, fixed = eqx.partition(arguments, perturbed)
+        back = jax.vjp(lambda moving: reverse(*eqx.combine(moving, fixed)), moving)[1]
+        return back(jax.tree.map(lambda x, g: np.zeros(x.shape, jax.dtypes.float0) if g is None else g, found, g))[0]
+
+    return with_rules(forward, Rules(pushed_by_jax(forward), pull, lambda *_: reason_against_second))
+
+
 def with_rules(run: Callable, rules: Rules) -> Callable:
     """Return `run`, which JAX cannot differentiate, with derivatives by rules, in both modes and to the second order.
 
@@ -109,9 +132,6 @@ def with_rules(run: Callable, rules: Rules) -> Callable:
         def rule(leaves, tangents):
             moving = _moving(tangents)
             along = [tangents[i] for i in moving]
-            if rules.together:
-                found, rates = pushed(moving, leaves, *along)
-                return lanes_first(found), _without_gaps(found, lanes_first(rates))
             found = own(*leaves)
             ends = jax.lax.stop_gradient(jax.tree.leaves(found))
             places = [i for i, x in enumerate(ends) if _is_number(x)]

@@ -20,7 +20,7 @@ import numpy as np
 from jourdain_jax.ensembles.distributions import Distribution
 from jourdain_jax.ensembles.outputs import OfEvent
 from jourdain_jax.ensembles.task import Task
-from jourdain_jax.motion.forward_mode import rollout_forward
+from jourdain_jax.motion.batches.rollout import rollout
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.trajectories import results
@@ -105,7 +105,7 @@ def _of_block(task: Task, columns: Sequence[str]):
 
     def outputs(drawn: Mapping):
         starts, parameters = task.starts_and_parameters(drawn)
-        rolled = rollout_forward(task.scene, starts, parameters=parameters or None, **task.span, options=task.options).lanes
+        rolled = rollout(task.scene, starts, parameters=parameters or None, **task.span, options=task.options).lanes
         found = eqx.filter_vmap(task.outputs_of_lane)(rolled)
         return found, jnp.where(rolled.result == results.EVENT, rolled.event, jnp.where(rolled.succeeded, -1, -2))
 

@@ -28,7 +28,7 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 _STATED = "times to save at are `ts`, and what is kept is said by `outputs` and `save`"
-REFUSED = dict.fromkeys(("adjoint", "progress", "parameters", "starts", "scene", "start"), _STATED)
+REFUSED = dict.fromkeys(("progress", "parameters", "starts", "scene", "start"), _STATED)
 
 
 @dataclass(frozen=True, repr=False)

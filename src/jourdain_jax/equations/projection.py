@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.fixed_point import fixed_point
 from jourdain_jax.equations.least_change import least_change
-from jourdain_jax.equations.listed import names_of_position_rows
+from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.rows import position_residual, velocity_residual
 from jourdain_jax.equations.virtual_power import mass_matrix_at
 from jourdain_jax.scene.scene import Scene
@@ -70,7 +70,7 @@ def project_positions(
     `typical`: lengths of the rows by which one counts as vanishing, from `closure_lengths` (default: none does, unless it is zero).
     `by`: how rows are evaluated.
     """
-    if jax.eval_shape(lambda s, q: closure_residual(s, 0.0, q), scene, q).shape[0] == 0:
+    if not (names_of_position_rows(scene) or scene.coordinates.quaternions):
         return q
     if free is None and not names_of_position_rows(scene):
         return _normalised(scene, q)
@@ -116,7 +116,7 @@ def project_speeds(
     `determined`: rows are affine and determine all speeds that are `free`, so that no metric is needed; `typical` is then in plain speeds.
     `by`: how rows and the mass matrix are evaluated.
     """
-    if jax.eval_shape(lambda s, q, u: velocity_residual(s, 0.0, q, u), scene, q, u).shape[0] == 0:
+    if not names_of_rows(scene):
         return u
     free = jnp.ones(u.shape, bool) if free is None else jnp.asarray(free)
     parameters = by.given(scene)

@@ -1,4 +1,5 @@
-"""Solvers of diffrax: `diffrax.diffeqsolve` of a scene's rates as it is, with its step-size control, its events and its adjoint.
+"""Solvers of diffrax: `diffrax.diffeqsolve` of a scene's rates as it is, with its step-size control, its events and its adjoints: `ForwardMode` in forward
+mode, `RecursiveCheckpointAdjoint` in reverse mode.
 
 Steps end at the saved times (`step_ts`) and at knots of the inputs (`jump_ts`), and are no longer than `max_step` (`dtmax`). States are put onto the rows where
 they are saved, not after each step; one that has left them by more than errors of its steps explain ends in a result code. A stop event is one that has
@@ -6,7 +7,8 @@ happened at the end of a step, located by the dense output: a value that falls a
 """
 
 import warnings
-from typing import ClassVar, Literal
+from functools import partial
+from typing import ClassVar
 
 import diffrax
 import equinox as eqx
@@ -15,6 +17,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, PyTree
 
+from jourdain_jax.calculus.differentiated_as import by_modes
+from jourdain_jax.calculus.guards import SECOND_ORDER_MESSAGE
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.integrators import event_search, integrands
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
@@ -70,7 +74,7 @@ class Diffrax(Integrator):
     """`diffrax.diffeqsolve`."""
 
     solver: diffrax.AbstractSolver
-    adjoint: diffrax.AbstractAdjoint
+    alongside: bool = eqx.field(static=True)  # as of `OwnSteps`
     max_steps: int = eqx.field(static=True)
     event_names: tuple[str, ...] = eqx.field(static=True)
     projects_saved: ClassVar[bool] = False
@@ -80,16 +84,15 @@ class Diffrax(Integrator):
     def name(self) -> str:
         return type(self.solver).__name__
 
-    def mode(self, setup: Setup) -> Literal["forward", "reverse", "any"]:
-        if isinstance(self.adjoint, diffrax.ForwardMode):
-            return "forward"
-        return "reverse" if isinstance(self.adjoint, diffrax.RecursiveCheckpointAdjoint) else "any"
-
     def reason_against_machine_code(self, setup: Setup) -> str:
         """It has none."""
         return "the solver is one of diffrax"
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
+        forward, reverse = (partial(self._solved, adjoint) for adjoint in (diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint()))
+        return (forward if self.alongside else by_modes(forward, reverse, SECOND_ORDER_MESSAGE))(setup, begun)
+
+    def _solved(self, adjoint: diffrax.AbstractAdjoint, setup: Setup, begun: Begun) -> Solved:
         origin, knots = begun.args[4], setup.knots
         t0, t1, ts = setup.t0 - origin, setup.t1 - origin, setup.ts - origin
         rtol, atol = setup.tolerances
@@ -106,7 +109,7 @@ class Diffrax(Integrator):
             begun.args,
             saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)]),
             stepsize_controller=control,
-            adjoint=self.adjoint,
+            adjoint=adjoint,
             event=event if self.event_names else None,
             max_steps=setup.most_steps(knots),
             throw=False,

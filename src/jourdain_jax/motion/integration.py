@@ -14,7 +14,6 @@ from jaxtyping import Array, Float
 from jourdain_jax.build.plausibility import faults_at
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.calculus.compiled import RUN_SELDOM
-from jourdain_jax.calculus.guards import forward_only, reverse_only
 from jourdain_jax.calculus.lanes_first import lanes_first
 from jourdain_jax.calculus.nan_where import entered, left
 from jourdain_jax.calculus.reals import in_default_precision
@@ -61,13 +60,8 @@ _compiled = for_programs(_one_motion, _compiler_options)
 
 
 def _prepared(setup: Setup) -> Setup:
-    """The setup with all numbers in the default precision (derivatives keep the type of what is differentiated).
-
-    In forward mode they raise our own error where the adjoint supports reverse mode alone; outputs do the other way round (`_finish`), since reverse mode
-    comes to them first.
-    """
-    numbers = in_default_precision({name: getattr(setup, name) for name in ("scene", "start", "inputs", "t0", "t1", "ts")})
-    return setup._replace(**(reverse_only(numbers) if setup.integrator.mode(setup) == "reverse" else numbers))
+    """The setup with all numbers in the default precision (derivatives keep the type of what is differentiated)."""
+    return setup._replace(**in_default_precision({name: getattr(setup, name) for name in ("scene", "start", "inputs", "t0", "t1", "ts")}))
 
 
 def _with_machine_code(setup: Setup) -> Setup:
@@ -110,8 +104,6 @@ def _finish(given: Setup, setup: Setup, asked: Float[Array, ""], begun: Begun, s
     t0, field, integrator = setup.t0, setup.field, setup.integrator
     start, args = begun.start, begun.args
     _, scene, inputs, fixed, origin = args
-    if integrator.mode(given) == "forward":
-        solved = eqx.tree_at(lambda s: (s.ys, s.y_end, s.t_end), solved, forward_only((solved.ys, solved.y_end, solved.t_end)))
     puts_back = field.projects and not integrator.projects_saved
     stored_first = field.stored(scene, t0, start.q, inputs(t0))
     direction = jnp.sign(setup.t1 - t0)

@@ -2,7 +2,7 @@
 
 import difflib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import jax
@@ -63,7 +63,7 @@ class AllOptions(Options):
     solver: "diffrax.AbstractSolver | ImplicitMethod | Taylor | Method | None" = None
     formulation: "Formulation | None" = None
     backend: str = "auto"
-    adjoint: "diffrax.AbstractAdjoint | None" = None
+    alongside: bool = False  # whether one run gives values and tangents: for derivatives by `jvp` and `jacfwd` alone
 
 
 class OptionFields(TypedDict, total=False):
@@ -79,7 +79,6 @@ class OptionFields(TypedDict, total=False):
     retry: bool
     formulation: "Formulation | None"
     backend: str
-    adjoint: "diffrax.AbstractAdjoint | None"
 
 
 class MotionFields(OptionFields, total=False):
@@ -92,8 +91,8 @@ class MotionFields(OptionFields, total=False):
 
 
 SPAN = ("t0", "t1", "ts", "inputs")  # arguments of a motion by name besides its options
-_STATIC = ("max_steps", "events", "work", "retry", "backend")
-OPTION_NAMES = tuple(field.name for field in fields(AllOptions))
+_STATIC = ("max_steps", "events", "work", "retry", "backend", "alongside")
+OPTION_NAMES = tuple(OptionFields.__annotations__)
 
 
 def _register(kind: type[Options]) -> None:
@@ -115,12 +114,9 @@ def _register(kind: type[Options]) -> None:
 _register(Options)
 _register(AllOptions)
 _DEFAULT = AllOptions()
-_KINDS = {  # of diffrax, and an example
-    "solver": ("AbstractSolver", "diffrax.Dopri8()"),
-    "adjoint": ("AbstractAdjoint", "diffrax.ForwardMode()"),
-}
 _BY_DIFFRAX = "call `diffrax.diffeqsolve(jj.diffrax_term(scene), ...)` with it"
 GONE = {  # options that there were once -> what serves now
+    "adjoint": f"all motions have derivatives in forward and in reverse mode; for an adjoint of diffrax {_BY_DIFFRAX}",
     "dt0": "the first step is 1e-4 of the span; structure-preserving solvers carry theirs, as in solver=jj.ImplicitMidpoint(step=0.01)",
     "saveat": f"give times to save at as `ts`; for values between steps, or at each step, {_BY_DIFFRAX}",
     "stepsize_controller": f"give `rtol`, `atol` and `max_step`, or solver=jj.ImplicitMidpoint(step=0.01); for another control {_BY_DIFFRAX}",
@@ -152,6 +148,11 @@ def as_options(
     found = AllOptions(**({} if options is None else vars(options)) | of_model | dict(by_name))
     _check(found)
     return found
+
+
+def alongside(options: AllOptions) -> AllOptions:
+    """Return options by which one run gives values and tangents, of `jvp` and `jacfwd` alone."""
+    return replace(options, alongside=True)
 
 
 def stated(options: AllOptions) -> dict[str, Any]:
@@ -186,20 +187,15 @@ def _check(options: AllOptions) -> None:
     most = options.max_steps
     if not isinstance(most, int | np.integer) or isinstance(most, bool) or most < 1:
         raise ValueError(f"`max_steps` is {most!r}, expected a whole number of at least 1; give the number of steps after which to stop")
-    for name in ("solver", "adjoint"):
-        if (value := getattr(options, name)) is not None and not isinstance(value, Taylor | Method | ImplicitMethod):
-            _check_kind(name, value)
+    solver = options.solver
+    own = solver is None or isinstance(solver, Taylor | Method | ImplicitMethod)
+    if not own and not isinstance(solver, diffrax.AbstractSolver):
+        raise ValueError(f"`solver` is {described(solver)}, expected an object of diffrax; write `{_meant(solver) or 'diffrax.Dopri8()'}`")
 
 
-def _check_kind(name: str, value) -> None:
-    """Raise ValueError where an option is no object of its kind; suggest the one that a text or a class may mean."""
-    kind, example = getattr(diffrax, _KINDS[name][0]), _KINDS[name][1]
-    if not isinstance(value, kind):
-        raise ValueError(f"`{name}` is {described(value)}, expected an object of diffrax; write `{_meant(value, kind) or example}`")
-
-
-def _meant(value, kind: type) -> str:
-    """Return the object that a text or a class may mean."""
+def _meant(value) -> str:
+    """Return the solver that a text or a class may mean."""
+    kind = diffrax.AbstractSolver
     if isinstance(value, type) and issubclass(value, kind | ImplicitMethod | Taylor):
         return f"{'jj' if value.__module__.startswith('jourdain_jax') else 'diffrax'}.{value.__name__}()"
     if not isinstance(value, str):

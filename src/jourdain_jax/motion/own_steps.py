@@ -12,13 +12,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jourdain_jax.calculus.differentiated_as import Rules, with_rules
-from jourdain_jax.calculus.guards import DifferentiationModeError
+from jourdain_jax.calculus.differentiated_as import Rules, by_modes, pushed_by_jax, with_rules
+from jourdain_jax.calculus.guards import SECOND_ORDER_MESSAGE, DifferentiationModeError
 from jourdain_jax.motion.batches.lockstep import in_blocks, width
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators import erk_loop, integrands
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
-from jourdain_jax.motion.integrators.of_diffrax import alongside, diffrax
 from jourdain_jax.motion.integrators.problem import Problem
 from jourdain_jax.motion.integrators.tableaus import Method, method_of
 from jourdain_jax.motion.native import native_motion
@@ -35,8 +34,7 @@ class OwnSteps(Integrator):
     """Our own loop, by a tableau, an implicit method or Taylor series; a static object, the same for all calls with these options."""
 
     solver: Method | ImplicitMethod = eqx.field(static=True)
-    kind: Literal["forward", "reverse", "both"] = eqx.field(static=True)  # of derivatives
-    alongside: bool = eqx.field(static=True)  # whether values and tangents come from one run
+    alongside: bool = eqx.field(static=True)  # whether one run gives values and tangents, of `jvp` and `jacfwd` alone
     max_steps: int = eqx.field(static=True)
     event_names: tuple[str, ...] = eqx.field(static=True)
     native: bool = eqx.field(static=True)  # whether machine code may integrate
@@ -48,11 +46,6 @@ class OwnSteps(Integrator):
     def name(self) -> str:
         return self.solver.name if self.order is None else "Taylor"
 
-    def mode(self, setup: Setup) -> Literal["forward", "reverse", "any"]:
-        if self.kind == "both":
-            return "reverse" if self.reason_against_machine_code(setup) else "any"
-        return self.kind
-
     def reason_against_machine_code(self, setup: Setup) -> str:
         if not self.native:
             return "another backend was asked for"
@@ -62,28 +55,31 @@ class OwnSteps(Integrator):
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
         if not setup.reason_against_machine_code:
-            return with_rules(_by_machine_code, _rules(setup, self.alongside))(setup, begun)
-        return _by_xla("forward" if self.kind == "forward" else "reverse", setup, begun)
+            return (_by_machine_code if self.alongside else with_rules(_by_machine_code, _rules(setup)))(setup, begun)
+        return self._in_modes(_by_xla)(setup, begun)
 
     def lanes_solved(self, setups: Setup, begun: Begun) -> Solved:
         serves = not setups.reason_against_machine_code
         if (program := setups.field.lowered) is None or serves or not isinstance(self.solver, Method):
             return super().lanes_solved(setups, begun)
-        mode: Mode = "forward" if self.kind == "forward" else "reverse"
-        return in_blocks(partial(_lanes_by_xla, mode), width(program), setups, begun)
+        return self._in_modes(lambda mode, *lanes: in_blocks(partial(_lanes_by_xla, mode), width(program), *lanes))(setups, begun)
+
+    def _in_modes(self, by_xla: Callable) -> Callable:
+        """Return a function of a mode, a setup and its beginning as a function of these two that serves both modes."""
+        forward = partial(by_xla, "forward")
+        return forward if self.alongside else by_modes(forward, partial(by_xla, "reverse"), SECOND_ORDER_MESSAGE)
 
 
 _once: Callable[..., OwnSteps] = lru_cache(maxsize=64)(OwnSteps)
 
 
-def own_steps(solver, adjoint, **static) -> OwnSteps | None:
+def own_steps(solver, **static) -> OwnSteps | None:
     """Return our own loop where it has the solver; None for solvers of diffrax."""
     method = solver if isinstance(solver, Method | ImplicitMethod) else method_of(solver)
     if method is None:
         return None
     method = method.without_step() if isinstance(method, FixedStepMethod) else method
-    kind = "both" if adjoint is None else "reverse" if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint) else "forward"
-    return _once(method, kind, adjoint is not None and type(adjoint) is alongside.Alongside, **static)
+    return _once(method, **static)
 
 
 def reason_against_series(setup: Setup, order: int) -> str:
@@ -147,18 +143,14 @@ def _own(setup: Setup) -> OwnSteps:
     return setup.integrator
 
 
-def _rules(setup: Setup, alongside: bool) -> Rules:
+def _rules(setup: Setup) -> Rules:
     """Derivatives of `_by_machine_code`."""
     form = native_motion.form_of(setup.field, setup.inputs, bool(setup.integrator.event_names))
-
-    def push(arguments, tangents):
-        moving, fixed = eqx.partition(arguments, jax.tree.map(lambda d: d is not None, tangents, is_leaf=lambda d: d is None))
-        return jax.jvp(lambda moving: _by_machine_code(*eqx.combine(moving, fixed)), (moving,), (tangents,))
 
     def pull(perturbed, arguments, found, g):
         return _pulled(perturbed, *arguments, found, g)
 
-    return Rules(push, pull, lambda *_: reason_against_derivatives(form, 2), alongside)
+    return Rules(pushed_by_jax(_by_machine_code), pull, lambda *_: reason_against_derivatives(form, 2))
 
 
 def _pulled(perturbed: tuple, setup: Setup, begun: Begun, found: Solved, g: Solved) -> tuple:

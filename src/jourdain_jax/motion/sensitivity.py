@@ -121,15 +121,13 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
     """`integrate(setup)`; its derivative, taken outside of `jit`, warns where the motion amplifies errors too much."""
     if nothing_is_traced() or not is_traced(setup):
         return integrate(setup)
-    mode = setup.integrator.mode(setup)
     start, (rtol, atol) = setup.start, setup.tolerances
     known = _known((start.q, start.u, rtol, atol))
     if known is None:
         return integrate(setup)
     only_start = not is_traced(eqx.tree_at(lambda s: s.start, setup, None))
     tolerances = float(known[2]), float(known[3])
-    sizes: list[tuple[Callable, _Growth | _Sizes]] = [] if mode == "reverse" else [(tap_tangents, _Growth(*tolerances, only_start))]
-    sizes += [] if mode == "forward" else [(tap_cotangents, _Sizes(*tolerances))]
+    sizes: list[tuple[Callable, _Growth | _Sizes]] = [(tap_tangents, _Growth(*tolerances, only_start)), (tap_cotangents, _Sizes(*tolerances))]
     at_start = start.q, start.u
     for shown, size in sizes:
         at_start = shown(at_start, size.start(known[:2]))

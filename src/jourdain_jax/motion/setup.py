@@ -6,7 +6,7 @@ Rates, projection and events are given tau, and the scene and its inputs t0 + ta
 
 import abc
 from operator import attrgetter
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -62,10 +62,6 @@ class Integrator(eqx.Module):
     @abc.abstractmethod
     def name(self) -> str:
         """The solver, as it stands in a trajectory."""
-
-    @abc.abstractmethod
-    def mode(self, setup: "Setup") -> Literal["forward", "reverse", "any"]:
-        """The mode of differentiation that it supports."""
 
     @abc.abstractmethod
     def reason_against_machine_code(self, setup: "Setup") -> str:

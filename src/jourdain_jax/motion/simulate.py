@@ -20,7 +20,6 @@ from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.inputs_in_rows import check_inputs_in_rows
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
-from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import nan_is_a_mark
@@ -70,15 +69,15 @@ def simulate(
     - `backend`: "native", the scene's scalar program (`jj.lower`) as machine code made for it, on CPUs, where llvmlite is installed and the solver is a
       default one; "xla", that program compiled by XLA: also for third derivatives, derivatives with respect to samples, `jax.export` and other devices, which
       machine code refuses; "dense", the dense matrices; "auto" (default), the first of these that serves. The first two take the same steps.
-    - `adjoint`: the default one serves forward and reverse mode, to the second order (`jax.hessian`), where machine code integrates; otherwise
-      reverse mode of first order, by recorded steps. `diffrax.ForwardMode()` serves forward mode of any order. Solvers of diffrax that our own loop does not
-      have take all of diffrax's (default: `diffrax.RecursiveCheckpointAdjoint()`).
+
+    Derivatives in forward and in reverse mode serve all motions. Where machine code integrates, so do those of the second order in all combinations
+    (`jax.hessian`); elsewhere forward mode of forward mode does, to any order.
 
     **Returns** a `Trajectory`, with a result code instead of an exception, whose message says what to do; `trajectory.raise_if_failed()` raises
     `SimulationError`.
 
-    **Raises** TypeError for unknown options, ValueError for bad arguments or a start that contradicts the constraints, `DifferentiationModeError` where the
-    adjoint does not support the mode of differentiation.
+    **Raises** TypeError for unknown options, ValueError for bad arguments or a start that contradicts the constraints, `DifferentiationModeError` for
+    derivatives that there are not.
 
     **Examples**
 
@@ -146,29 +145,20 @@ def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, in
     if solver is None:
         solver = default_solver(options.rtol) if order is None else DOPRI8
     static: dict[str, Any] = {"max_steps": options.max_steps, "event_names": field.event_names if options.events else ()}
-    own = own_steps(solver, options.adjoint, **static, native=native, order=order)
-    integrator = diffrax_steps.Diffrax(cast(Any, solver), options.adjoint or diffrax.RecursiveCheckpointAdjoint(), **static) if own is None else own
+    static["alongside"] = options.alongside
+    own = own_steps(solver, **static, native=native, order=order)
+    integrator = diffrax_steps.Diffrax(cast(Any, solver), **static) if own is None else own
     tolerances = tuple(as_array(x, start.q.dtype) for x in (options.rtol, options.atol))  # arrays: another tolerance is no other program
     first_step = (1.0 if isinstance(solver, FixedStepMethod) else 1e-4) * (t1 - t0)  # diffrax's own guess costs two more copies of the vector field to compile
     longest = as_array(LONGEST * abs(t1 - t0) if max_step is None else max_step, start.q.dtype)
     setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, longest, integrator, usual, reference)
     if own is None:
         diffrax_steps.check(setup)
-    else:
-        _check_adjoint(options.adjoint)
     if options.backend == "native" and (reason := setup.reason_against_machine_code):
         raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
     if order is not None and (reason := reason_against_series(setup, order)):
         raise ValueError(f"solver=jj.Taylor() cannot integrate `{type(scene).__name__}`: {reason}; omit `solver`, or use solver=diffrax.Dopri8()")
     return setup
-
-
-def _check_adjoint(adjoint) -> None:
-    if adjoint is not None and not isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint | diffrax.ForwardMode):
-        raise ValueError(
-            f"`adjoint` is a {type(adjoint).__name__}; use the default one, diffrax.RecursiveCheckpointAdjoint() or diffrax.ForwardMode(), or a `solver` "
-            "of diffrax that is not one of our own, such as diffrax.Kvaerno5(), which goes with all of diffrax's"
-        )
 
 
 def _start(scene: Scene, given, t0, inputs: Inputs, native: bool, projects: bool) -> tuple[State, Usual | None]:
