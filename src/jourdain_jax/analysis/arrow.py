@@ -15,11 +15,43 @@ Factorization Methods for Discrete Sequential Estimation (1977), chapter VI (squ
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
+
+Parts = TypeVar("Parts", bound="ByMember")
+ByUnknown = Float[np.ndarray, "members unknowns"]
+
+
+class ByMember:
+    """Base of dataclasses of arrays with an axis of members in front, and of parts that consist of such; None where a part is missing."""
+
+    def _parts(self) -> list:
+        return [getattr(self, field.name) for field in fields(self)]  # type: ignore[arg-type]
+
+    def of(self: Parts, members) -> Parts:
+        """Return a copy of the parts of some members."""
+        return type(self)(*(x if x is None else x.of(members) if isinstance(x, ByMember) else x[members] for x in self._parts()))
+
+    def put(self: Parts, members, new: Parts) -> None:
+        """Put the parts of `new` in the places of these members."""
+        for kept, one in zip(self._parts(), new._parts(), strict=True):
+            if isinstance(kept, ByMember):
+                kept.put(members, one)
+            elif kept is not None:
+                kept[members] = one
+
+    def replaced(self: Parts, members: np.ndarray, new: Parts, chosen: Bool[np.ndarray, "some"]) -> Parts:
+        """Return all members, with what is `new` of these where it is `chosen`."""
+        count = len(next(x for x in self._parts() if isinstance(x, np.ndarray)))
+        if len(members) == count and chosen.all():
+            return new
+        found = self.of(np.arange(count))
+        found.put(members[chosen], new.of(chosen))
+        return found
 
 
 def triangle(whole: Float[np.ndarray, "*batch samples width"]) -> Float[np.ndarray, "*batch width width"]:
@@ -28,16 +60,11 @@ def triangle(whole: Float[np.ndarray, "*batch samples width"]) -> Float[np.ndarr
     if whole.shape[-2] < width:
         whole = np.concatenate([whole, np.zeros((*whole.shape[:-2], width - whole.shape[-2], width))], axis=-2)
     reflected, _ = np.linalg.qr(whole, mode="raw")  # as LAPACK leaves it: the transposed triangle, and reflectors beyond its diagonal
-    return reflected[..., :width].swapaxes(-1, -2) * _upper(width)
-
-
-@lru_cache(maxsize=64)
-def _upper(width: int) -> Float[np.ndarray, "width width"]:
-    return np.triu(np.ones((width, width)))
+    return np.triu(reflected[..., :width].swapaxes(-1, -2))
 
 
 @dataclass(frozen=True)
-class Arrow:
+class Arrow(ByMember):
     """A linearised problem. Unknowns are (shared, own of piece 0, own of piece 1, ...)."""
 
     local: Float[np.ndarray, "members pieces local width"]  # the rows of T that hold own unknowns
@@ -46,90 +73,77 @@ class Arrow:
     joins: Float[np.ndarray, "members pieces joined both"] | None = None  # [B A C c]; zero of the first piece of a run
 
     @property
-    def arrays(self) -> tuple[np.ndarray, ...]:
-        """All that it holds, with the axis of members first."""
-        return (self.local, self.shared, self.scores) if self.joins is None else (self.local, self.shared, self.scores, self.joins)
-
-    @property
     def counts(self) -> tuple[int, int, int]:
         """Numbers of pieces, of unknowns of each piece, and of shared unknowns."""
         pieces, local = self.local.shape[1:3]
         return pieces, local, self.shared.shape[-1] - 1
-
-    def at(self, members) -> "Arrow":
-        """Return the problems of some members."""
-        return Arrow(*(x[members] for x in self.arrays))
-
-    def scaled(self, size: Float[np.ndarray, "members unknowns"]) -> "Arrow":
-        """Return this arrow, which has no joins, in unknowns divided by `size`."""
-        shared, local = self.split(size)
-        whole = np.concatenate([local, np.broadcast_to(shared[:, None], (*local.shape[:2], shared.shape[1])), np.ones((*local.shape[:2], 1))], axis=-1)
-        return Arrow(
-            self.local * whole[:, :, None], self.shared * np.concatenate([shared, np.ones((len(shared), 1))], axis=-1)[:, None], self.scores * shared[:, None]
-        )
 
     def split(self, x: Shaped[np.ndarray, "members unknowns"]) -> tuple[np.ndarray, np.ndarray]:
         """Return shared unknowns (members, shared), and unknowns of the pieces (members, pieces, local)."""
         pieces, local, shared = self.counts
         return x[:, :shared], x[:, shared:].reshape(len(x), pieces, local)
 
-    def _by_unknown(self, of: Callable[[np.ndarray], np.ndarray]) -> Float[np.ndarray, "members unknowns"]:
+    @property
+    def _blocks(self) -> list[np.ndarray]:
+        """Rows whose columns are those of the shared unknowns; of a piece and these; of a piece, the one before and these."""
+        return [x for x in (self.shared, self.local if self.local.shape[2] else None, self.joins) if x is not None]
+
+    def _columns(self, x: Shaped[np.ndarray, "members unknowns"]) -> list[np.ndarray]:
+        """Return the entries of x that belong to the columns of each block; before the first piece of a run, which joins nothing, any."""
+        shared, own = self.split(x)
+        each = np.broadcast_to(shared[:, None], (*own.shape[:2], shared.shape[1]))
+        leading = ([], [own], [own, np.roll(own, 1, axis=1)])[: len(self._blocks)]
+        return [np.concatenate([*parts, each], axis=-1) if parts else shared for parts in leading]
+
+    def _of_blocks(self, blocks: list[np.ndarray]) -> "Arrow":
+        shared, local, joins = (*blocks, None, None)[:3]
+        return Arrow(self.local if local is None else local, shared, self.scores, joins)
+
+    def scaled(self, size: ByUnknown) -> "Arrow":
+        """Return this arrow in unknowns divided by `size`."""
+        blocks = [rows.copy() for rows in self._blocks]
+        for rows, x in zip(blocks, self._columns(size), strict=True):
+            rows[..., :-1] *= x[..., None, :]
+        return replace(self._of_blocks(blocks), scores=self.scores * self.split(size)[0][:, None])
+
+    def _by_unknown(self, of: Callable[[np.ndarray], np.ndarray]) -> ByUnknown:
         """Return the sums over all rows of what is `of` rows: (..., rows, columns and residual) -> (..., columns)."""
-        _, m, _ = self.counts
-        shared = of(self.shared)
-        if not m:
-            return shared
-        local = of(self.local)
-        shared, own = shared + local[..., m:].sum(axis=1), local[..., :m]
-        if self.joins is not None:
-            joins = of(self.joins)
-            shared, own = shared + joins[..., 2 * m :].sum(axis=1), own + joins[..., :m]
-            own[:, :-1] += joins[:, 1:, m : 2 * m]
-        return np.concatenate([shared, own.reshape(len(own), -1)], axis=1)
+        shared, *others = map(of, self._blocks)
+        pieces, m, _ = self.counts
+        own = np.zeros((len(shared), pieces, m))
+        for lead, x in enumerate(others, 1):
+            shared = shared + x[..., lead * m :].sum(axis=1)
+            own += x[..., :m]
+            own[:, :-1] += x[:, 1:, m : lead * m] if lead > 1 else 0.0
+        return np.concatenate([shared, own.reshape(len(own), -1)], axis=1) if m else shared
 
     @cached_property
-    def column_norms(self) -> Float[np.ndarray, "members unknowns"]:
+    def column_norms(self) -> ByUnknown:
         """Length of each column of the Jacobian."""
         return np.sqrt(self._by_unknown(lambda rows: np.einsum("...ij,...ij->...j", rows[..., :-1], rows[..., :-1])))
 
     @cached_property
-    def gradient(self) -> Float[np.ndarray, "members unknowns"]:
+    def gradient(self) -> ByUnknown:
         """`J' r`."""
         return self._by_unknown(lambda rows: (rows[..., None, :, -1] @ rows[..., :-1])[..., 0, :])
 
-    def _changes(self, d: Float[np.ndarray, "members unknowns"]) -> list[np.ndarray]:
-        """Return by how much the residuals of each part change, to first order."""
-        shared, own = self.split(d)
-        _, m, _ = self.counts
-        found = [(self.shared[..., :-1] @ shared[..., None])[..., 0]]
-        if m:
-            found.append((self.local[..., :m] @ own[..., None] + self.local[..., m:-1] @ shared[:, None, :, None])[..., 0])
-        if self.joins is not None:
-            before = np.roll(own, 1, axis=1)[..., None]  # of the first piece it meets a zero
-            joins = self.joins
-            found.append((joins[..., :m] @ own[..., None] + joins[..., m : 2 * m] @ before + joins[..., 2 * m : -1] @ shared[:, None, :, None])[..., 0])
-        return found
+    def _changes(self, d: ByUnknown) -> list[np.ndarray]:
+        """Return by how much the residuals of each block change, to first order."""
+        return [(rows[..., :-1] @ x[..., None])[..., 0] for rows, x in zip(self._blocks, self._columns(d), strict=True)]
 
-    def change(self, d: Float[np.ndarray, "members unknowns"]) -> Float[np.ndarray, "members"]:
+    def change(self, d: ByUnknown) -> Float[np.ndarray, "members"]:
         """`|J d|^2`."""
         return sum(np.einsum("bi,bi->b", x, x) for x in (x.reshape(len(x), -1) for x in self._changes(d)))
 
-    def _held(self, held: Bool[np.ndarray, "members unknowns"], moved: Float[np.ndarray, "members unknowns"]) -> "Arrow":
+    def _held(self, held: Bool[np.ndarray, "members unknowns"], moved: ByUnknown) -> "Arrow":
         """Return the problem of all other unknowns, with the residuals where those that are `held` have `moved`."""
-        _, m, _ = self.counts
-        shared, own = self.split(~held)
-        parts = [self.shared.copy(), self.local.copy(), *([] if self.joins is None else [self.joins.copy()])]
-        for part, change in zip(parts, self._changes(np.where(held, moved, 0.0)), strict=False):
-            part[..., -1] += change
-        parts[0][..., :-1] *= shared[:, None]
-        for part, start in zip(parts[1:], (m, 2 * m), strict=False):
-            part[..., :m] *= own[:, :, None]
-            part[..., start:-1] *= shared[:, None, None]
-        if self.joins is not None:
-            parts[2][..., m : 2 * m] *= np.roll(own, 1, axis=1)[:, :, None]
-        return Arrow(parts[1], parts[0], self.scores, *parts[2:])
+        blocks = [rows.copy() for rows in self._blocks]
+        for rows, change, free in zip(blocks, self._changes(np.where(held, moved, 0.0)), self._columns(~held), strict=True):
+            rows[..., -1] += change
+            rows[..., :-1] *= free[..., None, :]
+        return self._of_blocks(blocks)
 
-    def step(self, damping: Float[np.ndarray, "members"], D, held, moved, cutoff: float) -> Float[np.ndarray, "members unknowns"]:
+    def step(self, damping: Float[np.ndarray, "members"], D, held, moved, cutoff: float) -> ByUnknown:
         """Return the damped step; unknowns that are `held` move by `moved`. D: (members, unknowns), positive."""
         _, m, p = self.counts
         here = self._held(held, moved) if held.any() else self
@@ -145,31 +159,27 @@ class Arrow:
         return np.where(held, moved, found)
 
 
-def with_prior(
-    arrow: Arrow, residual: Float[np.ndarray, "members unknowns"], mean: np.ndarray, sigma: np.ndarray, M: Float[np.ndarray, "shared shared"]
-) -> Arrow:
+def with_prior(arrow: Arrow, residual: ByUnknown, mean: np.ndarray, sigma: np.ndarray, M: Float[np.ndarray, "shared shared"]) -> Arrow:
     """Adds one `residual` (theta - mean) / sigma for each unknown that has a mean (not NaN); those of shared ones times M. The scores stay."""
     slope = np.broadcast_to(np.where(np.isnan(mean), 0.0, 1 / sigma), residual.shape)
     (r_s, r_l), (J_s, J_l) = arrow.split(residual), arrow.split(slope)
-    members, runs, m = r_l.shape
     every, M = M, np.eye(J_s.shape[1])  # where there is one run, its own unknowns count as shared, after the others
     M[: len(every), : len(every)] = every
-    rows = np.zeros((members, runs, m, arrow.local.shape[-1]))
-    rows[..., range(m), range(m)], rows[..., -1] = J_l, r_l
-    R = np.linalg.qr(np.concatenate([arrow.local, rows], axis=2), mode="r") if m else arrow.local
-    below = [R[:, :, m:, m:].reshape(members, -1, arrow.shared.shape[-1]), np.concatenate([M * J_s[:, None], M @ r_s[..., None]], axis=-1)]
-    return Arrow(R[:, :, :m], np.linalg.qr(np.concatenate([arrow.shared, *below], axis=1), mode="r"), arrow.scores)
+    tops, left = eliminated(arrow.local, J_l, residual=r_l)
+    below = np.concatenate([M * J_s[:, None], M @ r_s[..., None]], axis=-1)
+    return Arrow(tops, np.linalg.qr(np.concatenate([arrow.shared, left, below], axis=1), mode="r"), arrow.scores)
 
 
-def eliminated(local: np.ndarray, below: Float[np.ndarray, "members pieces local"], joins: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def eliminated(local: np.ndarray, below: np.ndarray, joins: np.ndarray | None = None, residual: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows that give own unknowns in terms of shared unknowns and of the piece before, and the rows that are left for these.
 
-    `below`: the diagonal of the rows that are added. The rows that are left stand one after another.
+    `below`: the diagonal (members, pieces, local) of the rows that are added, with a residual. The rows that are left stand one after another.
     """
     members, pieces, m, width = local.shape
     if not m:
         return local, np.zeros((members, 0, width))
-    added = np.concatenate([below[..., None] * np.eye(m), np.zeros((members, pieces, m, width - m))], axis=-1)
+    added = np.zeros((members, pieces, m, width))
+    added[..., range(m), range(m)], added[..., -1] = below, residual
     rows = np.concatenate([local, added], axis=2)
     if joins is None:
         R = np.linalg.qr(rows, mode="r")

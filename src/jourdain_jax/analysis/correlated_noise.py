@@ -22,9 +22,6 @@ from jaxtyping import Array, Float, Int
 from jourdain_jax.analysis.arrow import Arrow, eliminated
 
 SHORTEST, LONGEST = 0.1, 10.0  # of tau: of the shortest interval (the noise is white), and of the longest span (hardly to be told from a bias)
-SECTIONS = 20  # of the interval in log tau, each 0.618 of the one before
-_GOLDEN = (np.sqrt(5) - 1) / 2
-_TINY = 1e-7  # of the length of a column: what does not show adds a constant to log det
 
 
 def chain(weight: Float[Array | np.ndarray, "times *channel"], ts: Float[Array | np.ndarray, "times"], xp=np) -> tuple[Array | np.ndarray, Array | np.ndarray]:
@@ -53,61 +50,58 @@ def whitened(r, previous, rho):
 
 @dataclass(frozen=True)
 class Chains:
-    """Which sample goes before which in the residuals of runs of equal structure; a leading axis `runs`, and `members` where samples differ by member."""
+    """Which sample goes before which in the residuals of runs of equal structure, of each member."""
 
-    before: Int[np.ndarray, "runs *members samples"]
-    gap: Float[np.ndarray, "runs *members samples"]  # s
+    before: Int[np.ndarray, "runs members samples"]
+    gap: Float[np.ndarray, "runs members samples"]  # s
     known: Float[np.ndarray, "runs samples"]  # tau, s; zero where the noise is white or tau is not known
     channels: Mapping[str, slice]
 
     @staticmethod
-    def of(weights: Mapping[str, np.ndarray], ts: np.ndarray, taus: Mapping[str, np.ndarray], channels: Mapping[str, slice], has_members: bool) -> "Chains":
-        """The chains of samples with weights (runs, *members, times, *channel), times (runs, times) and correlation times (runs,) of some channels."""
-        before, gap, known, (runs, times) = [], [], [], ts.shape
+    def of(weights: Mapping[str, np.ndarray], ts: np.ndarray, taus: Mapping[str, np.ndarray], channels: Mapping[str, slice]) -> "Chains":
+        """The chains of samples with weights (runs, members, times, *channel), times (runs, times) and correlation times (runs,) of some channels."""
+        parts, known, (runs, times) = [], [], ts.shape
         for name, where in channels.items():
-            weight = weights[name]
-            lead, count = weight.shape[1 : 1 + has_members], (where.stop - where.start) // times
-            links = [chain(np.moveaxis(one.reshape(-1, times, count), 1, 0), t) for one, t in zip(weight, ts, strict=True)]
-            back = lambda x, lead=lead: np.moveaxis(x, 1, 2).reshape(len(x), *lead, -1)  # noqa: E731
-            before.append(where.start + back(np.stack([place for place, _ in links]) * count + np.arange(count)))
-            gap.append(back(np.stack([g for _, g in links])))
+            count = (where.stop - where.start) // times
+            apart = weights[name].reshape(runs, -1, times, count)
+            place, gap = (np.stack(x) for x in zip(*(chain(np.moveaxis(one, 1, 0), t) for one, t in zip(apart, ts, strict=True)), strict=True))
+            both = where.start + place * count + np.arange(count), gap
+            parts.append([np.moveaxis(x, 1, 2).reshape(runs, -1, times * count) for x in both])
             known.append(np.repeat(np.asarray(taus.get(name, np.zeros(runs)))[:, None], times * count, axis=1))
-        return Chains(np.concatenate(before, axis=-1), np.concatenate(gap, axis=-1), np.concatenate(known, axis=-1), channels)
+        before, gap = (np.concatenate(x, axis=-1) for x in zip(*parts, strict=True))
+        return Chains(before, gap, np.concatenate(known, axis=-1), channels)
 
-    def at(self, places, members, unknown: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Places before, and rho, of lanes: runs at these places, of these members (None: all alike), with correlation times (lanes,) of some channels."""
-        index = (places,) if members is None else (places, members)
+    def at(self, places: np.ndarray, members: np.ndarray, unknown: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Places before, and rho, of lanes: runs at these places, of these members, with correlation times (lanes,) of some channels."""
         tau = self.known[places].copy()
         for name, value in unknown.items():
             if name in self.channels:
                 tau[:, self.channels[name]] = value[:, None]
-        return self.before[index], memory(self.gap[index], tau)
+        return self.before[places, members], memory(self.gap[places, members], tau)
 
 
 def half_log_determinant(arrow: Arrow, size: Float[np.ndarray, "members unknowns"]) -> Float[np.ndarray, "members"]:
     """`log det(J'J) / 2` in unknowns divided by `size`, with a constant for what does not show."""
-    scaled = arrow.scaled(size)
-    _, m, p = arrow.counts
-    members, runs = scaled.local.shape[:2]
-    upper, rest = eliminated(scaled.local, np.full((members, runs, m), _TINY))
-    whole = np.concatenate([scaled.shared[..., :p], rest[..., :p], np.broadcast_to(_TINY * np.eye(p), (members, p, p))], axis=1)
+    scaled, tiny = arrow.scaled(size), 1e-7  # of the length of a column
+    runs, m, p = arrow.counts
+    members = len(size)
+    upper, rest = eliminated(scaled.local, np.full((members, runs, m), tiny))
+    whole = np.concatenate([scaled.shared[..., :p], rest[..., :p], np.broadcast_to(tiny * np.eye(p), (members, p, p))], axis=1)
     diagonals = np.einsum("bkii->bki", upper[..., :m]).reshape(members, -1), np.einsum("bii->bi", np.linalg.qr(whole, mode="r"))
     return sum((np.sum(np.log(np.abs(d)), axis=1) for d in diagonals), np.zeros(members))
 
 
-def lowest(f: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Where f, of each member, is lowest between low and high, by golden section."""
-    a, b = low.copy(), high.copy()
-    c, d = b - _GOLDEN * (b - a), a + _GOLDEN * (b - a)
-    fc, fd = f(c), f(d)
-    for _ in range(SECTIONS):
-        left = fc < fd
-        a, b = np.where(left, a, c), np.where(left, d, b)
-        kept, kept_f = np.where(left, c, d), np.where(left, fc, fd)
-        new = np.where(left, b - _GOLDEN * (b - a), a + _GOLDEN * (b - a))
-        of_new = f(new)
-        c, d = np.where(left, new, kept), np.where(left, kept, new)
-        fc, fd = np.where(left, of_new, kept_f), np.where(left, kept_f, of_new)
+def lowest(f: Callable[[np.ndarray], np.ndarray], a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Where f, of each member, is lowest between a and b, by golden section: the interval shrinks to 7e-5."""
+    golden = (np.sqrt(5) - 1) / 2
+    inner = [b - golden * (b - a), a + golden * (b - a)]
+    values = [f(x) for x in inner]
+    for _ in range(20):
+        left = values[0] < values[1]
+        a, b = np.where(left, a, inner[0]), np.where(left, inner[1], b)
+        kept = [np.where(left, *pair) for pair in (inner, values)]
+        new = np.where(left, b - golden * (b - a), a + golden * (b - a))
+        inner, values = ([np.where(left, n, k), np.where(left, k, n)] for n, k in zip((new, f(new)), kept, strict=True))
     return np.asarray((a + b) / 2)
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.estimate import Estimate, Range
 from jourdain_jax.analysis.quantities import Instrument, StopEvent, channel, cut
-from jourdain_jax.analysis.sensors import Actuator, Drive, Reading, Sensor, ideal, latest, numbers_of
+from jourdain_jax.analysis.sensors import Actuator, Drive, Reading, Sensor, ideal, latest, response
 from jourdain_jax.calculus.reals import Number, checked_unless_traced, described, is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled, as_inputs
 from jourdain_jax.scene.names import as_names, nearest
@@ -107,18 +107,16 @@ class Experiment(eqx.Module):
             )
         if not self.values:
             raise ValueError("`values` is empty; give at least one channel: name -> measured values; or the time of an event, in `events`")
-        _check_same_names("sigma", self.sigma, self.values)
-        for name in self.correlation_time:
-            if name not in self.values:
-                raise ValueError(f"`correlation_time` names channel `{name}`, which has no values; {nearest(name, self.values)}")
-        for name in self.sensors:
-            if name not in self.values:
-                raise ValueError(f"sensor `{name}` has no measured values; {nearest(name, self.values)}")
+        strange = "names channel `{}`, which has no values"
+        for names, what in ((self.sigma, f"`sigma` {strange}"), (self.correlation_time, f"`correlation_time` {strange}")):
+            _check_known(names, what, self.values)
+        _check_known(self.sensors, "sensor `{}` has no measured values", self.values)
+        for name in self.values:
+            if name not in self.sigma:
+                raise ValueError(f"channel `{name}` has no sigma; give `sigma` a number for it, or one number for all channels")
         if self.ended_by in (*self.sensors, *self.correlation_time):
             raise ValueError(f"`{self.ended_by}` is an event, whose time has no sensor and no correlation time; leave them out, or rename the channel")
-        for name in self.unknown_start:
-            if name not in self.start:
-                raise ValueError(f"unknown start value `{name}` has no first guess; give one in `start`. {nearest(name, self.start)}")
+        _check_known(self.unknown_start, "unknown start value `{}` has no first guess; give one in `start`", self.start)
         for name, value in self.values.items():
             if not _holds(lambda x: ~np.isinf(x), value):
                 raise ValueError(
@@ -133,6 +131,12 @@ class Experiment(eqx.Module):
 
     # Equinox's own costs a microsecond each time, to make methods pytrees; a fit asks for a hundred fields
     __getattribute__ = object.__getattribute__
+
+    def changed(self, **fields) -> "Experiment":
+        """This run with other fields, without another look at all that was looked at when it was made."""
+        found = object.__new__(type(self))
+        vars(found).update(vars(self) | fields)
+        return found
 
     def sigma_of(self, name: str, repeats: bool = False) -> Float[Array | np.ndarray, "..."]:
         """Sigma of each measured value of the channel `name`, in its unit; `repeats`: the values have a leading axis of repeats."""
@@ -192,13 +196,10 @@ def _check_times(ts) -> None:
         )
 
 
-def _check_same_names(what: str, names, expected) -> None:
+def _check_known(names: Iterable[str], what: str, known: Mapping) -> None:
     for name in names:
-        if name not in expected:
-            raise ValueError(f"`{what}` names channel `{name}`, which has no values; {nearest(name, expected)}")
-    for name in expected:
-        if name not in names:
-            raise ValueError(f"channel `{name}` has no {what}; give `{what}` a number for it, or one number for all channels")
+        if name not in known:
+            raise ValueError(f"{what.format(name)}; {nearest(name, known)}")
 
 
 def checked(scene: Scene, run: Experiment, index: int, repeats: bool) -> Experiment:
@@ -229,11 +230,9 @@ def checked(scene: Scene, run: Experiment, index: int, repeats: bool) -> Experim
         if run.sigma[name].shape not in ((), (times,), shape):
             raise ValueError(f"sigma of channel `{name}` of {where} has shape {run.sigma[name].shape}, expected (), {(times,)} or {shape}")
     inputs, drives = _inputs(scene, run, where, estimates)
-    found = object.__new__(type(run))  # without another look at all that was looked at when it was made
-    of_channels = {field: getattr(run, field) for field in ("values", "sigma", "start", "unknown_start", "sensors", "correlation_time")}
-    changed = of_channels | {"readings": readings, "drives": drives, "estimates": estimates}
-    vars(found).update(vars(run) | {field: dict(sorted(value.items())) for field, value in changed.items()} | {"inputs": inputs})  # sorted as JAX orders them
-    return found
+    by_name = {field: getattr(run, field) for field in ("values", "sigma", "start", "unknown_start", "sensors", "correlation_time")}
+    by_name |= {"readings": readings, "drives": drives, "estimates": estimates}
+    return run.changed(inputs=inputs, **{field: dict(sorted(value.items())) for field, value in by_name.items()})  # sorted as JAX orders them
 
 
 def _quantity(scene: Scene, given: str | Callable | Instrument | None, channel_name: str, where: str):
@@ -249,13 +248,13 @@ def _quantity(scene: Scene, given: str | Callable | Instrument | None, channel_n
 
 
 def _reading(sensor: Sensor, name: str, where: str, quantity, shape: tuple[int, ...], estimates: dict) -> Reading:
-    numbers, unknown, used = numbers_of(sensor)
+    numbers, unknown, used = response(sensor)
     for number in ("gain", "bias"):
         if numbers[number].shape not in ((), shape):
             raise ValueError(f"`{number}` of sensor `{name}` of {where} has shape {numbers[number].shape}, expected () or {shape}")
     estimates |= {f"{name}.{number}": getattr(sensor, number) for number in unknown}
     named = isinstance(quantity, str)
-    return Reading(None if named else quantity, quantity if named else "", numbers, unknown, used)
+    return Reading(numbers, unknown, used, None if named else quantity, quantity if named else "")
 
 
 def _check_begin(run: Experiment, name: str, where: str, repeats: bool) -> None:
@@ -287,19 +286,18 @@ def _inputs(scene: Scene, run: Experiment, where: str, estimates: dict) -> tuple
     inputs = as_inputs(scene, {**given} | {name: one.command for name, one in actuators.items()})
     drives = {}
     for name, actuator in actuators.items():
-        numbers, unknown, used = numbers_of(actuator)
-        drive = Drive(actuator.command, list(scene.inputs.entries).index(name), numbers, unknown, used, actuator.hold)
-        for number in unknown:
+        drive = Drive(*response(actuator), actuator.command, scene.inputs.entries.index(name), actuator.hold)
+        for number in drive.unknown:
             if f"{name}.{number}" in estimates:
                 raise ValueError(f"{where} has a channel and an input `{name}`, both with an estimated {number}; give the channel another name")
             estimates[f"{name}.{number}"] = getattr(actuator, number)
-        if "lag" in used and not is_traced((actuator.command.ts, run.ts)) and actuator.command.ts[-1] < run.ts[-1]:
+        if drive.has_filter and not is_traced((actuator.command.ts, run.ts)) and actuator.command.ts[-1] < run.ts[-1]:
             raise ValueError(
                 f"the command of input `{name}` of {where} ends at {float(actuator.command.ts[-1]):g} s, before the last sample at {float(run.ts[-1]):g} s, "
                 "and its lag does not go on after it; repeat the last value at a later time"
             )
         inputs = eqx.tree_at(lambda i, k=drive.index: i.channels[k], inputs, drive.signal())
-        if unknown:
+        if drive.unknown:
             drives[name] = drive
     return inputs, drives
 

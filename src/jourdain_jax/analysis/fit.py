@@ -44,10 +44,6 @@ _SPANS = (1 / 32, 1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 3 / 4)  # shares o
 _PATIENCE = 3  # steps within which a fit of whole runs is to make F far smaller, or spans grow
 _STEPS, _ROUGHLY = 8, 1.0  # tried on each of them, and their tolerance
 _FOLLOWED = 100.0  # times the squares that noise leaves, up to which a motion is followed, and a longer span can be next
-_SOME = 12  # steps between two estimates of correlation times
-_WHOLE, _WITH_MEMORY = "whole runs", "whole runs, after a turn of correlation times"  # what is minimised
-_OFF_BOUND = "whole runs, off a bound"
-_TURNS, _SETTLED = 20, 1e-3  # of correlation times and unknowns at most; change of the correlation of neighbouring samples that ends them
 
 
 def minimum(problem: Problem, theta: np.ndarray, limits: Limits, control: Control, one_will_do: bool) -> Minimum:
@@ -61,17 +57,17 @@ def minimum(problem: Problem, theta: np.ndarray, limits: Limits, control: Contro
     few = replace(control, most_steps=min(_STEPS, control.most_steps), patience=_PATIENCE, near=0.5 * _POOR * samples)
     rest = replace(control, most_steps=control.most_steps - few.most_steps)
     in_parts = samples > 0 and not (one_will_do and len(theta) > 1)
-    found = problem.minimum(theta, np.arange(len(theta)), limits, few if in_parts else control, _WHOLE)
-    unfinished = ~found.converged & ~found.stuck & in_parts & (rest.most_steps > 0)
 
     def of(members: np.ndarray, begin: np.ndarray, how: Control, span: Span | None = None) -> Minimum:
-        return problem.minimum(begin, members, limits, how, _WHOLE, span)
+        return problem.minimum(begin, members, limits, how, "whole runs", span)
 
     def far() -> np.ndarray:
         return found.at.cost > 0.5 * _POOR * samples
 
+    found = of(np.arange(len(theta)), theta, few if in_parts else control)
+    unfinished = ~found.converged & ~found.stuck & in_parts & (rest.most_steps > 0)
     if (near := np.flatnonzero(unfinished & ~far())).size:
-        found, unfinished[near] = found.replaced(near, of(near, found.theta[near], rest)), False
+        found, unfinished[near] = found.continued(near, of(near, found.theta[near], rest)), False
     poor = np.flatnonzero(~found.converged | far())
     if not poor.size or not samples or (one_will_do and np.argmin(found.at.cost) not in poor):
         return found
@@ -92,7 +88,7 @@ def minimum(problem: Problem, theta: np.ndarray, limits: Limits, control: Contro
     found = found.lowered(poor, replace(grown, steps=steps, trace=trace, grown=np.ones(len(poor), bool)))
     if (late := np.flatnonzero(unfinished & (~found.converged | far()))).size:
         more = of(late, ended[late], rest)
-        found = found.lowered(late, replace(more, steps=found.steps[late] + more.steps, trace=found.trace[late] + more.trace))
+        found = found.lowered(late, replace(more.after(found, late), grown=more.grown))
     return found
 
 
@@ -101,14 +97,14 @@ def with_memory(problem: Problem, found: Minimum, limits: Limits, control: Contr
     if not problem.with_memory:
         return found
     going = np.flatnonzero(np.isfinite(found.at.cost))
-    some = replace(control, most_steps=min(_SOME, control.most_steps))
-    for _ in range(_TURNS):
+    some = replace(control, most_steps=min(12, control.most_steps))
+    for _ in range(20):
         if not going.size:
             break
         changed = problem.restrict(found.theta[going], going)
-        again = problem.minimum(found.theta[going], going, limits, some, _WITH_MEMORY)
-        found = found.replaced(going, again)
-        going = going[(changed > _SETTLED) | ~again.converged]
+        again = problem.minimum(found.theta[going], going, limits, some, "whole runs, after a turn of correlation times")
+        found = found.continued(going, again)
+        going = going[(changed > 1e-3) | ~again.converged]
     found.converged[going] = False
     return found
 
@@ -117,21 +113,18 @@ def off_bounds(
     problem: Problem, found: Minimum, limits: Limits, control: Control, pieces: Piecewise | None, errors: str = "sigmas"
 ) -> tuple[Minimum, AtBounds]:
     """The minimum, gone on from where unknowns at a bound let it be lower away from it; and what is known of those that stay. `errors`: as of `fit`."""
-    for _ in range(_TURNS):
+    for _ in range(20):
         with nullcontext() if pieces is None else pieces.unmoved():
             around = Around(problem.linearised, found, limits, control)
             told = limits_at_bounds(around, if_free(problem, found, around.at_bound, limits, control, errors))
         if not told.lower:
             break
         members = np.array(list(told.lower))
-        again = problem.minimum(np.stack([theta for _, theta in told.lower.values()]), members, limits, control, _OFF_BOUND)
-        again = replace(again, steps=found.steps[members] + again.steps, trace=found.trace[members] + again.trace, grown=found.grown[members])
-        found = with_memory(problem, found.lowered(members, again), limits, control)
+        again = problem.minimum(np.stack([theta for _, theta in told.lower.values()]), members, limits, control, "whole runs, off a bound")
+        found = with_memory(problem, found.lowered(members, again.after(found, members)), limits, control)
     return found, told
 
 
-_SAME = 0.05  # of half the sum of squares, by which the same minimum is found lower from elsewhere
-_FEWEST_RUNS = 5  # that tell how much runs differ
 
 
 @shown_from_users_lines
@@ -252,7 +245,7 @@ def _fit(asked: Asked, data: Experiment | Sequence[Experiment], repeats: bool = 
         found = shot(problem, pieces, theta, limits, control)
     if not all(np.isfinite(trace[0][1][0]) for trace in found.trace):
         check_first_guess(scene, runs, unknowns)
-    same = np.zeros(members, int) if members else np.asarray(found.agreeing(_SAME))
+    same = np.zeros(members, int) if members else np.asarray(found.agreeing(0.05))
     if pieces is not None:
         pieces.keep(int(np.argmin(found.at.cost)))
         control = replace(control, cutoff=cutoff_of(pieces, control, np.arange(len(pieces.at.theta))))
@@ -288,9 +281,9 @@ def _checked_choices(loss, errors, shooting) -> Loss:
 
 
 def _check_noise(runs: Sequence[Experiment], asked: Asked) -> None:
-    if asked.errors == "runs" and len(runs) < _FEWEST_RUNS:
+    if asked.errors == "runs" and len(runs) < 5:
         raise ValueError(
-            f'errors="runs" takes standard errors from how runs differ, but there are {len(runs)}; give {_FEWEST_RUNS} or more, or errors="sigmas"'
+            f'errors="runs" takes standard errors from how runs differ, but there are {len(runs)}; give 5 or more, or errors="sigmas"'
         )
     robust, unknown = asked.loss != LEAST_SQUARES, in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma)
     if unknown and robust:

@@ -118,7 +118,7 @@ def information(arrow: Arrow, size: Float[np.ndarray, "members places"], estimat
     `size`: magnitude of each unknown, in its unit; `estimated`: places of unknowns; `bound`: (members, places), which lie at a bound, and are held there;
     `fails`: (members,), of which nothing is known; `cutoff`: singular values below this fraction of the largest count as zero.
     """
-    found = [_information(arrow.at([b]), size[b], estimated, bound[b], not fails[b], cutoff) for b in range(len(size))]
+    found = [_information(arrow.of([b]), size[b], estimated, bound[b], not fails[b], cutoff) for b in range(len(size))]
     stacked = {name: np.stack([getattr(one, name) for one in found]) for name in _ARRAYS if name != "hidden"}
     return Information(**stacked, hidden=tuple(one.hidden[0] for one in found), estimated=tuple(estimated.tolist()))
 

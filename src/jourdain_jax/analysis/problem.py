@@ -12,68 +12,55 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jourdain_jax.analysis.arrow import Arrow, arrow, triangle, with_prior
+from jourdain_jax.analysis.arrow import Arrow, ByMember, arrow, triangle, with_prior
 from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits, half_log_determinant, lowest
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Linearised, Minimum, minimise
 from jourdain_jax.analysis.losses import Loss
-from jourdain_jax.analysis.runs import Lanes, Some
+from jourdain_jax.analysis.runs import Lanes, Some, Taus
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.scene.scene import Scene
 
-_LEAST_SIGMA = 1e-10  # of the largest value of a channel: one that is met exactly
-_NODES = np.linspace(-3.2, 3.2, 9)  # of arcsin rho, in its standard deviations: 1 / sqrt(samples) without unknowns
-
 
 @dataclass(frozen=True)
-class Span:
+class Span(ByMember):
     """The first part of all runs. The first guess is a weak prior, known to its own size: what so few samples do not tell stays there."""
 
     shares: Float[np.ndarray, "members"]  # of the span of each run, from its start: samples beyond do not count
     begun: Float[np.ndarray, "members places"]  # first guesses
 
-    def at(self, members: np.ndarray) -> "Span":
-        """Return the numbers of some members."""
-        return Span(self.shares[members], self.begun[members])
-
 
 class Problem:
-    """Residuals with their derivatives, of any members at any numbers. `evaluate`: as `Lanes.evaluate`, where runs are computed in pieces."""
+    """Residuals with their derivatives, of any members at any numbers."""
 
-    def __init__(
-        self, scene: Scene, runs: tuple[Experiment, ...], unknowns: Unknowns, lanes: Lanes, loss: Loss, evaluate: Callable[..., Iterator[Some]] | None = None
-    ):
-        self.scene, self.runs, self.unknowns, self.lanes, self.loss = scene, runs, unknowns, lanes, loss
-        self.evaluate = lanes.evaluate if evaluate is None else evaluate
-        self.single = lanes.members is None
+    def __init__(self, scene: Scene, runs: tuple[Experiment, ...], unknowns: Unknowns, lanes: Lanes, loss: Loss):
+        self.scene, self.runs, self.unknowns, self.lanes, self.loss, self.single = scene, runs, unknowns, lanes, loss, lanes.single
         self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))  # channels whose sigma is
         largest = [max(float(np.nanmax(np.abs(run.values[name]))) for run in runs if name in run.values) for name in self.estimated]
-        self.least_sigma = _LEAST_SIGMA * np.array([x or 1.0 for x in largest])  # sigma of each of these
+        self.least_sigma = 1e-10 * np.array([x or 1.0 for x in largest])  # sigma of each of these: of one that is met exactly
         self.with_memory = tuple(sorted({name for run in runs for name in run.unknown_correlation}))  # channels whose correlation time is estimated
-        self.tau = np.zeros((lanes.members or 1, len(self.with_memory)))  # s, of these: at first as if their noise were white
-        self._counted = lanes.counted(self.estimated, np.arange(lanes.members or 1))  # samples of channels whose sigma is estimated, of each member
+        self.tau = np.zeros((lanes.count, len(self.with_memory)))  # s, of these: at first as if their noise were white
+
+    def taus(self, members: np.ndarray) -> dict[str, np.ndarray]:
+        """Correlation times of some members, by channel, s."""
+        return dict(zip(self.with_memory, self.tau[self._own(members)].T, strict=True)) if self.with_memory else {}
 
     def _own(self, members: np.ndarray) -> np.ndarray:
         """Where numbers of these members are in what is kept by member: in the first place, if the runs have no repeats."""
         return 0 * members if self.single else members
 
-    def taus(self, members: np.ndarray) -> dict[str, np.ndarray]:
-        """Correlation times of some members, by channel, s."""
-        if not self.with_memory:
-            return {}
-        found = self.tau[self._own(members)]
-        return dict(zip(self.with_memory, found.T, strict=True))
-
     def linearised(self, theta: np.ndarray, members: np.ndarray, span: Span | None = None) -> Linearised:
         """Return what is minimised, with its arrow, of some members, over all of the runs or a span of them."""
-        evaluated = self.evaluate(*self.unknowns.split(theta), members)
-        return self._assembled(theta, members, evaluated, self.taus(members), span)
+        return self.assembled(theta, members, self.evaluated(theta, members), self.taus(members), span)
+
+    def evaluated(self, theta: np.ndarray, members: np.ndarray) -> Iterator[Some]:
+        return self.lanes.evaluate(*self.unknowns.split(theta), members)
 
     def minimum(self, theta: np.ndarray, members: np.ndarray, limits: Limits, control: Control, what: str, span: Span | None = None) -> Minimum:
         """Return the minimum of some members, from theta."""
-        return minimise(lambda x, here: self.linearised(x, members[here], span and span.at(here)), theta, limits, control, what)
+        return minimise(lambda x, here: self.linearised(x, members[here], span and span.of(here)), theta, limits, control, what)
 
-    def _assembled(self, theta: np.ndarray, members: np.ndarray, evaluated: Iterable, taus: dict[str, np.ndarray], span: Span | None = None) -> Linearised:
+    def assembled(self, theta: np.ndarray, members: np.ndarray, evaluated: Iterable[Some], taus: Taus, span: Span | None = None) -> Linearised:
         """What is minimised, from what was evaluated; `taus`: correlation times by channel."""
         (p, m), count, runs, kinds = self.unknowns.layout.sizes, len(theta), self.unknowns.runs, 1 + len(self.estimated)
         triangles = np.zeros((count, runs, kinds, m + p + 1, m + p + 1))
@@ -104,7 +91,7 @@ class Problem:
                 failed = ~np.isfinite(triangles.sum(axis=(1, 2, 3, 4)) + cost)
                 triangles[failed], cost[failed] = 0.0, np.inf
         if kinds > 1:
-            samples = self._counted[self._own(members)]
+            samples = self.lanes.counted(self.estimated, members)
             sigma = np.sqrt(np.maximum(squares[:, 1:] / np.maximum(samples, 1), self.least_sigma**2))
             cost = cost + np.sum(samples * np.log(sigma), axis=1)
         whole, of_priors = self.joined(theta, triangles, np.concatenate([np.ones((count, 1)), sigma], axis=1), span)
@@ -144,8 +131,8 @@ class Problem:
 
     def restrict(self, theta: np.ndarray, members: np.ndarray) -> np.ndarray:
         """Puts correlation times that are not known to where the restricted likelihood is largest; by how much rho over one shortest interval changed."""
-        evaluated = list(self.evaluate(*self.unknowns.split(theta), members))
-        ends = {name: correlation_limits([np.asarray(run.ts) for run in self.runs if name in run.values]) for name in self.with_memory}
+        evaluated = list(self.evaluated(theta, members))
+        ends = {name: self._limits(name) for name in self.with_memory}
         taus, changed = {name: np.maximum(tau, ends[name][0]) for name, tau in self.taus(members).items()}, np.zeros(len(members))
         for name, (low, high) in ends.items():
             edges = (np.full(len(members), np.log(x)) for x in (low, high))
@@ -156,9 +143,12 @@ class Problem:
         self.tau[self._own(members)] = np.stack(list(taus.values()), axis=1)
         return changed
 
-    def _restricted(self, theta, members: np.ndarray, evaluated: list, taus: dict[str, np.ndarray]) -> tuple[np.ndarray, Linearised]:
+    def _limits(self, name: str) -> tuple[float, float]:
+        return correlation_limits([np.asarray(run.ts) for run in self.runs if name in run.values])
+
+    def _restricted(self, theta, members: np.ndarray, evaluated: list, taus: Taus) -> tuple[np.ndarray, Linearised]:
         """What the restricted likelihood is made of, to be as low as possible."""
-        at, logs = self._assembled(theta, members, evaluated, taus), np.zeros(len(members))
+        at, logs = self.assembled(theta, members, evaluated, taus), np.zeros(len(members))
         for b, j, _ in evaluated:
             np.add.at(logs, b, self.lanes.group_of(int(j[0])).log_widths(j, members[b], {n: tau[b] for n, tau in taus.items()}))
         return at.cost + logs + half_log_determinant(at.arrow, self.unknowns.sizes(theta)), at
@@ -172,12 +162,13 @@ class Problem:
         members, more, spread = np.arange(len(theta)), np.zeros((1, 1)), np.zeros((1, 1))
         if not self.with_memory:
             return more, spread
-        evaluated, taus = list(self.evaluate(*self.unknowns.split(theta), members)), self.taus(members)
+        evaluated, taus = list(self.evaluated(theta, members)), self.taus(members)
         for name in self.with_memory:
-            low, high = correlation_limits([np.asarray(run.ts) for run in self.runs if name in run.values])
+            low, high = self._limits(name)
             interval, counted = low / SHORTEST, self.lanes.counted([name], members)[:, 0]
             angle = lambda tau, h=interval: np.arcsin(np.exp(-h / tau))  # noqa: E731
-            nodes = angle(taus[name])[:, None] + _NODES / np.sqrt(counted)[:, None]
+            # in standard deviations of arcsin rho: 1 / sqrt(samples) without unknowns
+            nodes = angle(taus[name])[:, None] + np.linspace(-3.2, 3.2, 9) / np.sqrt(counted)[:, None]
             inside = (nodes >= angle(low)) & (nodes <= angle(high))
             found = []
             for node in np.clip(nodes, angle(low), angle(high)).T:
@@ -187,7 +178,7 @@ class Problem:
             weight = np.where(inside, np.exp(np.min(values, axis=1, keepdims=True) - values), 0.0)
             weight = (weight / weight.sum(axis=1, keepdims=True))[..., None]
             mean = lambda x, weight=weight: np.sum(weight * x, axis=1)  # noqa: E731
-            middle = errors[:, len(_NODES) // 2] ** 2
+            middle = errors[:, 4] ** 2
             with np.errstate(divide="ignore", invalid="ignore"):
                 logs = 2 * np.log(errors)
                 more = more + mean(errors**2) / middle - 1 + (mean(moved**2) - mean(moved) ** 2) / middle

@@ -44,8 +44,6 @@ from jourdain_jax.analysis.unknowns import unknowns_of
 from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.printing import Printed
 
-_SAME = 0.01  # sigmas: between residuals of one fit, computed twice
-
 
 @dataclass
 class TakenUp:
@@ -73,9 +71,8 @@ class TakenUp:
     def information(self) -> Information:
         """What the data tell at theta, from the sigmas alone: no factor for the loss, for sigmas that are estimated, or from how runs differ."""
         unknowns, theta = self.problem.unknowns, self.theta
-        bound = ((theta <= self.limits.low) | (theta >= self.limits.high)) & ~self.limits.fixed
         size, fails = unknowns.sizes(theta), ~np.isfinite(self.at.cost)
-        return information(self.at.arrow, size, unknowns.estimated, bound, fails, self.asked.control.cutoff).only()
+        return information(self.at.arrow, size, unknowns.estimated, self.limits.reached(theta), fails, self.asked.control.cutoff).only()
 
 
 def taken_up(fit: Estimates, data: Experiment | Sequence[Experiment]) -> TakenUp:
@@ -93,7 +90,7 @@ def taken_up(fit: Estimates, data: Experiment | Sequence[Experiment]) -> TakenUp
         return np.nan_to_num(again.residuals(run).get(name, np.nan)) * (sigma.get(name, 1.0) / fit.sigma.get(name, 1.0))
 
     pairs = [(np.nan_to_num(r), here(run, name)) for run, of in enumerate(fit.residuals) for name, r in of.items()]
-    if not all(a.shape == b.shape and np.max(np.abs(a - b), initial=0.0) < _SAME for a, b in pairs):
+    if not all(a.shape == b.shape and np.max(np.abs(a - b), initial=0.0) < 0.01 for a, b in pairs):
         raise ValueError("`data` are not those of the fit: its residuals are others there; give the runs that it was fitted to")
     return again
 
@@ -224,9 +221,9 @@ def informed(fitted: TakenUp, most: int) -> Informed:
     variance = variances(known.shared, known.own, known.follow)[places]
     found: list[dict[str, np.ndarray]] = [{}] * len(problem.runs)
     m, taus = unknowns.layout.sizes[1], problem.taus(np.array([0]))
-    for b, j, plain in problem.evaluate(*unknowns.split(fitted.theta), np.array([0])):
+    for b, j, plain in problem.evaluated(fitted.theta, np.array([0])):
         group = problem.lanes.group_of(int(j[0]))
-        white = group.whitened(j, b, plain, {name: np.broadcast_to(tau, len(j)) for name, tau in taus.items()})
+        white = group.whitened(j, b, plain, {name: tau[b] for name, tau in taus.items()})
         for run, r, J in zip(j.tolist(), white[..., -1], white[..., :-1], strict=True):
             rows = np.sqrt(problem.loss.weight(r))[:, None] * J
             for k, name in enumerate(problem.estimated):
@@ -242,12 +239,7 @@ def informed(fitted: TakenUp, most: int) -> Informed:
     return Informed(labels, tuple(found), tuple(np.asarray(run.ts) for run in problem.runs))
 
 
-_CLOSE = 0.01  # of the rise at the end of an interval
-_POINTS, _REFINED = 16, 8  # at most, on one side: outwards, and between the last two
-_JUMP = 3.0  # times the rise at the end of an interval: with more between two points, it may jump
 _STEP = 0.6  # of sqrt(rise), from point to point
-_FAR = 1e3  # sizes of the unknown, beyond which nothing is looked for
-_LOWER = 0.02  # of the rise, by which a lower minimum is found
 
 
 class Profile(Printed, eqx.Module):
@@ -304,8 +296,8 @@ class _Side:
         """The end of the interval on this side; infinite, or the bound, where there is none."""
         theta, origin, step = self._fitted.theta, float(self._fitted.theta[0, self._place]), self._first
         far, rise, slope = 0.0, 0.0, None
-        room = min(abs(self._bound - origin), _FAR * max(self._size, self._first))
-        for _ in range(_POINTS):
+        room = min(abs(self._bound - origin), 1e3 * max(self._size, self._first))
+        for _ in range(16):
             if far >= room:
                 break
             at = min(far + step, room)
@@ -318,7 +310,7 @@ class _Side:
                 self.note = f"the motion fails near {origin + self._way * at:.4g}"
                 continue
             self.points.append((origin + self._way * at, found))
-            if found < -_LOWER * RISE_95:
+            if found < -0.02 * RISE_95:
                 self.note = f"a lower minimum than that of the fit lies near {origin + self._way * at:.6g}: fit again from there"
             if found >= RISE_95:
                 self.is_closed, self.note = True, "" if "fails" in self.note else self.note
@@ -340,12 +332,12 @@ class _Side:
 
         `theta`: all unknowns at the inner point, from which the others follow; beyond the outer one they may have gone elsewhere.
         """
-        for _ in range(_REFINED):
+        for _ in range(8):
             low, end, high = np.sqrt(np.maximum([inner[1], RISE_95, outer[1]], 0.0))
-            middle = inner[0] + (outer[0] - inner[0]) * (0.5 if outer[1] > _JUMP * RISE_95 else float((end - low) / (high - low)))
+            middle = inner[0] + (outer[0] - inner[0]) * (0.5 if outer[1] > 3 * RISE_95 else float((end - low) / (high - low)))
             found, there = self._solved(theta, origin + self._way * middle)
             self.points.append((origin + self._way * middle, found))
-            if abs(found / RISE_95 - 1) < _CLOSE:
+            if abs(found / RISE_95 - 1) < 0.01:
                 return middle
             if found < RISE_95:
                 inner, theta = (middle, found), there

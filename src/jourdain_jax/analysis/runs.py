@@ -10,7 +10,8 @@ compiled once for runs of equal structure, whatever their number: memory does no
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -35,8 +36,6 @@ from jourdain_jax.motion.options import AllOptions, alongside
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.scene import Scene
-
-FILLED = 1e-6  # of a run's span: between the times that fill up a short one
 
 
 class Run(NamedTuple):
@@ -178,22 +177,20 @@ def filled_up(run: Run, times: int, knots: list[int], axis: int) -> Run:
     if not more:
         return run
     pad = lambda x: np.concatenate([x, np.zeros((*x.shape[:axis], more, *x.shape[axis + 1 :]))], axis=axis)  # noqa: E731
-    ts = np.concatenate([run.ts, run.ts[-1] + FILLED * (run.ts[-1] - run.t0) * np.arange(1, more + 1)])
+    ts = np.concatenate([run.ts, run.ts[-1] + 1e-6 * (run.ts[-1] - run.t0) * np.arange(1, more + 1)])
     return run._replace(ts=ts, values={n: pad(x) for n, x in run.values.items()}, weights={n: pad(x) for n, x in run.weights.items()})
 
 
-TOUCHED = 2**18  # bytes of saved states with their tangents in one loop: far below what XLA compiles into one function (see `jourdain_jax`)
-MOST_LANES = 64
-AHEAD = 4  # groups of lanes that are begun before the first is read
 Some = tuple[np.ndarray, np.ndarray, np.ndarray]  # members (among those asked for), runs, and [J r] (lanes, samples, unknowns + 1), own unknowns first
+Taus = Mapping[str, np.ndarray]  # correlation times that are estimated, s, of some members, by channel
 
 
 class Lanes:
-    """All lanes of a problem; `evaluate` gives their weighted residuals with derivatives."""
+    """All lanes of a problem; `evaluate` gives their weighted residuals with derivatives. `members`: repeats of the experiment; None: they have none."""
 
-    def __init__(self, scene: Scene, data: Sequence[Experiment], layout: Layout, options: AllOptions, members: int | None):
-        self.members = members
-        ready = lambda i: run_of(data[i], repeats=members is not None)  # noqa: E731
+    def __init__(self, scene: Scene, data: Sequence[Experiment], layout: Layout, options: AllOptions, members: int | None = None):
+        self.single, self.count = members is None, members or 1
+        ready = lambda i: run_of(data[i], repeats=not self.single)  # noqa: E731
         self.groups = [Group(scene, indices, list(map(ready, indices)), layout, options, members) for indices in grouped(data)]
         self._of_run = {run: group for group in self.groups for run in group.runs.tolist()}
 
@@ -208,36 +205,34 @@ class Lanes:
 
     def counted(self, names: Sequence[str], members: np.ndarray) -> Float[np.ndarray, "members names"]:
         """Samples of each of these channels that are not missing, in all runs."""
-        found = np.zeros((len(members), len(names)))
+        found = np.zeros((self.count, len(names)))
         for k, name in enumerate(names):
-            for group in self.groups:
-                weights = group.weights.get(name)
-                if weights is not None:
-                    here = np.count_nonzero(weights, axis=tuple(range(2, weights.ndim))) if self.members is not None else np.count_nonzero(weights)
-                    found[:, k] += here.sum(axis=0)[members] if self.members is not None else here
-        return found
+            for weights in (group.weights[name] for group in self.groups if name in group.weights):
+                found[:, k] += np.count_nonzero(weights, axis=(0, *range(2, weights.ndim)))
+        return found[0 * members if self.single else members]
 
 
 class Group:
-    """Runs of equal structure, padded to one length. A lane is a run, by its number in the problem, and a member."""
+    """Runs of equal structure, padded to one length. A lane is a run, by its number in the problem, and a member; runs without repeats have one for all."""
 
     def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, options: AllOptions, members: int | None):
-        self.runs, self._members, self._lengths = np.array(indices), members, [run.ts.shape[0] for run in runs]
-        times, knots, count = max(self._lengths), most_knots(runs), members or 1
+        self.runs, self._single, self._lengths = np.array(indices), members is None, [run.ts.shape[0] for run in runs]
+        times, knots = max(self._lengths), most_knots(runs)
         equal = runs if runs[0].grid is None or len(runs) == 1 else on_equal_grids(runs)
         filled = [filled_up(run, times, knots, 0 if members is None else 1) for run in equal]
         first = filled[0]
-        self.weights = {name: np.array([run.weights[name] for run in filled]) for name in first.weights}  # (runs, *members, times, *channel)
+        weights = {name: np.array([run.weights[name] for run in filled]) for name in first.weights}
+        self.weights = {name: x[:, None] if members is None else x for name, x in weights.items()}  # (runs, members, times, *channel)
         self._t0, self._ts = np.array([run.t0 for run in filled]), np.array([run.ts for run in filled])
         self.channels, end = {}, 0
-        for name, weight in sorted(first.weights.items()):
-            begin, end = end, end + math.prod(weight.shape[0 if members is None else 1 :])
+        for name, weight in sorted(self.weights.items()):
+            begin, end = end, end + math.prod(weight.shape[2:])
             self.channels[name] = slice(begin, end)
         taus = {name: np.stack([run.correlation_time[name] for run in filled]) for name in first.correlation_time}
-        self._chains = Chains.of(self.weights, self._ts, taus, self.channels, members is not None) if taus else None
+        self._chains = Chains.of(self.weights, self._ts, taus, self.channels) if taus else None
         # numbers of a run in one row, since each array that is handed over costs as much as some of the steps of a motion
         self._common = _row((scene, options), 1)[0]
-        self._rows = np.stack([_row(run, count, members is not None) for run in filled])
+        self._rows = np.stack([_row(run, members or 1, members is not None) for run in filled])
         if members is not None:
             first = first._replace(**{name: {n: x[0] for n, x in getattr(first, name).items()} for name in _BY_MEMBER})
         leaves, treedef = jax.tree.flatten(((scene, options), first))
@@ -245,8 +240,12 @@ class Group:
         self._run = _program(Reference.where_free(scene, layout.parameters), treedef, shapes, layout)
         saved = times if first.grid is None else first.grid.shape[0]
         states = saved * (len(scene.coordinate_names) + len(scene.speed_names)) * 8 * (1 + sum(layout.sizes))
-        self._width = int(min(MOST_LANES, max(1, TOUCHED // states)))
-        self._kept: dict[int, list] = {}
+        # bytes of saved states with their tangents in one loop: far below what XLA compiles into one function (see `jourdain_jax`)
+        self._width = int(min(64, max(1, 2**18 // states)))
+
+    def _own(self, members: np.ndarray) -> np.ndarray:
+        """Where the numbers of these members are."""
+        return 0 * members if self._single else members
 
     def places(self, runs: np.ndarray) -> np.ndarray:
         """Return the places of these runs in the group."""
@@ -254,27 +253,26 @@ class Group:
 
     def evaluate(self, shared, local, members) -> Iterator[Some]:
         """As of `Lanes`."""
-        if len(members) not in self._kept:
-            self._kept = {len(members): self._chunks(len(members))}
-        first, *chunks = self._kept[len(members)]
+        first, *chunks = self._chunks(len(members))
 
         def lanes(kept: int, b: np.ndarray, j: np.ndarray) -> Some:
-            rows = self._rows[j, members[b] if self._members is not None else 0]
+            rows = self._rows[j, self._own(members[b])]
             found = self._run(self._common, np.concatenate([rows, local[b, self.runs[j]], shared[b]], axis=1))
             return b[:kept], self.runs[j[:kept]], np.asarray(found)[:kept]
 
         yield lanes(*first)  # compiles, where that is needed
-        waiting: list[Future] = []
+        if not chunks:
+            return
+        pool, waiting = ThreadPoolExecutor(os.cpu_count() or 1), deque[Future]()
         try:
             for chunk in chunks:
-                waiting.append(_threads().submit(lanes, *chunk))
-                if len(waiting) == AHEAD:
-                    yield waiting.pop(0).result()
+                waiting.append(pool.submit(lanes, *chunk))
+                if len(waiting) == 4:  # are begun before the first is read
+                    yield waiting.popleft().result()
             while waiting:
-                yield waiting.pop(0).result()
+                yield waiting.popleft().result()
         finally:
-            for future in waiting:
-                future.cancel()
+            pool.shutdown(cancel_futures=True)
 
     def _chunks(self, members: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
         """How many lanes at a time, with positions of their members and runs; these are filled up with copies of the last."""
@@ -283,18 +281,18 @@ class Group:
         lanes = np.minimum(np.arange(-(-count // width) * width), count - 1).reshape(-1, width)
         return [(min(width, count - k * width), *np.divmod(some, len(self.runs))) for k, some in enumerate(lanes)]
 
-    def whitened(self, runs: np.ndarray, members: np.ndarray, rows: Float[np.ndarray, "lanes samples width"], taus: dict[str, np.ndarray]) -> np.ndarray:
+    def whitened(self, runs: np.ndarray, members: np.ndarray, rows: Float[np.ndarray, "lanes samples width"], taus: Taus) -> np.ndarray:
         """Rows of lanes, whitened; `taus`: correlation times (lanes,) that are estimated, s."""
         if self._chains is None:
             return rows
-        before, rho = self._chains.at(self.places(runs), None if self._members is None else members, taus)
+        before, rho = self._chains.at(self.places(runs), self._own(members), taus)
         return whitened(rows, np.take_along_axis(rows, before[..., None], axis=1), rho[..., None])
 
-    def log_widths(self, runs: np.ndarray, members: np.ndarray, taus: dict[str, np.ndarray]) -> Float[np.ndarray, "lanes"]:
+    def log_widths(self, runs: np.ndarray, members: np.ndarray, taus: Taus) -> Float[np.ndarray, "lanes"]:
         """`sum log sqrt(1 - rho^2)` of lanes."""
         if self._chains is None:
             return np.zeros(len(runs))
-        _, rho = self._chains.at(self.places(runs), None if self._members is None else members, taus)
+        _, rho = self._chains.at(self.places(runs), self._own(members), taus)
         return 0.5 * np.sum(np.log1p(-(rho**2)), axis=1)
 
     def within(self, runs: np.ndarray, share: Float[np.ndarray, "lanes"]) -> Bool[np.ndarray, "lanes samples"]:
@@ -309,9 +307,10 @@ class Group:
         place, found = int(np.searchsorted(self.runs, run)), {}
         for name, where in self.channels.items():
             weight = self.weights[name][place]
-            shape = weight.shape if self._members is None else weight.shape[1:]
-            part = flat[..., where].reshape((*flat.shape[:-1], *shape)) if flat.shape[-1] else np.full((*flat.shape[:-1], *shape), np.nan)
-            found[name] = np.where(weight > 0, part, np.nan)[(slice(None),) * (flat.ndim - 1) + (slice(self._lengths[place]),)]
+            shape = (*flat.shape[:-1], *weight.shape[1:])
+            part = flat[..., where].reshape(shape) if flat.shape[-1] else np.full(shape, np.nan)
+            kept = (..., slice(self._lengths[place]), *(slice(None),) * (weight.ndim - 2))
+            found[name] = np.where((weight[0] if self._single else weight) > 0, part, np.nan)[kept]
         return found
 
 
@@ -327,11 +326,6 @@ def _row(tree, count: int, by_member: bool = False) -> Float[np.ndarray, "member
         begin, end = end, end + part.shape[1]
         found[:, begin:end] = part
     return found
-
-
-@lru_cache(maxsize=1)
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="jourdain_fit")
 
 
 @lru_cache(maxsize=16)

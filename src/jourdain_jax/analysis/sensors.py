@@ -144,35 +144,22 @@ def held(ts: Float[Array, "knots"], values: Float[Array, "knots"]) -> tuple[Floa
     return jnp.concatenate([ts[:1], late]), jnp.concatenate([values[:1], jnp.stack([values[:-1], values[1:]], axis=1).reshape(-1)])
 
 
-def filtered_held(ts: Float[Array, "knots"], values: Float[Array, "knots"], lag) -> Float[Array, "knots"]:
-    """What the filter gives at the knots of such a command: y_k+1 = x_k + (y_k - x_k) exp(-h / lag)."""
-    steps = jnp.diff(ts)
-    decay = jnp.exp(-steps / jnp.maximum(lag, _LEAST * steps))
+def filtered(ts: Float[Array, "knots"], values: Float[Array, "knots"], lag, hold: bool = False) -> Float[Array, "knots"]:
+    """What the filter gives at the knots of a command that is linear in between, or is held until the next knot: exactly there.
 
-    def next_one(y, here):
-        x, d = here
-        y = x + (y - x) * d
-        return y, y
-
-    _, found = jax.lax.scan(next_one, values[0], (values[:-1], decay))
-    return jnp.concatenate([values[:1], found])
-
-
-def filtered(ts: Float[Array, "knots"], values: Float[Array, "knots"], lag) -> Float[Array, "knots"]:
-    """What the same filter gives at the knots of samples that are linear in between: exactly there.
-
-    y_k+1 = x_k+1 - lag m + (y_k - x_k + lag m) exp(-h / lag),     m = (x_k+1 - x_k) / h
+    y_k+1 = x_k+1 - lag m + (y_k - x_k + lag m) exp(-h / lag),     m = (x_k+1 - x_k) / h;      held: y_k+1 = x_k + (y_k - x_k) exp(-h / lag)
     """
     steps = jnp.diff(ts)
     decay = jnp.exp(-steps / jnp.maximum(lag, _LEAST * steps))
-    behind = lag * jnp.diff(values) / steps  # of the filter's output on a slope that lasts
+    behind = 0 * steps if hold else lag * jnp.diff(values) / steps  # of the filter's output on a slope that lasts
+    ends = values[:-1] if hold else values[1:]
 
     def next_one(y, here):
-        x, following, b, d = here
-        y = following - b + (y - x + b) * d
+        x, end, b, d = here
+        y = end - b + (y - x + b) * d
         return y, y
 
-    _, found = jax.lax.scan(next_one, values[0], (values[:-1], values[1:], behind, decay))
+    _, found = jax.lax.scan(next_one, values[0], (values[:-1], ends, behind, decay))
     return jnp.concatenate([values[:1], found])
 
 
@@ -251,21 +238,19 @@ class Actuator(eqx.Module):
 
 
 def _checked(owner: str, **numbers) -> list:
-    found = []
-    for name, value in numbers.items():
-        where = f"`{name}` of `{owner}`"
-        if not isinstance(value, Estimate):
-            value = checked_real(value, where, () if name in OF_TIME or owner == "Actuator" else None, advice="give a number, or an `Estimate`").astype(
-                jnp.result_type(float)
-            )
-            if not is_traced(value) and not np.all(np.isfinite(value)):
-                raise ValueError(f"{where} is {value}, expected a finite number")
-            if name in OF_TIME and not is_traced(value) and value < 0:
-                raise ValueError(f"{where} is {float(value):g} s, expected zero or more; where the clock of a channel is ahead, shift its times")
-        else:
-            _check_estimate(where, name, value)
-        found.append(value)
-    return found
+    return [_checked_number(f"`{name}` of `{owner}`", name, value, owner == "Actuator") for name, value in numbers.items()]
+
+
+def _checked_number(where: str, name: str, value, is_one: bool) -> "Float[Array, '...'] | Estimate":
+    if isinstance(value, Estimate):
+        _check_estimate(where, name, value)
+        return value
+    number = checked_real(value, where, () if name in OF_TIME or is_one else None, advice="give a number, or an `Estimate`").astype(jnp.result_type(float))
+    if not is_traced(number) and not np.all(np.isfinite(number)):
+        raise ValueError(f"{where} is {number}, expected a finite number")
+    if name in OF_TIME and not is_traced(number) and number < 0:
+        raise ValueError(f"{where} is {float(number):g} s, expected zero or more; where the clock of a channel is ahead, shift its times")
+    return number
 
 
 def _check_estimate(where: str, name: str, value: Estimate) -> None:
@@ -286,11 +271,9 @@ def default_range(name: str):
     return positive() if name == "lag" else unbounded()
 
 
-class Reading(eqx.Module):
-    """A sensor of one run made ready: its quantity looked up, numbers in place of what is to be estimated."""
+class Response(eqx.Module):
+    """The numbers of a sensor or actuator of one run, first guesses where they are to be estimated."""
 
-    operation: Channel | Instrument | StopEvent | None  # None: a coordinate or speed by name
-    name: str = eqx.field(static=True)  # of that
     numbers: dict[str, Float[Array | np.ndarray, "..."] | float]
     unknown: tuple[str, ...] = eqx.field(static=True)  # names of numbers that are estimated
     used: tuple[str, ...] = eqx.field(static=True)  # names of numbers that are not those of an ideal sensor
@@ -300,72 +283,72 @@ class Reading(eqx.Module):
         """Whether it shows something else than what is now."""
         return any(name in self.used for name in OF_TIME)
 
+    @property
+    def has_filter(self) -> bool:
+        """Whether it has a low-pass."""
+        return "lag" in self.used
+
+    def scaled(self, x):
+        """Apply gain and bias."""
+        x = self.numbers["gain"] * x if "gain" in self.used else x
+        return x + self.numbers["bias"] if "bias" in self.used else x
+
+
+class Reading(Response):
+    """A sensor of one run made ready: its quantity looked up."""
+
+    operation: Channel | Instrument | StopEvent | None  # None: a coordinate or speed by name
+    name: str = eqx.field(static=True)  # of that
+
     def quantity(self, motion: Trajectory, states: Motion | None) -> Float[Array, "times *channel"]:
         """What it measures, along a motion; `states`: the same as bodies, where a channel is a function of them."""
         if self.operation is None:
             return motion[self.name]
         return self.operation.over_times(motion) if isinstance(self.operation, Instrument) else jax.vmap(self.operation)(states)
 
-    @property
-    def has_filter(self) -> bool:
-        """Whether it has a low-pass."""
-        return "lag" in self.used
-
     def shown(self, x, grid, ts, begin=None) -> tuple[Float[Array, "times *channel"], Float[Array | np.ndarray, "grid entries"] | None]:
         """What it shows at `ts` of a quantity with values `x` at these times, or on a grid; and y on the grid, from what it is at first (None: at rest)."""
         y = None
         if grid is not None:
             x, y = read(x, grid, ts, self.numbers["delay"], self.numbers["lag"] if self.has_filter else None, begin)
-        x = self.numbers["gain"] * x if "gain" in self.used else x
-        return x + self.numbers["bias"] if "bias" in self.used else x, y
+        return self.scaled(x), y
 
 
 def ideal(name: str, event: StopEvent | None = None) -> Reading:
     """An ideal sensor of a coordinate or speed; or what shows the time of an event."""
-    return Reading(event, name, dict(NUMBERS), (), ())
+    return Reading(dict(NUMBERS), (), (), event, name)
 
 
-class Drive(eqx.Module):
-    """An actuator of one run made ready; see `Reading`."""
+class Drive(Response):
+    """An actuator of one run made ready."""
 
     command: Sampled
     index: int = eqx.field(static=True)  # of its input
-    numbers: dict[str, Float[Array | np.ndarray, ""]]
-    unknown: tuple[str, ...] = eqx.field(static=True)
-    used: tuple[str, ...] = eqx.field(static=True)
     hold: bool = eqx.field(static=True)
 
     def signal(self) -> Sampled:
         """What the scene is given."""
         ts, values = jnp.asarray(self.command.ts), jnp.asarray(self.command.values)
-        if "lag" in self.used:
-            values = (filtered_held if self.hold else filtered)(ts, values, self.numbers["lag"])
+        if self.has_filter:
+            values = filtered(ts, values, self.numbers["lag"], self.hold)
         elif self.hold and ts.shape[0] > 1:
             ts, values = held(ts, values)
-        values = self.numbers["gain"] * values if "gain" in self.used else values
-        values = values + self.numbers["bias"] if "bias" in self.used else values
-        return eqx.tree_at(lambda s: (s.ts, s.values), self.command, (ts + self.numbers["delay"], values))
+        return eqx.tree_at(lambda s: (s.ts, s.values), self.command, (ts + self.numbers["delay"], self.scaled(values)))
 
 
-def numbers_of(owner: Sensor | Actuator) -> tuple[dict, tuple[str, ...], tuple[str, ...]]:
+def response(owner: Sensor | Actuator) -> tuple[dict, tuple[str, ...], tuple[str, ...]]:
     """Its numbers (first guesses where they are estimated), names of those that are, and names of all that matter."""
     given = {name: getattr(owner, name) for name in NUMBERS}
     unknown = tuple(name for name, value in given.items() if isinstance(value, Estimate))
-    numbers = {}
-    for name, value in given.items():
-        number = value.guess if isinstance(value, Estimate) else value
-        numbers[name] = (jnp if is_traced(number) else np).asarray(number, jnp.result_type(float))
-    used = tuple(n for n, x in numbers.items() if n in unknown or is_traced(x) or not np.all(x == NUMBERS[n]))
-    return numbers, unknown, used
+    numbers = {name: value.guess if name in unknown else value for name, value in given.items()}
+    numbers = {name: (jnp if is_traced(x) else np).asarray(x, jnp.result_type(float)) for name, x in numbers.items()}
+    return numbers, unknown, tuple(n for n, x in numbers.items() if n in unknown or is_traced(x) or not np.all(x == NUMBERS[n]))
 
 
 def with_numbers(parts: Mapping[str, "Reading | Drive"], known: Mapping[str, Array | np.ndarray]) -> dict:
     """Readings or drives with these numbers (`gyro.gain` -> number) in place of those that are estimated."""
-    changed = {}
-    for label, part in parts.items():
-        numbers = part.numbers | {name: known[f"{label}.{name}"] for name in part.unknown}
-        changed[label] = eqx.tree_at(lambda p: p.numbers, part, numbers) if part.unknown else part
-    return changed
+    numbers = {label: part.numbers | {name: known[f"{label}.{name}"] for name in part.unknown} for label, part in parts.items()}
+    return {label: eqx.tree_at(lambda p: p.numbers, part, numbers[label]) if part.unknown else part for label, part in parts.items()}
 
 
 def latest(delay: Array | Estimate) -> float:

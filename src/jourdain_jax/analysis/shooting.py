@@ -53,9 +53,6 @@ def ended(motion: Trajectory, filters: Sequence[Float[Array, "times entries"]], 
     return {END: jnp.concatenate([x[last] for x in (motion.q, motion.u, *filters)])}
 
 
-_ROUND_OFF = 1e-9  # of a run's span
-
-
 @dataclass(frozen=True)
 class MultipleShooting:
     """Fit each run in pieces with starts of their own, which end where the next one begins.
@@ -115,7 +112,7 @@ def owned(run: Experiment, ends: Int[np.ndarray, "ends"]) -> dict[str, Int[np.nd
     ts, found = np.asarray(run.ts, float), {}
     for name in run.values:
         late = latest(run.sensors[name].delay) if name in run.sensors else 0.0
-        inner = np.searchsorted(ts, ts[ends[1:-1]] + late - _ROUND_OFF * (ts[-1] - ts[0]))
+        inner = np.searchsorted(ts, ts[ends[1:-1]] + late - 1e-9 * (ts[-1] - ts[0]))
         found[name] = np.concatenate([[0], inner, [len(ts)]])
     return found
 
@@ -133,36 +130,35 @@ def in_pieces(run: Experiment, ends: Int[np.ndarray, "ends"], states: int) -> li
             part = np.asarray(x[here], float)
             values[name] = np.where(counts.reshape(-1, *[1] * (part.ndim - 1)), part, np.nan)
         begins = first == ends[0]
-        piece = object.__new__(type(run))
         t0 = run.t0 if begins else np.asarray(run.ts[first])
-        own = {
-            "ts": run.ts[here],
-            "t0": t0,
-            "values": values,
-            "sigma": {name: x if x.ndim == 0 else x[here] for name, x in run.sigma.items()},
-            "start": (run.start if begins else {NODE: np.zeros(states)}) | {LAST: np.asarray(run.ts[end])},
-            "unknown_start": run.unknown_start if begins else {},
-            "inputs": _cut(run, float(t0), float(run.ts[last] + (run.ts[last] - t0) / FEWEST_INTERVALS)),  # a grid may end an interval later
-        }
-        vars(piece).update(vars(run) | own)
+        piece = run.changed(
+            ts=run.ts[here],
+            t0=t0,
+            values=values,
+            sigma={name: x if x.ndim == 0 else x[here] for name, x in run.sigma.items()},
+            start=(run.start if begins else {NODE: np.zeros(states)}) | {LAST: np.asarray(run.ts[end])},
+            unknown_start=run.unknown_start if begins else {},
+            inputs=_cut(run, float(t0), float(run.ts[last] + (run.ts[last] - t0) / FEWEST_INTERVALS)),  # a grid may end an interval later
+        )
         found.append(piece)
     return found
 
 
-def _cut(run: Experiment, t0: float, t1: float) -> "dict | Inputs | None":
+def _cut(run: Experiment, t0: float, t1: float) -> dict | Inputs | None:
     """The inputs with the knots about this span only; those of actuators stay whole, since their numbers may move them."""
     if not isinstance(run.inputs, Inputs):
         return run.inputs
     driven = {drive.index for drive in run.drives.values()}
-    channels = [x if k in driven or not isinstance(x, Sampled) else _between(x, t0, t1) for k, x in enumerate(run.inputs.channels)]
-    return Inputs(tuple(channels))
 
+    def between(index: int, signal):
+        if index in driven or not isinstance(signal, Sampled):
+            return signal
+        ts = np.asarray(signal.ts)
+        first = max(int(np.searchsorted(ts, t0, "right")) - 1, 0)
+        some = slice(first, max(min(int(np.searchsorted(ts, t1)), len(ts) - 1), first) + 1)
+        return Sampled(ts[some], np.asarray(signal.values)[some])
 
-def _between(sampled: Sampled, t0: float, t1: float) -> Sampled:
-    ts = np.asarray(sampled.ts)
-    first, last = max(int(np.searchsorted(ts, t0, "right")) - 1, 0), min(int(np.searchsorted(ts, t1)), len(ts) - 1)
-    last = max(last, first)
-    return Sampled(ts[first : last + 1], np.asarray(sampled.values)[first : last + 1])
+    return Inputs(tuple(between(k, x) for k, x in enumerate(run.inputs.channels)))
 
 
 def check_shooting(shooting) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jourdain_jax.analysis.experiment import Experiment
-from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum, column_scaling, damped_step, minimise
+from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Linearised, Minimum, Way, column_scaling, damped_step, minimise
 from jourdain_jax.analysis.piecewise import Piecewise
 from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.analysis.sensors import ideal
@@ -33,8 +33,6 @@ from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.scene import Scene
-
-_SAMPLES = 5  # that a parabola goes through
 
 
 def first_nodes(
@@ -105,21 +103,11 @@ def _entries(names: Names, name: str) -> np.ndarray:
 def _parabola(ts: Float[np.ndarray, "times"], x: Float[np.ndarray, "times"], t: float) -> tuple[float, float]:
     """Value and slope at a time of the parabola through the nearest samples; NaN where there are fewer than three."""
     there = np.flatnonzero(np.isfinite(x))
-    near = there[np.argsort(np.abs(ts[there] - t), kind="stable")[:_SAMPLES]]
+    near = there[np.argsort(np.abs(ts[there] - t), kind="stable")[:5]]
     if len(near) < 3:
         return np.nan, np.nan
     _, slope, value = np.polyfit(ts[near] - t, x[near], 2)
     return float(value), float(slope)
-
-
-WIDTHS = (0.1, 0.01)  # of gaps, in sizes of the states
-_TINY = 1e-4  # size of a coordinate or speed that hardly is, of the largest one
-LEAST_CUTOFF = 1e-14  # round-off of singular values, relative to the largest
-_UNDAMPED = 1e-24  # damping that only keeps what is held from being singular
-_ROUGHLY, _STEPS = 1.0, 15  # tolerance with gaps, and steps tried at most with each width
-_FAR = 2.0  # sigmas by which a step may change residuals, rms
-_SHORTEST = 1e-3  # share of a step
-_SMALL = 0.01  # size of a state that hardly changes, of its largest magnitude
 
 
 def shot(problem: Problem, lanes: Piecewise, theta: Float[np.ndarray, "members places"], limits: Limits, control: Control) -> Minimum:
@@ -127,17 +115,15 @@ def shot(problem: Problem, lanes: Piecewise, theta: Float[np.ndarray, "members p
     pieces, begin = _begun(problem, lanes, theta)
     unknowns = pieces.unknowns
     wide = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
-    steps, traces = np.zeros(len(theta), int), [()] * len(theta)
-    roughly = replace(control, tolerance=_ROUGHLY, most_steps=min(_STEPS, control.most_steps))
-    for width in WIDTHS:
-        what = f"pieces with gaps of {width:g}"
-        found = minimise(lambda x, members, w=width: lanes.joined(pieces, x, members, w), begin, wide, roughly, what)
-        begin, steps = found.theta, steps + found.steps
-        traces = [before + own for before, own in zip(traces, found.trace, strict=True)]
-    closed = _closed(problem, lanes, lanes.put(begin), limits, control)
-    trace = np.empty(len(theta), object)
-    trace[:] = [before + own for before, own in zip(traces, closed.trace, strict=True)]
-    return replace(closed, steps=closed.steps + steps, trace=trace)
+    roughly, every = replace(control, tolerance=1.0, most_steps=min(15, control.most_steps)), np.arange(len(theta))
+
+    def with_gaps(begin: np.ndarray, width: float) -> Minimum:
+        what = f"pieces with gaps of {width:g}"  # in sizes of the states
+        return minimise(lambda x, members: lanes.joined(pieces, x, members, width), begin, wide, roughly, what)
+
+    found = with_gaps(begin, 0.1)
+    found = with_gaps(found.theta, 0.01).after(found, every)
+    return _closed(problem, lanes, lanes.put(found.theta), limits, control).after(found, every)
 
 
 def _begun(problem: Problem, lanes: Piecewise, theta: np.ndarray) -> tuple[Problem, np.ndarray]:
@@ -155,9 +141,8 @@ def _begun(problem: Problem, lanes: Piecewise, theta: np.ndarray) -> tuple[Probl
     local = guess[:, lanes.shared :].reshape(count, len(lanes.parts), -1)  # a view
     local[:, lanes.follows, m:] = nodes[:, lanes.follows]
     _put_starts(problem, lanes, local, nodes)
-    for _ in lanes.evaluate_parts(guess[:, : lanes.shared], local, np.arange(count)):
-        pass
-    changes = lanes.ends[..., -1] - nodes
+    _, ends = lanes.evaluated(guess[:, : lanes.shared], local, np.arange(count))
+    changes = ends[..., -1] - nodes
     failed = ~np.isfinite(changes).all(axis=2)
     changes[failed] = 0.0
     for run in range(len(problem.runs)):
@@ -168,9 +153,9 @@ def _begun(problem: Problem, lanes: Piecewise, theta: np.ndarray) -> tuple[Probl
     local[:, lanes.follows, m:] = nodes[:, lanes.follows]
     # sizes: how numbers differ from node to node, and change over a piece
     sizes = np.maximum(np.std(nodes, axis=(0, 1)), np.sqrt(np.mean(changes**2, axis=(0, 1))))
-    sizes = np.maximum(sizes, _SMALL * np.max(np.abs(nodes), axis=(0, 1)))
+    sizes = np.maximum(sizes, 0.01 * np.max(np.abs(nodes), axis=(0, 1)))
     least = np.where(of_y, sizes, np.where(of_q, np.max(sizes[of_q], initial=0.0), np.max(sizes[~of_q & ~of_y], initial=0.0)))
-    lanes.node_sizes = np.where(least > 0, np.maximum(sizes, _TINY * least), 1.0)
+    lanes.node_sizes = np.where(least > 0, np.maximum(sizes, 1e-4 * least), 1.0)
     return lanes.problem(problem.loss), guess
 
 
@@ -201,42 +186,34 @@ def _put_starts(problem: Problem, lanes: Piecewise, local: np.ndarray, nodes: np
 
 def _closed(problem: Problem, lanes: Piecewise, theta: np.ndarray, limits: Limits, control: Control) -> Minimum:
     """The minimum with all gaps closed, by sequential quadratic programming from where the pieces are."""
-    lanes.closing = False
-    count = len(theta)
-    at = problem.linearised(theta, np.arange(count))
-    converged, stuck, steps = np.zeros(count, bool), np.zeros(count, bool), np.zeros(count, int)
-    costs, shares = [[cost] for cost in at.cost.tolist()], np.ones(count)
-    going = np.flatnonzero(np.isfinite(at.cost))
-    far = _FAR * np.sqrt(max(problem.samples, 1))
+
+    def evaluate(theta: np.ndarray, members: np.ndarray, share: np.ndarray) -> Linearised:
+        return problem.assembled(theta, members, lanes.moved(theta, members, share), problem.taus(members))
+
+    shares = np.ones(len(theta))
+    way = Way.begun(theta, evaluate(theta, np.arange(len(theta)), shares))
+    far = 2.0 * np.sqrt(max(problem.samples, 1))  # a step changes residuals by two sigmas at most, rms
     for _ in range(control.most_steps):
-        if not going.size:
+        here, arrow, x = way.here()
+        if not here.size:
             break
-        arrow, x, size = at.arrow.at(going), theta[going], limits.size(theta[going])
-        d = damped_step(arrow, x, column_scaling(arrow, size), np.full(going.size, _UNDAMPED), limits, cutoff_of(lanes, control, going))
-        length = lanes.change(problem, at.sigma[going], d, going)
-        done = lanes.closed(going) & (length <= control.tolerance) & (np.abs(d) <= control.tolerance * size).all(axis=1)
-        converged[going[done]] = True
-        going, d, x, length = going[~done], d[~done], x[~done], length[~done]
-        if not going.size:
+        size, undamped = limits.size(x), np.full(here.size, 1e-24)  # only keeps what is held from being singular
+        d = damped_step(arrow, x, column_scaling(arrow, size), undamped, limits, cutoff_of(lanes, control, here))
+        length = lanes.change(problem, way.at.sigma[here], d, here)
+        done = lanes.closed(here) & (length <= control.tolerance) & (np.abs(d) <= control.tolerance * size).all(axis=1)
+        here, d, x, length = way.arrived(here, done), d[~done], x[~done], length[~done]
+        if not here.size:
             break
-        steps[going] += 1
-        share = np.minimum(shares[going], far / np.maximum(length, far))
-        lanes.share[going] = share
-        trial = problem.linearised(x + share[:, None] * d, going)
+        share = np.minimum(shares[here], far / np.maximum(length, far))
+        end = x + share[:, None] * d
+        trial = evaluate(end, here, share)
         good = np.isfinite(trial.cost)
-        theta[going[good]] = (x + share[:, None] * d)[good]
-        at = at.replaced(going, trial, good)
-        shares[going] = np.where(good, np.minimum(2 * shares[going], 1.0), 0.25 * share)
-        for b in going.tolist():
-            costs[b].append(float(at.cost[b]))
-        lost = shares[going] < _SHORTEST
-        stuck[going[lost]], going = True, going[~lost]
-    lanes.closing, lanes.share = True, np.ones(count)
-    trace = np.empty(count, object)
-    trace[:] = [(("pieces that join", tuple(of_one)),) for of_one in costs]
-    return Minimum(theta, at, converged, stuck, steps, np.zeros(count, bool), trace)
+        way.go(here, end, trial, good)
+        shares[here] = np.where(good, np.minimum(2 * shares[here], 1.0), 0.25 * share)
+        way.give_up(shares < 1e-3)
+    return way.minimum("pieces that join")
 
 
 def cutoff_of(lanes: Piecewise, control: Control, members: np.ndarray) -> float:
     """The fraction of the largest singular value below which one counts as zero: less, where the largest has grown along the motion and the others have not."""
-    return max(control.cutoff / float(np.max(lanes.growth(members))), LEAST_CUTOFF)
+    return max(control.cutoff / float(np.max(lanes.growth(members))), 1e-14)  # round-off of singular values

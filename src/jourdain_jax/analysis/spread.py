@@ -47,10 +47,6 @@ from jourdain_jax.analysis.problem import Problem
 RISE_95 = 3.841458820694124  # of 2 F
 FAR_BEYOND = 3.0  # standard errors: an estimate that is held at its bound by more is no chance
 CLOSE = 0.02  # of p at the limit: its error there, and by how much F is to be lower elsewhere to count as lower
-MOST = 16  # evaluations of p
-FURTHER = 4.0  # factor of delta where p does not rise
-NARROW = 0.5  # of the rise that a standard error foretells: with less, the interval is too narrow
-MOST_LOOKED_AT = 8  # unknowns whose intervals are compared with the rise at their ends
 ADVICE = "`Fit.profiles` gives intervals that hold"
 
 
@@ -86,8 +82,7 @@ class Around:
     @property
     def at_bound(self) -> Bool[np.ndarray, "members unknowns"]:
         """Which unknowns lie at a bound."""
-        theta, limits = self.found.theta, self.limits
-        return ((theta <= limits.low) | (theta >= limits.high)) & ~limits.fixed
+        return self.limits.reached(self.found.theta)
 
     def rise(self, b: int, place: int, step: float) -> tuple[float, Minimum]:
         """How much F of member `b` rises when one unknown is moved by a step and held there (infinite where the motion fails), and the minimum there."""
@@ -97,7 +92,7 @@ class Around:
 
     def if_free(self, b: int, place: int) -> tuple[float, float]:
         """The standard error that an unknown at its bound had if it were free, infinite where it does not show, and the size of the slope of F."""
-        others, estimated, arrow = self.at_bound[b : b + 1], np.flatnonzero(~self.limits.fixed), self.found.at.arrow.at([b])
+        others, estimated, arrow = self.at_bound[b : b + 1], np.flatnonzero(~self.limits.fixed), self.found.at.arrow.of([b])
         others[0, place] = False
         known = information(arrow, self.limits.size(self.found.theta[b : b + 1]), estimated, others, np.zeros(1, bool), self.control.cutoff)
         error = float(known.standard_errors[0, np.searchsorted(estimated, place)])
@@ -153,7 +148,7 @@ def too_narrow_near_bounds(around: Around, told: AtBounds, errors: Float[np.ndar
     limits, theta, places = around.limits, around.found.theta[0], np.flatnonzero(~around.limits.fixed)
 
     def named(some: Iterable[int], steps: Callable[[int], list[float]]) -> list[str]:
-        return [f"`{labels[k]}`" for k in some if any(2 * around.rise(0, int(places[k]), step)[0] < NARROW * (step / errors[k]) ** 2 for step in steps(k))]
+        return [f"`{labels[k]}`" for k in some if any(2 * around.rise(0, int(places[k]), step)[0] < 0.5 * (step / errors[k]) ** 2 for step in steps(k))]
 
     def to_bounds(k: int) -> list[float]:
         steps = [float((end - theta)[places[k]]) for end in (limits.low, limits.high)]
@@ -169,7 +164,7 @@ def too_narrow_near_bounds(around: Around, told: AtBounds, errors: Float[np.ndar
         sentences.append(f"{_too_narrow(names)}, {why}; {ADVICE}")
     bounded = ", ".join(f"`{labels[k]}`" for k in np.flatnonzero(told.beyond[0, places] <= FAR_BEYOND))
     shared = [k for k, name in enumerate(labels) if bounded and np.isfinite(errors[k]) and not name.startswith("run ")]
-    if names := named(shared[:MOST_LOOKED_AT], to_ends):
+    if names := named(shared[:8], to_ends):
         sentences.append(f"{_too_narrow(names)}: where {bounded} may leave a bound, the squares rise less to the ends than standard errors foretell; {ADVICE}")
     return sentences
 
@@ -184,7 +179,7 @@ def _limit(profile: Callable[[float], tuple[float, Minimum]], inward: float, del
     Infinite with a minimum: that one is lower than at the bound.
     """
     inner, outer = (0.0, 0.0), (np.inf, np.inf)  # delta and rise on either side
-    for _ in range(MOST):
+    for _ in range(16):
         rise, at = profile(inward * delta)
         if rise < -CLOSE * end:
             return np.inf, at
@@ -202,7 +197,7 @@ def _limit(profile: Callable[[float], tuple[float, Minimum]], inward: float, del
         elif np.isfinite(outer[0]):  # the motion fails there
             delta = (inner[0] + outer[0]) / 2
         else:
-            delta = min(delta * min(np.sqrt(end / inner[1]) * (1 + CLOSE) if inner[1] else FURTHER, FURTHER), room)
+            delta = min(delta * min(np.sqrt(end / inner[1]) * (1 + CLOSE) if inner[1] else 4.0, 4.0), room)
     return (delta, at) if np.isfinite(outer[0]) else (np.inf, None)
 
 
@@ -213,7 +208,6 @@ def _root(slope: float, curvature: float, end: float) -> float:
 
 LEFT = 0.5  # degrees of freedom: with fewer, a channel does not tell its sigma
 _STEP = 0.03  # of sigma^2, for the second derivative of C
-_TURNS, _SETTLED = 50, 1e-8  # of sigmas and covariance; relative change of sigmas that ends them
 
 
 @dataclass(frozen=True)
@@ -240,13 +234,13 @@ def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: C
     residuals = [r[np.isfinite(r)] for r in np.concatenate([r.reshape(len(theta), -1) for of in by_run for r in of.values()], axis=1)]
     samples = np.concatenate([[[r.size] for r in residuals], problem.lanes.counted(problem.estimated, members)], axis=1)
     (determined, widths), unsure = np.zeros((2, len(theta), count)), problem.loss != LEAST_SQUARES
-    for _ in range(_TURNS):
+    for _ in range(50):
         left, before = samples - determined, widths.copy()
         untold[:, 1:] |= left[:, 1:] < LEFT
         widths[:, 1:] = np.maximum(np.sqrt(at.squares[:, 1:] / np.maximum(left[:, 1:], LEFT)), problem.least_sigma)
         widths[:, 0] = [np.sqrt(of_loss(r, p)) if r.size else 1.0 for r, p in zip(residuals, determined[:, 0].tolist(), strict=True)] if unsure else 1.0
         widths[untold] = np.inf
-        if np.allclose(widths, before, rtol=_SETTLED, atol=0):
+        if np.allclose(widths, before, rtol=1e-8, atol=0):
             break
         arrow = problem.joined(theta, at.triangles, widths)[0]
         known = told_by(arrow)
@@ -276,8 +270,6 @@ def _told_by_kind(known: Information, T: Float[np.ndarray, "members runs kinds w
     return p, np.concatenate([np.diagonal(Q, axis1=-2, axis2=-1), of_own.reshape(*of_own.shape[:2], -1)], axis=-1)
 
 
-NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
-_FEWEST_DEGREES = 4  # of freedom, that an estimated correlation time leaves
 
 
 @dataclass(frozen=True)
@@ -334,9 +326,9 @@ def _normal_or_t(of_memory: np.ndarray, of_sigmas: np.ndarray) -> np.ndarray:
     Its degrees of freedom are 2 / var(log C). The variances are those that estimated correlation times and sigmas leave. C is a mean over correlation times, so
     that t is to have that variance, without its n / (n - 2).
     """
-    of_memory = np.minimum(of_memory, 2 / _FEWEST_DEGREES)
+    of_memory = np.minimum(of_memory, 0.5)  # an estimated correlation time leaves four degrees of freedom at least
     doubt = of_memory + of_sigmas
-    return np.where(doubt > 0, students_t_95(2 / np.maximum(doubt, 1e-12)) * np.sqrt(1 - of_memory), NORMAL_95)
+    return np.where(doubt > 0, students_t_95(2 / np.maximum(doubt, 1e-12)) * np.sqrt(1 - of_memory), 1.959963984540054)
 
 
 def _of_rise(wider: np.ndarray, quantiles: np.ndarray, n: np.ndarray) -> Float[np.ndarray, "members unknowns"]:

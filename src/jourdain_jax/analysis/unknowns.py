@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 
 from jourdain_jax.analysis.estimate import Correlated, Estimate, Range, positive, unbounded, whitening
 from jourdain_jax.analysis.experiment import Experiment
@@ -75,7 +75,7 @@ class Unknowns:
             theta[1:, place] = self.ranges[place].spread(self.guess[place], share)
         return theta
 
-    def split(self, theta: Float[np.ndarray, "*members places"]) -> tuple[np.ndarray, np.ndarray]:
+    def split(self, theta: Shaped[np.ndarray, "*members places"]) -> tuple[np.ndarray, np.ndarray]:
         """Shared unknowns (*members, shared), and those of the runs (*members, runs, local)."""
         shared, local = self.layout.sizes
         return theta[..., :shared], theta[..., shared:].reshape(*theta.shape[:-1], self.runs, local)
