@@ -184,7 +184,7 @@ def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: By
 
 
 def fallen(before: Float[np.ndarray, "some"], trial: Linearised, d: ByUnknown, slope, promised, control: Control) -> Float[np.ndarray, "some"]:
-    """By how much F falls along a step d.
+    """Return by how much F falls along a step d.
 
     Near the minimum the simulation's own error decides whether F falls: it jumps where a motion takes one step more. There the slopes of F at both ends of the
     step, the first one of which is given, tell it to more digits.
