@@ -16,6 +16,7 @@ import jourdain_jax as jj
 from jourdain_jax.plotting.grounds_drawn import grounds_of
 from jourdain_jax.plotting.guesses import guessed
 from jourdain_jax.plotting.looks import looks_of
+from jourdain_jax.plotting.still import draw_still
 
 RED = "#ff0000"
 
@@ -208,16 +209,16 @@ def test_every_model_is_shown_with_shapes_on_its_ground(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("ground", "lowest"),
+    ("make", "lowest"),
     [
-        (jj.Sphere(1.0, side="inside", origin=(0.0, 0.0, 1.0)), 0.0),
-        (jj.Cylinder(1.0, (0.0, 1.0, 0.0), side="outside", origin=(0.0, 0.0, -1.0)), -2.0),
-        (jj.HeightMap(lambda x, y: 0.1 * x**2 + 0.2 * y**2), 0.0),
-        (jj.Surface(lambda x, y, z: z - 0.1 * x**2), 0.0),
+        (lambda: jj.Sphere(1.0, side="inside", origin=(0.0, 0.0, 1.0)), 0.0),
+        (lambda: jj.Cylinder(1.0, (0.0, 1.0, 0.0), side="outside", origin=(0.0, 0.0, -1.0)), -2.0),
+        (lambda: jj.HeightMap(lambda x, y: 0.1 * x**2 + 0.2 * y**2), 0.0),
+        (lambda: jj.Surface(lambda x, y, z: z - 0.1 * x**2), 0.0),
     ],
     ids=["sphere", "cylinder", "height map", "surface"],
 )
-def test_grounds_of_every_kind_are_drawn_where_they_are(ground, lowest):
+def test_grounds_of_every_kind_are_drawn_where_they_are(make, lowest):
     class OnGround(jj.Scene):
         coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
 
@@ -225,7 +226,7 @@ def test_grounds_of_every_kind_are_drawn_where_they_are(ground, lowest):
             return {"ball": jj.RigidBody.ball(1.0, 0.1, position=jnp.stack([q.x, q.y, q.z]), orientation=jj.quaternion_to_matrix(q.attitude))}
 
         def contacts(self, pose):
-            return {"ground": jj.ball_contact(pose["ball"], 0.1, ground=ground, height="row")}
+            return {"ground": jj.ball_contact(pose["ball"], 0.1, ground=make(), height="row")}
 
     scene = OnGround()
     motion = jj.simulate(scene, jj.start(scene, x=0.05, x_rate=0.1), ts=jnp.linspace(0.0, 0.3, 3))
@@ -233,7 +234,7 @@ def test_grounds_of_every_kind_are_drawn_where_they_are(ground, lowest):
     (drawn,) = page["grounds"]
     corners = numbers(drawn["mesh"]).reshape(-1, 3)
     assert corners[:, 2].min() == pytest.approx(lowest, abs=2e-3)
-    np.testing.assert_allclose([float(ground.value(corner)) for corner in corners[:: len(corners) // 20]], 0.0, atol=1e-5)
+    np.testing.assert_allclose([float(make().value(corner)) for corner in corners[:: len(corners) // 20]], 0.0, atol=1e-5)
 
 
 def test_what_cannot_be_shown_is_refused_with_advice(motion, tmp_path):
@@ -300,3 +301,14 @@ def test_a_hill_is_drawn_where_a_contact_names_it():
     (floor,) = grounds_of(other, looks_of(other), low, high)
     assert floor["kind"] == "plane"
     assert np.array_equal(floor["axes"], np.eye(3))
+
+
+@pytest.mark.parametrize(("view", "hidden"), [("above", "z"), ("side", "y"), ("space", ""), ((20.0, -50.0), "")])
+def test_a_still_picture_holds_all_bodies_within_axes_in_metres(motion, tmp_path, drawn, view, hidden):
+    draw_still(motion, tmp_path / "ball.png", view=view, at=2)
+    (axes,) = drawn[0].axes
+    corners = np.concatenate([path.vertices for path in axes.collections[-1].get_paths()])
+    shown = axes.transAxes.inverted().transform(axes.transData.transform(corners))
+    assert np.all((shown > 0.0) & (shown < 1.0))
+    for name in "xyz":
+        assert getattr(axes, f"get_{name}label")() == ("" if name == hidden else f"{name} in m")

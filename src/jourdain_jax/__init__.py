@@ -173,7 +173,7 @@ _GONE = {
     "MuntheKaas": "the default solvers renormalise quaternions after each step, are as accurate and take half of its time",
 }
 _pictures = _module_on_first_use("jourdain_jax.plotting.scene_picture")
-_show_scenes_with(lambda scene: _pictures.scene_svg(scene))
+_show_scenes_with(lambda scene: _pictures.scene_picture(scene))
 __getattr__, __dir__ = _names_on_first_use(globals(), {name: module for module, names in _ON_FIRST_USE.items() for name in names.split()}, _GONE)
 __version__ = _version_of("jourdain-jax")
 

@@ -6,7 +6,9 @@ import numpy as np
 
 from jourdain_jax.equations.kinematics import pose_at
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.plotting.guesses import across
 from jourdain_jax.plotting.looks import Curved, Drawn
+from jourdain_jax.plotting.solids import quads, revolved
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere
 from jourdain_jax.scene.validated import contacts_of
@@ -24,18 +26,20 @@ def grounds_of(trajectory: Trajectory, drawn: Drawn, low: np.ndarray, high: np.n
         ground = _ground(trajectory, drawn, name, contact, low, high)
         if not any(_same(ground, other) for other in found):
             found.append(ground)
-    return found or [_floor(low, high)]
+    return found or [_plane(np.array([0.0, 0.0, floor_under(low, high)]), np.eye(3), low, high)]
 
 
 def _ground(trajectory: Trajectory, drawn: Drawn, name: str, contact: Contact, low, high) -> dict:
     ground = contact.ground
-    if isinstance(ground, Sphere):
-        return _mesh(_sphere(float(ground.radius[0]), ground.side), np.asarray(ground.origin)[0])
+    if isinstance(ground, Sphere):  # of one that bodies are in, the lower half
+        angle = np.linspace(0.0, np.pi / 2 if ground.side == "inside" else np.pi, _CELLS // 2 + 1)
+        profile = float(ground.radius[0]) * np.stack([np.sin(angle), -np.cos(angle)], axis=1)
+        return _mesh(revolved(profile, _CELLS) + np.asarray(ground.origin)[0])
     if isinstance(ground, Cylinder):
         axis, origin = np.asarray(ground.axis)[0], np.asarray(ground.origin)[0]
-        corners = np.array([[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
-        ends = (corners - origin) @ axis
-        return _mesh(_cylinder(float(ground.radius[0]), axis, ends.min(), ends.max()), origin)
+        corners = np.stack(np.meshgrid(*np.stack([low, high], axis=1)), axis=-1)
+        along, radius = (corners - origin) @ axis, float(ground.radius[0])
+        return _mesh(revolved(np.array([[radius, along.min()], [radius, along.max()]]), 2 * _CELLS) @ across(axis).T + origin)
     if isinstance(ground, Curved):
         return _surface(trajectory, drawn, name, contact, low, high)
     plane = contact.plane
@@ -54,11 +58,10 @@ def _plane(origin, axes, low, high) -> dict:
     return {"kind": "plane", "origin": middle - ((middle - origin) @ normal) * normal, "axes": axes}
 
 
-def _floor(low, high) -> dict:
-    """A floor: z = 0 where bodies stand on it, else below them."""
+def floor_under(low, high) -> float:
+    """Height (m) of a floor under the box from `low` to `high`: z = 0 where bodies stand on it, else below them."""
     side = float(max(high - low))
-    base = 0.0 if -0.01 * side < low[2] < 0.2 * side else low[2] - 0.05 * side
-    return _plane(np.array([0.0, 0.0, base]), np.eye(3), low, high)
+    return 0.0 if -0.05 * side < low[2] < 0.2 * side else low[2] - 0.05 * side
 
 
 def _same(one: dict, other: dict) -> bool:
@@ -69,26 +72,10 @@ def _same(one: dict, other: dict) -> bool:
     return one[key].shape == other[key].shape and np.allclose(one[key], other[key]) and same_axes
 
 
-def _mesh(grid: np.ndarray, origin) -> dict:
-    """Triangles of a grid of points (rows, columns, 3); those with a corner that is NaN are left out."""
-    a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
-    triangles = np.concatenate([np.stack([a, b, c], axis=2).reshape(-1, 3, 3), np.stack([a, c, d], axis=2).reshape(-1, 3, 3)])
-    return {"kind": "mesh", "triangles": triangles[np.isfinite(triangles).all(axis=(1, 2))] + origin}
-
-
-def _sphere(radius: float, side: str) -> np.ndarray:
-    """A sphere, or the lower half of one that bodies are in."""
-    across = np.linspace(np.pi / 2 if side == "inside" else 0.0, np.pi, _CELLS // 2 + 1)[:, None]
-    around = np.linspace(0, 2 * np.pi, _CELLS + 1)
-    return radius * np.stack([np.sin(across) * np.cos(around), np.sin(across) * np.sin(around), np.cos(across) + 0 * around], axis=-1)
-
-
-def _cylinder(radius: float, axis: np.ndarray, first: float, last: float) -> np.ndarray:
-    side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    side /= np.linalg.norm(side)
-    around = np.linspace(0, 2 * np.pi, 2 * _CELLS + 1)[:, None]
-    ring = radius * (np.cos(around) * side + np.sin(around) * np.cross(axis, side))
-    return np.stack([ring + first * axis, ring + last * axis])
+def _mesh(grid: np.ndarray) -> dict:
+    """Triangles between the neighbours in a grid of points; those with a corner that is NaN are left out."""
+    triangles = quads(grid)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3, 3)
+    return {"kind": "mesh", "triangles": triangles[np.isfinite(triangles).all(axis=(1, 2))]}
 
 
 def _surface(trajectory: Trajectory, drawn: Drawn, name: str, contact: Contact, low, high) -> dict:
@@ -113,4 +100,4 @@ def _surface(trajectory: Trajectory, drawn: Drawn, name: str, contact: Contact, 
         return jax.vmap(height)(x, y)
 
     z = np.asarray(jax.jit(heights)(trajectory.scene, trajectory.ts[k], trajectory.q[k], x.ravel(), y.ravel())).reshape(x.shape)
-    return _mesh(np.stack([x, y, z], axis=-1), np.zeros(3))
+    return _mesh(np.stack([x, y, z], axis=-1))

@@ -34,7 +34,7 @@ def _of_outline(points: np.ndarray) -> list[Visual]:
     if rank == 3 and np.ptp(lengths) < _ROUND * size and len(points) > 20:
         return [Visual.ball(size)]
     if rank == 2 and len(points) > 20 and np.ptp(lengths[:40]) < _ROUND * size:
-        return [Visual.wheel(size, 0.2 * size, axis="z", turn=_axes_along(np.cross(points[0], points[10]), points[0]))]
+        return [Visual.wheel(size, 0.2 * size, axis="z", turn=across(np.cross(points[0], points[10])))]
     if rank == 3 and lengths.min() > _ROUND * size:
         return [_hull(points)]
     if rank == 2 and np.linalg.norm(points[-1] - points[0]) < _ROUND * size and lengths.min() > _ROUND * size:
@@ -53,8 +53,7 @@ def _of_contact(body: RigidBody, shape: Shape) -> list[Visual]:
         return [Visual.ellipsoid(shape.semi_axes, at=at, turn=to_body @ np.asarray(shape.orientation))]
     assert isinstance(shape, Wheel)
     width = 0.1 * shape.radius if shape.tyre is None else 2 * shape.tyre
-    axle = to_body @ np.asarray(shape.axle)
-    return [Visual.wheel(shape.radius, width, axis="z", at=at, turn=_axes_along(axle, np.eye(3)[np.argmin(np.abs(axle))]))]
+    return [Visual.wheel(shape.radius, width, axis="z", at=at, turn=across(to_body @ np.asarray(shape.axle)))]
 
 
 def _of_inertia(body: RigidBody) -> list[Visual]:
@@ -69,10 +68,10 @@ def _of_inertia(body: RigidBody) -> list[Visual]:
     return [Visual.box(sides, turn=axes)]
 
 
-def _axes_along(axis: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """A rotation matrix whose third column lies along `axis`, the first as near to `near` as it can."""
+def across(axis: np.ndarray) -> np.ndarray:
+    """A rotation matrix whose last column is the direction `axis`."""
     z = axis / np.linalg.norm(axis)
-    x = near - (near @ z) * z
+    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z], axis=1)
 
@@ -86,17 +85,11 @@ def _plate(rim: np.ndarray, half: float) -> Visual:
 
 
 def _hull(points: np.ndarray) -> Visual:
-    """The convex hull; triangles in one plane make one face."""
+    """The convex hull, of triangles that are anticlockwise seen from outside."""
     from scipy.spatial import ConvexHull
 
     hull = ConvexHull(points)
-    middle, faces = points[hull.vertices].mean(axis=0), []
-    for equation in np.unique(np.round(hull.equations, 6), axis=0):
-        members = np.unique(hull.simplices[np.all(np.abs(hull.equations - equation) < 2e-6, axis=1)])
-        corners, normal = points[members], equation[:3]
-        centre = corners.mean(axis=0)
-        first = corners[0] - centre
-        second = np.cross(normal, first)
-        ordered = members[np.argsort(np.arctan2((corners - centre) @ second, (corners - centre) @ first))]
-        faces.append(ordered if (centre - middle) @ normal > 0 else ordered[::-1])
-    return Visual.mesh(points, faces)
+    corners = points[hull.simplices]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    outwards = np.sum(normals * hull.equations[:, :3], axis=1) > 0
+    return Visual.mesh(points, np.where(outwards[:, None], hull.simplices, hull.simplices[:, ::-1]))

@@ -35,10 +35,6 @@ class Look:
     points: np.ndarray  # (times, points, 3), m: of a line; (times, 0, 3) of others
     radius: float  # m, of a line
 
-    def at(self, chosen: np.ndarray) -> "Look":
-        """This look at the `chosen` times."""
-        return Look(self.visual, self.positions[chosen], self.orientations[chosen], self.points[chosen], self.radius)
-
 
 @dataclass(frozen=True)
 class DrawnBody:
@@ -50,11 +46,6 @@ class DrawnBody:
     orientations: np.ndarray  # (times, 3, 3)
     angular_velocities: np.ndarray  # (times, 3), rad/s, inertial frame
     looks: list[Look]
-
-    def at(self, chosen: np.ndarray) -> "DrawnBody":
-        """This body at the `chosen` times."""
-        looks = [look.at(chosen) for look in self.looks]
-        return DrawnBody(self.name, self.colour, self.positions[chosen], self.orientations[chosen], self.angular_velocities[chosen], looks)
 
 
 @dataclass(frozen=True)
@@ -68,17 +59,14 @@ class Drawn:
     size: float  # m: the longest side of the box that holds all bodies at the first time
     sized: bool  # whether any body has a size of its own; particles are drawn as large as the picture asks
 
-    def at(self, chosen: np.ndarray) -> "Drawn":
-        """This drawing at the `chosen` ones of its times."""
-        bodies = {name: body.at(chosen) for name, body in self.bodies.items()}
-        return Drawn(self.ts[chosen], self.reached[chosen], bodies, _at(self.contacts, chosen), self.size, self.sized)
 
-
-def looks_of(trajectory: Trajectory, what: str = "draw") -> Drawn:
-    """What there is to draw of a motion; ValueError where it reached none of its times."""
+def looks_of(trajectory: Trajectory, what: str = "draw", most: int | None = None) -> Drawn:
+    """What there is to draw of a motion, at most so many of its saved times, evenly chosen; ValueError where it reached none of them."""
     reached = np.flatnonzero(np.asarray(trajectory.valid))
     if reached.size == 0:
         raise ValueError(f"the motion reached none of its saved times; there is nothing to {what}")
+    if most is not None and most < reached.size:
+        reached = reached[np.linspace(0, reached.size - 1, most).astype(int)]
     return _drawn(np.asarray(trajectory.ts)[reached], reached, _at(map_over_times(_seen, trajectory), reached))
 
 

@@ -8,9 +8,8 @@ from jourdain_jax.calculus.rotations import matrices_to_quaternions
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.grounds_drawn import grounds_of
 from jourdain_jax.plotting.looks import Drawn, DrawnBody, Look, corners_of, looks_of
-from jourdain_jax.scene.visuals import Visual
+from jourdain_jax.plotting.solids import triangles_of
 
-_FRAMES = 1000  # at most, of one motion
 _LONG = 5.0  # the whole motion is so many times as long as its bodies: the view follows them
 _ARROW = 0.4  # length of the longest arrow, of the bodies
 _USUAL = 0.9  # part of the forces that are usual: arrows show up to twice as much in proportion
@@ -37,7 +36,7 @@ class Numbers:
 
 def page_data(motions: list[Trajectory], title: str, options: dict) -> tuple[dict, Numbers]:
     """The description of the page, and its numbers."""
-    drawn = [_thinned(looks_of(motion, "show")) for motion in motions]
+    drawn = [looks_of(motion, "show", 1000) for motion in motions]
     numbers, first = Numbers(), drawn[0]
     near, far = _near(drawn), _far(drawn)
     size, reach = (float(np.max(high - low)) for low, high in (near, far))
@@ -107,13 +106,7 @@ def _shape(numbers: Numbers, look: Look, colour: str) -> dict:
         return shape | {"size": [], "count": look.points.shape[1], "points": numbers.add(_still(look.points)), "radius": look.radius}
     quaternions = quaternions_of(look.orientations)
     shape |= {"p": numbers.add(_still(look.positions)), "q": numbers.add(_still(quaternions)), "turns": [0]}
-    return shape | ({"mesh": numbers.add(_triangles(visual))} if visual.kind == "mesh" else {})
-
-
-def _triangles(visual: Visual) -> np.ndarray:
-    """Corners (triangles, 3, 3) of a mesh, m; faces with more corners as fans."""
-    corners = visual.faces.corners * np.asarray(visual.size)  # type: ignore[union-attr]
-    return corners[[(f[0], f[k], f[k + 1]) for f in visual.faces.polygons for k in range(1, len(f) - 1)]]  # type: ignore[union-attr]
+    return shape | ({"mesh": numbers.add(np.asarray(visual.size) * triangles_of(visual)[:, :3])} if visual.kind == "mesh" else {})
 
 
 def _ground(numbers: Numbers, ground: dict) -> dict:
@@ -157,13 +150,6 @@ def _at_rest(drawn: Drawn) -> bool:
 
 def _moves(body: DrawnBody) -> bool:
     return len(_still(body.positions)) > 1
-
-
-def _thinned(drawn: Drawn) -> Drawn:
-    """At most so many times as a screen can show."""
-    if len(drawn.ts) <= _FRAMES:
-        return drawn
-    return drawn.at(np.unique(np.linspace(0, len(drawn.ts) - 1, _FRAMES).astype(int)))
 
 
 def _extents(body: DrawnBody) -> np.ndarray:
