@@ -87,7 +87,7 @@ def steady(
     if not isinstance(max_steps, int | np.integer) or max_steps < 1:
         raise ValueError(f"`max_steps` is {max_steps!r}, expected a whole number of at least 1")
     scene = as_scene(scene)
-    t, q, u = _guessed(scene, guess, t0)
+    t, q, u = guessed(scene, guess, t0)
     f = as_input_vector(scene, inputs, q.dtype).astype(q.dtype)
     held = as_names(held)
     names = scene.coordinate_names.entries + scene.speed_names.entries
@@ -105,7 +105,7 @@ def steady(
     return _solve(_Problem(scene, t, f, privileged_speeds(scene, privileged), resting), q, u, free, max_steps)
 
 
-def _guessed(scene: Scene, guess, t0) -> tuple[Array, Array, Array]:
+def guessed(scene: Scene, guess, t0) -> tuple[Array, Array, Array]:
     """t, q, u of a guess."""
     if isinstance(guess, State):
         return guess.t, guess.q, guess.u

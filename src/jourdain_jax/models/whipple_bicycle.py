@@ -14,6 +14,7 @@ import math
 from collections.abc import Mapping
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import rot_x, rot_y, rot_z
@@ -149,6 +150,14 @@ class WhippleBicycle(Scene):
             "rear": disc_contact(pose["rear wheel"], self.rR, axis="y", height="coordinates"),
             "front": disc_contact(pose["front wheel"], self.rF, axis="y", height="row"),
         }
+
+    def mode_names(self, eigenvalues: np.ndarray) -> tuple[str, ...]:
+        """Names of the four modes: weave is the complex pair, or where all are real the two of one sign that meet at a higher speed, which grow when
+        riding forward; of the others castering is the faster one, capsize the slower.
+        """
+        order = np.argsort(-np.abs(eigenvalues.imag) if np.any(eigenvalues.imag) else -eigenvalues.real)
+        fast, slow = sorted(order[2:], key=lambda k: -abs(eigenvalues[k]))
+        return tuple("castering" if k == fast else "capsize" if k == slow else "weave" for k in range(4))
 
     def events(self, motion):
         # leant over too far, or the handlebar past a right angle, where a real one meets the frame

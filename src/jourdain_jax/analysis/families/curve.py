@@ -1,0 +1,124 @@
+"""Curves of solutions by pseudo-arclength (H. B. Keller, 1977): they pass points where an unknown turns back.
+
+    R(z) = 0,   t.(z - z_i) = s        t: unit tangent at z_i, J t = 0;   s: distance along it
+
+There are more rows than they hold independently, so every linear system is solved by singular values, and no product J' J is formed.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from jourdain_jax.analysis.families.equations import Look, Vector
+from jourdain_jax.analysis.families.spectrum import Modes, matched, surely_matched
+
+LONGEST, SHORTEST = 0.1, 1e-8  # steps, in sizes of the unknowns; the longest also relative to where the curve is, if that is far
+
+Equations = Callable[[Vector], Look]
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point of a curve, the equations and the tangent there."""
+
+    z: Vector
+    tangent: Vector
+    look: Look
+    hardness: int = 0  # corrections that led here
+    modes: Modes = field(default_factory=lambda: np.zeros(0, complex))  # eigenvalues of small motions, in the columns of the points before
+
+
+def solved(equations: Equations, z: Vector, rows: Vector, target: float) -> tuple[Vector, Look, int] | None:
+    """z with R = 0 and `rows . z = target`, the equations there and the number of corrections; None where Newton's method does not converge."""
+    for k in range(8):
+        look = equations(z)
+        if not (np.all(np.isfinite(look.R)) and np.all(np.isfinite(look.J))):
+            return None
+        step = np.linalg.lstsq(np.vstack([look.J, rows]), -np.append(look.R, rows @ z - target), rcond=1e-9)[0]
+        noise = 8 * np.finfo(float).eps * np.max(np.abs(look.J) @ np.abs(z))  # of R: at a branch point steps are this over a small number
+        z = z + step
+        if np.max(np.abs(step)) < 1e-11 * (1 + np.max(np.abs(z))) or np.max(np.abs(look.R)) < noise:
+            return z, look, k
+    return None
+
+
+def tangent_at(look: Look, before: Vector) -> Vector:
+    """The unit null vector of J that goes on from the one before."""
+    V = np.linalg.svd(look.J)[2]
+    return V[-1] * (1.0 if V[-1] @ before >= 0 else -1.0)
+
+
+def along(equations: Equations, point: Point, s: float, guess: Vector | None = None) -> Point | None:
+    """The point of the curve at a distance along the tangent of another one; None where none is found."""
+    t = point.tangent
+    found = solved(equations, point.z + s * t if guess is None else guess, t, t @ point.z + s)
+    if found is None:
+        return None
+    z, look, hardness = found
+    return Point(z, tangent_at(look, t), look, hardness)
+
+
+def traced(equations: Equations, spectrum: Callable[[Point], Modes], start: Point, ended: Callable[[Point, Point], str], most: int) -> tuple[list[Point], str]:
+    """Points of a curve from its start on, and why it ends.
+
+    `spectrum`: eigenvalues at a point, in any order; `ended`: of the last two points, a reason or nothing. A step is halved where it turns sharply, takes
+    many corrections, or moves eigenvalues so far that it is open which is which.
+    """
+    points, step, easy = [start], LONGEST / 10, 3
+    while len(points) < most:
+        here = points[-1]
+        there = _next(equations, spectrum, here, step, easy + 1)
+        if there is None:
+            step /= 2
+            if step < SHORTEST:
+                return points, "no further point is found: the equations are undefined, or lose rank, beyond it"
+            continue
+        points.append(there)
+        if reason := ended(here, there):
+            return points, reason
+        reach = float(np.max(np.abs(there.z)))
+        if reach > 1e3:
+            return points, "it goes on without bound"
+        if there.hardness <= easy:
+            step = min(1.5 * step, LONGEST * max(1.0, reach))
+    return points, f"{most} points"
+
+
+def _next(equations: Equations, spectrum: Callable[[Point], Modes], here: Point, step: float, hardest: int) -> Point | None:
+    """The point at the end of a step; None where the step must be halved."""
+    there = along(equations, here, step)
+    if there is None or there.hardness > hardest or here.tangent @ there.tangent < np.cos(np.deg2rad(10.0)):
+        return None
+    there = replace(there, modes=matched(here.modes, spectrum(there)))
+    sure = step < LONGEST / 1000 or surely_matched(here.modes, there.modes)  # those that meet are taken as they come
+    return there if sure else None
+
+
+def reversed_at(point: Point) -> Point:
+    """The point with the opposite tangent."""
+    return replace(point, tangent=-point.tangent)
+
+
+def located(equations: Equations, here: Point, there: Point, test: Callable[[Point], float], values: tuple[float, float]) -> Point | None:
+    """The point between two neighbours at which a smooth `test` changes its sign, given its values at both; None where the curve is lost.
+
+    By unequal halves down to a short piece, and on this along the chord: at a branch point itself the equations lose their rank, and for reasons of symmetry
+    it often lies in the middle.
+    """
+    share, short = 0.4, 1e-6  # a piece that short differs from its chord by the square of its length
+    (a, b), (at_a, at_b) = (0.0, float(here.tangent @ (there.z - here.z))), values
+    low, high = here, there
+    while b - a > short:
+        c = a + share * (b - a)
+        middle = along(equations, here, c, low.z + share * (high.z - low.z))  # a better guess than the tangent: another branch may be close
+        if middle is None:
+            return None
+        value = test(middle)
+        if (value > 0) == (at_a > 0):
+            low, a, at_a = middle, c, value
+        else:
+            high, b, at_b = middle, c, value
+    part = at_a / (at_a - at_b)
+    z, tangent = (getattr(low, name) + part * (getattr(high, name) - getattr(low, name)) for name in ("z", "tangent"))
+    return Point(z, tangent / np.linalg.norm(tangent), equations(z))

@@ -1,0 +1,187 @@
+"""Equations of steady motions as one scalar program, with their slopes.
+
+    R(z) = ( g,  phi,  dy/dt,  dq_j/dt ) = 0,      J = dR/dz        z: coordinates that matter, all speeds, and maybe one parameter of the scene
+
+y: the independent speeds of the scalar program; j: the coordinates that must rest. Coordinates on which nothing of this depends, a heading say, stay out.
+Unknowns are measured in units of their size, rows in SI units. Small motions about a steady one:
+
+    x = (dq, dy) = E s,   ds/dt = A s,   A = E' F E        E: orthonormal, spans the x that the rows allow;   F = d(dq/dt, dy/dt)/d(q, y)
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jourdain_jax.build.domain import coordinate_bounds
+from jourdain_jax.build.row_program import row_program
+from jourdain_jax.build.sampling import sample_states
+from jourdain_jax.dynamics.reduced import DEPENDS, PROBES, ignorable_coordinates
+from jourdain_jax.lowering.lower import lower
+from jourdain_jax.motion.native.called import nodes_called
+from jourdain_jax.native import host
+from jourdain_jax.native.scalar_program import unsupported
+from jourdain_jax.program.derivative import jacobian
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.graph import Graph
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.scene import Scene
+
+Vector = Float[np.ndarray, "unknowns"]
+
+
+@dataclass(frozen=True)
+class Look:
+    """The equations at one point, in units of rows and unknowns."""
+
+    R: Float[np.ndarray, "rows"]
+    J: Float[np.ndarray, "rows unknowns"]
+    F: Float[np.ndarray, "states states"]  # of (q, y), SI units
+    C: Float[np.ndarray, "rows_of_states states"]  # rows that (dq, dy) meet
+
+
+class SteadyEquations:
+    """R, J, F and the rows of (q, y) of one scene as functions of z."""
+
+    def __init__(self, scene: Scene, guess: tuple[float, np.ndarray, np.ndarray], inputs: np.ndarray, vary: str | None) -> None:
+        self.scene, self.vary, (t, q, u) = scene, vary, guess
+        self.t = t
+        self.names = (*scene.coordinate_names.entries, *scene.speed_names.entries)
+        leaves = [np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(scene)]
+        self._given = np.concatenate([*leaves, [t], q, u, inputs])
+        self._counts = sum(map(len, leaves)), len(q), len(u)
+        kept, resting = _coordinates(scene)
+        first, n = self._counts[0] + 1, len(q)
+        self.places = np.array([*(first + k for k in kept), *range(first + n, first + n + len(u)), *self._place_of(vary)], int)
+        self.unknowns = (*(self.names[k] for k in kept), *scene.speed_names.entries, *([] if vary is None else [vary]))
+        self.size = _sizes(scene, kept, self._given[self.places])
+        self._kept = len(kept)
+        self._program(kept, resting)
+
+    @property
+    def start(self) -> Vector:
+        """The guess, in units of the unknowns' sizes."""
+        return self._given[self.places] / self.size
+
+    def index(self, name: str) -> int:
+        """Number of an unknown; a ValueError with the nearest names where there is none."""
+        if name not in self.unknowns:
+            raise ValueError(f"`{name}` is no unknown of the steady motions of `{type(self.scene).__name__}`; {nearest(name, self.unknowns)}")
+        return self.unknowns.index(name)
+
+    def _place_of(self, vary: str | None) -> list[int]:
+        if vary is None:
+            return []
+        place = 0
+        for name, value, _ in parameters_of(self.scene):
+            if name == vary and np.ndim(value) == 0:
+                return [place]
+            place += np.size(value)
+        scalar = [name for name, value, _ in parameters_of(self.scene) if np.ndim(value) == 0]
+        raise ValueError(f"`vary` names `{vary}`, expected a parameter of `{type(self.scene).__name__}` that is one number; {nearest(vary, scalar)}")
+
+    def _program(self, kept: Sequence[int], resting: Sequence[int]) -> None:
+        """One graph of rows and rates, and the values of its nodes as a function of everything given."""
+        program, rows = lower(self.scene), row_program(self.scene)
+        graph, of = Graph(), program.traced
+        every = [graph.input(f"x{k}", True) for k in range(len(self._given))]
+        new = graph.copied([*program.qdot, *program.ydot], program.graph, _known((of.parameters, of.t, of.q, of.u, of.inputs), every))
+        row_nodes = [*rows.g, *rows.phi]
+        new_rows = graph.copied(row_nodes, rows.graph, _known((rows.parameters, rows.t, rows.q, rows.u, rows.inputs), every))
+        g, phi = [new_rows[n] for n in rows.g], [new_rows[n] for n in rows.phi]
+        qdot, ydot = [new[n] for n in program.qdot], [new[n] for n in program.ydot]
+        held = [*g, *phi, *ydot, *(qdot[k] for k in resting)]
+        rates = [*(qdot[k] for k in kept), *ydot]
+        parameters, n, _ = self._counts
+        y = [every[parameters + 1 + n + k] for k in program.independent]
+        self._in_states = [*range(len(kept)), *(len(kept) + k for k in program.independent)]
+        states = [*(every[parameters + 1 + k] for k in kept), *y]
+        of_states = [*g, *(phi if len(y) == len(program.speeds) else [])]
+        self._rows = len(held)
+        self._entries, nodes = {}, list(held)
+        for name, outputs, variables in (("J", held, [every[k] for k in self.places]), ("F", rates, states), ("C", of_states, states)):
+            column = {x: k for k, x in enumerate(variables)}
+            entries = [(i, column[x], node) for i, row in enumerate(jacobian(graph, outputs, variables)) for x, node in row.items()]
+            where = np.array([entry[:2] for entry in entries], int).reshape(-1, 2).T
+            self._entries[name] = (len(outputs), len(variables)), tuple(where), slice(len(nodes), len(nodes) + len(entries))
+            nodes += [node for *_, node in entries]
+        self._values = _evaluated(graph, nodes, every)
+
+    def __call__(self, z: Vector) -> Look:
+        """The equations at z."""
+        given = self._given.copy()
+        given[self.places] = z * self.size
+        values = self._values(given)
+        matrices = {}
+        for name, (shape, where, here) in self._entries.items():
+            matrices[name] = np.zeros(shape)
+            matrices[name][where] = values[here]
+        return Look(values[: self._rows], matrices["J"] * self.size, matrices["F"], matrices["C"])
+
+    def in_states(self, directions: Float[np.ndarray, "unknowns directions"]) -> Float[np.ndarray, "states directions"]:
+        """Directions of z, without a parameter, as ones of (q, y) in SI units."""
+        return (directions * self.size[: len(directions), None])[self._in_states]
+
+    def value_at_start(self, name: str) -> float:
+        """The value of a coordinate or speed that is no unknown."""
+        return float(self._given[self._counts[0] + 1 + self.names.index(name)])
+
+    def state(self, z: Vector) -> tuple[Float[np.ndarray, "coordinates"], Float[np.ndarray, "speeds"], float]:
+        """q, u and the parameter that varies (or NaN)."""
+        given = self._given.copy()
+        given[self.places] = z * self.size
+        first, n, m = self._counts[0] + 1, self._counts[1], self._counts[2]
+        return given[first : first + n], given[first + n : first + n + m], float(given[self.places[-1]]) if self.vary else np.nan
+
+
+def _coordinates(scene: Scene) -> tuple[list[int], list[int]]:
+    """Numbers of the coordinates that are unknowns, and of those that must rest."""
+    groups = {group: scene.coordinate_names.entries[first : first + length] for group, first, length in scene.coordinate_names.groups}
+    entries, on_rows = scene.coordinate_names.entries, _on_rows(scene)
+
+    ignorable = {entries.index(entry) for name in ignorable_coordinates(scene) for entry in groups.get(name, (name,))}
+    every = range(len(entries))
+    return [k for k in every if k not in ignorable or on_rows[k]], [k for k in every if k not in ignorable]
+
+
+def _on_rows(scene: Scene) -> np.ndarray:
+    """Which coordinates geometric rows depend on, at some state of the domain."""
+    rows = row_program(scene)
+    t, q, u = (np.asarray(x, float) for x in sample_states(scene, PROBES))
+    columns = [*[np.full(PROBES, x) for leaf in jax.tree.leaves(scene) for x in np.ravel(leaf)], t, *q.T, *u.T, *[np.zeros(PROBES)] * len(scene.inputs)]
+    nodes = [*_flat(rows.parameters), rows.t, *rows.q, *rows.u, *rows.inputs]
+    at = Probes(rows.graph, {rows.graph.value[n]: column for n, column in zip(nodes, columns, strict=True) if n >= 0})
+    depends = np.zeros(len(scene.coordinate_names.entries), bool)
+    for (_, k), node in rows.G.items():
+        depends[k] |= np.max(np.abs(at([node]))) > DEPENDS
+    return depends
+
+
+def _sizes(scene: Scene, kept: Sequence[int], values: np.ndarray) -> np.ndarray:
+    low, high = coordinate_bounds(scene)
+    of_coordinates = [high[k] - low[k] if high[k] > low[k] else 1.0 for k in kept]
+    of_speeds = [10.0] * len(scene.speed_names.entries)  # SI units
+    of_parameter = [abs(x) if x else 1.0 for x in values[len(of_coordinates) + len(of_speeds) :]]
+    return np.array([*of_coordinates, *of_speeds, *of_parameter])
+
+
+def _flat(parts) -> list[int]:
+    return [int(n) for part in parts for n in np.ravel(part)]
+
+
+def _known(variables, inputs: Sequence[int]) -> dict[int, int]:
+    """Inputs of a graph in the place of a program's variables: parameters by leaf, t, q, u, inputs."""
+    parameters, *rest = variables
+    return {n: x for n, x in zip([*_flat(parameters), *_flat(rest)], inputs, strict=True) if n >= 0}
+
+
+def _evaluated(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[np.ndarray], np.ndarray]:
+    """Values of nodes as a function of those of the variables: by machine code where it is made, otherwise by NumPy, operation by operation."""
+    if jax.config.jax_enable_x64 and not host.reason_against() and not unsupported(graph, nodes):
+        kernel = jax.jit(nodes_called(graph, nodes, variables, effort=0))
+        return lambda given: np.asarray(kernel(given))
+    names = [graph.value[n] for n in variables]
+    return lambda given: Probes(graph, dict(zip(names, given[:, None], strict=True)))(nodes)[:, 0]

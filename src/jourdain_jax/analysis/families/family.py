@@ -1,0 +1,235 @@
+"""Families of steady motions: the whole curve through one of them, with what is special on it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+
+from jourdain_jax.analysis.families.curve import Point, located
+from jourdain_jax.analysis.families.equations import SteadyEquations, Vector
+from jourdain_jax.analysis.families.followed import Followed, across, first_point, with_held
+from jourdain_jax.analysis.families.special import SURE
+from jourdain_jax.analysis.families.spectrum import Modes, matched
+from jourdain_jax.analysis.steady import guessed
+from jourdain_jax.analysis.table import complex_numbers, table
+from jourdain_jax.calculus.on_first_use import needed
+from jourdain_jax.calculus.reals import Numbers
+from jourdain_jax.motion.start import State
+from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, of_known_numbers
+from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
+from jourdain_jax.scene.printing import Printed, in_digits
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.tracebacks import shown_from_users_lines
+
+SHOWN = 1e-9  # sizes by which an unknown changes that is printed
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class FamilyPoint(Printed):
+    """A point of a family; `point["lean"]`, `point.state`. `kind` says what is special about it."""
+
+    kind: str
+    state: State
+    eigenvalues: Modes  # 1/s, in the columns of the family
+    modes: tuple[str, ...]  # names of the modes concerned
+    vary: str | None
+    parameter: float  # the value of the parameter that varies; NaN where none does
+    tangent: Vector  # of the curve, along its unknowns
+
+    def __getitem__(self, name: str) -> float:
+        """A coordinate, a speed, or the parameter that varies."""
+        return self.parameter if name == self.vary else float(self.state[name])
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether the point is a smooth function of the scene's parameters: no branch point."""
+        return self.kind != "branch point"
+
+    def _text(self) -> str:
+        concerned = f" ({', '.join(dict.fromkeys(self.modes))})" if self.modes else ""
+        eigenvalues = f"eigenvalues, 1/s: {', '.join(complex_numbers(self.eigenvalues))}"
+        return f"{self.kind or 'point of a family'}{concerned}\n{self.state}\n{eigenvalues}"
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Family(Printed):
+    """Steady motions along a curve, in its order; `family["lean"]`, `print(family)`.
+
+    Eigenvalues keep their columns along the curve; the zeros that belong to going on along the family, or to what is held, are left out.
+    """
+
+    by: Followed
+    points: tuple[Point, ...]
+    ends: tuple[str, str]  # why the curve ends at its first and at its last point
+    mode_names: tuple[str, ...]
+    special: tuple[FamilyPoint, ...] = ()
+
+    @property
+    def equations(self) -> SteadyEquations:
+        """The equations of the steady motions, and their unknowns."""
+        return self.by.equations
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, name: str) -> Float[np.ndarray, "points"]:
+        """Values of a coordinate, a speed, or the parameter that varies, at all points."""
+        known = self.equations
+        if name in known.unknowns:
+            k = known.index(name)
+            return np.array([point.z[k] for point in self.points]) * known.size[k]
+        if name in known.names:
+            return np.full(len(self), known.value_at_start(name))
+        raise UnknownNameError(f"a family of `{type(known.scene).__name__}` has no `{name}`; {nearest(name, dict.fromkeys((*known.names, *known.unknowns)))}")
+
+    @property
+    def eigenvalues(self) -> Complex[np.ndarray, "points modes"]:
+        """Eigenvalues of small motions in 1/s, each in its column, named by `mode_names`."""
+        return np.array([point.modes for point in self.points])
+
+    @property
+    def stable(self) -> Bool[np.ndarray, "points"]:
+        """Whether no small motion about a point grows."""
+        return np.all(self.eigenvalues.real <= SURE * (1 + np.abs(self.eigenvalues)), axis=1)
+
+    @property
+    def folds(self) -> tuple[FamilyPoint, ...]:
+        """Points at which a named value turns back."""
+        return tuple(point for point in self.special if point.kind.startswith("fold"))
+
+    @property
+    def branches(self) -> tuple[FamilyPoint, ...]:
+        """Points through which another family goes: `jj.family(scene, family.branches[0])` follows that one."""
+        return tuple(point for point in self.special if point.kind == "branch point")
+
+    @property
+    def changes(self) -> tuple[FamilyPoint, ...]:
+        """Points at which an eigenvalue passes zero, a pair the imaginary axis, or two eigenvalues meet."""
+        return tuple(point for point in self.special if point.modes)
+
+    def at(self, **named: float) -> tuple[FamilyPoint, ...]:
+        """Every point of the curve with this value of one coordinate, speed or parameter: `family.at(lean=0.4)`."""
+        if len(named) != 1:
+            raise ValueError(f"`at` takes one name with its value, and {len(named)} were given: a curve has points for one value")
+        ((name, value),) = named.items()
+        k = self.equations.index(name)
+        target, found = float(value) / self.equations.size[k], []
+        for here, there in pairwise(self.points):
+            values = here.z[k] - target, there.z[k] - target
+            if values[0] == 0.0:
+                found.append(self.point(here))
+            elif values[0] * values[1] < 0 and (point := located(self.by.looked, here, there, lambda p: p.z[k] - target, values)):
+                found.append(self.point(point))
+        if self.points[-1].z[k] == target and self.ends[1] != "the curve is closed":
+            found.append(self.point(self.points[-1]))
+        return tuple(found)
+
+    def point(self, point: Point, kind: str = "", columns: tuple[int, ...] = ()) -> FamilyPoint:
+        """A point of the curve with its state and eigenvalues."""
+        q, u, value = self.equations.state(point.z)
+        near = min(self.points, key=lambda p: np.max(np.abs(p.z - point.z)))
+        left, none = jnp.asarray(np.max(np.abs(point.look.R), initial=0.0)), jnp.zeros(())
+        scene = self.equations.scene
+        state = State(jnp.asarray(self.equations.t), jnp.asarray(q), jnp.asarray(u), none, none, left, (scene.coordinate_names, scene.speed_names))
+        modes = point.modes if len(point.modes) else matched(near.modes, self.by.spectrum(point))
+        return FamilyPoint(kind, state, modes, tuple(self.mode_names[k] for k in columns), self.equations.vary, value, point.tangent * self.equations.size)
+
+    def to_xarray(self):
+        """Points as an `xarray.Dataset`: every unknown, `stable`, and the eigenvalues with their names."""
+        xarray = needed("xarray", "a family as labelled arrays")
+        values = {name: ("point", self[name]) for name in self.equations.unknowns}
+        about = {"long_name": "eigenvalue", "units": "1/s"}
+        spectrum = {"eigenvalues": (("point", "mode"), self.eigenvalues, about), "stable": ("point", self.stable)}
+        return xarray.Dataset(values | spectrum, {"mode": list(self.mode_names)}, {"scene": type(self.equations.scene).__name__})
+
+    def _text(self) -> str:
+        known, ends = self.equations, self.ends
+        moved = {name: float(np.ptp(self[name])) / size for name, size in zip(known.unknowns, known.size, strict=True)}
+        shown = [name for name in known.unknowns if moved[name] > SHOWN][:8]
+        lines = [f"Family of steady motions of {type(known.scene).__name__}: {len(self)} points, {int(self.stable.sum())} of them stable"]
+        lines += ["  " + ends[0]] if ends[0] == ends[1] else [f"  begins: {ends[0]}", f"  ends: {ends[1]}"]
+        rows = [("", *shown, "modes")]
+        points = [self.point(self.points[0], "first point"), *self.special, self.point(self.points[-1], "last point")]
+        least = dict(zip(known.unknowns, SHOWN * known.size, strict=True))
+        for point in points:
+            values = in_digits(np.array([0.0 if abs(point[name]) < least[name] else point[name] for name in shown]))
+            rows.append((point.kind, *values, ", ".join(dict.fromkeys(point.modes))))
+        eigenvalues = zip(self.mode_names, complex_numbers(self.points[0].modes), strict=True)
+        return "\n".join([*lines, *table(rows), f"  eigenvalues at the first point, 1/s: {', '.join(f'{name} {value}' for name, value in eigenvalues)}"])
+
+
+@of_known_numbers
+@shown_from_users_lines
+def family(
+    scene: Scene | BuiltFor,
+    guess: "State | Mapping | FamilyPoint",
+    *,
+    until: Mapping[str, float] | None = None,
+    vary: str | None = None,
+    held: str | tuple[str, ...] = (),
+    names: tuple[str, ...] | None = None,
+    inputs: Numbers | dict | None = None,
+    max_points: int = 4000,
+) -> Family:
+    """Follow the family of steady motions through the one near a guess: `g = 0, phi = 0, dy/dt = 0, dq_j/dt = 0` with one freedom left.
+
+        turns = jj.family(bicycle, {"rear_spin_rate": 20.0, "lean": 1e-3}, until={"lean": 1.5})
+        print(turns)                                  # folds, branch points, changes of stability, why the curve ends
+        turns["lean"], turns.eigenvalues, turns.at(lean=0.4)
+        straight = jj.family(bicycle, turns.branches[0])
+
+    **Arguments**
+    - `guess`: as of `steady`; or a branch point of another family, whose other curve is followed.
+    - `until`: name -> value at which the curve ends. It is followed towards it from the guess, whose value of that name is kept at the start; without
+      `until` in both directions. A curve that closes ends there.
+    - `vary`: a parameter of the scene, one number, that changes along the curve.
+    - `held`: names of coordinates and speeds that keep the guess's value; `inputs`: as of `steady`.
+    - `names`: of the modes at the start, by ascending real part and of a pair the positive imaginary part first;
+      default: the `mode_names` of the scene, or "mode 1", ...
+    - `max_points`: at most, in each direction.
+
+    **Returns** a `Family`. Special points are located to round-off. By pseudo-arclength; two special points within one step are seen where the step is
+    halved until neighbours differ by little, but a pair of folds closer than 1e-3 of the sizes of the unknowns may be passed.
+
+    **Raises** ValueError: an unknown name; no steady motion near the guess; none or several freedoms (the error names what may be held); a start that is a
+    branch point itself; `NotLowered` where the scene has no scalar program. `DifferentiationModeError` inside `jit`: differentiate `steady` or `linearize`.
+    """
+    scene, until, held = as_scene(scene), dict(until or {}), as_names(held)
+    start = guess.state if isinstance(guess, FamilyPoint) else guess
+    t, q, u = (np.asarray(x, float) for x in guessed(scene, start, 0.0))
+    if vary is not None and isinstance(guess, FamilyPoint) and guess.vary == vary:
+        scene = scene.replace(**{vary: guess.parameter})
+    f = np.asarray(as_input_vector(scene, inputs), float)
+    equations = SteadyEquations(scene, (float(t), q, u), f, vary)
+    for name in (*held, *until):
+        equations.index(name)
+    looked = with_held(equations, held)
+    named = [name for name in (guess if isinstance(guess, Mapping) else ()) if name in equations.unknowns]
+    if isinstance(guess, FamilyPoint):
+        if guess.kind != "branch point" or len(guess.tangent) != len(equations.unknowns):
+            raise ValueError(f"`guess` is a point of a family ({guess.kind or 'not special'}), expected a branch point of one with the same unknowns")
+        begin = across(looked, equations.start, guess.tangent / equations.size)
+    else:
+        begin = first_point(looked, equations, named, [*held, *until])
+    targets = {equations.index(name): (name, float(value) / equations.size[equations.index(name)]) for name, value in until.items()}
+    by = Followed(equations, looked, len(held), targets)
+    points, ends = by.followed(begin, max_points)
+    first = next(k for k, point in enumerate(points) if point.z is begin.z)
+    if isinstance(guess, FamilyPoint):  # between its neighbours the branch point is found as any other
+        del points[first]
+    found = Family(by, tuple(points), ends, _mode_names(scene, names, points[min(first, len(points) - 1)].modes))
+    turning = {name: equations.index(name) for name in dict.fromkeys([*named, *until, *([vary] if vary else [])]) if name not in held}
+    special = [found.point(point, crossing.kind, crossing.columns) for crossing, point in by.special(points, turning)]
+    return replace(found, special=tuple(special))
+
+
+def _mode_names(scene: Scene, names: tuple[str, ...] | None, at_start: Modes) -> tuple[str, ...]:
+    """Names of the columns: as stated by the user, by the scene, or by number."""
+    named = getattr(scene, "mode_names", None)
+    names = tuple(names) if names is not None else named(at_start) if named else tuple(f"mode {k + 1}" for k in range(len(at_start)))
+    if len(names) != len(at_start):
+        raise ValueError(f"`names` holds {len(names)} names, expected one for each of the {len(at_start)} modes")
+    return names

@@ -1,0 +1,120 @@
+"""Special points between two neighbours of a curve: where a smooth test changes its sign.
+
+fold of a named unknown     t_k = 0                       t: tangent
+branch point                det (U'J; t) = 0              U: the rows that J holds independently, carried on from the neighbour
+zero eigenvalue             s = 0, real
+pair on the imaginary axis  Re s = 0, complex
+double root                 (s_a - s_b)^2 = 0             a pair of real ones becomes complex, or the reverse
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from jourdain_jax.analysis.families.curve import Equations, Point
+from jourdain_jax.analysis.families.equations import Look, Vector
+from jourdain_jax.analysis.families.spectrum import Modes, matched
+
+SURE = 1e-7  # relative to 1 + |s|: a real part, or a distance of two eigenvalues, that is not round-off
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """A test that changes its sign between two neighbours."""
+
+    kind: str
+    test: Callable[[Point], float]
+    values: tuple[float, float]
+    columns: tuple[int, ...] = ()  # of the eigenvalues concerned
+
+
+def folds(here: Point, there: Point, unknowns: dict[str, int]) -> Iterator[Crossing]:
+    """Folds of the named unknowns."""
+    for name, k in unknowns.items():
+        if here.tangent[k] * there.tangent[k] < 0 and min(abs(here.tangent[k]), abs(there.tangent[k])) > 1e-10:  # not round-off
+            yield Crossing(f"fold in {name}", lambda p, k=k: p.tangent[k], (here.tangent[k], there.tangent[k]))
+
+
+def branches(here: Point, there: Point) -> Iterator[Crossing]:
+    """A branch point."""
+    U = _held(here.look)[0]
+
+    def test(point: Point) -> float:
+        own, sigma, V = _held(point.look)
+        side = np.linalg.slogdet(U.T @ own)[0] * np.linalg.slogdet(V)[0] * np.sign(V[-1] @ point.tangent)
+        return float(side * sigma)
+
+    values = test(here), test(there)
+    if values[0] * values[1] < 0:
+        yield Crossing("branch point", test, values)
+
+
+def _held(look: Look) -> tuple[Float[np.ndarray, "rows held"], float, Float[np.ndarray, "unknowns unknowns"]]:
+    """A basis of the rows that J holds independently, the smallest singular value of these, and the right singular vectors."""
+    U, sigma, V = np.linalg.svd(look.J)
+    held = look.J.shape[1] - 1
+    return U[:, :held], float(sigma[held - 1]), V
+
+
+def changes(before: Modes, now: Modes, spectrum: Callable[[Point], Modes]) -> Iterator[Crossing]:
+    """Eigenvalues that pass zero or the imaginary axis, and pairs that meet; `spectrum`: eigenvalues at a point, in any order."""
+
+    def part(k: int) -> Callable[[Point], float]:
+        return lambda point: float(matched((before + now) / 2, spectrum(point))[k].real)
+
+    def apart(a: int, b: int) -> Callable[[Point], float]:
+        def test(point: Point) -> float:
+            found = matched((before + now) / 2, spectrum(point))
+            return float(((found[a] - found[b]) ** 2).real)
+
+        return test
+
+    for k, (a, b) in enumerate(zip(before, now, strict=True)):
+        if a.imag == 0 and b.imag == 0 and _surely_opposite(a, b):
+            yield Crossing("zero eigenvalue", part(k), (a.real, b.real), (k,))
+        if a.imag > 0 and b.imag != 0 and _surely_opposite(a, b):
+            yield Crossing("pair on the imaginary axis", part(k), (a.real, b.real), tuple(np.flatnonzero(np.isin(before, (a, np.conj(a)))).tolist()))
+    for a, b in {pair for v in (before, now) for pair in _pairs(v)}:
+        values = float(((before[a] - before[b]) ** 2).real), float(((now[a] - now[b]) ** 2).real)
+        least = (SURE * (1 + abs(before[a]))) ** 2
+        if values[0] * values[1] < 0 and min(map(abs, values)) > least:
+            yield Crossing("double root", apart(a, b), values, (a, b))
+
+
+def _surely_opposite(a: complex, b: complex) -> bool:
+    return bool(a.real * b.real < 0 and min(abs(a.real), abs(b.real)) > SURE * (1 + abs(a)))
+
+
+def _pairs(values: Modes) -> list[tuple[int, int]]:
+    """Columns of complex pairs."""
+    up = [k for k, s in enumerate(values) if s.imag > 0]
+    return [tuple(sorted((k, int(np.argmin(np.abs(values - np.conj(values[k]))))))) for k in up]  # type: ignore[misc]
+
+
+def tangents_across(equations: Equations, z: Vector) -> list[Vector]:
+    """Unit tangents of the two curves that cross at a branch point: a a' in its null space with l . R_zz a a = 0.
+
+    R_zz by central differences of J; l: the left null vectors, of which only one has such a form that does not vanish.
+    """
+    look = equations(z)
+    U, _, V = np.linalg.svd(look.J)
+    a, b = V[-1], V[-2]
+    left = U[:, look.J.shape[1] - 2 :]
+
+    h = 1e-4  # sizes of the unknowns
+
+    def bent(v: Vector) -> Float[np.ndarray, "rows unknowns"]:
+        return (equations(z + h * v).J - equations(z - h * v).J) / (2 * h)
+
+    of_a, of_b = bent(a), bent(b)
+    forms = left.T @ np.column_stack([of_a @ a, of_a @ b, of_b @ b])
+    aa, ab, bb = np.linalg.svd(forms)[2][0]
+    if abs(aa) < abs(bb):  # solve for the smaller share
+        (a, b), (aa, bb) = (b, a), (bb, aa)
+    inside = ab * ab - aa * bb
+    if inside <= 0 or aa == 0.0:
+        return [V[-1], V[-2]]
+    roots = [(-ab + side * np.sqrt(inside)) / aa for side in (1, -1)]
+    return [(r * a + b) / np.linalg.norm(r * a + b) for r in roots]

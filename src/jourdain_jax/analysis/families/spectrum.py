@@ -1,0 +1,71 @@
+"""Small motions about the points of a family: their eigenvalues, each in its column all along the curve.
+
+Directions along which the steady motions themselves go on, at the same parameters, belong to eigenvalues that are zero by structure; they are taken out as
+a subspace, T, not by their size: with P orthonormal and across T the others are those of P' A P.
+"""
+
+from itertools import permutations
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from jourdain_jax.analysis.families.equations import Look
+
+Modes = Complex[np.ndarray, "modes"]
+
+
+def null_space(C: Float[np.ndarray, "rows states"]) -> Float[np.ndarray, "states free"]:
+    """An orthonormal basis of the x with C x = 0."""
+    if not len(C):
+        return np.eye(C.shape[1])
+    _, sigma, V = np.linalg.svd(C)
+    rank = int(np.sum(sigma > 1e-9 * max(sigma[0], 1e-300)))
+    return V[rank:].T
+
+
+def eigenvalues_at(look: Look, freedoms: Float[np.ndarray, "states free"]) -> Modes:
+    """Eigenvalues in 1/s without the structural zeros; `freedoms`: directions of (q, y) along which steady motions go on."""
+    E = null_space(look.C)
+    A = E.T @ look.F @ E
+    T = np.linalg.qr(E.T @ freedoms)[0]
+    P = null_space(T.T)
+    return _in_pairs(np.linalg.eigvals(P.T @ A @ P).astype(complex))
+
+
+def _in_pairs(values: Modes) -> Modes:
+    """Sort by ascending real part, of a pair the positive imaginary part first; what is real has no imaginary part."""
+    return values[np.lexsort((-values.imag, values.real))]
+
+
+def matched(before: Modes, now: Modes) -> Modes:
+    """The eigenvalues in the columns of those before: in the order that moves them least."""
+    apart = np.abs(before[:, None] - now[None])
+    n = len(now)
+    if n <= 7:
+        order = min(permutations(range(n)), key=lambda order: sum(apart[k, j] for k, j in enumerate(order)))
+    else:
+        order = _nearest_first(apart)
+    return now[list(order)]
+
+
+def _nearest_first(apart: Float[np.ndarray, "modes modes"]) -> list[int]:
+    order, left = [-1] * len(apart), apart.copy()
+    for _ in order:
+        k, j = np.unravel_index(np.argmin(left), left.shape)
+        order[k] = int(j)
+        left[k], left[:, j] = np.inf, np.inf
+    return order
+
+
+def surely_matched(before: Modes, now: Modes) -> bool:
+    """Whether every eigenvalue moved by less than half of what separates it from others that are no partner of it."""
+    for k, (a, b) in enumerate(zip(before, now, strict=True)):
+        others = [x for j, x in enumerate(before) if j != k and not _partners(before, now, k, j)]
+        if others and abs(b - a) > 0.5 * min(abs(a - x) for x in others):
+            return False
+    return True
+
+
+def _partners(before, now, k: int, j: int) -> bool:
+    """Whether two columns are a complex pair at one end at least."""
+    return any(v[k].imag != 0 and v[j] == np.conj(v[k]) for v in (before, now))

@@ -1,0 +1,200 @@
+"""Families of steady motions: whole curves, their special points, stability; digits from independent equations (Newton-Euler in the turning frame)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+
+NAMES = ("lean", "steer", "pitch", "yaw_rate", "rear_spin_rate", "front_spin_rate")
+FIRST_HALF = {
+    0.1: (0.029108418746, 0.000225908884, 0.163649429132, 19.992685363213, 17.144262359656),
+    0.4: (0.162268296301, 0.004456954662, 0.854379503493, 17.191526326526, 14.976429620126),
+}
+SECOND_HALF = {
+    0.4: (0.297819270847, 0.006882298771, 1.205454357838, 12.954777370022, 11.727228530998),
+    0.1: (0.996950578614, 0.007853261055, 1.268104999035, 2.991071968509, 4.723275315848),
+}
+WEAVE, CAPSIZE, DOUBLE = 4.292382536341, 6.024262015388, 0.684283078892  # m/s
+
+
+@pytest.fixture(scope="module")
+def bicycle():
+    return jj.models.WhippleBicycle()
+
+
+@pytest.fixture(scope="module")
+def turns(bicycle):
+    return jj.family(bicycle, {"rear_spin_rate": 20.0, "lean": 1e-3}, until={"lean": 1.5})
+
+
+@pytest.fixture(scope="module")
+def straight(bicycle, turns):
+    return jj.family(bicycle, turns.branches[-1])
+
+
+def magnitudes(point) -> np.ndarray:
+    return np.abs([point[name] for name in NAMES])
+
+
+def test_hands_free_turns_are_one_closed_curve_with_every_digit(turns):
+    assert turns.ends == ("the curve is closed",) * 2
+    for lean in (0.1, 0.4):
+        points = sorted(turns.at(lean=lean), key=lambda point: -point["rear_spin_rate"])
+        assert len(points) == 4  # two ways of turning, forward and backward
+        for point, expected in zip(points, (FIRST_HALF[lean], SECOND_HALF[lean], SECOND_HALF[lean], FIRST_HALF[lean]), strict=True):
+            np.testing.assert_allclose(magnitudes(point), (lean, *expected), rtol=0, atol=2e-11)
+            assert point.state.residual < 1e-10
+
+
+def test_folds_and_rest_of_the_turns(turns):
+    first = turns.folds[0]
+    assert first.kind == "fold in lean"
+    np.testing.assert_allclose(magnitudes(first)[[0, 2, 3]], (0.420089250821, 0.005834627, 1.043780887), atol=2e-9)
+    np.testing.assert_allclose(magnitudes(first)[[1, 4, 5]], (0.218993988, 15.321918729, 13.533293415), atol=1e-7)
+    rest = turns.folds[1]
+    np.testing.assert_allclose(magnitudes(rest), (0, 1.339739911491, 0.007806882108, 0, 0, 0), atol=1e-9)
+
+
+def test_the_third_family_runs_through_its_fold_to_the_other_side(bicycle):
+    found = jj.family(bicycle, {"lean": 0.9, "steer": 0.25, "yaw_rate": -2.57, "rear_spin_rate": 22.2, "front_spin_rate": 20.6})
+    (point,) = found.at(lean=0.9)
+    expected = (0.9, 0.253265658718, 0.005858374011, 2.569920264555, 22.179528967864, 20.642557477777)
+    np.testing.assert_allclose(magnitudes(point), expected, atol=1e-10)
+    assert min(abs(abs(fold["lean"]) - 0.4811) for fold in found.folds if fold.kind == "fold in lean") < 5e-5
+    assert abs(np.max(np.abs(found["steer"])) - 2.635) < 2e-3
+    assert "without bound" in found.ends[0] + found.ends[1]
+
+
+def test_straight_running_crosses_the_turns_at_the_capsize_speed(turns, straight):
+    assert [abs(point["x_rate"]) for point in turns.branches] == pytest.approx([CAPSIZE, CAPSIZE], abs=1e-9)
+    assert [point["x_rate"] for point in straight.branches] == pytest.approx([-CAPSIZE, CAPSIZE], abs=1e-9)
+    assert not any(point.differentiable for point in straight.branches)
+
+
+def test_speeds_of_the_modes_are_the_published_ones(straight):
+    changes = {(point.kind, name): point["x_rate"] for point in straight.changes for name in point.modes if point["x_rate"] > 0}
+    assert changes["pair on the imaginary axis", "weave"] == pytest.approx(WEAVE, abs=1e-9)
+    assert changes["zero eigenvalue", "capsize"] == pytest.approx(CAPSIZE, abs=1e-9)
+    assert changes["double root", "weave"] == pytest.approx(DOUBLE, abs=1e-9)
+    speeds = straight["x_rate"]
+    stable = (speeds > WEAVE) & (speeds < CAPSIZE)
+    assert stable.any()
+    np.testing.assert_array_equal(straight.stable, stable)
+
+
+def test_columns_are_those_of_the_modes(straight, bicycle):
+    (point,) = straight.at(x_rate=5.0)
+    found = dict(zip(straight.mode_names, point.eigenvalues, strict=True))
+    assert found["castering"] == pytest.approx(-14.0783896927982, abs=1e-9)
+    assert found["capsize"] == pytest.approx(-0.322866429004087, abs=1e-9)
+    assert found["weave"].real == pytest.approx(-0.775341882195845, abs=1e-9)
+    small = jj.linearize(bicycle, point.state, ("lean", "steer"))
+    np.testing.assert_allclose(np.sort_complex(point.eigenvalues), np.sort_complex(small.eigenvalues()), atol=1e-9)
+
+
+def test_the_same_turn_ridden_backward_has_opposite_eigenvalues(turns):
+    forward, backward = (sorted(turns.at(lean=0.3), key=lambda point: point["rear_spin_rate"])[k] for k in (3, 0))
+    np.testing.assert_allclose(np.sort_complex(backward.eigenvalues), np.sort_complex(-forward.eigenvalues), atol=1e-8)
+
+
+def test_turns_from_the_capsize_point_on_are_unstable_by_a_real_eigenvalue(turns):
+    for lean, growth in ((0.1927, 0.0618), (0.3658, 0.3335), (0.4186, 0.994)):
+        point = max(turns.at(lean=lean), key=lambda point: point["rear_spin_rate"])
+        if lean == 0.4186:
+            point = sorted(turns.at(lean=lean), key=lambda point: -point["rear_spin_rate"])[1]
+        real = point.eigenvalues[point.eigenvalues.imag == 0].real
+        assert np.max(real) == pytest.approx(growth, abs=0.02)
+
+
+def test_an_upright_disc_is_stable_above_its_critical_spin():
+    disc = jj.models.TiltingDisc()
+    found = jj.family(disc, {"spin_rate": -4.0}, held="lean", until={"spin_rate": -0.5})
+    (change,) = found.changes
+    assert change.kind == "double root"
+    assert change["spin_rate"] == pytest.approx(-np.sqrt(9.81 / (3 * 0.5)), abs=1e-9)
+    np.testing.assert_array_equal(found.stable, found["spin_rate"] < change["spin_rate"])
+
+
+def test_steady_turns_of_a_disc_meet_their_closed_form():
+    found = jj.family(jj.models.TiltingDisc(), {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, held="lean", until={"yaw_rate": 6.0})
+    lean, yaw, spin, R, g = found["lean"], found["yaw_rate"], found["spin_rate"], 0.5, 9.81
+    # moments about the contact point: (5/4) yaw^2 sin cos - (-3/2) yaw spin cos ... of a thin disc
+    left = 1.25 * R * yaw**2 * np.sin(lean) * np.cos(lean) + 1.5 * R * yaw * spin * np.cos(lean) + g * np.sin(lean)
+    np.testing.assert_allclose(left, 0.0, atol=1e-9)
+
+
+class Bead(jj.Scene):
+    """A bead on a hoop that turns about its vertical diameter."""
+
+    radius: float = jj.parameter(0.5, unit="m", positive=True)
+    turning: float = jj.parameter(3.0, unit="rad/s")
+    coordinates = jj.coordinates("angle")
+    domain = {"angle": (-3.0, 3.0)}
+
+    def bodies(self, t, q):
+        x, heading = self.radius * jnp.sin(q.angle), self.turning * t
+        return {"bead": jj.Particle(0.2, jnp.stack([x * jnp.cos(heading), x * jnp.sin(heading), -self.radius * jnp.cos(q.angle)]))}
+
+    def loads(self, motion):
+        return jj.gravity(motion, 9.81)
+
+
+def test_a_bead_on_a_turning_hoop_leaves_the_bottom_at_a_pitchfork():
+    bottom = jj.family(Bead(), {"angle": 0.0}, vary="turning", until={"turning": 6.0})
+    (branch,) = bottom.branches
+    critical = np.sqrt(9.81 / 0.5)
+    assert branch["turning"] == pytest.approx(critical, abs=1e-9)
+    assert bottom["turning"][-1] == pytest.approx(6.0, abs=1e-9)
+    np.testing.assert_array_equal(bottom.stable, bottom["turning"] < critical)
+    aside = jj.family(Bead(), branch, vary="turning", until={"turning": 8.0})
+    np.testing.assert_allclose(np.cos(aside["angle"]), 9.81 / (aside["turning"] ** 2 * 0.5), atol=1e-9)
+    both = jj.family(Bead(), branch, vary="turning")
+    assert both["angle"].min() < -1.5
+    assert both["angle"].max() > 1.5
+    assert {point.kind for point in both.special} == {"branch point", "fold in turning"}
+    assert [point["turning"] for point in both.special] == pytest.approx([critical] * 2, abs=1e-9)
+
+
+def test_a_family_in_arrays_and_in_text(turns):
+    found = turns.to_xarray()
+    assert dict(found.sizes) == {"point": len(turns), "mode": 4}
+    np.testing.assert_array_equal(found["lean"], turns["lean"])
+    text = str(turns)
+    assert "the curve is closed" in text
+    assert "fold in lean" in text
+    assert "castering" in text
+    assert "hands" not in str(turns.folds[0])
+
+
+@pytest.mark.parametrize(
+    ("guess", "options", "error", "says"),
+    [
+        ({"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, {}, ValueError, "2 freedoms.*name 1 of `lean`.*`held`"),
+        ({"leen": 0.3}, {}, ValueError, "did you mean `lean`"),
+        ({"lean": 0.3}, {"vary": "radios"}, ValueError, "did you mean `radius`"),
+        ({"lean": 0.3}, {"until": {"x": 1.0}}, ValueError, "`x` is no unknown"),
+        ({"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, {"held": "lean", "names": ("one",)}, ValueError, "expected one for each of the 2 modes"),
+        ({"lean": float("nan")}, {}, ValueError, "undefined near the guess"),
+    ],
+)
+def test_what_cannot_be_followed_is_refused(guess, options, error, says):
+    with pytest.raises(error, match=says):
+        jj.family(jj.models.TiltingDisc(), guess, **options)
+
+
+def test_a_motion_that_stands_alone_and_points_that_are_no_branch_points(turns, bicycle):
+    with pytest.raises(ValueError, match="stands alone"):
+        jj.family(Bead(), {"angle": 0.0})
+    with pytest.raises(ValueError, match="expected a branch point"):
+        jj.family(bicycle, turns.folds[0])
+    with pytest.raises(ValueError, match="one name with its value"):
+        turns.at(lean=0.1, steer=0.1)
+    with pytest.raises(KeyError, match="did you mean `lean`"):
+        turns["leam"]
+
+
+def test_families_are_no_functions_to_be_traced(bicycle):
+    with pytest.raises(jj.DifferentiationModeError, match="`family` was called inside jit"):
+        jax.jit(lambda w: jj.family(bicycle.replace(w=w), {"rear_spin_rate": 20.0}).points[0].z)(1.02)
