@@ -13,12 +13,12 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 461_600,
+    "code tokens of src": 461_300,
     "code tokens of docs": 11_441,
     "code tokens of notebooks": 7_444,
-    "caches": 107,
-    "named numbers": 580,
-    "tests for a tracer": 134,
+    "caches": 106,
+    "named numbers": 537,
+    "tests for a tracer": 133,
     "functions with more than 8 parameters": 11,
     "ways: state put onto its constraints": 3,
     "ways: state put back onto its constraints within a step": 1,

@@ -30,14 +30,12 @@ def test_rates_for_diffeqsolve_give_the_motion_and_its_derivative_by_any_adjoint
     np.testing.assert_allclose(jax.grad(lambda radius: end(radius, diffrax.RecursiveCheckpointAdjoint()))(0.5), slope, rtol=1e-6)
 
 
-def test_lanes_and_derivatives_by_a_solver_of_diffrax_are_those_of_our_own():
+def test_lanes_by_a_solver_of_diffrax_are_those_of_our_own():
     lean = np.array([0.2, 0.3])
     by_own, by_diffrax = (
-        jj.rollout(DISC, START | {"lean": lean}, ts=[0.2, 0.5], solver=solver, rtol=1e-7, atol=1e-7, progress=False).lanes for solver in (None, diffrax.Bosh3())
+        jj.rollout(DISC, START | {"lean": lean}, ts=[0.2, 0.5], solver=solver, rtol=1e-7, atol=1e-7).lanes for solver in (None, diffrax.Bosh3())
     )
     np.testing.assert_allclose(by_diffrax.q, by_own.q, atol=1e-5)
-    slopes = [jax.grad(lambda x: jj.simulate(DISC, START | {"lean": x}, ts=[0.5], solver=s).q_end[0])(0.3) for s in (None, diffrax.Bosh3())]  # noqa: B023
-    np.testing.assert_allclose(slopes[1], slopes[0], rtol=1e-5)
 
 
 @pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])

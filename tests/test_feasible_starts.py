@@ -204,12 +204,14 @@ class Hidden(jj.Scene):
         return {"hidden": x * jnp.sqrt(4e-4 - x**2 - y**2)}
 
 
-def test_a_start_on_the_rows_is_not_refused_because_no_state_was_found_at_random():
-    with pytest.raises(NoStateFoundError, match="no admissible state"):
+def test_states_near_the_example_serve_where_none_was_found_at_random():
+    class Shown(Hidden):
+        example = {"x": 0.3, "y": 0.2}
+
+    with pytest.raises(NoStateFoundError, match=r"no admissible state .* or an `example` on the rows"):
         structure_of(Hidden())
-    found = jj.start(Hidden(), x=0.3, y=0.2, y_rate=1.0)
-    assert float(found.residual) < 1e-12
-    assert structure_of(Hidden()).degrees_of_freedom == 2
+    assert structure_of(Shown()).degrees_of_freedom == 2
+    assert float(jj.start(Shown(), x=0.3, y=0.2, y_rate=1.0).residual) < 1e-12
 
 
 def test_steady_motions_keep_the_coordinates_on_which_nothing_depends():

@@ -9,8 +9,7 @@ from jaxtyping import Array, Float
 import jourdain_jax as jj
 from jourdain_jax import coordinate_rates, motion_at, pose_at, position_residual, structure_of, velocity_residual
 from jourdain_jax.build.plausibility import numbers_of
-from jourdain_jax.build.probed import TIMED, generic_inputs
-from jourdain_jax.build.probed_on_graph import probed_on_graph, sampled_on_graph
+from jourdain_jax.build.probed_on_graph import TIMED, generic_inputs, probed_on_graph, sampled_on_graph
 from jourdain_jax.build.sampling import random_states, symmetric_configurations
 from jourdain_jax.build.trace import explicit_rates, potentials_of
 from jourdain_jax.equations.kinematics import inertias, velocities

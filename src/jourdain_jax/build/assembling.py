@@ -11,17 +11,10 @@ Source: J. Nocedal and S. Wright, Numerical Optimization (2006), section 10.3.
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
-from jourdain_jax.build.row_lengths import usual_lengths_of
 from jourdain_jax.calculus.gauss_newton import Look, nearest_root
 from jourdain_jax.calculus.sparse_slopes import Pattern
-
-_DAMPED_ITERATIONS = 60
-_FARTHEST = 0.25  # of the width of the domain, in one damped step
-_ON_ROWS = 1e4  # units of round-off, of what a row changes by when a coordinate changes by its own size
-_AT_REST = 1e-7  # last correction of the coordinates, relative to their size: more is no configuration on the rows
-_INSIDE = 1e-6  # of the width of the domain
-_ATTEMPTS = 4
 
 
 @dataclass(frozen=True)
@@ -52,8 +45,8 @@ def assemble(look: Look, pattern: Pattern, q: np.ndarray, low: np.ndarray, high:
     rows = _Rows(look, pattern, typical_lengths(pattern.lengths(look(q, np.arange(len(q)))[1])[generic]), low, high)
     found = _judged(rows, *_newton(rows, q, np.arange(len(q))))
     generator = np.random.default_rng(2)
-    for attempt in range(_ATTEMPTS):
-        lost = ~(found.on_rows & (found.outside <= _INSIDE)) & (np.arange(len(q)) < len(q) - far)
+    for attempt in range(4):
+        lost = ~(found.on_rows & (found.outside <= 1e-6)) & (np.arange(len(q)) < len(q) - far)
         if attempt:
             lost &= generic
         if not lost.any() or (attempt and lost.sum() <= generic.sum() / 2):
@@ -93,7 +86,8 @@ def _judged(rows: _Rows, q: np.ndarray, shift: np.ndarray) -> Assembled:
     with np.errstate(invalid="ignore"):
         position_error = np.max(np.abs(residual), axis=1, initial=0.0)
         size = np.maximum(rows.pattern.lengths(G), rows.typical) * (1 + np.max(np.abs(q), axis=1, initial=0.0, keepdims=True))
-        arrived = np.all(np.abs(residual) <= _ON_ROWS * np.finfo(float).eps * size, axis=1) & (shift <= _AT_REST)
+        # on the rows: residuals of 1e4 units of round-off of what a row changes by when a coordinate changes by its own size, coordinates at rest
+        arrived = np.all(np.abs(residual) <= 1e4 * np.finfo(float).eps * size, axis=1) & (shift <= 1e-7)
         outside = np.max(np.maximum(np.maximum(rows.low - q, q - rows.high), 0.0) / rows.width, axis=1, initial=0.0)
     nowhere = lambda x, good: np.where(good & np.isfinite(x), x, np.inf)  # noqa: E731
     return Assembled(q, nowhere(position_error, True), nowhere(shift, arrived), nowhere(outside, True))
@@ -123,7 +117,7 @@ def _damped(rows: _Rows, q: np.ndarray, which: np.ndarray) -> np.ndarray:
     scales = d[pattern.rows]
     f, J = d * residual, scales * G * widths
     damping, moving = np.full(len(which), 1e-2), np.all(np.isfinite(f), axis=1) & np.all(np.isfinite(J), axis=1)
-    for _ in range(_DAMPED_ITERATIONS):
+    for _ in range(60):
         k = np.flatnonzero(moving)
         if not k.size:
             break
@@ -131,7 +125,8 @@ def _damped(rows: _Rows, q: np.ndarray, which: np.ndarray) -> np.ndarray:
         held = ((best[k] <= low) & (step < 0)) | ((best[k] >= high) & (step > 0))
         if held.any():
             step = _damped_step(pattern, np.where(held[:, pattern.columns], 0.0, J[k]), f[k], damping[k])
-        step *= np.minimum(1.0, _FARTHEST / np.maximum(np.max(np.abs(step), axis=1, keepdims=True, initial=0.0), 1e-300))
+        # at most a quarter of the width of the domain in one step
+        step *= np.minimum(1.0, 0.25 / np.maximum(np.max(np.abs(step), axis=1, keepdims=True, initial=0.0), 1e-300))
         trial = np.clip(best[k] + width * step, low, high)
         residual, G = look(trial, which[k])
         f_trial = d * residual
@@ -153,3 +148,27 @@ def _damped_step(pattern: Pattern, J: np.ndarray, f: np.ndarray, damping: np.nda
     system, diagonal = J @ np.swapaxes(J, 1, 2), np.arange(J.shape[1])
     system[:, diagonal, diagonal] += damping[:, None]
     return -np.einsum("smn,sm->sn", J, np.linalg.solve(system, f[..., None])[..., 0])
+
+
+def speed_scales(M: Float[np.ndarray, "states speeds speeds"]) -> Float[np.ndarray, "states speeds"]:
+    """Scales of the speeds (see `speed_scale`) at many states, by NumPy."""
+    diagonal = np.diagonal(M, axis1=1, axis2=2)
+    return np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1)), 1)
+
+
+def typical_row_lengths(A: Float[np.ndarray, "states rows speeds"], elsewhere: Float[np.ndarray, "others rows speeds"]) -> Float[np.ndarray, "rows"]:
+    """The length of each row at most states: the median, or the largest for a row that vanishes at half of them.
+
+    A row that is round-off at all `A` of what it is `elsewhere`, off the geometric rows, keeps that length, and so counts as zero.
+    """
+    length, beyond = (usual_lengths_of(np.sqrt(np.sum(x**2, axis=2))) for x in (A, elsewhere))
+    return np.where(length > np.sqrt(np.finfo(A.dtype).eps) * beyond, length, beyond)
+
+
+def usual_lengths_of(length: Float[np.ndarray, "states rows"]) -> Float[np.ndarray, "rows"]:
+    """The median over the states at which all are numbers, or the largest for a row that vanishes at half of them; 0 for one that always does."""
+    length = length[np.all(np.isfinite(length), axis=1)]
+    if not len(length):
+        return np.zeros(length.shape[1], length.dtype)
+    median = np.median(length, axis=0)
+    return np.where(median > 0, median, length.max(axis=0))

@@ -20,8 +20,6 @@ from jourdain_jax.equations.projection import BY_AUTODIFF
 from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 
-MOST_STATES = 4  # that are looked at
-
 
 def may_contradict(scene: Scene, known: Structure, free_q: Bool[np.ndarray, "coordinates"], free_u: Bool[np.ndarray, "speeds"]) -> bool:
     """Whether values that are held, where entries are not free, may contradict each other; `known`: of the scene."""
@@ -42,7 +40,7 @@ def _loses_rank(matrices, free) -> bool:
 def _slopes(scene: Scene, of: Literal["closures", "rows"]) -> Float[np.ndarray, "states rows columns"]:
     """G or A at some states of the domain."""
     known = structure_of(scene)
-    states = slice(0, min(known.random, MOST_STATES))
+    states = slice(0, min(known.random, 4))
     return _evaluated(of, with_reference_parameters(scene), known.times[states], known.coordinates[states])
 
 

@@ -34,8 +34,6 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import contacts_of, loads_of
 
 TOLERANCE = 1e-4  # relative: constants may be typed with a few digits, mistakes are larger
-_POINT = 1e-9**2  # m^2: of bodies whose radius of gyration is smaller, moments are round-off
-_ROUNDED = 1e-2  # relative: of thin wheels the last moment is the sum of the others, and published moments have three digits
 _ROWS_INSTEAD = "write its rows in `velocity_constraints`: tangents @ (rolling.velocity_at(point) - ground.velocity_at(point))"
 
 
@@ -81,7 +79,8 @@ def stated_of(scene: Scene, pose: Pose, loads: tuple[Load, ...] = ()) -> Stated:
     tyres = {f"contact `{name}`": c.shape.tyre for name, c in contacts.items() if isinstance(c.shape, Wheel) and c.shape.tyre is not None}
     return Stated(
         mass={f"body `{name}`": body.mass for name, body in bodies.items()},
-        inertia={f"body `{name}`": jnp.concatenate([body.inertia, jnp.full((1, 3), _POINT * body.mass)]) for name, body in rigid.items()},
+        # moments of bodies whose radius of gyration is below 1e-9 m are round-off
+        inertia={f"body `{name}`": jnp.concatenate([body.inertia, jnp.full((1, 3), 1e-18 * body.mass)]) for name, body in rigid.items()},
         orientation={f"body `{name}`": body.orientation for name, body in rigid.items()},
         normal={f"contact `{name}`": jnp.stack([c.plane.normal @ c.plane.normal, size(c.point)]) for name, c in contacts.items()},
         gap={
@@ -276,7 +275,8 @@ def impossible_bodies(scene: Scene, q) -> tuple[str, ...]:
     found = _sentences(who, jax.tree.map(lambda x: x[None], stated), CHECKS)
     for name, inertia in stated.inertia.items():
         least, middle, largest = np.linalg.eigvalsh(inertia[:3])
-        if least > TOLERANCE * largest and largest > (1 + _ROUNDED) * (least + middle):
+        # the last moment of thin wheels is the sum of the others, and published moments have three digits
+        if least > TOLERANCE * largest and largest > (1 + 1e-2) * (least + middle):
             found.append(
                 f"{name} of `{who}` has principal moments of inertia {least:.4g}, {middle:.4g} and {largest:.4g} kg m^2, the last above the sum of the others: "
                 "no distribution of mass has them; bound the parameters of its inertia, or free fewer"

@@ -13,7 +13,6 @@ from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.scene import Scene
 
 _EXHAUSTIVE = 3000
-_SHORTLIST = 40
 
 
 def privileged_by_user(scene: Scene, freedoms: int) -> tuple[int, ...] | None:
@@ -62,7 +61,7 @@ def best_privileged(scaled: np.ndarray, count: int, rank: int) -> tuple[int, ...
         return round(worst_pivot(probes, list(dependent), rank, pivots), 6), round(float(np.median(pivots)), 6)
 
     some = scaled[:: max(1, len(scaled) // 40)]
-    best = sorted(subsets, key=lambda dependent: merit(dependent, some), reverse=True)[:_SHORTLIST]
+    best = sorted(subsets, key=lambda dependent: merit(dependent, some), reverse=True)[:40]
     dependent = max(best, key=lambda dependent: merit(dependent, scaled))
     return tuple(i for i in range(count) if i not in dependent)
 

@@ -10,16 +10,18 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, PyTree
 
-from jourdain_jax.build.assembling import Assembled, assemble, typical_lengths, without_rows
+from jourdain_jax.build.assembling import Assembled, assemble, speed_scales, typical_lengths, without_rows
 from jourdain_jax.build.domain import coordinate_bounds
-from jourdain_jax.build.probed import Probed, generic_inputs
-from jourdain_jax.build.row_lengths import speed_scales
+from jourdain_jax.build.plausibility import PoseNumbers
 from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
 from jourdain_jax.calculus.gauss_newton import nearest_root, shortest
+from jourdain_jax.calculus.reals import Entries
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.equations.virtual_power import mass_matrix
 from jourdain_jax.program.analyticity import CALLS, NONANALYTIC, decided_by, depend_on, passes
@@ -30,11 +32,37 @@ from jourdain_jax.program.identity_test import IdentityProbes, identity_probes, 
 from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 
+TIMED = ("rows", "poses", "inertias", "coordinate rates", "loads", "potential")
+
 # What poses and rows decide, and a motion can hardly be integrated without: where calls compute it, states far off are asked. Of loads nothing is believed.
 _MOTION = frozenset({"rows", "poses", "inertias", "coordinate rates", "rows at rest", "motion at rest", "inertia", "nonlinear"})
 
 
-MOST_GRAPHS = 64  # that are kept
+class Probed(eqx.Module):
+    """What is found at one state, or with a leading axis at all; trees have arrays as leaves."""
+
+    q: Float[Entries, "*states coordinates"]  # on the geometric rows
+    position_error: Float[Entries, "*states"]  # of these rows, as the next two from `Assembled`
+    error: Float[Entries, "*states"]  # of the coordinates
+    outside: Float[Entries, "*states"]  # of the domain
+    A: Float[Entries, "*states rows speeds"]
+    A_other: Float[Entries, "*states rows speeds"]  # at other speeds
+    A_beyond: Float[Entries, "*states rows speeds"]  # at the coordinates as they were before they were put on the geometric rows
+    M: Float[Entries, "*states speeds speeds"]
+    phi_at_rest: Float[Entries, "*states rows"]  # at u = 0
+    motion_at_rest: PyTree  # velocities and coordinate rates at u = 0
+    timed: dict[str, PyTree]  # rates in time by `TIMED`, while coordinates, speeds and inputs are held (for loads and potentials: the motion)
+    inertia_rates: PyTree  # along the motion
+    potential_rates: Float[Entries, "*states loads"]  # of each load's potential, along a generic change of the inputs
+    row_rates_of_inputs: Float[Entries, "*states rows"]  # along the same change
+    numbers: PoseNumbers
+    unproved: frozenset[str] = eqx.field(static=True, default=frozenset())  # what may be other than zero where no probe lies
+    in_calls: frozenset[str] = eqx.field(static=True, default=frozenset())  # what calls of JAX compute of poses and rows
+
+
+def generic_inputs(scene: Scene) -> np.ndarray:
+    """Values of inputs at which no term passes for absent."""
+    return np.linspace(0.5, 1.0, len(scene.inputs))
 
 
 @dataclass(frozen=True)
@@ -61,7 +89,7 @@ class LookedAt:
         return self.traced.graph
 
 
-@partial(once_per_class, most=MOST_GRAPHS)
+@partial(once_per_class, most=64)
 def looked_at(scene: Scene) -> LookedAt:
     """What is looked at of a class of scenes."""
     traced = traced_scene(scene)

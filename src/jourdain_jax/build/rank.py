@@ -10,13 +10,11 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.build.probed import Probed
-from jourdain_jax.build.row_lengths import speed_scales
+from jourdain_jax.build.assembling import speed_scales
+from jourdain_jax.build.probed_on_graph import Probed
 from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 
-ERRORS = 100.0  # of a configuration: singular values below are of the error, not of the rows
 LARGE_COEFFICIENT, TAIL = 20.0, 3.0  # of the rows that stay, in a row that is left out: at any probe; with both signs, beside the median
-CONTRADICTED = 1e-4  # of the largest row: numbers may be typed with a few digits, mistakes are larger
 
 
 class Scaled(eqx.Module):
@@ -41,7 +39,8 @@ def ranks_of(A: Float[np.ndarray, "states rows speeds"], errors: Float[np.ndarra
     if not A.size:
         return [0] * len(A)
     sigma = np.linalg.svd(A, compute_uv=False)
-    return np.sum(sigma > np.maximum(rank_cutoff(A.dtype), ERRORS * errors)[:, None] * sigma[:, :1], axis=1).tolist()
+    # singular values below 100 errors of the configuration are of the error, not of the rows
+    return np.sum(sigma > np.maximum(rank_cutoff(A.dtype), 100.0 * errors)[:, None] * sigma[:, :1], axis=1).tolist()
 
 
 def contradictions(
@@ -56,7 +55,8 @@ def contradictions(
     U = np.linalg.svd(A, full_matrices=False)[0]
     U = U * (np.arange(U.shape[2]) < np.array(ranks)[:, None])[:, None]
     left = at_rest - (U @ (U.transpose(0, 2, 1) @ at_rest[..., None]))[..., 0]
-    unmet = np.abs(left) > CONTRADICTED * np.max(np.abs(at_rest), axis=1, initial=0.0, keepdims=True)
+    # numbers may be typed with a few digits, mistakes are larger
+    unmet = np.abs(left) > 1e-4 * np.max(np.abs(at_rest), axis=1, initial=0.0, keepdims=True)
     if not unmet.size or not unmet.any(axis=1).all():
         return ()
     wrong = [(name, s) for s, name in enumerate(names) if unmet[:, s].any()]

@@ -19,8 +19,6 @@ from jaxtyping import Float
 from jourdain_jax.calculus.reals import is_traced_type
 from jourdain_jax.scene.scene import Scene
 
-MOST_CASES = 1024  # that are kept of one function
-
 
 def once_per_values(probe, of_traced: Callable | None = None):
     """A function of a scene (and of what else tells its cases apart), run once per class and values, on concrete parameters, also while they are traced.

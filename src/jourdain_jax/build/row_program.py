@@ -23,8 +23,6 @@ from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.scene import Scene
 
-MOST_PRODUCTS = 20_000  # of entries of velocities in a mass matrix that is written out
-
 
 @dataclass(frozen=True, eq=False)
 class RowProgram:
@@ -118,7 +116,8 @@ def _entries(rows: list[dict[int, int]], variables: list[int]) -> dict[tuple[int
 
 def _mass_matrix(nodes: LookedAt, u: list[int]) -> dict[tuple[int, int], int] | None:
     """`M = sum m beta' beta + gamma' I gamma`, the lower triangle."""
-    if sum(len(row) ** 2 for row in nodes.velocities) > MOST_PRODUCTS:
+    # products of entries of velocities: beyond, the mass matrix is not written out
+    if sum(len(row) ** 2 for row in nodes.velocities) > 20_000:
         return None
     graph, at = nodes.graph, nodes.traced.at
     bodies, place = len(at.mass), {n: k for k, n in enumerate(u)}

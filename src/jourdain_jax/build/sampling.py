@@ -11,18 +11,12 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.assembling import Assembled
 from jourdain_jax.build.domain import coordinate_bounds, speed_bounds
-from jourdain_jax.build.probed import Probed
-from jourdain_jax.build.probed_on_graph import sampled_on_graph
+from jourdain_jax.build.probed_on_graph import Probed, sampled_on_graph
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.scene.arguments import as_scene, of_known_numbers
-from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.scene import Scene, vectors_named
 
-SYMMETRIC_PROBES = 200
-SYMMETRIC_NUMBERS = 12_000  # in their coordinates together, at most: chains of hundreds of bodies are looked at in fewer symmetric configurations,
-FEWEST_SYMMETRIC = 24  # but in so many
-FEW_INSIDE = 8  # random states inside the domain: with fewer, those nearest to it are used as well
 GUESSES = 8  # of a start, of each kind
-NEAR = 0.1  # of the domain: how far the first guesses are from what was given
 NEARLY_INSIDE = 0.05  # of the width of the domain
 
 
@@ -30,27 +24,14 @@ class NoStateFoundError(ValueError):
     """No state of a scene's domain was found that is on its geometric rows and at which its rows are numbers."""
 
 
-_seen: dict[type, np.ndarray] = {}  # configurations on the rows that were given for scenes of a class in whose domain none was found
-
-
-def seen_on_rows(scene: Scene, q: np.ndarray) -> None:
-    """A configuration on the geometric rows of a scene in whose domain none was found: where that is so, states are looked for near it."""
-    _seen.setdefault(type(scene), np.asarray(q, float))
-
-
-def seen_of(scene: Scene) -> np.ndarray | None:
-    """The configuration that was given for scenes of this class, if there is one."""
-    return _seen.get(type(scene))
-
-
-def states_near_what_was_seen(scene: Scene, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """States near a configuration that was given for this class of scenes, not yet on the rows; None where there is none."""
-    if type(scene) not in _seen or len(_seen[type(scene)]) != len(scene.coordinate_names):
+def states_near_example(scene: Scene, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """States near the scene's example, not yet on the rows, for a domain in which none was found; None where it states none."""
+    if not scene.example:
         return None
     t, q, u = random_states(scene, count, generator)
     low, high = coordinate_bounds(scene)
     near = 10.0 ** -(1.0 + np.arange(count) % 6)  # of the domain: rows may be met, or be numbers, in a small part of it only
-    return t, _seen[type(scene)] + near[:, None] * (q - (low + high) / 2), u
+    return t, vectors_named(scene, scene.example)[0] + near[:, None] * (q - (low + high) / 2), u
 
 
 @of_known_numbers
@@ -68,7 +49,7 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
     drawn = -(-count // 32) * 32  # always a multiple of this, so that one program serves all small samples
     t, q, u = random_states(scene, drawn, np.random.default_rng(seed))
     q, u, found = sampled_on_graph(scene, t, q, u)
-    near = None if (found.on_rows & _are_numbers(u)).any() else states_near_what_was_seen(scene, drawn, np.random.default_rng(seed))
+    near = None if (found.on_rows & _are_numbers(u)).any() else states_near_example(scene, drawn, np.random.default_rng(seed))
     if near is not None:
         t, q, u = near
         q, u, found = sampled_on_graph(scene, t, q, u)
@@ -115,7 +96,7 @@ def guesses_of(scene: Scene, states: np.ndarray, q, free) -> Float[Array | np.nd
     apart = on.where(free, 0.0, (on_rows - q) / np.where(high > low, high - low, 1.0))
     nearest_first = on.argsort(on.sum(apart**2, axis=1))[:GUESSES]
     elsewhere = np.random.default_rng(3).uniform(low, high, (2 * GUESSES, len(low)))
-    near = q + NEAR * (elsewhere[:GUESSES] - (low + high) / 2)
+    near = q + 0.1 * (elsewhere[:GUESSES] - (low + high) / 2)
     return on.concatenate([near, on_rows[nearest_first], elsewhere[GUESSES:]]).astype(q.dtype)
 
 
@@ -136,12 +117,13 @@ def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) 
         )
         raise NoStateFoundError(
             f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the geometric rows by "
-            f"{np.min(found.position_error[generic]):.1e} or more; state a `domain` nearer to an assembled configuration, or check the geometric rows "
-            "against each other (where parameters are traced, numbers near their defaults stood in for them, or near one where they have none: give "
-            f"defaults near the values in use){nowhere}"
+            f"{np.min(found.position_error[generic]):.1e} or more; state a `domain` nearer to an assembled configuration, "
+            "or an `example` on the rows, or check the geometric rows against each other (where parameters are traced, numbers near their defaults stood in "
+            f"for them, or near one where they have none: give defaults near the values in use){nowhere}"
         )
     outside = np.sort(found.outside[good & generic])
-    return good & (found.outside <= max(outside[min(FEW_INSIDE, len(outside)) - 1], NEARLY_INSIDE))
+    # with fewer than 8 random states inside the domain, those nearest to it are used as well
+    return good & (found.outside <= max(outside[min(8, len(outside)) - 1], NEARLY_INSIDE))
 
 
 def symmetric_configurations(scene: Scene) -> np.ndarray:
@@ -150,7 +132,8 @@ def symmetric_configurations(scene: Scene) -> np.ndarray:
     reference = scene.coordinates.reference()
     attitude = {i + k for i, _ in scene.coordinates.quaternions for k in range(4)}
     turns = [(i, a) for i in range(len(low)) if i not in attitude for a in (np.pi / 2, -np.pi / 2) if low[i] <= a <= high[i]]
-    most = max(FEWEST_SYMMETRIC, min(SYMMETRIC_PROBES, SYMMETRIC_NUMBERS // max(1, len(low))))
+    # chains of hundreds of bodies are looked at in fewer configurations, 12,000 coordinates together, but in 24
+    most = max(24, min(200, 12_000 // max(1, len(low))))
     if len(turns) < most:
         pairs = sorted(itertools.combinations(turns, 2), key=lambda pair: pair[0][1] != pair[1][1])  # equal angles first: headings of one axle
         chosen = [(), *((turn,) for turn in turns), *pairs]

@@ -22,7 +22,6 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.scene.scene import Scene
 
 EVENLY, KNOTS, ACROSS, LINES = 192, 128, 48, 6  # intervals of time within the usual span, around numbers that may be knots, on each line across q; such lines
-MANY = 3  # kinks along coordinates that make a look-up: a single one may lie where no motion comes
 SPEEDS_WOULD_JUMP = (
     "speeds would have to jump there, by an impulse that no acceleration holds. Let it change within a short time, as by a `jj.Sampled` input, or end the "
     "motion there and start another with the speeds after the jump"
@@ -44,7 +43,8 @@ def kinks(scene: Scene, q: np.ndarray, u: np.ndarray) -> tuple[str, ...]:
             found.setdefault(rows[node], f"row `{rows[node]}` of `{type(scene).__name__}` jumps at t = {behind[0]:.6g} s: {SPEEDS_WOULD_JUMP}")
     met = [smooth[node] for node, *_ in _jumps(scene, nodes, list(smooth), u[0], *_across(q))]
     for name in dict.fromkeys(met):
-        if met.count(name) >= MANY:
+        # three kinks along coordinates make a look-up: a single one may lie where no motion comes
+        if met.count(name) >= 3:
             found.setdefault(name, _said(scene, name, "at several places on its way"))
     return tuple(found.values())
 

@@ -11,14 +11,13 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jourdain_jax.build.assembling import speed_scales, typical_row_lengths
 from jourdain_jax.build.plausibility import implausible, odd_gravity, odd_grounds
 from jourdain_jax.build.privileged import best_privileged, pivots_at, privileged_by_user, worst_pivot
-from jourdain_jax.build.probed import TIMED, Probed
-from jourdain_jax.build.probed_on_graph import follow_from_others, probed_on_graph
+from jourdain_jax.build.probed_on_graph import TIMED, Probed, follow_from_others, probed_on_graph
 from jourdain_jax.build.rank import Scaled, contradictions, ranks_of, redundant_rows, scaled_states
 from jourdain_jax.build.reference_parameters import once_per_values
-from jourdain_jax.build.row_lengths import speed_scales, typical_row_lengths
-from jourdain_jax.build.sampling import no_numbers, random_states, states_near_what_was_seen, symmetric_configurations, usable_states
+from jourdain_jax.build.sampling import no_numbers, random_states, states_near_example, symmetric_configurations, usable_states
 from jourdain_jax.build.smoothness import kinks
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
@@ -224,7 +223,7 @@ def _probed_structure(scene: Scene) -> Structure:
     drawn = random_states(scene, RANDOM_PROBES, generator)
     t, u, generic, found = _at_probes(scene, *drawn)
     finite = np.isfinite(found.error) & np.all(np.isfinite(found.A), axis=(1, 2))
-    near = None if finite[generic].any() else states_near_what_was_seen(scene, RANDOM_PROBES, generator)
+    near = None if finite[generic].any() else states_near_example(scene, RANDOM_PROBES, generator)
     if near is not None:
         drawn = near
         t, u, generic, found = _at_probes(scene, *near)

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.build.probed import generic_inputs
+from jourdain_jax.build.probed_on_graph import generic_inputs
 from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.build.structure import TRACED, closure_lengths, structure_whatever_its_faults, usual_rows
 from jourdain_jax.calculus.reals import is_traced
@@ -15,8 +15,6 @@ from jourdain_jax.equations.rows import UsualRows, velocity_residual
 from jourdain_jax.equations.scaling import speed_scale
 from jourdain_jax.equations.virtual_power import mass_matrix_at
 from jourdain_jax.scene.scene import Scene
-
-STATES = 12  # at which traced parameters are looked at
 
 
 class UsualLengths(eqx.Module):
@@ -39,7 +37,7 @@ def usual_lengths(scene: Scene) -> UsualLengths:
 def _of_traced(scene: Scene) -> tuple[UsualRows, Float[Array, "closures"]]:
     """Return lengths of rows at states probed with numbers near the class's defaults; computed while the motion runs."""
     known, still = structure_whatever_its_faults(scene), jax.lax.stop_gradient(scene)
-    count = min(STATES, known.random)
+    count = min(12, known.random)
     t, q, inputs = jnp.asarray(known.times[:count]), jnp.asarray(known.coordinates[:count]), jnp.asarray(generic_inputs(scene))
     u = jnp.ones(len(scene.speed_names), q.dtype)
 

@@ -14,7 +14,6 @@ from jourdain_jax.calculus.reals import is_array_type, nothing_is_traced
 # from kept object code then takes 1.55 s in place of 1.75; later versions have these emitters alone.
 _OLD: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jaxlib.version.__version_info__ < (0, 11, 1) else {}
 RUN_SELDOM = _OLD | {"xla_backend_optimization_level": 0}
-MOST_STRUCTURES = 1024  # of arguments, arrays left out, for which one function is kept compiled
 
 
 def compiled(f: Callable, options: dict | Callable | None = None) -> Callable:
@@ -24,7 +23,7 @@ def compiled(f: Callable, options: dict | Callable | None = None) -> Callable:
     no effect in calls inside another transformation: JAX takes options of whole programs only.
     """
 
-    @lru_cache(maxsize=MOST_STRUCTURES)
+    @lru_cache(maxsize=1024)  # structures of arguments, arrays left out
     def program(treedef, others, with_options: bool) -> Callable:
         def on_arrays(arrays):
             found, kept = _parted(f(*_whole(arrays, treedef, others)))

@@ -16,8 +16,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 MOST_STEPS = 80
 MOST_ENTRIES = 50_000  # of all slopes that are held at once, for each lane: of 96 trailers those of all guesses and 17 lanes took 57 GB
-_FARTHEST = 0.25  # of the size of the unknowns, in one step
-_GIVEN_UP = 1e7  # damping: no step makes the rows smaller
 
 
 class Nearest(eqx.Module):
@@ -64,8 +62,10 @@ def damped_search(
         best, f, J = (jnp.where(better, a, b) for a, b in ((search.trial, search.best), (f, search.f), (J, search.J)))
         damping = jnp.clip(jnp.where(better, search.damping / 6, search.damping * 5), 1e-14, 1e8)
         step = -J.T @ jnp.linalg.solve(J @ J.T + damping * jnp.eye(f.shape[0], dtype=f.dtype), f)
-        step = step * jnp.minimum(1.0, _FARTHEST / jnp.maximum(jnp.max(jnp.abs(step), initial=0.0), jnp.finfo(f.dtype).tiny))
-        going = (jnp.max(jnp.abs(f), initial=0.0) > tolerance) & (damping < _GIVEN_UP) & (search.steps < most_steps) & jnp.all(jnp.isfinite(f))
+        # at most a quarter of the size of the unknowns in one step
+        step = step * jnp.minimum(1.0, 0.25 / jnp.maximum(jnp.max(jnp.abs(step), initial=0.0), jnp.finfo(f.dtype).tiny))
+        # a damping of 1e7: no step makes the rows smaller
+        going = (jnp.max(jnp.abs(f), initial=0.0) > tolerance) & (damping < 1e7) & (search.steps < most_steps) & jnp.all(jnp.isfinite(f))
         return Search(jnp.clip(best + size * step, low, high), best, f, J, damping, search.steps + 1, going)
 
     f, J = jax.eval_shape(look, guess)

@@ -10,9 +10,6 @@ from collections.abc import Callable
 import numpy as np
 
 MOST_STEPS = 25
-AT_REST = 4 * float(np.finfo(float).eps)  # last correction, relative to 1 + |x|: nothing moves any more
-NEARLY_DEPENDENT = 1e-6  # of the triangular factor's diagonal: below, singular values decide
-SMALL = 1e-9  # beside the largest singular value: counts as zero
 
 # x of some states, and their numbers -> g, G in the form that `solve` takes
 Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -33,7 +30,7 @@ def nearest_root(look: Look, solve: Callable, x: np.ndarray, *, most: int = MOST
         step, size, moving = step[moves], size[moves], moving[moves]
         x[moving] -= step / np.maximum(1.0, size / longest)[:, None]
         last[moving] = size / (1 + np.max(np.abs(x[moving]), axis=1, initial=0.0))
-        moving = moving[last[moving] > AT_REST]
+        moving = moving[last[moving] > 4 * np.finfo(float).eps]
         if not moving.size:
             break
     return x, last
@@ -53,7 +50,8 @@ def pseudo_inverses(G: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndar
     places = np.flatnonzero(finite)
     if G.shape[1] <= G.shape[2]:
         Q, R = np.linalg.qr(np.swapaxes(scaled[finite], 1, 2))  # D G = R' Q'
-        regular = np.min(np.abs(np.diagonal(R, axis1=1, axis2=2)), axis=1, initial=1.0) > NEARLY_DEPENDENT
+        # where the triangular factor has a smaller diagonal, singular values decide
+        regular = np.min(np.abs(np.diagonal(R, axis1=1, axis2=2)), axis=1, initial=1.0) > 1e-6
         found[places[regular]] = Q[regular] @ np.swapaxes(np.linalg.inv(R[regular]), 1, 2)
         places = places[~regular]
     for k in places:
@@ -63,6 +61,6 @@ def pseudo_inverses(G: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndar
 
 def _by_singular_values(G: np.ndarray) -> np.ndarray:
     try:
-        return np.linalg.pinv(G, rcond=SMALL)
+        return np.linalg.pinv(G, rcond=1e-9)
     except np.linalg.LinAlgError:  # numbers too far apart for a decomposition
         return np.full(G.shape[::-1], np.nan)

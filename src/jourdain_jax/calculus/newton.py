@@ -13,10 +13,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-MOST_ITERATIONS = 20
-_AT_ROUND_OFF = 4.0  # units of round-off
-_STALLED = 0.1  # an iteration that no longer shrinks the correction by this has met round-off
-
 
 class Root(eqx.Module):
     """Where an iteration ended, and whether that is a root."""
@@ -37,15 +33,16 @@ def newton_root(residual: Callable, guess: Float[Array, "unknowns"], scale: Floa
     def solve(f, x0):
         def running(carry):
             _, _, settled, k = carry
-            return ~settled & (k < MOST_ITERATIONS)
+            return ~settled & (k < 20)
 
         def iterate(carry):
             x, size, _, k = carry
             value, derivative = jax.linearize(f, x)
             dx = jnp.linalg.solve(_matrix(derivative, x), value)
             new_size = jnp.max(jnp.abs(dx) / scale, initial=0.0)
-            at_round_off = new_size <= _AT_ROUND_OFF * eps
-            stalled = (new_size <= eps**0.6) & (new_size > _STALLED * size)
+            at_round_off = new_size <= 4.0 * eps  # units of round-off
+            # an iteration that no longer shrinks the correction to a tenth has met round-off
+            stalled = (new_size <= eps**0.6) & (new_size > 0.1 * size)
             return x - dx, new_size, at_round_off | stalled | ~jnp.isfinite(new_size), k + 1
 
         start = (x0, jnp.asarray(jnp.inf, x0.dtype), jnp.array(False), jnp.array(0, jnp.int32))

@@ -16,8 +16,7 @@ import jax
 import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
-from jourdain_jax.build.assembling import typical_lengths
-from jourdain_jax.build.row_lengths import speed_scales
+from jourdain_jax.build.assembling import speed_scales, typical_lengths
 from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import VelocityQuantities, jaxpr_of_scene
 from jourdain_jax.calculus.gauss_newton import shortest

@@ -18,7 +18,6 @@ from jourdain_jax.scene.scene import Scene
 DEFAULT_SAMPLES = 201
 _EVEN = np.linspace(0.0, 1.0, DEFAULT_SAMPLES)
 _SHORT = 1e-9  # s, a span for motions that are not asked for
-_ROUND_OFF = 4  # units in the last place by which a time at an end of the span may lie beyond it
 
 
 def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None, native: bool = True) -> State:
@@ -78,7 +77,8 @@ def times_fit(ts, t0, t1) -> "Bool[Array, ''] | np.bool_":
     """Whether the span is finite and not empty, and the times to save at lie in it, one after another; also of traced times."""
     xp = jnp if is_traced(ts, t0, t1) else np
     direction = xp.sign(t1 - t0)
-    slack = _ROUND_OFF * np.finfo(ts.dtype).eps * xp.maximum(xp.abs(t0), xp.abs(t1))
+    # times at an end of the span may lie beyond it by four units in the last place
+    slack = 4 * np.finfo(ts.dtype).eps * xp.maximum(xp.abs(t0), xp.abs(t1))
     from_start, to_end = (ts[0] - t0) * direction, (t1 - ts[-1]) * direction
     return (direction != 0) & xp.isfinite(t1 - t0) & xp.all((ts[1:] - ts[:-1]) * direction > 0) & (from_start >= -slack) & (to_end >= -slack)
 

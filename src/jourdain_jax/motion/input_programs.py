@@ -22,7 +22,6 @@ from jourdain_jax.program.calls import description
 from jourdain_jax.scene.names_read import is_function, now_read_by
 
 MOST_PROGRAMS = 64  # kept, so that equal ones are one object
-MOST_COMPILED = 16  # sets of them for which compiled motions are kept
 _TAKE_NUMBERS = ("add", "sub", "mul", "div", "lt", "le", "gt", "ge")  # finite derivatives with respect to a plain number, where it is not zero
 
 
@@ -154,5 +153,5 @@ def _one_of_equals(program: TimeProgram) -> TimeProgram:
 def for_programs(f: Callable, options: Callable | None = None) -> Callable[[Hashable], Callable]:
     """`f` compiled for a set of input programs; what was compiled for one is dropped, machine code included, when as many other sets were used since."""
     for_none = compiled(f, options)
-    for_some = lru_cache(maxsize=MOST_COMPILED)(lambda programs: compiled(f, options))
+    for_some = lru_cache(maxsize=16)(lambda programs: compiled(f, options))
     return lambda programs: for_some(programs) if programs else for_none

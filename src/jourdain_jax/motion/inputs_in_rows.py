@@ -16,8 +16,6 @@ from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.motion.inputs import Constant, Inputs, Sampled, inputs_at
 from jourdain_jax.scene.scene import Scene
 
-EVENLY = 256  # intervals of time
-
 
 def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
     """A ValueError that names an input on which velocity rows depend and which jumps between the times t0 and t1; nothing where one of these is traced."""
@@ -44,6 +42,6 @@ def _in_rows(scene: Scene, inputs: Inputs, q: np.ndarray, t0) -> Bool[np.ndarray
 
 def _first_jump(channel: Callable, t0: float, t1: float) -> float | None:
     """When an input jumps between these times; None where it is not seen to."""
-    values, ts = uncompiled_lanes(channel), np.linspace(t0, t1, EVENLY + 1)[:, None]
+    values, ts = uncompiled_lanes(channel), np.linspace(t0, t1, 257)[:, None]
     found = jumps(lambda t: np.asarray(values(t[:, 0]), float)[:, None], ts[:-1], ts[1:])
     return next((float(behind[0]) for _, _, behind in found), None)

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 
 from jourdain_jax.build.reference import Reference
-from jourdain_jax.build.structure import Structure, structure_of
+from jourdain_jax.build.structure import Structure, structure_of, structure_whatever_its_faults
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.listed import names_of_events, names_of_invariants
 from jourdain_jax.lowering.lower import lowered
@@ -159,6 +159,11 @@ class Model(BuiltFor, Printed):
             said.append(f"rows {', '.join(rows.may_set_in)} follow from the others at all probed states, but by no identity: they may set in elsewhere")
         if self.structure.chosen_by_user and self.state == "full":
             said.append("the privileged speeds that the scene states do not determine the others everywhere in its domain: all speeds are integrated")
+        if self.structure.decisions != _decisions_where_traced(self.reference.scene):
+            said.append(
+                "numbers near the class's defaults, which stand in for parameters that JAX traces, lead to other choices; "
+                "under `jit` and derivatives take `model.replace(...)`, which keeps those of this model"
+            )
         return tuple(said)
 
     def __reduce__(self):
@@ -190,6 +195,13 @@ class Model(BuiltFor, Printed):
         if self.state == "minimal":
             return "privileged speeds determine the others over the domain"
         return "privileged speeds do not determine the others over the whole domain" if known.affine else "rows are nonlinear in the speeds"
+
+
+def _decisions_where_traced(scene: Scene) -> tuple:
+    """Return what decides about a scene all of whose parameters JAX traces."""
+    found: list[tuple] = []
+    jax.eval_shape(lambda scene: found.append(structure_whatever_its_faults(scene).decisions), scene)
+    return found[0]
 
 
 def _flattened(model: Model) -> tuple[tuple, tuple]:

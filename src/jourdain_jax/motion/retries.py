@@ -33,7 +33,6 @@ from jourdain_jax.motion.vector_fields.choice import as_formulation
 from jourdain_jax.motion.vector_fields.field import VectorField
 
 OUT_OF_STEPS = (results.MAX_STEPS, results.SHRANK)
-_SHARE = 10  # a step of the implicit solver costs tens of explicit ones: it gets a tenth of the number
 
 RERUN_FIELDS = ("state_form", "reduction", "solver", "projected", "unwatched")  # of a trajectory, static: they say how a lane was run again
 Motions = TypeVar("Motions", bound=Trajectory)
@@ -115,7 +114,8 @@ def _with_retries(retries: int, options: AllOptions) -> AllOptions:
         solver = DOPRI8 if isinstance(options.solver, Taylor) else options.solver  # dense matrices have no series
         options = replace(options, formulation=replace(as_formulation(options.formulation), state="full"), backend="dense", solver=solver)
     if retries & results.IMPLICIT:
-        options = replace(options, solver=RadauIIA(), max_steps=max(1, options.max_steps // _SHARE))
+        # a step of the implicit solver costs tens of explicit ones: it gets a tenth of their number
+        options = replace(options, solver=RadauIIA(), max_steps=max(1, options.max_steps // 10))
     return options
 
 

@@ -18,10 +18,8 @@ from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
 from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.scene.scene import Scene
 
-MOST_KEPT = 64
 
-
-@lru_cache(maxsize=MOST_KEPT)
+@lru_cache(maxsize=64)
 def row_functions(program: RowProgram) -> RowFunctions:
     """g and G, phi and A, and M, by the program; of what is no machine code, by autodiff."""
     nodes = [*program.g, *program.G.values(), *program.phi, *program.A.values(), *(program.M or {}).values()]

@@ -33,8 +33,6 @@ from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.motion.watched import moving_jumps
 from jourdain_jax.scene.tracebacks import users_level
 
-LARGEST_ERROR = 0.05  # relative, of a derivative, beyond which a warning is given
-
 
 class SensitivityWarning(UserWarning):
     """A derivative was taken through a motion that amplifies errors so much that few of its digits are right, or whose loads jump."""
@@ -109,7 +107,7 @@ class _Growth:
 def _judge(amplification: float, rtol: float, steps: int) -> None:
     """A warning where so many steps, each as wrong as the tolerance lets it be, spoil a derivative."""
     error = steps * amplification * rtol
-    if error > LARGEST_ERROR:
+    if error > 0.05:
         text = (
             f"the derivative goes through a motion that amplifies errors {amplification:.1e} times: with rtol = {rtol:g} in each of {steps} steps its "
             f"relative error may be {error:.0e}; tighten `rtol` and `atol` (in float64), or shorten the span"

@@ -19,14 +19,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.build.held_values import may_contradict
 from jourdain_jax.build.row_program import RowProgram
-from jourdain_jax.build.sampling import NoStateFoundError, guesses_of, seen_on_rows
+from jourdain_jax.build.sampling import guesses_of
 from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.calculus.damped import first_root
 from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, described, is_traced, nothing_is_traced, real_type
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
-from jourdain_jax.equations.projection import closure_residual, project_positions
+from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.motion.inputs import as_inputs, inputs_at
@@ -39,9 +39,7 @@ from jourdain_jax.scene.printing import Printed, in_digits
 from jourdain_jax.scene.scene import Scene, vectors_named
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
-FAR = 10.0  # widths of the domain: a coordinate that Newton's method moves by more has run away
 _NOTHING: Mapping = MappingProxyType({})
-_TYPED = 1.5e-5  # of numbers that were typed with a few digits
 _OFF = 1e4  # units of round-off: a residual that is more
 
 
@@ -195,7 +193,8 @@ def _left(g: Float[Array, "closures"]) -> Float[Array, ""]:
 
 def _arrived(q, near_q, g, start: _Guess) -> Bool[Array, ""]:
     """Whether the rows are met, where coordinates may be found and without running far away."""
-    close = jnp.all(jnp.abs(near_q - q) <= FAR * start.usual.width)  # never where it is not a number
+    # a coordinate that Newton's method moves by more than ten widths of the domain has run away; never close where it is not a number
+    close = jnp.all(jnp.abs(near_q - q) <= 10.0 * start.usual.width)
     return jax.lax.stop_gradient(close & (_left(g) == 0)) & jnp.all(start.inside(near_q))
 
 
@@ -231,7 +230,7 @@ def _searched(scene: Scene, t, q, start: _Guess, guesses) -> _Put:
 
 def _tolerance(dtype) -> float:
     """The residual (m, rad) from which on given values contradict each other: that of numbers typed with a few digits, or of round-off."""
-    return max(_TYPED, _OFF * float(np.finfo(dtype).eps))
+    return max(1.5e-5, _OFF * float(np.finfo(dtype).eps))  # the first: of numbers typed with a few digits
 
 
 _compiled_projection = compiled(_put_onto_constraints, options=RUN_SELDOM)  # one program for every choice of what is held
@@ -278,7 +277,7 @@ def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, *, near: M
     t, free_q = _as_time(t0), _free(scene.coordinate_names.entries, given)
     if is_traced(q, u, t) or not (np.isfinite(q).all() and np.isfinite(u).all() and np.isfinite(t)):
         _check_finite({**near, **values, "t0": t0})
-    known = _structure(scene, t, q, free_q)
+    known = structure_of(scene)
     free_u = _free(scene.speed_names.entries, (*given, *_resting(scene, known, given)))
     determined = known.affine and not any(free_u[i] for i in known.independent)  # rows determine the speeds that are free
     usual = usual_sizes(scene, determined, native)
@@ -313,20 +312,6 @@ def _bounded(program: RowProgram | None, names: tuple[str, ...], given: tuple[st
         if not any(depend_on(program.graph, slopes, np.array(program.q)[free].tolist())):
             return np.zeros(len(names), bool)
     return free & _free(names, about)
-
-
-def _structure(scene: Scene, t, q, free_q) -> Structure:
-    """The structure of a scene; where no state of its domain was found, of the neighbourhood of a start that is on the rows."""
-    try:
-        return structure_of(scene)
-    except NoStateFoundError:
-        if is_traced((scene, t, q)):
-            raise
-        near = np.asarray(project_positions(scene, t, as_coordinates(scene, q), free=jnp.asarray(free_q)))
-        if not float(_left(closure_residual(scene, t, jnp.asarray(near)))) == 0:
-            raise
-        seen_on_rows(scene, near)
-        return structure_of(scene)
 
 
 def _resting(scene: Scene, known: Structure, given: tuple[str, ...]) -> tuple[str, ...]:

@@ -16,7 +16,6 @@ from jaxtyping import PyTree
 from jourdain_jax.lowering.lowered import Lowered
 
 TOGETHER = 8  # lanes, where the loop is one function
-LARGEST_PROGRAM = 3000  # operations: beyond, the loop touches too much memory to become one function (the bicycle, 2016, is still one)
 
 
 def in_blocks(function: Callable, lanes_at_once: int, *trees: PyTree) -> PyTree:
@@ -33,4 +32,5 @@ def in_blocks(function: Callable, lanes_at_once: int, *trees: PyTree) -> PyTree:
 
 def width(program: Lowered) -> int:
     """Return how many lanes of a lowered scene run in lockstep."""
-    return TOGETHER if program.operations <= LARGEST_PROGRAM and jax.default_backend() == "cpu" else 2**30
+    # with more operations the loop touches too much memory to become one function (the bicycle, 2016, is still one)
+    return TOGETHER if program.operations <= 3000 and jax.default_backend() == "cpu" else 2**30

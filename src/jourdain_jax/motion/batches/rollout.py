@@ -40,9 +40,6 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
-CHUNK = 512  # lanes whose stages fit the cache of a core
-MEMORY = 2**30  # bytes of saved states per chunk, at most
-
 
 class Rollout(Printed, eqx.Module):
     """Many motions of one scene: a `Trajectory` whose arrays have a leading axis of lanes."""
@@ -306,4 +303,5 @@ def _chunk(scene: Scene, count: int, chunk: int | None, ts) -> int:
         raise ValueError(f"`chunk` is {chunk!r}, expected a whole number, at least one lane")
     times = DEFAULT_SAMPLES if ts is None else np.shape(ts)[0]
     per_lane = 8 * times * (len(scene.coordinate_names) + len(scene.speed_names) + 2)
-    return max(1, min(count, CHUNK if chunk is None else chunk, max(1, MEMORY // per_lane)))
+    # the stages of 512 lanes fit the cache of a core; saved states of a chunk take 1 GiB at most
+    return max(1, min(count, 512 if chunk is None else chunk, max(1, 2**30 // per_lane)))
