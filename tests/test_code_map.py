@@ -13,19 +13,19 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 459_400,
+    "code tokens of src": 462_000,
     "code tokens of docs": 11_441,
     "code tokens of notebooks": 7_444,
-    "caches": 106,
-    "named numbers": 536,
+    "caches": 107,
+    "named numbers": 537,
     "tests for a tracer": 133,
     "functions with more than 8 parameters": 11,
     "ways: state put onto its constraints": 3,
     "ways: state put back onto its constraints within a step": 1,
     "ways: rows and their slopes for a projection": 2,
     "ways: damped least squares": 3,
-    "code tokens of tests": 353_700,
-    "code tokens of bench": 120_300,
+    "code tokens of tests": 354_600,
+    "code tokens of bench": 121_000,
     "test files that reach private names": 69,
 }
 

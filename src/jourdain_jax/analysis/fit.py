@@ -125,8 +125,6 @@ def off_bounds(
     return found, told
 
 
-
-
 @shown_from_users_lines
 def fit(
     scene: Scene | BuiltFor,
@@ -282,9 +280,7 @@ def _checked_choices(loss, errors, shooting) -> Loss:
 
 def _check_noise(runs: Sequence[Experiment], asked: Asked) -> None:
     if asked.errors == "runs" and len(runs) < 5:
-        raise ValueError(
-            f'errors="runs" takes standard errors from how runs differ, but there are {len(runs)}; give 5 or more, or errors="sigmas"'
-        )
+        raise ValueError(f'errors="runs" takes standard errors from how runs differ, but there are {len(runs)}; give 5 or more, or errors="sigmas"')
     robust, unknown = asked.loss != LEAST_SQUARES, in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma)
     if unknown and robust:
         raise ValueError(f"sigma of channel `{unknown[0]}` is None, but a robust loss needs to know what is far out; give a number")

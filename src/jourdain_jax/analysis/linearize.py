@@ -21,6 +21,7 @@ from jaxtyping import Array, Complex, Float
 from jourdain_jax.analysis.table import linearization_text
 from jourdain_jax.analysis.tangent import (
     Flow,
+    Programs,
     carried_along,
     dependent_coordinates,
     eliminated,
@@ -29,6 +30,7 @@ from jourdain_jax.analysis.tangent import (
     perturbations,
     privileged_at,
     privileged_speeds,
+    programs_of,
 )
 from jourdain_jax.build.structure import WELL_CONDITIONED
 from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
@@ -134,7 +136,7 @@ def linearize(
     state, speeds or coordinates that do not determine the others there.
     **Warns** (`SensitivityWarning`): a load has a kink or jumps at the state, as dry friction does at rest.
     """
-    scene = as_scene(scene)
+    built, scene = scene, as_scene(scene)
     f = as_input_vector(scene, inputs)
     state = as_state(scene, state, what="state", inputs=f)
     f = f.astype(state.q.dtype)
@@ -142,12 +144,12 @@ def linearize(
     coordinates = None if coordinates is None else as_names(coordinates)
     y = privileged_speeds(scene, privileged)
     dependent_s = dependent_coordinates(scene, state, coordinates or (), None if dependent is None else as_names(dependent))
-    found = _linearize(scene, state, f, y, tuple(dependent_s.tolist()), coordinates)
+    found = _linearize(scene, programs_of(built, y), state, f, y, tuple(dependent_s.tolist()), coordinates)
     if is_traced(found) or not found.pivot < WELL_CONDITIONED:
         return found
     if privileged is None and scene.privileged is None:
         chosen = privileged_at(scene, state, f, y)
-        found = found if chosen == y else _linearize(scene, state, f, chosen, tuple(dependent_s.tolist()), coordinates)
+        found = found if chosen == y else _linearize(scene, None, state, f, chosen, tuple(dependent_s.tolist()), coordinates)
     if found.pivot < SMALLEST_PIVOT:
         raise ValueError(
             f"the dependent speeds or coordinates of `{type(scene).__name__}` do not follow from its rows at this state (pivot {float(found.pivot):.1e}): "
@@ -167,7 +169,9 @@ def _warn_of_loads(scene: Scene, state: State, f) -> None:
 
 
 @_compiled
-def _linearize(scene: Scene, state: State, f, y: tuple[int, ...], dependent: tuple[int, ...], coordinates: tuple[str, ...] | None) -> Linearization:
+def _linearize(
+    scene: Scene, programs: Programs | None, state: State, f, y: tuple[int, ...], dependent: tuple[int, ...], coordinates: tuple[str, ...] | None
+) -> Linearization:
     perturbed = perturbations(scene, state.q)
     dependent_s = np.array(dependent, int)
     independent = tuple(perturbed.names[i] for i in others(dependent_s, len(perturbed.names)))
@@ -175,7 +179,7 @@ def _linearize(scene: Scene, state: State, f, y: tuple[int, ...], dependent: tup
         coordinates = tuple(name for name in independent if _own_rate(scene, name) in y)
 
     # the flow's derivative along every perturbation (ds, du, df) and, last, along the motion itself
-    now, slope, mass_matrix = jax.linearize(flow_of(scene, y), state.t, state.q, state.u, f, has_aux=True)
+    now, slope, mass_matrix = jax.linearize(flow_of(scene, y, programs), state.t, state.q, state.u, f, has_aux=True)
     counts = len(perturbed.names), state.u.shape[0], f.shape[0]
     s, u, _ = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
     ds, du, df = jnp.split(jnp.eye(sum(counts), dtype=f.dtype), np.cumsum(counts)[:-1])

@@ -270,8 +270,6 @@ def _told_by_kind(known: Information, T: Float[np.ndarray, "members runs kinds w
     return p, np.concatenate([np.diagonal(Q, axis1=-2, axis2=-1), of_own.reshape(*of_own.shape[:2], -1)], axis=-1)
 
 
-
-
 @dataclass(frozen=True)
 class Spread:
     """What is told of how far estimates are spread, of all members."""

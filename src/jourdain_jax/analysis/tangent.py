@@ -6,6 +6,10 @@
 of it is special. Dependent `ds` follow from the geometric rows g, dependent `du` from all velocity rows phi.
 """
 
+from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,9 +18,11 @@ from jaxtyping import Array, Float, Int
 
 from jourdain_jax.build.privileged import best_privileged, pivots_at
 from jourdain_jax.build.reference_parameters import with_reference_parameters
+from jourdain_jax.build.row_program import RowProgram, row_program
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import WELL_CONDITIONED, structure_of, usual_rows
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff, singular_values
+from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.calculus.rotations import quaternion_product
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import coordinate_rates
@@ -25,7 +31,14 @@ from jourdain_jax.equations.reductions import Privileged
 from jourdain_jax.equations.rows import position_residual
 from jourdain_jax.equations.scaling import row_scale, scaled
 from jourdain_jax.equations.virtual_power import equations_and_rows
+from jourdain_jax.lowering.lower import lowered
+from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
+from jourdain_jax.motion.row_functions import row_functions
 from jourdain_jax.motion.start import State
+from jourdain_jax.native import ffi
+from jourdain_jax.native.scalar_program import unsupported
+from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.scene import Scene
 
@@ -47,8 +60,51 @@ class Perturbations(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
 
 
-def flow_of(scene: Scene, privileged: tuple[int, ...]):
-    """`(t, q, u, f) -> (Flow, mass matrix)` with the accelerations in the given privileged speeds."""
+class Programs(NamedTuple):
+    """Scalar programs of a scene's rates in its privileged speeds, and of its rows, as machine code with derivatives of its own."""
+
+    rates: Lowered
+    rows: RowProgram
+
+
+def programs_of(scene: Scene | BuiltFor, privileged: tuple[int, ...]) -> Programs | None:
+    """The programs, where machine code serves for these privileged speeds; otherwise the scene's own matrices do, differentiated by JAX."""
+    if ffi.reason_against() or (isinstance(scene, BuiltFor) and scene.backend == "xla"):
+        return None
+    rates, rows = lowered(as_scene(scene)), row_program(as_scene(scene))
+    if not isinstance(rates, Lowered) or rates.independent != privileged or rows is None or rows.M is None:
+        return None
+    return None if unsupported(rates.graph, [*rates.qdot, *rates.ydot, *rates.guards]) else Programs(rates, rows)
+
+
+@lru_cache(maxsize=64)
+def _rates(program: Lowered) -> Callable[[Array], Array]:
+    """Coordinate rates, accelerations of the privileged speeds, and guards as a function of parameters, t, q, y and inputs in a row."""
+    of, nodes = program.traced, [*program.qdot, *program.ydot, *program.guards]
+    given = [*(n for part in of.parameters for n in part.ravel().tolist()), of.t, *of.q.tolist()]
+    given += [*(int(of.u[k]) for k in program.independent), *of.inputs.tolist()]
+    return values_of_nodes(program.graph, dict(enumerate(nodes)), len(nodes), given)
+
+
+def _flow_by(programs: Programs, scene: Scene):
+    rates, rows = _rates(programs.rates), row_functions(programs.rows)
+    geometric, n, chosen = len(names_of_position_rows(scene)), len(scene.coordinate_names), np.array(programs.rates.independent, int)
+
+    def flow(t, q, u, f):
+        parameters = [jnp.ravel(leaf) for leaf in jax.tree.leaves(scene)]
+        found = rates(jnp.concatenate([*parameters, t[None], q, u[chosen], f]).astype(real_type()))
+        guards = found[n + chosen.size :]
+        qdot = jnp.where(jnp.all(guards > 0), found[:n], jnp.nan)
+        udot = jnp.zeros_like(u).at[chosen].set(found[n : n + chosen.size])
+        return Flow(qdot, udot, rows.rows(scene, t, q, u, f)[0], rows.closures(scene, t, q)[0][:geometric]), rows.masses(scene, t, q)
+
+    return flow
+
+
+def flow_of(scene: Scene, privileged: tuple[int, ...], programs: Programs | None = None):
+    """`(t, q, u, f) -> (Flow, mass matrix)` with the accelerations in the given privileged speeds; by `programs` those of the other speeds are zero."""
+    if programs is not None:
+        return _flow_by(programs, scene)
 
     def flow(t, q, u, f):
         equations, rows = equations_and_rows(scene, t, q, u, f)

@@ -23,7 +23,7 @@ from jourdain_jax.program.derivative import cotangents, derivatives
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import Graph, Unsupported
 
-LARGEST_PROGRAM = 20_000  # operations of a derivative; machine code of so many takes 0.7 MB of the stack, and 0.15 s to make
+LARGEST_PROGRAM = 40_000  # operations of a derivative; machine code of so many takes 1.4 MB of the stack, and 0.3 s to make
 
 
 def values_of_nodes(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array]:
