@@ -13,10 +13,10 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 462_000,
+    "code tokens of src": 461_800,
     "code tokens of docs": 11_441,
     "code tokens of notebooks": 7_444,
-    "caches": 107,
+    "caches": 105,
     "named numbers": 537,
     "tests for a tracer": 133,
     "functions with more than 8 parameters": 11,

@@ -2,13 +2,12 @@
 
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from functools import lru_cache
 from numbers import Real
 
 import jax
 import numpy as np
 
-from jourdain_jax.build.reference_parameters import Values, defaults, reference_parameters, with_reference_parameters
+from jourdain_jax.build.reference_parameters import defaults, once_per_values, reference_parameters, with_reference_parameters
 from jourdain_jax.build.structure import structure_whatever_its_faults
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.scene.scene import Scene
@@ -28,7 +27,7 @@ class Reference:
         for place, (name, default) in enumerate(defaults(scene)):
             if name in free and isinstance(default, Real | np.ndarray | jax.Array) and np.shape(default) == np.shape(leaves[place]):
                 leaves[place] = np.asarray(default, real_type())
-        return _of_values(Values(leaves, treedef)) or Reference(scene)
+        return _found(jax.tree.unflatten(treedef, leaves)) or Reference(scene)
 
     def __init__(self, scene: Scene):
         self.scene = with_reference_parameters(scene)
@@ -47,10 +46,10 @@ class Reference:
         return isinstance(other, Reference) and self._key == other._key
 
 
-@lru_cache(maxsize=256)
-def _of_values(values: Values) -> Reference | None:
+@once_per_values
+def _found(scene: Scene) -> Reference | None:
     """That of a scene; None where no state of it is found."""
     try:
-        return Reference(values.scene)
+        return Reference(scene)
     except (TypeError, ValueError):
         return None

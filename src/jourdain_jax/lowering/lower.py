@@ -4,19 +4,17 @@ one with the fewest operations is kept. A scene that cannot be lowered says why.
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from dataclasses import replace
 from itertools import islice
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.build.reference_parameters import varied, with_reference_parameters
 from jourdain_jax.build.sampling import random_states
-from jourdain_jax.build.structure import Structure, structure_of
+from jourdain_jax.build.structure import Structure, structure_of, structure_whatever_its_faults
 from jourdain_jax.build.trace import TracedScene, Variables, named_values, traced_scene
 from jourdain_jax.lowering.appell import AppellOnGraph, Strategy
 from jourdain_jax.lowering.comparison import agree, check_against_dense, rates_of, values_at
@@ -32,6 +30,7 @@ from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.identity_test import IdentityProbes, equal
 from jourdain_jax.program.part import part_of
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
@@ -75,7 +74,10 @@ def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLower
     every_speed = not structure.has_minimal_state if every_speed is None else every_speed
     every_speed = every_speed or not structure.row_names
     massless = bool(every_speed and structure.row_names) and may_be_massless(scene, structure)
-    return _lowered(_Key.of(with_reference_parameters(scene), structure, every_speed, massless))
+    kept = (every_speed, None if every_speed else structure.independent, structure.redundant_rows, structure.affine, structure.driven)
+    kept += (structure.varying_inertia, structure.homogeneous, structure.potentials_of_inputs, structure.may_set_in)
+    kept += (structure.dependent_rows, structure.well_conditioned and structure.independent) if every_speed else ()
+    return _lowered(with_reference_parameters(scene), every_speed, massless, kept)
 
 
 def lower(scene: Scene | BuiltFor, every_speed: bool | None = None) -> Lowered:
@@ -94,38 +96,15 @@ def lower(scene: Scene | BuiltFor, every_speed: bool | None = None) -> Lowered:
     return found
 
 
-@dataclass(frozen=True)
-class _Key:
-    """What the program depends on, compared by `key`: not on the values of parameters."""
-
-    key: tuple
-    scene: Scene = field(compare=False)
-    structure: Structure = field(compare=False)
-    every_speed: bool = field(compare=False)
-    massless: bool = field(compare=False)
-
-    @staticmethod
-    def of(scene: Scene, structure: Structure, every_speed: bool, massless: bool) -> "_Key":
-        """That of a scene whose parameters are known."""
-        leaves, treedef = jax.tree.flatten(scene)
-        kept = (every_speed, None if every_speed else structure.independent, structure.redundant_rows, structure.affine, structure.driven)
-        kept += (structure.varying_inertia, structure.homogeneous, structure.potentials_of_inputs, structure.may_set_in, massless)
-        kept += (structure.dependent_rows, structure.well_conditioned and structure.independent) if every_speed else ()
-        return _Key((treedef, tuple(np.shape(x) for x in leaves), kept, jnp.result_type(float)), scene, structure, every_speed, massless)
-
-
-@lru_cache(maxsize=256)
-def _lowered(key: _Key) -> Lowered | NotLowered:
+@once_per_class
+def _lowered(scene: Scene, every_speed: bool, massless: bool, kept: tuple) -> Lowered | NotLowered:
+    """The program, which depends on what is `kept` of the structure, not on the values of parameters."""
+    begin = time.perf_counter()
     try:
         with np.errstate(all="ignore"):  # what is no number at a probe does not count there
-            return _timed(key)
+            found = _alone(_built(scene, structure_whatever_its_faults(scene), every_speed, massless))
     except NotLowered as reason:
         return NotLowered(str(reason))  # kept without its traceback
-
-
-def _timed(key: _Key) -> Lowered:
-    begin = time.perf_counter()
-    found = _alone(_built(key))
     return replace(found, seconds=time.perf_counter() - begin)
 
 
@@ -147,8 +126,7 @@ def _alone(found: Lowered) -> Lowered:
     )
 
 
-def _built(key: _Key) -> Lowered:
-    scene, structure, every_speed = key.scene, key.structure, key.every_speed
+def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool) -> Lowered:
     if not (structure.affine or every_speed):
         raise NotLowered("its rows are nonlinear in the speeds")
     if structure.may_set_in:
@@ -163,7 +141,7 @@ def _built(key: _Key) -> Lowered:
         if every_speed and len(structure.row_names) > structure.rank:  # elsewhere they contradict each other
             probes = on_velocity_rows(probes, traced)
         far = full_turns(probes, traced)
-        kept = KeptRows(traced.graph, structure, key.massless, probes, far) if every_speed and structure.row_names else None
+        kept = KeptRows(traced.graph, structure, massless, probes, far) if every_speed and structure.row_names else None
         return _best(scene, structure, AppellOnGraph(traced, structure, kept, probes, far, scene.coordinates.reference()))
     except Unsupported as reason:
         raise NotLowered(f"{reason} has no scalar form") from None

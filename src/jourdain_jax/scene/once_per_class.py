@@ -35,6 +35,7 @@ def once_per_class(describe: Callable, most: int = MOST_CASES) -> Callable:
                     known.pop(next(iter(known)))  # the oldest
         return found
 
+    vars(of)["cache_clear"] = known.clear
     return of
 
 
