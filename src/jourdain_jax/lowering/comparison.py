@@ -13,13 +13,8 @@ from jourdain_jax.lowering.mismatch import diagnose_mismatch
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.scene.scene import Scene
 
-LEAST_PROBES = 12  # at which programs can be compared, where so many were found
-LARGE = 5000  # operations: above, fewer probes are compared with the dense path
-FEW = 6  # of these probes
 TO_DENSE = {"float64": 1e-8, "float32": 1e-3}  # between the program (in double precision) and the dense path at the probes, relative to the size of each rate
 DIFFERS = "differs from the dense path"
-AGREEMENT = 1e-9  # between programs at the probes, relative to the size of each rate
-SHARED = 0.01  # of these, relative to the largest rate at a probe, whose round-off elimination spreads over all
 
 
 def rates_of(found: Equations) -> list[int]:
@@ -35,18 +30,21 @@ def values_at(found: Equations, probes: Probes) -> np.ndarray:
 def agree(values: np.ndarray, expected: np.ndarray) -> bool:
     """Whether two programs agree wherever the second serves."""
     usable = np.all(np.isfinite(expected), axis=0)
-    return bool(enough(usable) and np.all(np.abs(values - expected)[:, usable] <= AGREEMENT * _sizes(expected[:, usable])))
+    # 1e-9 between programs at the probes, relative to the size of each rate
+    return bool(enough(usable) and np.all(np.abs(values - expected)[:, usable] <= 1e-9 * _sizes(expected[:, usable])))
 
 
 def _sizes(rates: np.ndarray) -> np.ndarray:
     """To which the errors of rates (first axis) at probes are related: the usual size of each, in its own unit."""
     usual = np.max(np.abs(rates), axis=1, keepdims=True, initial=0.0)
-    return usual + SHARED * np.max(np.abs(rates), axis=0, initial=0.0) + np.finfo(float).tiny
+    # 0.01 of these, relative to the largest rate at a probe, whose round-off elimination spreads over all
+    return usual + 0.01 * np.max(np.abs(rates), axis=0, initial=0.0) + np.finfo(float).tiny
 
 
 def enough(usable: np.ndarray) -> bool:
     """Whether a program serves at enough of the probed states; of long chains only some are assembled."""
-    return int(np.count_nonzero(usable)) >= min(LEAST_PROBES, max(4, len(usable) // 2))
+    # at 12 probes programs can be compared, where so many were found
+    return int(np.count_nonzero(usable)) >= min(12, max(4, len(usable) // 2))
 
 
 def check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGraph, found: Equations, values: np.ndarray) -> None:
@@ -60,8 +58,10 @@ def check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGra
     sizes = (len(scene.coordinate_names), len(scene.speed_names), len(scene.inputs))
     q, u, inputs = (np.stack([probes.inputs[f"{p}_{i}"] for i in range(n)], -1) if n else np.zeros((len(t), 0)) for p, n in zip("qui", sizes, strict=True))
     usable = np.all(np.isfinite(values), axis=0)
-    large = builder.graph.operations(rates_of(found)) > LARGE
-    chosen = np.flatnonzero(usable)[:FEW] if large else np.arange(probes.count)
+    # operations: above, fewer probes are compared with the dense path
+    large = builder.graph.operations(rates_of(found)) > 5000
+    # above so many operations, 6 of the probes are compared
+    chosen = np.flatnonzero(usable)[:6] if large else np.arange(probes.count)
     dense = dense_rates(scene, structure, independent, *jax.tree.map(lambda x: x[chosen], (parameters, t, q, u, inputs)))
     expected, values = np.concatenate([dense.qdot, dense.ydot], axis=1).T, values[:, chosen]
     names = [*scene.coordinate_names.entries, *(scene.speed_names.entries[i] for i in independent)]

@@ -14,7 +14,6 @@ from jourdain_jax.program.identity_test import SURE, alike, equal
 from jourdain_jax.scene.scene import Scene
 
 FEW = 6  # probes that show most coordinates to count
-CLEARLY = 100.0  # times as large as the smallest pivot that serves: one that serves whatever is usual
 
 
 def _with_slopes(builder: AppellOnGraph, ydot: list[int], coordinates: list[int], regular: np.ndarray) -> set[int]:
@@ -59,7 +58,8 @@ def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expect
         before = here[:, lanes]
         before.error = here.error[:, lanes]
         sizes = np.abs(elsewhere(equations.pivots))
-        far_from_singular = np.all(sizes > CLEARLY * SMALLEST_PIVOT * usual(np.abs(generic(equations.pivots)))[:, None], axis=0)
+        # 100.0 times as large as the smallest pivot that serves: one that serves whatever is usual
+        far_from_singular = np.all(sizes > 100.0 * SMALLEST_PIVOT * usual(np.abs(generic(equations.pivots)))[:, None], axis=0)
         return np.any(~alike(then, before, far_from_singular), axis=0).reshape(len(groups), -1).any(axis=1)
 
     def regular_at_reference(group) -> bool:

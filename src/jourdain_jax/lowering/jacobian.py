@@ -17,9 +17,6 @@ from jourdain_jax.program.emit import run
 from jourdain_jax.program.fused import fused
 from jourdain_jax.program.graph import ARRAYS, Graph, Unsupported
 
-LARGEST_WORK = 100_000  # operations times variables: beyond, deriving takes longer than it can save
-LARGEST_GROWTH = 8  # operations of values and Jacobian over those of the values
-
 
 def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int], like: int, monitored: Sequence[int] = ()) -> Callable[..., tuple]:
     """A function of the values of `variables` (all that the outputs depend on) that returns those of `outputs`, as arrays of one shape, in the precision
@@ -74,11 +71,13 @@ def _entries(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> 
     operations = graph.operations(outputs)
     if graph.calls(outputs):
         return None
-    if operations * len(variables) > LARGEST_WORK:
+    # 100_000 operations times variables: beyond, deriving takes longer than it can save
+    if operations * len(variables) > 100_000:
         return None
     try:
         rows = jacobian(graph, outputs, variables)
     except Unsupported:
         return None
     entries = [(i, j, rows[i][n]) for j, n in enumerate(variables) for i in range(len(rows)) if n in rows[i]]
-    return entries if graph.operations([*outputs, *(node for *_, node in entries)]) <= LARGEST_GROWTH * max(operations, 10) else None
+    # 8 operations of values and Jacobian over those of the values
+    return entries if graph.operations([*outputs, *(node for *_, node in entries)]) <= 8 * max(operations, 10) else None

@@ -16,8 +16,6 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.scene import Scene
 
-NEAR = 1e-6  # off a state, relative to entries larger than one
-
 
 def loads_have_relations(scene: Scene) -> bool:
     """Return whether relations decide between branches of loads or masses."""
@@ -46,7 +44,8 @@ def bent_load(scene: Scene, t, q, u, inputs) -> str:
     if not numbers:
         return ""
     at = np.concatenate([np.ravel(x).astype(float) for x in (q, u, inputs)])
-    step = np.diag(NEAR * np.maximum(1.0, np.abs(at)))
+    # 1e-6 off a state, relative to entries larger than one
+    step = np.diag(1e-6 * np.maximum(1.0, np.abs(at)))
     q, u, inputs = np.split(np.concatenate([at + step, at - step]), np.cumsum([np.size(q), np.size(u)]), axis=1)
     beside = Probes(graph, {name: np.asarray(x, float) for name, x in named_values(scene, t, q, u, inputs).items()})
     size, bent = np.nanmax(np.abs(_probes(scene, traced)(loads)), axis=1), np.zeros(len(loads), bool)

@@ -36,7 +36,6 @@ from jourdain_jax.scene.scene import Scene
 
 PROBES = 56  # at most
 SHARES = (1.0, -1.0, *(0.1**k for k in range(1, 9)))  # of the usual differences from the values of parameters: the first with which these can be
-USUAL_STATES = 16  # at which a motion finds out what is usual for its parameters
 # Of the program before simplification; beyond, the dense path is taken. By XLA, the program needs a minute more than dense matrices there (24 joint angles,
 # 20,762 operations: 71 and 7.5 s), though an evaluation takes 0.15 of the time (in a batch 0.22). Below, the dense path lost everywhere (bench/README.md).
 # As machine code it wins beyond, too (a quadruped of 20,550 operations: 11 s of processor time to the first motion, 50 s by dense matrices; then 0.02 and
@@ -44,7 +43,6 @@ USUAL_STATES = 16  # at which a motion finds out what is usual for its parameter
 MOST_OPERATIONS, MOST_IN_MACHINE_CODE = 20_000, 50_000
 MOST_TERMS = 200  # of one normal form
 SMALL = 1000  # operations: below, further ways are tried
-LARGE = 5000  # operations: above, the explicit way is not tried
 _NODES = (
     "qdot",
     "ydot",
@@ -62,7 +60,6 @@ _NODES = (
     "projected_u",
     "fixed",
 )  # fields that are tuples of nodes
-NOT_SMALL = 4000  # operations: holding ignorable coordinates leaves no small program of so many
 
 
 def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLowered:
@@ -209,7 +206,8 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
     held = ignorable(scene, builder, best, expected)
     stages = [Stage("scalar program: structural zeros and ones removed, repeated parts shared", fewest)]
     plainly_held = fewest
-    if held and fewest < NOT_SMALL:
+    # 4000 operations: holding ignorable coordinates leaves no small program of so many
+    if held and fewest < 4000:
         plainly_held = graph.operations(rates_of(builder.build(replace(first, held=held))))
         stages.append(Stage("ignorable coordinates held in the accelerations", plainly_held))
     for strategy in _strategies(builder, held, plainly_held < SMALL, fewest):
@@ -281,14 +279,16 @@ def _strategies(builder: AppellOnGraph, held: tuple[int, ...], small: bool, plai
         yield Strategy(False, MOST_TERMS, MOST_TERMS, by_determinants=True, held=held)
     else:
         yield Strategy(False, MOST_TERMS, held=held)
-        if plainly <= LARGE and builder.graph.operations(rates_of(builder.build(Strategy(True)))) <= 1.35 * plainly:
+        # 5000 operations: above, the explicit way is not tried
+        if plainly <= 5000 and builder.graph.operations(rates_of(builder.build(Strategy(True)))) <= 1.35 * plainly:
             yield Strategy(True, MOST_TERMS, held=held)
 
 
 def _some_states(graph: Graph, probes: Probes, nodes) -> dict[int, np.ndarray]:
     """Values of what varies among the inputs of some nodes, at the first probes."""
     varying = [n for n in graph.reachable(nodes) if graph.op[n] == "input" and graph.varies[n]]
-    return {n: np.broadcast_to(probes.inputs[str(graph.value[n])], probes.count)[:USUAL_STATES] for n in varying}
+    # states at which a motion finds out what is usual for its parameters
+    return {n: np.broadcast_to(probes.inputs[str(graph.value[n])], probes.count)[:16] for n in varying}
 
 
 def _operands(graph: Graph, call: int) -> list[int]:

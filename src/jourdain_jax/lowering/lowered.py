@@ -17,8 +17,6 @@ from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import ARRAYS, Graph
 from jourdain_jax.scene.scene import Scene
 
-MOST_TYPESET = 100  # operations of a program whose equations a notebook shows
-
 
 class NotLowered(Exception):
     """Why a scene is not lowered."""
@@ -110,7 +108,8 @@ class Lowered:
 
     def _repr_latex_(self) -> str | None:
         """The equations in a notebook, if they are short; otherwise, and without SymPy, the summary."""
-        if self.operations > MOST_TYPESET or importlib.util.find_spec("sympy") is None:
+        # 100 operations of a program whose equations a notebook shows
+        if self.operations > 100 or importlib.util.find_spec("sympy") is None:
             return None
         return "$$\\begin{aligned}\n" + self.latex() + "\n\\end{aligned}$$"
 

@@ -27,8 +27,6 @@ from jourdain_jax.program.polynomial import NormalForms
 
 Columns = list[list[int]]
 
-LEAST = 1e-4  # sine, or length of a row beside its usual one: below it rows count as dependent, and the program does not serve
-
 
 class Accelerations(NamedTuple):
     """Nodes of the solution, and of what must not vanish on the way."""
@@ -57,7 +55,8 @@ def accelerations_by_multipliers(
     udot = [graph.add(w, graph.total(graph.mul(x[k], m) for x, m in zip(impulses, multipliers, strict=True))) for k, w in enumerate(free)]
     left = [(r, pivot) for r, pivot in enumerate(solved.pivots) if graph.varies[pivot]]
     sines = [graph.call("sqrt", graph.call("max", graph.zero, graph.div(pivot, S[r][r]))) for r, pivot in left]
-    least = max(LEAST if affine else 0.0, undecided(jnp.result_type(float))) ** 2
+    # sine, or length of a row beside its usual one: below it rows count as dependent, and the program does not serve
+    least = max(1e-4 if affine else 0.0, undecided(jnp.result_type(float))) ** 2
     usual = {graph.input(f"usual_{r}", False): S[r][r] for r, _ in left}
     margins = []
     for (r, pivot), (size, entry) in zip(left, usual.items(), strict=True):

@@ -23,11 +23,7 @@ from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.polynomial import NormalForms
 
 GOOD = 0.02  # of a pivot, relative to its row, at the worst probe
-NEAR = 0.25  # one with both signs that is so small somewhere vanishes in between
-REGULAR = 0.02  # smallest singular value of a scaled system that a pivot has to serve
-TERMS = 32  # of a determinant in normal form
 FEW = 12  # equations: with more, the operations that lead to a pivot are not counted when it is chosen
-LIKE = 8.0  # rows whose sizes differ by more are combined with weights
 
 
 @dataclass(frozen=True)
@@ -52,7 +48,8 @@ class Pivots:
     """The system `A x = right` while it is eliminated, and the choice of the next pivot. `probes`: of the domain; `far`: at full turns of all angles."""
 
     def __init__(self, graph: Graph, A: Sequence[Sequence[int]], right: Sequence[Sequence[int]], probes: Probes, far: Callable[[], Probes] | None):
-        self.graph, self.probes, self.forms = graph, probes, NormalForms(graph, TERMS, sign=probes.sign)
+        # terms of a determinant in normal form
+        self.graph, self.probes, self.forms = graph, probes, NormalForms(graph, 32, sign=probes.sign)
         self.A, self.right = [list(row) for row in A], [list(row) for row in right]
         self.rows, self.columns = set(range(len(self.A))), set(range(len(self.A[0]) if self.A else 0))
         self._far, self._kept_regular = far, None
@@ -148,7 +145,8 @@ class Pivots:
         ratio = self._beside_row(place)
         ratio = ratio[self._regular & np.isfinite(ratio)]
         size = np.min(np.abs(ratio), initial=np.inf)
-        return bool(size > NEAR or (size > GOOD and not ratio.min() < 0 < ratio.max()))
+        # one with both signs that is smaller than 0.25 somewhere vanishes in between
+        return bool(size > 0.25 or (size > GOOD and not ratio.min() < 0 < ratio.max()))
 
     def _beside_row(self, place: tuple[int, int]) -> Float[np.ndarray, "probes"]:
         """An entry beside the largest of its row, with its sign."""
@@ -171,7 +169,8 @@ class Pivots:
             A = A / np.where(usual > 0, usual, 1.0)
             width = np.sqrt(np.mean(np.sum(A**2, axis=1), axis=0))
             sigma = np.linalg.svd(A / np.where(width > 0, width, 1.0), compute_uv=False)[:, count - 1]
-            self._kept_regular = finite & (sigma > REGULAR)
+            # smallest singular value of a scaled system that a pivot has to serve
+            self._kept_regular = finite & (sigma > 0.02)
         return self._kept_regular
 
     def _at(self, nodes) -> np.ndarray:
@@ -253,7 +252,8 @@ class Pivots:
         """The weights of rows in a combination: one where their sizes are alike."""
         sizes = [float(np.nanmedian(self._size(r))) for r in rows]
         largest = max(sizes)
-        if min(sizes) * LIKE > largest:
+        # rows whose sizes differ by more are combined with weights
+        if min(sizes) * 8.0 > largest:
             return [1.0] * len(rows)
         return [4.0 ** round(np.log2(largest / size)) if size > 0 else 1.0 for size in sizes]
 

@@ -11,7 +11,6 @@ import sys
 
 from jourdain_jax.native.ir import Value, Writer
 
-MOST_SWEEPS = 40  # of rotations; 6 to 10 are taken
 _EPS = sys.float_info.epsilon
 
 
@@ -35,7 +34,8 @@ def write_rotated(w: Writer, rows: int, columns: int) -> None:
     width = rows + columns
     with w.function("rotated", "void", {"B": "ptr"}, attributes="noinline") as (B,):
         turned = w.room("i1")
-        with w.counted(0, MOST_SWEEPS):
+        # 40 of rotations; 6 to 10 are taken
+        with w.counted(0, 40):
             w.store(w.literal(0, "i1"), turned)
             with w.counted(0, rows) as i, w.counted(i + 1, rows) as j:
                 first, second = w.at(B, i * width, w.real), w.at(B, j * width, w.real)

@@ -31,7 +31,6 @@ _LISTS = "struct_size extension_start size types"
 # places, in words of 8 bytes
 _EXTENSION, ARGS, RETS = 1, 9, 14  # of a frame: its extension, its lists of pointers to arguments and results
 _TYPE, _DATA, _RANK, _DIMS = 2, 3, 4, 5  # of a buffer
-_SINGLE = 11  # the type of arrays in single precision
 _KIND, _METADATA = 1, 3  # of an extension
 _MAJOR = 3  # of metadata, with the minor version after it
 
@@ -163,7 +162,8 @@ def given(w: Writer, buffer: Value) -> Given:
 
 
 def _is_single(w: Writer, buffer: Value) -> Value:
-    return w.load("i32", buffer, 2 * _TYPE).equals(_SINGLE)
+    # 11: the type of arrays in single precision
+    return w.load("i32", buffer, 2 * _TYPE).equals(11)
 
 
 def _write_doubles(w: Writer) -> None:

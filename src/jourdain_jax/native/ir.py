@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
-MOST_INLINED = 10_000  # lines of a function times its calls, up to which it is written out at these on a GPU
 _COMPARED = {"lt": ("olt", "slt"), "le": ("ole", "sle"), "gt": ("ogt", "sgt"), "ge": ("oge", "sge"), "eq": ("oeq", "eq"), "ne": ("une", "ne")}
 
 
@@ -368,7 +367,8 @@ def _inlined(text: str) -> str:
         return sizes[name]
 
     def is_small(name: str) -> bool:
-        return sites(name) == 1 or sites(name) * size(name) <= MOST_INLINED
+        # 10_000 lines of a function times its calls, up to which it is written out at these on a GPU
+        return sites(name) == 1 or sites(name) * size(name) <= 10_000
 
     for name, part in parts.items():
         if " internal " in (head := part.split("\n", 1)[0]):

@@ -15,7 +15,6 @@ from jourdain_jax.native import host
 TRIPLE = "nvptx64-nvidia-cuda"
 KNOWN = (75, 80, 86, 89, 90, 100, 120)  # compute capabilities that text is made for; newer GPUs take that of older ones
 WARP = 32
-FEWEST_WARPS = 4  # of a multiprocessor: one for each of its parts
 _CALLED = (
     "cuCtxPopCurrent_v2",
     "cuCtxPushCurrent_v2",
@@ -163,4 +162,5 @@ def blocks(lanes: int, kernel: Loaded) -> int:
     """How many warps serve so many lanes: as many as registers allow, and whose local memory stays in the first cache, where that is not too few."""
     by_registers = _of_device(_REGISTERS) // (WARP * max(8, kernel.registers + -kernel.registers % 8))
     by_cache = _of_device(_CACHE) // max(1, WARP * kernel.local)
-    return min(-(lanes // -WARP), _of_device(_MULTIPROCESSORS) * min(by_registers, WARP, max(by_cache, FEWEST_WARPS)))
+    # 4 of a multiprocessor: one for each of its parts
+    return min(-(lanes // -WARP), _of_device(_MULTIPROCESSORS) * min(by_registers, WARP, max(by_cache, 4)))

@@ -3,8 +3,6 @@
 from jourdain_jax.native.ffi import FIRST_OF_SCRATCH, Given, product, write_handler
 from jourdain_jax.native.ir import Value, Writer
 
-MANY = 8  # times as many lanes as side by side make it worth while to start another thread, which takes some 30 us
-STACK = 2**23  # bytes for each thread, as the first one has in most systems; macOS gives others 512 kB
 NEXT, COUNT, IN, OUT = range(4)  # words of a job of rows: the number of the next row, how many there are, pointers to those given and to those returned
 
 
@@ -31,9 +29,11 @@ def share(w: Writer, job: Value, count: Value) -> None:
     how = w.room("i64", 16)  # a `pthread_attr_t`, which takes up to 64 bytes
     if threads > 1:
         w.external("pthread_attr_init", "i32", how)
-        w.external("pthread_attr_setstacksize", "i32", how, w.literal(STACK, "i64"))
+        # 2**23 bytes for each thread, as the first one has in most systems; macOS gives others 512 kB
+        w.external("pthread_attr_setstacksize", "i32", how, w.literal(2**23, "i64"))
     for more in range(1, threads):
-        with w.when(count >= (more + 1) * MANY * w.lanes):
+        # 8 times as many lanes as side by side make it worth while to start another thread, which takes some 30 us
+        with w.when(count >= (more + 1) * 8 * w.lanes):
             number = w.load("i64", started)
             failed = w.external("pthread_create", "i32", w.at(others, number, "i64"), how, loop, job)
             w.store(number + w.where(failed.equals(0), w.literal(1, "i64"), 0), started)

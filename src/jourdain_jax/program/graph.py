@@ -15,7 +15,6 @@ import numpy as np
 from jourdain_jax.calculus.scalar_operations import TABLE
 
 MOST_NODES = 500_000  # of one graph: some seconds of building
-MOST_FACTORS = 8  # of a product that is looked at for squares of sines
 MOST_MULTIPLICATIONS = 512  # of one product of matrices taken apart; measured: at 16 x 16 scalars are faster in batches, from 24 x 24 on a call is
 ARRAYS = {"array", "opaque", "output"}  # what is no scalar (`calls.py`)
 _GROWING = threading.Lock()  # threads may derive on one graph
@@ -132,7 +131,8 @@ class Graph:
     def _factors(self, node: int) -> list[int]:
         """Factors of a product of few; the node itself where it is none."""
         factors, split = [node], True
-        while split and len(factors) < MOST_FACTORS:
+        # 8 of a product that is looked at for squares of sines
+        while split and len(factors) < 8:
             split = False
             for k, n in enumerate(factors):
                 if self.op[n] == "mul":

@@ -26,7 +26,6 @@ from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.onto_rows import onto_rows
 
 STEPS, CLOSED = 30, 1e3  # of Newton's method; bounds of round-off that rows may be off
-FAR = 10.0  # half of the probes lie so much further out
 DIGITS = 40  # binary ones, that numbers in the code of a scene may span among themselves
 RADIX = 1.5, 3.0  # in the place of 2^DIGITS
 SURE = 16.0  # bounds of round-off that equal values may differ by: bounds are of first order
@@ -160,7 +159,8 @@ def identity_probes(probes: Probes, unchanged: Collection[str]) -> IdentityProbe
     Parameters, named p..., are positive.
     """
     generator, count = np.random.default_rng(2), probes.count
-    scale = np.where(np.arange(count) % 2, FAR, 1.0)
+    # half of the probes lie so much further out
+    scale = np.where(np.arange(count) % 2, 10.0, 1.0)
 
     def drawn(name: str, value: np.ndarray) -> np.ndarray:
         if name in unchanged:

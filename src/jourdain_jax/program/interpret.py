@@ -19,7 +19,6 @@ from jourdain_jax.eager.numpy_backend import applied
 from jourdain_jax.program.contractions import REDUCTIONS, product, reduced
 from jourdain_jax.program.graph import Graph, Unsupported
 
-LARGEST = 200_000  # scalars in one array
 _HOME = f"{Path(__file__).parent.parent}{os.sep}"  # where the source of this package lies
 
 
@@ -53,7 +52,8 @@ def as_nodes(graph: Graph, value: Value) -> np.ndarray:
     """The nodes of a value; numbers become constants."""
     if isinstance(value, Nodes):
         return value.ids
-    if value.size > LARGEST:
+    # 200_000 scalars in one array
+    if value.size > 200_000:
         raise Unsupported(f"an array of {value.size} numbers")
     return np.array([graph.const(x) for x in np.ravel(value)], dtype=np.int64).reshape(np.shape(value))
 

@@ -20,7 +20,6 @@ from jourdain_jax.program.calls import Call
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, Value, apply, refuse
 
-LARGE = 16  # entries of an array that is not taken apart beside a call
 LARGEST = 4096  # entries of an array of scalars
 
 
@@ -34,7 +33,8 @@ class _Variable:
 
     @property
     def is_large(self) -> bool:
-        return self.aval.size > LARGE
+        # 16 entries of an array that is not taken apart beside a call
+        return self.aval.size > 16
 
     @property
     def may_be_scalars(self) -> bool:

@@ -20,8 +20,6 @@ from jourdain_jax.motion.integrators.problem import Problem
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.trajectories import results
 
-_SHRANK = 0.01  # of the average step: a singularity is near
-
 
 def integrate(
     problem: Problem, method: Method | ImplicitMethod, y0: PyTree, t0, goals: Float[Array, "times *lanes"], dt0, kind: Literal["forward", "reverse"]
@@ -40,7 +38,8 @@ def integrate(
 def ended(end: Progress, t0) -> Progress:
     """Progress with the code of how the motion from `t0` ended, where no time is left to go to."""
     # the last steps against the average one
-    shrank = (end.code == results.MAX_STEPS) & (end.h * end.accepted < _SHRANK * jnp.abs(end.t - t0))
+    # 0.01 of the average step: a singularity is near
+    shrank = (end.code == results.MAX_STEPS) & (end.h * end.accepted < 0.01 * jnp.abs(end.t - t0))
     code = jnp.where(shrank, results.SHRANK, jnp.where(end.code == RUNNING, results.SUCCESS, end.code))
     return eqx.tree_at(lambda p: p.code, end, code)
 

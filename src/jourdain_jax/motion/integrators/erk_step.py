@@ -37,7 +37,6 @@ from jourdain_jax.motion.trajectories import results
 RUNNING, LOCATING = -1, -2
 NOISE = 0.6  # exponent of round-off: rows shrink to about its power 0.4 before a step passes
 SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
-_REST = 1e-6  # of the size of the state: a step that changes less counts as one that changes so much
 
 
 class Progress(eqx.Module):
@@ -190,7 +189,8 @@ def _relative(free: PyTree, y_0: PyTree, y_1: PyTree) -> Float[Array, ""]:
     """Return how far a projection moved a state from `free` to `y_1`, relative to the change from `y_0`: the largest ratio of any part of the state."""
     ratios = []
     for given, before, after in zip(*map(jax.tree.leaves, (free, y_0, y_1)), strict=True):
-        change = jnp.max(jnp.abs(after - before), initial=0.0) + _REST * (1 + jnp.max(jnp.abs(after), initial=0.0))
+        # 1e-6 of the size of the state: a step that changes less counts as one that changes so much
+        change = jnp.max(jnp.abs(after - before), initial=0.0) + 1e-6 * (1 + jnp.max(jnp.abs(after), initial=0.0))
         ratios.append(jnp.max(jnp.abs(after - given), initial=0.0) / change)
     return jax.lax.stop_gradient(jnp.max(jnp.stack(ratios)))
 

@@ -20,8 +20,6 @@ from jaxtyping import Array, Bool, Float, PyTree
 from jourdain_jax.motion.inputs import Inputs, Sampled
 
 _SHARE, _LOOSEST = 0.1, 1e-4
-_ONE_TIME = 1e-12  # of the span: times nearer to each other than this are one
-_INWARDS = 2.0**-10  # of the way to the middle of a step: so far inside a time at its end lies to see on which side of a knot it is
 
 
 def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> Float[Array, "knots"] | None:
@@ -34,7 +32,8 @@ def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> F
         return None
     t1, ts = jax.lax.stop_gradient((t1, ts))
     direction, span = jax.lax.stop_gradient((jnp.sign(t1 - t0), jnp.abs(t1 - t0)))
-    share, near = _SHARE * jnp.minimum(rtol, _LOOSEST), _ONE_TIME * span
+    # 1e-12 of the span: times nearer to each other than this are one
+    share, near = _SHARE * jnp.minimum(rtol, _LOOSEST), 1e-12 * span
     # which times these are is a number to differentiation, the times are not: steps end where a knot is moved to
     since = jnp.concatenate([jnp.where(bends(x, share), (x.ts - t0) * direction, jnp.inf) for x in samples])
     ends = jnp.sort(jnp.concatenate([(ts - jax.lax.stop_gradient(t0)) * direction, jnp.stack([jnp.zeros_like(span), span])]))
@@ -79,7 +78,8 @@ class SeenFromWithin(eqx.Module):
         """The value at time t, f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k)."""
         ts, values = self.sampled.ts, self.sampled.values
         at, middle, knots = jax.lax.stop_gradient((t, self.middle, ts))
-        at = jnp.where(jnp.isfinite(middle), at + _INWARDS * (middle - at), at)
+        # 2.0**-10 of the way to the middle of a step: so far inside a time at its end lies to see on which side of a knot it is
+        at = jnp.where(jnp.isfinite(middle), at + (2.0**-10) * (middle - at), at)
         k = jnp.clip(jnp.searchsorted(knots, at, side="right") - 1, 0, max(len(ts) - 2, 0))
         after = jnp.minimum(k + 1, len(ts) - 1)
         on_line = values[k] + (t - ts[k]) / jnp.where(after > k, ts[after] - ts[k], 1.0) * (values[after] - values[k])

@@ -7,7 +7,6 @@ import equinox as eqx
 from jourdain_jax.calculus.reals import Number, is_traced
 
 LEAST, MOST = 4, 30
-_UNKNOWN = 1e-12  # the tolerance that the order is for where it is traced
 
 
 class Taylor(eqx.Module):
@@ -32,5 +31,6 @@ class Taylor(eqx.Module):
 
 def order_for(rtol: Number) -> int:
     """p = ceil(1 - log(rtol)/2), at which the arithmetic for a length of time is least."""
-    tolerance = _UNKNOWN if is_traced(rtol) else float(rtol)
+    # the tolerance that the order is for where it is traced
+    tolerance = 1e-12 if is_traced(rtol) else float(rtol)
     return min(max(math.ceil(1 - math.log(tolerance) / 2), LEAST), MOST)

@@ -21,8 +21,6 @@ from jourdain_jax.native.scalar_program import as_real, written_in_turn
 from jourdain_jax.native.threads import write_rows
 from jourdain_jax.program.graph import Graph
 
-ALONE = 2  # places for the lanes of one motion; measured: 64 us with 2, 66 with 1 or 4, 99 with 8 (10 s of a disc at 1e-8)
-
 
 def called(write: Callable[[Writer], None], shapes: Callable, of_samples: int = 0, effort: int = 2) -> Callable:
     """A module of LLVM IR as a function of arrays without lanes; `shapes`: of its results, given the arguments.
@@ -47,7 +45,8 @@ def called(write: Callable[[Writer], None], shapes: Callable, of_samples: int = 
 
     @jax.custom_batching.custom_vmap
     def run(*arguments):
-        return call(ALONE, 1, *arguments)
+        # 2 places for the lanes of one motion; measured: 64 us with 2, 66 with 1 or 4, 99 with 8 (10 s of a disc at 1e-8)
+        return call(2, 1, *arguments)
 
     @run.def_vmap
     def run_many(count, batched: list[bool], *arguments):

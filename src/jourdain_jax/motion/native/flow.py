@@ -28,12 +28,12 @@ from jourdain_jax.motion.native.taylor import products
 from jourdain_jax.motion.trajectories import results
 
 OF_SAMPLES = 'machine code does not differentiate with respect to samples of an input; `jj.simulate(..., backend="xla")` does'
-MOST_PRODUCTS = 36_000  # of coefficients in a step by Taylor series of second derivatives; where there are more, steps are those of the tableau
 
 
 def flow(form: Form, method: Method, order: int | None) -> Callable[[Start], Found]:
     """The motion by a kernel; `order`: of Taylor series, in the place of the tableau."""
-    order = None if order is not None and len(form.moving) > 1 and products(form, order) > MOST_PRODUCTS else order
+    # 36_000 of coefficients in a step by Taylor series of second derivatives; where there are more, steps are those of the tableau
+    order = None if order is not None and len(form.moving) > 1 and products(form, order) > 36_000 else order
     own = jax.custom_jvp(kernel(form, method, order).motion)
 
     @partial(own.defjvp, symbolic_zeros=True)

@@ -21,8 +21,6 @@ from jourdain_jax.native.scalar_program import as_real, written, written_in_turn
 from jourdain_jax.program.derivative import directional_derivative
 from jourdain_jax.program.graph import Graph
 
-INLINED = 120  # operations: so few are written anew at each stage
-
 
 @dataclass(frozen=True)
 class Form:
@@ -163,7 +161,8 @@ def known_values(w: Writer, form: Form, state: Value, tau: Value, y: Value) -> d
 def write_rates(w: Writer, form: Form) -> None:
     """`rates(state, tau, y, k, pivots)`: the rates of the state `y` into `k`, and what is monitored, pivots relative to their usual sizes."""
     program, layout = form.program, form.layout
-    how = "alwaysinline" if program.operations <= INLINED else "noinline"
+    # 120 operations: so few are written anew at each stage
+    how = "alwaysinline" if program.operations <= 120 else "noinline"
     arguments = {"state": "ptr", "tau": w.real, "y": "ptr", "k": "ptr", "pivots": "ptr"}
     with w.function("rates", "void", arguments, attributes=how) as (state, tau, y, k, pivots):
         power = [program.power] if form.with_work else []

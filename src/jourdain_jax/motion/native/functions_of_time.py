@@ -21,11 +21,9 @@ from jourdain_jax.program.graph import ARRAYS, Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 
 MOST_NUMBERS = 200  # in a function of time; of a long table each is a row of a lane, and `jj.Sampled` looks up in it
-MOST_KEPT = 64
-STATES = 64  # at which it is seen whether functions jump
 
 
-@lru_cache(maxsize=MOST_KEPT)
+@lru_cache(maxsize=64)
 def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) -> Lowered | str:
     """The program with these functions in the place of inputs, or why there is none, in words; their numbers come last among what is `fixed`."""
     numbers = sum(math.prod(shape) for function in functions if function is not None for shape in function.shapes)
@@ -86,7 +84,8 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
 def _random(graph: Graph, nodes: Iterable[int]) -> Probes:
     """Return random times and numbers for functions."""
     generator = np.random.default_rng(11)
-    return Probes(graph, {str(graph.value[n]): generator.uniform(-1.0, 3.0, STATES) for n in graph.reachable(nodes) if graph.op[n] == "input"})
+    # states at which it is seen whether functions jump
+    return Probes(graph, {str(graph.value[n]): generator.uniform(-1.0, 3.0, 64) for n in graph.reachable(nodes) if graph.op[n] == "input"})
 
 
 def numbers_of(channel: FunctionOfTime) -> list:

@@ -20,9 +20,6 @@ from jourdain_jax.native.scalar_program import as_real, unsupported, written_in_
 from jourdain_jax.native.threads import write_rows
 
 LARGEST_PROGRAM = 60_000  # operations
-# Of a matrix. Measured: speeds of 6 trailers take 0.10 ms here and 0.08 by XLA alone, 0.05 and 0.06 each in a batch; of 12 (2,812 entries) 0.68 and 0.20,
-# 0.32 and 0.18; of 32 14.6 and 1.4, 3.6 and 1.2.
-MOST_ENTRIES = 3_000
 _EPS = sys.float_info.epsilon
 
 Kind = Literal["positions", "speeds", "determined speeds"]
@@ -68,7 +65,9 @@ class Rows:
         if self.kind == "speeds" and self.program.M is None:
             return "the mass matrix is too large"
         rows, columns = len(self.residuals), len(self.moving)
-        if max((rows + columns) * rows, columns**2) > MOST_ENTRIES:
+        # Entries of a matrix. Measured: speeds of 6 trailers take 0.10 ms here and 0.08 by XLA alone, 0.05 and
+        # 0.06 each in a batch; of 12 (2,812 entries) 0.68 and 0.20, 0.32 and 0.18; of 32 14.6 and 1.4, 3.6 and 1.2.
+        if max((rows + columns) * rows, columns**2) > 3_000:
             return "the rows are too many"
         nodes = [*self.residuals, *self.slopes.values(), *({} if self.metric is None else self.metric).values()]
         if self.program.graph.operations(nodes) > LARGEST_PROGRAM:

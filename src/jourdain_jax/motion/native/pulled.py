@@ -20,7 +20,6 @@ from jourdain_jax.program.graph import Graph
 
 # Operations of a derivative of the first order, of which reverse mode keeps some on the stack, and of the second.
 LARGEST_DERIVATIVE = 10_000, 40_000
-MOST_FORMS = 64
 _ARGUMENTS = ("state", "tau", "y", "g", "to_y", "to_known")
 
 
@@ -43,7 +42,7 @@ def check_derivatives(form: Form, order: int) -> None:
         raise DifferentiationModeError(f'{reason}; `jj.simulate(..., backend="xla")` has them')
 
 
-@lru_cache(maxsize=MOST_FORMS)
+@lru_cache(maxsize=64)
 def reason_against_derivatives(form: Form, order: int) -> str:
     """Return why machine code that integrates a form cannot differentiate it so many times, in words; empty where it can."""
     if order > len(LARGEST_DERIVATIVE):

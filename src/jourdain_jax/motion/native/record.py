@@ -18,7 +18,6 @@ from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.threads import lanes_taken, next_lane
 
 STARTS, TO_STATES, TO_ENDS, GOALS, FOUND = range(FIRST_ARRAY, FIRST_ARRAY + 5)
-MOST_SLOTS = 4096  # of a thread of a GPU
 FIRST_SLOTS = 64  # for which there is memory at first; then twice as many, and so on
 
 
@@ -78,7 +77,8 @@ def write_record(w: Writer, form: Form, method: Method, asked: int, job: Value) 
 def prepare(w: Writer, form: Form, method: Method) -> None:
     """What the record needs in the module."""
     if w.device:
-        w.scratch = Slot.of(form, method).all, MOST_SLOTS
+        # 4096 of a thread of a GPU
+        w.scratch = Slot.of(form, method).all, 4096
     else:
         _write_more_room(w)
 

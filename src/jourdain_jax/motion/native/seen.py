@@ -29,10 +29,6 @@ from jourdain_jax.program.graph import Graph
 from jourdain_jax.scene.scene import Scene
 
 MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the process
-LARGEST_PROGRAM = 60_000  # operations
-# Operations of the dependent speeds from which on their derivatives are machine code. Measured, gradients of batches over all saved states, by XLA and here:
-# 5 operations, 28 and 42 ms; 66, 98 and 69; 228, 405 and 108. One motion of 16 trailers compiles in 16 to 19 s and 4.5 s.
-FEWEST = 60
 _TRUTHS = frozenset(("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite"))
 
 
@@ -41,7 +37,8 @@ def is_supported(program: Lowered) -> bool:
     """Whether all this can be machine code."""
     graph, nodes = program.graph, [*_seen_nodes(program), *program.fixed, *program.usual.values()]
     truths = any(_is_truth(graph, n) for n in program.fixed)  # which XLA hands on as such
-    return not truths and graph.operations(nodes) <= LARGEST_PROGRAM and not unsupported(graph, nodes)
+    # 60_000 operations
+    return not truths and graph.operations(nodes) <= 60_000 and not unsupported(graph, nodes)
 
 
 def _is_truth(graph: Graph, node: int) -> bool:
@@ -105,13 +102,14 @@ def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Ar
         return tuple(jnp.reshape(part, jnp.shape(x)) for x, part in zip(arguments, parts, strict=True))
 
     run = unless_batched(1, by_machine_code, by_xla)
-    values = with_rules(run, Rules(push, pull)) if _has_many_operations(program) else differentiated_as(by_xla, run)
+    # Operations from which on derivatives are machine code. Measured, gradients of batches over all saved states,
+    # by XLA and here: 5 operations, 28 and 42 ms; 66, 98 and 69; 228, 405 and 108. One motion of 16 trailers
+    # compiles in 16 to 19 s and 4.5 s.
+    if program.graph.operations(program.z) >= 60:
+        values = with_rules(run, Rules(push, pull))
+    else:
+        values = differentiated_as(by_xla, run)
     return values(_stacked(fixed), jnp.asarray(t, real_type()), q, y, inputs)
-
-
-@lru_cache(maxsize=MOST_KERNELS)
-def _has_many_operations(program: Lowered) -> bool:
-    return program.graph.operations(program.z) >= FEWEST
 
 
 @lru_cache(maxsize=MOST_KERNELS)
@@ -185,7 +183,6 @@ def _write_seen(program: Lowered, count: int, w: Writer) -> None:
     write_rows(w, len(given), count)
 
 
-@lru_cache(maxsize=MOST_KERNELS)
 def _needed(program: Lowered) -> tuple[tuple[int, ...], ...]:
     """The entries of the scene's parameters on which something that is fixed depends."""
     needed = set(program.graph.reachable([*program.fixed, *program.usual.values()]))

@@ -19,7 +19,6 @@ from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native.exponentials import power
 from jourdain_jax.native.ir import Value, Writer
 
-UNROLLED = 12  # numbers of a state; more are gone through by loops, whose code is short
 IDLE = -9.0  # code of a place that has no lane
 
 
@@ -158,7 +157,8 @@ def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Valu
 
 def for_rows(w: Writer, rows: range, body: Callable[[int | Value], object]) -> None:
     """`body` for the number of every row."""
-    if len(rows) <= UNROLLED:
+    # 12 numbers of a state; more are gone through by loops, whose code is short
+    if len(rows) <= 12:
         for i in rows:
             body(i)
     else:

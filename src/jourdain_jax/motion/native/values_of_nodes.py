@@ -23,8 +23,6 @@ from jourdain_jax.program.derivative import cotangents, derivatives
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import Graph, Unsupported
 
-LARGEST_PROGRAM = 40_000  # operations of a derivative; machine code of so many takes 1.4 MB of the stack, and 0.3 s to make
-
 
 def values_of_nodes(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array]:
     """Values of nodes, at their places among so many numbers that are zero otherwise, as a function of the values of the variables."""
@@ -97,7 +95,8 @@ class Derivatives:
         except Unsupported:
             return None
         found = {place: node for place, node in found.items() if node != graph.zero}
-        if unsupported(graph, found.values()) or graph.operations(found.values()) > LARGEST_PROGRAM:
+        # operations of a derivative; machine code of so many takes 1.4 MB of the stack, and 0.3 s to make
+        if unsupported(graph, found.values()) or graph.operations(found.values()) > 40_000:
             return None
         given = [*variables, *weights, *(w if order == 2 else ())]
         return differentiated_as(*_by_xla_and_machine_code(graph, found, len(variables) if back else self.size, given))
