@@ -77,7 +77,6 @@ from jourdain_jax.scene.spline import Spline
 from jourdain_jax.scene.visuals import Visual
 
 if _typing.TYPE_CHECKING:  # what else there is, for static tools
-    from jourdain_jax.analysis.checked import Checked, check
     from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
     from jourdain_jax.analysis.estimate import Estimate, bounds, joint_normal, positive, unbounded
     from jourdain_jax.analysis.experiment import Experiment
@@ -86,13 +85,12 @@ if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.analysis.fit import fit, fit_batch
     from jourdain_jax.analysis.fit_result import Fit
     from jourdain_jax.analysis.layout import possible_inertia
-    from jourdain_jax.analysis.likelihood import log_likelihood
+    from jourdain_jax.analysis.likelihood import PlannedInformation, log_likelihood, planned_information
     from jourdain_jax.analysis.linearize import Linearization, linearize
     from jourdain_jax.analysis.log_density import LogDensity, log_density
     from jourdain_jax.analysis.losses import huber, student_t
-    from jourdain_jax.analysis.planning import PlannedInformation, planned_information
     from jourdain_jax.analysis.quantities import Accelerometer, LoadCell
-    from jourdain_jax.analysis.report import Report, report
+    from jourdain_jax.analysis.report import Checked, Report, check, report
     from jourdain_jax.analysis.sensors import Actuator, Sensor
     from jourdain_jax.analysis.shooting import MultipleShooting
     from jourdain_jax.analysis.statements import derivative_exists
@@ -124,7 +122,6 @@ if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.plotting.show import View, show
 
 _ON_FIRST_USE = {
-    "analysis.checked": "Checked check",
     "analysis.energy": "Energy EnergyBalance energy energy_balance",
     "analysis.estimate": "Estimate bounds joint_normal positive unbounded",
     "analysis.experiment": "Experiment",
@@ -133,13 +130,12 @@ _ON_FIRST_USE = {
     "analysis.fit": "fit fit_batch",
     "analysis.fit_result": "Fit",
     "analysis.layout": "possible_inertia",
-    "analysis.likelihood": "log_likelihood",
+    "analysis.likelihood": "PlannedInformation log_likelihood planned_information",
     "analysis.linearize": "Linearization linearize",
     "analysis.log_density": "LogDensity log_density",
     "analysis.losses": "huber student_t",
-    "analysis.planning": "PlannedInformation planned_information",
     "analysis.quantities": "Accelerometer LoadCell",
-    "analysis.report": "Report report",
+    "analysis.report": "Checked Report check report",
     "analysis.sensors": "Actuator Sensor",
     "analysis.shooting": "MultipleShooting",
     "analysis.statements": "derivative_exists",

@@ -24,6 +24,8 @@ from jaxtyping import Bool, Float, Shaped
 
 Parts = TypeVar("Parts", bound="ByMember")
 ByUnknown = Float[np.ndarray, "members unknowns"]
+PerMember = Float[np.ndarray, "members"]
+Flags = Bool[np.ndarray, "members"]
 
 
 class ByMember:
@@ -131,7 +133,7 @@ class Arrow(ByMember):
         """Return by how much the residuals of each block change, to first order."""
         return [(rows[..., :-1] @ x[..., None])[..., 0] for rows, x in zip(self._blocks, self._columns(d), strict=True)]
 
-    def change(self, d: ByUnknown) -> Float[np.ndarray, "members"]:
+    def change(self, d: ByUnknown) -> PerMember:
         """`|J d|^2`."""
         return sum(np.einsum("bi,bi->b", x, x) for x in (x.reshape(len(x), -1) for x in self._changes(d)))
 
@@ -143,7 +145,7 @@ class Arrow(ByMember):
             rows[..., :-1] *= free[..., None, :]
         return self._of_blocks(blocks)
 
-    def step(self, damping: Float[np.ndarray, "members"], D, held, moved, cutoff: float) -> ByUnknown:
+    def step(self, damping: PerMember, D, held, moved, cutoff: float) -> ByUnknown:
         """Return the damped step; unknowns that are `held` move by `moved`. D: (members, unknowns), positive."""
         _, m, p = self.counts
         here = self._held(held, moved) if held.any() else self
@@ -202,7 +204,7 @@ def _beside(rows: Float[np.ndarray, "*batch rows width"], m: int) -> Float[np.nd
     return np.concatenate([rows[..., :m], np.zeros((*rows.shape[:-1], m)), rows[..., m:]], axis=-1)
 
 
-def by_singular_values(shared: np.ndarray, D: np.ndarray, damping: Float[np.ndarray, "members"], cutoff: float) -> Float[np.ndarray, "members shared"]:
+def by_singular_values(shared: np.ndarray, D: np.ndarray, damping: PerMember, cutoff: float) -> Float[np.ndarray, "members shared"]:
     """The damped step of the shared unknowns, in unknowns times D: (S^2 + lambda) ds = - S U' c; what does not show stays as it is."""
     U, S, Vt = np.linalg.svd(shared[..., :-1] / D[:, None], full_matrices=False)
     hidden = S[:, :1] * cutoff >= S  # the first is the largest

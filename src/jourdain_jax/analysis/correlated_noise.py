@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jourdain_jax.analysis.arrow import Arrow, eliminated
+from jourdain_jax.analysis.arrow import Arrow, PerMember, eliminated
 
 SHORTEST, LONGEST = 0.1, 10.0  # of tau: of the shortest interval (the noise is white), and of the longest span (hardly to be told from a bias)
 
@@ -80,7 +80,7 @@ class Chains:
         return self.before[places, members], memory(self.gap[places, members], tau)
 
 
-def half_log_determinant(arrow: Arrow, size: Float[np.ndarray, "members unknowns"]) -> Float[np.ndarray, "members"]:
+def half_log_determinant(arrow: Arrow, size: Float[np.ndarray, "members unknowns"]) -> PerMember:
     """`log det(J'J) / 2` in unknowns divided by `size`, with a constant for what does not show."""
     scaled, tiny = arrow.scaled(size), 1e-7  # of the length of a column
     runs, m, p = arrow.counts

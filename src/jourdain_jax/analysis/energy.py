@@ -9,7 +9,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import structure_of
@@ -18,6 +17,7 @@ from jourdain_jax.dynamics.power import power
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.virtual_power import energies_at, unconstrained_equations
 from jourdain_jax.scene.arguments import of_known_numbers
+from jourdain_jax.scene.parameters import Scalar
 from jourdain_jax.scene.scene import Scene
 
 _ORIGINS = {
@@ -32,11 +32,11 @@ _ORIGINS = {
 class Energy(eqx.Module):
     """Energy of one state, in J: `kinetic` T, `potential` V and their `total`."""
 
-    kinetic: Float[Array, ""]
-    potential: Float[Array, ""]  # of all loads and of the scene that have one; loads without one are not in it
+    kinetic: Scalar
+    potential: Scalar  # of all loads and of the scene that have one; loads without one are not in it
 
     @property
-    def total(self) -> Float[Array, ""]:
+    def total(self) -> Scalar:
         """T + V."""
         return self.kinetic + self.potential
 

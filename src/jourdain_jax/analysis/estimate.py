@@ -34,8 +34,6 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Number, checked_known, described
 
-_FAR = 5.0  # a factor by which a first guess may be off
-
 
 @dataclass(frozen=True)
 class Range:
@@ -57,7 +55,7 @@ class Range:
         if self.kind == "bounds":
             return np.asarray(self.low + share * (self.high - self.low))
         if self.kind == "positive":
-            return guess * _FAR ** (2 * share - 1)
+            return guess * 5.0 ** (2 * share - 1)  # a factor by which a first guess may be off
         return guess + (2 * share - 1) * max(abs(guess), self.least_size(guess))
 
     def not_below(self, low: float) -> "Range":
@@ -103,7 +101,6 @@ def unbounded(scale: Number | None = None) -> Range:
     return Range("unbounded", scale=None if scale is None else float(scale))
 
 
-_LEAST = 1e-8  # eigenvalue of correlations: a combination that is known exactly counts as known to a ten thousandth of the sigmas
 _ROUND_OFF = 1e-9  # of correlations
 
 
@@ -162,7 +159,8 @@ def whitening(priors: Sequence) -> Float[np.ndarray, "numbers numbers"]:
         which, sigma = [priors[k].place for k in places], np.array([priors[k].sigma for k in places])
         C = priors[places[0]].covariance[np.ix_(which, which)] / np.outer(sigma, sigma)
         e, V = np.linalg.eigh(C)
-        M[np.ix_(places, places)] = V.T / np.sqrt(np.maximum(e, _LEAST))[:, None]
+        # eigenvalue of correlations: a combination that is known exactly counts as known to a ten thousandth of the sigmas
+        M[np.ix_(places, places)] = V.T / np.sqrt(np.maximum(e, 1e-8))[:, None]
     return M
 
 
@@ -214,6 +212,7 @@ def _check_prior(prior) -> None:
         raise ValueError(f"`prior` of `Estimate` is {prior}, expected a standard deviation above zero; a number that is known needs no estimate")
 
 
+Points = Float[Array, "*batch unknowns"]
 class Transforms(eqx.Module):
     """One transform for each unknown."""
 
@@ -229,20 +228,20 @@ class Transforms(eqx.Module):
     def _are(self, kind: str) -> np.ndarray:
         return np.array([one == kind for one in self.kinds], bool)
 
-    def constrain(self, x: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch unknowns"]:
+    def constrain(self, x: Points) -> Points:
         """The unknowns in their units."""
         positive, between = self._are("positive"), self._are("bounds")
         share = jax.nn.sigmoid(jnp.where(between, x, 0.0))
         return jnp.where(positive, jnp.exp(jnp.where(positive, x, 0.0)), jnp.where(between, self.low + (self.high - self.low) * share, x))
 
-    def log_slopes(self, x: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch unknowns"]:
+    def log_slopes(self, x: Points) -> Points:
         """`log |d theta / dx|` of each."""
         positive, between = self._are("positive"), self._are("bounds")
         inside = jnp.where(between, x, 0.0)
         logs = jnp.log(self.high - self.low) + jax.nn.log_sigmoid(inside) + jax.nn.log_sigmoid(-inside)
         return jnp.where(positive, x, jnp.where(between, logs, 0.0))
 
-    def unconstrain(self, theta: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch unknowns"]:
+    def unconstrain(self, theta: Points) -> Points:
         """The inverse of `constrain`; infinite at a bound, NaN beyond it."""
         positive, between = self._are("positive"), self._are("bounds")
         share = jnp.where(between, (theta - self.low) / (self.high - self.low), 0.5)

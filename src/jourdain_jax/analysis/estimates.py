@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jourdain_jax.analysis.fit_statistics import Statistics
+from jourdain_jax.analysis.fit_statistics import PerRepeat, PerUnknown, Statistics
 from jourdain_jax.analysis.information import CORRELATED, derived, hidden_combinations, standard_errors, weak_combinations
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.levenberg_marquardt import Control
@@ -31,10 +31,10 @@ from jourdain_jax.scene.scene import Scene
 class Estimated(Printed, eqx.Module):
     """One unknown, in its unit; NaN for what the measurements cannot tell."""
 
-    value: Float[np.ndarray, "*repeats"]
-    standard_error: Float[np.ndarray, "*repeats"]
-    low: Float[np.ndarray, "*repeats"]  # ends of the 95 % interval
-    high: Float[np.ndarray, "*repeats"]
+    value: PerRepeat
+    standard_error: PerRepeat
+    low: PerRepeat  # ends of the 95 % interval
+    high: PerRepeat
     unit: str = eqx.field(static=True)
 
     def _text(self) -> str:
@@ -57,19 +57,18 @@ class ChannelResiduals(Printed, eqx.Module):
     rms: float
     largest: float  # in magnitude
 
+    @staticmethod
+    def of(run: int, name: str, r: np.ndarray) -> "ChannelResiduals":
+        """The summary of the residuals `r` of a channel, NaN where a sample is missing."""
+        r = r[~np.isnan(r)]
+        numbers = (r.mean(), np.sqrt((r**2).mean()), np.abs(r).max()) if r.size else (np.nan,) * 3
+        return ChannelResiduals(run, name, r.size, *map(float, numbers))
+
     def _text(self) -> str:
         of = f"{self.samples} samples, mean {self.mean:.2g}, rms {self.rms:.3g}, largest {self.largest:.3g}"
         return f"residuals of `{self.channel}` of run {self.run}, in sigmas: {of}"
 
 
-def summary(run: int, name: str, r: np.ndarray) -> ChannelResiduals:
-    """The summary of the residuals `r` of a channel, NaN where a sample is missing."""
-    r = r[~np.isnan(r)]
-    mean, rms, largest = (r.mean(), np.sqrt((r**2).mean()), np.abs(r).max()) if r.size else (np.nan,) * 3
-    return ChannelResiduals(run, name, r.size, float(mean), float(rms), float(largest))
-
-
-MOST_COMPARED = 1000  # unknowns
 
 
 GONE = {
@@ -101,8 +100,8 @@ class Estimates(Printed):
     `correlation_time`, `chi_square`, `samples`, `degrees_of_freedom` and all else of `Statistics`.
     """
 
-    values: Float[np.ndarray, "*repeats unknowns"]
-    beyond: Float[np.ndarray, "*repeats unknowns"]  # of estimates at a bound, by how many standard errors the data would put them beyond; NaN elsewhere
+    values: PerUnknown
+    beyond: PerUnknown  # of estimates at a bound, by how many standard errors the data would put them beyond; NaN elsewhere
     converged: Bool[np.ndarray, "*repeats"]
     stuck: Bool[np.ndarray, "*repeats"]  # no step lowers the sum of squares, however short, and this is no minimum
     steps: Int[np.ndarray, "*repeats"]  # tried
@@ -155,7 +154,7 @@ class Estimates(Printed):
         return self.covariance / (self.standard_errors[..., :, None] * self.standard_errors[..., None, :])
 
     @property
-    def reduced_chi_square(self) -> Float[np.ndarray, "*repeats"]:
+    def reduced_chi_square(self) -> PerRepeat:
         """Sum of squared residuals per degree of freedom, near 1 where scene and sigmas are right; NaN where there are as many unknowns as samples."""
         return np.asarray(self.chi_square / np.where(self.degrees_of_freedom > 0, self.degrees_of_freedom, np.nan))
 
@@ -171,7 +170,7 @@ class Estimates(Printed):
     @property
     def correlated(self) -> tuple[str, ...]:
         """Pairs of unknowns whose estimates correlate by `CORRELATED` or more in magnitude, strongest first, one sentence each."""
-        some = np.flatnonzero(np.isfinite(self.standard_errors))[:MOST_COMPARED]
+        some = np.flatnonzero(np.isfinite(self.standard_errors))[:1000]  # unknowns
         found = np.triu(self.correlation[np.ix_(some, some)], 1)
         pairs = sorted(zip(*np.nonzero(np.abs(found) >= CORRELATED), strict=True), key=lambda ij: -abs(found[ij]))
         return tuple(
@@ -206,7 +205,7 @@ class Estimates(Printed):
 
     def residual_summary(self) -> tuple[ChannelResiduals, ...]:
         """Count, mean, rms and largest residual per run and channel."""
-        return tuple(summary(run, name, np.asarray(r)) for run, found in enumerate(self.residuals) for name, r in found.items())
+        return tuple(ChannelResiduals.of(run, name, np.asarray(r)) for run, found in enumerate(self.residuals) for name, r in found.items())
 
     def derived(self, function: Callable[[Scene], Array], unit: str = "") -> Estimated:
         """A number, or an array of them, that follows from the parameters, with its standard error and 95 % interval.

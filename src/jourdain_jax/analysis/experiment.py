@@ -3,7 +3,7 @@
 value_k = reading of the channel's sensor at t_k + sigma_k e_k,   e_k independent, standard normal
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.estimate import Estimate, Range
 from jourdain_jax.analysis.quantities import Instrument, StopEvent, channel, cut
-from jourdain_jax.analysis.sensors import Actuator, Drive, Reading, Sensor, ideal, latest, response
+from jourdain_jax.analysis.sensors import Actuator, Drive, Numbers, Reading, Sensor, Times, ideal, latest, response
 from jourdain_jax.calculus.reals import Number, checked_unless_traced, described, is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled, as_inputs
 from jourdain_jax.scene.names import as_names, nearest
@@ -48,10 +48,10 @@ class Experiment(eqx.Module):
     that do not match, more than one event, one that is not after the start, and samples that may show what was before the start.
     """
 
-    ts: Float[Array | np.ndarray, "times"]  # s; all on NumPy where it is known
-    values: dict[str, Float[Array | np.ndarray, "..."]]
-    sigma: dict[str, Float[Array | np.ndarray, "..."]]
-    start: dict[str, Float[Array | np.ndarray, "..."]]
+    ts: Times  # s; all on NumPy where it is known
+    values: dict[str, Numbers]
+    sigma: dict[str, Numbers]
+    start: dict[str, Numbers]
     unknown_start: dict[str, Range | None]
     inputs: dict | Inputs | None
     sensors: dict[str, Sensor]
@@ -138,7 +138,7 @@ class Experiment(eqx.Module):
         vars(found).update(vars(self) | fields)
         return found
 
-    def sigma_of(self, name: str, repeats: bool = False) -> Float[Array | np.ndarray, "..."]:
+    def sigma_of(self, name: str, repeats: bool = False) -> Numbers:
         """Sigma of each measured value of the channel `name`, in its unit; `repeats`: the values have a leading axis of repeats."""
         sigma, values = self.sigma[name], self.values[name]
         # one sigma per time acts on all components of the channel
@@ -146,6 +146,7 @@ class Experiment(eqx.Module):
         xp = jnp if is_traced(sigma) else np
         aligned = xp.reshape(sigma, sigma.shape + (1,) * (dimensions - sigma.ndim)) if sigma.ndim else sigma
         return xp.broadcast_to(aligned, values.shape)
+Data = Experiment | Sequence[Experiment]
 
 
 def _holds(condition: Callable, x) -> bool:

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.estimate import Correlated, Estimate
-from jourdain_jax.analysis.experiment import Experiment
+from jourdain_jax.analysis.experiment import Data, Experiment
 from jourdain_jax.analysis.likelihood import as_fit_options, as_runs, check_known, mapped
 from jourdain_jax.analysis.quantities import Channel, Instrument, StopEvent
 from jourdain_jax.analysis.runs import Run, equal_runs
@@ -37,6 +37,7 @@ from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.parameters import Scalar
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
@@ -46,8 +47,8 @@ _NODES = _NODES + 0.5
 
 @shown_from_users_lines
 def filtered_log_likelihood(
-    scene: Scene | BuiltFor, data: Experiment | Sequence[Experiment], *, process_noise: Mapping, options: Options | None = None, **by_name: Unpack[OptionFields]
-) -> Float[Array, ""]:
+    scene: Scene | BuiltFor, data: Data, *, process_noise: Mapping, options: Options | None = None, **by_name: Unpack[OptionFields]
+) -> Scalar:
     """`log_likelihood` of a motion that is disturbed as it goes on, by an extended Kalman filter: a rider or rough ground is no noise of a sensor.
 
     **Arguments**
@@ -80,7 +81,7 @@ def filtered_log_likelihood(
     for numbers, alike in equal_runs(runs):
         names = tuple(dict.fromkeys(name for i in numbers for name in runs[i].unknown_start))
 
-        def one(run: Run, begun: Float[Array, "2 unknown"], names=names) -> Float[Array, ""]:
+        def one(run: Run, begun: Float[Array, "2 unknown"], names=names) -> Scalar:
             mean, sigma = begun
             run = run._replace(start=run.start | dict(zip(names, mean, strict=True)))
             return _Filter(scene, run, settled, speeds, intensities).log_likelihood(names, sigma)
@@ -101,7 +102,7 @@ class _Filter:
         self.coordinates = others(dependent_coordinates(scene, self.begin, (), None), count)
         self.held = (*(scene.coordinate_names.entries[i] for i in self.coordinates), *(scene.speed_names.entries[i] for i in speeds))
 
-    def log_likelihood(self, unknown: tuple[str, ...], sigma: Float[Array, "unknown"]) -> Float[Array, ""]:
+    def log_likelihood(self, unknown: tuple[str, ...], sigma: Float[Array, "unknown"]) -> Scalar:
         """The log-likelihood of all samples; `sigma`: standard deviations of start values."""
         run, begin = self.run, self.begin
         x = self._independent(begin.q, begin.u)

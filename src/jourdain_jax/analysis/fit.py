@@ -18,7 +18,7 @@ import numpy as np
 
 from jourdain_jax.analysis.estimate import Estimate, Range
 from jourdain_jax.analysis.estimates import Asked
-from jourdain_jax.analysis.experiment import Experiment
+from jourdain_jax.analysis.experiment import Data, Experiment
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.fit_statistics import statistics
 from jourdain_jax.analysis.layout import PossibleInertia
@@ -42,7 +42,7 @@ from jourdain_jax.scene.tracebacks import shown_from_users_lines
 _POOR = 10.0  # times the sum of squares that noise alone leaves, one for each sample
 _SPANS = (1 / 32, 1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 3 / 4)  # shares of the span that a fit grows over
 _PATIENCE = 3  # steps within which a fit of whole runs is to make F far smaller, or spans grow
-_STEPS, _ROUGHLY = 8, 1.0  # tried on each of them, and their tolerance
+_STEPS = 8  # tried on each of them
 _FOLLOWED = 100.0  # times the squares that noise leaves, up to which a motion is followed, and a longer span can be next
 
 
@@ -71,21 +71,18 @@ def minimum(problem: Problem, theta: np.ndarray, limits: Limits, control: Contro
     poor = np.flatnonzero(~found.converged | far())
     if not poor.size or not samples or (one_will_do and np.argmin(found.at.cost) not in poor):
         return found
-    ended, begin, steps, place = found.theta.copy(), theta[poor], found.steps[poor], np.zeros(len(poor), int)
-    trace = found.trace[poor]
-    while (some := np.flatnonzero(place < len(_SPANS))).size:
-        span = Span(np.array(_SPANS)[place[some]], theta[poor[some]])
-        grown = of(poor[some], begin[some], replace(few, tolerance=_ROUGHLY, patience=None), span)
-        begin[some], steps[some] = grown.theta, steps[some] + grown.steps
-        for i, (_, costs), k in zip(some.tolist(), (of_one[0] for of_one in grown.trace), place[some].tolist(), strict=True):
-            trace[i] += ((f"the first {_SPANS[k]:.3g} of each run", costs),)
+    ended, spans, place = found.theta.copy(), np.array(_SPANS), np.zeros(len(poor), int)
+    way = replace(found.of(poor), theta=theta[poor])
+    while (some := np.flatnonzero(place < len(spans))).size:
+        grown = of(poor[some], way.theta[some], replace(few, tolerance=1.0, patience=None), Span(spans[place[some]], theta[poor[some]]))
+        grown.trace[:] = [((f"the first {spans[k]:.3g} of each run", costs),) for k, ((_, costs),) in zip(place[some], grown.trace, strict=True)]
+        way = way.continued(some, grown)
         place[some] += 1
-        followed = problem.is_followed(grown.at, np.array(_SPANS), _FOLLOWED)
-        for k in range(1, len(_SPANS)):
+        followed = problem.is_followed(grown.at, spans, _FOLLOWED)
+        for k in range(1, len(spans)):
             place[some] += (place[some] == k) & followed[:, k]  # the next one is followed, and left out
-    grown = of(poor, begin, control)
-    steps, trace = steps + grown.steps, trace + grown.trace
-    found = found.lowered(poor, replace(grown, steps=steps, trace=trace, grown=np.ones(len(poor), bool)))
+    grown = of(poor, way.theta, control).after(way, np.arange(len(poor)))
+    found = found.lowered(poor, replace(grown, grown=np.ones(len(poor), bool)))
     if (late := np.flatnonzero(unfinished & (~found.converged | far()))).size:
         more = of(late, ended[late], rest)
         found = found.lowered(late, replace(more.after(found, late), grown=more.grown))
@@ -128,7 +125,7 @@ def off_bounds(
 @shown_from_users_lines
 def fit(
     scene: Scene | BuiltFor,
-    data: Experiment | Sequence[Experiment],
+    data: Data,
     free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
     *,
     cutoff: float = 1e-6,
@@ -198,7 +195,7 @@ def fit(
 
 def fit_batch(
     scene: Scene | BuiltFor,
-    data: Experiment | Sequence[Experiment],
+    data: Data,
     free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
     *,
     cutoff: float = 1e-6,
@@ -220,7 +217,7 @@ def fit_batch(
     return _fit(Asked(as_scene(scene), _named(free), settled, least, Control(tolerance, max_iterations, cutoff), errors, 1, None), data, repeats=True)
 
 
-def _fit(asked: Asked, data: Experiment | Sequence[Experiment], repeats: bool = False) -> Fit:
+def _fit(asked: Asked, data: Data, repeats: bool = False) -> Fit:
     scene, control, data = asked.scene, asked.control, tuple(data) if isinstance(data, Iterator) else data
     if is_traced((scene, data, control.tolerance, control.cutoff, asked.options)):
         raise DifferentiationModeError(

@@ -21,9 +21,7 @@ from jourdain_jax.analysis.table import table
 from jourdain_jax.calculus.figures import DATA, MODEL, QUIET, figure
 
 _WIDTH, _HEIGHT = 460, 200  # pixels
-_MOST_ROWS = 40  # unknowns in one figure
 _NARROWEST, _WIDEST = 1e-4, 100.0  # per cent
-_LEAST_ABOVE = 1e-3  # F above its minimum: less is drawn as this
 
 
 def data_and_prediction(caption: str, label: str, one: Prediction, component: int) -> str:
@@ -57,20 +55,20 @@ def autocorrelation(name: str, found: np.ndarray, limit: float) -> str:
 
 def interval_widths(fit: Estimates) -> str:
     """Draw half the width of the 95 % interval of each unknown, in per cent of the estimate, on an axis of powers of ten."""
-    names = fit.labels[:_MOST_ROWS]
-    values = np.asarray(fit.values[: len(names)], float)
-    half = np.array([max(e.high - e.value, e.value - e.low) for e in (fit[name] for name in names)], float)
+    names = fit.labels[:40]  # unknowns in one figure
+    values, low, high = (np.asarray(x[: len(names)], float) for x in (fit.values, fit.low, fit.high))
+    half = np.maximum(high - values, values - low)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = 100 * half / np.abs(values)
-    told = np.isfinite(half)
-    words = [f"{v:.4g} {unit}".strip() + (f" ± {h:.2g}" if s < 1000 else "") for v, unit, h, s in zip(values, fit.units, half, share, strict=False)]
-    words = [w if good else "one-sided" if bound else "the data do not tell" for w, good, bound in zip(words, told, fit.at_bound, strict=False)]
+    told, words = np.isfinite(half), ["one-sided" if bound else "the data do not tell" for bound in fit.at_bound]
+    for i in np.flatnonzero(told):
+        words[i] = f"{values[i]:.4g} {fit.units[i]}".strip() + (f" ± {half[i]:.2g}" if share[i] < 1000 else "")
 
     def draw(whole) -> None:
         axes = whole.add_subplot(xlabel="half of the 95 % interval, in % of the estimate", xscale="log")
         shown = np.where(told, np.clip(share, _NARROWEST, _WIDEST), _NARROWEST)
         bars = axes.barh(range(len(names)), shown, color=[MODEL if s < 100 else DATA for s in share])
-        axes.bar_label(bars, words, padding=3, fontsize=8)
+        axes.bar_label(bars, words[: len(names)], padding=3, fontsize=8)
         axes.set_yticks(range(len(names)), [name if len(name) <= 30 else name[:29] + "…" for name in names])
         axes.set_xlim(max(_NARROWEST, 0.5 * shown.min()), 40 * _WIDEST)
         axes.invert_yaxis()
@@ -129,7 +127,7 @@ def way_to_the_minimum(trace: tuple[tuple[str, tuple[float, ...]], ...]) -> str:
         for (a, b), (_, costs) in zip(pairwise(begins), trace, strict=True):
             finite = np.where(np.isfinite(costs), costs, np.nan)
             lowest = np.nanmin(finite) if np.isfinite(finite).any() else np.nan
-            axes.plot(np.arange(a, b), np.maximum(finite - lowest, _LEAST_ABOVE), ".-", color=MODEL, lw=1.2)
+            axes.plot(np.arange(a, b), np.maximum(finite - lowest, 1e-3), ".-", color=MODEL, lw=1.2)  # F above its minimum: less is drawn as this
         for begin in begins[1:-1]:
             axes.axvline(begin - 0.5, color=QUIET, ls="--", lw=0.8)
 
@@ -137,9 +135,6 @@ def way_to_the_minimum(trace: tuple[tuple[str, tuple[float, ...]], ...]) -> str:
 
 
 _MOST_PANELS = 40  # components of channels of runs that are drawn, of the runs fitted and of those held out
-_MOST_CORRELATED = 30  # unknowns in the table of correlations
-_MOST_RUNS = 8  # of which it is drawn where they inform
-_LAGS = 20
 _PAGE = """<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
 body{{font:15px/1.45 sans-serif;max-width:980px;margin:2em auto;padding:0 1em;color:#222}}pre{{font-size:13px;white-space:pre-wrap}}
 figure{{display:inline-block;margin:.4em .6em .4em 0;vertical-align:top}}figcaption{{font-size:13px;max-width:460px}}h2{{margin-top:1.6em}}
@@ -201,7 +196,7 @@ def _informed(shares: Informed) -> Section:
         "By how much the variance of an estimate would fall if these samples were a little more precise, of all samples together; it allows for all other "
         "unknowns being estimated, too."
     )
-    shown = np.sort(np.argsort(-shares.of_runs.sum(axis=0), kind="stable")[:_MOST_RUNS])
+    shown = np.sort(np.argsort(-shares.of_runs.sum(axis=0), kind="stable")[:8])  # of which it is drawn where they inform
     columns = {f"run {run}": shares.of_runs[:, run] for run in shown} | shares.of_channels | {"priors": shares.of_priors}
     rows = [("unknown", *columns, "half of what the best run tells")]
     for i, name in enumerate(shares.labels):
@@ -213,9 +208,9 @@ def _informed(shares: Informed) -> Section:
 
 
 def _correlations(fit: Estimates) -> Section:
-    names = fit.labels[:_MOST_CORRELATED]
+    names = fit.labels[:30]  # unknowns in the table of correlations
     found = fit.correlation[: len(names), : len(names)]
-    rows = [("", *names), *((name, *(_number(c, ".2f") for c in row)) for name, row in zip(names, found, strict=True))]
+    rows = [("", *names), *((name, *("-" if np.isnan(c) else f"{c:.2f}" for c in row)) for name, row in zip(names, found, strict=True))]
     about = f"The first {len(names)} of {len(fit.labels)} unknowns." if len(fit.labels) > len(names) else ""
     return Section("Correlations", about, table(rows))
 
@@ -246,7 +241,7 @@ def _whiteness(fit: Estimates, fitted: Sequence[dict[str, Prediction]]) -> Secti
         rows.append((name, f"{rho:.3f}", f"{limit:.3f}", "yes" if white else "NO", time, narrow))
         series = [np.asarray(run[name]).reshape(len(run[name]), -1) for run in fit.whitened if name in run]
         total = sum(np.nansum(r**2) for r in series)
-        lags = range(1, min(_LAGS, max(map(len, series)) - 1) + 1)
+        lags = range(1, min(20, max(map(len, series)) - 1) + 1)
         found = np.array([sum(np.nansum(r[lag:] * r[:-lag]) for r in series) / total for lag in lags])
         figures.append(autocorrelation(name, found, limit))
     if any(row[3] == "NO" for row in rows):
@@ -262,5 +257,3 @@ def _way(fit: Estimates) -> Section:
     return Section("The way to the minimum", told, table(rows), [way_to_the_minimum(fit.trace)])
 
 
-def _number(x, form: str) -> str:
-    return "-" if np.isnan(x) else format(float(x), form)

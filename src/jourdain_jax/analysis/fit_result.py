@@ -1,18 +1,16 @@
 """Results of fits: estimates, the reasons to doubt them, and further calls (profiles, predictions, plans)."""
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from jourdain_jax.analysis.estimates import Estimates
-from jourdain_jax.analysis.experiment import Experiment
+from jourdain_jax.analysis.experiment import Data, Experiment
 from jourdain_jax.analysis.fit_page import fit_page, interval_widths
 from jourdain_jax.analysis.fit_text import batch_text, text, warnings_of
 from jourdain_jax.analysis.resumed import Prediction, Profile, informed, of_fitted, of_held_out, profiles, taken_up
 from jourdain_jax.scene.names import as_names
-
-MOST_INFORMED = 24  # unknowns of which the report says what informs them
 
 
 class Fit(Estimates):
@@ -31,7 +29,7 @@ class Fit(Estimates):
         """Why estimates or intervals should not be relied on, the most serious reason first, one sentence each."""
         return warnings_of(self)
 
-    def profiles(self, data: Experiment | Sequence[Experiment], names: str | Iterable[str] = ()) -> dict[str, Profile]:
+    def profiles(self, data: Data, names: str | Iterable[str] = ()) -> dict[str, Profile]:
         """The profile likelihood of the unknowns in `names` (default: all that are not of one run alone), by name: how far each may be moved, all others
         being fitted anew, before 2 (F - F_min) reaches 3.84, and whether that is "bounded", "one-sided" or "flat". `data`: the runs fitted.
 
@@ -45,7 +43,7 @@ class Fit(Estimates):
         errors, of_rise = (dict(zip(self.labels, x.tolist(), strict=True)) for x in (self.standard_errors, self.statistics.of_rise))
         return profiles(fitted, as_names(names) or of_all, errors, of_rise)
 
-    def predict(self, runs: Experiment | Sequence[Experiment]) -> tuple[dict[str, Prediction], ...]:
+    def predict(self, runs: Data) -> tuple[dict[str, Prediction], ...]:
         """What the fit predicts for `runs` that had no part in it, by channel: `prediction`, `error`, `rms` (in the unit of the channel) and `r_squared`.
 
         What all runs share is held at its estimate; start values that are unknown, and numbers of sensors of each run, are fitted to the run itself.
@@ -57,9 +55,9 @@ class Fit(Estimates):
     def report(
         self,
         path: str | os.PathLike,
-        data: Experiment | Sequence[Experiment] = (),
+        data: Data = (),
         *,
-        held_out: Experiment | Sequence[Experiment] = (),
+        held_out: Data = (),
         profiles: "bool | str | Iterable[str] | Mapping[str, Profile]" = False,
         units: Mapping[str, str] | None = None,
     ) -> None:
@@ -89,7 +87,7 @@ class Fit(Estimates):
         page = fit_page(
             self,
             fitted=of_fitted(self, runs) if runs else (),
-            shares=informed(taken_up(self, runs), MOST_INFORMED) if runs else None,
+            shares=informed(taken_up(self, runs), 24) if runs else None,  # unknowns of which the report says what informs them
             held_out=self.predict(others) if others else (),
             profiles=along,
             units=units or {},

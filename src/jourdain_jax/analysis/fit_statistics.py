@@ -64,29 +64,31 @@ def events_met(problem: Problem, theta: Float[np.ndarray, "places"], options: Al
     return tuple(found)
 
 
+PerRepeat = Float[np.ndarray, "*repeats"]
+PerUnknown = Float[np.ndarray, "*repeats unknowns"]
 @dataclass(frozen=True, eq=False)
 class Statistics:
     """All that is told of a minimum besides where it lies."""
 
     scene: Scene  # with the estimates
     starts: tuple[dict[str, Float[Array | np.ndarray, "..."]], ...]  # initial values of each run, with the estimates
-    sizes: Float[np.ndarray, "*repeats unknowns"]  # magnitudes of the unknowns, against which the rank is judged
-    standard_errors: Float[np.ndarray, "*repeats unknowns"]  # NaN where not identifiable
-    low: Float[np.ndarray, "*repeats unknowns"]  # ends of the 95 % intervals; NaN where not identifiable
-    high: Float[np.ndarray, "*repeats unknowns"]
+    sizes: PerUnknown  # magnitudes of the unknowns, against which the rank is judged
+    standard_errors: PerUnknown  # NaN where not identifiable
+    low: PerUnknown  # ends of the 95 % intervals; NaN where not identifiable
+    high: PerUnknown
     at_bound: Bool[np.ndarray, "*repeats unknowns"]  # these have no standard error, and a one-sided interval
-    quantiles: Float[np.ndarray, "*repeats unknowns"]  # q
+    quantiles: PerUnknown  # q
     information: Information  # covariance in blocks, and the directions that do not show
     residuals: tuple[dict[str, Float[np.ndarray, "..."]], ...]  # of each run by channel: (prediction - value) / sigma; NaN where missing
     whitened: tuple[dict[str, Float[np.ndarray, "..."]], ...]  # residuals, where their noise has a memory less what the sample before foretells
-    sigma: dict[str, Float[np.ndarray, "*repeats"]]  # of channels whose noise was estimated
-    correlation_time: dict[str, Float[np.ndarray, "*repeats"]]  # s, of channels where they were estimated; near zero: white
+    sigma: dict[str, PerRepeat]  # of channels whose noise was estimated
+    correlation_time: dict[str, PerRepeat]  # s, of channels where they were estimated; near zero: white
     untold: tuple[str, ...]  # channels that do not tell their sigma, in any repeat
-    chi_square: Float[np.ndarray, "*repeats"]  # sum of squared whitened residuals; NaN where the motion fails
+    chi_square: PerRepeat  # sum of squared whitened residuals; NaN where the motion fails
     samples: Int[np.ndarray, "*repeats"]  # with a finite sigma
-    degrees_of_freedom: Float[np.ndarray, "*repeats"]  # samples less the directions that they determined; priors take their share
-    of_rise: Float[np.ndarray, "*repeats unknowns"]  # by what 2 (F - F_min) is to be divided, for an interval that ends where it is `RISE_95`
-    from_prior: Float[np.ndarray, "*repeats unknowns"]  # in standard deviations of the prior; NaN where there is none
+    degrees_of_freedom: PerRepeat  # samples less the directions that they determined; priors take their share
+    of_rise: PerUnknown  # by what 2 (F - F_min) is to be divided, for an interval that ends where it is `RISE_95`
+    from_prior: PerUnknown  # in standard deviations of the prior; NaN where there is none
     oddities: tuple[str, ...]  # sentences about what is odd in the runs
     events_met: tuple[str, ...]  # sentences about events before the end of a run, or not met; none in a batch, and where runs were fitted in pieces
     too_narrow: tuple[str, ...]  # sentences about intervals that bounds make too narrow; none in a batch
@@ -101,22 +103,24 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, control: Contro
     unknowns, theta, single = problem.unknowns, found.theta, problem.single
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
+    here = lambda x: one(x[:, places])  # noqa: E731
     low, high = limits.low[places], limits.high[places]
     bound = (theta <= limits.low) | (theta >= limits.high)
-    limit = one(at_bounds.limit[:, places])
+    limit = here(at_bounds.limit)
     about = spread(problem, found, bound, limits, control, errors)
     levels, known, reach = about.levels, about.known.only() if single else about.known, one(about.quantiles * about.known.standard_errors)
     residuals = tuple(problem.by_channel(run, levels.at, one) for run in range(len(problem.runs)))
     white = tuple(problem.by_channel(run, levels.at, one, white=True) for run in range(len(problem.runs)))
-    samples = sum(np.sum(np.isfinite(r), axis=tuple(range(0 if single else 1, r.ndim))) for run in residuals for r in run.values())
+    over = lambda r: tuple(range(0 if single else 1, r.ndim))  # noqa: E731
+    samples = sum(np.sum(np.isfinite(r), axis=over(r)) for run in residuals for r in run.values())
     determined = np.where(fails, 0.0, _determined(levels.known, unknowns))
 
     too_narrow = []
     if single and found.converged[0]:
         too_narrow = moved_from_bounds(at_bounds, theta[0], reach, places, unknowns.labels)
         if errors == "sigmas":
-            too_narrow += too_narrow_near_bounds(Around(problem.linearised, found, limits, control), at_bounds, about.plain[0], unknowns.labels)
-    values = one(theta[:, places])
+            too_narrow += too_narrow_near_bounds(Around(problem.linearised, found, limits, control), at_bounds, about.rise.errors[0], unknowns.labels)
+    values = here(theta)
     shared, local = unknowns.split(theta)
     scene = unknowns.layout.scene(problem.scene, one(shared))
     if not single:
@@ -124,11 +128,11 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, control: Contro
     return Statistics(
         scene=scene,
         starts=tuple(unknowns.layout.start(run.start, one(local[:, i])) for i, run in enumerate(problem.runs)),
-        sizes=one(size[:, places]),
+        sizes=here(size),
         standard_errors=known.standard_errors,
         low=np.where(values <= low, low, np.where(values >= high, limit, np.maximum(values - reach, low))),
         high=np.where(values >= high, high, np.where(values <= low, limit, np.minimum(values + reach, high))),
-        at_bound=one(bound[:, places]),
+        at_bound=here(bound),
         quantiles=one(about.quantiles),
         information=known,
         residuals=residuals,
@@ -136,10 +140,10 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, control: Contro
         sigma={name: one(levels.at.sigma[:, k]) for k, name in enumerate(problem.estimated)},
         correlation_time={name: one(problem.tau[:, k]) for k, name in enumerate(problem.with_memory)},
         untold=tuple(name for name, wrong in zip(problem.estimated, levels.untold.T, strict=True) if wrong.any()),
-        chi_square=np.where(one(fails), np.nan, sum(_sum_of_squares(r, single) for run in white for r in run.values())),
+        chi_square=np.where(one(fails), np.nan, sum(np.nansum(r**2, axis=over(r)) for run in white for r in run.values())),
         samples=np.asarray(samples),
         degrees_of_freedom=np.asarray(samples - one(determined)),
-        of_rise=one(np.where(bound[:, places], at_bounds.if_free.of_rise[:, places], about.of_rise)),
+        of_rise=one(np.where(bound[:, places], at_bounds.if_free.of_rise[:, places], about.rise.of_rise)),
         from_prior=(values - unknowns.prior_mean[places]) / unknowns.prior_sigma[places],
         oddities=oddities(problem.scene, problem.runs, not single),
         events_met=() if options is None else events_met(problem, theta[0], options),
@@ -155,8 +159,3 @@ def _determined(known: Information, unknowns: Unknowns) -> Float[np.ndarray, "me
     rows = M * weight[:q]
     of_shared = np.einsum("ij,bjk,ik->b", rows, known.shared, rows)
     return known.rank - of_shared - variances(known.shared, known.own, known.follow)[:, q:] @ weight[q:] ** 2
-
-
-def _sum_of_squares(r: np.ndarray, single: bool) -> np.ndarray:
-    with np.errstate(over="ignore"):
-        return np.asarray(np.nansum(r**2, axis=tuple(range(0 if single else 1, r.ndim))))

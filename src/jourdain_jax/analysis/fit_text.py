@@ -13,16 +13,13 @@ from jourdain_jax.analysis.losses import LEAST_SQUARES
 from jourdain_jax.analysis.spread import FAR_BEYOND
 from jourdain_jax.analysis.table import table
 
-_BEYOND_ALL = 1e150  # sigmas: the square is no number any more
-_COINCIDING = 3  # different residuals that two channels may share by chance
-_FROM_PRIOR = 4.0  # standard deviations: an estimate that lies further from its prior is no chance
 _SURE = 5.0  # standard deviations: a mean square that is further from 1 is no chance
 
 
 def warnings_of(fit: Estimates) -> tuple[str, ...]:
     """Warnings of a fit of one experiment, the most serious reason first, one sentence each."""
     if not np.isfinite(fit.chi_square):
-        if any(np.any(np.abs(r) > _BEYOND_ALL) for run in fit.residuals for r in run.values()):
+        if any(np.any(np.abs(r) > 1e150) for run in fit.residuals for r in run.values()):  # sigmas: the square is no number any more
             return ("residuals overflow at the first guess: use NaN for missing values, and check `sigma`",)
         return ("the motion fails at the first guess, so that there is nothing to fit; look at it with `simulate`", *fit.events_met)
     return tuple(sentence for reason in REASONS for sentence in reason(fit))
@@ -59,7 +56,7 @@ def _counted_twice(fit: Estimates) -> Iterator[str]:
             counted = np.round(r[np.isfinite(r)], 6)
             here = f"`{name}` of run {run}"
             there = first.setdefault(counted.tobytes(), here)
-            if here != there and len(np.unique(counted)) > _COINCIDING:
+            if here != there and len(np.unique(counted)) > 3:  # different residuals that two channels may share by chance
                 yield f"{there} and {here} hold the same numbers: counted as two measurements, they make intervals too narrow; leave one out"
 
 
@@ -70,7 +67,7 @@ def _only_one_guess(fit: Estimates) -> Iterator[str]:
 
 def _far_from_priors(fit: Estimates) -> Iterator[str]:
     for name, far in zip(fit.labels, fit.from_prior, strict=True):
-        if abs(far) > _FROM_PRIOR:
+        if abs(far) > 4.0:  # standard deviations: an estimate that lies further from its prior is no chance
             yield f"`{name}` lies {abs(far):.2g} standard deviations from its prior: the prior, the data or the scene is not right"
 
 

@@ -27,7 +27,7 @@ The size of an unknown is its magnitude; near zero, its typical change (`Range`)
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import jax
 import jax.numpy as jnp
@@ -39,15 +39,10 @@ from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.scene.scene import Scene
 
-_ARRAYS = ["singular_values", "hidden", "least_part", "rank", "identifiable", "standard_errors", "shared", "own", "follow"]
+_ARRAYS = ("singular_values", "least_part", "rank", "identifiable", "standard_errors", "shared", "own", "follow")
 _WHOLE = 0.01  # how far from a multiple of one half an exponent may be, to be taken as that, and two changes from being equal
-_NORMAL = 1e7  # degrees of freedom, beyond which Student's t is normal
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
-_NODES = (_NODES + 1) / 2
-_MOVES = 0.1  # standard errors: an unknown that moves so far along a direction that does not show has a part in it
 
 
-@partial(jax.tree_util.register_dataclass, meta_fields=["estimated"], data_fields=_ARRAYS)
 @dataclass(frozen=True, eq=False)
 class Information:
     """Covariance in blocks, and directions (changes of theta / size) that do not show. A batch of fits has a leading axis `members` in all arrays."""
@@ -83,7 +78,7 @@ class Information:
 
     def only(self) -> "Information":
         """That of the only member, without the axis of members."""
-        return replace(self, **{name: np.asarray(getattr(self, name)[0]) for name in _ARRAYS if name != "hidden"})
+        return replace(self, **{name: np.asarray(getattr(self, name)[0]) for name in _ARRAYS})
 
     def between_runs(self, scores: Float[np.ndarray, "*members runs shared"]) -> "Information":
         """Takes the covariance of the shared unknowns from how much runs differ: C (sum g g') C n / (n - 1), g: scores of n runs, C: the covariance so far.
@@ -104,10 +99,11 @@ def variances(shared: np.ndarray, own: np.ndarray, follow: np.ndarray) -> Float[
 
 def students_t_95(degrees):
     """97.5 % quantile q of Student's t with one degree of freedom or more: q = sqrt(n) tan a,   2 c integral_0^a cos^(n - 1) = 0.95."""
-    n = np.clip(np.asarray(degrees, float), 1.0, _NORMAL)
+    n = np.clip(np.asarray(degrees, float), 1.0, 1e7)  # degrees of freedom, beyond which Student's t is normal
+    nodes, weights = np.polynomial.legendre.leggauss(40)
     c, a = np.vectorize(lambda x: np.exp(math.lgamma((x + 1) / 2) - math.lgamma(x / 2)) / np.sqrt(np.pi))(n), np.zeros(n.shape)
     for _ in range(12):  # Newton's method, from below: what is integrated falls
-        area = a / 2 * (np.cos(a[..., None] * _NODES) ** (n[..., None] - 1) @ _WEIGHTS)
+        area = a / 2 * (np.cos(a[..., None] * (nodes + 1) / 2) ** (n[..., None] - 1) @ weights)
         a = a + (0.475 / c - area) / np.cos(a) ** (n - 1)
     return np.asarray(np.sqrt(n) * np.tan(a))
 
@@ -119,7 +115,7 @@ def information(arrow: Arrow, size: Float[np.ndarray, "members places"], estimat
     `fails`: (members,), of which nothing is known; `cutoff`: singular values below this fraction of the largest count as zero.
     """
     found = [_information(arrow.of([b]), size[b], estimated, bound[b], not fails[b], cutoff) for b in range(len(size))]
-    stacked = {name: np.stack([getattr(one, name) for one in found]) for name in _ARRAYS if name != "hidden"}
+    stacked = {name: np.stack([getattr(one, name) for one in found]) for name in _ARRAYS}
     return Information(**stacked, hidden=tuple(one.hidden[0] for one in found), estimated=tuple(estimated.tolist()))
 
 
@@ -167,7 +163,7 @@ def least_move(cutoff: float, largest):
 
     An error of J by cutoff * largest (singular value) turns such a direction by as many.
     """
-    return np.maximum(_MOVES, cutoff * largest)
+    return np.maximum(0.1, cutoff * largest)  # standard errors: an unknown that moves so far along a direction that does not show has a part in it
 
 
 def _hidden_directions(own: np.ndarray, runs: np.ndarray, shared: np.ndarray, follow: np.ndarray, held: np.ndarray) -> np.ndarray:
@@ -261,26 +257,24 @@ def standard_errors(
     NaN for those that depend on a direction that does not show, or on an unknown at a bound.
     """
     shared = slopes.shape[-1]
-    covariance, largest = known.whole_covariance[..., :shared, :shared], np.max(known.singular_values, axis=-1, initial=0.0)
+    parts = known.whole_covariance[..., :shared, :shared], np.max(known.singular_values, axis=-1, initial=0.0), known.rank, slopes, sizes, at_bound
 
-    def of_one(C, hidden, rank, largest, slopes, sizes, at_bound):
+    def of_one(hidden, C, largest, rank, slopes, sizes, at_bound):
         error = np.sqrt(np.einsum("...i,ij,...j->...", slopes, C, slopes))
         scaled = slopes * sizes  # with respect to theta / size
         part = np.linalg.norm(scaled @ hidden[:, :shared].T, axis=-1)
-        told = (part <= np.minimum(np.sqrt(cutoff) * np.linalg.norm(scaled, axis=-1), error * least_move(cutoff, largest))) & ~np.any(
-            (slopes != 0) & (at_bound | (rank == 0)), axis=-1
-        )
-        return np.where(told, error, np.nan)
+        most = np.minimum(np.sqrt(cutoff) * np.linalg.norm(scaled, axis=-1), error * least_move(cutoff, largest))
+        lost = np.any((slopes != 0) & (at_bound | (rank == 0)), axis=-1)
+        return np.where((part <= most) & ~lost, error, np.nan)
 
     if sizes.ndim == 1:
-        return of_one(covariance, known.hidden[0], known.rank, largest, slopes, sizes, at_bound)
-    return np.stack([of_one(*one) for one in zip(covariance, known.hidden, known.rank, largest, slopes, sizes, at_bound, strict=True)])
+        return of_one(known.hidden[0], *parts)
+    return np.stack([of_one(*one) for one in zip(known.hidden, *parts, strict=True)])
+
 
 
 WEAK = 0.1  # relative standard error from which a direction is named
 CORRELATED = 0.98  # from which a pair is
-_PART = 0.1  # of the largest entry of a direction: what is less is left out
-_MOST = 400  # unknowns that are looked at
 
 
 def weak_combinations(
@@ -290,7 +284,7 @@ def weak_combinations(
 
     They are those of the unknowns that runs share, where there are any.
     """
-    some = np.flatnonzero(np.isfinite(np.diagonal(covariance)))[:_MOST]
+    some = np.flatnonzero(np.isfinite(np.diagonal(covariance)))[:400]  # unknowns that are looked at
     shared = [i for i in some if not labels[i].startswith("run ")]
     some = np.array(shared) if shared else some
     if not some.size:
@@ -304,7 +298,8 @@ def weak_combinations(
         if spread < WEAK:
             break
         change = spread * directions[:, k] * scale / np.where(is_relative, np.abs(values[some]), 1.0)  # d theta / |theta|, or d theta
-        parts = np.flatnonzero(np.abs(directions[:, k]) > _PART * np.max(np.abs(directions[:, k])))
+        # of the largest entry of a direction: what is less is left out
+        parts = np.flatnonzero(np.abs(directions[:, k]) > 0.1 * np.max(np.abs(directions[:, k])))
         parts = parts[np.argsort(-np.abs(directions[parts, k]))]
         told = [_by(labels[some[i]], change[i] * np.sign(change[parts[0]]), bool(is_relative[i])) for i in parts]
         if len(told) == 1:

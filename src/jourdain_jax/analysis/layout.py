@@ -21,7 +21,6 @@ A function is traced when it is handed over, and ties are compared by what they 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
 from typing import Literal
 
 import jax
@@ -247,7 +246,7 @@ class Place:
     begin: int
     kind: Kind = "scene"  # a parameter or an initial value; a number of a sensor or an actuator; of a body's inertia
 
-    @cached_property
+    @property
     def end(self) -> int:
         """One past the last."""
         return self.begin + math.prod(self.shape)
@@ -271,17 +270,17 @@ class Layout:
     bodies: tuple[BodyInertia, ...] = ()
     ties: tuple[Tie, ...] = ()
 
-    @cached_property
+    @property
     def sizes(self) -> tuple[int, int]:
         """How many are shared, and how many each run has."""
         return self.shared[-1].end if self.shared else 0, self.local[-1].end if self.local else 0
 
-    @cached_property
+    @property
     def parameters(self) -> set[str]:
         """Names of the parameters that differ from those of the scene."""
         return {place.name for place in self.shared if place.kind == "scene"} | set(self.following)
 
-    @cached_property
+    @property
     def following(self) -> tuple[str, ...]:
         """Names of the parameters that follow from unknowns: moments of inertia of bodies, and what is tied to others."""
         return tuple(dict.fromkeys([*(entry.name for body in self.bodies for entry in body.entries), *(tie.name for tie in self.ties)]))
@@ -315,7 +314,7 @@ class Layout:
         """The start of a run with these unknowns of its own."""
         return start | {place.name: place.of(local) for place in self.local if place.name in start}
 
-    @cached_property
+    @property
     def numbers(self) -> bool:
         """Whether sensors or actuators have any."""
         return any(place.of_sensor for place in (*self.shared, *self.local))
@@ -325,7 +324,6 @@ class Layout:
         return {place.name: place.of(vector) for places, vector in ((self.shared, shared), (self.local, local)) for place in places if place.of_sensor}
 
 
-@lru_cache(maxsize=256)
 def _leaf(treedef, name: str) -> int:
     """Which leaf of a scene the parameter of this name is."""
     return getattr(jax.tree.unflatten(treedef, range(treedef.num_leaves)), name)

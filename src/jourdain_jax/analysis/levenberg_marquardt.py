@@ -20,17 +20,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jourdain_jax.analysis.arrow import Arrow, ByMember, ByUnknown
+from jourdain_jax.analysis.arrow import Arrow, ByMember, ByUnknown, Flags, PerMember
 
 LEAST, MOST = 1e-9, 1e9  # damping lambda: at least, and where no step is found
-ROUGHLY = 1e-2  # standard errors: tolerance where the value of F matters, not the place
 
 
 @dataclass
 class Linearised(ByMember):
     """Value and slopes at some theta, of each member."""
 
-    cost: Float[np.ndarray, "members"]  # F; not finite where the motion fails
+    cost: PerMember  # F; not finite where the motion fails
     arrow: Arrow  # J and residuals with J'r = dF/dtheta
     residuals: np.ndarray  # (members, runs) of those of all samples, not whitened; None where another run had failed
     sigma: Float[np.ndarray, "members channels"]  # of channels whose noise is estimated
@@ -69,10 +68,10 @@ class Minimum(ByMember):
 
     theta: ByUnknown
     at: Linearised
-    converged: Bool[np.ndarray, "members"]
-    stuck: Bool[np.ndarray, "members"]  # no step lowers F, however short, and this is no minimum
+    converged: Flags
+    stuck: Flags  # no step lowers F, however short, and this is no minimum
     steps: Int[np.ndarray, "members"]  # tried
-    grown: Bool[np.ndarray, "members"]  # whether it was found over growing spans
+    grown: Flags  # whether it was found over growing spans
     trace: np.ndarray  # (members,) of tuples of (what was minimised, F at first and after each step tried)
 
     def lowest(self) -> "Minimum":
@@ -104,9 +103,9 @@ class Way:
 
     theta: ByUnknown
     at: Linearised
-    going: Bool[np.ndarray, "members"]
-    converged: Bool[np.ndarray, "members"]
-    stuck: Bool[np.ndarray, "members"]
+    going: Flags
+    converged: Flags
+    stuck: Flags
     steps: Int[np.ndarray, "members"]
     costs: list[list[float]]  # F at first and after each step tried
 
@@ -199,7 +198,8 @@ def minimum_beside(evaluate: Callable, theta: Float[np.ndarray, "1 unknowns"], p
     """The minimum over all unknowns but one, which is held at this value; to one per cent of a standard error."""
     begin, fixed = np.clip(theta, limits.low, limits.high), limits.fixed.copy()
     begin[0, place], fixed[place] = value, True
-    return minimise(evaluate, begin, replace(limits, fixed=fixed), replace(control, tolerance=max(control.tolerance, ROUGHLY)))
+    # standard errors: tolerance where the value of F matters, not the place
+    return minimise(evaluate, begin, replace(limits, fixed=fixed), replace(control, tolerance=max(control.tolerance, 1e-2)))
 
 
 def column_scaling(arrow: Arrow, size: ByUnknown) -> ByUnknown:
@@ -230,7 +230,7 @@ def damped_step(arrow: Arrow, theta, D, damping, limits: Limits, cutoff: float) 
     return np.clip(theta + d, low, limits.high) - theta
 
 
-def is_small(change, size, d, control: Control) -> Bool[np.ndarray, "members"]:
+def is_small(change, size, d, control: Control) -> Flags:
     """Which steps end a minimisation."""
     small = change <= control.tolerance**2
     return small & (np.abs(d) <= control.tolerance * size).all(axis=1) if small.any() else small

@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits
-from jourdain_jax.analysis.estimate import Estimate, Range, Transforms, bounds, positive
-from jourdain_jax.analysis.experiment import Experiment
+from jourdain_jax.analysis.estimate import Estimate, Points, Range, Transforms, bounds, positive
+from jourdain_jax.analysis.experiment import Data
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.layout import Layout, PossibleInertia
 from jourdain_jax.analysis.likelihood import as_fit_options, as_runs, in_all_or_none, mapped, of_run
@@ -32,11 +32,13 @@ from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
-from jourdain_jax.scene.names import as_names, nearest
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.parameters import Scalar
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 _INSIDE = 0.02  # of the width of a range: the least distance from its ends of the centre of a whitened density
+Point = Float[Array, "unknowns"]
 
 
 class LogDensity(eqx.Module):
@@ -65,11 +67,11 @@ class LogDensity(eqx.Module):
     with_memory: tuple[str, ...] = eqx.field(static=True)  # channels whose correlation time is, last among the unknowns
     intervals: Float[np.ndarray, "with_memory"]  # s, the shortest of each of these
 
-    def __call__(self, z: Float[Array, "unknowns"]) -> Float[Array, ""]:
+    def __call__(self, z: Point) -> Scalar:
         """The logarithm of the density; -inf where the motion fails."""
         return _density(self, self._checked(z), Reference(self.scene))
 
-    def _at(self, z: Float[Array, "unknowns"], reference: Reference) -> Float[Array, ""]:
+    def _at(self, z: Point, reference: Reference) -> Scalar:
         x = self._spread(z)
         inner = self.transforms.constrain(x)
         theta = self._told(inner)
@@ -85,7 +87,7 @@ class LogDensity(eqx.Module):
         scene, sigma = self.layout.scene(self.scene, shared), dict(zip(self.sigmas, theta[count:end], strict=True))
         tau = dict(zip(self.with_memory, theta[end:], strict=True))
 
-        def one(run: Run, local: Float[Array, "local"]) -> Float[Array, ""]:
+        def one(run: Run, local: Float[Array, "local"]) -> Scalar:
             here = run.at(self.layout, shared, local)
             weights = {name: weight / sigma[name] if name in sigma else weight for name, weight in here.weights.items()}
             memory = here.correlation_time | {name: tau[name] for name in here.correlation_time if name in tau}
@@ -95,20 +97,20 @@ class LogDensity(eqx.Module):
             return logs + sum(jnp.sum(mapped(one, group, local[np.array(runs)])) for group, runs in zip(self.groups, self.runs, strict=True))
 
     @property
-    def initial(self) -> Float[Array, "unknowns"]:
+    def initial(self) -> Point:
         """z at the first guess of all unknowns."""
         return self.unconstrain({})
 
-    def constrain(self, z: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch unknowns"]:
+    def constrain(self, z: Points) -> Points:
         """The unknowns at z, in their units and in the order of `labels`; of one vector or many."""
         return self._told(self.transforms.constrain(self._spread(self._checked(z))))
 
-    def named(self, z: Float[Array, "*batch unknowns"]) -> dict[str, Float[Array, "*batch"]]:
+    def named(self, z: Points) -> dict[str, Float[Array, "*batch"]]:
         """The unknowns at z by name, in their units; of one vector or many."""
         theta = self.constrain(z)
         return {label: theta[..., i] for i, label in enumerate(self.labels)}
 
-    def unconstrain(self, values: Mapping) -> Float[Array, "unknowns"]:
+    def unconstrain(self, values: Mapping) -> Point:
         """z at these values of unknowns by name, in their units; those that are not given are at their first guess.
 
         Raises ValueError for names that are not unknown, and for values at or beyond a bound.
@@ -122,7 +124,7 @@ class LogDensity(eqx.Module):
             raise ValueError(f"`{self.labels[off[0]]}` is {float(theta[off[0]]):g}, which is at or beyond a bound of it; give a value inside")
         return jax.scipy.linalg.solve_triangular(self.factor, x - self.centre, lower=True)
 
-    def scene_at(self, z: Float[Array, "unknowns"]) -> Scene:
+    def scene_at(self, z: Point) -> Scene:
         """The scene with the parameters at z."""
         return self.layout.scene(self.scene, self._split(self.constrain(z))[0])
 
@@ -162,20 +164,20 @@ class LogDensity(eqx.Module):
             raise ValueError(f"the vector has shape {z.shape}, expected ({len(self.labels)},): one number for each of {', '.join(self.labels)}")
         return z
 
-    def _spread(self, z: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch unknowns"]:
+    def _spread(self, z: Points) -> Points:
         return self.centre + z @ self.factor.T
 
-    def _told(self, inner: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch unknowns"]:
+    def _told(self, inner: Points) -> Points:
         """The unknowns, from what stands for them between the bounds of their transforms."""
         end = len(self.labels) - len(self.with_memory)
         return jnp.concatenate([inner[..., :end], -self.intervals / jnp.log(jnp.sin(inner[..., end:]))], axis=-1)
 
-    def _inner(self, theta: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch unknowns"]:
+    def _inner(self, theta: Points) -> Points:
         """The inverse of `_told`."""
         end = len(self.labels) - len(self.with_memory)
         return jnp.concatenate([theta[..., :end], jnp.arcsin(jnp.exp(-self.intervals / theta[..., end:]))], axis=-1)
 
-    def _split(self, theta: Float[Array, "unknowns"]) -> tuple[Float[Array, "shared"], Float[Array, "runs local"]]:
+    def _split(self, theta: Point) -> tuple[Float[Array, "shared"], Float[Array, "runs local"]]:
         shared, local = self.layout.sizes
         every = jnp.asarray(self.fixed).at[np.array(self.places, int)].set(theta[: len(self.places)])
         return every[:shared], every[shared:].reshape(-1, local) if local else jnp.zeros((sum(map(len, self.runs)), 0))
@@ -187,7 +189,7 @@ _density = compiled(LogDensity._at)
 @shown_from_users_lines
 def log_density(
     scene: Scene | BuiltFor,
-    data: Experiment | Sequence[Experiment],
+    data: Data,
     free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
     *,
     options: Options | None = None,
@@ -221,16 +223,16 @@ def log_density(
     limits = [correlation_limits([np.asarray(run.ts) for run in runs if name in run.values]) for name in with_memory]
     intervals = np.array([low / SHORTEST for low, _ in limits])
     angles = [bounds(*(float(np.arcsin(np.exp(-h / tau))) for tau in ends)) for h, ends in zip(intervals, limits, strict=True)]
-    unknowns = unknowns_of(scene, runs, free if isinstance(free, Mapping) else tuple(as_names(free)))
+    unknowns = unknowns_of(scene, runs, free)
     with reference_parameters(scene):
         if not is_traced((scene, [(run.start, run.t0, run.inputs) for run in runs])):
             check_starts(scene, runs, unknowns)
         grouped = equal_runs(runs)
         guesses = [_rms(scene, [group for _, group in grouped if name in group.weights], name, settled) for name in sigmas]
     guesses += (intervals / np.log(2)).tolist()  # neighbouring samples correlate by a half
-    places, priors = unknowns.estimated, np.concatenate
-    none = np.full(len(guesses), np.inf)
-    size = len(places) + len(guesses)
+    places = unknowns.estimated
+    known, size = np.isfinite(unknowns.prior_mean[places]), len(places) + len(guesses)
+    with_noise = lambda x, of_noise: np.concatenate([x, np.full(len(guesses), of_noise)])  # noqa: E731
     return LogDensity(
         scene=scene,
         groups=tuple(group for _, group in grouped),
@@ -238,8 +240,8 @@ def log_density(
         fixed=unknowns.guess,
         transforms=Transforms([*(unknowns.ranges[place] for place in places), *(positive() for _ in sigmas), *angles]),
         guess=np.concatenate([unknowns.guess[places], guesses]),
-        prior_mean=np.concatenate([np.nan_to_num(unknowns.prior_mean[places]), np.zeros(len(guesses))]),
-        prior_sigma=priors([np.where(np.isfinite(unknowns.prior_mean[places]), unknowns.prior_sigma[places], np.inf), none]),
+        prior_mean=with_noise(np.where(known, unknowns.prior_mean[places], 0.0), 0.0),
+        prior_sigma=with_noise(np.where(known, unknowns.prior_sigma[places], np.inf), np.inf),
         whitening=unknowns.whitening,
         centre=np.zeros(size),
         factor=np.eye(size),

@@ -11,10 +11,9 @@ Source: P. J. Huber and E. M. Ronchetti, Robust Statistics, 2nd ed. (2009), sect
 
 import math
 from dataclasses import dataclass
-from types import ModuleType
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jourdain_jax.calculus.reals import Number, checked_real
 
@@ -26,26 +25,26 @@ class Loss:
     kind: str
     parameter: float
 
-    def value(self, r: Float[Array | np.ndarray, "*batch samples"], xp: ModuleType = np) -> Float[Array | np.ndarray, "*batch"]:
-        """Sum of rho over the last axis. `xp`: NumPy, or `jax.numpy`."""
+    def value(self, r: Float[np.ndarray, "*batch samples"]) -> Float[np.ndarray, "*batch"]:
+        """Sum of rho over the last axis."""
         k = self.parameter
         if math.isinf(k):
-            return 0.5 * xp.einsum("...i,...i->...", r, r)
+            return 0.5 * np.einsum("...i,...i->...", r, r)
         size = abs(r)
         if self.kind == "student-t":
-            return xp.sum((k + 1) / 2 * xp.log1p(r**2 / k), axis=-1)
-        return xp.sum(xp.where(size <= k, 0.5 * r**2, k * xp.minimum(size, np.finfo(float).max / max(k, 1.0)) - 0.5 * k**2), axis=-1)
+            return np.sum((k + 1) / 2 * np.log1p(r**2 / k), axis=-1)
+        return np.sum(np.where(size <= k, 0.5 * r**2, k * np.minimum(size, np.finfo(float).max / max(k, 1.0)) - 0.5 * k**2), axis=-1)
 
-    def weight(self, r: Float[Array | np.ndarray, "*samples"], xp: ModuleType = np) -> Float[Array | np.ndarray, "*samples"]:
+    def weight(self, r: Float[np.ndarray, "*samples"]) -> Float[np.ndarray, "*samples"]:
         """w(r)."""
         k = self.parameter
         if not np.isfinite(k):
-            return xp.ones_like(r)
-        return (k + 1) / (k + r**2) if self.kind == "student-t" else xp.minimum(1.0, k / xp.maximum(abs(r), np.finfo(float).tiny))
+            return np.ones_like(r)
+        return (k + 1) / (k + r**2) if self.kind == "student-t" else np.minimum(1.0, k / np.maximum(abs(r), np.finfo(float).tiny))
 
-    def weighted(self, rows: Float[Array | np.ndarray, "*samples width"], r: Float[Array | np.ndarray, "*samples"], xp: ModuleType = np):
+    def weighted(self, rows: Float[np.ndarray, "*samples width"], r: Float[np.ndarray, "*samples"]):
         """Rows times the roots of their weights."""
-        return rows if math.isinf(self.parameter) else xp.sqrt(self.weight(r, xp))[..., None] * rows
+        return rows if math.isinf(self.parameter) else np.sqrt(self.weight(r))[..., None] * rows
 
     def inflation(self, r: Float[np.ndarray, "samples"], determined: float) -> float:
         """The factor by which the covariance (J'WJ)^-1 is to be multiplied, from the residuals that count, which determined so many unknowns."""

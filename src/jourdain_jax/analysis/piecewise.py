@@ -13,9 +13,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from jourdain_jax.analysis.arrow import ByMember, ByUnknown
+from jourdain_jax.analysis.arrow import ByMember, ByUnknown, Flags, PerMember
 from jourdain_jax.analysis.estimate import unbounded
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.layout import Place
@@ -180,11 +180,11 @@ class Piecewise(Lanes):
         for b, j, rows in self._of_runs(members, failed):
             yield b, j, closed(rows, self.own + self.shared)
 
-    def moved(self, theta: ByUnknown, members: np.ndarray, share: Float[np.ndarray, "members"]) -> Iterator[Some]:
+    def moved(self, theta: ByUnknown, members: np.ndarray, share: PerMember) -> Iterator[Some]:
         """As `evaluate`, where a share of the gaps is closed, and rows are [J g r]: r will have changed by g once pieces join."""
         return self._of_runs(members, ~self._move(theta, members, share))
 
-    def _of_runs(self, members: np.ndarray, failed: Bool[np.ndarray, "members"]) -> Iterator[Some]:
+    def _of_runs(self, members: np.ndarray, failed: Flags) -> Iterator[Some]:
         here = np.arange(len(members))
         for run in range(len(self.runs)):
             rows = np.full((len(here), *self._shape(run)), np.nan)
@@ -196,7 +196,7 @@ class Piecewise(Lanes):
         """The shape of [J g r] of a run."""
         return max(where.stop for where in self.group_of(run).channels.values()), self.own + self.shared + 2
 
-    def change(self, problem: Problem, sigma: np.ndarray, d: np.ndarray, members: np.ndarray) -> Float[np.ndarray, "members"]:
+    def change(self, problem: Problem, sigma: np.ndarray, d: np.ndarray, members: np.ndarray) -> PerMember:
         """Return the change of all residuals by a step that closes the gaps, |J d + g|, in units of sigma."""
         d_shared, d_own = self.unknowns.split(d)
         squares = np.zeros(len(d))
@@ -213,7 +213,7 @@ class Piecewise(Lanes):
         shared, own = self.unknowns.split(theta)
         return np.concatenate([own[:, self.run_of], np.broadcast_to(shared[:, None], (len(theta), len(self.parts), self.shared))], axis=2)
 
-    def growth(self, members: np.ndarray) -> Float[np.ndarray, "members"]:
+    def growth(self, members: np.ndarray) -> PerMember:
         """The factor by which small changes of the unknowns grow from the first node to where they are largest, in sizes of states and unknowns."""
         sizes = self._by_piece(self.unknowns.sizes(self.at.theta[members]))
         slopes = self.at.slopes[members][:, :, self.own :] * sizes[:, :, None] / self.node_sizes[:, None]
@@ -227,17 +227,17 @@ class Piecewise(Lanes):
         yield
         self.at = kept
 
-    def closed(self, members: np.ndarray) -> Bool[np.ndarray, "members"]:
+    def closed(self, members: np.ndarray) -> Flags:
         """Whether the pieces join, to the tolerance of the simulation."""
         return self.continuity(members) <= 1.0
 
-    def continuity(self, members: np.ndarray) -> Float[np.ndarray, "members"]:
+    def continuity(self, members: np.ndarray) -> PerMember:
         """Return the largest jump from one piece to the next, in tolerances of the options, `atol + rtol |x|`."""
         rtol, atol = self.tolerance
         allowed = atol + rtol * np.maximum(np.abs(self.at.local[members][..., self.own :]), self.node_sizes)
         return np.max(np.abs(self.at.jumps[members]) / allowed, axis=(1, 2), initial=0.0)
 
-    def _move(self, theta: ByUnknown, members: np.ndarray, share: Float[np.ndarray, "members"]) -> Bool[np.ndarray, "members"]:
+    def _move(self, theta: ByUnknown, members: np.ndarray, share: PerMember) -> Flags:
         """Pieces of some members to other unknowns; which of them do not fail there. The others stay."""
         m, M = self.own, self.own + self.states
         before, (shared, own) = self.at.of(members), self.unknowns.split(theta)

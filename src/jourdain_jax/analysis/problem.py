@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jourdain_jax.analysis.arrow import Arrow, ByMember, arrow, triangle, with_prior
+from jourdain_jax.analysis.arrow import Arrow, ByMember, PerMember, arrow, triangle, with_prior
 from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits, half_log_determinant, lowest
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Linearised, Minimum, minimise
@@ -26,7 +26,7 @@ from jourdain_jax.scene.scene import Scene
 class Span(ByMember):
     """The first part of all runs. The first guess is a weak prior, known to its own size: what so few samples do not tell stays there."""
 
-    shares: Float[np.ndarray, "members"]  # of the span of each run, from its start: samples beyond do not count
+    shares: PerMember  # of the span of each run, from its start: samples beyond do not count
     begun: Float[np.ndarray, "members places"]  # first guesses
 
 

@@ -1,15 +1,28 @@
-"""What kind of system a scene is, in one table: freedoms, rows, rank, integrability, growth, cyclic and ignorable coordinates."""
+"""What kind of system a scene is, in one table: freedoms, rows, rank, integrability, growth, cyclic and ignorable coordinates.
 
+Likely mistakes of a scene in one table: it can be computed, but is hardly meant.
+
+smoothness        poses, rows and rates of coordinates that jump, or whose velocities do, on lines through states of the domain
+grounds           what the ground of a contact does, and what is stated of it
+bodies            0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2, and all that is refused where a motion starts
+scalar program    its rates and slopes against JAX's
+"""
+
+import textwrap
 from dataclasses import asdict, dataclass
 
 import jax
 
 from jourdain_jax.analysis.integrability import growth_vector, row_integrability
 from jourdain_jax.build.domain import COORDINATE_DOMAIN, SPEED_DOMAIN
-from jourdain_jax.build.structure import structure_of
+from jourdain_jax.build.plausibility import impossible_bodies
+from jourdain_jax.build.structure import structure_of, structure_whatever_its_faults
 from jourdain_jax.calculus.figures import MODEL, QUIET, figure
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reduced import cyclic_coordinates, ignorable_coordinates
+from jourdain_jax.lowering.comparison import DIFFERS
+from jourdain_jax.lowering.lower import lowered
+from jourdain_jax.lowering.lowered import NotLowered
 from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.model import Model, build
@@ -17,13 +30,12 @@ from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.vector_fields.choice import vector_field
 from jourdain_jax.native import nvidia
-from jourdain_jax.scene.arguments import BuiltFor, of_known_numbers
+from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers
 from jourdain_jax.scene.printing import Printed, preformatted
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
-_LABEL = 26  # width of the first column
-_LINE = 120
+AS_IN_STRUCTURE = ("degrees_of_freedom", "rank", "redundant_rows", "rheonomic", "affine", "worst_pivot", "typical_pivot", "rank_losses")
 
 
 @dataclass(frozen=True, repr=False)
@@ -98,7 +110,8 @@ class Report(Printed):
         }
         lines = [f"Report on {self.scene}"]
         for label, fact in facts.items():
-            lines += _wrapped(label, fact)
+            first, *more = textwrap.wrap(fact, 94, break_long_words=False, break_on_hyphens=False) or [""]
+            lines += [f"  {label:<24}{first}", *(" " * 26 + line for line in more)]
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
@@ -174,10 +187,8 @@ def report(scene: Scene | BuiltFor, *, depth: int = 4, start: State | dict | Non
         scene=type(scene).__name__,
         coordinates=scene.coordinate_names.entries,
         speeds=scene.speed_names.entries,
-        degrees_of_freedom=structure.degrees_of_freedom,
         rows=structure.row_names,
-        rank=structure.rank,
-        redundant_rows=structure.redundant_rows,
+        **{name: getattr(structure, name) for name in AS_IN_STRUCTURE},
         integrable_rows=by_row.integrable_rows,
         nonholonomic_rows=by_row.nonholonomic_rows,
         frobenius_violations=by_row.violations,
@@ -185,17 +196,12 @@ def report(scene: Scene | BuiltFor, *, depth: int = 4, start: State | dict | Non
         closed=growth.closed,
         bracket_depth=depth,
         holonomic_rows_together=growth.holonomic_rows_together,
-        rheonomic=structure.rheonomic,
         depends_on_time=structure.timed,
-        affine=structure.affine,
         cyclic_coordinates=cyclic_coordinates(scene),
         ignorable_coordinates=ignorable_coordinates(scene),
         privileged_velocities=tuple(scene.speed_names.entries[i] for i in structure.independent),
         privileged_by_user=structure.chosen_by_user,
         lowering=_lowering(built),
-        worst_pivot=structure.worst_pivot,
-        typical_pivot=structure.typical_pivot,
-        rank_losses=structure.rank_losses,
         rank_at_start=None if start is None and rank_at_start == structure.rank else rank_at_start,
         events=built.events,
         domain={name: (float(low), float(high)) for name, (low, high) in scene.domain.items()},
@@ -215,16 +221,6 @@ def _listed(names: tuple[str, ...]) -> str:
     return f"{len(names)}: {', '.join(names)}" if names else "none"
 
 
-def _wrapped(label: str, text: str) -> list[str]:
-    """One fact in two columns, broken at blanks."""
-    words, lines = text.split(" "), [""]
-    for word in words:
-        if lines[-1] and len(lines[-1]) + 1 + len(word) > _LINE - _LABEL:
-            lines.append("")
-        lines[-1] += f" {word}" if lines[-1] else word
-    return [f"  {label if i == 0 else '':<{_LABEL - 2}}{line}" for i, line in enumerate(lines)]
-
-
 def _lowering(built: Model) -> str:
     found = built.program
     if found is None:
@@ -235,3 +231,43 @@ def _lowering(built: Model) -> str:
     if not reason and jax.default_backend() == "gpu":
         where += f" of the CPU and of NVIDIA GPUs ({nvidia.architecture()})"
     return f"a scalar program of {found.operations} operations{calls}; {where}"
+
+
+@dataclass(frozen=True, repr=False)
+class Checked(Printed):
+    """Findings of `check`: subject -> sentences on what looks wrong, none where all is plausible. Printed as a table."""
+
+    scene: str
+    found: dict[str, tuple[str, ...]]
+
+    @property
+    def passed(self) -> bool:
+        """True where nothing looks wrong."""
+        return not any(self.found.values())
+
+    def _text(self) -> str:
+        rows = [f"  {what:<16} {'; '.join(sentences) or 'ok'}" for what, sentences in self.found.items()]
+        return "\n".join([f"Check of {self.scene}: {'nothing looks wrong' if self.passed else 'LOOK AT THIS'}", *rows])
+
+
+@shown_from_users_lines
+@of_known_numbers
+def check(scene: Scene | BuiltFor) -> Checked:
+    """Look for likely mistakes of a scene: kinks and jumps, grounds that other bodies carry, impossible bodies, a program that differs from JAX.
+
+        print(jj.check(scene))
+
+    Looks at some states of the domain; a narrow feature between them is not seen. When the scene is built or moves, the first finding is raised as an error,
+    except a program that differs (dense matrices serve) and a moment of inertia above the sum of the others.
+    ValueError where no admissible state is found, or a motion that the rows leave free has no inertia.
+    """
+    scene = as_scene(scene)
+    known = structure_whatever_its_faults(scene)
+    program = "" if known.kinks or known.odd_grounds or known.faults else lowered(scene)
+    found = {
+        "smoothness": known.kinks,
+        "grounds": known.odd_grounds,
+        "bodies": known.faults or impossible_bodies(scene, known.coordinates[0]),
+        "scalar program": (str(program),) if isinstance(program, NotLowered) and DIFFERS in str(program) else (),
+    }
+    return Checked(type(scene).__name__, found)

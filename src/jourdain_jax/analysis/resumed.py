@@ -27,13 +27,14 @@ one before it ended. Correlation times are held. Source: D. J. Venzon and S. H. 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.analysis.estimates import Asked, Estimates
-from jourdain_jax.analysis.experiment import Experiment
+from jourdain_jax.analysis.experiment import Data, Experiment
 from jourdain_jax.analysis.information import Information, information, variances
 from jourdain_jax.analysis.levenberg_marquardt import Limits, Linearised, minimise, minimum_beside
 from jourdain_jax.analysis.likelihood import as_runs
@@ -75,7 +76,7 @@ class TakenUp:
         return information(self.at.arrow, size, unknowns.estimated, self.limits.reached(theta), fails, self.asked.control.cutoff).only()
 
 
-def taken_up(fit: Estimates, data: Experiment | Sequence[Experiment]) -> TakenUp:
+def taken_up(fit: Estimates, data: Data) -> TakenUp:
     """A `Fit` of one experiment where it ended, with residuals and derivatives computed anew. ValueError where `data` are not what it was fitted to."""
     again = for_runs(fit, data, fitted=True)
     unknowns = again.problem.unknowns
@@ -95,7 +96,7 @@ def taken_up(fit: Estimates, data: Experiment | Sequence[Experiment]) -> TakenUp
     return again
 
 
-def for_runs(fit: Estimates, runs: Experiment | Sequence[Experiment], fitted: bool = False) -> TakenUp:
+def for_runs(fit: Estimates, runs: Data, fitted: bool = False) -> TakenUp:
     """The problem of a `Fit` for these runs, at the first guesses; ValueError where they do not fit the scene.
 
     `fitted`: they are those of the fit, in pieces where it was found so.
@@ -144,7 +145,7 @@ def of_fitted(fit: Estimates, runs: Sequence[Experiment]) -> tuple[dict[str, Pre
     return tuple(_by_channel(fit, run, residuals) for run, residuals in zip(runs, fit.residuals, strict=True))
 
 
-def of_held_out(fit: Estimates, runs: Experiment | Sequence[Experiment]) -> tuple[dict[str, Prediction], ...]:
+def of_held_out(fit: Estimates, runs: Data) -> tuple[dict[str, Prediction], ...]:
     """Predictions of other runs; ValueError where they do not fit the scene, or share unknowns that the fit did not estimate."""
     runs = (runs,) if isinstance(runs, Experiment) else tuple(runs)
     other = for_runs(fit, runs)
@@ -269,79 +270,83 @@ def profiles(fitted: TakenUp, names: Iterable[str], errors: dict[str, float], in
         if name not in unknowns.labels:
             raise UnknownNameError(f"`{name}` was not estimated; {nearest(name, unknowns.labels)}")
         place = int(unknowns.estimated[unknowns.labels.index(name)])
-        sides = [_Side(fitted, place, errors[name], inflation[name], way) for way in (-1.0, 1.0)]
-        ends = [side.end() for side in sides]
-        points = sorted({(float(fitted.theta[0, place]), 0.0), *sides[0].points, *sides[1].points})
-        closed = sides[0].is_closed, sides[1].is_closed
+        low, high = (_side(fitted, place, errors[name], inflation[name], way) for way in (-1.0, 1.0))
+        points = sorted({(float(fitted.theta[0, place]), 0.0), *low.points, *high.points})
+        closed = low.is_closed, high.is_closed
         kind = ("flat", "one-sided", "bounded")[sum(closed)]
-        notes = tuple(dict.fromkeys(side.note for side in sides if side.note))
+        notes = tuple(dict.fromkeys(note for note in (low.note, high.note) if note))
         values, rise = np.array(points).T
         estimate = float(fitted.theta[0, place])
-        found[name] = Profile(name, unknowns.units[unknowns.labels.index(name)], estimate, values, rise, ends[0], ends[1], closed, kind, notes)
+        found[name] = Profile(name, unknowns.units[unknowns.labels.index(name)], estimate, values, rise, low.end, high.end, closed, kind, notes)
     return found
 
 
-class _Side:
+class _Side(NamedTuple):
     """The profile from the estimate to one side."""
 
-    def __init__(self, fitted: TakenUp, place: int, error: float, inflation: float, way: float):
-        self._fitted, self._place, self._inflation, self._way = fitted, place, inflation, way
-        self._size = float(fitted.problem.unknowns.sizes(fitted.theta)[0, place])
-        self._first = _STEP * error if np.isfinite(error) and error > 0 else 0.1 * self._size
-        self._bound = float((fitted.limits.low if way < 0 else fitted.limits.high)[place])
-        self.points: list[tuple[float, float]] = []
-        self.is_closed, self.note = False, ""
+    end: float  # of the interval; infinite, or the bound, where there is none
+    points: list[tuple[float, float]]
+    is_closed: bool
+    note: str
 
-    def end(self) -> float:
-        """The end of the interval on this side; infinite, or the bound, where there is none."""
-        theta, origin, step = self._fitted.theta, float(self._fitted.theta[0, self._place]), self._first
-        far, rise, slope = 0.0, 0.0, None
-        room = min(abs(self._bound - origin), 1e3 * max(self._size, self._first))
-        for _ in range(16):
-            if far >= room:
-                break
-            at = min(far + step, room)
-            # others go on as they went from the point before to this one
-            found, there = self._solved(theta if slope is None else theta + slope * (at - far), origin + self._way * at)
-            if not np.isfinite(found):
-                step = (at - far) / 4
-                if step < 1e-3 * self._first:
-                    break
-                self.note = f"the motion fails near {origin + self._way * at:.4g}"
-                continue
-            self.points.append((origin + self._way * at, found))
-            if found < -0.02 * RISE_95:
-                self.note = f"a lower minimum than that of the fit lies near {origin + self._way * at:.6g}: fit again from there"
-            if found >= RISE_95:
-                self.is_closed, self.note = True, "" if "fails" in self.note else self.note
-                return origin + self._way * self._crossing(theta, origin, (far, rise), (at, found))
-            speed = (np.sqrt(max(found, 0.0)) - np.sqrt(max(rise, 0.0))) / (at - far)
-            step = (at - far) * float(np.clip(_STEP / max(speed * (at - far), 1e-9), 0.5, 4.0))
-            slope, theta, far, rise = (there - theta) / (at - far), there, at, found
-        return self._bound if np.isfinite(self._bound) else self._way * np.inf
 
-    def _solved(self, theta: np.ndarray, value: float) -> tuple[float, np.ndarray]:
-        """The rise at a value of the unknown, and all others there; infinite where the motion fails."""
-        found = minimum_beside(self._fitted.evaluate, theta, self._place, value, self._fitted.limits, self._fitted.asked.control)
+def _side(fitted: TakenUp, place: int, error: float, inflation: float, way: float) -> _Side:
+    """The profile to one side: `way` is 1 or -1."""
+    theta, origin, note = fitted.theta, float(fitted.theta[0, place]), ""
+    size, bound = float(fitted.problem.unknowns.sizes(theta)[0, place]), float((fitted.limits.low if way < 0 else fitted.limits.high)[place])
+    first = step = _STEP * error if np.isfinite(error) and error > 0 else 0.1 * size
+    points: list[tuple[float, float]] = []
+
+    def solved(theta: np.ndarray, at: float) -> tuple[float, np.ndarray]:
+        """The rise so far from the estimate, and all others there; infinite where the motion fails."""
+        nonlocal note
+        found = minimum_beside(fitted.evaluate, theta, place, origin + way * at, fitted.limits, fitted.asked.control)
         if np.isfinite(found.at.cost[0]) and not found.converged[0]:
-            self.note = f"no minimum over the others was found near {value:.4g}, so that the interval may be too narrow"
-        return 2 * float(found.at.cost[0] - self._fitted.at.cost[0]) / self._inflation, found.theta
+            note = f"no minimum over the others was found near {origin + way * at:.4g}, so that the interval may be too narrow"
+        rise = 2 * float(found.at.cost[0] - fitted.at.cost[0]) / inflation
+        if np.isfinite(rise):
+            points.append((origin + way * at, rise))
+        return rise, found.theta
 
-    def _crossing(self, theta: np.ndarray, origin: float, inner: tuple[float, float], outer: tuple[float, float]) -> float:
+    def crossing(theta: np.ndarray, inner: tuple[float, float], outer: tuple[float, float]) -> float:
         """Where the rise is that of the interval's end, between two points: by halves where it jumps, else by secants of its root, which is nearly straight.
 
         `theta`: all unknowns at the inner point, from which the others follow; beyond the outer one they may have gone elsewhere.
         """
+        nonlocal note
         for _ in range(8):
             low, end, high = np.sqrt(np.maximum([inner[1], RISE_95, outer[1]], 0.0))
             middle = inner[0] + (outer[0] - inner[0]) * (0.5 if outer[1] > 3 * RISE_95 else float((end - low) / (high - low)))
-            found, there = self._solved(theta, origin + self._way * middle)
-            self.points.append((origin + self._way * middle, found))
+            found, there = solved(theta, middle)
             if abs(found / RISE_95 - 1) < 0.01:
                 return middle
             if found < RISE_95:
                 inner, theta = (middle, found), there
             else:
                 outer = middle, found
-        self.note = f"the sum of squares jumps near {origin + self._way * outer[0]:.4g}: beyond it, other unknowns are elsewhere"
+        note = f"the sum of squares jumps near {origin + way * outer[0]:.4g}: beyond it, other unknowns are elsewhere"
         return outer[0]
+
+    far, rise, slope = 0.0, 0.0, np.zeros(1)
+    room = min(abs(bound - origin), 1e3 * max(size, first))
+    for _ in range(16):
+        if far >= room:
+            break
+        at = min(far + step, room)
+        # others go on as they went from the point before to this one
+        found, there = solved(theta + slope * (at - far), at)
+        if not np.isfinite(found):
+            step = (at - far) / 4
+            if step < 1e-3 * first:
+                break
+            note = f"the motion fails near {origin + way * at:.4g}"
+            continue
+        if found < -0.02 * RISE_95:
+            note = f"a lower minimum than that of the fit lies near {origin + way * at:.6g}: fit again from there"
+        if found >= RISE_95:
+            note = "" if "fails" in note else note
+            return _Side(origin + way * crossing(theta, (far, rise), (at, found)), points, True, note)
+        speed = (np.sqrt(max(found, 0.0)) - np.sqrt(max(rise, 0.0))) / (at - far)
+        step = (at - far) * float(np.clip(_STEP / max(speed * (at - far), 1e-9), 0.5, 4.0))
+        slope, theta, far, rise = (there - theta) / (at - far), there, at, found
+    return _Side(bound if np.isfinite(bound) else way * np.inf, points, False, note)

@@ -28,7 +28,7 @@ from jourdain_jax.analysis.correlated_noise import Chains, whitened
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.quantities import Channel, StopEvent
-from jourdain_jax.analysis.sensors import Drive, Reading, grid, ideal, intervals, with_numbers
+from jourdain_jax.analysis.sensors import Drive, Numbers, Reading, Times, grid, ideal, intervals, with_numbers
 from jourdain_jax.analysis.shooting import LAST, NODE, begin, ended
 from jourdain_jax.build.reference import Reference
 from jourdain_jax.motion.inputs import Inputs, Sampled
@@ -42,11 +42,11 @@ class Run(NamedTuple):
     """A run made ready: its measurements with weights 1 / sigma, zero where a sample is missing."""
 
     t0: Float[Array | np.ndarray, ""]
-    ts: Float[Array | np.ndarray, "times"]
+    ts: Times
     grid: Float[Array | np.ndarray, "grid"] | None  # s, at equal intervals: where sensors are late, the motion is worked out there
-    values: dict[str, Float[Array | np.ndarray, "..."]]
-    weights: dict[str, Float[Array | np.ndarray, "..."]]
-    start: dict[str, Float[Array | np.ndarray, "..."]]
+    values: dict[str, Numbers]
+    weights: dict[str, Numbers]
+    start: dict[str, Numbers]
     inputs: dict | Inputs | None
     sensors: dict[str, Reading]
     drives: dict[str, Drive]
@@ -61,7 +61,7 @@ class Run(NamedTuple):
             options = replace(options, backend="xla")  # which differentiates with respect to samples
         return simulate(scene, begin(scene, self.start, self.t0), t0=self.t0, ts=ts, inputs=inputs, options=options)
 
-    def residuals(self, scene: Scene, simulate: Callable, options: AllOptions) -> dict[str, Float[Array | np.ndarray, "..."]]:
+    def residuals(self, scene: Scene, simulate: Callable, options: AllOptions) -> dict[str, Numbers]:
         """`(reading - value) / sigma` by channel; of a piece of a run also what it ends at."""
         ts = self.ts if self.grid is None else self.grid
         motion = self.motion(scene, simulate, ts, replace(options, events=False))

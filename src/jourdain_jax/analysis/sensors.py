@@ -35,11 +35,14 @@ from jourdain_jax.calculus.reals import checked_real, described, is_traced
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.parameters import Scalar
 
 FEWEST_INTERVALS = 64  # up to the end of a run, or to the next node of a piece
+Numbers = Float[Array | np.ndarray, "..."]
+Times = Float[Array | np.ndarray, "times"]
 
 
-def intervals(t0, ts: Float[Array | np.ndarray, "times"], node=None) -> int:
+def intervals(t0, ts: Times, node=None) -> int:
     """How many there are from the start to the last sample: those of the samples where these are equal, too; else none longer than their median.
 
     Of traced times only their number is known: there are two intervals for each of theirs, as if the first sample were at the start. Of a piece of a run the
@@ -54,7 +57,7 @@ def intervals(t0, ts: Float[Array | np.ndarray, "times"], node=None) -> int:
     return int(np.ceil(count * float((ts[-1] - t0) / (end - t0)) - 1e-9))
 
 
-def grid(t0, ts: Float[Array | np.ndarray, "times"], count: int, node=None) -> Float[Array | np.ndarray, "grid"]:
+def grid(t0, ts: Times, count: int, node=None) -> Float[Array | np.ndarray, "grid"]:
     """So many intervals up to the last sample; those of a piece go on for at most one more, so that its next `node` is one of the times."""
     end = ts[-1] if node is None else node
     until = count if node is None or node == ts[-1] else int(count * float((end - t0) / (ts[-1] - t0)) + 1e-9)
@@ -75,7 +78,7 @@ _NODES = _NODES + 0.5
 def read(
     values: Float[Array | np.ndarray, "grid *channel"],
     grid: Float[Array | np.ndarray, "grid"],
-    ts: Float[Array | np.ndarray, "times"],
+    ts: Times,
     delay,
     lag=None,
     begin: Float[Array, "entries"] | None = None,
@@ -89,12 +92,14 @@ def read(
     interval = jnp.clip(jnp.floor(jax.lax.stop_gradient(x)), 0, count - 2).astype(int)
     flat = values.reshape(count, -1)
     coefficients = _COEFFICIENTS.astype(flat.dtype)
-    some = flat[_first(np.arange(count - 1), count)[:, None] + np.arange(POINTS)]
+    begins = np.arange(count - 1)
+    first = np.clip(begins - (POINTS // 2 - 1), 0, count - POINTS)  # of the points about each interval
+    some = flat[first[:, None] + np.arange(POINTS)]
     polynomials = jnp.einsum("ij,kjc->kic", coefficients, some)  # (intervals, powers, channel)
-    left = (np.arange(count - 1) - _first(np.arange(count - 1), count) - _MIDDLE).astype(flat.dtype)  # place of the interval's begin
+    left = jnp.asarray(begins - first - _MIDDLE, flat.dtype)  # place of the interval's begin
     since = (x - interval)[:, None]
     if lag is None:
-        found, y = _value(polynomials[interval], jnp.asarray(left)[interval][:, None] + since), flat
+        found, y = _value(polynomials[interval], left[interval][:, None] + since), flat
     else:
         rho = lag / step
 
@@ -102,15 +107,10 @@ def read(
             polynomial, begin = here
             return _relaxed(y, polynomial, begin, jnp.ones((), flat.dtype), rho), y
 
-        end, begins = jax.lax.scan(next_one, flat[0] if begin is None else begin, (polynomials, jnp.asarray(left)))
-        found = jax.vmap(_relaxed, (0, 0, 0, 0, None))(begins[interval], polynomials[interval], jnp.asarray(left)[interval], since[:, 0], rho)
-        y = jnp.concatenate([begins, end[None]])
+        end, at_begins = jax.lax.scan(next_one, flat[0] if begin is None else begin, (polynomials, left))
+        found = jax.vmap(_relaxed, (0, 0, 0, 0, None))(at_begins[interval], polynomials[interval], left[interval], since[:, 0], rho)
+        y = jnp.concatenate([at_begins, end[None]])
     return found.reshape(ts.shape[0], *values.shape[1:]), y
-
-
-def _first(interval: np.ndarray, count: int) -> np.ndarray:
-    """The first of the points about an interval."""
-    return np.clip(interval - (POINTS // 2 - 1), 0, count - POINTS)
 
 
 def _value(polynomial: Float[Array, "*batch powers channel"], at) -> Float[Array, "*batch channel"]:
@@ -194,8 +194,8 @@ class Sensor(eqx.Module):
     quantity: str | Callable | Instrument | None
     gain: Float[Array, "..."] | Estimate
     bias: Float[Array, "..."] | Estimate
-    delay: Float[Array, ""] | Estimate  # s
-    lag: Float[Array, ""] | Estimate  # s
+    delay: Scalar | Estimate  # s
+    lag: Scalar | Estimate  # s
 
     def __init__(self, quantity=None, *, gain=1.0, bias=0.0, delay=0.0, lag=0.0):
         if not (quantity is None or isinstance(quantity, str | Instrument) or callable(quantity)):
@@ -222,10 +222,10 @@ class Actuator(eqx.Module):
     """
 
     command: Sampled
-    gain: Float[Array, ""] | Estimate
-    bias: Float[Array, ""] | Estimate
-    delay: Float[Array, ""] | Estimate  # s
-    lag: Float[Array, ""] | Estimate  # s
+    gain: Scalar | Estimate
+    bias: Scalar | Estimate
+    delay: Scalar | Estimate  # s
+    lag: Scalar | Estimate  # s
     hold: bool = eqx.field(static=True)
 
     def __init__(self, command, *, gain=1.0, bias=0.0, delay=0.0, lag=0.0, hold=False):
@@ -274,7 +274,7 @@ def default_range(name: str):
 class Response(eqx.Module):
     """The numbers of a sensor or actuator of one run, first guesses where they are to be estimated."""
 
-    numbers: dict[str, Float[Array | np.ndarray, "..."] | float]
+    numbers: dict[str, Numbers | float]
     unknown: tuple[str, ...] = eqx.field(static=True)  # names of numbers that are estimated
     used: tuple[str, ...] = eqx.field(static=True)  # names of numbers that are not those of an ideal sensor
 

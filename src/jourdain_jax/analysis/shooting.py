@@ -34,7 +34,6 @@ from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.scene import Scene
 
 NODE, LAST = "node of a piece", "time of the next node"  # in the start of a run that is a piece
-END = "~end of a piece"  # among its residuals, after all channels
 
 
 def begin(scene: Scene, start: dict, t0):
@@ -50,7 +49,7 @@ def ended(motion: Trajectory, filters: Sequence[Float[Array, "times entries"]], 
     if LAST not in start:
         return {}
     last = jnp.argmin(jnp.abs(ts - start[LAST]))
-    return {END: jnp.concatenate([x[last] for x in (motion.q, motion.u, *filters)])}
+    return {"~end of a piece": jnp.concatenate([x[last] for x in (motion.q, motion.u, *filters)])}  # among its residuals, after all channels
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jourdain_jax.analysis.arrow import Arrow
+from jourdain_jax.analysis.arrow import Arrow, ByUnknown
 from jourdain_jax.analysis.information import Information, information, students_t_95, variances
 from jourdain_jax.analysis.levenberg_marquardt import LEAST, Control, Limits, Linearised, Minimum, minimum_beside
 from jourdain_jax.analysis.losses import LEAST_SQUARES
@@ -51,21 +51,22 @@ ADVICE = "`Fit.profiles` gives intervals that hold"
 
 
 @dataclass(frozen=True)
-class IfFree:
-    """What is known of unknowns at a bound, as if they were free."""
+class Rise:
+    """How far F may rise within an interval."""
 
-    of_rise: Float[np.ndarray, "members unknowns"]  # f
-    wider: Float[np.ndarray, "members unknowns"]  # w
-    degrees: Float[np.ndarray, "members unknowns"]  # n
+    errors: ByUnknown  # standard errors that F alone foretells
+    of_rise: ByUnknown  # f
+    wider: ByUnknown  # w
+    degrees: ByUnknown  # n
 
 
 @dataclass
 class AtBounds:
     """What is known of unknowns at a bound, of fits that have converged; NaN for all others."""
 
-    limit: Float[np.ndarray, "members unknowns"]  # infinite where the data give none
-    beyond: Float[np.ndarray, "members unknowns"]  # by how many standard errors the data would put it beyond its bound
-    if_free: IfFree
+    limit: ByUnknown  # infinite where the data give none
+    beyond: ByUnknown  # by how many standard errors the data would put it beyond its bound
+    if_free: Rise
     lower: dict[int, tuple[float, np.ndarray]] = field(default_factory=dict)  # by member: F and all unknowns where it is lower, one being off its bound
     at_limit: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)  # by member and unknown at a bound: all unknowns with that one at its limit
 
@@ -90,16 +91,8 @@ class Around:
         at = minimum_beside(lambda x, _: self.evaluate(x, np.array([b])), theta, place, theta[0, place] + step, self.limits, self.control)
         return float(at.at.cost[0] - self.found.at.cost[b]), at
 
-    def if_free(self, b: int, place: int) -> tuple[float, float]:
-        """The standard error that an unknown at its bound had if it were free, infinite where it does not show, and the size of the slope of F."""
-        others, estimated, arrow = self.at_bound[b : b + 1], np.flatnonzero(~self.limits.fixed), self.found.at.arrow.of([b])
-        others[0, place] = False
-        known = information(arrow, self.limits.size(self.found.theta[b : b + 1]), estimated, others, np.zeros(1, bool), self.control.cutoff)
-        error = float(known.standard_errors[0, np.searchsorted(estimated, place)])
-        return error if np.isfinite(error) else np.inf, abs(float(arrow.gradient[0, place]))
 
-
-def limits_at_bounds(around: Around, if_free: IfFree) -> AtBounds:
+def limits_at_bounds(around: Around, if_free: Rise) -> AtBounds:
     """Each unknown at a bound is moved away from it, all others following."""
     theta = around.found.theta
     told = AtBounds(np.full(theta.shape, np.nan), np.full(theta.shape, np.nan), if_free)
@@ -112,9 +105,10 @@ def _look_inward(around: Around, told: AtBounds, b: int, place: int) -> None:
     """Tells what one unknown at its bound shows when it is moved away from it."""
     bound, limits = around.found.theta[b, place], around.limits
     inward = 1.0 if bound <= limits.low[place] else -1.0
-    (error, slope), end = around.if_free(b, place), RISE_95 / 2 * told.if_free.of_rise[b, place]
+    error, f, w, n = (x[b, place] for x in vars(told.if_free).values())
+    slope, end = abs(float(around.found.at.arrow.gradient[b, place])), RISE_95 / 2 * f
     if np.isfinite(error):
-        left = told.if_free.wider[b, place] ** 2 - (slope * error) ** 2 / told.if_free.degrees[b, place]
+        left = w**2 - (slope * error) ** 2 / n
         told.beyond[b, place] = np.inf if left <= 0 else slope * error / np.sqrt(left)
     if told.beyond[b, place] > FAR_BEYOND:  # the bound decides: the slope alone gives the limit
         told.limit[b, place] = bound + inward * _root(slope, 1 / error**2, end)
@@ -216,8 +210,8 @@ class NoiseLevels:
 
     at: Linearised
     known: Information
-    doubt: Float[np.ndarray, "members unknowns"]  # variance of log C_ii, 2 over its degrees of freedom
-    more: Float[np.ndarray, "members unknowns"]  # what weights that are estimated add to C_ii, relative to it
+    doubt: ByUnknown  # variance of log C_ii, 2 over its degrees of freedom
+    more: ByUnknown  # what weights that are estimated add to C_ii, relative to it
     untold: Bool[np.ndarray, "members channels"]  # which channels do not tell their sigma: nothing is taken from them
 
 
@@ -276,11 +270,8 @@ class Spread:
 
     levels: NoiseLevels  # sigmas, and what is known with them
     known: Information  # the same, or from how much runs differ
-    plain: Float[np.ndarray, "members unknowns"]  # standard errors that F alone foretells
-    quantiles: Float[np.ndarray, "members unknowns"]  # q
-    wider: Float[np.ndarray, "members unknowns"]  # w
-    degrees: Float[np.ndarray, "members unknowns"]  # n
-    of_rise: Float[np.ndarray, "members unknowns"]  # f
+    quantiles: ByUnknown  # q
+    rise: Rise
 
 
 def spread(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members places"], limits: Limits, control: Control, errors: str) -> Spread:
@@ -304,18 +295,17 @@ def spread(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members pl
         quantiles, of_sigmas = students_t_95(len(problem.runs) - 1), np.zeros(1)
     quantiles, degrees = (np.broadcast_to(x, plain.shape) for x in (quantiles, 2 / np.maximum(of_sigmas, 1e-12)))
     wider = known.standard_errors / plain
-    return Spread(levels, known, plain, quantiles, wider, degrees, _of_rise(wider, quantiles, degrees))
+    return Spread(levels, known, quantiles, Rise(plain, _of_rise(wider, quantiles, degrees), wider, degrees))
 
 
-def if_free(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members places"], limits: Limits, control: Control, errors: str) -> IfFree:
-    """f, w and n of each unknown at a `bound`, as if it were free."""
-    told = IfFree(np.ones(bound.shape), np.ones(bound.shape), np.full(bound.shape, np.inf))
-    if problem.estimated or problem.with_memory or problem.loss != LEAST_SQUARES or errors == "runs":
-        for place in np.flatnonzero(bound.any(axis=0)).tolist():
-            others = np.where(np.arange(bound.shape[1]) == place, False, bound)
-            here, k = spread(problem, found, others, limits, control, errors), np.searchsorted(problem.unknowns.estimated, place)
-            told.of_rise[:, place], told.wider[:, place], told.degrees[:, place] = here.of_rise[:, k], here.wider[:, k], here.degrees[:, k]
-    return told
+def if_free(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members places"], limits: Limits, control: Control, errors: str) -> Rise:
+    """What is known of each unknown at a `bound`, as if it were free; NaN of others."""
+    told = np.full((4, *bound.shape), np.nan)
+    for place in np.flatnonzero(bound.any(axis=0)).tolist():
+        others = np.where(np.arange(bound.shape[1]) == place, False, bound)
+        here, k = spread(problem, found, others, limits, control, errors), np.searchsorted(problem.unknowns.estimated, place)
+        told[..., place] = [x[:, k] for x in vars(here.rise).values()]
+    return Rise(*told)
 
 
 def _normal_or_t(of_memory: np.ndarray, of_sigmas: np.ndarray) -> np.ndarray:
@@ -329,7 +319,7 @@ def _normal_or_t(of_memory: np.ndarray, of_sigmas: np.ndarray) -> np.ndarray:
     return np.where(doubt > 0, students_t_95(2 / np.maximum(doubt, 1e-12)) * np.sqrt(1 - of_memory), 1.959963984540054)
 
 
-def _of_rise(wider: np.ndarray, quantiles: np.ndarray, n: np.ndarray) -> Float[np.ndarray, "members unknowns"]:
+def _of_rise(wider: np.ndarray, quantiles: np.ndarray, n: np.ndarray) -> ByUnknown:
     """f; where an unknown has no standard error, the largest of others is taken."""
     f = wider**2 * n * np.log1p(quantiles**2 / n) / RISE_95
     return np.where(np.isfinite(f), f, np.max(f, axis=-1, keepdims=True, where=np.isfinite(f), initial=1.0))

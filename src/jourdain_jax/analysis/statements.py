@@ -8,13 +8,15 @@ derivatives    d/ds of every piece along one direction in (parameters, t, q, u):
 Derivatives of accelerations and constraint forces: whether they exist, forward against reverse mode, against central differences.
 """
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.verification import DIFFERENCE_STEP, Check, central_difference, check
+from jourdain_jax.analysis.verification import Check, beside, central_difference, check
 from jourdain_jax.build.structure import plain_row_lengths, usual_rows
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff
 from jourdain_jax.calculus.reals import as_real, described
@@ -30,6 +32,7 @@ from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.loads import Gravity, Load
 from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.parameters import Scalar
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import loads_of, potential_of
 
@@ -92,15 +95,12 @@ def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds colum
     point, direction = (moving, q, u), (relative, dq, du)
     forward, size = _forward(arguments, point, direction)
     reverse = _reverse(arguments, point, direction)
-    # fourth-order central difference, every point through the same program
-    h = DIFFERENCE_STEP[u.dtype.name] / (1 + float(jnp.max(jnp.abs(u), initial=0.0)))
-    along = [_outcome_of_numbers(arguments, jax.tree.map(lambda x, d, k=k: x + k * h * d, point, direction)) for k in (-2, -1, 1, 2)]
-    difference = central_difference(along, h)
-    by_way = lambda error: {f"reduction `{name}`": float(e) for name, e in zip(names, np.asarray(error / size), strict=True)}  # noqa: E731
-    return [
-        check("jvp against vjp", by_way(jnp.abs(forward - reverse)), u.dtype, note),
-        check("differences", by_way(jnp.abs(forward - difference)), u.dtype, note),
-    ]
+    difference = central_difference(*beside(partial(_outcome_of_numbers, arguments), point, direction, u))
+    found = []
+    for name, other in (("jvp against vjp", reverse), ("differences", difference)):
+        errors = np.abs(forward - other) / size
+        found.append(check(name, {f"reduction `{way}`": e for way, e in zip(names, errors, strict=True)}, u.dtype, note))
+    return found
 
 
 def _outcome(arguments, point) -> Float[Array, "reductions"]:
@@ -139,15 +139,14 @@ def _dot(a, b):
 
 
 _FLOOR = {"float64": 1e-4, "float32": 1e-2}  # SI units; what is smaller is not told from round-off in a difference
-_KINK = 1e-3  # a kink is a jump of order one, and its estimate is of lower order than the difference
 
 
 def statement_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], seed: int) -> list[Check]:
     """The three checks above; `Z` spans the admissible speeds."""
     inertia, potentials = _evaluate(scene, t, q, u, inputs, Z)
     return [
-        check("inertia", {name: float(value) for name, value in inertia.items()}, q.dtype),
-        check("potentials", {name: float(value) for name, value in potentials.items()}, q.dtype),
+        check("inertia", inertia, q.dtype),
+        check("potentials", potentials, q.dtype),
         _derivatives(scene, t, q, u, inputs, seed),
     ]
 
@@ -158,7 +157,7 @@ def _evaluate(scene: Scene, t, q, u, inputs, Z) -> tuple[dict, dict]:
     return _inertia(motion) | _gravity(scene, motion), _potentials(scene, motion, Z)
 
 
-def _inertia(motion: Motion) -> dict[str, Float[Array, ""]]:
+def _inertia(motion: Motion) -> dict[str, Scalar]:
     values = {}
     for name, moving in motion.bodies.items():
         body = moving.body
@@ -175,12 +174,12 @@ def _inertia(motion: Motion) -> dict[str, Float[Array, ""]]:
     return values
 
 
-def _gravity(scene: Scene, motion: Motion) -> dict[str, Float[Array, ""]]:
+def _gravity(scene: Scene, motion: Motion) -> dict[str, Scalar]:
     directions = {_name(i, load): load.direction for i, load in enumerate(loads_of(scene, motion)) if isinstance(load, Gravity)}
     return {f"{name}: its direction is no unit vector": jnp.abs(jnp.linalg.norm(e) - 1) for name, e in directions.items()}
 
 
-def _potentials(scene: Scene, motion: Motion, Z) -> dict[str, Float[Array, ""]]:
+def _potentials(scene: Scene, motion: Motion, Z) -> dict[str, Scalar]:
     t, q, u, inputs = motion.t, motion.q.array, motion.u.array, motion.inputs.array
     loads = loads_of(scene, motion)
     stated = [i for i, load in enumerate(loads) if load.potential is not None]
@@ -248,16 +247,16 @@ def _derivatives(scene: Scene, t, q, u, inputs, seed: int) -> Check:
     direction = (jax.tree.map(lambda x: draw(x) * jnp.where(x == 0, 1.0, x), moving), jnp.ones_like(t), draw(q), draw(u))
     point = (moving, t, q, u)
     value, change = _pushed(fixed, inputs, point, direction)
-    h = DIFFERENCE_STEP[kind] / (1 + float(jnp.max(jnp.abs(u), initial=0.0)))
-    along = [_at_numbers(fixed, inputs, jax.tree.map(lambda x, d, k=k: x + k * h * d, point, direction)) for k in (-2, -1, 1, 2)]
+    along, h = beside(partial(_at_numbers, fixed, inputs), point, direction, u)
     values = {}
     for name in value:
         f, slope, ends = np.asarray(value[name]), np.asarray(change[name]), [np.asarray(x[name]) for x in along]
         # 2 s(h) - s(2h) with s(h) = (f(h) - 2 f(0) + f(-h))/h: of third order where f is smooth, the jump of the slope at a kink
         kink = (2 * (ends[1] + ends[2]) - 4 * f) / h - (ends[0] + ends[3] - 2 * f) / (2 * h)
         size = np.max(np.abs(f), initial=0.0) + np.max(np.abs(slope), initial=0.0) + _FLOOR[kind]
-        error = np.maximum(np.abs(slope - central_difference(ends, h)), _KINK * np.abs(kink))
-        values[f"{name}: its derivative"] = float(np.max(error, initial=0.0) / size)
+        # a kink is a jump of order one, and its estimate is of lower order than the difference
+        error = np.maximum(np.abs(slope - central_difference(ends, h)), 1e-3 * np.abs(kink))
+        values[f"{name}: its derivative"] = np.max(error, initial=0.0) / size
     return check("derivatives", values, q.dtype)
 
 

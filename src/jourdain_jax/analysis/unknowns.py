@@ -7,7 +7,7 @@ Whether the runs of a fit start on the constraints, at the first guess and where
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -20,9 +20,8 @@ from jourdain_jax.analysis.layout import BodyInertia, Kind, Layout, Place, Possi
 from jourdain_jax.analysis.sensors import UNITS, default_range
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.scene.names import as_names, nearest
+from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
-
-_LEAST = 1e-6  # of the first guess: the bound of a parameter that is to be above zero
 
 
 @dataclass(frozen=True)
@@ -40,17 +39,17 @@ class Unknowns:
     prior_sigma: Float[np.ndarray, "places"]
     whitening: Float[np.ndarray, "shared shared"]  # of priors of shared ones: see `joint_prior`
 
-    @cached_property
+    @property
     def with_prior(self) -> np.ndarray:
         """Places of those of which something is known beforehand."""
         return np.flatnonzero(np.isfinite(self.prior_mean))
 
-    @cached_property
+    @property
     def estimated(self) -> np.ndarray:
         """Places of those that are not fixed."""
         return np.flatnonzero(~self.fixed)
 
-    @cached_property
+    @property
     def ends(self) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of every place."""
         return np.array([r.low for r in self.ranges]), np.array([r.high for r in self.ranges])
@@ -108,17 +107,15 @@ def unknowns_of(
     Raises ValueError for unknown names, for guesses outside their bounds, for a parameter of each run, for an estimate that runs share but state differently,
     and where nothing is free.
     """
-    parameters = _parameters(type(scene))
-    entries: list[_Entry] = []
-    shared, local, functions = _Places(), _Places(), {}
+    parameters = {name: about for name, _, about in parameters_of(scene)}
+    shared: list[tuple[Kind, _Entry]] = []
     bodies: list[BodyInertia] = []
+    functions = {}
     for name, given in (free if isinstance(free, Mapping) else dict.fromkeys(as_names(free))).items():
         if isinstance(given, PossibleInertia):
             bodies.append(inertia_of_body(scene, name))
             numbers = zip(bodies[-1].labels, ("kg m^2", ""), (positive(), unbounded(1.0)), bodies[-1].numbers(scene), strict=True)
-            for label, unit, default, guess in numbers:
-                entries.append(_entry(label, unit, None, default, np.asarray(guess)))
-                shared.add(label, guess.shape, "inertia")
+            shared += [("inertia", _entry(label, unit, None, default, np.asarray(guess))) for label, unit, default, guess in numbers]
             continue
         if name not in parameters:
             raise ValueError(f"`free` names `{name}`, which is no parameter of `{type(scene).__name__}`; {nearest(name, parameters)}")
@@ -128,29 +125,24 @@ def unknowns_of(
             functions[name] = given
             continue
         about = parameters[name]
-        default = positive() if about["positive"] or about["non_negative"] else unbounded()
-        entry = _entry(name, about["unit"], given, default, np.asarray(getattr(scene, name)))
-        entries.append(_not_negative(entry, about["positive"]) if about["positive"] or about["non_negative"] else entry)
-        shared.add(name, entries[-1].guess.shape)
-    for label, estimate in _of_all_runs(runs).items():
-        if not estimate.per_run:
-            entries.append(_of_sensor(label, label, estimate))
-            shared.add(label, entries[-1].guess.shape, "sensor")
-    for name in dict.fromkeys(name for run in runs for name in run.unknown_start):
-        local.add(name, next(run.start[name].shape for run in runs if name in run.unknown_start))
-    for label, estimate in _of_all_runs(runs).items():
-        if estimate.per_run:
-            local.add(label, np.shape(estimate.guess), "sensor")
-    for index, run in enumerate(runs):
-        for place in local.found:
-            entries.append(_of_run(f"run {index}: {place.name}", place, run))
+        has_sign = about["positive"] or about["non_negative"]
+        entry = _entry(name, about["unit"], given, positive() if has_sign else unbounded(), np.asarray(getattr(scene, name)))
+        shared.append(("scene", _not_negative(entry, about["positive"]) if has_sign else entry))
+    of_runs = _of_all_runs(runs)
+    shared += [("sensor", _of_sensor(label, label, estimate)) for label, estimate in of_runs.items() if not estimate.per_run]
+    starts = {name: run.start[name].shape for run in reversed(runs) for name in run.unknown_start}
+    own: list[tuple[str, tuple[int, ...], Kind]] = [(name, starts[name], "scene") for name in dict.fromkeys(name for run in runs for name in run.unknown_start)]
+    own += [(label, np.shape(estimate.guess), "sensor") for label, estimate in of_runs.items() if estimate.per_run]
+    local = _placed(own)
+    entries = [entry for _, entry in shared]
+    entries += [_of_run(f"run {index}: {place.name}", place, run) for index, run in enumerate(runs) for place in local]
     if all(entry.fixed for entry in entries):
         raise ValueError(f"nothing is free; name parameters in `free` ({', '.join(f'`{name}`' for name in parameters)}), or `unknown_start` values of a run")
     free_ones = [entry for entry in entries if not entry.fixed]
     counts = [entry.guess.size for entry in entries]
     each = lambda values: np.array([x for x, count in zip(values, counts, strict=True) for _ in range(count)])  # noqa: E731
     guess = np.concatenate([entry.guess.ravel() for entry in entries], dtype=float)
-    layout = Layout(tuple(shared.found), tuple(local.found), tuple(bodies))
+    layout = Layout(_placed((entry.label, entry.guess.shape, kind) for kind, entry in shared), local, tuple(bodies))
     _check_told_once(layout, functions)
     for name, function in functions.items():
         layout = replace(layout, ties=(*layout.ties, tied_by(name, function, layout.scene(scene, guess[: layout.sizes[0]]))))
@@ -168,28 +160,21 @@ def unknowns_of(
     )
 
 
-@lru_cache(maxsize=256)
-def _parameters(kind: type[Scene]) -> dict[str, Mapping]:
-    """What is told of the parameters of a class, by name."""
-    return {name: field.metadata for name, field in kind.__dataclass_fields__.items() if field.metadata.get("parameter")}
-
-
 def _not_negative(entry: "_Entry", positive: bool) -> "_Entry":
     """The range cut at zero, below which the scene has no motion; a little above it where it has none at zero either. ValueError for a guess below zero."""
     if np.any(entry.guess < 0):
         raise ValueError(f"first guess of `{entry.label}` is {entry.guess}, but this parameter is declared as not negative; give one that is not below zero")
-    cut = entry.range.not_below(_LEAST * float(entry.guess.min()) if positive else 0.0)
+    # of the first guess: the bound of a parameter that is to be above zero
+    cut = entry.range.not_below(1e-6 * float(entry.guess.min()) if positive else 0.0)
     return replace(entry, range=cut)
 
 
-class _Places:
+def _placed(parts: Iterable[tuple[str, tuple[int, ...], Kind]]) -> tuple[Place, ...]:
     """Places one after another."""
-
-    def __init__(self) -> None:
-        self.found: list[Place] = []
-
-    def add(self, name: str, shape: tuple[int, ...], kind: Kind = "scene") -> None:
-        self.found.append(Place(name, shape, self.found[-1].end if self.found else 0, kind))
+    found: list[Place] = []
+    for name, shape, kind in parts:
+        found.append(Place(name, shape, found[-1].end if found else 0, kind))
+    return tuple(found)
 
 
 def _check_told_once(layout: Layout, functions: Mapping) -> None:
@@ -293,21 +278,13 @@ def _key(leaves: list, treedef, run: Experiment, unknowns: Unknowns, index: int)
     others, of_run = jax.tree.flatten((run.t0, run.inputs))
     shared, local = unknowns.split(np.where(unknowns.fixed, unknowns.guess, 0.0))
     start = layout.start(run.start, local[index])
-    return layout, treedef, of_run, *start, *map(_content, (*others, *layout.leaves(leaves, treedef, shared), *start.values()))
-
-
-def _content(x):
-    return x if callable(x) else np.asarray(x).tobytes()
-
-
-def _with(scene: Scene, run: Experiment, unknowns: Unknowns, theta: np.ndarray, index: int) -> tuple[Scene, dict]:
-    shared, local = unknowns.split(theta)
-    return unknowns.layout.scene(scene, shared), unknowns.layout.start(run.start, local[index])
+    numbers = *others, *layout.leaves(leaves, treedef, shared), *start.values()
+    return layout, treedef, of_run, *start, *(x if callable(x) else np.asarray(x).tobytes() for x in numbers)
 
 
 def _check(scene: Scene, run: Experiment, unknowns: Unknowns, theta: np.ndarray, index: int, why: str) -> None:
-    moved, given = _with(scene, run, unknowns, theta, index)
+    shared, local = unknowns.split(theta)
     try:
-        consistent_start(moved, t0=run.t0, inputs=run.inputs, **given)
+        consistent_start(unknowns.layout.scene(scene, shared), t0=run.t0, inputs=run.inputs, **unknowns.layout.start(run.start, local[index]))
     except ValueError as error:
         raise ValueError(f"the start of run {index} {why}. {error}") from None

@@ -1,6 +1,9 @@
 """The result of a verification: comparisons, each with its size, its threshold and its culprit."""
 
+from collections.abc import Callable
+
 import equinox as eqx
+import jax
 import numpy as np
 
 from jourdain_jax.scene.printing import Printed
@@ -55,13 +58,20 @@ class Check(eqx.Module):
         return {"name": self.name, "value": value, "threshold": self.threshold, "passed": self.passed, "culprit": self.culprit, "note": self.note}
 
 
-def check(name: str, values: dict[str, float], dtype, note: str = "") -> Check:
-    """The check called `name` (a key of `THRESHOLDS`) from its value for every suspect; NaN counts as larger than any number."""
+def check(name: str, values: dict, dtype, note: str = "") -> Check:
+    """The check called `name` (a key of `THRESHOLDS`) from a number for every suspect; NaN counts as larger than any number."""
     threshold = THRESHOLDS[np.dtype(dtype).name][name]
     if not values:
         return Check(name, 0.0, threshold, "nothing", note)
-    culprit = max(values, key=lambda key: np.inf if np.isnan(values[key]) else values[key])
-    return Check(name, float(values[culprit]), threshold, culprit, note)
+    sizes = {suspect: float(value) for suspect, value in values.items()}
+    culprit = max(sizes, key=lambda suspect: np.inf if np.isnan(sizes[suspect]) else sizes[suspect])
+    return Check(name, sizes[culprit], threshold, culprit, note)
+
+
+def beside(f: Callable, point, direction, u) -> tuple[list, float]:
+    """Values of f at -2h, -h, h and 2h along a direction, and h; all points through the same program. `u`: the speeds, which h goes with."""
+    h = DIFFERENCE_STEP[u.dtype.name] / (1 + float(np.max(np.abs(u), initial=0.0)))
+    return [f(jax.tree.map(lambda x, d, k=k: x + k * h * d, point, direction)) for k in (-2, -1, 1, 2)], h
 
 
 def central_difference(along: list, h: float):

@@ -193,4 +193,4 @@ def _acts_on_speeds(scene: Scene) -> bool:
 def _energy(found: dict) -> Check:
     value = np.abs(found["energy_rate"] - found["power"]) / (np.finfo(found["M"].dtype).tiny + found["power_scale"])
     culprit = "a load whose potential does not give its force, or a row whose power is not counted"
-    return check("energy", {culprit: float(value)}, found["M"].dtype)
+    return check("energy", {culprit: value}, found["M"].dtype)
