@@ -168,6 +168,17 @@ def test_a_family_in_arrays_and_in_text(turns):
     assert "hands" not in str(turns.folds[0])
 
 
+def test_a_family_is_drawn_against_its_own_values(turns, straight):
+    _, (axis,) = jj.plot(turns, "x_rate", "lean", units={"lean": "deg"})
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("x_rate", "lean in deg")
+    assert max(axis.lines[0].get_ydata()) == pytest.approx(np.rad2deg(0.4200892), abs=0.2)
+    assert {text.get_text() for text in axis.get_legend().get_texts()} == {"unstable", "fold", "branch point", "eigenvalues meet or cross"}
+    stable = jj.plot(straight, "x_rate", "rear_spin_rate")[1][0].lines[1].get_ydata()
+    assert np.isfinite(stable).sum() == straight.stable.sum() > 0
+    with pytest.raises(ValueError, match="1 were given"):
+        jj.plot(turns, "lean")
+
+
 @pytest.mark.parametrize(
     ("guess", "options", "error", "says"),
     [

@@ -5,11 +5,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jourdain_jax.analysis.families.family import Family
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.backend import check_folder, pyplot
+from jourdain_jax.plotting.families_drawn import plot_family
 from jourdain_jax.plotting.units import checked_units
 from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.names import UnknownNameError, nearest
@@ -45,6 +47,7 @@ def plot(
       rollout, coordinates and speeds: the median of all lanes that are still under way, and a band for each number in `bands`, the part of them that it holds.
     - `units`: name -> unit, such as `{"lean": "deg", "spin_rate": "rpm", "t": "ms"}` (default: SI, radians). Coordinates: m, km, cm, mm, rad, mrad, deg,
       turn; speeds: m/s, km/h, cm/s, mm/s, rad/s, deg/s, turn/s, rpm; energies: J, kJ, mJ; `"t"`: s, ms, min, h.
+    - A family (`jj.family`) is drawn against its own values: `jj.plot(turns, "x_rate", "lean")`, stable parts in full, special points marked.
     - `title`: default: of a rollout, how its lanes ended. `path`: where to write it (.png, .svg, .pdf); `axes`: existing axes, one per name.
 
     Returns the matplotlib figure and an array of its axes, shape (names,). KeyError for an unknown name, with the nearest valid one; ValueError for an
@@ -55,10 +58,12 @@ def plot(
         motions = [jj.simulate(jj.models.TiltingDisc(), {"lean": 0.3, "spin_rate": spin}, t1=3.0) for spin in (-3.0, -4.0)]
         figure, axes = jj.plot(motions, "lean", units={"lean": "deg"}, labels=["slow", "fast"])
     """
-    motions = _checked_motions(motion)
-    labels, bands = _checked_labels(labels, len(motions)), _checked_bands(bands)
     if path is not None:
         check_format(path)
+    if isinstance(motion, Family):
+        return plot_family(motion, names, units, title, path, axes)
+    motions = _checked_motions(motion)
+    labels, bands = _checked_labels(labels, len(motions)), _checked_bands(bands)
     names = names or _scene(motions[0]).coordinate_names.entries
     values = [[_values(one, name, bands) for name in names] for one in motions]
     sizes = checked_units(units, _kinds(motions))
