@@ -13,11 +13,11 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 460_500,
+    "code tokens of src": 460_450,
     "code tokens of docs": 11_441,
     "code tokens of notebooks": 7_444,
-    "caches": 93,
-    "named numbers": 467,
+    "caches": 91,
+    "named numbers": 466,
     "tests for a tracer": 133,
     "functions with more than 8 parameters": 11,
     "ways: state put onto its constraints": 3,

@@ -29,8 +29,6 @@ from jourdain_jax.motion.row_functions import row_functions
 from jourdain_jax.native import ffi
 from jourdain_jax.scene.scene import Scene
 
-MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the process
-
 
 class Usual(eqx.Module):
     """Sizes by which rows and coordinates are measured, and of what kind rows are."""
@@ -114,17 +112,12 @@ def functions_of_rows(usual: Usual) -> RowFunctions:
 
 def _by_either(usual: Usual, kind, affine: bool, by_xla):
     of_rows = partial(by_xla, functions_of_rows(usual))
-    if usual.program is None or _reason_against(rows := Rows(usual.program, kind, affine)):
+    if usual.program is None or (rows := Rows(usual.program, kind, affine)).reason_against():
         return of_rows
     return differentiated_as(of_rows, partial(_put, rows))
 
 
-@lru_cache(maxsize=MOST_KERNELS)
-def _reason_against(rows: Rows) -> str:
-    return rows.reason_against()
-
-
-@lru_cache(maxsize=MOST_KERNELS)
+@lru_cache(maxsize=64)
 def _kernel(rows: Rows, given_in: np.dtype):
     count, cutoff = len(rows.moving) + len(rows.residuals), rank_cutoff(given_in)
     return called(lambda w: write(w, rows, cutoff), lambda *_: ((count,),), effort=1)

@@ -123,7 +123,6 @@ class _Guess(NamedTuple):
         return ~self.bounded | ((q >= self.usual.low) & (q <= self.usual.high))
 
 
-@lru_cache(maxsize=1024)
 def _free(names: tuple[str, ...], held: tuple[str, ...]) -> Bool[np.ndarray, "entries"]:
     """Which of these entries are not held."""
     return np.array([name not in held for name in names], bool)
