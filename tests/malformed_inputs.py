@@ -448,7 +448,7 @@ FILES: dict[str, Case] = {
     ),
     "jj.load_trajectory(rewritten('more.npz', parameter_load=np.array(1.0)), Bead)": "`more.npz` has a parameter `load` that `Bead` has not",
     "jj.save(run, 'nowhere/run.npz')": "cannot write `nowhere/run.npz`: there is no folder `nowhere`; make it first",
-    "jj.save(run, '.')": "cannot write `.`: it is a folder; give the name of a file in it, such as motion.npz",
+    "jj.save(run, '.')": "cannot write `.`: it is a folder; give the name of a file in it",
     "jj.save(run, 3.5)": "`path` is a float, expected the name of a file",
     "jj.save(b, 'b.npz')": "`save` was given a Bead, expected a `Trajectory` from `jj.simulate`",
     "jj.save(lanes.lanes, 'lanes.npz')": (

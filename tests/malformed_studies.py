@@ -14,7 +14,7 @@ DESIGNS: dict[str, str] = {
     "jj.Normal('heavy', 0.1)": "`mean` of Normal",
     "jj.Uniform(1.0, 1.0)": "expected low < high",
     "jj.LogUniform(0.0, 1.0)": "expected a positive number",
-    "jj.LogNormal(-1.0, 1.0)": "positive median",
+    "jj.LogNormal(-1.0, 1.0)": "positive number",
     "jj.Uniform(0.0, np.inf)": "expected a finite number",
     "jj.Levels([])": "at least one",
     "jj.Design({})": "nothing varies",

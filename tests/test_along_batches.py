@@ -1,6 +1,5 @@
 """What a motion is asked for at all its times, and a batch at all its lanes, is what its single states and lanes answer."""
 
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -183,6 +183,59 @@ def test_two_rods_move_as_those_that_are_written_by_hand():
         assert own == pytest.approx(expected, rel=1e-12)
 
 
+# a parallelogram: two cranks of 0.3 m on the ground, 0.5 m apart, and a coupler that hangs on the first one
+LINKAGE = """
+<mujoco model="linkage"><compiler angle="radian"/>{option}<worldbody>
+  <body name="first"><joint name="a" axis="0 1 0"/><geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.2"/>
+    <body name="coupler" pos="0 0 -0.3"><joint name="b" axis="0 1 0"/><geom type="capsule" size="0.02" fromto="0 0 0 0.5 0 0" mass="0.4"/></body></body>
+  <body name="second" pos="0.5 0 0"><joint name="c" axis="0 1 0"/><geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.2"/></body>
+  <body name="wall" pos="3 0 0"><geom type="mesh" mesh="m"/></body>
+</worldbody><equality>{equality}</equality></mujoco>
+"""
+CLOSED = {
+    "connect": '<connect name="pin" body1="coupler" body2="second" anchor="0.5 0 0"/>',
+    "joints": '<joint joint1="b" joint2="a" polycoef="0 -1"/><joint joint1="c" joint2="a"/>',
+}
+
+
+@pytest.mark.parametrize("way", CLOSED)
+def test_a_loop_that_equality_closes_moves_as_its_closed_form(way):
+    """T = (I + I + m L^2) thetadot^2 / 2 of both cranks and the coupler, which does not turn; V = -(m_1 L/2 + m_2 L/2 + m L) g cos theta."""
+    scene = jj.from_mjcf(LINKAGE.format(option="", equality=CLOSED[way]))()
+    theta = 0.4
+    start = jj.start(scene, a=theta, a_rate=0.7)
+    np.testing.assert_allclose([start["b"], start["c"], start["b_rate"]], [-theta, theta, -0.7], atol=1e-9)
+    own = float(scene.first_inertia[1]) + 0.2 * 0.15**2
+    expected = -9.81 * (0.2 * 0.3 + 0.4 * 0.3) * np.sin(theta) / (2 * own + 0.4 * 0.3**2)
+    assert float(jj.accelerations(scene, 0.0, start.q, start.u).udot[0]) == pytest.approx(expected, rel=1e-9)
+    motion = jj.simulate(scene, start, t1=1.0).raise_if_failed()
+    assert float(jnp.abs(motion["b"] + motion["a"]).max()) < 1e-7
+
+
+def test_a_weld_holds_a_body_in_the_stated_pose():
+    weld = '<weld body1="coupler" body2="second" anchor="0 0 -0.3"/><joint joint1="a" polycoef="0.2"/>'
+    scene = jj.from_mjcf(LINKAGE.format(option="", equality=f'{weld}<connect body1="first" anchor="1 2 3" active="false"/>'))()
+    rows = scene.geometric_constraints(jj.pose_at(scene, 0.0, [0.2, -0.1, 0.3]))
+    np.testing.assert_allclose(rows["a is held"], 0.0, atol=1e-15)
+    # the coupler is turned by a + b = 0.1, the second crank by 0.3
+    np.testing.assert_allclose(rows["weld 1 of `equality`, attitude"], [0.0, -2 * np.sin(0.2), 0.0], atol=1e-12)
+    tip = np.array([0.5 - 0.3 * np.sin(0.3), 0.0, -0.3 * np.cos(0.3)])
+    pin = np.array([-0.3 * np.sin(0.2) + 0.5 * np.cos(0.1), 0.0, -0.3 * np.cos(0.2) - 0.5 * np.sin(0.1)])
+    np.testing.assert_allclose(rows["weld 1 of `equality`"], tip - pin, atol=1e-12)
+
+
+def test_files_are_included_once_and_gravity_may_be_off(tmp_path):
+    (tmp_path / "closed.xml").write_text(f"<mujoco><option><flag gravity='disable'/></option><equality>{CLOSED['joints']}</equality></mujoco>")
+    text = LINKAGE.format(option='<include file="closed.xml"/>', equality="")
+    (tmp_path / "arm.xml").write_text(text)
+    scene = jj.from_mjcf(tmp_path / "arm.xml")()
+    assert not hasattr(scene, "gravity")
+    assert len(scene.geometric_constraints(jj.pose_at(scene, 0.0, np.zeros(3)))) == 2
+    (tmp_path / "closed.xml").write_text("<mujoco><include file='closed.xml'/></mujoco>")
+    with pytest.raises(ValueError, match=r"`closed.xml` is included twice"):
+        jj.from_mjcf(tmp_path / "arm.xml")
+
+
 def test_geoms_are_drawn():
     scene = jj.from_mjcf(DEGREES)()
     looks = scene.visuals(jj.pose_at(scene, 0.0, jj.start(scene, **scene.example).q))
@@ -219,14 +272,16 @@ BAD = {
     "friction-loss": (_body('<joint name="j" frictionloss="0.1"/>'), r"`frictionloss=\"0.1\"` of joint `j`"),
     "unknown-attribute": (_body('<joint name="j" dampin="0.1"/>'), r"`dampin=\"0.1\"` of joint `j` is not read"),
     "ball-spring": (_body('<joint name="j" type="ball" stiffness="1"/>'), r"the stiffness of the ball joint `j` is not read"),
-    "equality": (_body(HINGE, "<equality/>"), r"`equality` in `mujoco` is not read"),
+    "equality": (_body(HINGE, '<equality><joint joint1="k"/></equality>'), r"joint 1 of `equality` names `k`, which is no hinge or slide"),
+    "no-anchor": (_body(HINGE, '<equality><connect body1="b"/></equality>'), r"anchor of connect 1 of `equality` is missing"),
+    "tendon-equality": (_body(HINGE, "<equality><tendon/></equality>"), r"`tendon` in `equality` is not read"),
     "tendon": (_body(HINGE, "<tendon/>"), r"`tendon` in `mujoco` is not read"),
-    "include": (_body(HINGE, '<include file="x.xml"/>'), r"`include` in `mujoco` is not read"),
+    "include": (_body(HINGE, '<include file="x.xml"/>'), r"x.xml: cannot be read"),
     "composite": (_body(f"{HINGE}<composite/>"), r"`composite` in body `b` is not read"),
     "mocap": (_body(HINGE).replace('name="b"', 'name="b" mocap="true"'), r'`mocap="true"` of body `b`'),
     "servo": (_body(HINGE, '<actuator><position name="p" joint="j"/></actuator>'), r"`position` `p` in `actuator` is not read"),
     "motor-of-nothing": (_body(HINGE, '<actuator><motor name="p" joint="k"/></actuator>'), r"motor `p` pushes `k`, which is no hinge or slide"),
-    "no-gravity-flag": (_body(HINGE, '<option><flag gravity="disable"/></option>'), r'`gravity="disable"` of `flag`'),
+    "no-spring-flag": (_body(HINGE, '<option><flag spring="disable"/></option>'), r'`spring="disable"` of `flag`'),
     "viscosity": (_body(HINGE, '<option viscosity="1"/>'), r'`viscosity="1"` of `option`'),
     "total-mass": (_body(HINGE, compiler='<compiler settotalmass="3"/>'), r'`settotalmass="3"` of `compiler`'),
     "massless": (f'<mujoco><worldbody><body name="b">{HINGE}</body></worldbody></mujoco>', r"link `b`, which `j` moves, has no mass"),

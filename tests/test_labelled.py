@@ -129,7 +129,7 @@ def test_a_report_shows_how_far_manoeuvres_reach_in_a_notebook(drawn):
 
 def test_a_motion_shows_its_coordinates_as_lines_in_a_notebook(motion, drawn):
     shown = motion._repr_html_()
-    assert shown.startswith("<table>")
+    assert shown.startswith("<pre>Trajectory of ")
     assert shown.count("<img") == len(drawn) == 1
     low, high = float(motion["x"].min()), float(motion["x"].max())
     axes = {axes.get_title(): axes for axes in drawn[0].axes}
@@ -140,7 +140,7 @@ def test_a_motion_shows_its_coordinates_as_lines_in_a_notebook(motion, drawn):
 def test_figures_are_replaced_by_a_sentence_where_matplotlib_is_missing(motion, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     shown = motion._repr_html_()
-    assert shown.startswith("<table>")
+    assert shown.startswith("<pre>Trajectory of ")
     assert "a figure needs the package `matplotlib`" in shown
     assert "jourdain-jax[plot]" in shown
 

@@ -15,7 +15,6 @@ from jourdain_jax import DifferentiationModeError
 pytestmark = machine_code.needed
 
 
-
 class Falling(jj.Scene):
     """A ball that is thrown against the wind, which is an input, and the ground."""
 

@@ -25,9 +25,7 @@ def test_the_summary_prints_steps_drift_residuals_contact_and_result(rolling):
     text = str(rolling)
     for part in ("Trajectory of TiltingDisc", "reached the end", "Dopri8", "minimal", "drift", "velocity", "friction coefficient needed", "N"):
         assert part in text
-    html = rolling._repr_html_()
-    assert html.startswith("<table>")
-    assert html.count("<tr>") == text.count("\n")
+    assert rolling._repr_html_().startswith(f"<pre>{text[:60]}")
     assert "drift is not seen: one time was saved" in str(jj.simulate(rolling.scene, {"lean": 0.3}, ts=[0.1]))
 
 

@@ -8,7 +8,20 @@ import os
 import secrets
 from pathlib import Path
 
+from jourdain_jax.calculus.reals import described
+
 _BINARY = getattr(os, "O_BINARY", 0)  # without it, Windows writes two bytes for every one that is a line feed
+
+
+def check_place(path: str | os.PathLike) -> None:
+    """Raise a ValueError where a file cannot be written at `path`: its folder does not exist, or it is one itself."""
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"`path` is {described(path)}, expected the name of a file")
+    place, folder = os.fspath(path), os.path.dirname(path) or "."
+    if not os.path.isdir(folder):
+        raise ValueError(f"cannot write `{place}`: there is no folder `{folder}`; make it first")
+    if os.path.isdir(path):
+        raise ValueError(f"cannot write `{place}`: it is a folder; give the name of a file in it")
 
 
 def write_whole(path: str | os.PathLike, content: bytes | memoryview, *, wait: bool = False, mode: int = 0o666) -> None:

@@ -1,13 +1,13 @@
 """The verbs about models: `models`, `report`, `verify`, `simulate`."""
 
 import json
-import os
 
 import numpy as np
 
 from jourdain_jax.analysis.report import report
 from jourdain_jax.analysis.verify import verify
 from jourdain_jax.calculus.reading import number
+from jourdain_jax.calculus.writing import check_place
 from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.models.registry import MODELS, counts_of, known_model, model
 from jourdain_jax.motion.simulate import simulate
@@ -17,7 +17,6 @@ from jourdain_jax.motion.trajectories.results import EVENT, FALLBACKS, SUCCESS
 from jourdain_jax.motion.trajectories.storage import save
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.animation import animate, check_suffix
-from jourdain_jax.plotting.backend import check_folder
 from jourdain_jax.plotting.quantities import check_format, plot
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
@@ -170,9 +169,7 @@ def _simulate(options) -> bool:
 def _check_files(options) -> None:
     """Before a long run, not after it: the files can be written."""
     for path in filter(None, (options.out, options.plot, options.animate)):
-        check_folder(path)
-        if os.path.isdir(path):
-            raise ValueError(f"cannot write `{path}`: it is a folder; give the name of a file in it")
+        check_place(path)
     if options.plot:
         check_format(options.plot)
     if options.animate:

@@ -23,6 +23,7 @@ rtol = 1e-6
 
 import json
 import math
+import re
 import sys
 import tomllib
 from collections.abc import Callable, Mapping
@@ -39,17 +40,10 @@ from jourdain_jax.models.registry import model
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN
 from jourdain_jax.scene.names import nearest
 
-_LARGEST = 100_000_000  # bytes of a file, whose tables may have a row for each sample
 ACTIONS = ("status", "resume", "export", "merge")
 VARYING: dict[str, Callable] = {"normal": Normal, "uniform": Uniform, "log-normal": LogNormal, "log-uniform": LogUniform}
-OUTPUTS = {
-    "end": End,
-    "largest": Largest,
-    "smallest": Smallest,
-    "largest-magnitude": LargestMagnitude,
-    "integral": Integral,
-    "event-time": EventTime,
-    "happened": Happened,
+OUTPUTS: dict[str, Callable] = {
+    re.sub("(?<=.)(?=[A-Z])", "-", kind.__name__).lower(): kind for kind in (End, Largest, Smallest, LargestMagnitude, Integral, EventTime, Happened)
 }
 TABLES = ("set", "vary", "start", "outputs", "options", "correlation")
 KEYS = ("model", "t1", "samples", "sampler", "seed", "save", "every", "chunk", *TABLES)
@@ -73,7 +67,8 @@ def _sweep(options) -> bool:
     if action not in ACTIONS:
         if paths:
             raise ValueError(f"`{action}` is not known to `sweep`; {nearest(action, ACTIONS)} To run a study: jourdain-jax sweep FILE.toml --out FOLDER")
-        text = read_text(action, _LARGEST, f"a TOML file of a study, or one of {', '.join(ACTIONS)}")
+        # bytes of a file, whose tables may have a row for each sample
+        text = read_text(action, 100_000_000, f"a TOML file of a study, or one of {', '.join(ACTIONS)}")
         return _run(text, action, options.out or str(Path(action).with_suffix(".zarr")), options)
     if not paths or (action != "merge" and len(paths) > 1):
         raise ValueError(f"`sweep {action}` takes {'folders' if action == 'merge' else 'one folder'} of a study")

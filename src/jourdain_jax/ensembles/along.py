@@ -17,8 +17,6 @@ from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 
 FOR_EXTREMES, FOR_INTEGRALS = 5, 4  # values that a polynomial goes through
-FINE = 33  # places at which the polynomial is looked at
-NEAR = 1 / 16  # of the time between values: an end that follows the last of them sooner takes its place, since a polynomial through both swings
 
 
 def sampled(motion: Trajectory, quantity: str | Callable) -> tuple[Float[Array, "more"], Float[Array, "more"], Int[Array, ""]]:
@@ -29,7 +27,8 @@ def sampled(motion: Trajectory, quantity: str | Callable) -> tuple[Float[Array, 
     reached = jnp.sum(motion.valid)
     before, last = (motion.ts[jnp.maximum(reached - k, 0)] for k in (2, 1))
     beyond = jnp.abs(motion.t_end - last)
-    place = reached - ((beyond > 0) & (beyond <= NEAR * jnp.abs(last - before)))  # of the end
+    # of the time between values: an end that follows the last of them sooner takes its place, since a polynomial through both swings
+    place = reached - ((beyond > 0) & (beyond <= (1 / 16) * jnp.abs(last - before)))  # of the end
 
     def with_end(values, end):
         kept = jnp.where((jnp.arange(len(values)) < place).reshape(-1, *[1] * end.ndim), values, end)
@@ -51,7 +50,8 @@ def largest(times: Float[Array, "times"], values: Float[Array, "times"], count: 
         return values[k]
     first, s, y = _window(times, values, count, k - FOR_EXTREMES // 2, k, FOR_EXTREMES)
     low, high = s[jnp.clip(k - 1 - first, 0, FOR_EXTREMES - 1)], s[jnp.clip(k + 1 - first, 0, FOR_EXTREMES - 1)]
-    places = jnp.linspace(low, high, FINE)
+    # places at which the polynomial is looked at
+    places = jnp.linspace(low, high, 33)
     near = places[jnp.argmax(jax.vmap(lambda place: _polynomial(s, y, place))(places))]
     slope = jax.grad(lambda place: _polynomial(s, y, place))
     bend = jax.grad(slope)(near)

@@ -6,7 +6,7 @@ Dask starts a chunk again where its worker died. A chunk on which workers died a
 import os
 import pickle
 import threading
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from jourdain_jax.calculus.reals import described
@@ -14,9 +14,7 @@ from jourdain_jax.ensembles import optional
 from jourdain_jax.ensembles.run import Runner
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
-from jourdain_jax.ensembles.workers import keep_to_share, sent_to_others, whatever_dies
-
-AHEAD = 2  # chunks per thread of a worker: one under way, one that waits for it
+from jourdain_jax.ensembles.workers import computed, keep_to_share, sent_to_others, whatever_dies
 
 _runners: dict[tuple, Runner] = {}  # of this worker: for the study that it worked on last, in one folder
 _one_at_a_time = threading.Lock()
@@ -33,10 +31,19 @@ def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
         path = str(store.path.resolve())
         study = client.submit(bytes, sent, pure=False)  # a task, and no scattered data: the scheduler knows how to have it again when a worker died
         asked = study, path, os.getpid(), _places(distributed, client)
-        most = AHEAD * max(1, sum(client.nthreads().values()))
+        # chunks per thread of a worker: one under way, one that waits for it
+        most = 2 * max(1, sum(client.nthreads().values()))
 
         def compute(numbers: list[int], alone: bool):
-            return _computed(distributed, client, asked, numbers, interrupted, 1 if alone else most)
+            return computed(
+                lambda number: client.submit(_chunk, number, *asked, pure=False),
+                lambda running: distributed.wait(running, return_when="FIRST_COMPLETED").done,
+                distributed.KilledWorker,
+                store,
+                numbers,
+                interrupted,
+                1 if alone else most,
+            )
 
         return whatever_dies(store, numbers, interrupted, compute, 1)
 
@@ -50,32 +57,6 @@ def _places(distributed, client) -> dict[object, int] | None:
     if type(cluster) is not distributed.LocalCluster or not cluster.processes or set(threads) != {1}:
         return None
     return {name: place for place, name in enumerate(sorted(cluster.workers))}
-
-
-def _computed(distributed, client, asked: tuple, numbers, interrupted, most: int) -> Generator[tuple[int, int], None, list[int]]:
-    """Lanes and failed lanes, chunk by chunk as they come; returns the numbers of chunks on which workers died. At most `most` are asked for at a time."""
-    left, running = iter(numbers), {}
-    suspects: list[int] = []
-    ended = distributed.as_completed()
-
-    def ask() -> None:
-        if not suspects and not interrupted() and (number := next(left, None)) is not None:
-            future = client.submit(_chunk, number, *asked, pure=False)
-            running[future] = number
-            ended.add(future)
-
-    for _ in range(most):
-        ask()
-    for future in ended:
-        number = running.pop(future)
-        try:
-            found = future.result()
-        except distributed.KilledWorker:
-            suspects.append(number)
-        else:
-            yield found
-        ask()
-    return suspects
 
 
 def _chunk(number: int, sent: bytes, path: str, asking: int, places: dict | None) -> tuple[int, int]:

@@ -7,7 +7,7 @@ which spreads u well (Latin hypercube, Sobol) spreads the values well. Its numbe
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -18,6 +18,23 @@ from jourdain_jax.ensembles.optional import special_functions
 class Distribution:
     """Base of the distributions: `values(u)` is the inverse distribution function."""
 
+    _positive: ClassVar[str] = ""  # which number must be above zero
+
+    def __post_init__(self):
+        """Make the numbers floats; ValueError where one is not finite, or they are out of their ranges."""
+        kind, known = type(self).__name__, dict(vars(self))
+        for name, value in known.items():
+            known[name] = float(checked_known(value, f"`{name}` of {kind}", (), advice="give one number"))
+            object.__setattr__(self, name, known[name])
+            if not np.isfinite(known[name]):
+                raise ValueError(f"`{name}` of {kind} is {value}, expected a finite number")
+        if known.get("sigma", 0.0) < 0:
+            raise ValueError(f"`sigma` of {kind} is {known['sigma']:g}, expected a standard deviation of at least 0")
+        if not known.get("low", 0.0) < known.get("high", 1.0):
+            raise ValueError(f"{kind} has low = {known['low']:g} and high = {known['high']:g}, expected low < high")
+        if self._positive and known[self._positive] <= 0:
+            raise ValueError(f"`{self._positive}` of {kind} is {known[self._positive]:g}, expected a positive number")
+
     @abstractmethod
     def values(self, u: np.ndarray) -> np.ndarray:
         """The values at the probabilities `u`, which lie between 0 and 1."""
@@ -27,28 +44,12 @@ class Distribution:
         """Derivatives of `values(u)` with respect to the numbers of the distribution, by their names."""
 
 
-def _check(owner: Distribution) -> None:
-    """Make the numbers of a distribution floats; ValueError where one is not finite, or `low` is not below `high`."""
-    kind = type(owner).__name__
-    for name, value in vars(owner).items():
-        object.__setattr__(owner, name, float(checked_known(value, f"`{name}` of {kind}", (), advice="give one number")))
-        if not np.isfinite(getattr(owner, name)):
-            raise ValueError(f"`{name}` of {kind} is {value}, expected a finite number")
-    if isinstance(owner, Uniform | LogUniform) and not owner.low < owner.high:
-        raise ValueError(f"{kind} has low = {owner.low:g} and high = {owner.high:g}, expected low < high")
-
-
 @dataclass(frozen=True)
 class Normal(Distribution):
     """A normal distribution with the given `mean` and standard deviation `sigma`, in the unit of what varies; sigma = 0: always the mean."""
 
     mean: Any
     sigma: Any
-
-    def __post_init__(self):
-        _check(self)
-        if self.sigma < 0:
-            raise ValueError(f"`sigma` of Normal is {self.sigma:g}, expected a standard deviation of at least 0")
 
     def values(self, u: np.ndarray) -> np.ndarray:
         return self.mean + self.sigma * special_functions().ndtri(u)
@@ -64,9 +65,6 @@ class Uniform(Distribution):
     low: Any
     high: Any
 
-    def __post_init__(self):
-        _check(self)
-
     def values(self, u: np.ndarray) -> np.ndarray:
         return self.low + (self.high - self.low) * u
 
@@ -80,11 +78,7 @@ class LogNormal(Distribution):
 
     median: Any
     sigma: Any
-
-    def __post_init__(self):
-        _check(self)
-        if self.median <= 0 or self.sigma < 0:
-            raise ValueError(f"LogNormal has median {self.median:g} and sigma {self.sigma:g}, expected a positive median and sigma >= 0")
+    _positive = "median"
 
     def values(self, u: np.ndarray) -> np.ndarray:
         return self.median * np.exp(self.sigma * special_functions().ndtri(u))
@@ -100,11 +94,7 @@ class LogUniform(Distribution):
 
     low: Any
     high: Any
-
-    def __post_init__(self):
-        _check(self)
-        if self.low <= 0:
-            raise ValueError(f"`low` of LogUniform is {self.low:g}, expected a positive number")
+    _positive = "low"
 
     def values(self, u: np.ndarray) -> np.ndarray:
         return self.low * (self.high / self.low) ** u

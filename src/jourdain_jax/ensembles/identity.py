@@ -6,7 +6,6 @@ the user (as `jax.grad` does), by what they close over. So a changed function ma
 """
 
 import copyreg
-import functools
 import hashlib
 import sys
 from collections.abc import Iterator, Mapping
@@ -19,8 +18,6 @@ import numpy as np
 
 from jourdain_jax.scene.names_read import spaces
 from jourdain_jax.scene.scene import Scene
-
-DEEPEST = 20  # functions and classes that name others
 
 
 def digest(x: object) -> str:
@@ -43,7 +40,8 @@ def _content(x: object, depth: int, within: set[int], known: dict[tuple[int, int
         return "array", array.dtype.str, array.shape, hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
     if _is_formula(x):
         return "formula", type(x).__qualname__, str(x)
-    if depth > DEEPEST or id(x) in within:
+    # functions and classes that name others
+    if depth > 20 or id(x) in within:
         return "deeper", type(x).__qualname__
     if (id(x), depth) not in known:
         known[id(x), depth] = x, _hashed(_parts(x, depth, within | {id(x)}, known))
@@ -126,7 +124,6 @@ def _names_in(code: CodeType) -> tuple[str, ...]:
     return tuple(sorted(set(code.co_names).union(*(_names_in(inner) for inner in code.co_consts if isinstance(inner, CodeType)))))
 
 
-@functools.lru_cache(maxsize=4096)
 def is_installed(name: str | None) -> bool:
     """Whether a module belongs to Python, to an installed package, or to this one."""
     top = (name or "").partition(".")[0]

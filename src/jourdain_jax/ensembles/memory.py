@@ -18,21 +18,18 @@ from typing import Any
 from jourdain_jax.calculus.reals import described
 
 COMPILED = 500e6  # bytes for compilers and what they compile; the disc takes 220 MB, the bicycle 400 MB
-IMPORTED = 240e6  # bytes that a process holds with this package and before it computes
 BLOCKS = 4.0  # copies of a block's states that are there at once; seen: 3.7
 CHUNKS = 2.0  # the arrays of a chunk's blocks, and these put together
-_UNITS = {"": 1, "B": 1, "KB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30, "TIB": 2**40}
 _NOT_HERE = "`memory` is held on Linux with glibc only; leave it out here"
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 
 
 def bytes_of(memory: Any) -> int:
     """Bytes that `memory` says: a number of bytes, or a text such as "2GB" (10^9 bytes) or "500 MiB" (2^20); ValueError otherwise."""
-    found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+(?:e[0-9]+)?)\s*([a-z]*)\s*", str(memory).lower())
-    unit = found and _UNITS.get(found.group(2).upper())
-    if isinstance(memory, bool) or not found or not unit or not math.isfinite(float(found.group(1))):
+    found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+(?:e[0-9]+)?)\s*(?:(?:([kmgt])(i?))?b)?\s*", str(memory).lower())
+    if isinstance(memory, bool) or not found or not math.isfinite(float(found[1])):
         raise ValueError(f"`memory` is {described(memory)}, expected a number of bytes, or a text such as '2GB' or '500MB'")
-    return int(float(found.group(1)) * unit)
+    return int(float(found[1]) * (1024 if found[3] else 1000) ** " kmgt".index(found[2] or " "))
 
 
 def resident() -> int:
@@ -58,7 +55,8 @@ def of_each(memory: Any, processes: int) -> int:
 
 def room(allowed: int, *, here: bool) -> float:
     """Bytes for blocks and chunks in a process that may hold `allowed` bytes: this one (`here`), or a new one; ValueError where there is none."""
-    held = resident() if here else IMPORTED
+    # bytes that a process holds with this package and before it computes
+    held = resident() if here else 240e6
     give_back_at_once()
     if allowed < held + COMPILED:
         need = f"{'this process' if here else 'a new process'} holds {held / 1e6:.0f} MB before it begins, and compiling may take {COMPILED / 1e6:.0f} MB"

@@ -22,7 +22,6 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.tracebacks import users_level
 
 LEVELS = (0.025, 0.5, 0.975)
-_MOST_DRAWN = 12  # outputs in a notebook
 
 
 @dataclass(frozen=True, repr=False)
@@ -56,12 +55,12 @@ class StudyResult(Printed):
 
     def __init__(self, store: Store, task: Task | None = None):
         self.store, self.task = store, task
+        self._gathered = self._gather()
 
     def __len__(self) -> int:
         return self.store.lanes
 
-    @cached_property
-    def _gathered(self) -> dict:
+    def _gather(self) -> dict:
         """What the receipts hold, together."""
         known = {number: self.store.receipt(number) for number in self.store.receipts()}
         receipts = [receipt for receipt in known.values() if receipt is not None]
@@ -237,7 +236,8 @@ class StudyResult(Printed):
 
     def _repr_html_(self) -> str:
         drawn = [name for name in self.outputs if self._gathered["chunks"] and self._bars(name, 40)[0].sum() > 0]
-        shown = drawn[:_MOST_DRAWN]
+        # outputs in a notebook
+        shown = drawn[:12]
         more = f"and {len(drawn) - len(shown)} more" if len(drawn) > len(shown) else ""
         return super()._repr_html_() + (figure(lambda whole: self._draw(whole, shown, 40), 240 * len(shown), 200, more) if shown else "")
 

@@ -3,7 +3,6 @@
 The first Ctrl-C lets the chunk under way end; a second one ends at once. Both leave a folder from which the same call goes on.
 """
 
-import functools
 import json
 import re
 import signal
@@ -131,7 +130,6 @@ def _chunk(task: Task, chunk: int | None) -> int:
     return int(chunk)
 
 
-@functools.cache
 def versions() -> dict[str, str]:
     """Versions of what computes."""
     return {"python": python_version()} | {name: version_of(name) for name in PACKAGES}

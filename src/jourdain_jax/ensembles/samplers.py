@@ -16,7 +16,6 @@ import numpy as np
 from jourdain_jax.calculus.on_first_use import needed
 
 MOST_SOBOL = 2**30  # points of the sequence, of 30 bits
-_ROUNDS = 6
 _M1, _M2, _GOLDEN = (np.uint64(x) for x in (0xBF58476D1CE4E5B9, 0x94D049BB133111EB, 0x9E3779B97F4A7C15))
 
 
@@ -43,7 +42,7 @@ def permuted(seed: int, number: int, index: np.ndarray, count: int) -> np.ndarra
     """Where the permutation `number` of 0 to count - 1 sends `index`."""
     half = np.uint64(max(1, (max(count - 1, 1).bit_length() + 1) // 2))
     mask = np.uint64((1 << int(half)) - 1)
-    keys = _mixed(np.random.Philox(key=seed + (1 << 64)).advance(number * 2).random_raw(_ROUNDS) * _GOLDEN)
+    keys = _mixed(np.random.Philox(key=seed + (1 << 64)).advance(number * 2).random_raw(6) * _GOLDEN)
     found, walking = index.astype(np.uint64), np.ones(index.shape, bool)
     while walking.any():
         left, right = found[walking] >> half, found[walking] & mask

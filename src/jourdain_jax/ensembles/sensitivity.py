@@ -17,8 +17,6 @@ import numpy as np
 from jourdain_jax.ensembles.optional import special_functions
 from jourdain_jax.scene.printing import Printed
 
-RESAMPLES = 200
-
 
 @dataclass(frozen=True, repr=False)
 class SobolIndices(Printed):
@@ -65,7 +63,7 @@ def sobol_indices(values, names: Sequence[str], *, confidence: float = 0.95) -> 
     if len(groups) < 2 or np.ptp(groups[:, [0, -1]]) == 0:  # those whose variance is divided by
         raise ValueError("fewer than two groups of samples have values, or all values are equal; Sobol' indices need a quantity that varies")
     generator = np.random.default_rng(0)
-    drawn = np.stack([_indices(groups[generator.integers(0, len(groups), len(groups))]) for _ in range(RESAMPLES)])
+    drawn = np.stack([_indices(groups[generator.integers(0, len(groups), len(groups))]) for _ in range(200)])
     half = special_functions().ndtri(0.5 + confidence / 2) * drawn.std(axis=0, ddof=1)
     first, total = _indices(groups)
     return SobolIndices(names, first, half[0], total, half[1], confidence, len(groups), int(np.sum(~sound)))

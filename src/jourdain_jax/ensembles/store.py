@@ -39,7 +39,6 @@ from jourdain_jax.motion.trajectories.results import CODES
 FORMAT = 2
 _BEGIN = b"jourdain-jax chunk 2\n"
 MOST_CHUNKS, MOST_LANES = 2**24, 2**40  # of a study, of a chunk
-_LARGEST = 100_000_000  # bytes of one of the files that are written once
 _MANIFEST = "run/manifest.json"
 RECEIPT = ("codes", "again", "steps", "failed", "sums", "cells", "extremes")  # arrays of a receipt
 
@@ -80,8 +79,8 @@ class Store:
 
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
-        self._digests = self._read_manifest()
         self.study = self._read_study()
+        self._digests = self._read_manifest()
         self.lanes, self.chunk = self.study["samples"], self.study["chunk"]
         self.columns = {name: Column(**entry | {"more": tuple(map(tuple, entry["more"]))}) for name, entry in self.study["columns"].items()}
         decides = [self.study.get(name) for name in ("identity", "samples", "chunk", "block", "outputs")]  # the same in all shares
@@ -137,19 +136,25 @@ class Store:
             shutil.rmtree(beside, ignore_errors=True)
         return Store(path)
 
-    def _read_manifest(self) -> dict[str, str]:
-        """The digests of files that are written once, by name; every file but the grid, which can be found again, is there and has its digest."""
+    def _read_study(self) -> dict:
+        """What study this is, its numbers within their ranges."""
         if not (self.path / "run" / "study.json").exists():
             if self.path.is_file():
                 raise ValueError(f"`{self.path}` is a file, expected the folder of a study")
             what = "is not a study: it holds no `run/study.json`" if self.path.exists() else "does not exist"
             raise ValueError(f"`{self.path}` {what}; give the folder of a study, or a new name")
-        if not (self.path / _MANIFEST).exists():
-            found = parsed(json.loads, self._read("run/study.json"), f"{self.path}/run/study.json", "JSON")
-            if isinstance(found, dict) and found.get("format") != FORMAT:
-                raise self._of_another_format(found.get("format"))
-        found = parsed(json.loads, self._read(_MANIFEST), f"{self.path}/{_MANIFEST}", "JSON")
-        digests = found.get("digests") if isinstance(found, dict) else None
+        found = self._json("run/study.json")
+        if found.get("format") != FORMAT:
+            text = f"has format {found.get('format')}, this version of jourdain-jax reads {FORMAT}; use the version that wrote it, or run the study anew"
+            raise ValueError(f"`{self.path}` {text} in another folder")
+        if fault := _beyond(found):
+            raise self._damaged("run/study.json", fault)
+        return found
+
+    def _read_manifest(self) -> dict[str, str]:
+        """The digests of files that are written once, by name; every file but the grid, which can be found again, is there and has its digest."""
+        found = self._json(_MANIFEST)
+        digests = found.get("digests")
         if not isinstance(digests, dict) or found.get("digest") != _digest_of(digests):
             raise self._damaged(_MANIFEST)
         for name in digests:
@@ -157,24 +162,19 @@ class Store:
                 raise self._damaged(name)
         return digests
 
+    def _json(self, name: str) -> dict:
+        """The dictionary in a file of JSON."""
+        found = parsed(json.loads, self._read(name), f"{self.path}/{name}", "JSON")
+        if not isinstance(found, dict):
+            raise self._damaged(name)
+        return found
+
     def _read(self, name: str) -> bytes:
-        return read_bytes(self.path / name, _LARGEST, "the folder of a study with all its files")
+        # bytes of one of the files that are written once
+        return read_bytes(self.path / name, 100_000_000, "the folder of a study with all its files")
 
     def _damaged(self, name: str, what: str = "it is not what was written") -> ValueError:
         return ValueError(f"`{self.path / name}` is damaged ({what}); the study cannot be continued: move the folder away and run it anew")
-
-    def _of_another_format(self, found) -> ValueError:
-        text = f"has format {found}, this version of jourdain-jax reads {FORMAT}; use the version that wrote it, or run the study anew in another folder"
-        return ValueError(f"`{self.path}` {text}")
-
-    def _read_study(self) -> dict:
-        """What study this is, its numbers within their ranges."""
-        found = parsed(json.loads, self._read("run/study.json"), f"{self.path}/run/study.json", "JSON")
-        if not isinstance(found, dict) or found.get("format") != FORMAT:
-            raise self._of_another_format(found.get("format") if isinstance(found, dict) else None)
-        if fault := _beyond(found):
-            raise self._damaged("run/study.json", fault)
-        return found
 
     @property
     def attributes(self) -> dict:

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, Unpack
 
 import numpy as np
@@ -31,6 +31,18 @@ _STATED = "times to save at are `ts`, and what is kept is said by `outputs` and 
 REFUSED = dict.fromkeys(("progress", "parameters", "starts", "scene", "start"), _STATED)
 
 
+class TaskFields(MotionFields, total=False):
+    """What a run of a study computes, by name."""
+
+    t0: Any
+    t1: Any
+    ts: Any
+    outputs: Mapping | None
+    save: str
+    every: int
+    options: Options | None
+
+
 @dataclass(frozen=True, repr=False)
 class Study(Printed):
     """Many motions of one scene, whose parameters or start values vary.
@@ -55,14 +67,19 @@ class Study(Printed):
     samples: int | None = None
     seed: int = 0
     correlation: Any = None
+    design: Design = field(init=False, repr=False, compare=False)  # the samples: parameters by name, start values by name with `_at_start`
     _given: Any = field(init=False, repr=False, compare=False)  # the scene, or its model
+    _constants: dict = field(init=False, repr=False, compare=False)  # start values that do not vary
 
     def __post_init__(self):
         object.__setattr__(self, "_given", self.scene)
         object.__setattr__(self, "scene", as_scene(self.scene))
-        _ = self.design  # says what is wrong
+        varying, constants = self._named()
+        object.__setattr__(self, "_constants", constants)
+        column = {name: name + AT_START for name in self.start or ()} | {name: name for name in self.vary or ()}
+        pairs = {tuple(column.get(x, x) for x in pair) if isinstance(pair, tuple) else pair: value for pair, value in (self.correlation or {}).items()}
+        object.__setattr__(self, "design", Design(varying, self.sampler, self.samples, self.seed, pairs or None))
 
-    @cached_property
     def _named(self) -> tuple[dict, dict]:
         """What varies, by the names of its columns, and the start values that do not."""
         examples = {"vary": '{"mass": jj.Normal(12.0, 0.3)}', "start": '{"lean": 0.3}', "correlation": '{("mass", "radius"): 0.5}'}
@@ -93,14 +110,6 @@ class Study(Printed):
                 varying[name + AT_START] = how
         return varying, constants
 
-    @cached_property
-    def design(self) -> Design:
-        """The samples: parameters by name, start values by name with `_at_start`."""
-        varying, _ = self._named
-        column = {name: name + AT_START for name in self.start or ()} | {name: name for name in self.vary or ()}
-        pairs = {tuple(column.get(x, x) for x in pair) if isinstance(pair, tuple) else pair: value for pair, value in (self.correlation or {}).items()}
-        return Design(varying, self.sampler, self.samples, self.seed, pairs or None)
-
     def task(
         self, *, t1=None, ts=None, t0=None, outputs: Mapping | None = None, save: str = "outputs", every: int = 1, inputs=None, options=None, **by_name
     ) -> Task:
@@ -118,18 +127,12 @@ class Study(Printed):
             text = f"`ts` begins at {times[0]:g} s, and the motion at {first:g} s: the integral `{missed[0]}` would leave out what is between"
             raise ValueError(f"{text}; let `ts` begin where the motion does")
         span = {"t0": float(first), "t1": float(last), "ts": np.asarray(times, float), "inputs": inputs}
-        return Task(self.scene, self.design, self._named[1], known, span, options, save, int(every))
+        return Task(self.scene, self.design, self._constants, known, span, options, save, int(every))
 
     def run(
         self,
         path: str | os.PathLike,
         *,
-        t1=None,
-        ts=None,
-        t0=None,
-        outputs: Mapping | None = None,
-        save: str = "outputs",
-        every: int = 1,
         chunk: int | None = None,
         progress: bool = True,
         processes: int = 1,
@@ -137,8 +140,7 @@ class Study(Printed):
         memory: int | str | None = None,
         shard: tuple[int, int] = (1, 1),
         command: str = "",
-        options: Options | None = None,
-        **by_name: Unpack[MotionFields],
+        **what: Unpack[TaskFields],
     ) -> StudyResult:
         """Run what is missing of the study in the folder `path`, which is made where there is none, and open it.
 
@@ -160,13 +162,13 @@ class Study(Printed):
           studies with other blocks differ in their last digits.
         - `shard`: (k, n): only the k-th of n shares of the chunks, for a folder of its own on one of n machines; `jj.merge_studies` puts them together.
         - `progress`: a bar; `command`: text that is kept with the study.
-        - `options`: a `jj.Options`; `by_name`: its fields, and `inputs`, as in `rollout`.
+        - `options`: a `jj.Options`, or its fields by name; `inputs`: as in `rollout`. These, and `t0` to `save` above, are the `what` of the signature.
 
         Raises ValueError where the folder holds another study or `memory` is too little, MemoryError where it turned out to be, `InUseError` where another
         process runs it, OSError where it cannot be written.
         Ctrl-C: the chunk under way ends, all is kept, and KeyboardInterrupt says so.
         """
-        task = self.task(t1=t1, ts=ts, t0=t0, outputs=outputs, save=save, every=every, options=options, **by_name)
+        task = self.task(**what)
         shards = tuple(shard)
         if len(shards) != 2 or not all(isinstance(x, int) for x in shards) or not 1 <= shards[0] <= shards[1]:
             raise ValueError(f"`shard` is {shard}, expected (k, n) with 1 <= k <= n")
@@ -180,22 +182,22 @@ class Study(Printed):
         store = run(task, path, chunk=chunk, progress=progress, shard=shards, command=command, workers=compute)
         return StudyResult(store, task)
 
-    def mean_gradients(self, *, parameters: Sequence[str] = (), t1=None, ts=None, t0=None, outputs: Mapping | None = None, **more) -> MeanGradients:
+    def mean_gradients(self, *, parameters: Sequence[str] = (), **what: Unpack[TaskFields]) -> MeanGradients:
         """Derivatives of the means of all outputs with respect to the numbers of the distributions, and to the `parameters` that all lanes share.
 
         They are pathwise derivatives: the mean over lanes of exact derivatives of their motions, in forward mode, for the samples of this study. Where lanes
         end at events, a `SensitivityWarning`, also among `warnings` of the result, says what they may miss. This process computes it; nothing is
         stored.
 
-        - `t0`, `t1`, `ts`, `outputs`, `more`: as in `run`.
+        - `what`: `t0`, `t1`, `ts`, `outputs`, `inputs` and options, as in `run`.
 
             found = study.mean_gradients(t1=2.0, outputs={"final lean": jj.End("lean", "rad")}, parameters=("gravity",))
             found.of("final lean", "radius.sigma")
 
         Raises ValueError for unknown names.
         """
-        return mean_gradients(self.task(t1=t1, ts=ts, t0=t0, outputs=outputs, **more), tuple(parameters))
+        return mean_gradients(self.task(**what), tuple(parameters))
 
     def _text(self) -> str:
-        constants = ", ".join(f"{name} = {np.asarray(value).tolist()}" for name, value in self._named[1].items())
+        constants = ", ".join(f"{name} = {np.asarray(value).tolist()}" for name, value in self._constants.items())
         return f"Study of {type(self.scene).__name__}\n{self.design}" + (f"\n  all start with {constants}" if constants else "")

@@ -27,13 +27,12 @@ from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.options import AllOptions, stated
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.motion.trajectories.labelled import CODES, OF_LANES
+from jourdain_jax.motion.trajectories.labelled import CODES, FIELDS, OF_LANES
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
 LARGEST_BLOCK = 2048  # lanes: enough that few wait for the last one, few enough that a chunk is a fraction of a second
-BLOCK_MEMORY = 2**26  # bytes of saved states of a block, at most
 AT_START = "_at_start"  # how columns of start values are called, after the coordinate or speed
 RESERVED = ("lane", "saved_lane", "run", "zarr.json")  # axes, and names of files beside the arrays
 SAVES = ("statistics", "outputs", "trajectories")
@@ -66,7 +65,8 @@ class Task:
     def block(self) -> int:
         """Lanes of a block."""
         block = min(self.largest_block or LARGEST_BLOCK, max(8, 1 << (len(self.design) - 1).bit_length()))
-        while block > 8 and block * self.bytes_of_lane > BLOCK_MEMORY:
+        # bytes of saved states of a block, at most
+        while block > 8 and block * self.bytes_of_lane > (2**26):
             block //= 2
         return block
 
@@ -123,8 +123,7 @@ class Task:
 
     @staticmethod
     def _of_lanes(rolled: Trajectory, count: int) -> dict[str, np.ndarray]:
-        found = (rolled.result, rolled.event, rolled.accepted, rolled.rejected, rolled.fallback, rolled.t_end)
-        return {name: np.asarray(x)[:count].astype(dtype) for (name, (dtype, _, _)), x in zip(OF_LANES.items(), found, strict=True)}
+        return {name: np.asarray(getattr(rolled, FIELDS[name]))[:count].astype(dtype) for name, (dtype, _, _) in OF_LANES.items()}
 
     def outputs_of_lane(self, motion: Trajectory) -> Float[Array, "outputs"]:
         """The outputs of one motion; NaN where it failed."""

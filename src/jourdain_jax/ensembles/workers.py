@@ -11,9 +11,10 @@ import signal
 import threading
 import warnings
 from collections.abc import Callable, Generator, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection, get_context, parent_process
+from typing import Any
 
 from jourdain_jax.ensembles.run import Runner
 from jourdain_jax.ensembles.store import Store
@@ -25,8 +26,7 @@ _NONE_BEGAN = (
     "no worker of this study could begin, as what it printed says. Each imports the program that was started: run studies in it under "
     '`if __name__ == "__main__":`, and define scenes and outputs in a module; or take processes=1'
 )
-_asked: list[tuple[Task, Store]] = []  # of this worker, one
-_runner: list[Runner] = []  # made for its first chunk
+_own: list[Runner | tuple[Task, Store]] = []  # of this worker, one: a runner since its first chunk, before what it is made of
 
 
 def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, int]]]:
@@ -35,7 +35,20 @@ def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, in
 
     def workers(store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:
         def compute(numbers: list[int], alone: bool):
-            return _until_a_worker_dies(sent, store, numbers, 1 if alone else count, interrupted)
+            most, begun = 1 if alone else count, get_context("spawn").Event()
+            with _pool(sent, store, most, begun) as pool:
+                died = yield from computed(
+                    lambda number: pool.submit(_chunk, number),
+                    lambda running: wait(running, return_when=FIRST_COMPLETED).done,
+                    BrokenProcessPool,
+                    store,
+                    numbers,
+                    interrupted,
+                    most,
+                )
+                if died and not begun.is_set():
+                    raise RuntimeError(_NONE_BEGAN)
+                return died
 
         return whatever_dies(store, numbers, interrupted, compute, MOST_DEATHS - 1)
 
@@ -85,27 +98,30 @@ def sent_to_others(task: Task) -> bytes:
         raise ValueError(f"this study cannot be sent to other processes ({error}); {text}") from None
 
 
-def _until_a_worker_dies(sent: bytes, store: Store, numbers: list[int], count: int, interrupted) -> Generator[tuple[int, int], None, list[int]]:
-    """Run chunks; returns the numbers of those that were under way when a worker died, empty where none did."""
+def computed(submit, wait, deadly: type[Exception], store: Store, numbers, interrupted, most: int) -> Generator[tuple[int, int], None, list[int]]:
+    """Lanes and failed lanes of chunks as they come, at most `most` of them under way; returns the numbers of those on which a process died.
+
+    `submit(number)`: a future; `wait(futures)`: those of them that are done, at least one; `deadly`: the error of one whose process died.
+    """
     left = iter(numbers)
-    running: dict[Future, int] = {}
-    begun = get_context("spawn").Event()
-    with _pool(sent, store, count, begun) as pool:
-        try:
-            while True:
-                while len(running) < count and not interrupted() and (number := next(left, None)) is not None:
-                    running[pool.submit(_chunk, number)] = number
-                if not running:
-                    return []
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    yield future.result()
-                    del running[future]
-        except BrokenProcessPool:
-            if not begun.is_set():
-                raise RuntimeError(_NONE_BEGAN) from None
-            receipts = {number: store.receipt(number) for number in running.values()}
-            yield from (receipt.lanes for receipt in receipts.values() if receipt is not None)  # kept before the worker died
+    running: dict[Any, int] = {}
+    died: list[int] = []
+    while True:
+        while not died and len(running) < most and not interrupted() and (number := next(left, None)) is not None:
+            try:
+                running[submit(number)] = number
+            except deadly:  # a pool whose process has died
+                died.append(number)
+        if not running:
+            receipts = {number: store.receipt(number) for number in died}
+            yield from (receipt.lanes for receipt in receipts.values() if receipt is not None)  # kept before the process died
             return [number for number, receipt in receipts.items() if receipt is None]
+        for future in wait(list(running)):
+            number = running.pop(future)
+            try:
+                yield future.result()
+            except deadly:
+                died.append(number)
 
 
 def _pool(sent: bytes, store: Store, count: int, begun) -> ProcessPoolExecutor:
@@ -123,7 +139,7 @@ def _begin(sent: bytes, path: str, places, begun) -> None:
     if parent := parent_process():
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
     keep_to_share(*places.get())
-    _asked.append((pickle.loads(sent), Store(path)))
+    _own.append((pickle.loads(sent), Store(path)))
     begun.set()
 
 
@@ -143,6 +159,6 @@ def _end_with(parent: int) -> None:
 
 
 def _chunk(number: int) -> tuple[int, int]:
-    if not _runner:
-        _runner.append(Runner(*_asked[0]))
-    return _runner[0].run(number)
+    runner = _own[0] if isinstance(_own[0], Runner) else Runner(*_own[0])
+    _own[0] = runner
+    return runner.run(number)

@@ -14,7 +14,7 @@ from jourdain_jax.importers.identifiers import identifier
 from jourdain_jax.importers.mjcf_elements import TABLE, Defaults, attributes_of
 from jourdain_jax.importers.placing import about, by_euler_angles, by_quaternion, combined, onto_axis
 from jourdain_jax.importers.solids import SIZES, moments, volume
-from jourdain_jax.importers.tree import Joint, Link, Look, Mass, Matrix, Motor, Tree, Vector
+from jourdain_jax.importers.tree import Closure, Follower, Joint, Link, Look, Mass, Matrix, Motor, Tree, Vector
 from jourdain_jax.importers.tree_scene import tree_scene
 from jourdain_jax.importers.urdf import colour_of
 from jourdain_jax.importers.xml_file import Element, XmlFile
@@ -23,7 +23,6 @@ from jourdain_jax.scene.scene import Scene
 
 _TYPES = ("free", "ball", "slide", "hinge")
 _LOOKS = {"sphere": "ball", "capsule": "capsule", "cylinder": "cylinder", "box": "box", "ellipsoid": "ellipsoid"}
-_WATER = 1000.0  # kg/m^3, of geoms that state neither mass nor density
 
 
 def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> type[Scene]:
@@ -44,10 +43,12 @@ def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> 
     `<joint>_stiffness` and `gravity` (m/s^2); and of bodies that `free` names `<body>_origin` (m). Inertias of geoms come from their mass or density. The pose
     that the file states is the `example`.
 
+    `connect`, `weld` and `joint` of `equality` are geometric rows, which hold exactly: loops are closed as they are in the stated pose.
+
     Geoms are drawn; what they touch is not read: rolling is stated in `contacts` of a subclass. Limits stop nothing; those of joints become the `domain`.
 
     **Raises** ValueError, by name: a file that cannot be read, a body that moves and has no mass, moments of inertia that no body has, what is said twice, and
-    whatever changes the motion, or is no part of the format, and is not read, such as `equality`, `tendon`, `armature`, `frictionloss` or a misspelt attribute,
+    whatever changes the motion, or is no part of the format, and is not read, such as `tendon`, `armature`, `frictionloss` or a misspelt attribute,
     unless `ignore` names it. A warning lists what else is left out.
     """
     file = XmlFile(path, TABLE, "MJCF", ignore)
@@ -68,6 +69,7 @@ class _Reader:
             raise file.fault(f"`eulerseq` of `compiler` is `{self.sequence}`, expected three letters out of x, y, z, X, Y, Z")
         self.meshes = {mesh.get("name") or (mesh.get("file") or "").rpartition("/")[2].partition(".")[0]: mesh for mesh in file.root.findall("asset/mesh")}
         self.links: list[Link] = []
+        self.moving: set[str | None] = set()  # names of links
         self.start: dict[str, float] = {}
 
     def tree(self, free: tuple[str, ...]) -> Tree:
@@ -77,8 +79,32 @@ class _Reader:
             self.links.append(Link("world" if not self.links else f"world {len(self.links) + 1}", None, np.zeros(3), np.eye(3), looks=looks))
             self._children(section, None, None)
         gravity = self.file.numbers(self.option.get("gravity"), 3, "`gravity`", [0.0, 0.0, -9.81])
-        name = self.file.root.get("model") or "Mjcf"
-        return Tree(name, tuple(self.links), gravity, tuple(self._motors()), free=free, start=self.start)
+        if any(flag.get("gravity") == "disable" for flag in self.file.root.findall("option/flag")):
+            gravity = np.zeros(3)
+        joints = [joint.name for link in self.links for joint in link.joints if joint.kind in ("hinge", "slide")]
+        name, motors, ties = self.file.root.get("model") or "Mjcf", tuple(self._motors(joints)), tuple(self._ties(joints))
+        return Tree(name, tuple(self.links), gravity, motors, ties, free, self.start)
+
+    def _ties(self, joints: list[str]) -> Iterable[Follower | Closure]:
+        """What `equality` states, as rows that hold exactly."""
+        stated = () if "equality" in self.file.ignore else self.file.root.findall("equality/*")
+        for k, element in enumerate(stated):
+            what, follows = f"{element.tag} {k + 1} of `equality`", element.tag == "joint"
+            ends = [element.get(f"{'joint' if follows else 'body'}{end}") for end in (1, 2)]
+            known = joints if follows else [link.name for link in self.links]
+            for end in (ends[0], ends[1] or ends[0]):
+                if end not in known:
+                    raise self.file.fault(f"{what} names `{end}`, which is no {'hinge or slide' if follows else 'body'}; {nearest(str(end), known)}")
+            if element.get("active") == "false":
+                continue
+            if follows:
+                coefficients = self.file.numbers(element.get("polycoef"), None, f"polycoef of {what}", [0.0, 1.0])
+                yield Follower(ends[0] or "", ends[1] or "", tuple(coefficients))
+            else:  # the anchor of a weld is a point of the second body
+                weld = element.tag == "weld"
+                link, other = ends[::-1] if weld else ends
+                anchor = self.file.numbers(element.get("anchor"), 3, f"anchor of {what}", np.zeros(3) if weld else None)
+                yield Closure(element.get("name") or what, link, other, anchor, weld)
 
     def _children(self, holder: Element, parent: str | None, childclass: str | None) -> None:
         for element in holder.findall("body"):
@@ -95,7 +121,11 @@ class _Reader:
                 raise self.file.fault(f"body `{name}` has a free joint and {'a parent' if parent else 'others'}; expected it alone, in the world")
             self._free_start(joints[0], position, turn)
             position, turn = np.zeros(3), np.eye(3)
-        self.links.append(Link(name, parent, position, turn, joints, self._mass(body, childclass, name), self._looks(body, childclass, f"body `{name}`")))
+        moves = bool(joints) or parent in self.moving
+        if moves:
+            self.moving.add(name)
+        mass = self._mass(body, childclass, name) if moves else None  # what never moves needs none
+        self.links.append(Link(name, parent, position, turn, joints, mass, self._looks(body, childclass, f"body `{name}`")))
         self._children(body, name, childclass)
 
     def _free_start(self, joint: Joint, position: Vector, turn: Matrix) -> None:
@@ -141,9 +171,7 @@ class _Reader:
         inertial = body.find("inertial")
         if inertial is not None and rule != "true":
             return self._stated_mass(inertial, f"`inertial` of body `{name}`")
-        if rule == "false":
-            return None
-        masses = [self._mass_of_geom(geom, childclass, name) for geom in body.findall("geom")]
+        masses = [] if rule == "false" else [self._mass_of_geom(geom, childclass, name) for geom in body.findall("geom")]
         heavy = [mass for mass in masses if mass is not None]
         return combined(heavy) if heavy else None
 
@@ -172,19 +200,18 @@ class _Reader:
 
     def _mass_of_geom(self, geom: Element, childclass: str | None, body: str) -> Mass | None:
         given, kind, what = self._geom(geom, childclass, f"body `{body}`")
-        density = self.file.number(given.get("density"), f"density of {what}", _WATER)
-        stated = "mass" in given
-        mass = self.file.number(given.get("mass"), f"mass of {what}", 0.0)
-        for word, number in (("mass", mass), ("density", density)):
-            if number < 0:
-                raise self.file.fault(f"{word} of {what} is {number:g}, expected a number that is not negative")
-        if (mass if stated else density) == 0:
+        # kg/m^3, of geoms that state neither mass nor density
+        word = "mass" if "mass" in given else "density"
+        number = self.file.number(given.get(word), f"{word} of {what}", 1000.0)
+        if number < 0:
+            raise self.file.fault(f"{word} of {what} is {number:g}, expected a number that is not negative")
+        if number == 0:
             return None
         if kind not in SIZES:
             self.file.refuse(kind, f"the mass of {what}, of the type `{kind}`,", 'give body an `inertial`, or the geom mass="0"')
             return None
         position, turn, size = self._solid(given, kind, what)
-        mass = mass if stated else density * volume(kind, size)
+        mass = number if word == "mass" else number * volume(kind, size)
         return Mass(mass, position, turn @ np.diag(mass * moments(kind, size)) @ turn.T)
 
     def _solid(self, given: dict[str, str], kind: str, what: str) -> tuple[Vector, Matrix, np.ndarray]:
@@ -257,8 +284,7 @@ class _Reader:
         across = across / np.linalg.norm(across)
         return np.stack([along, across, np.cross(along, across)], axis=1)
 
-    def _motors(self) -> Iterable[Motor]:
-        names = [joint.name for link in self.links for joint in link.joints if joint.kind in ("hinge", "slide")]
+    def _motors(self, names: list[str]) -> Iterable[Motor]:
         for k, element in enumerate(self.file.root.findall("actuator/motor")):
             given = self.defaults.of(element, None, f"motor `{element.get('name') or k + 1}`")
             name = given.get("name") or f"{given.get('joint')}_motor"

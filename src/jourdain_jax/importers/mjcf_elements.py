@@ -10,11 +10,12 @@ _CONTACT = "contype conaffinity condim group priority friction solmix solref sol
 # actuators that share their defaults with `motor`, as far as it has the attribute
 _ACTUATORS = {"general", "position", "velocity", "intvelocity", "damper", "cylinder", "muscle"}
 _IDLE = "camera light site visual statistic size sensor keyframe custom contact texture material hfield skin"
+_SOFT = "class solref solimp"
 _SWITCH, _RANGED = ("true", "false"), ("true", "false", "auto")
 # What elements may hold, the attributes of their classes included; all else is refused by name. Idle is what has to do with contacts, limits, drawing, and how
 # the other engine computes.
 TABLE = {
-    "mujoco": Holds("model", many="compiler option default worldbody asset actuator", listed=_IDLE),
+    "mujoco": Holds("model", many="compiler option default worldbody asset actuator equality include", listed=_IDLE),
     "compiler": Holds(
         "angle eulerseq inertiafromgeom meshdir assetdir autolimits",
         idle="texturedir strippath fusestatic discardvisual usethread saveinertial convexhull exactmeshinertia fitaabb conflict lengthrange",
@@ -37,10 +38,13 @@ TABLE = {
         "sleep_tolerance",
         off={"density": "0", "viscosity": "0", "actuatorgroupdisable": ""},
     ),
+    "include": Holds("file"),
     "flag": Holds(
+        "gravity",
         idle="constraint equality frictionloss limit contact warmstart filterparent refsafe sensor midphase eulerdamp autoreset nativeccd island multiccd "
         "energy invdiscrete sleep",
-        off=dict.fromkeys(("spring", "damper", "passive", "gravity", "actuation", "clampctrl"), "enable") | {"fwdinv": "disable enable", "override": "disable"},
+        off=dict.fromkeys(("spring", "damper", "passive", "actuation", "clampctrl"), "enable") | {"fwdinv": "disable enable", "override": "disable"},
+        words={"gravity": ("enable", "disable")},
     ),
     "default": Holds("class", many="default", idle=f"{' '.join(_ACTUATORS)} motor adhesion mesh material joint geom site camera light pair equality tendon"),
     "worldbody": Holds(many="geom body", listed=_IDLE),
@@ -72,6 +76,10 @@ TABLE = {
         f"name class type size fromto mass density rgba mesh {_PLACE}", idle=f"material hfield {_CONTACT}", off={"shellinertia": "false", "fluidshape": "none"}
     ),
     "actuator": Holds(many="motor"),
+    "equality": Holds(many="connect weld joint"),
+    "connect": Holds("name active body1 body2 anchor", idle=_SOFT, words={"active": _SWITCH}),
+    "weld": Holds("name active body1 body2 anchor", idle=f"torquescale {_SOFT}", off={"relpose": "0 1 0 0 0 0 0"}, words={"active": _SWITCH}),
+    "equality/joint": Holds("name active joint1 joint2 polycoef", idle=_SOFT, words={"active": _SWITCH}),
     "motor": Holds(
         "name class joint gear ctrllimited ctrlrange forcelimited forcerange", idle="group user", words={"ctrllimited": _RANGED, "forcelimited": _RANGED}
     ),

@@ -2,13 +2,14 @@
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from jourdain_jax.importers.tree import Mass, Matrix, Vector
 
 
 def about(axis: Vector, angle: float) -> Matrix:
-    """Rotation by `angle` (rad) about a unit vector: `cos I + sin [k]x + (1 - cos) k k'`."""
-    return np.cos(angle) * np.eye(3) + np.sin(angle) * cross_matrix(axis) + (1 - np.cos(angle)) * np.outer(axis, axis)
+    """Rotation by `angle` (rad) about a unit vector."""
+    return Rotation.from_rotvec(angle * axis).as_matrix()
 
 
 def cross_matrix(v: Vector) -> Matrix:
@@ -18,22 +19,21 @@ def cross_matrix(v: Vector) -> Matrix:
 
 def by_roll_pitch_yaw(angles: Vector) -> Matrix:
     """URDF's `rpy`: about the fixed x, y, z axes in turn (rad)."""
-    return about(np.eye(3)[2], angles[2]) @ about(np.eye(3)[1], angles[1]) @ about(np.eye(3)[0], angles[0])
+    return Rotation.from_euler("xyz", angles).as_matrix()
 
 
 def by_euler_angles(angles: Vector, sequence: str) -> Matrix:
     """MJCF's `euler`: about axes in turn (rad), those of the turned frame in lower case, fixed ones in upper case."""
     turn = np.eye(3)
     for letter, angle in zip(sequence, angles, strict=True):
-        one = about(np.eye(3)["xyz".index(letter.lower())], angle)
+        one = Rotation.from_euler(letter.lower(), angle).as_matrix()
         turn = turn @ one if letter.islower() else one @ turn
     return turn
 
 
 def by_quaternion(q: Float[np.ndarray, "4"]) -> Matrix:
-    """A quaternion (w, x, y, z) of any norm but zero."""
-    w, v = q[0] / np.linalg.norm(q), q[1:] / np.linalg.norm(q)
-    return np.eye(3) + 2 * (w * cross_matrix(v) + cross_matrix(v) @ cross_matrix(v))
+    """A quaternion (w, x, y, z) of any norm; NaN for zero."""
+    return Rotation.from_quat(np.roll(q, -1)).as_matrix() if np.any(q) else np.full((3, 3), np.nan)
 
 
 def onto_axis(direction: Vector) -> Matrix:

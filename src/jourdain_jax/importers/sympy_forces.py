@@ -10,8 +10,6 @@ from jourdain_jax.importers.formulas import sympy_package
 from jourdain_jax.importers.sympy_kinematics import AffineRows, Pose, RandomStates
 from jourdain_jax.importers.sympy_system import MechanicalSystem
 
-_IMPLIED = 1e-9  # of a row: what of it the geometric rows leave, relative
-
 
 @dataclass(frozen=True)
 class Forces:
@@ -58,5 +56,6 @@ def velocity_rows(system: MechanicalSystem, states: RandomStates) -> list[Any]:
     for found in states.finite(own.symbols | rates.symbols, lambda leaves: {"own": own.coefficients(leaves), "rates": rates.coefficients(leaves)}, "a row"):
         given, implied = found["own"], found["rates"]
         left = given - given @ np.linalg.pinv(implied) @ implied
-        kept |= np.max(np.abs(left), axis=1) > _IMPLIED * np.max(np.abs(given), axis=1)
+        # of a row: what of it the geometric rows leave, relative
+        kept |= np.max(np.abs(left), axis=1) > 1e-9 * np.max(np.abs(given), axis=1)
     return [row for row, keep in zip(rows, kept, strict=True) if keep]

@@ -83,13 +83,12 @@ class AffineRows:
         sympy = sympy_package()
         expressions = [system.resolved(sympy.sympify(row)) for row in rows]
         self.speeds, self.symbols = system.speeds, symbols_in(expressions) | set(system.speeds)
-        self._formulas = Formulas({"rows": expressions}, list(self.symbols))
+        columns = [*([row.diff(speed) for row in expressions] for speed in self.speeds), [row.subs(dict.fromkeys(self.speeds, 0)) for row in expressions]]
+        self._formulas = Formulas({str(k): column for k, column in enumerate(columns)}, list(self.symbols))
 
     def coefficients(self, leaves: dict[Any, float]) -> Float[np.ndarray, "rows columns"]:
         """`[A b]`: the values at rest, and what each speed adds."""
-        at_rest = leaves | dict.fromkeys(self.speeds, 0.0)
-        b = self._formulas.numbers(at_rest)["rows"]
-        return np.stack([*(self._formulas.numbers(at_rest | {speed: 1.0})["rows"] - b for speed in self.speeds), b], axis=1)
+        return np.stack(list(self._formulas.numbers(leaves).values()), axis=1)
 
     def met(self, leaves: dict[Any, float]) -> dict[Any, float]:
         """The nearest speeds at which the rows vanish, with all else; NaN where there are no numbers."""

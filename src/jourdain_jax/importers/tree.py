@@ -64,12 +64,22 @@ class Link:
 
 @dataclass(frozen=True)
 class Follower:
-    """A joint whose coordinate follows that of another: `q = factor q_leader + offset`."""
+    """A joint whose coordinate follows that of another, or stays where it is: `q - reference = sum of c_k (q_leader - its reference)^k`."""
 
     joint: str
-    leader: str
-    factor: float
-    offset: float
+    leader: str  # "" for none
+    coefficients: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Closure:
+    """A point of a link that stays where another one has it in the stated pose; with `turn`, the link does not turn against that one either."""
+
+    name: str
+    link: str | None  # None: the inertial frame
+    other: str | None
+    anchor: Vector  # m, in the frame of the link
+    turn: bool
 
 
 @dataclass(frozen=True)
@@ -91,7 +101,7 @@ class Tree:
     links: tuple[Link, ...]
     gravity: Vector  # m/s^2
     motors: tuple[Motor, ...] = ()
-    followers: tuple[Follower, ...] = ()
+    ties: tuple[Follower | Closure, ...] = ()  # geometric rows
     free: tuple[str, ...] = ()  # links whose places are parameters
     start: dict[str, float] = field(default_factory=dict)  # coordinate -> value that the file states
 

@@ -11,7 +11,7 @@ from jourdain_jax.calculus.rotations import quaternion_to_matrix
 from jourdain_jax.importers.identifiers import class_name, identifiers
 from jourdain_jax.importers.placing import combined, cross_matrix, onto_axis
 from jourdain_jax.importers.scene_class import scene_class
-from jourdain_jax.importers.tree import Joint, Link, Look, Mass, Tree
+from jourdain_jax.importers.tree import Follower, Joint, Link, Look, Mass, Tree
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.coordinates import Quaternion, coordinates, inputs, quaternion
 from jourdain_jax.scene.loads import Load, generalized_force
@@ -59,11 +59,24 @@ class TreeScene(Scene):
         return tuple(found)
 
     def geometric_constraints(self, pose):
-        """Joints that follow others."""
-        return {
-            f"{one.joint} follows {one.leader}": pose.q[self._names[one.joint]] - one.factor * pose.q[self._names[one.leader]] - one.offset
-            for one in self._tree.followers
-        }
+        """Joints that follow others, and loops that are closed."""
+        if not self._tree.ties:
+            return {}
+        q, found = self.coordinates.reference(), {}
+        q[[self.coordinate_names.entries.index(name) for name in self._tree.start]] = list(self._tree.start.values())
+        now, stated = self._frames(pose.q), self._frames(self.coordinate_names.view(_array(q)))
+        moved = {j.name: pose.q[self._names[j.name]] - j.reference for link in self._tree.links for j in link.joints if j.kind in ("hinge", "slide")}
+        for one in self._tree.ties:
+            if isinstance(one, Follower):
+                expected = sum(c * moved.get(one.leader, 0.0) ** k for k, c in enumerate(one.coefficients) if c)
+                found[f"{one.joint} follows {one.leader}" if one.leader else f"{one.joint} is held"] = moved[one.joint] - expected
+                continue
+            (R, r), (other_R, other_r), (S, s), (other_S, other_s) = now[one.link], now[one.other], stated[one.link], stated[one.other]
+            found[one.name] = r + R @ one.anchor - other_r - other_R @ (other_S.T @ (s + S @ one.anchor - other_s))
+            if one.turn:  # the vector part of the turn since the stated pose
+                turned = R.T @ other_R @ other_S.T @ S
+                found[f"{one.name}, attitude"] = jnp.stack([turned[k - 1, k - 2] - turned[k - 2, k - 1] for k in range(3)])
+        return found
 
     def visuals(self, pose):
         """Shapes of the file; those of links without a body stand in the inertial frame."""
@@ -78,7 +91,7 @@ class TreeScene(Scene):
                     found.setdefault("", []).append(_visual(look, origin + R @ look.position, R @ look.turn))
         return found
 
-    def _frames(self, q) -> dict[str, Frame]:
+    def _frames(self, q) -> dict[str | None, Frame]:
         """Orientation and origin of every link."""
         found: dict[str | None, Frame] = {None: (np.eye(3), np.zeros(3))}
         for link in self._tree.links:
@@ -88,7 +101,7 @@ class TreeScene(Scene):
             for joint in link.joints:
                 R, origin = _moved(joint, self._names[joint.name], R, origin, q)
             found[link.name] = R, origin
-        return {name: frame for name, frame in found.items() if name is not None}
+        return found
 
     def _centre(self, link: Link):
         """Mass centre in the frame of the link, m."""

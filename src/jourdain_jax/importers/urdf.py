@@ -125,7 +125,7 @@ class _Reader:
                 raise ValueError(f"`motors` names `{name}`, which is no joint of one coordinate; {nearest(name, names)}")
         followers = tuple(self._follower(joint, names) for joint in joints if joint.find("mimic") is not None and joint.get("type") != "fixed")
         pushed = tuple(Motor(f"{name}_motor", name) for name in motors)
-        return Tree(self.file.root.get("name") or "Robot", tuple(links), np.array([0.0, 0.0, -9.81]), pushed, followers, free)
+        return Tree(self.file.root.get("name") or "Robot", tuple(links), np.array([0.0, 0.0, -9.81]), pushed, followers, free=free)
 
     def _end(self, joint: Element, which: str, name: str) -> str:
         found = joint.find(which)
@@ -175,7 +175,7 @@ class _Reader:
         if leader == name:
             raise self.file.fault(f"joint `{name}` mimics itself; expected another joint")
         factor = self.file.number(mimic.get("multiplier"), f"multiplier of joint `{name}`", 1.0)
-        return Follower(name, leader, factor, self.file.number(mimic.get("offset"), f"offset of joint `{name}`", 0.0))
+        return Follower(name, leader, (self.file.number(mimic.get("offset"), f"offset of joint `{name}`", 0.0), factor))
 
     def _origin(self, element: Element, what: str) -> tuple[Vector, Matrix]:
         origin = element.find("origin")

@@ -55,12 +55,30 @@ class XmlFile:
         if any("xacro" in str(element.tag) for element in self.root.iter()):
             raise self.fault("it has elements of xacro; let `xacro FILE > robot.urdf` write the URDF first")
         self._left_out: Counter[str] = Counter()
-        self._check(self.root, f"`{root_tag}`")
+        if "include" in table:
+            self._include(self.root, set())
+            check_depth(self.root, list, self.source)
+        self._check(self.root, f"`{root_tag}`", root_tag)
 
-    def _check(self, element: Element, what: str) -> None:
+    def _include(self, holder: Element, known: set[Path]) -> None:
+        """Put what other files hold in place of elements `include`; ValueError for a file that is included twice, or in itself."""
+        for k, child in reversed(list(enumerate(holder))):
+            if child.tag != "include":
+                self._include(child, known)
+                continue
+            path = self.folder / child.get("file", "")
+            if path in known:
+                raise self.fault(f"`{path.name}` is included twice; expected once")
+            known.add(path)
+            inner: Element = parsed(ElementTree.fromstring, read_bytes(path, LARGEST, "an included file"), str(path), "XML")
+            check_depth(inner, list, str(path))
+            self._include(inner, known)
+            holder[k : k + 1] = list(inner)
+
+    def _check(self, element: Element, what: str, kind: str) -> None:
         """A ValueError for anything in an element that the table does not have, unless it is to be ignored; `what`: the element, in words."""
-        holds = self.table[element.tag]
-        self.check_attributes(element.tag, element.attrib, what)
+        holds = self.table[kind]
+        self.check_attributes(kind, element.attrib, what)
         self.check_text(element, what)
         counts = Counter(child.tag for child in element)
         if twice := next((tag for tag in holds.one.split() if counts[tag] > 1), None):
@@ -69,7 +87,8 @@ class XmlFile:
         for child in element:
             tag, name = str(child.tag).rpartition("}")[2], child.get("name")
             if child.tag in holds.one.split() + holds.many.split():
-                self._check(child, f"{tag} `{name}`" if name and tag in holds.many.split() else f"`{tag}`{where}")
+                inner = f"{kind}/{tag}" if f"{kind}/{tag}" in self.table else tag
+                self._check(child, f"{tag} `{name}`" if name and tag in holds.many.split() else f"`{tag}`{where}", inner)
             elif child.tag in holds.listed.split():
                 self.leave_out(child.tag)
             elif child.tag not in holds.idle.split():

@@ -7,10 +7,11 @@ import numpy as np
 from jourdain_jax.bicycle.job import Study
 from jourdain_jax.plotting.animation import animate
 from jourdain_jax.plotting.backend import pyplot
+from jourdain_jax.plotting.quantities import plot
 
 # columns of the eigenvalues; weave is a pair, two real ones below the double root
 _MODES = (("castering", (0,), "tab:green"), ("capsize", (1,), "tab:orange"), ("weave", (2, 3), "tab:blue"))
-_FLOOR, _CEILING = -12.0, 12.0  # 1/s; castering goes far below what matters
+_CEILING = 12.0  # 1/s; castering goes far below what matters
 
 
 def draw_eigenvalues(study: Study, path: str | os.PathLike) -> None:
@@ -25,7 +26,7 @@ def draw_eigenvalues(study: Study, path: str | os.PathLike) -> None:
     _band(imaginary, study.grid, np.abs(weave), np.abs(samples[:, :, 2].imag), "tab:blue", "weave")
     _mark_range(study, (real, imaginary))
     real.axhline(0.0, color="0.3", lw=0.8)
-    real.set_ylim(_FLOOR, _CEILING)
+    real.set_ylim(-_CEILING, _CEILING)
     real.set_ylabel("real part in 1/s")
     imaginary.set_ylabel("imaginary part in rad/s")
     imaginary.set_ylim(bottom=0.0)
@@ -73,27 +74,21 @@ def _value(study: Study, name: str, part: str = "value") -> float | None:
 
 def draw_rides(study: Study, path: str | os.PathLike) -> None:
     """Lean and steer against time for the three rides."""
-    plt = pyplot()
-    figure, (lean, steer) = plt.subplots(2, 1, sharex=True, figsize=(7.5, 5.5), layout="constrained")
     rides = study.rides
-    for i, (label, speed) in enumerate(zip(rides.labels, rides.speeds, strict=True)):
-        lane = rides.lanes.lane(i)
-        t = np.asarray(lane.ts)
-        for axis, name in ((lean, "lean"), (steer, "steer")):
-            axis.plot(t, np.degrees(np.asarray(lane[name])), lw=1.6, label=f"{speed:.2f} m/s, {label}")
+    lanes = [rides.lanes.lane(i) for i in range(len(rides.labels))]
+    labels = [f"{speed:.2f} m/s, {label}" for label, speed in zip(rides.labels, rides.speeds, strict=True)]
+    title = f"{study.bicycle.name}: hands-free after a kick in lean rate"
+    figure, panels = pyplot().subplots(2, 1, sharex=True, figsize=(7.5, 5.5), layout="constrained")
+    plot(lanes, "lean", "steer", units={"lean": "deg", "steer": "deg"}, labels=labels, title=title, axes=panels)
+    for panel, name in zip(panels, ("lean", "steer"), strict=True):
+        panel.set_ylabel(f"{name} to the right in degrees")
+    for lane in lanes:
         if np.isnan(np.asarray(lane["lean"])[-1]):
             end = float(lane.t_end), np.degrees(float(lane.q_end[3]))
-            lean.plot(*end, "kx")
-            lean.annotate(lane.event_names[int(lane.event)], end, xytext=(6, -4), textcoords="offset points", fontsize=9)
-    lean.set_ylabel("lean to the right in degrees")
-    steer.set_ylabel("steer to the right in degrees")
-    steer.set_xlabel("t in s")
-    lean.set_title(f"{study.bicycle.name}: hands-free after a kick in lean rate", fontsize=11)
-    lean.legend(fontsize=9)
-    for axis in (lean, steer):
-        axis.grid(alpha=0.3)
+            panels[0].plot(*end, "kx")
+            panels[0].annotate(lane.event_names[int(lane.event)], end, xytext=(6, -4), textcoords="offset points", fontsize=9)
     figure.savefig(path, dpi=150)
-    plt.close(figure)
+    pyplot().close(figure)
 
 
 def animate_ride(study: Study, path: str | os.PathLike) -> None:

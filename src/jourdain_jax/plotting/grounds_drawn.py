@@ -14,7 +14,6 @@ from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere
 from jourdain_jax.scene.validated import contacts_of
 
 _CELLS = 48  # of a mesh, along each of its two parameters
-_NEWTON = 12  # steps from the height of the bodies to a surface f(x, y, z) = 0
 
 
 def grounds_of(trajectory: Trajectory, drawn: Drawn, low: np.ndarray, high: np.ndarray) -> list[dict]:
@@ -91,7 +90,8 @@ def _surface(trajectory: Trajectory, drawn: Drawn, name: str, contact: Contact, 
 
         def height(x, y):
             z = jnp.asarray(from_height)
-            for _ in range(_NEWTON):
+            # steps from the height of the bodies to a surface f(x, y, z) = 0
+            for _ in range(12):
                 value, slope = jax.value_and_grad(lambda z: ground.value(jnp.stack([x, y, z])))(z)
                 z = z - value / slope
             left = ground.value(jnp.stack([x, y, z]))

@@ -13,7 +13,6 @@ from jourdain_jax.scene.contact_points import Ball, Ellipsoid, Shape, Wheel
 from jourdain_jax.scene.visuals import Visual
 
 _ROUND = 1e-6  # of a body's size: a difference of lengths that counts as none
-_PLATE = 0.01  # thickness of a plate, of its size
 
 
 def guessed(body: RigidBody | Particle, shapes: list[Shape], dot: float) -> list[Visual]:
@@ -38,7 +37,8 @@ def _of_outline(points: np.ndarray) -> list[Visual]:
     if rank == 3 and lengths.min() > _ROUND * size:
         return [_hull(points)]
     if rank == 2 and np.linalg.norm(points[-1] - points[0]) < _ROUND * size and lengths.min() > _ROUND * size:
-        return [_plate(points[:-1], 0.5 * _PLATE * size)]
+        # thickness of a plate, of its size
+        return [_plate(points[:-1], 0.5 * 0.01 * size)]
     kept = [points[0], *(b for a, b in pairwise(points) if np.linalg.norm(b - a) > _ROUND * size)]
     return [Visual.line(*kept)]
 

@@ -21,8 +21,6 @@ from jourdain_jax.scene.visuals import Visual
 
 PALETTE = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf")
 PLAIN = "#8a8a86"  # of what belongs to no body
-_THIN = 0.011  # radius of a line, of the size of what is drawn
-_DOT = 0.02  # radius of a particle, of the size of what is drawn
 
 
 @dataclass(frozen=True)
@@ -33,7 +31,7 @@ class Look:
     positions: np.ndarray  # (times, 3), m
     orientations: np.ndarray  # (times, 3, 3)
     points: np.ndarray  # (times, points, 3), m: of a line; (times, 0, 3) of others
-    radius: float  # m, of a line
+    radius: float  # m, of a line; 0: thin
 
 
 @dataclass(frozen=True)
@@ -47,6 +45,12 @@ class DrawnBody:
     angular_velocities: np.ndarray  # (times, 3), rad/s, inertial frame
     looks: list[Look]
 
+    def extents(self) -> np.ndarray:
+        """Points (times, points, 3) in space, m, whose box holds the body."""
+        corners = np.concatenate([_corners_of(look.visual) for look in self.looks])
+        local = np.concatenate([np.broadcast_to(corners, (len(self.positions), *corners.shape)), *(look.points for look in self.looks)], axis=1)
+        return np.einsum("tij,tpj->tpi", self.orientations, local) + self.positions[:, None]
+
 
 @dataclass(frozen=True)
 class Drawn:
@@ -56,8 +60,17 @@ class Drawn:
     reached: np.ndarray  # their numbers among all saved times
     bodies: dict[str, DrawnBody]
     contacts: dict[str, Contact]  # leading axis: times
-    size: float  # m: the longest side of the box that holds all bodies at the first time
     sized: bool  # whether any body has a size of its own; particles are drawn as large as the picture asks
+
+    @property
+    def size(self) -> float:
+        """The longest side of the box that holds all bodies at the first time, m."""
+        return float(max(np.ptp(np.concatenate([body.extents()[0] for body in self.bodies.values()]), axis=0).max(), 1e-3))
+
+    @property
+    def thin(self) -> float:
+        """Radius of a line that has none, m."""
+        return 0.011 * self.size
 
 
 def looks_of(trajectory: Trajectory, what: str = "draw", most: int | None = None) -> Drawn:
@@ -81,38 +94,37 @@ def _drawn(ts: np.ndarray, reached: np.ndarray, seen) -> Drawn:
     paths = np.concatenate([np.asarray(body.position) for body in bodies.values()])
     first = {name: _at(body, 0) for name, body in bodies.items()}
     # a particle that moves far is small in the picture: what has no size is measured by the whole motion, if there is nothing else
-    dot = _DOT * max(float(np.ptp(paths, axis=0).max()), 1e-3)
+    # radius of a particle, of the size of what is drawn
+    dot = 0.02 * max(float(np.ptp(paths, axis=0).max()), 1e-3)
     stated = {name: list(looks) for name, looks in visuals.items()}
     sized = any(isinstance(body, RigidBody) or name in stated for name, body in first.items())
     for name, body in first.items():
         if name not in stated:
             shapes = [_at(contact.shape, 0) for contact in contacts.values() if contact.body == name and contact.shape is not None]
             stated[name] = [_same_at_all(look, len(reached)) for look in guessed(body, shapes, dot)]
-    size = _size(first, {name: [_at(look, 0) for look in looks] for name, looks in stated.items()})
     drawn = {}
     for k, (name, body) in enumerate(bodies.items()):
         turned = np.asarray(body.orientation) if isinstance(body, RigidBody) else np.broadcast_to(np.eye(3), (len(reached), 3, 3))
-        drawn[name] = DrawnBody(name, PALETTE[k % len(PALETTE)], np.asarray(body.position), turned, velocities[name], [_look(v, size) for v in stated[name]])
+        drawn[name] = DrawnBody(name, PALETTE[k % len(PALETTE)], np.asarray(body.position), turned, velocities[name], [_look(v) for v in stated[name]])
     if stated.get(""):
         still = np.zeros((len(reached), 3))
-        drawn[""] = DrawnBody("", PLAIN, still, np.broadcast_to(np.eye(3), (len(reached), 3, 3)), still, [_look(v, size) for v in stated[""]])
-    return Drawn(ts, reached, drawn, contacts, size, sized)
+        drawn[""] = DrawnBody("", PLAIN, still, np.broadcast_to(np.eye(3), (len(reached), 3, 3)), still, [_look(v) for v in stated[""]])
+    return Drawn(ts, reached, drawn, contacts, sized)
 
 
 def _seen(scene, t, q, u, inputs):
     motion = motion_at(scene, t, q, u, inputs)
     pose = motion.pose()
-    contacts = {name: _closed_form(contact) for name, contact in contacts_of(scene, pose).items()}
+    contacts = dict(contacts_of(scene, pose))
+    for name, contact in contacts.items():
+        if isinstance(contact.ground, Surface | HeightMap):
+            contacts[name] = eqx.tree_at(lambda c: c.ground, contact, Curved())
     bodies = {name: found.body for name, found in motion.bodies.items()}
     return bodies, {name: found.angular_velocity for name, found in motion.bodies.items()}, visuals_of(scene, pose), contacts
 
 
 class Curved(eqx.Module):
     """Stands for a ground that a function describes, which knows one instant alone: the scene is asked anew where the ground is drawn."""
-
-
-def _closed_form(contact: Contact) -> Contact:
-    return eqx.tree_at(lambda c: c.ground, contact, Curved()) if isinstance(contact.ground, Surface | HeightMap) else contact
 
 
 def _at(tree, index):
@@ -123,19 +135,18 @@ def _same_at_all(visual: Visual, times: int) -> Visual:
     return jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), (times, *np.shape(x))), visual)
 
 
-def _look(visual: Visual, size: float) -> Look:
+def _look(visual: Visual) -> Look:
     """A shape with a leading axis of times."""
     first = _at(visual, 0)
     points = np.asarray(visual.size) if visual.kind == "line" else np.zeros((len(visual.position), 0, 3))
-    radius = 0.0 if visual.kind != "line" else _THIN * size if first.radius is None else float(first.radius)
-    return Look(first, np.asarray(visual.position), np.asarray(visual.orientation), points, radius)
+    return Look(first, np.asarray(visual.position), np.asarray(visual.orientation), points, 0.0 if first.radius is None else float(first.radius))
 
 
-def corners_of(visual: Visual) -> np.ndarray:
-    """Points (points, 3) in the frame of its body, m, whose box holds the shape."""
+def _corners_of(visual: Visual) -> np.ndarray:
+    """Points (points, 3) in the frame of its body, m, whose box holds the shape at the first time; of a line none."""
     size = np.asarray(visual.size)
     if visual.kind == "line":
-        return size
+        return np.zeros((0, 3))
     if visual.kind == "mesh":
         own = visual.faces.corners * size  # type: ignore[union-attr]
     else:
@@ -144,13 +155,3 @@ def corners_of(visual: Visual) -> np.ndarray:
             half = np.array([size[0], size[0], size[1] / 2 + (size[0] if visual.kind == "capsule" else 0.0)])
         own = half * np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     return own @ np.asarray(visual.orientation).T + np.asarray(visual.position)
-
-
-def _size(bodies: dict, looks: dict[str, list[Visual]]) -> float:
-    points = []
-    for name, shapes in looks.items():
-        body = bodies.get(name)
-        turned = np.asarray(body.orientation) if isinstance(body, RigidBody) else np.eye(3)
-        place = np.zeros(3) if body is None else np.asarray(body.position)
-        points += [corners_of(shape) @ turned.T + place for shape in shapes]
-    return float(max(np.ptp(np.concatenate(points), axis=0).max(), 1e-3))

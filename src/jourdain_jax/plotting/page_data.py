@@ -1,5 +1,6 @@
 """Motions as data for the page that shows them: a description in JSON, and one run of 32-bit floats that it points into."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -7,12 +8,22 @@ import numpy as np
 from jourdain_jax.calculus.rotations import matrices_to_quaternions
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.grounds_drawn import grounds_of
-from jourdain_jax.plotting.looks import Drawn, DrawnBody, Look, corners_of, looks_of
+from jourdain_jax.plotting.looks import Drawn, DrawnBody, Look, looks_of
 from jourdain_jax.plotting.solids import triangles_of
 
-_LONG = 5.0  # the whole motion is so many times as long as its bodies: the view follows them
-_ARROW = 0.4  # length of the longest arrow, of the bodies
-_USUAL = 0.9  # part of the forces that are usual: arrows show up to twice as much in proportion
+
+@dataclass(frozen=True)
+class Display:
+    """How `show` shows motions."""
+
+    title: str
+    follow: bool | None = None
+    paths: Sequence | None = None
+    forces: bool = True
+    colours: Mapping[str, str] = field(default_factory=dict)
+    view: Sequence = (22.0, -60.0)
+    height: int = 480
+    play: bool = False
 
 
 @dataclass
@@ -34,27 +45,28 @@ class Numbers:
         return np.concatenate(self.parts).astype("<f4").tobytes()
 
 
-def page_data(motions: list[Trajectory], title: str, options: dict) -> tuple[dict, Numbers]:
+def page_data(motions: list[Trajectory], display: Display) -> tuple[dict, Numbers]:
     """The description of the page, and its numbers."""
     drawn = [looks_of(motion, "show", 1000) for motion in motions]
     numbers, first = Numbers(), drawn[0]
     near, far = _near(drawn), _far(drawn)
     size, reach = (float(np.max(high - low)) for low, high in (near, far))
     colours = {name: body.colour for one in drawn for name, body in one.bodies.items() if name}
-    follow = first.sized and reach > _LONG * size and not _at_rest(first) if options["follow"] is None else options["follow"]
+    # by itself, where the whole motion is five times as long as its bodies
+    follow = first.sized and reach > 5 * size and not _at_rest(first) if display.follow is None else display.follow
     shown = size if follow else max(size, reach / 3)
-    arrows, longest = _arrows(motions, drawn, shown) if options["forces"] else ([[] for _ in drawn], "")
+    arrows, longest = _arrows(motions, drawn, shown) if display.forces else ([[] for _ in drawn], "")
     tile = _round_number(shown / 4)
     grounds = grounds_of(motions[0], first, *far)
     squares = f"squares of the ground: {tile:g} m" if any(ground["kind"] == "plane" for ground in grounds) else ""
     notes = [squares, longest]
     parts = zip(motions, drawn, arrows, strict=True)
     page = {
-        "title": title,
-        "names": [{"name": name, "colour": options["colours"].get(name, colour)} for name, colour in colours.items()],
+        "title": display.title,
+        "names": [{"name": name, "colour": display.colours.get(name, colour)} for name, colour in colours.items()],
         "note": "; ".join(note for note in notes if note),
         "span": [float(first.ts[0]), float(first.ts[-1])],
-        "motions": [_motion(numbers, motion, one, own, options) for motion, one, own in parts],
+        "motions": [_motion(numbers, motion, one, own, display) for motion, one, own in parts],
         "grounds": [_ground(numbers, ground) for ground in grounds],
         "size": size,
         "reach": reach,
@@ -64,15 +76,15 @@ def page_data(motions: list[Trajectory], title: str, options: dict) -> tuple[dic
         "tile": tile,
         "thickness": 0.018 * shown,
         "follow": bool(follow),
-        "view": list(options["view"]),
-        "play": bool(options["play"]),
+        "view": np.asarray(display.view, float).tolist(),
+        "play": bool(display.play),
     }
     return page, numbers
 
 
-def _motion(numbers: Numbers, motion: Trajectory, drawn: Drawn, arrows: list, options: dict) -> dict:
-    colour = {name: options["colours"].get(name, body.colour) for name, body in drawn.bodies.items()}
-    ends = options["paths"]
+def _motion(numbers: Numbers, motion: Trajectory, drawn: Drawn, arrows: list, display: Display) -> dict:
+    colour = {name: display.colours.get(name, body.colour) for name, body in drawn.bodies.items()}
+    ends = display.paths
     if ends is not None:
         paths = [(colour[name], np.asarray(motion.point(name, local))[drawn.reached]) for name, local in ends]
     elif drawn.contacts:
@@ -81,29 +93,29 @@ def _motion(numbers: Numbers, motion: Trajectory, drawn: Drawn, arrows: list, op
         paths = [(colour[name], body.positions) for name, body in drawn.bodies.items() if _moves(body)]
     return {
         "ts": numbers.add(drawn.ts),
-        "bodies": [_body(numbers, body, drawn.ts, colour[name]) for name, body in drawn.bodies.items()],
+        "bodies": [_body(numbers, body, drawn, colour[name]) for name, body in drawn.bodies.items()],
         "paths": [{"colour": colour, "points": numbers.add(points)} for colour, points in paths],
         "forces": [{"name": name, "points": numbers.add(points), "vectors": numbers.add(vectors)} for name, points, vectors in arrows],
     }
 
 
-def _body(numbers: Numbers, body: DrawnBody, ts, colour: str) -> dict:
+def _body(numbers: Numbers, body: DrawnBody, drawn: Drawn, colour: str) -> dict:
     quaternions = quaternions_of(body.orientations)
     return {
         "name": body.name,
         "moves": bool(body.name) and _moves(body),
         "p": numbers.add(_still(body.positions)),
         "q": numbers.add(_still(quaternions)),
-        "turns": numbers.add(_whole_turns(quaternions, body.angular_velocities, ts)),
-        "shapes": [_shape(numbers, look, colour) for look in body.looks],
+        "turns": numbers.add(_whole_turns(quaternions, body.angular_velocities, drawn.ts)),
+        "shapes": [_shape(numbers, look, colour, drawn.thin) for look in body.looks],
     }
 
 
-def _shape(numbers: Numbers, look: Look, colour: str) -> dict:
+def _shape(numbers: Numbers, look: Look, colour: str, thin: float) -> dict:
     visual = look.visual
     shape = {"kind": visual.kind, "colour": visual.colour or colour, "opacity": visual.opacity, "size": np.asarray(visual.size).ravel().tolist()}
     if visual.kind == "line":
-        return shape | {"size": [], "count": look.points.shape[1], "points": numbers.add(_still(look.points)), "radius": look.radius}
+        return shape | {"size": [], "count": look.points.shape[1], "points": numbers.add(_still(look.points)), "radius": look.radius or thin}
     quaternions = quaternions_of(look.orientations)
     shape |= {"p": numbers.add(_still(look.positions)), "q": numbers.add(_still(quaternions)), "turns": [0]}
     return shape | ({"mesh": numbers.add(np.asarray(visual.size) * triangles_of(visual)[:, :3])} if visual.kind == "mesh" else {})
@@ -152,18 +164,9 @@ def _moves(body: DrawnBody) -> bool:
     return len(_still(body.positions)) > 1
 
 
-def _extents(body: DrawnBody) -> np.ndarray:
-    """Corners (times, points, 3) of a body in space, m."""
-    times = len(body.positions)
-    corners = [np.broadcast_to(corners_of(look.visual), (times, len(corners_of(look.visual)), 3)) for look in body.looks if look.visual.kind != "line"]
-    corners += [look.points for look in body.looks if look.visual.kind == "line"]
-    local = np.concatenate(corners, axis=1)
-    return np.einsum("tij,tpj->tpi", body.orientations, local) + body.positions[:, None]
-
-
 def _far(drawn: list[Drawn]) -> np.ndarray:
     """The lowest and the highest corner (2, 3), m, of the box that holds all bodies at all times."""
-    points = np.concatenate([_extents(body).reshape(-1, 3) for one in drawn for body in one.bodies.values()])
+    points = np.concatenate([body.extents().reshape(-1, 3) for one in drawn for body in one.bodies.values()])
     return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
@@ -173,7 +176,7 @@ def _near(drawn: list[Drawn]) -> np.ndarray:
     for one in drawn:
         moving = [body for name, body in one.bodies.items() if name and _moves(body)]
         middle = np.mean([body.positions for body in moving], axis=0) if moving else np.zeros((len(one.ts), 3))
-        points = np.concatenate([_extents(body) for body in moving or one.bodies.values()], axis=1) - middle[:, None]
+        points = np.concatenate([body.extents() for body in moving or one.bodies.values()], axis=1) - middle[:, None]
         lows.append(points.min(axis=(0, 1)))
         highs.append(points.max(axis=(0, 1)))
     return np.stack([np.min(lows, axis=0), np.max(highs, axis=0)])
@@ -199,12 +202,12 @@ def _arrows(motions: list[Trajectory], drawn: list[Drawn], size: float) -> tuple
     strongest = float(sizes.max())
     if strongest == 0.0:
         return [[(name, points, 0.0 * vectors) for name, points, vectors in own] for own in found], ""
-    usual = 2.0 * float(np.quantile(sizes[1:], _USUAL))
+    usual = 2.0 * float(np.quantile(sizes[1:], 0.9))
     longest = strongest if usual == 0.0 or strongest < 2.0 * usual else usual
 
     def scaled(vectors: np.ndarray) -> np.ndarray:
         lengths = np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), longest)
-        return _ARROW * size * vectors / lengths
+        return 0.4 * size * vectors / lengths
 
     told = f"longest arrow: {longest:.3g} N" + (f" and more, up to {strongest:.3g} N" if longest < strongest else "")
     return [[(name, points, scaled(vectors)) for name, points, vectors in own] for own in found], told

@@ -7,10 +7,11 @@ import numpy as np
 
 from jourdain_jax.analysis.families.family import Family
 from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.writing import check_place
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.plotting.backend import check_folder, pyplot
+from jourdain_jax.plotting.backend import pyplot
 from jourdain_jax.plotting.families_drawn import plot_family
 from jourdain_jax.plotting.units import checked_units
 from jourdain_jax.scene.arguments import of_known_numbers
@@ -23,7 +24,7 @@ _DARK, _PALE = 0.4, 0.2  # opacity of the narrowest band, and of the others
 def check_format(path: str | os.PathLike) -> None:
     """ValueError where matplotlib knows no picture with the suffix of this path."""
     known = pyplot().FigureCanvasBase.get_supported_filetypes()
-    check_folder(path)
+    check_place(path)
     suffix = os.path.splitext(os.fspath(path))[1].removeprefix(".").lower()
     if suffix not in known:
         raise ValueError(f"cannot write `{path}`: a plot is a .png, .svg or .pdf file, and matplotlib knows no `{suffix or 'file without suffix'}`")
@@ -157,8 +158,8 @@ def _head(place, axis, title: str | None, columns: int) -> None:
     handles, labels = axis.get_legend_handles_labels()
     shown = [(handle, label) for handle, label in zip(handles, labels, strict=True) if label]
     if shown:
-        where = {"loc": "best"} if place is axis else {"loc": "outside upper left"}
-        place.legend(*zip(*shown, strict=True), fontsize="small", ncols=min(columns if columns > 1 else len(shown), 4), **where)
+        row = {"loc": "outside upper left", "ncols": min(columns if columns > 1 else len(shown), 4)}
+        place.legend(*zip(*shown, strict=True), fontsize="small", **({"loc": "best"} if place is axis else row))
 
 
 def _values(motion: Trajectory | Rollout, name: str, bands: Sequence[float]) -> np.ndarray:

@@ -1,7 +1,6 @@
 """A drawing of a scene at its example start: what a notebook shows beside its parameters."""
 
 from jourdain_jax.calculus.figures import figure
-from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.start import start
 from jourdain_jax.plotting.looks import looks_at
 from jourdain_jax.plotting.space import axes_in_space, box_of, draw, painted
@@ -13,10 +12,8 @@ def scene_picture(scene) -> str:
 
     A scene that cannot be started has no picture: a notebook displays what is still being written, and `jj.start` says what is wrong.
     """
-    if is_traced(scene):
-        return ""
     try:
         bodies = painted(looks_at(scene, start(scene, **scene.example)), 0)
-    except Exception:  # whatever the user's methods raise
+    except Exception:  # whatever the user's methods raise, and that numbers are not known
         return ""
     return figure(lambda whole: draw(axes_in_space(whole, VIEWS["space"]), bodies, [], box_of(bodies[:1])), 300, 200)

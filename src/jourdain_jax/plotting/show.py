@@ -5,21 +5,18 @@ import html
 import json
 import os
 import zlib
-from collections.abc import Mapping, Sequence
-from functools import cache
 from importlib import resources
+from typing import Any
 
 import numpy as np
 
 from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.writing import check_place
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.plotting.backend import check_folder
-from jourdain_jax.plotting.page_data import page_data
+from jourdain_jax.plotting.page_data import Display, page_data
 from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.names import nearest
-
-LANES = 12  # of a rollout, at most
 
 
 class View:
@@ -43,28 +40,17 @@ class View:
 
 
 @of_known_numbers
-def show(
-    motion,
-    path: str | os.PathLike | None = None,
-    *,
-    title: str | None = None,
-    follow: bool | None = None,
-    paths: Sequence | None = None,
-    forces: bool = True,
-    colours: Mapping[str, str] | None = None,
-    view: Sequence = (22.0, -60.0),
-    height: int = 480,
-    play: bool = False,
-) -> View:
+def show(motion, path: str | os.PathLike | None = None, **how: Any) -> View:
     """A 3D view of a `motion` to turn, zoom, play and scrub, in a notebook or any browser.
 
     - `motion`: from `jj.simulate`; or several in a list, or the lanes of a rollout (at most 12, evenly chosen), drawn one over the other, all but the first
       translucent.
     - `path`: a file (.html) to write as well: it holds all it needs. `ride.html#t=2.5` opens at 2.5 s.
-    - `title`: default: the name of the scene. `height`: of the view in a notebook, in pixels. `play`: whether it plays when it opens.
-    - `follow`: the view moves with the bodies (default: where they go far). `view`: elevation and azimuth it starts from, in degrees.
+    - `how`, by name: `title`: default: the name of the scene. `height`: of the view in a notebook, in pixels (480).
+    - `play`: whether it plays when it opens.
+    - `follow`: the view moves with the bodies (default: where they go far). `view`: elevation and azimuth it starts from, in degrees (default: (22, -60)).
     - `paths`: (body, body-frame point in m) pairs to trace (default: contact points, or mass centres where there is no contact).
-    - `forces`: arrows of the contact forces. `colours`: name of a body -> "#rrggbb".
+    - `forces`: arrows of the contact forces (default: they are drawn). `colours`: name of a body -> "#rrggbb".
 
     What bodies look like, a scene says in `visuals`, see `jj.Visual`; otherwise it is guessed. Returns a `View`. ValueError for what cannot be shown.
 
@@ -76,17 +62,15 @@ def show(
     if path is not None:
         _check_suffix(path)
     motions = _motions(motion)
+    display = Display(**{"title": type(motions[0].scene).__name__} | {name: value for name, value in how.items() if value is not None})
     names = list(dict.fromkeys(name for one in motions for name in one.motions().bodies))
-    for name in colours or {}:
+    for name in display.colours:
         if name not in names:
             raise ValueError(f"`colours` names `{name}`, which is no body; {nearest(name, names)}")
-    angles = np.asarray(view, float)
-    if angles.shape != (2,):
-        raise ValueError(f"`view` is {view!r}, expected elevation and azimuth in degrees, such as (22, -60)")
-    title = type(motions[0].scene).__name__ if title is None else title
-    options = {"follow": follow, "paths": paths, "forces": forces, "colours": dict(colours or {}), "view": angles.tolist(), "play": play}
-    description, numbers = page_data(motions, title, options)
-    shown = View(_page(title, description, numbers.bytes()), title, height)
+    if np.shape(display.view) != (2,):
+        raise ValueError(f"`view` is {display.view!r}, expected elevation and azimuth in degrees, such as (22, -60)")
+    description, numbers = page_data(motions, display)
+    shown = View(_page(display.title, description, numbers.bytes()), display.title, display.height)
     if path is not None:
         shown.save(path)
     return shown
@@ -95,7 +79,7 @@ def show(
 def _motions(given) -> list[Trajectory]:
     """The single motions in what was given."""
     if isinstance(given, Rollout):
-        chosen = np.unique(np.linspace(0, len(given) - 1, min(LANES, len(given))).astype(int))
+        chosen = np.unique(np.linspace(0, len(given) - 1, min(12, len(given))).astype(int))
         lanes = [given.lane(int(k)) for k in chosen]
         return [lane for lane in lanes if bool(np.any(np.asarray(lane.valid)))] or lanes[:1]
     if isinstance(given, Trajectory) and given.q.ndim == 2:
@@ -110,7 +94,7 @@ def _page(title: str, description: dict, numbers: bytes) -> str:
         "TITLE": html.escape(title),
         "SCENE": json.dumps(description).replace("</", "<\\/"),
         "NUMBERS": _packed(numbers),
-        "THREE": _viewer(),
+        "THREE": _packed(_file("three.bundle.js").encode()),
         "PLAYER": _file("player.js"),
     }
     page = _file("page.html")
@@ -119,13 +103,8 @@ def _page(title: str, description: dict, numbers: bytes) -> str:
     return page
 
 
-@cache
-def _viewer() -> str:
-    return _packed(_file("three.bundle.js").encode())
-
-
 def _packed(content: bytes) -> str:
-    return base64.b64encode(zlib.compress(content, 9)).decode()
+    return base64.b64encode(zlib.compress(content)).decode()
 
 
 def _file(name: str) -> str:
@@ -135,4 +114,4 @@ def _file(name: str) -> str:
 def _check_suffix(path: str | os.PathLike) -> None:
     if not str(path).lower().endswith((".html", ".htm")):
         raise ValueError(f"cannot write `{os.fspath(path)}`: a 3D view is a .html file; for a .gif use `jj.animate`, for figures `jj.plot`")
-    check_folder(path)
+    check_place(path)

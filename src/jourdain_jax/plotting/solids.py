@@ -12,13 +12,16 @@ from jourdain_jax.scene.visuals import Visual
 Quads = Float[np.ndarray, "faces 4 3"]  # m; corners anticlockwise, seen from outside
 
 
-def faces_of(look: Look, k: int) -> tuple[Quads, Float[np.ndarray, "faces"]]:
-    """Faces of a shape at the time with number `k` in its own axes (a line: in those of its body), and how dark each is painted, 0 to 1."""
+def faces_of(look: Look, k: int, thin: float) -> tuple[Quads, Float[np.ndarray, "faces"]]:
+    """Faces of a shape at the time with number `k` in its own axes (a line: in those of its body), and how dark each is painted, 0 to 1.
+
+    `thin`: radius of a line that has none, m.
+    """
     visual, size = look.visual, np.asarray(look.visual.size)
     dark = None
     if visual.kind == "line":
         points = look.points[k]
-        found = np.concatenate([_bar(a, b, look.radius) for a, b in pairwise(points) if np.any(a != b)] or [np.zeros((0, 4, 3))])
+        found = np.concatenate([_bar(a, b, look.radius or thin) for a, b in pairwise(points) if np.any(a != b)] or [np.zeros((0, 4, 3))])
     elif visual.kind == "ellipsoid":  # its octants are painted in turn, so that one sees it roll
         found = size * quads(revolved(_arc(np.pi, 13), 24))
         dark = np.kron(0.35 * np.eye(2)[[0, 1, 0, 1]].T, np.ones((6, 6))).ravel()

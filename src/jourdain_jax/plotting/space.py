@@ -17,11 +17,11 @@ _INK = "#444444"  # of paths
 
 def painted(drawn: Drawn, k: int, strength: float = 1.0) -> Painted:
     """All bodies at the time with number `k`; `strength` below 1: paler."""
-    corners, colours = [], []
+    corners, colours, size = [], [], drawn.size
     for body in drawn.bodies.values():
         for look in body.looks:
-            own, dark = faces_of(look, k)
-            own, whose = split(own, drawn.size / 12)
+            own, dark = faces_of(look, k, drawn.thin)
+            own, whose = split(own, size / 12)
             if look.visual.kind != "line":
                 own = own @ look.orientations[k].T + look.positions[k]
             own = own @ body.orientations[k].T + body.positions[k]

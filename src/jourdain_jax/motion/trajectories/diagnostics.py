@@ -1,7 +1,5 @@
 """Numbers by which a motion can be trusted: drifts, residuals, conditioning, contact forces, and their printed summary."""
 
-import html
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -81,10 +79,7 @@ def diagnose(trajectory: Record) -> Diagnostics:
     return _diagnosed(trajectory, map_over_times(checks, trajectory, by_inputs=True))
 
 
-COARSE = 1e-3  # of a step: a clock that resolves less rounds times visibly
-VIOLATED = 1e-4  # residual of a row, relative to the state
 DRIFTED = 1e-2  # of the energy that moves
-_ROUND_OFF = 1e-6  # of the whole energy: where less than that moves, as at rest, nothing is said of its drift
 
 
 @eager_if_concrete
@@ -95,7 +90,8 @@ def _diagnosed(trajectory: Record, found: Checked) -> Diagnostics:
     return Diagnostics(
         energy_drift=_span(energy.balance),
         energy_kind=energy.kind + (", which the work changes that was left out" if _lacks_work(trajectory) else ""),
-        energy_size=jnp.nanmax(energy.kinetic) + _span(energy.potential) + _ROUND_OFF * jnp.nanmax(jnp.abs(energy.balance)),
+        # of the whole energy: where less than that moves, as at rest, nothing is said of its drift
+        energy_size=jnp.nanmax(energy.kinetic) + _span(energy.potential) + 1e-6 * jnp.nanmax(jnp.abs(energy.balance)),
         position_residual=_largest(geometric),
         velocity_residual=_largest(rows),
         smallest_singular_value=jnp.nanmin(jnp.where(reached, found.smallest_singular_value, jnp.nan)),
@@ -139,7 +135,8 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
     elif smallest < np.sqrt(jnp.finfo(trajectory.q.dtype).eps):
         warned.append(f"rows come within {smallest:.1e} of a loss of rank: digits are lost there")
     for kind, residual, state in (("geometric", found.position_residual, trajectory.q), ("velocity", found.velocity_residual, trajectory.u)):
-        if float(residual) > VIOLATED * (1.0 + float(_largest(state))):
+        # residual of a row, relative to the state
+        if float(residual) > 1e-4 * (1.0 + float(_largest(state))):
             warned.append(
                 f"{kind} rows are violated by up to {float(residual):.1e}: take projection or smaller tolerances, or look for rows that contradict each other"
             )
@@ -159,7 +156,8 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
     ts, steps = np.asarray(trajectory.ts), max(int(trajectory.accepted), 1)
     resolved, step = float(np.spacing(np.max(np.abs(ts)))), abs(float(trajectory.t_end) - float(ts[0])) / steps
     by_clock = not trajectory.inputs.constant or bool(structure_of(trajectory.scene).timed)
-    if by_clock and resolved > COARSE * step > 0:
+    # of a step: a clock that resolves less rounds times visibly
+    if by_clock and resolved > 1e-3 * step > 0:
         warned.append(
             f"the clock resolves {resolved:.0e} s at these times, and steps are of {step:.0e} s: loads, poses and inputs that depend on time are given "
             "rounded times; count time from zero, or take float64"
@@ -173,8 +171,8 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
     return (*warned, *(f"contact `{name}` would have to pull: a real one lifts off" for name in pulled))
 
 
-def summary_rows(trajectory: Record, message: str) -> list[tuple[str, str]]:
-    """The summary as pairs of heading and text."""
+def summary(trajectory: Record, message: str) -> str:
+    """A printed summary: steps, drift, residuals, contacts, result."""
     found = diagnose(trajectory)
     ts = np.asarray(trajectory.ts)
     reached = int(np.sum(np.isfinite(np.asarray(trajectory.q)).all(axis=-1)))
@@ -200,7 +198,9 @@ def summary_rows(trajectory: Record, message: str) -> list[tuple[str, str]]:
     ]
     rows += [(f"invariant {name}", f"drift {float(drift):.2e}") for name, drift in found.invariant_drifts.items() if several]
     rows += [(f"contact {name}", _contact_text(contact)) for name, contact in found.contacts.items()]
-    return rows + [("warning", text) for text in warnings_of(found, trajectory) if not text.startswith("contact")]
+    rows += [("warning", text) for text in warnings_of(found, trajectory) if not text.startswith("contact")]
+    width = max(len(name) for name, _ in rows)
+    return "\n".join([f"Trajectory of {type(trajectory.scene).__name__}", *(f"  {name:<{width}}  {text}" for name, text in rows)])
 
 
 def _left_domain(trajectory: Record) -> str:
@@ -236,18 +236,3 @@ def _contact_text(contact: ContactExtremes) -> str:
         return f"{text}; the tangential force is not determined by the rows (minimum norm)"
     hint = "" if contact.honest else "; if this contact does not hold up all bodies, name those that it does in `carried=`"
     return f"{text}; not determined by the rows (minimum norm){hint}"
-
-
-def summary(trajectory: Record, message: str) -> str:
-    """A printed summary: steps, drift, residuals, contacts, result."""
-    rows = [(f"Trajectory of {type(trajectory.scene).__name__}", ""), *summary_rows(trajectory, message)]
-    width = max(len(name) for name, _ in rows[1:])
-    return "\n".join([rows[0][0], *(f"  {name:<{width}}  {text}" for name, text in rows[1:])])
-
-
-def summary_html(trajectory: Record, message: str) -> str:
-    """The summary as an HTML table, for notebooks."""
-    left = "style='text-align:left'"
-    rows = summary_rows(trajectory, message)
-    body = "".join(f"<tr><th {left}>{html.escape(a)}</th><td {left}>{html.escape(b)}</td></tr>" for a, b in rows)
-    return f"<table><caption>Trajectory of {html.escape(type(trajectory.scene).__name__)}</caption>{body}</table>"

@@ -23,7 +23,7 @@ OF_LANES: dict[str, tuple[str, float, dict]] = {  # name: type, what stands for 
     "retries": ("int8", -1, {"long_name": "how it was run again", "flag_masks": [1, 2], "flag_meanings": "full_state implicit_solver"}),
     "end_time": ("float64", math.nan, {"long_name": "time at which the motion ended", "units": "s"}),
 }
-_FIELDS = {"result": "result", "event": "event", "steps": "accepted", "rejected_steps": "rejected", "retries": "fallback", "end_time": "t_end"}
+FIELDS = {"result": "result", "event": "event", "steps": "accepted", "rejected_steps": "rejected", "retries": "fallback", "end_time": "t_end"}
 
 
 def dataset(record: Record, units: Mapping[str, str] | None = None):
@@ -51,7 +51,7 @@ def dataset(record: Record, units: Mapping[str, str] | None = None):
         add(name, along, values, {"long_name": name} | ({"units": units[name]} if name in units else {}))
     for name, (dtype, _, about) in OF_LANES.items():
         more = {"event_names": list(record.event_names)} if name == "event" else {}
-        add(name, lanes, np.asarray(getattr(record, _FIELDS[name])).astype(dtype), about | more)
+        add(name, lanes, np.asarray(getattr(record, FIELDS[name])).astype(dtype), about | more)
     for name, value, about in parameters_of(record.scene):
         values = np.asarray(value)
         axes = tuple(f"{name}_{k}" for k in range(values.ndim - len(lanes)))

@@ -26,9 +26,6 @@ from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import invariants_of
 
-FEW_TIMES = 1000  # of one motion that is known: NumPy is done before a program is compiled (contact forces of a bicycle at 101 times: 1 s, not 7)
-MOST_ENTRIES = 4_000_000  # of square matrices of the coordinates, at once: of 200 trailers at 201 times the derivatives of all poses took more than 23 GB
-
 
 class Record(eqx.Module):
     """The numbers of a motion; NaN at times that were not reached."""
@@ -70,7 +67,8 @@ def map_over_times(f, record: Record, by_inputs: bool = False):
     `by_inputs`: f needs the rates of the inputs, where rows depend on some that change. Of a batch of motions: with its axes of lanes first.
     """
     by_inputs, known = by_inputs and _needs_rates(record), not is_traced((f, record))
-    if known and record.q.ndim == 2 and len(record.ts) <= FEW_TIMES:
+    # of one motion that is known: NumPy is done before a program is compiled (contact forces of a bicycle at 101 times: 1 s, not 7)
+    if known and record.q.ndim == 2 and len(record.ts) <= 1000:
         return _on_numpy(f, record, by_inputs)
     mapped = _compiled(record.inputs.programs)
     whole = jax.config.jax_debug_nans and known and bool(jnp.all(jnp.isfinite(record.q)))  # then NaN is no mark
@@ -102,7 +100,8 @@ def _at_one_time(f, record: Record, by_inputs: bool, t, q, u):
 
 def _largest_block(record: Record) -> int:
     """The number of times at which quantities are worked out together."""
-    return max(1, MOST_ENTRIES // record.q.shape[-1] ** 2)
+    # of square matrices of the coordinates, at once: of 200 trailers at 201 times the derivatives of all poses took more than 23 GB
+    return max(1, 4_000_000 // record.q.shape[-1] ** 2)
 
 
 @with_nan_as_a_mark

@@ -24,7 +24,7 @@ import numpy as np
 
 from jourdain_jax.calculus.reading import check_depth, parsed
 from jourdain_jax.calculus.reals import described
-from jourdain_jax.calculus.writing import write_whole
+from jourdain_jax.calculus.writing import check_place, write_whole
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.marks import with_nan_as_a_mark
@@ -39,7 +39,6 @@ from jourdain_jax.scene.scene import Scene
 
 _ARRAYS = tuple(name for name in AXES if name not in ("inputs", "work"))
 _NEEDS_NUMBERS = jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError
-MOST_DENSE = 1100  # bytes that a compressed one stands for, at most: deflate's longest match
 _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load_rollout(path, scene)"}
 
 
@@ -97,13 +96,7 @@ def _check_saved(motion, path) -> None:
                 f"field `{field.name}` of `{type(scene).__name__}` is {described(getattr(scene, field.name))}, which `save` cannot store; "
                 "expected arrays, numbers or texts, or the class's default"
             )
-    if not isinstance(path, str | os.PathLike):
-        raise ValueError(f"`path` is {described(path)}, expected the name of a file")
-    folder = os.path.dirname(path) or "."
-    if not os.path.isdir(folder):
-        raise ValueError(f"cannot write `{os.fspath(path)}`: there is no folder `{folder}`; make it first")
-    if os.path.isdir(path):
-        raise ValueError(f"cannot write `{os.fspath(path)}`: it is a folder; give the name of a file in it, such as motion.npz")
+    check_place(path)
 
 
 @with_nan_as_a_mark
@@ -246,7 +239,8 @@ def _unpacked(file) -> dict[str, np.ndarray]:
             name = member.filename.removesuffix(".npy")
             if name not in (*AXES, "header") and not name.startswith("parameter:"):
                 continue
-            if name in found or member.file_size > MOST_DENSE * member.compress_size + 1000:
+            # bytes that a compressed one stands for, at most: deflate's longest match
+            if name in found or member.file_size > 1100 * member.compress_size + 1000:
                 raise ValueError(f"`{name}` is there twice" if name in found else f"`{name}` claims {member.file_size} bytes")
             content = archive.read(member)
             head = io.BytesIO(content)

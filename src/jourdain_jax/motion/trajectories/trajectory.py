@@ -20,17 +20,17 @@ from jourdain_jax.motion.inputs import inputs_at
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.trajectories import labelled, over_times, results
-from jourdain_jax.motion.trajectories.diagnostics import Energies, diagnose, summary, summary_html, warnings_of
+from jourdain_jax.motion.trajectories.diagnostics import Energies, diagnose, summary, warnings_of
 from jourdain_jax.motion.trajectories.over_times import Record, map_over_times
 from jourdain_jax.motion.trajectories.sketch import sketch
 from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.parameters import parameter_faults
-from jourdain_jax.scene.printing import preformatted, shapes_of
+from jourdain_jax.scene.printing import Printed, preformatted
 
 
-class Trajectory(Record):
+class Trajectory(Record, Printed):
     """The motion of a scene. Times after an early end (event, failure) hold NaN.
 
     `t_end`, `q_end`, `u_end` are the last state that was reached, of a failed motion the one at which it failed, with derivatives of
@@ -122,21 +122,12 @@ class Trajectory(Record):
         """Coordinates and speeds as a `pandas.DataFrame`, one row for each time (s). ImportError without pandas."""
         return labelled.frame(self)
 
-    def __str__(self) -> str:
+    def _text(self) -> str:
         with nan_is_a_mark():
-            return summary(self, self.message) if self._is_known_motion else self._outline
+            return summary(self, self.message) if self.q.ndim == 2 else f"Trajectories of {type(self.scene).__name__}, lanes {self.q.shape[:-2]}"
 
     def _repr_html_(self) -> str:
-        return summary_html(self, self.message) + sketch(self) if self._is_known_motion else preformatted(self._outline)
-
-    @property
-    def _is_known_motion(self) -> bool:
-        return self.q.ndim == 2 and not is_traced(self)
-
-    @property
-    def _outline(self) -> str:
-        """What is shown of many motions, and of one whose numbers are not known."""
-        return shapes_of(self) if is_traced(self) else f"Trajectories of {type(self.scene).__name__}, lanes {self.q.shape[:-2]}"
+        return preformatted(str(self)) + ("" if self.q.ndim > 2 or is_traced(self) else sketch(self))
 
     @property
     @of_known_numbers
