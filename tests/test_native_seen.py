@@ -76,7 +76,7 @@ def test_derivatives_are_those_by_xla(name):
     program = lowered(scene)
     (q,), (y,) = _states(scene, program, 1)
     along = jax.tree.map(jnp.ones_like, scene), jnp.ones_like(q), jnp.ones_like(y)
-    assert seen._has_many_operations(program) == (name == "trailer-chain")
+    assert (program.graph.operations(program.z) >= 60) == (name == "trailer-chain")
     ours, theirs = (jax.jit(lambda *x, f=f: jax.jvp(f, x, along))(scene, q, y) for f in _by_both(scene, program))
     _same(ours, theirs, 1e-12)
 

@@ -62,7 +62,8 @@ def check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGra
     large = builder.graph.operations(rates_of(found)) > 5000
     # above so many operations, 6 of the probes are compared
     chosen = np.flatnonzero(usable)[:6] if large else np.arange(probes.count)
-    dense = dense_rates(scene, structure, independent, *jax.tree.map(lambda x: x[chosen], (parameters, t, q, u, inputs)))
+    states = parameters, t, q, u, inputs
+    dense = dense_rates(scene, structure, independent, *jax.tree.map(lambda x: x[chosen], states))
     expected, values = np.concatenate([dense.qdot, dense.ydot], axis=1).T, values[:, chosen]
     names = [*scene.coordinate_names.entries, *(scene.speed_names.entries[i] for i in independent)]
     usable = usable[chosen] & np.all(np.isfinite(expected), axis=0)
@@ -72,7 +73,7 @@ def check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGra
     limit = TO_DENSE[jnp.result_type(float).name]
     if np.max(error) > limit:
         worst = names[int(np.argmax(error))]
-        culprit = diagnose_mismatch(scene, builder.traced, probes, limit, parameters, t, q, u, inputs)
+        culprit = diagnose_mismatch(scene, builder.traced, probes, limit, states)
         raise NotLowered(f"the rate of `{worst}` {DIFFERS} by {np.max(error):.1e}: {culprit}")
     if found.events and not np.allclose(probes(found.events)[:, chosen][:, usable], dense.events.T[:, usable], rtol=limit, atol=limit, equal_nan=True):
         raise NotLowered(f"the value of a stop event {DIFFERS}")

@@ -48,7 +48,7 @@ def dense_rates(scene: Scene, structure: Structure, independent: tuple[int, ...]
     traced = _Traced(scene, structure.potentials_of_inputs)
     kept = list(structure.kept_rows)
     parts = range(0, len(t), max(1, LANES // max(1, u.shape[1])))
-    found = [_rates(traced, structure, kept, independent, *jax.tree.map(lambda x, i=i: x[i : i + parts.step], (parameters, t, q, u, inputs))) for i in parts]
+    found = [_rates(traced, structure, kept, independent, jax.tree.map(lambda x, i=i: x[i : i + parts.step], (parameters, t, q, u, inputs))) for i in parts]
     return DenseRates(*(np.concatenate([getattr(x, name) for x in found]) for name in ("qdot", "ydot", "events")))
 
 
@@ -84,7 +84,8 @@ class _Traced:
         return [x[:, 0] for x in values], [np.moveaxis(x, 1, -1) for x in slopes]
 
 
-def _rates(traced: _Traced, structure: Structure, kept: list[int], independent: tuple[int, ...], parameters: Scene, t, q, u, inputs) -> DenseRates:
+def _rates(traced: _Traced, structure: Structure, kept: list[int], independent: tuple[int, ...], states: tuple) -> DenseRates:
+    parameters, t, q, u, inputs = states
     every = np.arange(u.shape[1])
     dependent = np.setdiff1d(every, independent)
     u = np.where(np.isin(every, dependent), 0.0, u)

@@ -19,13 +19,13 @@ from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.scene import Scene
 
 
-def diagnose_mismatch(scene: Scene, traced: TracedScene, probes: Probes, limit: float, parameters: Scene, t, q, u, inputs) -> str:
+def diagnose_mismatch(scene: Scene, traced: TracedScene, probes: Probes, limit: float, states: tuple) -> str:
     """What differs between graph and JAX, by name, and how; where no body, load or row does, that it is the solution of the equations.
 
-    `limit`: of the difference, relative to the size of the quantity at the probes; `parameters`, `t`, `q`, `u`, `inputs`: the probes, with a leading axis.
+    `limit`: of the difference, relative to the size of the quantity at the probes; `states`: parameters, t, q, u and inputs at the probes, with a leading axis.
     """
     try:
-        found = list(_differing(scene, traced, probes, limit, parameters, t, q, u, inputs))
+        found = list(_differing(scene, traced, probes, limit, states))
     except Unsupported as reason:
         return f"{reason} has no derivative in scalars"
     values = list(dict.fromkeys(owner for owner, in_value in found if in_value))
@@ -40,11 +40,12 @@ def diagnose_mismatch(scene: Scene, traced: TracedScene, probes: Probes, limit: 
 _NOBODY = "bodies, loads and rows agree, but not the solutions of the equations; rows, or the inertia along what they leave free, may be nearly singular there"
 
 
-def _differing(scene: Scene, traced: TracedScene, probes: Probes, limit: float, parameters, t, q, u, inputs) -> Iterator[tuple[str, bool]]:
+def _differing(scene: Scene, traced: TracedScene, probes: Probes, limit: float, states: tuple) -> Iterator[tuple[str, bool]]:
     """Owners of what differs, and whether it differs itself (otherwise in its rate)."""
+    _, _, q, u, _ = states
     g, directional_derivative = traced.graph, (1.0, np.cos(1.0 + np.arange(q.shape[1])), np.sin(1.0 + np.arange(u.shape[1])))
     direction = {n: g.const(x) for n, x in zip([traced.t, *traced.q.tolist(), *traced.u.tolist()], np.hstack(directional_derivative).tolist(), strict=True)}
-    values, rates = _by_jax(parameters, t, q, u, inputs, directional_derivative)
+    values, rates = _by_jax(*states, directional_derivative)
     names = names_of_bodies(scene)
     bodies = [f"body `{name}`" for name in names]
     loads, speeds = [f"a load on body `{name}`" for name in names], [f"a load on speed `{name}`" for name in scene.speed_names.entries]

@@ -71,8 +71,12 @@ def dip(w: Writer, h: Value, c_0: Values, rate_0: Values, c_1: Values, rate_1: V
     return shares < 1.0, shares
 
 
-def advance(w: Writer, p: Lanes, begins: Value, trying: Value, locating: Value, t_0: Value, c_0: Values, rate_0: Values, t_1: Value, c_1: Values) -> Value:
-    """The search after a step, into its rows, in lanes where it `begins` or which are `locating`; the number of the event that is now the first."""
+def advance(w: Writer, p: Lanes, begins: Value, trying: Value, locating: Value, start: tuple[Value, Values, Values], end: tuple[Value, Values]) -> Value:
+    """Put the search after a step into its rows, in lanes where it `begins` or which are `locating`; return the number of the event that is now the first.
+
+    `start`, `end`: time and values at both ends of the step, and rates at its start.
+    """
+    (t_0, c_0, rate_0), (t_1, c_1) = start, end
     changes, count = begins | locating, len(c_1)
     t, flat, left = p.every("search_t"), p.every("search_c"), p["search_left"]
     c = [flat[i * count : (i + 1) * count] for i in range(3)]

@@ -141,7 +141,7 @@ def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Valu
     new["taken"] = w.where(accept, step, 0.0)  # by how far the state has gone on
     each_row(w, rows, y1, lambda i: w.where(accept, w.load(w.real, y1, i), w.load(w.real, y, i)))
     if form.has_events:
-        new = _monitored(w, form, method, p, k, step, accept, new, y1)
+        new = _monitored(w, form, method, p, k, trial, new)
     if trial.pivot is not None:
         counts = accept & ~locating & new["code"].equals(float(RUNNING)) & new["t"].equals(t1)
         pivot = w.where(counts, w.smaller(p["pivot"], trial.pivot), p["pivot"])
@@ -252,14 +252,12 @@ def _count(w: Writer, happens: Value) -> Value:
     return w.where(happens, 1.0, w.number(0.0))
 
 
-def _monitored(
-    w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Value, step: Value, accept: Value, new: dict[str, Value], y1: Value
-) -> dict[str, Value]:
-    """The step in which an event may have happened or is being located, or before which one has; changes `y1`."""
-    layout, count, y = form.layout, form.layout.events, p.pointer
+def _monitored(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Value, trial: Trial, new: dict[str, Value]) -> dict[str, Value]:
+    """The step in which an event may have happened or is being located, or before which one has; changes the state after it."""
+    layout, count, y, y1, step = form.layout, form.layout.events, p.pointer, trial.y1, trial.step
     t, code, rows = p["t"], p["code"], range(layout.integrated)
     locating, fresh = code.equals(float(LOCATING)), (p["accepted"] + p["rejected"]).equals(0.0)
-    accept = accept & ~locating & new["code"].equals(float(RUNNING))
+    accept = trial.accept & ~locating & new["code"].equals(float(RUNNING))
 
     def events(t: Value, y: Value, stage: int) -> tuple[list[Value], list[Value]]:
         values, rates = w.room(w.real, count), w.room(w.real, count)
@@ -277,7 +275,7 @@ def _monitored(
     changes, first = happened | locating, w.room(w.real)
     w.store(p["event"], first)
     with w.when(w.any(changes)):
-        w.store(search.advance(w, p, happened, was_trying, locating, t, c_0, rate_0, new["t"], c_1), first)
+        w.store(search.advance(w, p, happened, was_trying, locating, (t, c_0, rate_0), (new["t"], c_1)), first)
     left, shift = p["search_left"], p["search_shift"]
     found, back = locating & left.equals(0.0), changes & (left > DIFFERENTIABLE + 1.0)
     # a motion that starts beyond an event has no motion at all
