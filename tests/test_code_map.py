@@ -13,12 +13,12 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 460_400,
+    "code tokens of src": 460_200,
     "code tokens of docs": 11_441,
     "code tokens of notebooks": 7_444,
     "caches": 84,
     "named numbers": 441,
-    "tests for a tracer": 131,
+    "tests for a tracer": 124,
     "functions with more than 8 parameters": 4,
     "ways: state put onto its constraints": 3,
     "ways: state put back onto its constraints within a step": 1,

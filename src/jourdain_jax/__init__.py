@@ -88,14 +88,13 @@ if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.analysis.likelihood import PlannedInformation, log_likelihood, planned_information
     from jourdain_jax.analysis.linearize import Linearization, linearize
     from jourdain_jax.analysis.log_density import LogDensity, log_density
-    from jourdain_jax.analysis.losses import huber, student_t
+    from jourdain_jax.analysis.problem import huber, student_t
     from jourdain_jax.analysis.quantities import Accelerometer, LoadCell
     from jourdain_jax.analysis.report import Checked, Report, check, report
     from jourdain_jax.analysis.sensors import Actuator, Sensor
     from jourdain_jax.analysis.shooting import MultipleShooting
-    from jourdain_jax.analysis.statements import derivative_exists
+    from jourdain_jax.analysis.statements import Verification, derivative_exists
     from jourdain_jax.analysis.steady import SteadyMotion, steady
-    from jourdain_jax.analysis.verification import Verification
     from jourdain_jax.analysis.verify import verify
     from jourdain_jax.ensembles.design import Design
     from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
@@ -133,14 +132,13 @@ _ON_FIRST_USE = {
     "analysis.likelihood": "PlannedInformation log_likelihood planned_information",
     "analysis.linearize": "Linearization linearize",
     "analysis.log_density": "LogDensity log_density",
-    "analysis.losses": "huber student_t",
+    "analysis.problem": "huber student_t",
     "analysis.quantities": "Accelerometer LoadCell",
     "analysis.report": "Checked Report check report",
     "analysis.sensors": "Actuator Sensor",
     "analysis.shooting": "MultipleShooting",
-    "analysis.statements": "derivative_exists",
+    "analysis.statements": "Verification derivative_exists",
     "analysis.steady": "SteadyMotion steady",
-    "analysis.verification": "Verification",
     "analysis.verify": "verify",
     "ensembles.design": "Design",
     "ensembles.distributions": "Levels LogNormal LogUniform Normal Uniform",

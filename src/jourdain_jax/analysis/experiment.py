@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.estimate import Estimate, Range
 from jourdain_jax.analysis.quantities import Instrument, StopEvent, channel, cut
 from jourdain_jax.analysis.sensors import Actuator, Drive, Numbers, Reading, Sensor, Times, ideal, latest, response
-from jourdain_jax.calculus.reals import Number, checked_unless_traced, described, is_traced
+from jourdain_jax.calculus.reals import Number, array_module, checked_unless_traced, described, is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled, as_inputs
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.scene import Scene, entries_named
@@ -143,7 +143,7 @@ class Experiment(eqx.Module):
         sigma, values = self.sigma[name], self.values[name]
         # one sigma per time acts on all components of the channel
         dimensions = values.ndim - int(repeats)
-        xp = jnp if is_traced(sigma) else np
+        xp = array_module(sigma)
         aligned = xp.reshape(sigma, sigma.shape + (1,) * (dimensions - sigma.ndim)) if sigma.ndim else sigma
         return xp.broadcast_to(aligned, values.shape)
 Data = Experiment | Sequence[Experiment]
@@ -155,7 +155,7 @@ def _holds(condition: Callable, x) -> bool:
 
 
 def _array(x) -> Array | np.ndarray:
-    return (jnp if is_traced(x) else np).asarray(x, jnp.result_type(float))
+    return array_module(x).asarray(x, jnp.result_type(float))
 
 
 def _reals(what: str, given: Mapping, advice: str = "check how it is put together") -> dict[str, Array | np.ndarray]:

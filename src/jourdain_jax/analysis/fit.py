@@ -17,16 +17,14 @@ from typing import Unpack
 import numpy as np
 
 from jourdain_jax.analysis.estimate import Estimate, Range
-from jourdain_jax.analysis.estimates import Asked
+from jourdain_jax.analysis.estimates import Asked, statistics
 from jourdain_jax.analysis.experiment import Data, Experiment
 from jourdain_jax.analysis.fit_result import Fit
-from jourdain_jax.analysis.fit_statistics import statistics
 from jourdain_jax.analysis.layout import PossibleInertia
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum
 from jourdain_jax.analysis.likelihood import as_fit_options, as_runs, in_all_or_none
-from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
 from jourdain_jax.analysis.piecewise import Piecewise, Shot, problem_of
-from jourdain_jax.analysis.problem import Problem, Span
+from jourdain_jax.analysis.problem import LEAST_SQUARES, Loss, Problem, Span
 from jourdain_jax.analysis.shooting import MultipleShooting, check_shooting
 from jourdain_jax.analysis.shooting_steps import cutoff_of, shot
 from jourdain_jax.analysis.spread import Around, AtBounds, if_free, limits_at_bounds

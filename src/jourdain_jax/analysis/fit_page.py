@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 
 from jourdain_jax.analysis.estimates import Estimates
-from jourdain_jax.analysis.fit_text import agreement
 from jourdain_jax.analysis.resumed import RISE_95, Informed, Prediction, Profile
 from jourdain_jax.analysis.table import table
 from jourdain_jax.calculus.figures import DATA, MODEL, QUIET, figure
@@ -251,7 +250,7 @@ def _whiteness(fit: Estimates, fitted: Sequence[dict[str, Prediction]]) -> Secti
 
 
 def _way(fit: Estimates) -> Section:
-    told = agreement(fit) if fit.guesses > 1 else "one first guess was tried; `guesses=30` would tell how many lead here"
+    told = fit.agreement if fit.guesses > 1 else "one first guess was tried; `guesses=30` would tell how many lead here"
     rows = [("what is minimised", "steps tried", "F at first", "F at last")]
     rows += [(what, str(len(costs) - 1), f"{costs[0]:.6g}", f"{costs[-1]:.6g}") for what, costs in fit.trace]
     return Section("The way to the minimum", told, table(rows), [way_to_the_minimum(fit.trace)])

@@ -1,16 +1,238 @@
-"""Results of fits: estimates, the reasons to doubt them, and further calls (profiles, predictions, plans)."""
+"""Results of fits: estimates, the reasons to doubt them, and further calls (profiles, predictions, plans).
+
+A fit as text: what `print` shows of one, and of a batch.
+
+Why estimates of a fit, or their intervals, should not be relied on, in words.
+"""
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from jourdain_jax.analysis.estimates import Estimates
 from jourdain_jax.analysis.experiment import Data, Experiment
 from jourdain_jax.analysis.fit_page import fit_page, interval_widths
-from jourdain_jax.analysis.fit_text import batch_text, text, warnings_of
+from jourdain_jax.analysis.problem import LEAST_SQUARES
 from jourdain_jax.analysis.resumed import Prediction, Profile, informed, of_fitted, of_held_out, profiles, taken_up
+from jourdain_jax.analysis.spread import FAR_BEYOND
+from jourdain_jax.analysis.table import table
 from jourdain_jax.scene.names import as_names
+
+_SURE = 5.0  # standard deviations: a mean square that is further from 1 is no chance
+
+
+def warnings_of(fit: Estimates) -> tuple[str, ...]:
+    """Warnings of a fit of one experiment, the most serious reason first, one sentence each."""
+    if not np.isfinite(fit.chi_square):
+        if any(np.any(np.abs(r) > 1e150) for run in fit.residuals for r in run.values()):  # sigmas: the square is no number any more
+            return ("residuals overflow at the first guess: use NaN for missing values, and check `sigma`",)
+        return ("the motion fails at the first guess, so that there is nothing to fit; look at it with `simulate`", *fit.events_met)
+    return tuple(sentence for reason in REASONS for sentence in reason(fit))
+
+
+def _no_minimum(fit: Estimates) -> Iterator[str]:
+    if fit.stuck:
+        yield "no step leads to a better fit, and yet this is no minimum: nearby the motion fails, or it is rougher than its tolerance; start elsewhere"
+    elif fit.shooting is not None and fit.shooting.continuity > 1:
+        jump = float(fit.shooting.continuity)
+        yield f"pieces of runs do not join: states jump by up to {jump:.2g} tolerances of the simulation; take shorter pieces, or start nearer"
+    elif not fit.converged:
+        yield "no minimum was found; raise `max_iterations`, or start nearer to it"
+
+
+def _decided_by_bounds(fit: Estimates) -> Iterator[str]:
+    if names := [f"`{name}`" for name, far in zip(fit.labels, fit.beyond, strict=True) if far > FAR_BEYOND]:
+        verb = "lies at a bound, which decides its value" if len(names) == 1 else "lie at bounds, which decide their values"
+        yield f"{', '.join(names)} {verb}; all standard errors lose their meaning: widen the bounds"
+
+
+def _untold_sigmas(fit: Estimates) -> Iterator[str]:
+    for name in fit.untold:
+        yield (
+            f"channel `{name}` has no degrees of freedom left to estimate its sigma; pass `sigma`: estimates are drawn to meet its samples exactly, and "
+            "intervals take nothing from them"
+        )
+
+
+def _counted_twice(fit: Estimates) -> Iterator[str]:
+    first: dict[bytes, str] = {}
+    for run, of_run in enumerate(fit.residuals):
+        for name, r in of_run.items():
+            counted = np.round(r[np.isfinite(r)], 6)
+            here = f"`{name}` of run {run}"
+            there = first.setdefault(counted.tobytes(), here)
+            if here != there and len(np.unique(counted)) > 3:  # different residuals that two channels may share by chance
+                yield f"{there} and {here} hold the same numbers: counted as two measurements, they make intervals too narrow; leave one out"
+
+
+def _only_one_guess(fit: Estimates) -> Iterator[str]:
+    if fit.guesses > 1 and fit.converged and fit.agreeing == 1:
+        yield f"only one of {fit.guesses} first guesses led to this minimum, so there may be a lower one; try more `guesses`, or narrower bounds"
+
+
+def _far_from_priors(fit: Estimates) -> Iterator[str]:
+    for name, far in zip(fit.labels, fit.from_prior, strict=True):
+        if abs(far) > 4.0:  # standard deviations: an estimate that lies further from its prior is no chance
+            yield f"`{name}` lies {abs(far):.2g} standard deviations from its prior: the prior, the data or the scene is not right"
+
+
+def _large_residuals(fit: Estimates) -> Iterator[str]:
+    if large := [size for size in _sizes_of_residuals(fit) if size.least > _by_chance(size.narrow, _SURE)]:
+        why = "a local minimum (start nearer), a scene that is not right, or sigmas that are too small"
+        yield f"the residuals{large[0].named} are larger than the sigmas allow: {why}"
+
+
+def _small_residuals(fit: Estimates) -> Iterator[str]:
+    if small := _too_small(fit):
+        times = f" by a factor of about {1 / np.sqrt(small[0].most):.2g}" if small[0].most > 0 else ""
+        yield (
+            f"the residuals{small[0].named} are smaller than the sigmas foretell{times}: sigmas are too large, so that intervals are too wide, or samples were "
+            "smoothed or have no noise; a sigma of `None` is estimated"
+        )
+
+
+def _coloured_residuals(fit: Estimates) -> Iterator[str]:
+    wide = {name for size in _too_small(fit) for name in size.channels}
+    named = ", ".join(f"`{name}` ({rho:.2f})" for name, rho in _coloured(fit).items() if name not in wide)
+    own = [name for name in fit.labels if name.startswith("run ")]
+    start = f"residuals of {named} are not white (in brackets: correlation of neighbouring ones), which makes intervals"
+    if named and fit.errors == "sigmas":
+        yield (
+            f"{start} too narrow: the scene, a sensor or the noise is not right; `correlation_time=None` estimates a memory of the noise, and with five runs "
+            'or more, errors="runs" gives intervals that allow for it'
+        )
+    elif named and own:
+        yield f"{start} of what is a run's own too narrow (`{own[0]}`): how runs differ says nothing of it"
+
+
+REASONS: tuple[Callable[[Estimates], Iterator[str] | tuple[str, ...]], ...] = (  # the most serious first
+    _no_minimum,
+    _decided_by_bounds,
+    _untold_sigmas,
+    lambda fit: fit.impossible,
+    lambda fit: fit.events_met,
+    lambda fit: fit.oddities,
+    lambda fit: fit.too_narrow,
+    _counted_twice,
+    _only_one_guess,
+    _far_from_priors,
+    _large_residuals,
+    _small_residuals,
+    _coloured_residuals,
+)
+
+
+class _Size(NamedTuple):
+    """The mean square of the residuals of some channels, in sigmas."""
+
+    channels: list[str]
+    named: str  # as a sentence goes on; empty where these are all channels
+    least: float  # where they determined no unknown that others may have determined
+    narrow: float  # standard deviation of that, of normal residuals
+    most: float  # where they determined all of them
+    wide: float
+
+
+def _coloured(fit: Estimates) -> dict[str, float]:
+    """Return correlations of neighbouring residuals, for channels whose residuals are not white."""
+    return {name: rho for name, (rho, limit) in fit.autocorrelation.items() if abs(rho) > limit}
+
+
+def _too_small(fit: Estimates) -> list[_Size]:
+    """Return which values are too small to be chance; residuals with a correlation rho of neighbours tell (1 + rho)/(1 - rho) times less."""
+    coloured = _coloured(fit)
+
+    def larger(channels: list[str]) -> float:
+        return max((1 + rho) / max(1 - rho, 1e-9) for rho in (0.0, *(coloured.get(name, 0.0) for name in channels)))
+
+    return [size for size in _sizes_of_residuals(fit) if size.most * larger(size.channels) < _by_chance(size.wide, -_SURE)]
+
+
+def _by_chance(spread: float, deviations: float) -> float:
+    """A mean square so many standard deviations from 1: its cube root is nearly normal, also far out (Wilson and Hilferty). `spread`: one of it, near 1."""
+    return max(1 - spread**2 / 9 + deviations * spread / 3, 0.0) ** 3
+
+
+def _sizes_of_residuals(fit: Estimates) -> list[_Size]:
+    """Sizes of the residuals of all channels whose sigmas are known, then of one by one; under a robust loss those of most, since some are far out."""
+    robust, determined = fit.asked.loss != LEAST_SQUARES, float(fit.samples - fit.degrees_of_freedom)
+    names = [name for name in dict.fromkeys(name for run in fit.whitened for name in run) if name not in fit.sigma]
+    found = []
+    for channels in (names, *([name] for name in names)):
+        squares = np.concatenate([np.zeros(0), *(np.ravel(run[name]) for run in fit.whitened for name in channels if name in run)]) ** 2
+        squares = squares[np.isfinite(squares)]
+        if squares.size:
+            some = len(channels) < len(names)
+            named = f" of {', '.join(f'`{name}`' for name in channels)}" if some else ""
+            found.append(_Size(channels, named, *_mean_square(squares, 0.0 if some else determined, robust), *_mean_square(squares, determined, robust)))
+    return found
+
+
+def _mean_square(squares: np.ndarray, determined: float, robust: bool) -> tuple[float, float]:
+    """The mean square of residuals that determined so many unknowns, and its standard deviation where they are normal; `robust`: from their median."""
+    degrees = max(squares.size - determined, 1)
+    if robust:  # the median of w^2 is 0.4549 for a normal w; relative to it, that of n has the standard deviation 2.33 / sqrt(n)
+        return float(np.median(squares)) / 0.4549, 2.33 / degrees**0.5
+    return float(np.sum(squares)) / degrees, (2 / degrees) ** 0.5  # chi-square has mean n and variance 2 n
+
+
+MOST_NAMED = 8  # combinations of unknowns that are told poorly, pairs that correlate
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def text(fit: Estimates) -> str:
+    """The text of a fit of one experiment: estimates with their intervals, warnings, what the data do not tell, residuals by channel."""
+    lines = [
+        f"Fit of {type(fit.scene).__name__}: {'converged' if fit.converged else 'NOT CONVERGED'} in {int(fit.steps)} steps; "
+        f"{int(fit.samples)} samples, {len(fit.labels)} unknowns, reduced chi-square {float(fit.reduced_chi_square):.4g}"
+    ]
+    lines += [f"WARNING: {sentence}" for sentence in warnings_of(fit)]
+    if fit.grown:
+        lines.append("found over growing spans: the first guess led elsewhere")
+    if fit.shooting is not None:
+        pieces = " + ".join(map(str, fit.shooting.pieces[:MOST_NAMED])) + (" + ..." if len(fit.shooting.pieces) > MOST_NAMED else "")
+        lines.append(f"found by multiple shooting in {pieces} pieces, which join to {float(fit.shooting.continuity):.1g} of the simulation's tolerance")
+    if fit.guesses > 1:
+        lines.append(fit.agreement)
+    if fit.errors == "runs":
+        lines.append(f"standard errors from how much the {len(fit.residuals)} runs differ")
+    lines += [f"sigma of `{name}`, estimated: {float(sigma):.4g}" for name, sigma in fit.sigma.items()]
+    lines += [f"correlation time of the noise of `{name}`, estimated: {float(tau):.4g} s" for name, tau in fit.correlation_time.items()]
+    rows = [("unknown", "unit", "estimate", "std. error", "95 % interval")]
+    rows += [_row(name, e, " (one-sided, at its bound)" if at_bound else "") for (name, e), at_bound in zip(fit.estimates.items(), fit.at_bound, strict=True)]
+    rows += [_row(name, e, " (tied)") for name, e in fit.tied.items() if e.value.ndim == 0]
+    lines += table(rows)
+    if fit.not_identifiable:
+        lines.append(f"singular values below {fit.cutoff:g} of the largest count as zero:")
+        lines += [f"  {sentence}" for sentence in fit.not_identifiable]
+    for sentences, what in ((fit.weak, "combinations"), (fit.correlated, "pairs")):
+        lines += [f"  {sentence}" for sentence in sentences[:MOST_NAMED]]
+        lines += [f"  and {len(sentences) - MOST_NAMED} more {what}"] if len(sentences) > MOST_NAMED else []
+    rows = [("run", "channel", "samples", "mean", "rms", "largest residual (in sigmas)")]
+    for s in fit.residual_summary():
+        rows.append((str(s.run), s.channel, str(s.samples), f"{s.mean:.2g}", f"{s.rms:.3g}", f"{s.largest:.3g}"))
+    return "\n".join(lines + table(rows))
+
+
+def _row(name: str, e, remark: str) -> tuple[str, ...]:
+    error = f"{e.standard_error:.2g}" if np.isfinite(e.standard_error) else "-"
+    interval = f"[{e.low:.6g}, {e.high:.6g}]" if not np.isnan(e.low + e.high) else "none"
+    return name, e.unit, f"{e.value:.6g}", error, interval + remark
+
+
+def batch_text(fit: Estimates) -> str:
+    """The text of many fits: mean and spread of the estimates that converged."""
+    good = np.asarray(fit.converged)
+    rows = [("unknown", "unit", "mean", "std. deviation", "mean std. error")]
+    for name, e in fit.estimates.items():
+        values, errors = np.asarray(e.value)[good], np.asarray(e.standard_error)[good]
+        errors = errors[np.isfinite(errors)]  # an estimate at its bound has none
+        some, error = good.sum() > 1, f"{errors.mean():.2g}" if errors.size else "-"
+        numbers = (f"{values.mean():.6g}", f"{values.std(ddof=1):.2g}", error) if some else ("-", "-", "-")
+        rows.append((name, e.unit, *numbers))
+    return "\n".join([f"{good.size} fits of {type(fit.scene).__name__}: {good.sum()} converged", *table(rows)])
 
 
 class Fit(Estimates):

@@ -35,7 +35,7 @@ from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.build.reference import Reference
 from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.calculus.compiled import compiled
-from jourdain_jax.calculus.reals import described, is_traced
+from jourdain_jax.calculus.reals import array_module, described, is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.simulate import simulate
@@ -303,7 +303,7 @@ def planned_information(
     numbers = [eqx.tree_at(lambda r: r.start, run, {n: np.zeros(x.shape) if is_traced(x) else x for n, x in run.start.items()}) for run in runs]
     unknowns = unknowns_of(with_reference_parameters(scene), numbers, free)
     places, count = unknowns.estimated, unknowns.layout.sizes[0]
-    ready = tuple(run_of(run, jnp if is_traced((run.values, run.sigma)) else np) for run in runs)
+    ready = tuple(run_of(run, array_module((run.values, run.sigma))) for run in runs)
     theta = _values(scene, runs, unknowns)
     F, J = _sensitivities(scene, ready, theta, settled, unknowns.layout, tuple(places.tolist()), Reference(scene))
     prior = np.diag(1 / np.where(np.isfinite(unknowns.prior_mean[places]), unknowns.prior_sigma[places], np.inf))
@@ -337,5 +337,5 @@ def _values(scene: Scene, runs: Sequence[Experiment], unknowns: Unknowns) -> Flo
     rows = [of_kind[place.kind](place) for place in unknowns.layout.shared]
     for run, own in zip(runs, local, strict=True):
         rows += [run.start.get(place.name, place.of(own)) for place in unknowns.layout.local]
-    xp = jnp if is_traced(rows) else np
+    xp = array_module(rows)
     return xp.concatenate([xp.ravel(x) for x in rows])

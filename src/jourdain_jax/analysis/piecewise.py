@@ -20,8 +20,7 @@ from jourdain_jax.analysis.estimate import unbounded
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.layout import Place
 from jourdain_jax.analysis.levenberg_marquardt import Linearised
-from jourdain_jax.analysis.losses import Loss
-from jourdain_jax.analysis.problem import Problem, closed
+from jourdain_jax.analysis.problem import Loss, Problem, closed
 from jourdain_jax.analysis.runs import Lanes, Some
 from jourdain_jax.analysis.shooting import NODE, MultipleShooting, ends_of_pieces, in_pieces, numbers_of_filters, owned
 from jourdain_jax.analysis.unknowns import Unknowns

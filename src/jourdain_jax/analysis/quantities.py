@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.sampling import sample_states
-from jourdain_jax.calculus.reals import checked_known, checked_real, described, is_traced
+from jourdain_jax.calculus.reals import array_module, checked_known, checked_real, described, is_traced
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reactions import contact_forces
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
@@ -247,7 +247,7 @@ def cut(events: Mapping, t0, ts, values: dict, sigma: dict) -> tuple:
         if x.ndim <= axis or x.shape[axis] != len(ts):  # of another shape: that is said once the scene is known
             return x
         part = x[:, kept] if axis else x[kept]
-        return (jnp if is_traced(x) else np).where(after.reshape(after.shape + (1,) * (x.ndim - after.ndim)), np.nan, part)
+        return array_module(x).where(after.reshape(after.shape + (1,) * (x.ndim - after.ndim)), np.nan, part)
 
     of_event = np.full((*at.shape, last + 1), np.nan)
     of_event[..., -1] = at

@@ -31,7 +31,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.estimate import Estimate, positive, unbounded
 from jourdain_jax.analysis.quantities import Channel, Instrument, StopEvent
-from jourdain_jax.calculus.reals import checked_real, described, is_traced
+from jourdain_jax.calculus.reals import array_module, checked_real, described, is_traced
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.motion_state import Motion
@@ -61,7 +61,7 @@ def grid(t0, ts: Times, count: int, node=None) -> Float[Array | np.ndarray, "gri
     """So many intervals up to the last sample; those of a piece go on for at most one more, so that its next `node` is one of the times."""
     end = ts[-1] if node is None else node
     until = count if node is None or node == ts[-1] else int(count * float((end - t0) / (ts[-1] - t0)) + 1e-9)
-    xp = jnp if is_traced((t0, end)) else np
+    xp = array_module((t0, end))
     found = xp.asarray(t0 + (end - t0) * xp.arange(count + 1) / until, jnp.result_type(float))
     return xp.where(xp.arange(count + 1) == until, end, found)  # this one without round-off
 
@@ -246,9 +246,11 @@ def _checked_number(where: str, name: str, value, is_one: bool) -> "Float[Array,
         _check_estimate(where, name, value)
         return value
     number = checked_real(value, where, () if name in OF_TIME or is_one else None, advice="give a number, or an `Estimate`").astype(jnp.result_type(float))
-    if not is_traced(number) and not np.all(np.isfinite(number)):
+    if is_traced(number):
+        return number
+    if not np.all(np.isfinite(number)):
         raise ValueError(f"{where} is {number}, expected a finite number")
-    if name in OF_TIME and not is_traced(number) and number < 0:
+    if name in OF_TIME and number < 0:
         raise ValueError(f"{where} is {float(number):g} s, expected zero or more; where the clock of a channel is ahead, shift its times")
     return number
 
@@ -341,7 +343,7 @@ def response(owner: Sensor | Actuator) -> tuple[dict, tuple[str, ...], tuple[str
     given = {name: getattr(owner, name) for name in NUMBERS}
     unknown = tuple(name for name, value in given.items() if isinstance(value, Estimate))
     numbers = {name: value.guess if name in unknown else value for name, value in given.items()}
-    numbers = {name: (jnp if is_traced(x) else np).asarray(x, jnp.result_type(float)) for name, x in numbers.items()}
+    numbers = {name: array_module(x).asarray(x, jnp.result_type(float)) for name, x in numbers.items()}
     return numbers, unknown, tuple(n for n, x in numbers.items() if n in unknown or is_traced(x) or not np.all(x == NUMBERS[n]))
 
 

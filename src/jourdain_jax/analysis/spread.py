@@ -41,8 +41,7 @@ from jaxtyping import Bool, Float
 from jourdain_jax.analysis.arrow import Arrow, ByUnknown
 from jourdain_jax.analysis.information import Information, information, students_t_95, variances
 from jourdain_jax.analysis.levenberg_marquardt import LEAST, Control, Limits, Linearised, Minimum, minimum_beside
-from jourdain_jax.analysis.losses import LEAST_SQUARES
-from jourdain_jax.analysis.problem import Problem
+from jourdain_jax.analysis.problem import LEAST_SQUARES, Problem
 
 RISE_95 = 3.841458820694124  # of 2 F
 FAR_BEYOND = 3.0  # standard errors: an estimate that is held at its bound by more is no chance

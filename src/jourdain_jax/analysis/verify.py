@@ -19,8 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.statements import by_reduction, gradient_checks, statement_checks
-from jourdain_jax.analysis.verification import Check, Verification, check
+from jourdain_jax.analysis.statements import Check, Verification, by_reduction, check, gradient_checks, statement_checks
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import plain_row_lengths, structure_of, usual_rows
 from jourdain_jax.calculus.null_space import null_space_svd
@@ -51,7 +50,7 @@ def verify(scene: Scene | BuiltFor, state: State | dict | None = None, inputs: N
 
         print(verify(disc, start(disc, lean=0.3, spin_rate=-3.0)))
 
-    Values are relative to the size of what is compared; thresholds go with the floating-point type (`analysis.verification`): in single precision
+    Values are relative to the size of what is compared; thresholds go with the floating-point type (`analysis.statements`): in single precision
     gross errors are found, and nothing is certified. Where no reduction applies (no inertia along a free direction) there are no gradients to check, and
     the verification fails.
 

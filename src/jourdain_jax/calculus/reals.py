@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from types import ModuleType
 from typing import TypeAlias
 
 import jax
@@ -144,6 +145,11 @@ def is_traced(*trees) -> bool:
     """Whether any leaf is being traced, so that its number is not known."""
     known = len(trees) == 1 and isinstance(trees[0], float | int | np.ndarray)  # no tree, and this takes a tenth of the time
     return not known and any(is_traced_type(type(leaf)) for leaf in jax.tree.leaves(trees))
+
+
+def array_module(x) -> ModuleType:
+    """Return `jax.numpy` where something in `x` is traced, otherwise NumPy."""
+    return jnp if is_traced(x) else np
 
 
 def nothing_is_traced() -> bool:
