@@ -8,6 +8,7 @@ import gc
 import importlib.metadata
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -86,6 +87,16 @@ def _compiled_programs_are_dropped():
         if sys.platform == "linux":
             ctypes.CDLL(None).malloc_trim(0)  # glibc keeps what was freed otherwise
     gc.freeze()
+
+
+@pytest.fixture(scope="module")
+def small_blocks() -> Iterator[None]:
+    """Blocks of a study are of 32 lanes, so that few lanes make several."""
+    from jourdain_jax.ensembles import task
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(task, "LARGEST_BLOCK", 32)
+        yield
 
 
 @pytest.fixture

@@ -13,11 +13,7 @@ from jourdain_jax.ensembles import task
 
 distributed = pytest.importorskip("distributed")
 COUNT = 150  # lanes, in five chunks
-
-
-@pytest.fixture(autouse=True)
-def _blocks_are_small(monkeypatch):
-    monkeypatch.setattr(task, "LARGEST_BLOCK", 32)
+pytestmark = pytest.mark.usefixtures("small_blocks")
 
 
 def run(path, outputs=None, **options):

@@ -14,6 +14,7 @@ from jourdain_jax import Contact
 from jourdain_jax.analysis.statements import Check
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions
 from jourdain_jax.motion.trajectories.diagnostics import Diagnostics, Energies
+from jourdain_jax.scene import description
 from jourdain_jax.scene.coordinates import Coordinates, Names
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose, Motion, Point, Pose
 from jourdain_jax.scene.names import Named
@@ -125,3 +126,9 @@ def test_the_examples_of_a_docstring_run(name, holds, capsys):
     exec(textwrap.dedent(text), made)
     assert capsys.readouterr().out
     assert holds(made)
+
+
+def test_the_list_of_methods_is_that_of_the_base_class():
+    methods = [name for name, member in vars(jj.Scene).items() if inspect.isfunction(inspect.unwrap(member)) and not name.startswith("_")]
+    assert set(description.METHODS) == set(methods) - {"replace", "named"}
+    assert set(description.ATTRIBUTES) == {name for name in jj.Scene.__annotations__ if not name.startswith("_")}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.information import weak_combinations
+from jourdain_jax.analysis.information import hidden_combinations, weak_combinations
 
 START = {"x_rate": -0.6, "heading_rate": 0.9}
 TS = jnp.linspace(0.0, 4.0, 41)
@@ -199,6 +199,19 @@ def test_weak_directions_are_named_by_what_changes_along_them():
     (told,) = weak_combinations(lone * sizes * sizes[:, None], values, sizes, labels)
     assert told.startswith("a change of `c` by 0.2 is one standard error")
     assert weak_combinations(np.full((3, 3), np.nan), values, sizes, labels) == ()
+
+
+def test_two_hidden_directions_and_a_parameter_that_does_nothing():
+    # d theta_0/theta_0 = d theta_2/theta_2, with theta_1 = 0 counted in its own unit; theta_3 does nothing
+    directions = np.linalg.qr(np.array([[1.0, 0.5, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]).T)[0].T
+    turned = np.array([[0.6, 0.8], [-0.8, 0.6]]) @ directions
+    sentences = hidden_combinations(turned, 1e-3, np.ones(4), np.array([1.0, 0.0, 1.0, 1.0]), tuple("abcd"))
+    assert len(sentences) == 2
+    assert "`d` does not show in any channel" in sentences
+    assert any("`a` and `b` and `c`" in s and "d a/a : d b : d c/c = 1 : 0.5 : 1" in s for s in sentences)
+    # where two directions share an unknown, no product of powers of two unknowns shows
+    rows = np.linalg.qr(np.array([[1.0, 0.0, 0.4], [0.0, 1.0, 0.3]]).T)[0].T
+    assert all("`c` do not show separately" in s and "what shows" not in s for s in hidden_combinations(rows, 1e-3, np.ones(3), np.ones(3), tuple("abc")))
 
 
 def test_names_that_no_data_tell_stand_in_the_report(tmp_path, drawn):

@@ -8,7 +8,6 @@ import pytest
 from small_scenes import OnLine
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.unknowns import unknowns_of
 
 TS, SIGMA = np.linspace(0.0, 40.0, 201), 0.01
 
@@ -111,18 +110,6 @@ def test_a_minimum_that_one_guess_alone_leads_to_is_warned_of():
     found = jj.fit(Oscillator(stiffness=18.5), data(0), {"stiffness": jj.bounds(2.0, 80.0)}, guesses=2)
     assert found.agreeing == 1
     assert "only one of 2 first guesses led to this minimum" in found.warning
-
-
-def test_first_guesses_fill_the_ranges_of_all_unknowns():
-    scene, start = Oscillator(), {"x": 0.5, "x_rate": 0.0}
-    run = jj.Experiment(TS, {"x": exact(TS)}, SIGMA, start=start, unknown_start={"x": jj.bounds(0.0, 1.0), "x_rate": jj.unbounded(2.0)})
-    unknowns = unknowns_of(scene, (run,), {"damping": jj.positive(), "stiffness": jj.bounds(10.0, 30.0)})
-    guesses = unknowns.first_guesses(101)
-    np.testing.assert_array_equal(guesses[0], [0.1, 18.0, 0.5, 0.0])
-    for column, low, high, as_share in zip(guesses[1:].T, (0.02, 10.0, 0.0, -2.0), (0.5, 30.0, 1.0, 2.0), (np.log, *3 * [np.asarray]), strict=True):
-        share = (as_share(column) - as_share(low)) / (as_share(high) - as_share(low))
-        np.testing.assert_array_equal(np.sort(np.floor(100 * share)), np.arange(100))  # one in each hundredth
-    np.testing.assert_array_equal(unknowns.first_guesses(101), guesses)
 
 
 @pytest.mark.parametrize("guesses", [0, -3, True])

@@ -1,7 +1,5 @@
 """A scene's class is read for misspelt methods, names that do not exist and arguments it does not take, before anything is computed."""
 
-import inspect
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,7 +8,6 @@ from small_scenes import Bead
 
 import jourdain_jax as jj
 from jourdain_jax.models import MODELS
-from jourdain_jax.scene import description
 
 
 def described(**members):
@@ -103,12 +100,6 @@ def test_own_methods_parameters_and_helpers_beside_the_real_method_are_left_alon
             return cls()
 
     assert float(Own().load) == 2.0
-
-
-def test_the_list_of_methods_is_that_of_the_base_class():
-    methods = [name for name, member in vars(jj.Scene).items() if inspect.isfunction(inspect.unwrap(member)) and not name.startswith("_")]
-    assert set(description.METHODS) == set(methods) - {"replace", "named"}
-    assert set(description.ATTRIBUTES) == {name for name in jj.Scene.__annotations__ if not name.startswith("_")}
 
 
 @pytest.mark.parametrize(

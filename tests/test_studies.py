@@ -7,7 +7,6 @@ import result_codes as results
 import xarray
 
 import jourdain_jax as jj
-from jourdain_jax.ensembles import task
 
 COUNT, BAD = 150, 37  # lanes; one whose radius is negative
 OUTPUTS = {
@@ -18,11 +17,7 @@ OUTPUTS = {
     "distance": jj.Quantity(lambda motion: jnp.hypot(motion.q_end[0], motion.q_end[1]), "m"),
 }
 ASKED = {"t1": 1.0, "ts": np.linspace(0.0, 1.0, 11), "rtol": 1e-6, "atol": 1e-6, "progress": False}
-
-
-@pytest.fixture(autouse=True)
-def _blocks_are_small(monkeypatch):
-    monkeypatch.setattr(task, "LARGEST_BLOCK", 32)
+pytestmark = pytest.mark.usefixtures("small_blocks")
 
 
 def discs():
@@ -35,10 +30,8 @@ def discs():
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(task, "LARGEST_BLOCK", 32)
-        return discs().run(tmp_path_factory.mktemp("whole") / "discs.zarr", outputs=OUTPUTS, **ASKED)
+def whole(tmp_path_factory, small_blocks):
+    return discs().run(tmp_path_factory.mktemp("whole") / "discs.zarr", outputs=OUTPUTS, **ASKED)
 
 
 def assert_same(found, expected):

@@ -36,11 +36,7 @@ from jourdain_jax.ensembles.run import Runner, opened
 from jourdain_jax.ensembles.store import Store
 
 COUNT = 90  # lanes, in three chunks
-
-
-@pytest.fixture(autouse=True)
-def _blocks_are_small(monkeypatch):
-    monkeypatch.setattr(task, "LARGEST_BLOCK", 32)
+pytestmark = pytest.mark.usefixtures("small_blocks")
 
 
 def study(seed=3, **more):
@@ -53,10 +49,8 @@ def run(path, seed=3, **options):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(task, "LARGEST_BLOCK", 32)
-        return run(tmp_path_factory.mktemp("whole") / "discs.zarr")
+def whole(tmp_path_factory, small_blocks):
+    return run(tmp_path_factory.mktemp("whole") / "discs.zarr")
 
 
 @pytest.fixture

@@ -31,11 +31,7 @@ rtol = 1e-6
 [correlation]
 "radius lean" = 0.5
 """
-
-
-@pytest.fixture(autouse=True)
-def _blocks_are_small(monkeypatch):
-    monkeypatch.setattr(task, "LARGEST_BLOCK", 32)
+pytestmark = pytest.mark.usefixtures("small_blocks")
 
 
 def test_a_study_runs_from_a_file_goes_on_and_is_exported(tmp_path, capsys, monkeypatch):

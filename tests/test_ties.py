@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.layout import tied_by
 
 Sleigh = jj.models.ChaplyginSleigh
 START, TIMES = {"x_rate": 0.6, "heading_rate": 0.9}, np.linspace(0.0, 2.0, 21)
@@ -80,14 +79,6 @@ def test_ties_follow_from_ties_before_them(data):
     density = jj.log_density(Sleigh(), data, free=free)
     scene = density.scene_at(density.unconstrain({"offset": 0.3}))
     np.testing.assert_allclose(scene.mass, 8.0 * scene.offset, rtol=1e-15)
-
-
-def test_a_new_function_that_does_the_same_is_the_same_tie():
-    scene = Sleigh()
-    one, same, other = (tied_by("inertia", lambda s, k=k: k * s.mass, scene) for k in (2.0, 2.0, 3.0))
-    assert one == same
-    assert hash(one) == hash(same)
-    assert one != other
 
 
 @pytest.mark.parametrize(
