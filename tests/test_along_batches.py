@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import OnLine
 from test_inputs import OnBelt
 
@@ -39,9 +40,9 @@ def test_forces_on_a_body_along_a_motion_are_those_of_each_time_and_row(moved):
         for s, row in enumerate(map_over_times.row_names):
             for i in range(len(TS)):
                 eager_if_concrete = jax.tree.map(lambda x, i=i: x[i], map_over_times)
-                np.testing.assert_array_equal(forces[row][i], eager_if_concrete.force[s, b])
-                np.testing.assert_array_equal(eager_if_concrete.forces_on(body)[row], eager_if_concrete.force[s, b])
-                np.testing.assert_array_equal(eager_if_concrete.torques_on(body)[row], eager_if_concrete.torque[s, b])
+                assert_array_equal(forces[row][i], eager_if_concrete.force[s, b])
+                assert_array_equal(eager_if_concrete.forces_on(body)[row], eager_if_concrete.force[s, b])
+                assert_array_equal(eager_if_concrete.torques_on(body)[row], eager_if_concrete.torque[s, b])
             assert forces[row].shape == torques[row].shape == (len(TS), 3)
 
 
@@ -51,11 +52,11 @@ def test_points_of_bodies_along_a_motion_are_those_at_each_time(moved):
         assert name in motions
         assert body.orientation.shape == (len(TS), 3, 3)
         point = body.point(local)
-        np.testing.assert_allclose(point.position, moved.point(name, local), rtol=0, atol=1e-14)
+        assert_allclose(point.position, moved.point(name, local), rtol=0, atol=1e-14)
         for i in range(len(TS)):
             one = jax.tree.map(lambda x, i=i: x[i], body)
-            np.testing.assert_allclose(point.velocity[i], one.point(local).velocity, rtol=0, atol=1e-14)
-            np.testing.assert_allclose(body.velocity_at(point.position)[i], one.velocity_at(one.place(local)), rtol=0, atol=1e-14)
+            assert_allclose(point.velocity[i], one.point(local).velocity, rtol=0, atol=1e-14)
+            assert_allclose(body.velocity_at(point.position)[i], one.velocity_at(one.place(local)), rtol=0, atol=1e-14)
 
 
 QUANTITIES = {
@@ -77,7 +78,7 @@ def test_a_batch_is_asked_as_its_lanes_are(lanes, quantity):
     for i in range(len(lanes)):
         own = jax.tree.leaves(quantity(lanes.lane(i)))
         for all_lanes, one in zip(jax.tree.leaves(together), own, strict=True):
-            np.testing.assert_allclose(all_lanes[i], one, rtol=1e-9, atol=1e-9)
+            assert_allclose(all_lanes[i], one, rtol=1e-9, atol=1e-9)
 
 
 def test_names_say_what_they_hold(lanes):
@@ -129,8 +130,8 @@ def test_a_failed_motion_gives_nan_where_it_is_asked_to_and_its_neighbours_keep_
     assert np.isnan(end[1]).all()
     assert np.isnan(q[1]).all()
     assert np.isnan(u_end[1]).all()
-    np.testing.assert_allclose(end[0], 0.5 * np.cos(1.0), rtol=1e-7)
-    np.testing.assert_allclose(slope, np.cos(1.0), rtol=1e-7)
+    assert_allclose(end[0], 0.5 * np.cos(1.0), rtol=1e-7)
+    assert_allclose(slope, np.cos(1.0), rtol=1e-7)
 
 
 def test_derivatives_of_a_failed_motion_are_nan_and_do_not_pass_for_those_of_a_minimum():
@@ -143,4 +144,4 @@ def test_derivatives_of_a_failed_motion_are_nan_and_do_not_pass_for_those_of_a_m
         assert np.isfinite(found[0]), way
         assert np.isnan(found[1]), way
     shared = jax.jacfwd(lambda k: jnp.sum(jnp.where(jnp.array([True, False]), jax.vmap(end)(k * jnp.array([1.0, 1e8])), 0.0)))(1.0)
-    np.testing.assert_allclose(shared, -0.25 * np.sin(1.0), rtol=1e-7)
+    assert_allclose(shared, -0.25 * np.sin(1.0), rtol=1e-7)

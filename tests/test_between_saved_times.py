@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import result_codes as results
 from moving_linkages import NarrowPendulum, Parallelogram, SliderCrank, pendulum_angles, slider_crank_motion
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 
@@ -72,7 +73,7 @@ class BladeTwice(jj.Scene):
 def test_rows_stated_twice_hide_no_singular_partition():
     options = {"ts": [0.5, 2.0], "formulation": jj.Formulation("minimal"), "backend": "dense", "rtol": 1e-6, "atol": 1e-6}
     motion = jj.simulate(BladeTwice(), {"x_rate": 1.0, "heading_rate": 1.0}, **options)
-    np.testing.assert_allclose(motion.q[0], [np.sin(0.5), 1.0 - np.cos(0.5), 0.5], rtol=1e-5)  # a circle, heading along y at pi/2
+    assert_allclose(motion.q[0], [np.sin(0.5), 1.0 - np.cos(0.5), 0.5], rtol=1e-5)  # a circle, heading along y at pi/2
     assert int(motion.result) == results.SINGULAR_PARTITION
 
 
@@ -123,4 +124,4 @@ def test_a_row_is_compared_with_its_usual_length_for_the_parameters_of_the_motio
     for size in (1e-5, 1e5):
         found = of_size(size)
         assert int(found.result) == results.SUCCESS
-        np.testing.assert_allclose(found.q_end, [1.7, 0.0, 1.7], atol=1e-5)
+        assert_allclose(found.q_end, [1.7, 0.0, 1.7], atol=1e-5)

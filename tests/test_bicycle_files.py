@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 from jourdain_jax.bicycle import interval, measured_bicycle, read_bicycle, sample_parameters, shipped_bicycles
@@ -156,7 +157,7 @@ def test_unphysical_samples_are_counted_and_named(tmp_path):
 def test_limits_are_those_of_the_samples_that_have_the_quantity():
     values = jnp.concatenate([jnp.linspace(0.0, 1.0, 1001), jnp.full(999, jnp.nan)])
     result = interval(values)
-    np.testing.assert_allclose([result.value, result.low, result.high], [0.5, 0.025, 0.975], rtol=1e-12)
+    assert_allclose([result.value, result.low, result.high], [0.5, 0.025, 0.975], rtol=1e-12)
     assert float(result.fraction) == 1001 / 2000
     counted = jnp.arange(2000) < 2000 - 999 // 3
     assert float(interval(values, counted=counted, nominal=0.4).fraction) == 1001 / (2000 - 333)
@@ -178,7 +179,7 @@ def test_a_measured_bicycle_is_a_scene_and_a_prior():
     }
     design = jj.Study(bicycle.scene, vary=bicycle.prior, sampler="sobol", samples=1024).design
     trail = design.values()["c"]
-    np.testing.assert_allclose([np.mean(trail), np.std(trail)], [bicycle.values["c"], bicycle.sigmas["c"]], rtol=0.01)
+    assert_allclose([np.mean(trail), np.std(trail)], [bicycle.values["c"], bicycle.sigmas["c"]], rtol=0.01)
     with pytest.raises(ValueError, match=r"no measured bicycle `Browsr`.*Browser"):
         measured_bicycle("Browsr")
 

@@ -2,8 +2,8 @@
 
 import json
 
-import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from jourdain_jax.bicycle import Refused, run, shipped_bicycles, table, write_results
 from jourdain_jax.cli import main
@@ -20,9 +20,9 @@ def studies():
 def test_the_speeds_are_those_of_the_linear_formulas(studies):
     # from the published appendix formulas, evaluated on the same files
     rigid = studies[0].speeds
-    np.testing.assert_allclose(rigid["weave_speed"]["value"], 5.0083877167528, rtol=1e-9)
-    np.testing.assert_allclose(rigid["capsize_speed"]["value"], 6.4290536046576, rtol=1e-9)
-    np.testing.assert_allclose(studies[1].speeds["weave_speed"]["value"], 3.7592036310992, rtol=1e-9)
+    assert_allclose(rigid["weave_speed"]["value"], 5.0083877167528, rtol=1e-9)
+    assert_allclose(rigid["capsize_speed"]["value"], 6.4290536046576, rtol=1e-9)
+    assert_allclose(studies[1].speeds["weave_speed"]["value"], 3.7592036310992, rtol=1e-9)
 
 
 def test_a_file_that_is_missing_is_named(tmp_path, capsys):

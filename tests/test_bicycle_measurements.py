@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from oracles.hang_lines import mean_of_intersections
 
 from jourdain_jax.bicycle import Refused, benchmark_from_measurements, measured_bicycle, sample_parameters, shipped_bicycles, shipped_measurements, study
@@ -26,11 +27,11 @@ def off(name, of=None):
 
 def test_periods_of_the_scenes_are_those_of_the_formulas():
     found = jax.jit(period)(SwungPart(mass=2.0, inertia=0.3, length=0.4, gravity=9.8))
-    np.testing.assert_allclose(found, 2 * np.pi * np.sqrt((0.3 + 2.0 * 0.4**2) / (2.0 * 9.8 * 0.4)), rtol=1e-13)
+    assert_allclose(found, 2 * np.pi * np.sqrt((0.3 + 2.0 * 0.4**2) / (2.0 * 9.8 * 0.4)), rtol=1e-13)
     tilt, n = 0.7, np.array([-np.sin(0.7), np.cos(0.7)])
     along = n @ np.array([[0.3, 0.1], [0.1, 0.5]]) @ n
     found = jax.jit(period)(TwistedPart(Ixx=0.3, Izz=0.5, Ixz=0.1, tilt=tilt, stiffness=4.0))
-    np.testing.assert_allclose(found, 2 * np.pi * np.sqrt(along / 4.0), rtol=1e-13)
+    assert_allclose(found, 2 * np.pi * np.sqrt(along / 4.0), rtol=1e-13)
 
 
 @pytest.mark.parametrize("name", DELFT)
@@ -52,7 +53,7 @@ def test_centres_of_mass_differ_by_how_lines_are_averaged_only(name):
         angles, beside = ([readings.means[f"{what}{part}{k}"] for k in readings.hangings[part]] for what in ("alpha", "a"))
         x, z = mean_of_intersections(np.deg2rad(angles), np.array(beside), found.values["lam"])
         digits = 1e-3 if name == "Balanceassistv1" else 1e-9  # its file gives three of them
-        np.testing.assert_allclose([hung_by[0] + x, hung_by[1] + z], [published.values[f"x{part}"], published.values[f"z{part}"]], atol=digits)
+        assert_allclose([hung_by[0] + x, hung_by[1] + z], [published.values[f"x{part}"], published.values[f"z{part}"]], atol=digits)
 
 
 def test_a_fork_measured_apart_from_its_handlebar_and_a_frame_on_a_table():
@@ -90,14 +91,14 @@ def test_derivatives_by_readings_are_central_differences(tmp_path):
         slope = np.array([(ends[0][n] - ends[1][n]) / 2e-4 for n in PARAMETER_NAMES])
         # what this reading adds to the covariance: known exactly, it is gone
         less = benchmark_from_measurements(write(tmp_path, text.replace(line, f"{name} = {value!r}+/-0.0"))).covariance
-        np.testing.assert_allclose(whole.covariance - less, np.outer(slope, slope), rtol=1e-5, atol=1e-9 * np.abs(whole.covariance).max())
+        assert_allclose(whole.covariance - less, np.outer(slope, slope), rtol=1e-5, atol=1e-9 * np.abs(whole.covariance).max())
 
 
 def test_samples_have_the_covariance():
     found = benchmark_from_measurements("Browser")
     samples = np.asarray(sample_parameters(found, jax.random.key(0), 20000).values)
     sigma = np.array([found.sigmas[n] for n in PARAMETER_NAMES])
-    np.testing.assert_allclose(np.cov(samples.T) / np.outer(sigma, sigma), found.covariance / np.outer(sigma, sigma), atol=0.03)
+    assert_allclose(np.cov(samples.T) / np.outer(sigma, sigma), found.covariance / np.outer(sigma, sigma), atol=0.03)
     i, j = PARAMETER_NAMES.index("IRxx"), PARAMETER_NAMES.index("IFxx")
     assert found.covariance[i, j] / (sigma[i] * sigma[j]) > 0.99  # both are gauged by one rod
 
@@ -150,5 +151,5 @@ def test_an_unknown_bicycle_is_refused_with_the_nearest_one():
 def test_several_readings_count_as_their_mean(tmp_path):
     path = write(tmp_path, GOOD.replace("w = 1.121+/-0.002", "w = 1.120+/-0.002, 1.122+/-0.002"))
     readings = read_readings(path)
-    np.testing.assert_allclose([readings.means["w"], readings.sigmas["w"]], [1.121, 0.002 / np.sqrt(2)])
+    assert_allclose([readings.means["w"], readings.sigmas["w"]], [1.121, 0.002 / np.sqrt(2)])
     assert jnp.isfinite(benchmark_from_measurements(path).covariance).all()

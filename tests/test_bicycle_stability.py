@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from oracles import whipple_bicycle as oracle
 from tolerances import tolerance
 
@@ -45,26 +46,26 @@ def _growth_rates(matrices, speed):
 
 def test_the_appendix_formulas_give_the_published_matrices():
     for matrix, published in zip(_matrices(_parameters("Benchmark"))[:4], BENCHMARK[:4], strict=True):
-        np.testing.assert_allclose(matrix, published, rtol=1e-14, atol=1e-13)
+        assert_allclose(matrix, published, rtol=1e-14, atol=1e-13)
 
 
 @pytest.mark.parametrize("speed", oracle.EIGENVALUES)
 def test_the_benchmark_eigenvalues_are_the_published_ones(speed):
     castering, capsize, *weave = oracle.EIGENVALUES[speed]
     (found,) = eigenvalues_of(*BENCHMARK, np.array([float(speed)]))
-    np.testing.assert_allclose(found, [castering, capsize, *sorted(weave, key=lambda root: (root.real, root.imag))], rtol=1e-12, atol=1e-12)
+    assert_allclose(found, [castering, capsize, *sorted(weave, key=lambda root: (root.real, root.imag))], rtol=1e-12, atol=1e-12)
 
 
 def test_the_benchmark_speeds_are_the_published_ones():
     found = speeds_of(*BENCHMARK)
     close = {"rtol": 5e-14, "atol": 0}
-    np.testing.assert_allclose(found.weave_speed, oracle.WEAVE_SPEED, **close)
-    np.testing.assert_allclose(found.capsize_speed, oracle.CAPSIZE_SPEED, **close)
-    np.testing.assert_allclose(found.double_root_speed, oracle.DOUBLE_ROOT_SPEED, **close)
-    np.testing.assert_allclose(found.weave_frequency, oracle.WEAVE_FREQUENCY, **close)
-    np.testing.assert_allclose(found.double_root_eigenvalue, oracle.DOUBLE_ROOT, **close)
-    np.testing.assert_allclose(found.stable_from, found.weave_speed, **close)
-    np.testing.assert_allclose(found.stable_to, found.capsize_speed, **close)
+    assert_allclose(found.weave_speed, oracle.WEAVE_SPEED, **close)
+    assert_allclose(found.capsize_speed, oracle.CAPSIZE_SPEED, **close)
+    assert_allclose(found.double_root_speed, oracle.DOUBLE_ROOT_SPEED, **close)
+    assert_allclose(found.weave_frequency, oracle.WEAVE_FREQUENCY, **close)
+    assert_allclose(found.double_root_eigenvalue, oracle.DOUBLE_ROOT, **close)
+    assert_allclose(found.stable_from, found.weave_speed, **close)
+    assert_allclose(found.stable_to, found.capsize_speed, **close)
     assert bool(found.stable_range_exists)
 
 
@@ -73,7 +74,7 @@ def test_the_characteristic_polynomial_is_zero_at_the_eigenvalues():
         coefficients = np.asarray(characteristic_polynomial(_matrices(_parameters("Rigid")), speed))
         roots = np.roots(coefficients[::-1])
         expected = _growth_rates(_matrices(_parameters("Rigid")), speed)
-        np.testing.assert_allclose(roots[np.lexsort((roots.imag, roots.real))], expected, rtol=1e-9, atol=1e-9)
+        assert_allclose(roots[np.lexsort((roots.imag, roots.real))], expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", RIDEABLE)
@@ -100,7 +101,7 @@ def test_the_eigenvalues_cross_where_the_speeds_say(name):
     below, above = (_growth_rates(matrices, found.double_root_speed * (1 + shift))[2:] for shift in (-1e-6, 1e-6))
     assert (below.imag == 0).all()
     assert (above.imag != 0).all()
-    np.testing.assert_allclose([below.real, above.real], found.double_root_eigenvalue, rtol=1e-2)
+    assert_allclose([below.real, above.real], found.double_root_eigenvalue, rtol=1e-2)
 
     assert bool(found.stable_range_exists)
     middle = 0.5 * (found.stable_from + found.stable_to)
@@ -133,14 +134,14 @@ def test_a_bicycle_that_speed_does_not_change_has_no_stable_range():
 def test_speeds_beyond_the_largest_are_not_reported():
     found = speeds_of(*BENCHMARK, max_speed=5.0)
     assert np.isnan(found.capsize_speed)
-    np.testing.assert_allclose([found.weave_speed, found.stable_to], [oracle.WEAVE_SPEED, 5.0], rtol=1e-13)
+    assert_allclose([found.weave_speed, found.stable_to], [oracle.WEAVE_SPEED, 5.0], rtol=1e-13)
 
 
 def test_speeds_scale_with_the_square_root_of_gravity_and_with_nothing_else():
     M, C1, K0, K2, g = BENCHMARK
     here, there = speeds_of(*BENCHMARK), speeds_of(*(7.0 * A for A in (M, C1, K0, K2)), 4.0 * g)
     for name in ("weave_speed", "capsize_speed", "double_root_speed", "stable_from", "stable_to"):
-        np.testing.assert_allclose(getattr(there, name), 2.0 * getattr(here, name), rtol=1e-13)
+        assert_allclose(getattr(there, name), 2.0 * getattr(here, name), rtol=1e-13)
 
 
 @pytest.mark.parametrize("quantity", ["weave_speed", "capsize_speed", "double_root_speed", "weave_frequency"])
@@ -155,12 +156,12 @@ def test_derivatives_of_the_speeds_are_their_central_differences(quantity):
 
     start = jnp.array([parameters[name] for name in names])
     reverse, forward = jax.jit(jax.grad(speed))(start), jax.jit(jax.jacfwd(speed))(start)
-    np.testing.assert_allclose(reverse, forward, rtol=tolerance("round_off"))
+    assert_allclose(reverse, forward, rtol=tolerance("round_off"))
     for k, size in enumerate(np.abs(start)):
         step = 1e-4 * size * np.eye(len(names))[k]
         near, far = (speed(start + h * step) - speed(start - h * step) for h in (1, 2))
         difference = (8 * near - far) / (12 * 1e-4 * size)  # fourth order
-        np.testing.assert_allclose(forward[k], difference, rtol=tolerance("gradient_fd"))
+        assert_allclose(forward[k], difference, rtol=tolerance("gradient_fd"))
 
 
 def test_a_missing_speed_does_not_spoil_the_derivatives_of_the_others():
@@ -180,5 +181,5 @@ def test_all_real_roots_in_an_interval_are_found_and_no_others():
         inside = np.polynomial.polynomial.polyfromroots([*expected, -1.0, 2.5])
         coefficients = np.polynomial.polynomial.polymul(inside, [1.0, 0.0, 1.0])
         found = np.asarray(real_roots(list(jnp.asarray(coefficients)), jnp.asarray(0.0), jnp.asarray(2.0)))
-        np.testing.assert_allclose(found[: len(expected)], expected, rtol=1e-10)
+        assert_allclose(found[: len(expected)], expected, rtol=1e-10)
         assert np.isnan(found[len(expected) :]).all()

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
 from jourdain_jax.models import MODELS, ChaplyginSleigh, DoublePendulumRods, TiltingDisc
@@ -50,12 +51,12 @@ def test_what_was_built_stands_wherever_its_scene_does():
     sleigh = ChaplyginSleigh()
     built = jj.build(sleigh)
     start, ts = {"x_rate": 0.5, "heading_rate": 0.3}, jnp.array([0.5, 1.0])
-    np.testing.assert_array_equal(jj.simulate(built, start, ts=ts).q, jj.simulate(sleigh, start, ts=ts).q)
+    assert_array_equal(jj.simulate(built, start, ts=ts).q, jj.simulate(sleigh, start, ts=ts).q)
     many = {"x_rate": jnp.array([0.5, 0.6])}
-    np.testing.assert_array_equal(jj.rollout(built, many, ts=ts).lanes.q, jj.rollout(sleigh, many, ts=ts).lanes.q)
+    assert_array_equal(jj.rollout(built, many, ts=ts).lanes.q, jj.rollout(sleigh, many, ts=ts).lanes.q)
     state = jj.start(built, **start)
-    np.testing.assert_array_equal(state.u, jj.start(sleigh, **start).u)
-    np.testing.assert_array_equal(jj.linearize(built, state).A, jj.linearize(sleigh, state).A)
+    assert_array_equal(state.u, jj.start(sleigh, **start).u)
+    assert_array_equal(jj.linearize(built, state).A, jj.linearize(sleigh, state).A)
     assert str(jj.report(built)) == str(jj.report(sleigh))
     assert jj.lower(built) is jj.lower(sleigh)
     data = jj.Experiment(ts, {"heading": jnp.array([0.1, 0.2])}, 0.01, start=start)
@@ -90,9 +91,9 @@ def test_a_model_with_other_parameters_keeps_its_choices_and_is_differentiated_u
     offsets = jnp.array([0.2, 0.3])
     slopes = jax.jit(jax.vmap(jax.grad(end, argnums=1), (None, 0)))(model, offsets)
     expected = [jax.grad(lambda offset: jj.simulate(ChaplyginSleigh(offset=offset), start, ts=ts).q_end[0])(x) for x in offsets]
-    np.testing.assert_allclose(slopes, expected, rtol=1e-6)
+    assert_allclose(slopes, expected, rtol=1e-6)
     assert len(jax.tree.leaves(model)) == len(jax.tree.leaves(model.scene))
-    np.testing.assert_allclose(jj.start(model, **start).u, jj.start(model.scene, **start).u, rtol=0, atol=1e-14)
+    assert_allclose(jj.start(model, **start).u, jj.start(model.scene, **start).u, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("name", MODELS)

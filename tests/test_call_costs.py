@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from code_map import MOST_FILES
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import OnPlane
 
 import jourdain_jax as jj
@@ -58,10 +59,10 @@ def test_a_new_function_with_other_numbers_compiles_nothing(compilations):
     }
     options = {"start": jj.start(Pushed(), x=0.1), "formulation": jj.Formulation(stabilisation=None)}
     for make in kinds.values():
-        np.testing.assert_allclose(moved(make(1.0), **options)["x"][-1], pulled(1.0), atol=1e-7)
+        assert_allclose(moved(make(1.0), **options)["x"][-1], pulled(1.0), atol=1e-7)
         before = len(compilations)
         for k in (2.0, 3.5):
-            np.testing.assert_allclose(moved(make(k), **options)["x"][-1], pulled(k), atol=1e-7)
+            assert_allclose(moved(make(k), **options)["x"][-1], pulled(k), atol=1e-7)
         assert len(compilations) == before
 
 
@@ -77,7 +78,7 @@ def test_the_same_function_with_a_rule_of_its_own_compiles_once(compilations):
 
     moved(force)
     before = len(compilations)
-    np.testing.assert_allclose(moved(force)["x"][-1], pulled(2.0), atol=1e-7)
+    assert_allclose(moved(force)["x"][-1], pulled(2.0), atol=1e-7)
     assert len(compilations) == before
 
 
@@ -98,7 +99,7 @@ def test_a_function_whose_global_or_closure_has_changed_is_another_function():
         K, box[0] = k, k
         wanted = {by_global: k, by_box: k, by_helper: k if k > 0 else 0.0}
         for f, amplitude in wanted.items():
-            np.testing.assert_allclose(moved(f)["x"][-1], pulled(amplitude), atol=1e-7)
+            assert_allclose(moved(f)["x"][-1], pulled(amplitude), atol=1e-7)
     K = 2.0
 
 
@@ -117,7 +118,7 @@ def test_programs_that_differ_are_told_apart():
         traced, shape = input_programs.traced(f, real)
         assert shape.shape == ()
         for t in (0.0, 0.4, 1.7):
-            np.testing.assert_allclose(traced(t), f(t), rtol=1e-15)
+            assert_allclose(traced(t), f(t), rtol=1e-15)
     programs = {input_programs.traced(f, real)[0].program for f in functions}
     assert len(programs) == len(functions)
 
@@ -129,7 +130,7 @@ def test_a_function_of_time_serves_outside_of_jit_and_inside_in_turn():
     compiled = jax.jit(lambda start: moved(force, start)["x"][-1])
     start = jj.start(Pushed(), x=0.1)
     for run in (lambda: moved(force, start)["x"][-1], lambda: compiled(start)) * 3:
-        np.testing.assert_allclose(run(), pulled(2.0), atol=1e-7)
+        assert_allclose(run(), pulled(2.0), atol=1e-7)
 
 
 def test_the_structure_of_a_scene_is_found_without_compiling_its_constants(compilations):
@@ -175,7 +176,7 @@ def test_a_motion_does_not_depend_on_how_often_it_was_asked_for():
     start = jj.start(disc, lean=0.3, spin_rate=-3.0)
     first, *others = [jj.simulate(scene, start, ts=times) for scene in (disc, disc, jj.models.TiltingDisc(), *[disc] * 100)]
     for motion in others:
-        jax.tree.map(np.testing.assert_array_equal, (motion.q, motion.u, motion.q_end), (first.q, first.u, first.q_end))
+        jax.tree.map(assert_array_equal, (motion.q, motion.u, motion.q_end), (first.q, first.u, first.q_end))
 
 
 def test_what_is_kept_of_a_scene_is_kept_by_the_values_of_its_parameters():
@@ -186,8 +187,8 @@ def test_what_is_kept_of_a_scene_is_kept_by_the_values_of_its_parameters():
 
     small, large = ends(0.4), ends(0.8)
     assert np.max(np.abs(small - large)) > 1e-2
-    np.testing.assert_array_equal(ends(0.4), small)
-    np.testing.assert_array_equal(ends(0.8), large)
+    assert_array_equal(ends(0.4), small)
+    assert_array_equal(ends(0.8), large)
 
 
 LOSSES = {
@@ -200,7 +201,7 @@ LOSSES = {
 @pytest.mark.parametrize("options", LOSSES.values(), ids=LOSSES)
 def test_gradients_reach_what_an_input_function_closes_over_without_jit(options):
     slope = jax.grad(lambda k: moved(lambda t: k * jnp.sin(t), **options)["x"][-1])(1.5)
-    np.testing.assert_allclose(slope, pulled(1.0) - pulled(0.0), rtol=1e-5)
+    assert_allclose(slope, pulled(1.0) - pulled(0.0), rtol=1e-5)
 
 
 def test_gradients_reach_what_an_input_function_closes_over_in_every_mode():
@@ -210,15 +211,15 @@ def test_gradients_reach_what_an_input_function_closes_over_in_every_mode():
         return moved(lambda t: jax.jit(lambda t: k * jnp.sin(t))(t), **options)["x"][-1]
 
     _, slope = jax.jvp(end, (1.5,), (1.0,))
-    np.testing.assert_allclose(slope, expected, rtol=1e-6)
-    np.testing.assert_allclose(jax.vmap(end)(jnp.array([0.0, 1.5])), [pulled(0.0), pulled(1.5)], atol=1e-7)
-    np.testing.assert_allclose(jax.jit(jax.grad(end))(1.5), expected, rtol=1e-6)
+    assert_allclose(slope, expected, rtol=1e-6)
+    assert_allclose(jax.vmap(end)(jnp.array([0.0, 1.5])), [pulled(0.0), pulled(1.5)], atol=1e-7)
+    assert_allclose(jax.jit(jax.grad(end))(1.5), expected, rtol=1e-6)
 
     def lanes(k):
         found = jj.rollout(Pushed(), {"x": np.array([0.1, 0.2])}, ts=TS, inputs={"f": lambda t: k * jnp.sin(t)}, progress=False)
         return jnp.sum(found["x"][:, -1])
 
-    np.testing.assert_allclose(jax.grad(lanes)(1.5), 2 * expected, rtol=1e-6)
+    assert_allclose(jax.grad(lanes)(1.5), 2 * expected, rtol=1e-6)
 
 
 def test_inputs_of_any_kind_are_what_they_were_given_as():
@@ -226,7 +227,7 @@ def test_inputs_of_any_kind_are_what_they_were_given_as():
     given = {"f": jj.Sampled(ts, ts**2), "g": lambda t: jnp.interp(t, ts, ts**2)}
     inputs = as_inputs(Pushed(), given)
     for t in (0.1, 0.6, 1.4):
-        np.testing.assert_allclose(inputs(t), [np.interp(t, ts, ts**2)] * 2, rtol=1e-14)
+        assert_allclose(inputs(t), [np.interp(t, ts, ts**2)] * 2, rtol=1e-14)
     assert inputs.programs
     assert not inputs.constant
     assert as_inputs(Pushed(), inputs) is inputs
@@ -252,5 +253,5 @@ def test_motions_go_on_after_the_precision_is_switched():
         jax.config.update("jax_enable_x64", True)
     for a, b, again in zip(double, single, run(), strict=True):
         assert (a.dtype, b.dtype) == (np.float64, np.float32)
-        np.testing.assert_allclose(b, a, atol=1e-3)
-        np.testing.assert_array_equal(again, a)
+        assert_allclose(b, a, atol=1e-3)
+        assert_array_equal(again, a)

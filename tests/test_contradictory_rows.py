@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose
 from small_scenes import OnPlane
 
 import jourdain_jax as jj
@@ -41,7 +42,7 @@ def test_rows_that_contradict_each_other_later_are_told(way):
     codes = [int(run(off).result) for off in (0.0, 0.5)]
     inside = jax.jit(jax.vmap(lambda off: run(off).result))(np.array([0.0, 0.5])).tolist()
     assert codes == inside == [results.SUCCESS, results.CONTRADICTORY_ROWS]
-    np.testing.assert_allclose(run(0.0).q_end, [1.0 - np.cos(1.0), 1.0], rtol=1e-7)
+    assert_allclose(run(0.0).q_end, [1.0 - np.cos(1.0), 1.0], rtol=1e-7)
 
 
 def test_lanes_are_told_each_by_itself():
@@ -67,4 +68,4 @@ def test_what_long_steps_violate_is_no_contradiction():
 
 def test_derivatives_are_as_without_the_check():
     end = lambda speed: jj.simulate(TwoBelts(), {"y_rate": speed}, ts=[1.0], inputs=belts(0.0)).q_end[1] ** 2  # noqa: E731
-    np.testing.assert_allclose([jax.grad(end)(1.0), jax.jit(jax.grad(end))(2.0)], [2.0, 4.0], rtol=1e-7)
+    assert_allclose([jax.grad(end)(1.0), jax.jit(jax.grad(end))(2.0)], [2.0, 4.0], rtol=1e-7)

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from oracles import chaplygin_sleigh as sleigh_oracle
 from small_scenes import OnLine
 
@@ -66,8 +67,8 @@ def test_a_known_correlation_time_gives_the_generalised_least_squares_of_the_den
         information += J.T @ np.linalg.solve(V, J)
         gradient += J.T @ np.linalg.solve(V, r)
         chi_square += r @ np.linalg.solve(V, r)
-    np.testing.assert_allclose(found.covariance, np.linalg.inv(information), rtol=1e-3)
-    np.testing.assert_allclose(float(found.chi_square), chi_square, rtol=1e-4)
+    assert_allclose(found.covariance, np.linalg.inv(information), rtol=1e-3)
+    assert_allclose(float(found.chi_square), chi_square, rtol=1e-4)
     assert np.all(np.abs(np.linalg.solve(information, gradient)) < 1e-3 * found.standard_errors)
 
 
@@ -127,8 +128,8 @@ def test_intervals_are_those_of_all_correlation_times_by_their_restricted_likeli
     weight /= weight.sum()
     whole = weight @ variances + weight @ estimates**2 - (weight @ estimates) ** 2
     best = int(np.argmax(logs))
-    np.testing.assert_allclose(found.standard_errors, np.sqrt(variances[best]), rtol=0.01)
-    np.testing.assert_allclose(found.high - found.values, 1.98 * np.sqrt(whole), rtol=0.02)
+    assert_allclose(found.standard_errors, np.sqrt(variances[best]), rtol=0.01)
+    assert_allclose(found.high - found.values, 1.98 * np.sqrt(whole), rtol=0.02)
 
 
 def one(correlation_time) -> jj.Experiment:

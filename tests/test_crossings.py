@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import result_codes as results
 from machine_code import BACKENDS
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import OnPlane
 
 import jourdain_jax as jj
@@ -90,7 +91,7 @@ def test_what_acts_in_a_part_of_the_way_is_met_by_the_same_steps_of_both_loops(k
     found = [motion(scene, backend=backend, **loose) for backend in BACKENDS]
     assert abs(float(exact.q_end[0]) - SPAN) > 5e-3, "nothing acted"
     for one in found:
-        np.testing.assert_allclose(one.q_end, exact.q_end, atol=2e-3)
+        assert_allclose(one.q_end, exact.q_end, atol=2e-3)
         assert int(one.crossings) == int(exact.crossings) >= 2
         assert not np.isfinite(one.together)
         assert (int(one.accepted), int(one.rejected)) == (int(found[0].accepted), int(found[0].rejected))
@@ -116,7 +117,7 @@ def test_a_load_that_is_passed_in_one_step_is_named():
     assert np.isfinite(motion(scene).together)
     assert "changed in the one step" in " ".join(motion(scene).warnings)
     lanes = jj.rollout(scene, {"x": np.zeros(3), "x_rate": np.array([1.0, 0.1, -1.0])}, ts=[SPAN], rtol=1e-3, atol=1e-3, progress=False)
-    np.testing.assert_array_equal(lanes.crossed_together, [0])
+    assert_array_equal(lanes.crossed_together, [0])
     assert "1 crossed two or more relations in one step" in str(lanes)
 
 
@@ -158,7 +159,7 @@ def test_inputs_that_are_functions_of_time_are_watched():
 
     found = [motion(Cart(), inputs={"push": Pushed(0.9)}, backend=backend) for backend in BACKENDS]
     for one in found:
-        np.testing.assert_allclose(one.q_end[0], 2.0 + 0.6 * (2.0 - 0.915), atol=1e-6)
+        assert_allclose(one.q_end[0], 2.0 + 0.6 * (2.0 - 0.915), atol=1e-6)
         assert int(one.crossings) == 2
 
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from jourdain_jax.program import emit
 from jourdain_jax.program.graph import Graph
@@ -39,12 +40,12 @@ def test_values_and_derivatives_of_a_deep_program_are_those_of_the_plain_one():
     for run in (program, lambda a, x: by_hand(a, x, length)):
         assert jax.eval_shape(run, 2.0, lanes).shape == (5,)
     expected = by_hand(2.0, lanes, length)
-    np.testing.assert_allclose(jax.jit(program)(2.0, lanes), expected, rtol=1e-12)
-    np.testing.assert_allclose(jax.jit(jax.vmap(program, (None, 0)))(2.0, lanes), expected, rtol=1e-12)
+    assert_allclose(jax.jit(program)(2.0, lanes), expected, rtol=1e-12)
+    assert_allclose(jax.jit(jax.vmap(program, (None, 0)))(2.0, lanes), expected, rtol=1e-12)
     slopes = [jax.jit(jax.vmap(jax.grad(f), (None, 0)))(2.0, lanes) for f in (program, lambda a, x: by_hand(a, x, length))]
-    np.testing.assert_allclose(*slopes, rtol=1e-11)
+    assert_allclose(*slopes, rtol=1e-11)
     forward = jax.jit(lambda a: jax.jvp(lambda a: program(a, lanes), (a,), (1.0,))[1])(2.0)
-    np.testing.assert_allclose(forward, slopes[1], rtol=1e-11)
+    assert_allclose(forward, slopes[1], rtol=1e-11)
 
 
 def test_pieces_are_kept_apart_in_the_compiled_program():
@@ -95,17 +96,17 @@ def values():
 def test_batches_are_those_of_single_lanes(program, values):
     lanes = values * jnp.linspace(0.9, 1.1, 5)[:, None]
     expected = recursed(lanes.T)
-    np.testing.assert_allclose(jax.jit(program)(lanes.T), expected, rtol=1e-13)  # lanes last
-    np.testing.assert_allclose(jax.jit(jax.vmap(program))(lanes).T, expected, rtol=1e-13)
+    assert_allclose(jax.jit(program)(lanes.T), expected, rtol=1e-13)  # lanes last
+    assert_allclose(jax.jit(jax.vmap(program))(lanes).T, expected, rtol=1e-13)
 
 
 def test_numbers_may_be_given_for_arrays(values):
     graph, inputs, outputs = chain(LINKS)
     found = emit.run(graph, outputs, dict(zip(inputs, values.tolist(), strict=True)))
-    np.testing.assert_allclose(jnp.stack([jnp.asarray(x) for x in found]), recursed(values), rtol=1e-13)
+    assert_allclose(jnp.stack([jnp.asarray(x) for x in found]), recursed(values), rtol=1e-13)
 
 
 def test_single_precision_stays_so(program, values):
     found = jax.jit(program)(values.astype(jnp.float32))
     assert found.dtype == jnp.float32
-    np.testing.assert_allclose(found, recursed(values), rtol=2e-4)
+    assert_allclose(found, recursed(values), rtol=2e-4)

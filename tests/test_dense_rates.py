@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from small_scenes import OnPlane
 
 import jourdain_jax as jj
@@ -40,15 +41,15 @@ def test_they_are_those_of_the_accelerations(name, every_speed):
     found = rates(scene, independent, t, q, u, inputs)
     for k in range(STATES):
         udot = jj.accelerations(scene, t[k], q[k], u[k], inputs[k]).udot
-        np.testing.assert_allclose(found.ydot[k], udot[np.array(independent)], rtol=1e-9, atol=1e-9 * (1 + np.max(np.abs(udot))))
-        np.testing.assert_allclose(found.qdot[k], jj.coordinate_rates(scene, t[k], q[k], u[k]), rtol=1e-12, atol=1e-12)
+        assert_allclose(found.ydot[k], udot[np.array(independent)], rtol=1e-9, atol=1e-9 * (1 + np.max(np.abs(udot))))
+        assert_allclose(found.qdot[k], jj.coordinate_rates(scene, t[k], q[k], u[k]), rtol=1e-12, atol=1e-12)
 
 
 def test_they_are_nan_where_a_speed_has_no_inertia():
     q = np.array([[0.0, 0.3], [2.0, 0.3]])
     found = rates(Polar(), (0, 1), np.zeros(2), q, np.array([[1.0, 0.5], [1.0, 0.5]]), np.zeros((2, 0)))
     assert np.all(np.isnan(found.ydot[0]))
-    np.testing.assert_allclose(found.ydot[1], [2.0 * 0.5**2, -2 * 1.0 * 0.5 / 2.0], rtol=1e-12)
+    assert_allclose(found.ydot[1], [2.0 * 0.5**2, -2 * 1.0 * 0.5 / 2.0], rtol=1e-12)
 
 
 class SaidTwice(OnPlane):
@@ -63,13 +64,13 @@ def test_rows_that_follow_from_others_are_left_out_where_rounded_coordinates_mak
     scene = SaidTwice()
     t, q, u = jj.sample_states(scene, STATES)
     found = rates(scene, (0, 1), t, q.astype(np.float32).astype(float), u, np.zeros((STATES, 0)))
-    np.testing.assert_allclose(found.ydot, -np.sum(u**2, axis=1, keepdims=True) * q, atol=1e-5)
+    assert_allclose(found.ydot, -np.sum(u**2, axis=1, keepdims=True) * q, atol=1e-5)
 
 
 def test_rows_that_rounding_makes_independent_count_once():
     A, b = np.array([[[1.0, 0.0, 0.0], [1.0, 1e-8, 0.0]]]), np.ones((1, 2))
     Z, c = _null_space(A, b, rank=1)
     assert np.linalg.matrix_rank(Z[0]) == 2
-    np.testing.assert_allclose(A @ Z, 0.0, atol=2e-8)
-    np.testing.assert_allclose(c, [[1.0, 0.0, 0.0]], atol=2e-8)
+    assert_allclose(A @ Z, 0.0, atol=2e-8)
+    assert_allclose(c, [[1.0, 0.0, 0.0]], atol=2e-8)
     assert np.linalg.matrix_rank(_null_space(A, b, rank=2)[0][0]) == 1

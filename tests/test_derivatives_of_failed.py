@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from small_scenes import OnLine
 
 import jourdain_jax as jj
@@ -86,16 +87,16 @@ def test_they_are_nan_after_the_failure_right_before_it_and_zero_where_nobody_as
     slope, ok = jax.jit(jax.jacrev(found, has_aux=True))(1.0)
     assert ok.tolist() == [True, False]
     good = _alone((1.0, 1.0, 1.0, -50.0), 1.0)
-    np.testing.assert_allclose(slope[0], jax.grad(lambda p: good(p) ** 2)(1.0), rtol=1e-6)
+    assert_allclose(slope[0], jax.grad(lambda p: good(p) ** 2)(1.0), rtol=1e-6)
     assert np.isnan(slope[2:]).all()
     if moves:
-        np.testing.assert_allclose(slope[1], jax.grad(_alone(numbers, TIMES[0]))(1.0), rtol=1e-6)
+        assert_allclose(slope[1], jax.grad(_alone(numbers, TIMES[0]))(1.0), rtol=1e-6)
     else:
         assert np.isnan(slope[1])
     if backend == "native":
         twice = jax.jit(jax.hessian(lambda p: found(p)[0]))(1.0)
-        np.testing.assert_allclose(jax.jit(jax.jacfwd(lambda p: found(p)[0]))(1.0), slope, rtol=1e-8)
-        np.testing.assert_allclose(twice[0], jax.hessian(lambda p: good(p) ** 2)(1.0), rtol=1e-5)
+        assert_allclose(jax.jit(jax.jacfwd(lambda p: found(p)[0]))(1.0), slope, rtol=1e-8)
+        assert_allclose(twice[0], jax.hessian(lambda p: good(p) ** 2)(1.0), rtol=1e-5)
         assert np.isnan(twice[2:]).all()
 
 
@@ -108,4 +109,4 @@ def test_a_single_motion_that_failed_has_no_derivative_at_its_end():
     assert np.isnan(jax.jacfwd(end)(1.0, "u_end"))
     assert np.isnan(jax.grad(jax.grad(end))(1.0, "q_end"))
     before = _alone((1.0, 40.0, 1.0, 0.3), TIMES[0])
-    np.testing.assert_allclose(jax.grad(end)(1.0, "u"), jax.grad(lambda p: before(p, "u_end"))(1.0), rtol=1e-6)
+    assert_allclose(jax.grad(end)(1.0, "u"), jax.grad(lambda p: before(p, "u_end"))(1.0), rtol=1e-6)

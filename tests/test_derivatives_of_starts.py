@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import small_scenes
 from jax.flatten_util import ravel_pytree
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 from jourdain_jax.eager.eager import eval_numpy
@@ -55,8 +56,8 @@ def test_derivatives_are_those_of_what_is_computed(scene, held, off):
     put = _along(scene, held, off)
     weights = jnp.asarray(np.random.default_rng(3).normal(size=put(0.0).size))
     forward = jax.jit(jax.jacfwd(put))(0.0)
-    np.testing.assert_allclose(forward, _slope(jax.jit(put)), atol=1e-8 * np.max(np.abs(forward)))
-    np.testing.assert_allclose(jax.jit(jax.grad(lambda s: weights @ put(s)))(0.0), weights @ forward, rtol=1e-10)
+    assert_allclose(forward, _slope(jax.jit(put)), atol=1e-8 * np.max(np.abs(forward)))
+    assert_allclose(jax.jit(jax.grad(lambda s: weights @ put(s)))(0.0), weights @ forward, rtol=1e-10)
 
 
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
@@ -70,17 +71,17 @@ def test_values_that_are_all_given_move_with_the_rows_in_derivatives(derivative)
         state = jj.start(scene, {"x": sin, "z": -cos, **rates})
         return jnp.concatenate([state.q, state.u])
 
-    np.testing.assert_allclose(begins(1.0, 0.0), [sin, -cos, cos, sin], atol=1e-15)
+    assert_allclose(begins(1.0, 0.0), [sin, -cos, cos, sin], atol=1e-15)
     by_length, by_rate = jax.jit(derivative(begins, argnums=(0, 1)))(1.0, 0.0)
-    np.testing.assert_allclose(by_length, [sin, -cos, 0.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(by_rate, np.zeros(4), atol=1e-12)
+    assert_allclose(by_length, [sin, -cos, 0.0, 0.0], atol=1e-12)
+    assert_allclose(by_rate, np.zeros(4), atol=1e-12)
 
 
 def test_second_derivatives_are_differences_of_first_ones():
     put = _along(small_scenes.BeadOnTurningWire(), (), 0.1)
     expected = _slope(jax.jit(jax.jacfwd(put)))
     for second in (jax.jacfwd(jax.jacfwd(put)), jax.jacfwd(jax.jacrev(put)), jax.jacrev(jax.jacrev(put))):
-        np.testing.assert_allclose(jax.jit(second)(0.0), expected, atol=1e-7 * np.max(np.abs(expected)))
+        assert_allclose(jax.jit(second)(0.0), expected, atol=1e-7 * np.max(np.abs(expected)))
 
 
 @pytest.mark.parametrize(("metric", "rows"), [(True, "independent"), (False, "redundant"), (True, "redundant"), (True, "contradicting")])
@@ -107,9 +108,9 @@ def test_the_least_change_has_the_derivatives_of_a_pseudo_inverse(metric, rows):
         return np.linalg.solve(L.T, np.linalg.pinv(np.linalg.solve(L, A[:, free].T).T, rcond=1e-10) @ r)
 
     changed = eval_numpy(change)(0.1)
-    np.testing.assert_allclose(changed[free], expected(0.1), rtol=1e-11)
+    assert_allclose(changed[free], expected(0.1), rtol=1e-11)
     assert changed[2] == 0.0
     first, reverse, second = (eval_numpy(of(change)) for of in (jax.jacfwd, jax.jacrev, lambda change: jax.jacfwd(jax.jacfwd(change))))
-    np.testing.assert_allclose(first(0.1)[free], _slope(expected, 0.1), rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(reverse(0.1), first(0.1), rtol=1e-11, atol=1e-12)
-    np.testing.assert_allclose(second(0.1), _slope(first, 0.1), rtol=1e-7, atol=1e-7)
+    assert_allclose(first(0.1)[free], _slope(expected, 0.1), rtol=1e-8, atol=1e-8)
+    assert_allclose(reverse(0.1), first(0.1), rtol=1e-11, atol=1e-12)
+    assert_allclose(second(0.1), _slope(first, 0.1), rtol=1e-7, atol=1e-7)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
 
@@ -15,20 +16,20 @@ def test_a_sample_depends_on_its_number_alone(sampler):
     together = design.values()
     for first, last in ((0, 1), (13, 14), (17, 230), (399, 400)):
         for name, column in design.values(first, last).items():
-            np.testing.assert_array_equal(column, together[name][first:last])
+            assert_array_equal(column, together[name][first:last])
     assert not np.any(jj.Design(TWO, sampler=sampler, samples=400, seed=8).values()["mass"] == together["mass"])
 
 
 @pytest.mark.parametrize("sampler", ["random", "sobol"])
 def test_more_samples_begin_with_the_same_ones(sampler):
     few, many = (jj.Design(TWO, sampler=sampler, samples=n, seed=3).values(0, 100)["mass"] for n in (100, 5000))
-    np.testing.assert_array_equal(few, many)
+    assert_array_equal(few, many)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 63, 64, 65, 777])
 def test_a_latin_hypercube_has_one_sample_in_each_stratum(count):
     at = jj.Design(TWO, sampler="latin-hypercube", samples=count, seed=1).values()
-    np.testing.assert_array_equal(np.sort(np.floor((at["radius"] - 0.3) / 0.1 * count)), np.arange(count))
+    assert_array_equal(np.sort(np.floor((at["radius"] - 0.3) / 0.1 * count)), np.arange(count))
     assert count < 777 or abs(np.mean(at["mass"]) - 12.0) < 1e-4
 
 
@@ -52,17 +53,17 @@ def test_normal_quantities_have_the_correlation_asked_for(sampler):
     names = {"a": jj.Normal(0.0, 1.0), "b": jj.Normal(5.0, 2.0), "c": jj.Normal(1.0, 0.1)}
     design = jj.Design(names, sampler=sampler, samples=4096, seed=4, correlation={("a", "b"): 0.8, ("c", "b"): -0.3})
     found = np.corrcoef(np.stack(list(design.values().values())))
-    np.testing.assert_allclose(found, [[1.0, 0.8, 0.0], [0.8, 1.0, -0.3], [0.0, -0.3, 1.0]], atol=4 / np.sqrt(4096))
+    assert_allclose(found, [[1.0, 0.8, 0.0], [0.8, 1.0, -0.3], [0.0, -0.3, 1.0]], atol=4 / np.sqrt(4096))
     assert np.std(design.values()["b"]) == pytest.approx(2.0, rel=0.05)
 
 
 def test_a_grid_crosses_its_levels_and_a_table_is_taken_as_it_is():
     grid = jj.Design({"a": jj.Levels([1.0, 2.0]), "b": jj.Levels([10.0, 20.0, 30.0])})
     assert len(grid) == 6
-    np.testing.assert_array_equal(grid.values()["a"], [1, 1, 1, 2, 2, 2])
-    np.testing.assert_array_equal(grid.values(2, 5)["b"], [30, 10, 20])
+    assert_array_equal(grid.values()["a"], [1, 1, 1, 2, 2, 2])
+    assert_array_equal(grid.values(2, 5)["b"], [30, 10, 20])
     table = jj.Design({"a": [3.0, 1.0, 2.0], "b": np.arange(3)})
-    np.testing.assert_array_equal(table.values(1, 3)["a"], [1.0, 2.0])
+    assert_array_equal(table.values(1, 3)["a"], [1.0, 2.0])
     assert "3 values from 1 to 3" in str(table)
 
 

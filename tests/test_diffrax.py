@@ -5,6 +5,7 @@ import jax
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 
@@ -24,10 +25,10 @@ def test_rates_for_diffeqsolve_give_the_motion_and_its_derivative_by_any_adjoint
     def expected(radius):
         return jj.simulate(DISC.replace(radius=radius), START, ts=[0.5]).q_end[0]
 
-    np.testing.assert_allclose(end(0.5, diffrax.ForwardMode()), expected(0.5), rtol=1e-7)
+    assert_allclose(end(0.5, diffrax.ForwardMode()), expected(0.5), rtol=1e-7)
     slope = jax.grad(expected)(0.5)
-    np.testing.assert_allclose(jax.jacfwd(lambda radius: end(radius, diffrax.ForwardMode()))(0.5), slope, rtol=1e-6)
-    np.testing.assert_allclose(jax.grad(lambda radius: end(radius, diffrax.RecursiveCheckpointAdjoint()))(0.5), slope, rtol=1e-6)
+    assert_allclose(jax.jacfwd(lambda radius: end(radius, diffrax.ForwardMode()))(0.5), slope, rtol=1e-6)
+    assert_allclose(jax.grad(lambda radius: end(radius, diffrax.RecursiveCheckpointAdjoint()))(0.5), slope, rtol=1e-6)
 
 
 def test_lanes_by_a_solver_of_diffrax_are_those_of_our_own():
@@ -35,7 +36,7 @@ def test_lanes_by_a_solver_of_diffrax_are_those_of_our_own():
     by_own, by_diffrax = (
         jj.rollout(DISC, START | {"lean": lean}, ts=[0.2, 0.5], solver=solver, rtol=1e-7, atol=1e-7).lanes for solver in (None, diffrax.Bosh3())
     )
-    np.testing.assert_allclose(by_diffrax.q, by_own.q, atol=1e-5)
+    assert_allclose(by_diffrax.q, by_own.q, atol=1e-5)
 
 
 @pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
@@ -44,7 +45,7 @@ def test_a_solver_of_diffrax_has_derivatives_in_both_modes_up_to_an_event(deriva
         return jj.simulate(DISC, {"lean": lean, "spin_rate": -0.1}, t1=5.0, ts=[0.1], **options).t_end
 
     by_diffrax = derivative(lambda lean: end(lean, solver=diffrax.Bosh3(), rtol=1e-7, atol=1e-7))(0.6)
-    np.testing.assert_allclose(by_diffrax, jax.grad(end)(0.6), rtol=1e-5)
+    assert_allclose(by_diffrax, jax.grad(end)(0.6), rtol=1e-5)
 
 
 def test_a_fit_takes_a_solver_of_diffrax():
@@ -52,7 +53,7 @@ def test_a_fit_takes_a_solver_of_diffrax():
     lean = np.asarray(jj.simulate(DISC, START, ts=ts)["lean"])
     run = jj.Experiment(ts, {"lean": lean}, 1e-4, start=START)
     found = jj.fit(DISC.replace(radius=0.45), run, free="radius", solver=diffrax.Bosh3(), rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(found.scene.radius, DISC.radius, rtol=1e-4)
+    assert_allclose(found.scene.radius, DISC.radius, rtol=1e-4)
 
 
 def test_a_state_that_leaves_its_constraints_by_more_than_errors_of_its_steps_is_a_result_code(monkeypatch):

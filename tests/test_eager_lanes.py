@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from jourdain_jax.eager.lanes import uncompiled, uncompiled_lanes
 
@@ -57,14 +58,14 @@ def test_lanes_are_those_of_vmap(f):
     assert jax.tree.structure(found) == jax.tree.structure(expected)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert a.dtype == b.dtype
-        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+        assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
 def test_what_all_lanes_share_has_no_axis_of_lanes():
     random = np.random.default_rng(0)
     x, A = random.normal(size=4), random.normal(size=(5, 3, 4))
     found, expected = uncompiled_lanes(_products, shared=1)(x, A), jax.vmap(_products, in_axes=(None, 0))(x, A)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12), found, expected)
+    jax.tree.map(lambda a, b: assert_allclose(a, b, rtol=1e-12, atol=1e-12), found, expected)
 
 
 def test_what_no_result_needs_is_not_worked_out():
@@ -82,7 +83,7 @@ def test_what_no_result_needs_is_not_worked_out():
 def test_a_singular_matrix_run_uncompiled_gives_nan_as_jax_does():
     f = jax.vmap(jnp.linalg.cholesky)
     A = np.stack([np.eye(2), -np.eye(2)])
-    np.testing.assert_array_equal(np.isnan(uncompiled(f)(A)), np.isnan(f(A)))
+    assert_array_equal(np.isnan(uncompiled(f)(A)), np.isnan(f(A)))
 
 
 def test_integers_and_rounding_run_uncompiled_are_those_of_jax():
@@ -97,4 +98,4 @@ def test_integers_and_rounding_run_uncompiled_are_those_of_jax():
 
     for found, expected in zip(jax.tree.leaves(uncompiled(f)(n, flags, x)), jax.tree.leaves(f(n, flags, x)), strict=True):
         assert found.dtype == expected.dtype
-        np.testing.assert_array_equal(found, expected)
+        assert_array_equal(found, expected)

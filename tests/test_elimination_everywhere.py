@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import result_codes as results
 from generated_robots import BeadOnCurve, PlanarRobot, drawn
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 from jourdain_jax import NullSpaceQR, structure_of
@@ -82,7 +83,7 @@ def test_motions_through_full_turns_are_served_by_one_program(scene, start, stat
     assert int(motion.result) == results.SUCCESS
     assert "lowered" in motion.reduction
     assert motion.smallest_pivot > 0.1
-    np.testing.assert_allclose(motion.q_end, reference.q_end, atol=1e-8)
+    assert_allclose(motion.q_end, reference.q_end, atol=1e-8)
 
 
 def test_rows_along_axes_at_any_angle_that_is_traced_are_served():
@@ -91,7 +92,7 @@ def test_rows_along_axes_at_any_angle_that_is_traced_are_served():
     angles = jnp.array([0.0, 0.4, np.pi / 2, -2.0])
     ends = jax.jit(jax.vmap(lambda a: jj.simulate(scene.replace(turned=a), start, ts=jnp.array([2.0]), rtol=1e-10, atol=1e-10, work=False)))(angles)
     assert np.all(np.asarray(ends.result) == results.SUCCESS)
-    np.testing.assert_allclose(ends.q_end, jnp.broadcast_to(ends.q_end[0], ends.q_end.shape), atol=1e-8)
+    assert_allclose(ends.q_end, jnp.broadcast_to(ends.q_end[0], ends.q_end.shape), atol=1e-8)
 
 
 WEIGHTLESS_ROBOT = PlanarRobot(trailers=1, maximal=True, **WEIGHTLESS), PlanarRobot(trailers=1, maximal=True).start(**ROBOT)
@@ -110,7 +111,7 @@ WEIGHTLESS_CAR = TrailerChain(trailers=1, **WEIGHTLESS), TrailerChain(trailers=1
 def test_massless_trailers_follow_also_where_their_masses_are_traced(scene, start, state):
     motion, reference = motion_and_reference(scene, start, 2.0, traced=WEIGHTLESS, formulation=jj.Formulation(state))
     assert int(motion.result) == results.SUCCESS
-    np.testing.assert_allclose(motion.q_end, reference.q_end, atol=1e-8)
+    assert_allclose(motion.q_end, reference.q_end, atol=1e-8)
 
 
 class LightKnee(jj.Scene):
@@ -137,9 +138,9 @@ def test_multipliers_serve_where_a_body_that_rows_hold_has_no_mass(knee):
     start = {"x": 0.6, "z": -0.8, "x_end": 1.2, "z_end": -1.6, "x_rate": 4.0}
     motion, reference = motion_and_reference(LightKnee(knee=knee), start, 2.0, traced=("knee",))
     assert int(motion.result) == results.SUCCESS
-    np.testing.assert_allclose(motion.q_end, reference.q_end, atol=1e-8)
+    assert_allclose(motion.q_end, reference.q_end, atol=1e-8)
     energy = motion.energies().balance
-    np.testing.assert_allclose(energy, jnp.full(len(energy), energy[0]), atol=1e-7)
+    assert_allclose(energy, jnp.full(len(energy), energy[0]), atol=1e-7)
 
 
 class Twice(PlanarRobot):
@@ -159,7 +160,7 @@ def test_dependent_rows_are_served_in_both_forms_of_the_state(state):
     assert structure.dependent_rows  # what is left of them still depends on each other
     motion, reference = motion_and_reference(scene, scene.start(**ROBOT), 2.0, formulation=jj.Formulation(state), traced=("turned",))
     assert int(motion.result) == results.SUCCESS
-    np.testing.assert_allclose(motion.q_end, reference.q_end, atol=1e-8)
+    assert_allclose(motion.q_end, reference.q_end, atol=1e-8)
 
 
 @pytest.mark.parametrize("turned", [0.0, 0.1, 0.7, 2.5])
@@ -190,7 +191,7 @@ def test_rates_may_be_differentiated_where_rows_were_combined():
     for step in steps:
         ends = [by_matrices(float(scene.track) + sign * step[0], q[0] + sign * step[1:]) for sign in (1, -1)]
         by_hand.append((ends[0] - ends[1]) / 2e-5)
-    np.testing.assert_allclose(slopes, by_hand, atol=1e-7)
+    assert_allclose(slopes, by_hand, atol=1e-7)
 
 
 @pytest.mark.parametrize("scale", [1e3, 1e-4])

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose
 from small_scenes import OnLine, OnPlane
 
 import jourdain_jax as jj
@@ -57,7 +58,7 @@ def test_a_feature_that_steps_pass_over_is_told_by_the_energy(way):
 def test_an_edge_that_steps_can_follow_is_passed():
     motion = jj.simulate(Step(width=0.05), {"x_rate": 3.0, "y_rate": 1.0}, ts=[1.5])
     assert int(motion.result) == results.SUCCESS
-    np.testing.assert_allclose(motion.u_end[0], np.sqrt(9.0 - 4.0), rtol=1e-6)
+    assert_allclose(motion.u_end[0], np.sqrt(9.0 - 4.0), rtol=1e-6)
 
 
 def test_a_potential_that_is_not_that_of_its_force_is_told():
@@ -100,4 +101,4 @@ def test_steps_without_control_are_taken_as_they_are():
 def test_the_derivative_of_a_motion_is_what_it_was_without_the_check():
     """x = a cos(w t), dx/dk = -a t sin(w t)/(2 w)."""
     slope = jax.grad(lambda k: jj.simulate(Spring(k), {"x": 0.3}, ts=[2.0], rtol=1e-11, atol=1e-11).q_end[0])(4.0)
-    np.testing.assert_allclose(slope, -0.3 * 2.0 * np.sin(4.0) / 4.0, rtol=1e-8)
+    assert_allclose(slope, -0.3 * 2.0 * np.sin(4.0) / 4.0, rtol=1e-8)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose
 from small_scenes import OnLine
 
 import jourdain_jax as jj
@@ -49,7 +50,7 @@ def test_a_fall_is_located_with_derivatives_up_to_the_third(solver):
     height = 2.0
     exact = np.sqrt(2 * height / GRAVITY)
     for expected in (exact, exact / (2 * height), -exact / (4 * height**2), 3 * exact / (8 * height**3)):
-        np.testing.assert_allclose(fall_time(height), expected, rtol=1e-9)
+        assert_allclose(fall_time(height), expected, rtol=1e-9)
         fall_time = jax.jacfwd(fall_time)
 
 
@@ -71,9 +72,9 @@ def test_reverse_mode_to_an_event_does_not_depend_on_derivatives_beyond_it():
     work = lambda z: GRAVITY * z - stiffness * (z + depth) ** 10.5 / 10.5  # noqa: E731
     speed = np.sqrt(2 * (work(height) - work(0.0)))
     assert np.isnan(jax.grad(push)(-depth))
-    np.testing.assert_allclose(landing_speed(height), -speed, rtol=1e-9)
+    assert_allclose(landing_speed(height), -speed, rtol=1e-9)
     assert any(beyond)
-    np.testing.assert_allclose(jax.grad(landing_speed)(height), -(GRAVITY - push(height + depth)) / speed, rtol=1e-7)
+    assert_allclose(jax.grad(landing_speed)(height), -(GRAVITY - push(height + depth)) / speed, rtol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -91,8 +92,8 @@ def test_reverse_mode_to_an_event_does_not_depend_on_derivatives_beyond_it():
 def test_an_event_is_found_in_its_step_whatever_its_shape(value, digits):
     end = stopped(jnp.array([0.0]), value, rates=lambda t, y: jnp.ones_like(y))
     assert int(end.code) == results.EVENT
-    np.testing.assert_allclose(end.t, 0.7, atol=digits)
-    np.testing.assert_allclose(end.y[0], end.t, rtol=1e-13)
+    assert_allclose(end.t, 0.7, atol=digits)
+    assert_allclose(end.y[0], end.t, rtol=1e-13)
 
 
 class Flat(OnLine):
@@ -112,6 +113,6 @@ def test_the_time_of_an_event_whose_value_has_no_slope_has_no_derivative(options
         motion = jj.simulate(Flat(wall=wall, order=order), {"x": 0.0, "x_rate": 1.0}, t1=4.0, ts=[0.5], **options)
         return jnp.stack([motion.t_end, motion.q_end[0], motion.q[0, 0] * wall])
 
-    np.testing.assert_allclose(met(1.5, 3), [1.5, 1.5, 0.75], rtol=1e-7)
-    np.testing.assert_allclose(derivative(met)(1.5, 1), [1.0, 1.0, 0.5], rtol=1e-9)
-    np.testing.assert_allclose(derivative(met)(1.5, 3), [np.nan, np.nan, 0.5], rtol=1e-9)  # what was saved on the way is none of the event's
+    assert_allclose(met(1.5, 3), [1.5, 1.5, 0.75], rtol=1e-7)
+    assert_allclose(derivative(met)(1.5, 1), [1.0, 1.0, 0.5], rtol=1e-9)
+    assert_allclose(derivative(met)(1.5, 3), [np.nan, np.nan, 0.5], rtol=1e-9)  # what was saved on the way is none of the event's

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import OnLine, Upright
 
 import jourdain_jax as jj
@@ -67,11 +68,11 @@ def test_the_first_of_several_events_in_one_long_step_ends_the_motion(options):
     walls = dict(zip(("floor", "wall", "roof", "slope"), throws[:, 2:].T, strict=True))
     lanes = jj.rollout(Thrown(), starts, parameters=walls, ts=[5.0], max_step=np.inf, progress=False, **options).lanes  # some step is beyond all of them
     expected = [first_crossing(*throw) for throw in throws]
-    np.testing.assert_array_equal(lanes.event, [event for event, _ in expected])
-    np.testing.assert_allclose(lanes.t_end, [t for _, t in expected], rtol=1e-12)
+    assert_array_equal(lanes.event, [event for event, _ in expected])
+    assert_allclose(lanes.t_end, [t for _, t in expected], rtol=1e-12)
     assert set(np.asarray(lanes.event)) >= {0, 1, 3}
     assert np.all(np.asarray(lanes.result) == results.EVENT)
-    np.testing.assert_allclose(lanes.q_end[:, 0], throws[:, 0] * lanes.t_end, rtol=1e-12)
+    assert_allclose(lanes.q_end[:, 0], throws[:, 0] * lanes.t_end, rtol=1e-12)
 
 
 def test_the_derivative_of_the_first_event_is_its_own():
@@ -81,8 +82,8 @@ def test_the_derivative_of_the_first_event_is_its_own():
 
     t, dt = 2.0 / 4.5, 1 / 4.5
     expected = [dt, -GRAVITY * t * dt]
-    np.testing.assert_allclose(jax.jacrev(end)(2.0), expected, rtol=1e-10)
-    np.testing.assert_allclose(jax.jacfwd(end)(2.0), expected, rtol=1e-10)
+    assert_allclose(jax.jacrev(end)(2.0), expected, rtol=1e-10)
+    assert_allclose(jax.jacfwd(end)(2.0), expected, rtol=1e-10)
 
 
 # where a stone from z = 1 with the speeds 4.5 and 2 m/s meets a plane: its place, and the value a t^2 + b t + c
@@ -108,8 +109,8 @@ def test_the_second_derivative_of_one_of_several_events_is_its_own(plane):
         t = 2 * c / (-b + jnp.sqrt(b**2 - 4 * a * c))
         return jnp.stack([t, 4.5 * t, 1.0 + 2.0 * t - GRAVITY * t**2 / 2])
 
-    np.testing.assert_allclose(end(place), closed(place), rtol=1e-9)
-    np.testing.assert_allclose(jax.hessian(end)(place), jax.hessian(closed)(place), rtol=1e-6, atol=1e-9)
+    assert_allclose(end(place), closed(place), rtol=1e-9)
+    assert_allclose(jax.hessian(end)(place), jax.hessian(closed)(place), rtol=1e-6, atol=1e-9)
 
 
 class Bounded(OnLine):
@@ -136,17 +137,17 @@ def test_an_event_that_is_no_number_beyond_its_boundary_stops_the_motion_there()
     own = {name: np.where(kinds == k, edges, 1e3) for k, name in enumerate(("arc", "root", "jump", "positive"))}
     lanes = jj.rollout(Bounded(), {"x_rate": np.full(12, 1.3)}, parameters=own, ts=[5.0], progress=False).lanes
     assert np.all(np.asarray(lanes.result) == results.EVENT)
-    np.testing.assert_array_equal(lanes.event, np.array([0, 3, 1, 2])[kinds])  # in the order of the alphabet
-    np.testing.assert_allclose(lanes.q_end[:, 0], edges, rtol=1e-13)
-    np.testing.assert_allclose(lanes.t_end, edges / 1.3, rtol=1e-13)
+    assert_array_equal(lanes.event, np.array([0, 3, 1, 2])[kinds])  # in the order of the alphabet
+    assert_allclose(lanes.q_end[:, 0], edges, rtol=1e-13)
+    assert_allclose(lanes.t_end, edges / 1.3, rtol=1e-13)
 
 
 def test_the_time_at_which_a_value_ends_has_the_derivative_of_its_boundary():
     def end(edge):
         return jj.simulate(Bounded(arc=edge), {"x_rate": 1.3}, ts=[5.0]).t_end
 
-    np.testing.assert_allclose(jax.grad(end)(0.7), 1 / 1.3, rtol=1e-6)
-    np.testing.assert_allclose(jax.jacfwd(end)(0.7), 1 / 1.3, rtol=1e-6)
+    assert_allclose(jax.grad(end)(0.7), 1 / 1.3, rtol=1e-6)
+    assert_allclose(jax.jacfwd(end)(0.7), 1 / 1.3, rtol=1e-6)
 
 
 def test_a_start_whose_event_is_no_number_is_beyond_it_and_a_state_that_is_none_is_a_failure():
@@ -164,8 +165,8 @@ def test_a_value_that_falls_below_zero_and_rises_again_within_a_step_is_an_event
     scene = Thrown(floor=-100.0, wall=100.0, slope=100.0)
     lanes = jj.rollout(scene, starts, parameters={"roof": top - passes}, ts=[longest], max_step=np.inf, progress=False).lanes
     expected = 5.0 / GRAVITY - np.sqrt(2 * passes / GRAVITY)
-    np.testing.assert_array_equal(lanes.event, np.full(3, 2))
-    np.testing.assert_allclose(lanes.t_end, expected, rtol=1e-9)
+    assert_array_equal(lanes.event, np.full(3, 2))
+    assert_allclose(lanes.t_end, expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("backend", ["auto", "xla"])
@@ -177,15 +178,15 @@ def test_a_value_that_ends_a_step_just_below_zero_was_zero_where_it_fell_not_the
             return {"decayed": jnp.exp(-50.0 * motion.t) - 1e-10}
 
     found = jj.simulate(Decaying(), {"x_rate": 1.0}, ts=[5.0], backend=backend)
-    np.testing.assert_allclose(found.t_end, np.log(1e10) / 50, rtol=1e-9)
+    assert_allclose(found.t_end, np.log(1e10) / 50, rtol=1e-9)
     by, top = 3e-9, 1.0 + 5.0**2 / (2 * GRAVITY)
 
     def end(roof):
         motion = jj.simulate(Thrown(floor=-100.0, wall=100.0, roof=roof, slope=100.0), {"z": 1.0, "x_rate": 0.0, "z_rate": 5.0}, ts=[2.0], backend=backend)
         return motion.t_end
 
-    np.testing.assert_allclose(end(top - by), 5.0 / GRAVITY - np.sqrt(2 * by / GRAVITY), rtol=1e-9)
-    np.testing.assert_allclose(jax.grad(end)(top - by), 1 / np.sqrt(2 * GRAVITY * by), rtol=1e-4)
+    assert_allclose(end(top - by), 5.0 / GRAVITY - np.sqrt(2 * by / GRAVITY), rtol=1e-9)
+    assert_allclose(jax.grad(end)(top - by), 1 / np.sqrt(2 * GRAVITY * by), rtol=1e-4)
 
 
 def test_an_event_is_no_mistake_to_a_search_for_nan_and_a_mistake_still_is():

@@ -2,8 +2,8 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 
@@ -31,25 +31,25 @@ def test_a_batch_is_exported_with_the_numbers_of_xla():
     exported = jax.export.export(jax.jit(jax.vmap(_places)))(jax.ShapeDtypeStruct((count,), jnp.float64))
     assert MACHINE_CODE not in exported.mlir_module()
     found = exported.call(SPEEDS)
-    np.testing.assert_allclose(found, jax.vmap(_places)(SPEEDS), rtol=0, atol=1e-14)
-    np.testing.assert_allclose(found, jax.vmap(lambda v: _places(v, "auto"))(SPEEDS), rtol=0, atol=1e-11)
+    assert_allclose(found, jax.vmap(_places)(SPEEDS), rtol=0, atol=1e-14)
+    assert_allclose(found, jax.vmap(lambda v: _places(v, "auto"))(SPEEDS), rtol=0, atol=1e-11)
 
 
 def test_gradients_are_exported_and_taken_of_what_was_exported():
     gradient = jax.jit(jax.vmap(jax.grad(_total)))
     expected = gradient(SPEEDS)
-    np.testing.assert_allclose(_exported(gradient, SPEEDS).call(SPEEDS), expected, rtol=1e-9)
-    np.testing.assert_allclose(_exported(_total, 1.0).vjp().call(SPEEDS[1], jnp.ones(()))[0], expected[1], rtol=1e-9)
+    assert_allclose(_exported(gradient, SPEEDS).call(SPEEDS), expected, rtol=1e-9)
+    assert_allclose(_exported(_total, 1.0).vjp().call(SPEEDS[1], jnp.ones(()))[0], expected[1], rtol=1e-9)
 
 
 def test_derivatives_in_forward_mode_are_exported():
     forward = jax.jit(jax.vmap(jax.jacfwd(_places)))
-    np.testing.assert_allclose(_exported(forward, SPEEDS).call(SPEEDS), forward(SPEEDS), rtol=1e-9, atol=1e-12)
+    assert_allclose(_exported(forward, SPEEDS).call(SPEEDS), forward(SPEEDS), rtol=1e-9, atol=1e-12)
 
 
 def test_second_derivatives_are_exported():
     second = jax.jit(jax.jacfwd(jax.jacfwd(_places)))
-    np.testing.assert_allclose(_exported(second, 1.0).call(1.0), second(1.0), rtol=1e-9, atol=1e-12)
+    assert_allclose(_exported(second, 1.0).call(1.0), second(1.0), rtol=1e-9, atol=1e-12)
 
 
 def test_an_exported_program_says_that_it_has_no_hessian():
@@ -67,4 +67,4 @@ def test_machine_code_in_a_program_that_runs_elsewhere_is_an_error_that_names_th
     with pytest.raises(RuntimeError, match=r'to be exported.*backend="xla"'):
         jax.export.export(by_machine_code)(jax.ShapeDtypeStruct((), jnp.float64))
     both = _exported(_places, 1.0, platforms=("cpu", "cuda"))
-    np.testing.assert_allclose(both.call(1.0), _places(1.0), rtol=0, atol=1e-11)
+    assert_allclose(both.call(1.0), _places(1.0), rtol=0, atol=1e-11)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from test_mean_gradients import Thrown
 
 import jourdain_jax as jj
@@ -57,7 +58,7 @@ def test_values_that_were_not_reached_do_not_count(count):
 def test_the_derivative_is_that_of_the_largest_value():
     """Of a sin(3 t + phase): 1 by the amplitude, 0 by the phase."""
     by = jax.jit(jax.grad(lambda a, phase: largest(TIMES, a * wave(phase), ALL), argnums=(0, 1)))(1.3, 0.4)
-    np.testing.assert_allclose(by, [1.0, 0.0], atol=2e-5)
+    assert_allclose(by, [1.0, 0.0], atol=2e-5)
 
 
 def test_outputs_of_a_motion_find_its_turning_point_and_what_adds_up():
@@ -82,7 +83,7 @@ def test_an_end_just_after_a_saved_time_is_no_node_of_its_own():
     options = {"t1": 2.0, "ts": np.linspace(0.0, 2.0, 21), "rtol": 1e-8, "atol": 1e-8}
     lanes = jj.rollout(Thrown(), {"z": 4.5 * after**2, "z_rate": 0.0}, **options).lanes
     for output, exact in ((jj.Integral("z"), 3.0 * after**3), (jj.Integral(lambda m: m["z_rate"] ** 2), 27.0 * after**3), (jj.Largest("z"), 4.5 * after**2)):
-        np.testing.assert_allclose(jax.vmap(output.of)(lanes), exact, rtol=1e-9)
+        assert_allclose(jax.vmap(output.of)(lanes), exact, rtol=1e-9)
 
 
 def test_a_motion_that_runs_back_in_time_has_its_end_too():

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
 
@@ -44,24 +45,24 @@ def test_hands_free_turns_are_one_closed_curve_with_every_digit(turns):
         points = sorted(turns.at(lean=lean), key=lambda point: -point["rear_spin_rate"])
         assert len(points) == 4  # two ways of turning, forward and backward
         for point, expected in zip(points, (FIRST_HALF[lean], SECOND_HALF[lean], SECOND_HALF[lean], FIRST_HALF[lean]), strict=True):
-            np.testing.assert_allclose(magnitudes(point), (lean, *expected), rtol=0, atol=2e-11)
+            assert_allclose(magnitudes(point), (lean, *expected), rtol=0, atol=2e-11)
             assert point.state.residual < 1e-10
 
 
 def test_folds_and_rest_of_the_turns(turns):
     first = turns.folds[0]
     assert first.kind == "fold in lean"
-    np.testing.assert_allclose(magnitudes(first)[[0, 2, 3]], (0.420089250821, 0.005834627, 1.043780887), atol=2e-9)
-    np.testing.assert_allclose(magnitudes(first)[[1, 4, 5]], (0.218993988, 15.321918729, 13.533293415), atol=1e-7)
+    assert_allclose(magnitudes(first)[[0, 2, 3]], (0.420089250821, 0.005834627, 1.043780887), atol=2e-9)
+    assert_allclose(magnitudes(first)[[1, 4, 5]], (0.218993988, 15.321918729, 13.533293415), atol=1e-7)
     rest = turns.folds[1]
-    np.testing.assert_allclose(magnitudes(rest), (0, 1.339739911491, 0.007806882108, 0, 0, 0), atol=1e-9)
+    assert_allclose(magnitudes(rest), (0, 1.339739911491, 0.007806882108, 0, 0, 0), atol=1e-9)
 
 
 def test_the_third_family_runs_through_its_fold_to_the_other_side(bicycle):
     found = jj.family(bicycle, {"lean": 0.9, "steer": 0.25, "yaw_rate": -2.57, "rear_spin_rate": 22.2, "front_spin_rate": 20.6})
     (point,) = found.at(lean=0.9)
     expected = (0.9, 0.253265658718, 0.005858374011, 2.569920264555, 22.179528967864, 20.642557477777)
-    np.testing.assert_allclose(magnitudes(point), expected, atol=1e-10)
+    assert_allclose(magnitudes(point), expected, atol=1e-10)
     assert min(abs(abs(fold["lean"]) - 0.4811) for fold in found.folds if fold.kind == "fold in lean") < 5e-5
     assert abs(np.max(np.abs(found["steer"])) - 2.635) < 2e-3
     assert "without bound" in found.ends[0] + found.ends[1]
@@ -81,7 +82,7 @@ def test_speeds_of_the_modes_are_the_published_ones(straight):
     speeds = straight["x_rate"]
     stable = (speeds > WEAVE) & (speeds < CAPSIZE)
     assert stable.any()
-    np.testing.assert_array_equal(straight.stable, stable)
+    assert_array_equal(straight.stable, stable)
 
 
 def test_columns_are_those_of_the_modes(straight, bicycle):
@@ -91,12 +92,12 @@ def test_columns_are_those_of_the_modes(straight, bicycle):
     assert found["capsize"] == pytest.approx(-0.322866429004087, abs=1e-9)
     assert found["weave"].real == pytest.approx(-0.775341882195845, abs=1e-9)
     small = jj.linearize(bicycle, point.state, ("lean", "steer"))
-    np.testing.assert_allclose(np.sort_complex(point.eigenvalues), np.sort_complex(small.eigenvalues()), atol=1e-9)
+    assert_allclose(np.sort_complex(point.eigenvalues), np.sort_complex(small.eigenvalues()), atol=1e-9)
 
 
 def test_the_same_turn_ridden_backward_has_opposite_eigenvalues(turns):
     forward, backward = (sorted(turns.at(lean=0.3), key=lambda point: point["rear_spin_rate"])[k] for k in (3, 0))
-    np.testing.assert_allclose(np.sort_complex(backward.eigenvalues), np.sort_complex(-forward.eigenvalues), atol=1e-8)
+    assert_allclose(np.sort_complex(backward.eigenvalues), np.sort_complex(-forward.eigenvalues), atol=1e-8)
 
 
 def test_turns_from_the_capsize_point_on_are_unstable_by_a_real_eigenvalue(turns):
@@ -114,7 +115,7 @@ def test_an_upright_disc_is_stable_above_its_critical_spin():
     (change,) = found.changes
     assert change.kind == "double root"
     assert change["spin_rate"] == pytest.approx(-np.sqrt(9.81 / (3 * 0.5)), abs=1e-9)
-    np.testing.assert_array_equal(found.stable, found["spin_rate"] < change["spin_rate"])
+    assert_array_equal(found.stable, found["spin_rate"] < change["spin_rate"])
 
 
 def test_steady_turns_of_a_disc_meet_their_closed_form():
@@ -122,7 +123,7 @@ def test_steady_turns_of_a_disc_meet_their_closed_form():
     lean, yaw, spin, R, g = found["lean"], found["yaw_rate"], found["spin_rate"], 0.5, 9.81
     # moments about the contact point: (5/4) yaw^2 sin cos - (-3/2) yaw spin cos ... of a thin disc
     left = 1.25 * R * yaw**2 * np.sin(lean) * np.cos(lean) + 1.5 * R * yaw * spin * np.cos(lean) + g * np.sin(lean)
-    np.testing.assert_allclose(left, 0.0, atol=1e-9)
+    assert_allclose(left, 0.0, atol=1e-9)
 
 
 class Bead(jj.Scene):
@@ -147,9 +148,9 @@ def test_a_bead_on_a_turning_hoop_leaves_the_bottom_at_a_pitchfork():
     critical = np.sqrt(9.81 / 0.5)
     assert branch["turning"] == pytest.approx(critical, abs=1e-9)
     assert bottom["turning"][-1] == pytest.approx(6.0, abs=1e-9)
-    np.testing.assert_array_equal(bottom.stable, bottom["turning"] < critical)
+    assert_array_equal(bottom.stable, bottom["turning"] < critical)
     aside = jj.family(Bead(), branch, vary="turning", until={"turning": 8.0})
-    np.testing.assert_allclose(np.cos(aside["angle"]), 9.81 / (aside["turning"] ** 2 * 0.5), atol=1e-9)
+    assert_allclose(np.cos(aside["angle"]), 9.81 / (aside["turning"] ** 2 * 0.5), atol=1e-9)
     both = jj.family(Bead(), branch, vary="turning")
     assert both["angle"].min() < -1.5
     assert both["angle"].max() > 1.5
@@ -160,7 +161,7 @@ def test_a_bead_on_a_turning_hoop_leaves_the_bottom_at_a_pitchfork():
 def test_a_family_in_arrays_and_in_text(turns):
     found = turns.to_xarray()
     assert dict(found.sizes) == {"point": len(turns), "mode": 4}
-    np.testing.assert_array_equal(found["lean"], turns["lean"])
+    assert_array_equal(found["lean"], turns["lean"])
     text = str(turns)
     assert "the curve is closed" in text
     assert "fold in lean" in text

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import OnLine
 
 import jourdain_jax as jj
@@ -44,8 +45,8 @@ def test_an_oscillator_far_in_time_is_the_one_at_zero(options):
     near = jj.simulate(Oscillator(), ts=since, t0=0.0, **options).raise_if_failed()
     for t0 in FAR:
         far = jj.simulate(Oscillator(), ts=t0 + since, t0=t0, **options).raise_if_failed()
-        np.testing.assert_array_equal(far.q, near.q)
-        np.testing.assert_array_equal(far.ts, t0 + since)
+        assert_array_equal(far.q, near.q)
+        assert_array_equal(far.ts, t0 + since)
         assert int(far.accepted) == int(near.accepted)
         assert float(far.t_end) == t0 + 1.0
 
@@ -57,22 +58,22 @@ def test_an_event_far_in_time_is_the_one_at_zero_and_so_is_its_derivative():
 
     for options in ({}, {"solver": diffrax.Dopri5()}):
         t, speed = passed(0.5, 2.0**31, options)
-        np.testing.assert_allclose(t, np.arccos(-0.5) / 10.0, rtol=0, atol=2.0**-21)  # of the clock
-        np.testing.assert_allclose(speed, -10 * np.sqrt(0.75), rtol=1e-7)
+        assert_allclose(t, np.arccos(-0.5) / 10.0, rtol=0, atol=2.0**-21)  # of the clock
+        assert_allclose(speed, -10 * np.sqrt(0.75), rtol=1e-7)
     slope = jax.grad(lambda stops: passed(stops, 2.0**31, {})[1])(0.5)
-    np.testing.assert_allclose(slope, 10 * 0.5 / np.sqrt(0.75), rtol=1e-6)
+    assert_allclose(slope, 10 * 0.5 / np.sqrt(0.75), rtol=1e-6)
 
 
 def test_the_state_and_the_time_advance_together():
     """xdot = 1 in steps that do not divide the span: x is the time, to the last digit of the clock."""
     motion = jj.simulate(Oscillator(stiffness=0.0), {"x": 0.0, "x_rate": 1.0}, t0=1e9, ts=1e9 + np.linspace(0.0, 3.0, 7), t1=1e9 + 3.0)
-    np.testing.assert_allclose(motion["x"], np.asarray(motion.ts) - 1e9, rtol=1e-14, atol=1e-14)
+    assert_allclose(motion["x"], np.asarray(motion.ts) - 1e9, rtol=1e-14, atol=1e-14)
 
 
 def test_a_driven_oscillator_gets_the_time_of_the_clock():
     t0 = 1e6
     motion = jj.simulate(Oscillator(stiffness=0.0, driven=1.0), {"x": 0.0}, t0=t0, ts=[t0 + 1.0])
-    np.testing.assert_allclose(motion.u_end[0], (np.sin(2 * (t0 + 1.0)) - np.sin(2 * t0)) / 2, rtol=0, atol=1e-8)
+    assert_allclose(motion.u_end[0], (np.sin(2 * (t0 + 1.0)) - np.sin(2 * t0)) / 2, rtol=0, atol=1e-8)
 
 
 def test_a_clock_that_is_coarse_beside_the_steps_is_warned_of():
@@ -85,7 +86,7 @@ def test_a_clock_that_is_coarse_beside_the_steps_is_warned_of():
 def test_lanes_far_in_time_are_the_ones_at_zero():
     starts = {"x": np.array([1.0, 0.5])}
     near, far = (jj.rollout(Oscillator(), starts, t0=t0, ts=[t0 + 0.5, t0 + 1.0], progress=False) for t0 in (0.0, 1.7e9))
-    np.testing.assert_array_equal(far.lanes.q, near.lanes.q)
+    assert_array_equal(far.lanes.q, near.lanes.q)
 
 
 PROGRAM = """
@@ -107,4 +108,4 @@ def test_single_precision_far_in_time_is_as_right_as_at_zero():
     environment = {**os.environ, "JAX_ENABLE_X64": "0"}
     near, far = json.loads(subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True).stdout)
     assert far == near
-    np.testing.assert_allclose(far, np.cos([5.0, 10.0]), rtol=0, atol=1e-3)
+    assert_allclose(far, np.cos([5.0, 10.0]), rtol=0, atol=1e-3)

@@ -8,6 +8,7 @@ import pytest
 import result_codes as results
 from jax.flatten_util import ravel_pytree
 from linkages import Parallelogram, SliderCrank, Windows, bennett, bricard
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import DiscWithHeightRow
 
 import jourdain_jax as jj
@@ -39,7 +40,7 @@ def test_any_part_of_a_state_on_the_rows_is_a_start(name):
             given = np.setdiff1d(given, attitude) if first not in given else np.union1d(given, attitude)
         found = jj.start(scene, **{names[i]: q[i] for i in given})
         assert float(found.residual) < 1e-9
-        np.testing.assert_array_equal(np.asarray(found.q)[given], q[given])
+        assert_array_equal(np.asarray(found.q)[given], q[given])
 
 
 @pytest.mark.parametrize("given", [{"z": 0.4}, {"z": 0.1}])
@@ -90,7 +91,7 @@ def test_a_start_is_put_together_in_the_domain_that_its_scene_states(given):
     found = jj.start(Hanging(), given)
     assert float(found.residual) < 1e-12
     assert -1.05 <= float(found["z"]) <= -0.1
-    np.testing.assert_allclose(jj.simulate(Hanging(), given, ts=np.array([0.0, 0.01])).q[0], found.q, atol=1e-9)
+    assert_allclose(jj.simulate(Hanging(), given, ts=np.array([0.0, 0.01])).q[0], found.q, atol=1e-9)
 
 
 @pytest.mark.parametrize("x", [1.7, 2.1, 2.6, 2.9])
@@ -125,9 +126,9 @@ def test_lanes_are_put_together_in_the_domain_or_end_with_a_code():
     assert lanes.result.tolist() == [results.SUCCESS, results.SUCCESS, results.INCONSISTENT_START]
     height = lambda x: jj.start(scene, x=x, y=0.0).q[2]  # noqa: E731
     values, slopes = jax.jit(jax.vmap(jax.value_and_grad(height)))(places[:2])
-    np.testing.assert_allclose(values, -jnp.sqrt(1 - places[:2] ** 2), rtol=1e-12)
-    np.testing.assert_allclose(slopes, -places[:2] / values, rtol=1e-9)
-    np.testing.assert_allclose(jax.jit(jax.jacfwd(height))(0.6), 0.75, rtol=1e-9)
+    assert_allclose(values, -jnp.sqrt(1 - places[:2] ** 2), rtol=1e-12)
+    assert_allclose(slopes, -places[:2] / values, rtol=1e-9)
+    assert_allclose(jax.jit(jax.jacfwd(height))(0.6), 0.75, rtol=1e-9)
     assert np.isinf(jax.jit(lambda x: jj.start(scene, x=x, y=0.0).residual)(1.0))
 
 
@@ -145,13 +146,13 @@ def test_an_attitude_of_which_a_part_is_named_is_refused_where_many_have_it(give
 def test_parts_of_an_attitude_that_no_other_has_leave_the_rest_zero():
     half, disc = 0.2, SCENES["disc with quaternion"]
     given = {"attitude_w": np.cos(half), "attitude_x": np.sin(half)}
-    np.testing.assert_allclose(jj.start(disc, given)["attitude"], [np.cos(half), np.sin(half), 0.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(jj.start(disc, attitude_z=1.0, z=0.5)["attitude"], [0.0, 0.0, 0.0, 1.0], atol=1e-12)
+    assert_allclose(jj.start(disc, given)["attitude"], [np.cos(half), np.sin(half), 0.0, 0.0], atol=1e-12)
+    assert_allclose(jj.start(disc, attitude_z=1.0, z=0.5)["attitude"], [0.0, 0.0, 0.0, 1.0], atol=1e-12)
 
     def lean(half):
         return jj.start(disc, attitude_w=jnp.cos(half), attitude_x=jnp.sin(half))["z"]
 
-    np.testing.assert_allclose(jax.jit(jax.grad(lean))(half), -np.sin(2 * half), rtol=1e-9)
+    assert_allclose(jax.jit(jax.grad(lean))(half), -np.sin(2 * half), rtol=1e-9)
 
 
 def test_a_motion_from_named_values_begins_at_their_start():
@@ -161,8 +162,8 @@ def test_a_motion_from_named_values_begins_at_their_start():
     assert int(found.guess) > 0
     for values in ({"x": 1.4}, whole):
         motion, state = jj.simulate(crank, values, ts=times), jj.start(crank, **values)
-        np.testing.assert_allclose(motion.q[0], state.q, atol=1e-9)
-        np.testing.assert_allclose(float(motion.moved_q), float(state.moved_q), atol=1e-9)
+        assert_allclose(motion.q[0], state.q, atol=1e-9)
+        assert_allclose(float(motion.moved_q), float(state.moved_q), atol=1e-9)
     with pytest.raises(ValueError, match="contradicts row `rim height`"):
         jj.simulate(disc, {"z": 0.6}, ts=times)
 
@@ -176,10 +177,10 @@ def test_starts_in_lanes_find_what_single_ones_find_and_have_derivatives():
 
     a, slope, q = jax.jit(jax.vmap(lambda x: jax.jvp(crank, (x,), (1.0,), has_aux=True)))(places)
     single = [jj.start(scene, x=x) for x in places.tolist()]
-    np.testing.assert_allclose(q, np.stack([np.asarray(state.q) for state in single]), atol=1e-8)
+    assert_allclose(q, np.stack([np.asarray(state.q) for state in single]), atol=1e-8)
     assert max(int(state.guess) for state in single) > 0
     # r^2 + x^2 - 2 r x cos(a) = l^2
-    np.testing.assert_allclose(slope, (np.cos(a) - places) / (places * np.sin(a)), rtol=1e-7)
+    assert_allclose(slope, (np.cos(a) - places) / (places * np.sin(a)), rtol=1e-7)
 
 
 def test_a_start_found_elsewhere_has_a_derivative_in_reverse_mode():
@@ -262,7 +263,7 @@ def test_a_start_whose_rows_determine_its_speeds_has_the_derivatives_of_the_near
         return eval_numpy(lambda x: (f(x), jax.jacfwd(f)(x), jax.grad(f)(x), jax.jacfwd(jax.grad(f))(x)))
 
     for found, expected in zip(derivatives(determined)(numbers), derivatives(nearest)(numbers), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+        assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_a_state_that_newtons_method_does_not_bring_onto_the_rows_is_searched_for_and_then_named():

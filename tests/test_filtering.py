@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from numpy.testing import assert_allclose
 from small_scenes import Oscillator
 
 import jourdain_jax as jj
@@ -53,7 +54,7 @@ def measured(unknown=(), values=None):
 def test_linear_scene_has_the_likelihood_of_kalmans_filter(spread, noise):
     unknown = {n: jj.Estimate(prior=jj.Normal(m, s)) for n, m, s in zip(("x", "x_rate"), (0.3, -0.1), spread, strict=True) if s}
     found = jj.filtered_log_likelihood(Oscillator(), measured(unknown), process_noise={"x_rate": noise}, **TIGHT)
-    np.testing.assert_allclose(found, kalman(0.3, 5.0, noise, samples(), spread), rtol=1e-9)
+    assert_allclose(found, kalman(0.3, 5.0, noise, samples(), spread), rtol=1e-9)
 
 
 def test_derivatives_are_those_of_kalmans_filter():
@@ -69,7 +70,7 @@ def test_derivatives_are_those_of_kalmans_filter():
         up, down = (theta.at[i].add(s * h) for s in (1, -1))
         return (kalman(*up, samples(), (0.0, 0.0)) - kalman(*down, samples(), (0.0, 0.0))) / (2 * h)
 
-    np.testing.assert_allclose(found, [differences(i) for i in range(3)], rtol=1e-5)
+    assert_allclose(found, [differences(i) for i in range(3)], rtol=1e-5)
 
 
 def test_undisturbed_sleigh_has_the_plain_likelihood():
@@ -78,7 +79,7 @@ def test_undisturbed_sleigh_has_the_plain_likelihood():
     sensors = {"nose": lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))}
     runs = [jj.Experiment(ts + t0, values, 0.05, start=start, sensors=sensors) for t0 in (0.0, 1.0)]
     found = jj.filtered_log_likelihood(sleigh, runs, process_noise={})
-    np.testing.assert_allclose(found, jj.log_likelihood(sleigh, runs), rtol=1e-6)
+    assert_allclose(found, jj.log_likelihood(sleigh, runs), rtol=1e-6)
 
 
 def test_dependent_coordinates_follow():
@@ -86,7 +87,7 @@ def test_dependent_coordinates_follow():
     scene, ts = jj.models.SpringAndRod(), np.linspace(0.1, 0.6, 6)
     motion = jj.simulate(scene, scene.example, t0=0.0, ts=ts)
     run = jj.Experiment(ts, {name: np.asarray(motion[name]) + 0.01 for name in ("z1", "x2", "z2")}, 0.02, start=scene.example, t0=0.0)
-    np.testing.assert_allclose(jj.filtered_log_likelihood(scene, run, process_noise={}), jj.log_likelihood(scene, run), rtol=1e-6)
+    assert_allclose(jj.filtered_log_likelihood(scene, run, process_noise={}), jj.log_likelihood(scene, run), rtol=1e-6)
 
 
 @pytest.mark.parametrize(

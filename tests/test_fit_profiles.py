@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 
@@ -25,8 +26,8 @@ def test_the_profile_of_a_linear_unknown_is_the_parabola_of_its_standard_error()
     for one in fit.profiles(data).values():
         e = fit[one.name]
         assert one.kind == "bounded"
-        np.testing.assert_allclose(one.rise, ((one.values - e.value) / e.standard_error) ** 2, atol=2e-3)
-        np.testing.assert_allclose([one.low, one.high], [e.low, e.high], atol=0.01 * e.standard_error)
+        assert_allclose(one.rise, ((one.values - e.value) / e.standard_error) ** 2, atol=2e-3)
+        assert_allclose([one.low, one.high], [e.low, e.high], atol=0.01 * e.standard_error)
         assert "bounded" in str(one)
 
 
@@ -101,13 +102,13 @@ def test_a_share_is_by_how_much_the_variance_falls_with_the_weight_of_the_sample
 
     fit, runs = fitted(0.0, "")
     found = shares(fit, runs)
-    np.testing.assert_allclose(found.of_runs.sum(axis=1), 1.0, rtol=1e-9)
+    assert_allclose(found.of_runs.sum(axis=1), 1.0, rtol=1e-9)
     told = {"run 1": found.of_runs[:, 1], "heading": found.of_channels["heading"], "a sample": found.of_samples[0]["x"][:, 25]}
     for where, share in told.items():
         if memory and where == "a sample":
             continue  # with a memory, the sample after it is whitened with the sigma of this one
         more, less = (fitted(h, where)[0].standard_errors ** 2 for h in (0.01, -0.01))
-        np.testing.assert_allclose(share, -(np.log(more) - np.log(less)) / 0.02, rtol=1e-3, atol=1e-5, err_msg=where)
+        assert_allclose(share, -(np.log(more) - np.log(less)) / 0.02, rtol=1e-3, atol=1e-5, err_msg=where)
 
 
 def test_a_prior_takes_what_the_data_do_not_tell():
@@ -152,11 +153,11 @@ def test_a_run_held_out_is_predicted_with_its_own_start_fitted_to_it():
         fit.scene, jj.Experiment(TS, other.values, other.sigma | {"gyro": None}, start=other.start, unknown_start=("heading_rate",), sensors={"gyro": known})
     )
     for name, sigma in (("x", 0.01), ("gyro", float(by_hand.sigma["gyro"]))):
-        np.testing.assert_allclose(found[name].error, sigma * by_hand.residuals[0][name], atol=2e-5)
+        assert_allclose(found[name].error, sigma * by_hand.residuals[0][name], atol=2e-5)
         assert found[name].rms == pytest.approx(float(np.sqrt(np.mean(found[name].error ** 2))))
         assert 0.99 < found[name].r_squared < 1
     assert 0.5 < found["x"].rms / 0.01 < 1.5
-    np.testing.assert_allclose(found["gyro"].sigma, float(fit.sigma["gyro"]))
+    assert_allclose(found["gyro"].sigma, float(fit.sigma["gyro"]))
 
 
 def test_runs_held_out_that_cannot_be_predicted_are_answered():

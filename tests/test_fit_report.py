@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
 from jourdain_jax.analysis.information import hidden_combinations, weak_combinations
@@ -94,12 +95,12 @@ def test_what_is_drawn_are_the_data_and_a_simulation(fitted, tmp_path, drawn):
     for name, label, sigma in (("x", "x in m", 0.01), ("heading", "heading in SI units", float(fit.sigma["heading"]))):
         above, below = panels[label].axes
         dots, line = (of.get_xydata() for of in above.lines)
-        np.testing.assert_array_equal(dots, np.stack([TS, data.values[name]], axis=1))  # a missing sample has no dot
+        assert_array_equal(dots, np.stack([TS, data.values[name]], axis=1))  # a missing sample has no dot
         assert np.isfinite(dots).all() == (name == "heading")
         predicted = np.asarray(motion[name])[np.isin(TS, line[:, 0])]
-        np.testing.assert_allclose(line[:, 1], predicted, rtol=0, atol=1e-7)
+        assert_allclose(line[:, 1], predicted, rtol=0, atol=1e-7)
         assert len(line) >= np.isfinite(data.values[name]).sum()
-        np.testing.assert_allclose(below.lines[-1].get_ydata(), (np.asarray(motion[name]) - data.values[name]) / sigma, atol=1e-3)
+        assert_allclose(below.lines[-1].get_ydata(), (np.asarray(motion[name]) - data.values[name]) / sigma, atol=1e-3)
 
 
 def test_report_loads_nothing_and_is_small(fitted, tmp_path):

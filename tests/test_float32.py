@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose
 from oracles import chaplygin_sleigh, skate
 from tolerances import relative_error
 
@@ -224,8 +225,8 @@ def test_batches_events_and_records_are_right_in_single_precision(single):
     slopes = 2 / F / (1 + 2 * s)  # with respect to the mass of 2 kg
     assert found["ways"].endswith("machine code")
     assert found["alone"] == found["batch"][0]
-    np.testing.assert_allclose(found["batch"], 1 + s, rtol=SINGLE)
-    np.testing.assert_allclose(found["slopes"], slopes, rtol=GRADIENT)
+    assert_allclose(found["batch"], 1 + s, rtol=SINGLE)
+    assert_allclose(found["slopes"], slopes, rtol=GRADIENT)
 
 
 def test_reductions_agree_in_single_precision(compared):

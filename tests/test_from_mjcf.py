@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
@@ -74,7 +75,7 @@ def test_the_equations_are_those_of_mujoco(name):
 )
 def test_motors_share_the_defaults_of_all_actuators(defaults, gear):
     text = _body(HINGE, '<actuator><motor name="m" joint="j"/></actuator>', f"<default>{defaults}</default>")
-    np.testing.assert_allclose(jj.generalized_forces(jj.from_mjcf(text)(), 0.0, np.zeros(1), np.zeros(1), {"m": 2.0}), [2.0 * gear])
+    assert_allclose(jj.generalized_forces(jj.from_mjcf(text)(), 0.0, np.zeros(1), np.zeros(1), {"m": 2.0}), [2.0 * gear])
 
 
 @pytest.mark.parametrize("near", [1e-9, 1e-7, 1e-5, 1e-3])
@@ -83,7 +84,7 @@ def test_an_axis_that_points_nearly_down_is_reached_by_the_shortest_turn(near):
     text = f'<mujoco><worldbody><body zaxis="{near} 0 -1"><joint name="j"/><geom size="0.1" pos="1 2 0"/></body></worldbody></mujoco>'
     (body,) = jj.pose_at(jj.from_mjcf(text)(), 0.0, np.zeros(1)).bodies.values()
     slope = np.array([near, -1.0]) / np.hypot(near, 1.0)  # of the axis: its x and z
-    np.testing.assert_allclose(body.position, [slope[1], 2.0, -slope[0]], rtol=0, atol=1e-15)
+    assert_allclose(body.position, [slope[1], 2.0, -slope[0]], rtol=0, atol=1e-15)
 
 
 def test_the_stated_pose_is_the_example():
@@ -91,7 +92,7 @@ def test_the_stated_pose_is_the_example():
     start = jj.start(scene, **scene.example)
     expected = jj.rot_x(np.deg2rad(10)) @ jj.rot_y(np.deg2rad(20)) @ jj.rot_z(np.deg2rad(30))
     poses = jj.pose_at(scene, 0.0, start.q)
-    np.testing.assert_allclose(poses["base"].orientation, expected, atol=1e-12)
+    assert_allclose(poses["base"].orientation, expected, atol=1e-12)
     assert start["elbow"] == pytest.approx(np.deg2rad(10))
     assert start["al_one"] == pytest.approx(np.deg2rad(20))
     assert scene.domain["elbow"] == (-np.deg2rad(30), np.deg2rad(30))
@@ -99,7 +100,7 @@ def test_the_stated_pose_is_the_example():
         text = f'<mujoco><worldbody><body name="b" quat="{turn}"><freejoint/><geom size="1"/></body></worldbody></mujoco>'
         q = np.array([jj.from_mjcf(text)().example[f"b_joint_attitude_{part}"] for part in "wxyz"])
         stated = np.array(turn.split(), float)
-        np.testing.assert_allclose(abs(q @ stated), np.linalg.norm(stated), rtol=1e-12)
+        assert_allclose(abs(q @ stated), np.linalg.norm(stated), rtol=1e-12)
 
 
 def test_several_geoms_are_one_body():
@@ -112,8 +113,8 @@ def test_several_geoms_are_one_body():
     moved = box * ball / (box + ball) * (apart @ apart * np.eye(3) - np.outer(apart, apart))
     own = np.diag(box / 3 * np.array([0.1**2 + 0.05**2, 0.2**2 + 0.05**2, 0.2**2 + 0.1**2])) + 0.4 * ball * 0.1**2 * np.eye(3)
     assert scene.b_mass == pytest.approx(box + ball, rel=1e-12)
-    np.testing.assert_allclose(scene.b_mass_centre, centre, atol=1e-12)
-    np.testing.assert_allclose(scene.b_inertia, own + moved, atol=1e-12)
+    assert_allclose(scene.b_mass_centre, centre, atol=1e-12)
+    assert_allclose(scene.b_inertia, own + moved, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -130,7 +131,7 @@ def test_solids_have_the_moments_of_the_textbook(geom, mass, moments):
     scene = jj.from_mjcf(f'<mujoco><worldbody><body name="b"><freejoint/><geom {geom}/></body></worldbody></mujoco>')()
     factor = {"sphere": 0.5, "cylinder": 1.0, "ellipsoid": 1.0, "box": 1.0}[geom.split('"')[1]]
     assert scene.b_mass == pytest.approx(mass, rel=1e-12)
-    np.testing.assert_allclose(scene.b_inertia, 0.01 * factor * mass * np.array(moments), rtol=1e-12)
+    assert_allclose(scene.b_inertia, 0.01 * factor * mass * np.array(moments), rtol=1e-12)
 
 
 def test_a_capsule_is_a_cylinder_with_two_half_balls():
@@ -140,8 +141,8 @@ def test_a_capsule_is_a_cylinder_with_two_half_balls():
     squared = 0.01 - np.maximum(np.abs(z) - 0.2, 0) ** 2  # of the radius
     slice_ = 1000 * np.pi * squared * 0.6 / len(z)
     across = np.sum(slice_ * (squared / 4 + z**2))
-    np.testing.assert_allclose(scene.b_mass, np.sum(slice_), rtol=1e-9)
-    np.testing.assert_allclose(scene.b_inertia, [across, across, np.sum(slice_ * squared / 2)], rtol=1e-9)
+    assert_allclose(scene.b_mass, np.sum(slice_), rtol=1e-9)
+    assert_allclose(scene.b_inertia, [across, across, np.sum(slice_ * squared / 2)], rtol=1e-9)
 
 
 class TwoRods(jj.Scene):
@@ -246,8 +247,8 @@ def test_geoms_are_drawn():
         "body5": ["ellipsoid"],
         "apart": ["capsule"],
     }
-    np.testing.assert_allclose(looks["base"][0].size, [0.4, 0.2, 0.1])
-    np.testing.assert_allclose(looks["apart"][0].size, [0.1, 0.4])
+    assert_allclose(looks["base"][0].size, [0.4, 0.2, 0.1])
+    assert_allclose(looks["apart"][0].size, [0.1, 0.4])
     assert looks["upper"][0].colour == "#336699"
 
 

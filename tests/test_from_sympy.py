@@ -7,6 +7,7 @@ import textwrap
 import jax
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from tolerances import tolerance
 
 import jourdain_jax as jj
@@ -136,8 +137,8 @@ def test_a_contact_point_without_coordinates_gets_a_path():
     scene = jj.from_sympy(kane, origin, values)()
     assert scene.coordinate_names.entries[3:] == ("C_x", "C_y")
     motion = jj.motion_at(scene, 0.0, [0.0, 0.0, 0.0, 0.2, 0.1], [0.0, 3.0, 0.0])  # upright, rolling along x
-    np.testing.assert_allclose(motion["disc"].velocity, [1.2, 0.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(motion["disc"].position, [0.2, 0.1, 0.4], atol=1e-12)
+    assert_allclose(motion["disc"].velocity, [1.2, 0.0, 0.0], atol=1e-12)
+    assert_allclose(motion["disc"].position, [0.2, 0.1, 0.4], atol=1e-12)
 
 
 def test_a_wheel_without_an_angle_gets_one():
@@ -147,12 +148,12 @@ def test_a_wheel_without_an_angle_gets_one():
     motion = jj.motion_at(scene, 0.0, [0.3, 0.2, 1.0, 0.0, 0.0], [0.5, -0.4, 2.0, 0.0, 0.0])
     R = np.asarray(motion["disc"].orientation)
     omega = np.array([0.0, 0.0, 0.5]) + jj.rot_z(0.3) @ np.array([-0.4, 0.0, 0.0]) + 2.0 * R[:, 1]
-    np.testing.assert_allclose(motion["disc"].angular_velocity, omega, atol=1e-12)
+    assert_allclose(motion["disc"].angular_velocity, omega, atol=1e-12)
     disc = kane.bodies[0]
     own = mechanics.inertia(disc.frame, *(systems.m * systems.r**2 / n for n in (4, 2, 4)))
     disc.inertia = (own, disc.masscenter)
     stated = jj.pose_at(jj.from_sympy(kane, origin, values)(), 0.0, [0.3, 0.2, 1.0, 0.0, 0.0])["disc"]
-    np.testing.assert_allclose(stated.body.inertia, motion["disc"].body.inertia, atol=1e-12)
+    assert_allclose(stated.body.inertia, motion["disc"].body.inertia, atol=1e-12)
 
 
 def test_velocities_that_agree_where_rows_are_met_need_no_coordinates():
@@ -201,7 +202,7 @@ def test_functions_of_many_kinds_have_values_on_jax():
     one += [sympy.Piecewise((x, x > y), (y**2, sympy.Or(y > 5, sympy.Ne(x, y))), (0, True)), sympy.sinc(x), sympy.pi * x + sympy.E, sympy.Rational(1, 3) * y]
     values = Formulas({"all": one}, [x, y]).values({x: 0.3, y: 0.8})["all"]
     expected = [float(expression.subs({x: 0.3, y: 0.8})) for expression in one]
-    np.testing.assert_allclose(np.array(values, float), expected, rtol=1e-12)
+    assert_allclose(np.array(values, float), expected, rtol=1e-12)
 
 
 def _angular_velocity_of_its_own():

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
@@ -113,8 +114,8 @@ def test_the_place_of_a_link_is_a_parameter_where_it_is_to_be_one():
     arm = jj.from_urdf(ARM, free=["frame", "third"])()
     q = jnp.array([0.3, 0.2, 0.5])
     slope = jax.jacobian(lambda origin: jj.pose_at(arm.replace(frame_origin=origin), 0.0, q)["third"].position)(arm.frame_origin)
-    np.testing.assert_allclose(slope, jj.pose_at(arm, 0.0, q)["first"].orientation, atol=1e-12)
-    np.testing.assert_allclose(arm.third_origin, [0.3, 0.0, 0.0])
+    assert_allclose(slope, jj.pose_at(arm, 0.0, q)["first"].orientation, atol=1e-12)
+    assert_allclose(arm.third_origin, [0.3, 0.0, 0.0])
 
 
 class Robot(jj.from_urdf(ROBOT, base="planar", motors=["left", "right"])):
@@ -141,7 +142,7 @@ def test_a_robot_on_two_wheels_follows_its_closed_form():
     along, across = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
     expected = [*(vdot * along + v * omega * across), omegadot, (vdot - b * omegadot) / r, (vdot + b * omegadot) / r]
     found = jj.accelerations(robot, 0.0, q, u, {"left_motor": left, "right_motor": right}).udot
-    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-10)
+    assert_allclose(found, expected, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("base", ["fixed", "planar", "free"])
@@ -163,8 +164,8 @@ def test_joints_of_several_coordinates_move_as_a_free_body(kind, speeds):
     if kind == "planar":
         normal = np.array([0.0, 0.6, 0.8])
         assert abs(motion.velocity @ normal) < 1e-12
-        np.testing.assert_allclose(motion.angular_velocity, u[2] * normal, atol=1e-12)
-        np.testing.assert_allclose(motion.velocity @ motion.velocity, u[0] ** 2 + u[1] ** 2, rtol=1e-12)
+        assert_allclose(motion.angular_velocity, u[2] * normal, atol=1e-12)
+        assert_allclose(motion.velocity @ motion.velocity, u[0] ** 2 + u[1] ** 2, rtol=1e-12)
 
 
 def test_shapes_are_drawn_where_the_file_has_them():
@@ -174,10 +175,10 @@ def test_shapes_are_drawn_where_the_file_has_them():
     assert {name: [look.kind for look in found] for name, found in looks.items()} == {"": ["box", "ellipsoid"], "first": ["box"], "second": ["cylinder"]}
     first = looks["first"][0]
     assert (first.colour, first.opacity) == ("#ff8000", 0.5)
-    np.testing.assert_allclose(first.position, [-0.1, -0.2, -0.1], atol=1e-12)  # from the mass centre
+    assert_allclose(first.position, [-0.1, -0.2, -0.1], atol=1e-12)  # from the mass centre
     R = np.asarray(pose["first"].orientation)
     ball = pose["first"].place([-0.1, -0.2, 0.1]) + R @ np.asarray(jj.rot_z(1.0)) @ np.array([0.01, 0.0, 0.0])
-    np.testing.assert_allclose(looks[""][1].position, ball, atol=1e-12)
+    assert_allclose(looks[""][1].position, ball, atol=1e-12)
 
 
 def test_meshes_are_found_in_packages_and_beside_the_file(tmp_path):
@@ -193,7 +194,7 @@ def test_meshes_are_found_in_packages_and_beside_the_file(tmp_path):
     scene = jj.from_urdf(folder / "r.urdf", base="free")()
     looks = scene.visuals(jj.pose_at(scene, 0.0, scene.coordinates.reference()))["b"]
     assert [look.kind for look in looks] == ["mesh", "mesh"]
-    np.testing.assert_allclose(looks[0].size, [0.1, 0.1, 0.2])
+    assert_allclose(looks[0].size, [0.1, 0.1, 0.2])
 
 
 def test_elements_that_are_left_out_are_listed():

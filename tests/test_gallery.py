@@ -9,6 +9,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 
@@ -52,8 +53,8 @@ def test_a_trailer_hitched_behind_the_axle_runs_on_the_circle_of_the_closed_form
     behind = np.sqrt(radius**2 + hitch**2 - tongue**2)
     start = jj.start(robot, left_rate=5.0, right_rate=7.0, trailer=-np.arctan2(hitch, radius) - np.arctan2(tongue, behind))
     trailer = jj.motion_at(robot, 0.0, start.q, start.u)["trailer"]
-    np.testing.assert_allclose([start["heading_rate"], start["trailer_rate"]], turn, rtol=1e-12)  # it turns as fast as the robot: steady
-    np.testing.assert_allclose(np.linalg.norm(trailer.velocity), turn * behind, rtol=1e-12)
+    assert_allclose([start["heading_rate"], start["trailer_rate"]], turn, rtol=1e-12)  # it turns as fast as the robot: steady
+    assert_allclose(np.linalg.norm(trailer.velocity), turn * behind, rtol=1e-12)
 
 
 def test_the_rows_of_both_steered_wheels_of_a_car_agree_to_round_off():
@@ -70,7 +71,7 @@ def test_a_tricycle_turns_its_wheels_by_their_radii_and_carries_by_its_lever():
     start = jj.start(tricycle, steer=0.5, front_rate=6.0)
     turn = 6.0 * 0.2 / np.hypot(1.1 / np.tan(0.5), 1.1)  # rad/s
     wheels = [turn * (1.1 / np.tan(0.5) + side * 0.4) / 0.2 for side in (-1, 1)]
-    np.testing.assert_allclose([start["heading_rate"], start["left_rate"], start["right_rate"]], [turn, *wheels], rtol=1e-12)
+    assert_allclose([start["heading_rate"], start["left_rate"], start["right_rate"]], [turn, *wheels], rtol=1e-12)
 
 
 def test_a_push_moves_a_scooter_by_its_masses_and_the_turning_of_its_wheels():
@@ -78,8 +79,8 @@ def test_a_push_moves_a_scooter_by_its_masses_and_the_turning_of_its_wheels():
     start = jj.start(scooter, **scooter.upright(3.0))
     found = jj.accelerations(scooter, 0.0, start.q, start.u, {"push": 100.0})
     rates = dict(zip(scooter.speed_names.entries, found.udot, strict=True))
-    np.testing.assert_allclose(rates["x_rate"], 100.0 / scooter.effective_mass(), rtol=1e-12)
-    np.testing.assert_allclose(rates["front_spin_rate"], rates["x_rate"] / 0.1, rtol=1e-12)
+    assert_allclose(rates["x_rate"], 100.0 / scooter.effective_mass(), rtol=1e-12)
+    assert_allclose(rates["front_spin_rate"], rates["x_rate"] / 0.1, rtol=1e-12)
 
 
 def test_a_unicycle_leans_and_pitches_by_the_eigenvalues_of_the_closed_form():
@@ -102,8 +103,8 @@ def test_a_ball_at_rest_on_a_free_plate_sets_off_as_in_the_closed_form():
     rates = dict(zip(plate.speed_names.entries, jj.accelerations(plate, 0.0, start.q, start.u).udot, strict=True))
     # 7/5 m r^2 s'' = m g r sin(a),   (J + m x^2) a'' = m g x cos(a),   x = r (s - a)
     pitch = m * G * x * np.cos(tilt) / (J + m * x**2)
-    np.testing.assert_allclose(rates["pitch_rate"], pitch, rtol=1e-12)
-    np.testing.assert_allclose(rates["x_rate"], 5 / 7 * G * np.sin(tilt) - r * pitch, rtol=1e-12)
+    assert_allclose(rates["pitch_rate"], pitch, rtol=1e-12)
+    assert_allclose(rates["x_rate"], 5 / 7 * G * np.sin(tilt) - r * pitch, rtol=1e-12)
 
 
 def test_the_pendulum_of_a_spherical_robot_swings_at_the_frequency_of_the_closed_form():
@@ -134,7 +135,7 @@ def test_driven_wheels_leave_the_angular_momentum_of_a_satellite():
     motion = jj.simulate(satellite, jj.start(satellite, **satellite.example), t1=5.0, rtol=1e-11, atol=1e-11, inputs=drive)
     assert float(jnp.abs(motion["attitude_x"][-1])) > 0.02  # it has turned
     for name, values in motion.invariants().items():
-        np.testing.assert_allclose(values, values[0], atol=1e-9, err_msg=name)
+        assert_allclose(values, values[0], atol=1e-9, err_msg=name)
 
 
 def maker():

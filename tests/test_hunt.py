@@ -11,6 +11,7 @@ from hunting.family import Ask, Family, Truth, together
 from hunting.record import BY_CODE, BY_WARNING, LOST, REFUSED, RIGHT, UNDECIDED, WRONG, refusal
 from hunting.reference import integrate
 from hunting.table import as_markdown, figures, losses
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 
@@ -57,14 +58,14 @@ def test_the_reference_of_an_oscillator_is_its_closed_form():
     w, ts = np.array([1.0, 7.0, 50.0]), np.linspace(0.5, 3.0, 4) * np.ones((3, 1))
     rates = lambda _, y: np.stack([y[:, 1], -(w**2) * y[:, 0]], axis=1)  # noqa: E731
     y = integrate(rates, np.stack([np.ones(3), np.zeros(3)], axis=1), ts)
-    np.testing.assert_allclose(y[..., 0], np.cos(w[:, None] * ts), atol=1e-9)
+    assert_allclose(y[..., 0], np.cos(w[:, None] * ts), atol=1e-9)
 
 
 def test_a_motion_that_ends_in_finite_time_has_no_reference_and_does_not_spoil_its_neighbours():
     rates = lambda _, y: np.stack([y[:, 0] ** 2, -y[:, 1]], axis=1)  # noqa: E731
     y = integrate(rates, np.array([[0.1, 1.0], [2.0, 1.0]]), np.array([[0.4, 1.0]] * 2))
     assert np.all(np.isnan(y[1, -1]))
-    np.testing.assert_allclose(y[0], [[0.1 / 0.96, np.exp(-0.4)], [0.1 / 0.9, np.exp(-1.0)]], rtol=1e-10)
+    assert_allclose(y[0], [[0.1 / 0.96, np.exp(-0.4)], [0.1 / 0.9, np.exp(-1.0)]], rtol=1e-10)
 
 
 BRANCHES = {"parallel": (linkages.parallelogram, linkages.antiparallelogram), "kite": (linkages.kite, linkages.folded_kite)}
@@ -78,9 +79,9 @@ def test_branches_close_their_loop_and_conserve_energy(kind, branch):
     (a, b, c), speeds = np.moveaxis(truth.values[..., :3], -1, 0), np.moveaxis(truth.values[..., 3:], -1, 0)
     n = {name: value[:, None] for name, value in n.items()}
     closed = n["r1"] * np.exp(1j * a) + n["r2"] * np.exp(1j * b) - n["d"] - n["r3"] * np.exp(1j * c)
-    np.testing.assert_allclose(np.abs(closed), 0.0, atol=1e-13)
+    assert_allclose(np.abs(closed), 0.0, atol=1e-13)
     energy = linkages._twice_kinetic(n, (a, b, c), speeds) / 2 + linkages._potential(n, (a, b, c))
-    np.testing.assert_allclose(energy - energy[:, :1], 0.0, atol=1e-9 * np.max(np.abs(energy)))
+    assert_allclose(energy - energy[:, :1], 0.0, atol=1e-9 * np.max(np.abs(energy)))
 
 
 def _motion(x, code=results.SUCCESS, warned=()):

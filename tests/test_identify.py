@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from oracles import chaplygin_sleigh as sleigh_oracle
 from oracles import rattleback as rattleback_oracle
 from small_scenes import Cart
@@ -75,8 +76,8 @@ def test_covariance_is_that_of_central_differences(sleigh_fit):
         apart = [simulate(scene.replace(**{name: value * (1 + sign * step)})) for sign in (1, -1)]
         columns.append(np.ravel(apart[0] - apart[1]) / (2 * value * step * SIGMA))
     J = np.stack(columns, axis=1)
-    np.testing.assert_allclose(sleigh_fit.covariance, np.linalg.inv(J.T @ J), rtol=1e-4)  # simulation at 1e-8, differences at 1e-5
-    np.testing.assert_allclose(sleigh_fit.correlation[0, 1], sleigh_fit.covariance[0, 1] / np.prod(sleigh_fit.standard_errors))
+    assert_allclose(sleigh_fit.covariance, np.linalg.inv(J.T @ J), rtol=1e-4)  # simulation at 1e-8, differences at 1e-5
+    assert_allclose(sleigh_fit.correlation[0, 1], sleigh_fit.covariance[0, 1] / np.prod(sleigh_fit.standard_errors))
 
 
 def test_intervals_cover_the_truth_in_90_to_99_percent_of_200_repeats(sleigh_batch):
@@ -97,7 +98,7 @@ def test_a_batch_gives_what_single_fits_give(sleigh_batch):
     single = fit(GUESS, one, ("inertia", "offset"))
     apart = np.abs(single.values - sleigh_batch.values[17]) / single.standard_errors
     assert apart.max() < 1e-2  # both stop within the tolerance of the minimum
-    np.testing.assert_allclose(single.standard_errors, sleigh_batch.standard_errors[17], rtol=1e-4)
+    assert_allclose(single.standard_errors, sleigh_batch.standard_errors[17], rtol=1e-4)
 
 
 def test_mass_and_inertia_of_the_sleigh_are_named_as_inseparable(sleigh_fit):
@@ -112,7 +113,7 @@ def test_mass_and_inertia_of_the_sleigh_are_named_as_inseparable(sleigh_fit):
         assert np.isnan([found[name].standard_error, found[name].low, found[name].high]).all()
     # the offset, and the ratio that shows, are those of the fit with the mass known
     offset, known = found["offset"], sleigh_fit["offset"]
-    np.testing.assert_allclose([offset.value, offset.low, offset.high], [known.value, known.low, known.high], atol=1e-6)
+    assert_allclose([offset.value, offset.low, offset.high], [known.value, known.low, known.high], atol=1e-6)
     ratio = found["inertia"].value / found["mass"].value
     assert ratio == pytest.approx(float(sleigh_fit["inertia"].value) / 1.3, rel=1e-4)
     table = str(found)
@@ -194,7 +195,7 @@ def test_several_runs_with_sampled_inputs_bounds_and_unknown_starts():
     assert found.units == ("kg", "N s/m", "N/m", "")
     assert found.converged
     # without noise the estimates are the truth, to the accuracy of the simulation
-    np.testing.assert_allclose(found.values, [2.0, 0.6, 5.0, -0.2], rtol=1e-6)
+    assert_allclose(found.values, [2.0, 0.6, 5.0, -0.2], rtol=1e-6)
     assert found.chi_square < 1e-8
     assert int(found.samples) == 2 * (3 * 21 + 11)
     assert [residual["x"].shape for residual in found.residuals] == [(21,), (21,), (11,), (21,)]
@@ -281,7 +282,7 @@ def test_a_parameter_that_cannot_be_negative_ends_at_zero_whatever_its_range():
     for given in (unbounded(), unbounded(0.1), bounds(-1.0, 2.0)):
         found = fit(Cart(mass=2.2, damping=0.6), run, {"mass": unbounded(), "damping": given})
         assert found.converged
-        np.testing.assert_allclose(found.values, usual.values, rtol=1e-6)
+        assert_allclose(found.values, usual.values, rtol=1e-6)
     assert fit(Cart(mass=2.2, damping=0.0), run, {"mass": None, "damping": unbounded(0.1)}).converged
     with pytest.raises(ValueError, match=r"first guess of `damping` is -0\.5, but this parameter is declared as not negative"):
         fit(Cart(), run, {"damping": jj.Estimate(-0.5, range=bounds(-1.0, 2.0))})
@@ -425,7 +426,7 @@ def test_one_bad_repeat_harms_no_other():
     values = {name: np.stack([v, np.full_like(v, 1e300), v]) for name, v in data.values.items()}
     found = fit_batch(Cart(mass=1.7), cart_run(values=values), ("mass",))
     assert found.converged.tolist() == [True, False, True]
-    np.testing.assert_allclose(found["mass"].value[::2], 2.0, rtol=1e-6)
+    assert_allclose(found["mass"].value[::2], 2.0, rtol=1e-6)
 
 
 # Several runs, noise that is not stated, samples that are far out. -------------------------------------------------------
@@ -482,7 +483,7 @@ def test_many_runs_with_unknown_starts_are_those_of_a_dense_fit():
 
     theta = np.asarray(found.values)
     J = np.stack([(dense(theta + h) - dense(theta - h)) / 2e-6 for h in 1e-6 * np.eye(9)], axis=1)
-    np.testing.assert_allclose(found.covariance, np.linalg.inv(J.T @ J), rtol=1e-5, atol=1e-12)
+    assert_allclose(found.covariance, np.linalg.inv(J.T @ J), rtol=1e-5, atol=1e-12)
     step = np.linalg.lstsq(J, -dense(theta), rcond=None)[0]
     assert np.max(np.abs(step) / found.standard_errors) < 1e-3
     # one run less is the same program, and costs no more than its runs
@@ -521,8 +522,8 @@ def test_sigmas_that_are_not_known_are_estimated_channel_by_channel():
         assert met.converged
         assert float(met.sigma["mine"]) == pytest.approx(1e-10 * scale * np.max(np.abs(x)), rel=1e-3)
     known = fit(Cart(mass=1.7), cart_run(ts=run.ts, values=run.values, sigma={name: float(s) for name, s in found.sigma.items()}), THREE)
-    np.testing.assert_allclose(found.values, known.values, rtol=2e-4)
-    np.testing.assert_allclose(found.standard_errors, known.standard_errors, rtol=1e-3)
+    assert_allclose(found.values, known.values, rtol=2e-4)
+    assert_allclose(found.standard_errors, known.standard_errors, rtol=1e-3)
     assert "sigma of `x`, estimated: 0.0" in str(found)
     # sigma_c^2 = sum e^2 / (n_c - p_c), and the p_c of both channels are the three unknowns
     assert sum(201 * (1 - one.rms**2) for one in found.residual_summary()) == pytest.approx(3.0, rel=1e-6)
@@ -545,7 +546,7 @@ def test_noise_with_a_memory_is_warned_of_and_runs_tell_honest_errors():
     assert honest == pytest.approx(spread, rel=0.5)  # 14 % is the sampling error of a deviation from 25
     assert naive < 0.6 * spread
     # intervals are those of Student's t with seven degrees of freedom
-    np.testing.assert_allclose(found[0]["mass"].high - found[0]["mass"].value, 2.364624 * found[0]["mass"].standard_error, rtol=1e-3)
+    assert_allclose(found[0]["mass"].high - found[0]["mass"].value, 2.364624 * found[0]["mass"].standard_error, rtol=1e-3)
 
 
 def test_estimates_that_go_together_are_named():
@@ -597,7 +598,7 @@ def test_what_moves_with_an_unknown_of_each_run_has_no_interval_and_all_else_kee
     shown = {name for name in found.labels if np.isfinite(found[name].standard_error)}
     assert shown == {"mass"}
     assert int(found.information.rank) == len(found.labels) - 1
-    np.testing.assert_allclose(found["mass"].standard_error, known["mass"].standard_error, rtol=1e-4)
+    assert_allclose(found["mass"].standard_error, known["mass"].standard_error, rtol=1e-4)
 
 
 # Bad input. ---------------------------------------------------------------------------------------------------------------
@@ -629,6 +630,6 @@ def test_a_fit_ends_at_the_minimum_whatever_its_tolerance():
     assert exact.converged
     assert np.max(np.abs(found.values - exact.values) / exact.standard_errors) < 1e-4
     there = jj.simulate(found.scene, found.starts[0], ts=ts)
-    np.testing.assert_allclose(found.residuals[0]["x"], (there["x"] - data.values["x"]) / 0.01, atol=1e-3)
+    assert_allclose(found.residuals[0]["x"], (there["x"] - data.values["x"]) / 0.01, atol=1e-3)
     (_, costs) = found.trace[0]
-    np.testing.assert_allclose(costs[-1], 0.5 * float(found.chi_square), rtol=1e-6)
+    assert_allclose(costs[-1], 0.5 * float(found.chi_square), rtol=1e-6)

@@ -5,6 +5,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import OnLine
 
 import jourdain_jax as jj
@@ -45,7 +46,7 @@ def test_a_frequency_far_from_the_guess_is_found_over_growing_spans(factor):
     assert "found over growing spans" in str(found)
     near = jj.fit(Oscillator(stiffness=18.5), data(0), FREE)
     assert not near.grown
-    np.testing.assert_allclose(found.values, near.values, atol=1e-3 * near.standard_errors.min())
+    assert_allclose(found.values, near.values, atol=1e-3 * near.standard_errors.min())
 
 
 def test_spans_that_a_motion_follows_already_are_left_out(monkeypatch):
@@ -55,7 +56,7 @@ def test_spans_that_a_motion_follows_already_are_left_out(monkeypatch):
     assert quick.grown
     assert every.grown
     assert quick.steps < every.steps
-    np.testing.assert_allclose(quick.values, every.values, atol=1e-3 * every.standard_errors.min())
+    assert_allclose(quick.values, every.values, atol=1e-3 * every.standard_errors.min())
 
 
 def test_whole_runs_that_lead_nowhere_are_given_up_soon(monkeypatch):
@@ -65,7 +66,7 @@ def test_whole_runs_that_lead_nowhere_are_given_up_soon(monkeypatch):
     assert quick.grown
     assert patient.grown
     assert len(quick.trace[0][1]) < len(patient.trace[0][1])
-    np.testing.assert_allclose(quick.values, patient.values, atol=1e-3 * patient.standard_errors.min())
+    assert_allclose(quick.values, patient.values, atol=1e-3 * patient.standard_errors.min())
 
 
 def test_a_fit_that_is_far_off_goes_on_where_growing_spans_do_not_help(monkeypatch):
@@ -82,10 +83,10 @@ def test_repeats_that_end_in_a_local_minimum_are_fitted_again_alone():
     found = jj.fit_batch(Oscillator(stiffness=50.0), measured, FREE)
     assert found.grown[[0, 1, 2, 4]].all()
     good = [0, 1, 2, 4]
-    np.testing.assert_allclose(found["stiffness"].value[good], 18.0, atol=4 * found["stiffness"].standard_error[good].max())
+    assert_allclose(found["stiffness"].value[good], 18.0, atol=4 * found["stiffness"].standard_error[good].max())
     assert found.reduced_chi_square[3] > 100
     alone = jj.fit(Oscillator(stiffness=50.0), jj.Experiment(TS, {"x": measured.values["x"][2]}, SIGMA, start={"x": 0.5}), FREE)
-    np.testing.assert_allclose(found.values[2], alone.values, rtol=1e-9)
+    assert_allclose(found.values[2], alone.values, rtol=1e-9)
 
 
 def test_a_scene_that_is_not_right_is_warned_of_all_the_same():
@@ -102,8 +103,8 @@ def test_the_lowest_minimum_of_many_first_guesses_counts():
     assert 2 <= found.agreeing < 24
     assert not found.warnings
     assert f"{int(found.agreeing)} of 24 first guesses led to this minimum" in str(found)
-    np.testing.assert_allclose(found.values, near.values, atol=1e-3 * near.standard_errors.min())
-    np.testing.assert_array_equal(jj.fit(*asked, guesses=24).values, found.values)
+    assert_allclose(found.values, near.values, atol=1e-3 * near.standard_errors.min())
+    assert_array_equal(jj.fit(*asked, guesses=24).values, found.values)
 
 
 def test_a_minimum_that_one_guess_alone_leads_to_is_warned_of():

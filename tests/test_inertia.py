@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose
 from tolerances import tolerance
 
 import jourdain_jax as jj
@@ -78,11 +79,11 @@ def test_an_inertia_that_is_a_matrix_is_lowered_and_its_symmetric_part_counts():
     I, along = np.asarray(scene.inertia), np.array([[0.3, 0.7, 0.0], [0.7, 0.0, -0.4], [0.0, -0.4, 0.2]])
     for s in (0.0, 1.0):
         found = jj.accelerations(Tumbling(I + s * along), 0.0, [1.0, 0.0, 0.0, 0.0], omega).udot
-        np.testing.assert_allclose((I + s * along) @ found, np.cross((I + s * along) @ omega, omega), rtol=1e-12, atol=1e-12)  # Euler
+        assert_allclose((I + s * along) @ found, np.cross((I + s * along) @ omega, omega), rtol=1e-12, atol=1e-12)  # Euler
     slopes = jax.jacrev(turned)(I)
-    np.testing.assert_allclose(slopes, np.swapaxes(slopes, 1, 2), atol=1e-14)
+    assert_allclose(slopes, np.swapaxes(slopes, 1, 2), atol=1e-14)
     differences = (turned(I + 1e-4 * along) - turned(I - 1e-4 * along)) / 2e-4
-    np.testing.assert_allclose(np.sum(slopes * along, axis=(1, 2)), differences, rtol=1e-6)
+    assert_allclose(np.sum(slopes * along, axis=(1, 2)), differences, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -103,7 +104,7 @@ def test_speeds_that_move_no_mass_are_refused_by_name(scene, names, ask):
 def test_a_coordinate_without_inertia_that_a_row_holds_is_no_fault():
     # virtual power of both forces: m x'' = 3 + 2 * 1
     motion = jj.simulate(Geared(), {}, t1=2.0, rtol=1e-12, atol=1e-12).raise_if_failed()
-    np.testing.assert_allclose(motion.q_end, np.array([1.0, 2.0]) * 0.5 * 2.5 * 4.0, rtol=tolerance("closed_form"))
+    assert_allclose(motion.q_end, np.array([1.0, 2.0]) * 0.5 * 2.5 * 4.0, rtol=tolerance("closed_form"))
 
 
 def test_an_isolated_loss_of_inertia_is_no_fault_of_the_scene():
@@ -125,7 +126,7 @@ def test_a_motion_that_starts_without_inertia_says_so_instead_of_inventing_an_ac
 def test_a_lane_without_mass_says_so_and_harms_no_other():
     lanes = jj.rollout(Geared(), {}, parameters={"mass": np.array([2.0, 0.0])}, t1=2.0, progress=False)
     assert lanes.result.tolist() == [results.SUCCESS, results.NOT_FINITE]
-    np.testing.assert_allclose(lanes.lane(0).q_end[0], 5.0, rtol=1e-7)
+    assert_allclose(lanes.lane(0).q_end[0], 5.0, rtol=1e-7)
 
 
 def test_derivatives_at_a_state_with_inertia_are_finite_beside_the_guard():
@@ -134,7 +135,7 @@ def test_derivatives_at_a_state_with_inertia_are_finite_beside_the_guard():
         return jj.accelerations(OnSphere(), 0.0, q, u).udot[1]
 
     # azimuth'' = -2 polar' azimuth' cot(polar)
-    np.testing.assert_allclose(jax.grad(azimuth)(0.7), 0.3 / np.sin(0.7) ** 2, rtol=1e-12)
+    assert_allclose(jax.grad(azimuth)(0.7), 0.3 / np.sin(0.7) ** 2, rtol=1e-12)
 
 
 def test_verification_fails_where_no_acceleration_is_determined_and_says_so():
@@ -160,4 +161,4 @@ class BurningRocket(jj.Scene):
 
 def test_mass_that_leaves_takes_its_momentum_with_it():
     motion = jj.simulate(BurningRocket(), {"x_rate": 1.0, "angle_rate": 2.0}, t1=2.0, rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(motion.u_end, [1.0 + 6.0 * np.log(2.0), 2.0], atol=1e-9)  # m x'' = F, I angle'' = 0
+    assert_allclose(motion.u_end, [1.0 + 6.0 * np.log(2.0), 2.0], atol=1e-9)  # m x'' = F, I angle'' = 0

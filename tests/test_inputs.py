@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from small_scenes import OnPlane
 
@@ -39,7 +40,7 @@ SPEEDS = {
 @pytest.mark.parametrize("speed", SPEEDS.values(), ids=SPEEDS)
 def test_a_start_meets_rows_that_depend_on_inputs_at_its_time(speed):
     start = jj.start(OnBelt(), t0=2.0, y=0.5, inputs={"speed": speed})
-    np.testing.assert_allclose(start["x_rate"], 1.5 * 3.0, rtol=1e-14)
+    assert_allclose(start["x_rate"], 1.5 * 3.0, rtol=1e-14)
     assert start.residual < 1e-14
     assert jj.start(OnBelt(), t0=2.0, y=0.5)["x_rate"] == 0.0
 
@@ -57,18 +58,18 @@ def test_a_start_follows_its_inputs_smoothly_and_in_batches():
     def carried(speed):
         return jj.start(OnBelt(), y=0.5, inputs={"speed": speed})["x_rate"]
 
-    np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(carried)))(jnp.array([1.0, 3.0])), 1.5, rtol=1e-14)
+    assert_allclose(jax.jit(jax.vmap(jax.grad(carried)))(jnp.array([1.0, 3.0])), 1.5, rtol=1e-14)
 
 
 def test_named_starts_of_simulate_rollout_and_linearize_meet_rows_that_depend_on_inputs():
     scene, values, inputs = OnBelt(), {"y": 0.5, "x_rate": 4.5}, {"speed": 3.0}
     alone = jj.simulate(scene, values, ts=[0.0, 0.5], inputs=inputs).raise_if_failed()
     assert alone.moved_u == 0.0
-    np.testing.assert_allclose(alone.q_end, [4.5 * 0.5, 0.5], rtol=1e-12)
+    assert_allclose(alone.q_end, [4.5 * 0.5, 0.5], rtol=1e-12)
     starts = {"y": np.array([0.5, 0.2]), "x_rate": np.array([4.5, 3.6])}
     lanes = jj.rollout(scene, starts, ts=[0.0, 0.5], inputs=inputs, progress=False)
     assert lanes.failed.size == 0
-    np.testing.assert_allclose(lanes["x"][:, -1], [4.5 * 0.5, 3.6 * 0.5], rtol=1e-12)
+    assert_allclose(lanes["x"][:, -1], [4.5 * 0.5, 3.6 * 0.5], rtol=1e-12)
     assert jj.linearize(scene, values, (), inputs=inputs).A.shape[0] > 0
     assert jj.verify(scene, values, inputs=inputs).passed
 
@@ -148,9 +149,9 @@ def test_the_work_of_a_sampled_input_in_a_potential_is_that_of_a_quadrature(opti
     motion = jj.simulate(PulledBead(), ts=SPAN, rtol=1e-11, atol=1e-11, inputs=inputs, **options).raise_if_failed()
     work = work_by_quadrature()
     # the solver's steps cross the kinks of the hand's path, where its order is lost
-    np.testing.assert_allclose(motion.work, work, atol=1e-8 * np.max(np.abs(work)))
+    assert_allclose(motion.work, work, atol=1e-8 * np.max(np.abs(work)))
     balance = np.asarray(motion.energies().balance)
-    np.testing.assert_allclose(balance, balance[0], atol=1e-8 * np.max(np.abs(work)))
+    assert_allclose(balance, balance[0], atol=1e-8 * np.max(np.abs(work)))
 
 
 def test_an_input_that_jumps_does_the_work_of_moving_the_spring_at_once():
@@ -158,9 +159,9 @@ def test_an_input_that_jumps_does_the_work_of_moving_the_spring_at_once():
     scene = PulledBead(damping=0.0, stiffening=0.0, stiffness=18.0)
     motion = jj.simulate(scene, ts=jnp.array([0.0, 0.5 - 1e-9, 0.5, 1.0]), rtol=1e-10, atol=1e-10, inputs=jumps).raise_if_failed()
     before, after = (0.5 * 18.0 * (motion["x"][2] - hand) ** 2 for hand in (0.1, 0.3))
-    np.testing.assert_allclose(motion.work, [0.0, 0.0, after - before, after - before], atol=1e-7)
+    assert_allclose(motion.work, [0.0, 0.0, after - before, after - before], atol=1e-7)
     balance = np.asarray(motion.energies().balance)
-    np.testing.assert_allclose(balance, balance[0], atol=1e-7)
+    assert_allclose(balance, balance[0], atol=1e-7)
 
 
 def test_lanes_and_gradients_carry_the_work_of_inputs():
@@ -168,14 +169,14 @@ def test_lanes_and_gradients_carry_the_work_of_inputs():
     options = {"ts": SPAN, "rtol": 1e-11, "atol": 1e-11, "inputs": inputs}
     lanes = jj.rollout(PulledBead(), parameters={"mass": np.array([2.0, 3.0])}, progress=False, **options)
     work = work_by_quadrature()
-    np.testing.assert_allclose(lanes.lane(0).work, work, atol=1e-8 * np.max(np.abs(work)))
+    assert_allclose(lanes.lane(0).work, work, atol=1e-8 * np.max(np.abs(work)))
 
     def last(last_place):
         moved = jj.Sampled(KNOTS, jnp.asarray(PLACES).at[3].set(last_place))
         return jj.simulate(PulledBead(), **options | {"inputs": {"hand": moved, "push": 0.7}, "backend": "xla"}).work[-1]
 
     slope = (last(0.2 + 1e-4) - last(0.2 - 1e-4)) / 2e-4
-    np.testing.assert_allclose(jax.grad(last)(0.2), slope, rtol=1e-6)
+    assert_allclose(jax.grad(last)(0.2), slope, rtol=1e-6)
 
 
 def test_potentials_that_depend_on_inputs_are_found_and_named():
@@ -204,16 +205,16 @@ class Towed(OnPlane):
 def test_rates_of_inputs_in_rows_accelerate_and_do_work(options):
     motion = jj.simulate(Towed(), {"x_rate": 1.0}, t1=2.0, rtol=1e-9, atol=1e-9, inputs={"speed": lambda t: t**2}, **options).raise_if_failed()
     # x'' + y'' = 0, y'' - x'' = 2 t
-    np.testing.assert_allclose(motion.u_end, [-1.0, 3.0], atol=1e-8)
-    np.testing.assert_allclose(motion.q_end, [2.0 - 4.0 / 3.0, 2.0 + 4.0 / 3.0], atol=1e-7)
-    np.testing.assert_allclose(motion.work[-1], 4.0, atol=1e-7)
-    np.testing.assert_allclose(motion.accelerations().udot[-1], [-2.0, 2.0], atol=1e-8)
+    assert_allclose(motion.u_end, [-1.0, 3.0], atol=1e-8)
+    assert_allclose(motion.q_end, [2.0 - 4.0 / 3.0, 2.0 + 4.0 / 3.0], atol=1e-7)
+    assert_allclose(motion.work[-1], 4.0, atol=1e-7)
+    assert_allclose(motion.accelerations().udot[-1], [-2.0, 2.0], atol=1e-8)
 
 
 def test_rates_of_samples_in_rows_are_their_slopes():
     ramp = {"speed": jj.Sampled([0.0, 2.0], [0.0, 4.0])}
     lanes = jj.rollout(Towed(), {"x_rate": np.array([1.0, 2.0])}, t1=2.0, inputs=ramp, progress=False).lanes
-    np.testing.assert_allclose(lanes.u_end, [[-1.0, 3.0], [0.0, 4.0]], atol=1e-7)
+    assert_allclose(lanes.u_end, [[-1.0, 3.0], [0.0, 4.0]], atol=1e-7)
 
 
 JUMPS = {
@@ -238,7 +239,7 @@ def test_an_input_of_a_row_that_jumps_is_refused_for_lanes():
 
 def test_an_input_of_a_row_may_bend():
     motion = jj.simulate(Towed(), {"x_rate": 1.0}, t1=2.0, inputs={"speed": lambda t: jnp.clip(t, 0.5, 1.5) - 0.5})
-    np.testing.assert_allclose(motion.u_end, [0.5, 1.5], atol=1e-6)  # x'' + y'' = 0
+    assert_allclose(motion.u_end, [0.5, 1.5], atol=1e-6)  # x'' + y'' = 0
 
 
 def test_an_input_of_a_row_that_has_no_derivative_is_refused():

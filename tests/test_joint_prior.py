@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from small_scenes import Cart
 
 import jourdain_jax as jj
@@ -36,11 +37,11 @@ def test_the_estimate_is_where_likelihood_and_prior_balance_and_its_information_
     pull = np.linalg.solve(COVARIANCE, at - np.array(list(MEAN.values())))
     scale = np.array([found[name].standard_error for name in NAMES])
     assert np.max(np.abs(scale * pull)) > 0.1  # the prior does pull
-    np.testing.assert_allclose(scale * slope, scale * pull, atol=2e-6)
+    assert_allclose(scale * slope, scale * pull, atol=2e-6)
     of_data, of_both = planned(found.scene, data)
     order = [found.labels.index(name) for name in NAMES]
-    np.testing.assert_allclose(found.covariance[np.ix_(order, order)], np.linalg.inv(of_data + np.linalg.inv(COVARIANCE)), rtol=1e-5)
-    np.testing.assert_allclose(of_both - of_data, np.linalg.inv(COVARIANCE), rtol=1e-6)
+    assert_allclose(found.covariance[np.ix_(order, order)], np.linalg.inv(of_data + np.linalg.inv(COVARIANCE)), rtol=1e-5)
+    assert_allclose(of_both - of_data, np.linalg.inv(COVARIANCE), rtol=1e-6)
 
 
 def test_it_counts_beside_an_unknown_start_of_one_run_and_of_two():
@@ -50,20 +51,20 @@ def test_it_counts_beside_an_unknown_start_of_one_run_and_of_two():
     for count in (1, 2):
         found = jj.fit(CART, data[:count], TOGETHER)
         of_data, of_both = planned(found.scene, data[:count])
-        np.testing.assert_allclose(found.covariance, np.linalg.inv(of_both), rtol=5e-3)
-        np.testing.assert_allclose((of_both - of_data)[:2, :2], np.linalg.inv(COVARIANCE), rtol=1e-6)
+        assert_allclose(found.covariance, np.linalg.inv(of_both), rtol=5e-3)
+        assert_allclose((of_both - of_data)[:2, :2], np.linalg.inv(COVARIANCE), rtol=1e-6)
 
 
 def test_without_correlation_it_is_a_prior_for_each():
     data, diagonal = run(), jj.joint_normal(MEAN, np.diag(np.diag(COVARIANCE)))
     together, apart = jj.fit(CART, data, diagonal), jj.fit(CART, data, APART)
-    np.testing.assert_allclose(together.values, apart.values, rtol=1e-10)
-    np.testing.assert_allclose(together.standard_errors, apart.standard_errors, rtol=1e-8)
+    assert_allclose(together.values, apart.values, rtol=1e-10)
+    assert_allclose(together.standard_errors, apart.standard_errors, rtol=1e-8)
 
 
 def test_of_one_of_the_names_the_marginal_counts():
     together, apart = (jj.fit(CART, run(), {"mass": prior["mass"]}) for prior in (TOGETHER, APART))
-    np.testing.assert_allclose(together.values, apart.values, rtol=1e-12)
+    assert_allclose(together.values, apart.values, rtol=1e-12)
 
 
 def test_density_has_the_normal_density_of_all_names():
@@ -94,10 +95,10 @@ def test_pendulum_readings_give_a_joint_prior():
     bicycle = benchmark_from_measurements("Browser")
     joint = bicycle.joint_prior
     assert list(joint) == list(bicycle.prior)
-    np.testing.assert_allclose([prior.sigma for prior in joint.values()], [prior.sigma for prior in bicycle.prior.values()], rtol=1e-12)
+    assert_allclose([prior.sigma for prior in joint.values()], [prior.sigma for prior in bicycle.prior.values()], rtol=1e-12)
     pair = ("IBxx", "IBzz")
     which, inverse = [list(bicycle.values).index(name) for name in pair], np.linalg.inv(whitening([joint[name] for name in pair]))
     sigma = np.array([joint[name].sigma for name in pair])
-    np.testing.assert_allclose(sigma[:, None] * (inverse @ inverse.T) * sigma, bicycle.covariance[np.ix_(which, which)], rtol=1e-9)
+    assert_allclose(sigma[:, None] * (inverse @ inverse.T) * sigma, bicycle.covariance[np.ix_(which, which)], rtol=1e-9)
     published = measured_bicycle("Browser")
     assert published.joint_prior == published.prior

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from small_scenes import OnLine
 
 import jourdain_jax as jj
@@ -34,8 +35,8 @@ LOOPS = {
 def test_a_hammer_blow_of_a_millisecond_is_felt_in_every_loop(options):
     motion = jj.simulate(Struck(), t1=10.0, inputs={"force": BLOW}, work=False, **({"ts": [10.0]} | options)).raise_if_failed()
     if not isinstance(options.get("solver"), jj.ImplicitMidpoint):
-        np.testing.assert_allclose(motion.q_end[0], 0.5 * (10 - 2.0142), rtol=1e-9)
-    np.testing.assert_allclose(motion.u_end[0], 0.5, rtol=1e-9)
+        assert_allclose(motion.q_end[0], 0.5 * (10 - 2.0142), rtol=1e-9)
+    assert_allclose(motion.u_end[0], 0.5, rtol=1e-9)
 
 
 def test_a_hammer_blow_is_felt_at_every_tolerance_and_whenever_it_comes():
@@ -47,14 +48,14 @@ def test_a_hammer_blow_is_felt_at_every_tolerance_and_whenever_it_comes():
         motion = jj.simulate(Struck(), ts=[10.0], inputs=inputs, rtol=tolerance, atol=tolerance, work=False)
         grid = np.concatenate([[0.0], ts, [10.0]])
         impulse = np.trapezoid(np.concatenate([[0.0], values, [0.0]]), grid)  # that of the push is zero
-        np.testing.assert_allclose(motion.u_end[0], impulse / 2, rtol=0, atol=1e-9 + 1e-9 * abs(impulse))
+        assert_allclose(motion.u_end[0], impulse / 2, rtol=0, atol=1e-9 + 1e-9 * abs(impulse))
 
 
 def test_a_blow_within_thousands_of_samples_is_felt():
     ts = np.linspace(0.0, 10.0, 10_001)
     values = np.where((ts > 2.0135) & (ts < 2.0165), 1000.0, 0.0)
     motion = jj.simulate(Struck(), ts=[10.0], inputs={"force": jj.Sampled(ts, values)}, rtol=1e-3, atol=1e-3, work=False)
-    np.testing.assert_allclose(motion.u_end[0], np.trapezoid(values, ts) / 2, rtol=1e-9)
+    assert_allclose(motion.u_end[0], np.trapezoid(values, ts) / 2, rtol=1e-9)
     assert int(motion.accepted) < 100  # the straight parts have no knots
 
 
@@ -67,16 +68,16 @@ def test_lanes_feel_blows_of_their_own_and_forwards_and_backwards():
         motion = jj.simulate(Struck(), {}, t0=t0, ts=jnp.stack([t1]), inputs=inputs, work=False, **options)
         return motion.q_end[0]
 
-    np.testing.assert_allclose(jax.vmap(lambda at: end(at, 0.0, jnp.asarray(10.0)))(at), 0.5 * (10 - at), rtol=1e-9)
-    np.testing.assert_allclose(jax.vmap(lambda at: end(at, 10.0, jnp.asarray(0.0)))(at), 0.5 * at, rtol=1e-9)
-    np.testing.assert_allclose(jax.grad(lambda at: end(at, 0.0, jnp.asarray(10.0), backend="xla"))(3.0), -0.5, rtol=1e-6)
+    assert_allclose(jax.vmap(lambda at: end(at, 0.0, jnp.asarray(10.0)))(at), 0.5 * (10 - at), rtol=1e-9)
+    assert_allclose(jax.vmap(lambda at: end(at, 10.0, jnp.asarray(0.0)))(at), 0.5 * at, rtol=1e-9)
+    assert_allclose(jax.grad(lambda at: end(at, 0.0, jnp.asarray(10.0), backend="xla"))(3.0), -0.5, rtol=1e-6)
     forward = jax.jacfwd(lambda at: end(at, 0.0, jnp.asarray(10.0), backend="xla"))
-    np.testing.assert_allclose(forward(3.0), -0.5, rtol=1e-6)
+    assert_allclose(forward(3.0), -0.5, rtol=1e-6)
 
 
 def test_lanes_of_a_rollout_feel_a_blow_that_they_share():
     lanes = jj.rollout(Struck(), parameters={"mass": np.array([1.0, 2.0, 4.0])}, ts=[10.0], inputs={"force": BLOW}, work=False, progress=False).lanes
-    np.testing.assert_allclose(lanes.u_end[:, 0], [1.0, 0.5, 0.25], rtol=1e-9)
+    assert_allclose(lanes.u_end[:, 0], [1.0, 0.5, 0.25], rtol=1e-9)
 
 
 CLOCK, FORCE, PUSH = np.linspace(0.0, 2.0, 6), np.array([0.3, -1.0, 0.8, 0.5, -0.7, 0.2]), np.array([-0.4, 0.6, 0.1, -0.9, 0.7, 0.5])
@@ -104,7 +105,7 @@ def test_a_delay_of_one_input_has_its_derivative_where_knots_meet_each_other_and
         motion = jj.simulate(Struck(mass=1.0), {}, t0=t0, ts=np.linspace(t0, t1, times), **asked)
         return motion["x"][-1]
 
-    np.testing.assert_allclose(slope(end)(0.0), rate_of_late(FORCE, t0, t1), rtol=1e-9)
+    assert_allclose(slope(end)(0.0), rate_of_late(FORCE, t0, t1), rtol=1e-9)
 
 
 @pytest.mark.parametrize("backend", ["auto", "xla"])
@@ -114,4 +115,4 @@ def test_a_saved_time_at_a_knot_moves_its_own_state_alone(backend):
         return jj.simulate(Struck(mass=1.0), {}, t0=0.0, ts=ts, inputs=inputs, rtol=1e-5, atol=1e-5, work=False, backend=backend)["x"]
 
     speeds = np.concatenate([[0.0], np.cumsum(np.diff(CLOCK) * (FORCE[1:] + FORCE[:-1]) / 2)])
-    np.testing.assert_allclose(jax.jacrev(states)(jnp.asarray(CLOCK)), np.diag(speeds), atol=1e-9)
+    assert_allclose(jax.jacrev(states)(jnp.asarray(CLOCK)), np.diag(speeds), atol=1e-9)

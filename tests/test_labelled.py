@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 import jourdain_jax as jj
 
@@ -28,10 +29,10 @@ def lanes():
 
 def test_a_motion_becomes_a_dataset_with_names_times_and_units(motion):
     data = motion.to_xarray(units={"x": "m"})
-    np.testing.assert_array_equal(data.time, motion.ts)
+    assert_array_equal(data.time, motion.ts)
     for name in (*motion.scene.coordinate_names.entries, *motion.scene.speed_names.entries):
         assert data[name].dims == ("time",)
-        np.testing.assert_array_equal(data[name], motion[name])
+        assert_array_equal(data[name], motion[name])
     quaternion = [name for name in motion.scene.coordinate_names.entries if name.startswith("attitude")]
     assert {data[name].attrs["units"] for name in quaternion} == {"1"}
     assert (data.time.attrs["units"], data.x.attrs["units"], data.mass.attrs["units"]) == ("s", "m", "kg")
@@ -44,21 +45,21 @@ def test_a_motion_becomes_a_dataset_with_names_times_and_units(motion):
 def test_a_rollout_has_an_axis_of_lanes_with_their_codes_and_parameters(lanes):
     data = lanes.to_xarray()
     assert data.x0.dims == ("lane", "time")
-    np.testing.assert_array_equal(data.x0, lanes["x0"])
-    np.testing.assert_array_equal(data.result, lanes.result)
-    np.testing.assert_array_equal(data.car_mass, [1.0, 2.0, 3.0])
-    np.testing.assert_array_equal(data.steps, lanes.lanes.accepted)
+    assert_array_equal(data.x0, lanes["x0"])
+    assert_array_equal(data.result, lanes.result)
+    assert_array_equal(data.car_mass, [1.0, 2.0, 3.0])
+    assert_array_equal(data.steps, lanes.lanes.accepted)
     one = data.sel(lane=1).sel(time=0.2, method="nearest")
     assert float(one.forward0) == float(lanes.lane(1)["forward0"][2])
 
 
 def test_tables_have_one_row_for_each_time_of_each_lane(motion, lanes):
     table = motion.to_pandas()
-    np.testing.assert_array_equal(table.index, motion.ts)
-    np.testing.assert_array_equal(table["x"], motion["x"])
+    assert_array_equal(table.index, motion.ts)
+    assert_array_equal(table["x"], motion["x"])
     many = lanes.to_pandas()
     assert many.index.names == ["lane", "time"]
-    np.testing.assert_array_equal(many.loc[2]["x1"], lanes.lane(2)["x1"])
+    assert_array_equal(many.loc[2]["x1"], lanes.lane(2)["x1"])
 
 
 class _Timed(jj.Scene):

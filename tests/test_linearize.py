@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from oracles import rolling_disc, whipple_bicycle
 from small_scenes import DrivenPendulum
 from tolerances import relative_error, tolerance
@@ -181,7 +182,7 @@ def test_derivatives_pass_through_linearisation(derivative):
         small = linearize(disc, jj.consistent(disc, 0.0, *disc.named(spin_rate=4.0, x_rate=4.0 * radius)[:2]), ("yaw", "lean", "spin"))
         return jnp.stack([small.K[1, 1], small.C[1, 0]])
 
-    np.testing.assert_allclose(jax.jit(derivative(terms))(0.5), [-9.81, -3.0 * 0.5 * 4.0], rtol=tolerance("round_off"))
+    assert_allclose(jax.jit(derivative(terms))(0.5), [-9.81, -3.0 * 0.5 * 4.0], rtol=tolerance("round_off"))
 
 
 def test_wrong_names_are_answered_with_valid_ones():
@@ -225,7 +226,7 @@ def test_speeds_are_chosen_at_the_state_where_those_of_the_domain_do_not_serve(h
     small = linearize(scene, state, ())
     assert small.pivot > 0.02
     # straight ahead at 1 m/s with both skates in line: a heading stays, a steer of the front one falls as exp(-t), an offset and the speed stay
-    np.testing.assert_allclose(small.state_eigenvalues().real, [-1.0, 0.0, 0.0, 0.0, 0.0, 0.0], atol=1e-6)
+    assert_allclose(small.state_eigenvalues().real, [-1.0, 0.0, 0.0, 0.0, 0.0, 0.0], atol=1e-6)
     in_jit = jax.jit(lambda u: linearize(scene, jj.consistent(scene, 0.0, state.q, u), ()))(state.u)
     assert in_jit.pivot < 1e-12
     assert np.isnan(in_jit.A).all()

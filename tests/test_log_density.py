@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from small_scenes import Oscillator
 
 import jourdain_jax as jj
@@ -48,13 +49,13 @@ def test_density_is_likelihood_times_prior_times_derivative_of_the_transforms():
         return by_hand(constrain(z), data, 0.02) + jnp.linalg.slogdet(slopes)[1]
 
     z = density.initial + jnp.array([0.1, 0.03, -0.005, 0.002])
-    np.testing.assert_allclose(density.constrain(z), constrain(z), rtol=1e-14)
+    assert_allclose(density.constrain(z), constrain(z), rtol=1e-14)
     value, slope = jax.jit(jax.value_and_grad(density))(z)
     many = z + 1e-3 * jnp.arange(3.0)[:, None]
     values, slopes = jax.jit(jax.vmap(jax.value_and_grad(density)))(many)
     right, right_slopes = jax.jit(jax.vmap(jax.value_and_grad(expected)))(jnp.concatenate([z[None], many]))
-    np.testing.assert_allclose([value, *values], right, rtol=1e-8)
-    np.testing.assert_allclose([slope, *slopes], right_slopes, rtol=2e-6)
+    assert_allclose([value, *values], right, rtol=1e-8)
+    assert_allclose([slope, *slopes], right_slopes, rtol=2e-6)
 
 
 def test_whitened_density_is_that_of_the_same_unknowns_and_nearly_round():
@@ -65,16 +66,16 @@ def test_whitened_density_is_that_of_the_same_unknowns_and_nearly_round():
     white = plain.whitened(fit)
     z = jnp.array([0.5, -0.3, 0.2, 0.8, -0.4])
     x = plain.unconstrain(white.named(z))
-    np.testing.assert_allclose(white.unconstrain(white.named(z)), z, atol=1e-10)
+    assert_allclose(white.unconstrain(white.named(z)), z, atol=1e-10)
     # log p(z) = log p(x) + log |dx / dz|
-    np.testing.assert_allclose(white(z), plain(x) + np.linalg.slogdet(jax.jacfwd(lambda z: plain.unconstrain(white.named(z)))(z))[1], rtol=1e-9)
+    assert_allclose(white(z), plain(x) + np.linalg.slogdet(jax.jacfwd(lambda z: plain.unconstrain(white.named(z)))(z))[1], rtol=1e-9)
     middle = white.named(jnp.zeros(5))
-    np.testing.assert_allclose([middle[label] for label in fit.labels], fit.values, rtol=1e-12)
-    np.testing.assert_allclose(middle["x.sigma"], fit.sigma["x"], rtol=1e-12)
+    assert_allclose([middle[label] for label in fit.labels], fit.values, rtol=1e-12)
+    assert_allclose(middle["x.sigma"], fit.sigma["x"], rtol=1e-12)
     steps = jnp.concatenate([jnp.zeros((1, 5)), 0.1 * jnp.eye(5), -0.1 * jnp.eye(5)])
     here, *others = np.asarray(jax.vmap(white)(steps))
     curvatures = (np.array(others[:5]) + np.array(others[5:]) - 2 * here) / 0.01
-    np.testing.assert_allclose(curvatures, 5 * [-1.0], atol=0.05)
+    assert_allclose(curvatures, 5 * [-1.0], atol=0.05)
 
 
 def remembering():
@@ -104,15 +105,15 @@ def test_noise_with_an_unknown_memory_has_the_density_of_its_covariance():
     other = first + jnp.array([0.1, 0.03, -0.005, 0.002, -0.3, 0.4])
     of_both = jax.jit(jax.value_and_grad(density))
     (value, slope), (right, right_slope) = of_both(other), jax.jit(jax.value_and_grad(expected))(other)
-    np.testing.assert_allclose(value - of_both(first)[0], right - expected(first), rtol=1e-8)
-    np.testing.assert_allclose(slope, right_slope, rtol=1e-5)
-    np.testing.assert_allclose(density.unconstrain(density.named(other)), other, rtol=1e-8)
+    assert_allclose(value - of_both(first)[0], right - expected(first), rtol=1e-8)
+    assert_allclose(slope, right_slope, rtol=1e-5)
+    assert_allclose(density.unconstrain(density.named(other)), other, rtol=1e-8)
     fit = jj.fit(Oscillator(), data, FREE)
     white = density.whitened(fit)
     middle = white.named(jnp.zeros(6))
-    np.testing.assert_allclose([middle[label] for label in fit.labels], fit.values, rtol=1e-12)
+    assert_allclose([middle[label] for label in fit.labels], fit.values, rtol=1e-12)
     in_white, plain = jax.jit(lambda z: white(z)), [value, of_both(density.unconstrain(middle))[0]]
-    np.testing.assert_allclose(np.diff([in_white(white.unconstrain(point)) for point in (density.named(other), middle)]), np.diff(plain), atol=1e-8)
+    assert_allclose(np.diff([in_white(white.unconstrain(point)) for point in (density.named(other), middle)]), np.diff(plain), atol=1e-8)
 
 
 def test_unknowns_lead_back_and_stay_finite_far_away():
@@ -122,7 +123,7 @@ def test_unknowns_lead_back_and_stay_finite_far_away():
     density = jj.log_density(Oscillator(), data, free)
     x = jnp.array([[-2.0, 0.3, 1.5], [3.0, 800.0, -20.0]])
     for point in x:
-        np.testing.assert_allclose(density.unconstrain(density.named(point)), point, rtol=1e-7)
+        assert_allclose(density.unconstrain(density.named(point)), point, rtol=1e-7)
     assert np.isfinite(jax.jacrev(density.constrain)(x[1])).all()
 
 

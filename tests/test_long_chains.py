@@ -7,6 +7,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
 from jourdain_jax.build import structure
@@ -64,8 +65,8 @@ def test_chains_are_assembled_in_a_band_as_by_dense_matrices():
     assert dense.band is None
     expected = assemble(look, dense, q, low, high, generic)
     assert found.on_rows.all()
-    np.testing.assert_array_equal(found.on_rows, expected.on_rows)
-    np.testing.assert_allclose(found.q, expected.q, rtol=0, atol=1e-9)
+    assert_array_equal(found.on_rows, expected.on_rows)
+    assert_allclose(found.q, expected.q, rtol=0, atol=1e-9)
 
 
 def test_a_band_knows_rows_that_depend_on_each_other():
@@ -76,7 +77,7 @@ def test_a_band_knows_rows_that_depend_on_each_other():
     f = np.ones((2, 64))
     x, size = pattern.band.solved(values, np.zeros(2), f)
     G = pattern.dense(values)[0]
-    np.testing.assert_allclose(x[0], np.linalg.solve(G @ G.T, f[0]), rtol=1e-10)
+    assert_allclose(x[0], np.linalg.solve(G @ G.T, f[0]), rtol=1e-10)
     exact = np.linalg.norm(np.linalg.inv(G @ G.T), np.inf)
     assert 0.1 * exact < size[0] < 1.001 * exact
     assert not size[1] < sparse_slopes.REGULAR

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose
 from tolerances import tolerance
 
 import jourdain_jax as jj
@@ -32,8 +33,8 @@ def test_the_program_puts_states_where_dense_matrices_put_them(name):
     fixed, nothing = program.fixed_values(scene), jnp.zeros(len(scene.inputs))
     found_q, found_u = map(jnp.stack, program.projected(fixed, t, tuple(q), tuple(u), nothing, structure_of(scene).affine))
     expected_q = project_positions(scene, t, q, iterations=2)
-    np.testing.assert_allclose(found_q, expected_q, atol=tolerance("round_off"))
-    np.testing.assert_allclose(found_u, project_speeds(scene, t, expected_q, u, iterations=2), atol=tolerance("round_off") * (1 + np.max(np.abs(u))))
+    assert_allclose(found_q, expected_q, atol=tolerance("round_off"))
+    assert_allclose(found_u, project_speeds(scene, t, expected_q, u, iterations=2), atol=tolerance("round_off") * (1 + np.max(np.abs(u))))
 
 
 def test_a_disc_held_by_a_quaternion_keeps_its_norm_by_the_program():
@@ -56,11 +57,11 @@ def test_a_motion_through_a_loss_of_rank_is_right_or_continued_by_dense_matrices
     beyond = jj.simulate(board, start, t1=float((np.pi - 0.6) / 0.5), rtol=1e-9, atol=1e-9)
     dense = jj.simulate(board, start, t1=float((np.pi - 0.6) / 0.5), rtol=1e-11, atol=1e-11, backend="dense")
     assert int(beyond.result) == int(dense.result) == results.SUCCESS
-    np.testing.assert_allclose(beyond.u_end, dense.u_end, atol=1e-6)
+    assert_allclose(beyond.u_end, dense.u_end, atol=1e-6)
     assert int(motion.result) in (results.SUCCESS, results.SINGULAR_PARTITION, results.STEP_TOO_SMALL)
     if int(motion.result) == results.SUCCESS:
         middle = jnp.interp(motion.t_end, dense.ts, dense["x_rate"])
-        np.testing.assert_allclose(motion["x_rate"][-1], middle, atol=1e-3)
+        assert_allclose(motion["x_rate"][-1], middle, atol=1e-3)
 
 
 def test_which_scenes_keep_all_speeds():
@@ -72,7 +73,7 @@ def test_which_scenes_keep_all_speeds():
     # on request, also where speeds could be eliminated
     full = jj.simulate(MODELS["chaplygin-sleigh"](), formulation=jj.Formulation("full"), t1=1.0, rtol=1e-11, atol=1e-11)
     assert full.reduction == "multipliers (KKT), lowered to machine code"
-    np.testing.assert_allclose(full.u_end, jj.simulate(MODELS["chaplygin-sleigh"](), t1=1.0, rtol=1e-11, atol=1e-11).u_end, atol=1e-9)
+    assert_allclose(full.u_end, jj.simulate(MODELS["chaplygin-sleigh"](), t1=1.0, rtol=1e-11, atol=1e-11).u_end, atol=1e-9)
 
 
 def test_a_long_chain_counts_as_well_conditioned_where_a_short_one_with_the_same_number_does_not():

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import result_codes as results
 from baselines.hand_derived import HAND_DERIVED, operations
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import OnLine, Upright
 
 import jourdain_jax as jj
@@ -84,7 +85,7 @@ def test_the_readable_source_computes_the_rates(name):
     exec(program.python_source(), scope)
     fixed = scope["fixed"](*(float(x) for leaf in jax.tree.leaves(PRINTED[name]) for x in np.ravel(leaf)))
     for (t, q, y, inputs), expected in printed_states(PRINTED[name], program):
-        np.testing.assert_allclose(scope["rates"](fixed, t, *q, *y, *inputs), expected, rtol=1e-11, atol=1e-11)
+        assert_allclose(scope["rates"](fixed, t, *q, *y, *inputs), expected, rtol=1e-11, atol=1e-11)
 
 
 @pytest.mark.parametrize("name", PRINTED)
@@ -103,7 +104,7 @@ def test_the_source_in_c_compiles_without_warnings_and_computes_the_rates(name, 
     for (t, q, y, inputs), expected in printed_states(PRINTED[name], program):
         out = vector(np.zeros(len(expected)))
         rates(parameters, ctypes.c_double(t), vector(q), vector(y), vector(inputs), out)
-        np.testing.assert_allclose(list(out), expected, rtol=1e-11, atol=1e-11)
+        assert_allclose(list(out), expected, rtol=1e-11, atol=1e-11)
 
 
 def test_what_is_printed_states_units_symbols_and_what_is_relied_on():
@@ -235,7 +236,7 @@ def test_a_derivative_rule_is_believed_as_jax_believes_it(scene):
     """Whatever it says: the program and dense matrices move in the same way."""
     assert "has a derivative of its own" in jj.lower(scene).calls[0]
     program, dense = (jj.simulate(scene, t1=0.5, rtol=1e-10, atol=1e-10, backend=backend).raise_if_failed() for backend in ("auto", "dense"))
-    np.testing.assert_allclose(program.q_end, dense.q_end, rtol=1e-8, atol=1e-9)
+    assert_allclose(program.q_end, dense.q_end, rtol=1e-8, atol=1e-9)
 
 
 def test_a_program_that_grows_past_the_budget_is_not_lowered_and_the_dense_path_is_taken_with_a_note(monkeypatch):
@@ -265,7 +266,7 @@ def test_a_coordinate_that_chooses_a_branch_is_not_ignorable_where_no_probe_take
     assert jj.lower(scene).held == ("y",)
     start = jj.start(scene, x=10.5, x_rate=0.5)
     ends = [jj.simulate(scene, start, t1=1.0, **options).q_end for options in ({}, {"formulation": jj.Formulation("full", "kkt")})]
-    np.testing.assert_allclose(*ends, atol=1e-6)
+    assert_allclose(*ends, atol=1e-6)
 
 
 def test_what_a_scene_has_not_costs_nothing():
@@ -291,10 +292,10 @@ class Falling(Upright):
 def test_values_computed_together_are_the_same_and_have_the_same_derivatives():
     both = lambda x: fused((jnp.sin(x) * 2.0, jnp.sin(x) + x))  # noqa: E731
     x = jnp.linspace(-2.0, 2.0, 7)
-    np.testing.assert_array_equal(jax.jit(both)(x)[1], jnp.sin(x) + x)
-    np.testing.assert_array_equal(jax.vmap(both)(x)[0], jnp.sin(x) * 2.0)
-    np.testing.assert_allclose(jax.grad(lambda x: jnp.sum(both(x)[0] + both(x)[1]))(x), 3 * jnp.cos(x) + 1, rtol=1e-14)
-    np.testing.assert_allclose(jax.hessian(lambda x: both(x)[0])(0.7), -2 * np.sin(0.7), rtol=1e-14)
+    assert_array_equal(jax.jit(both)(x)[1], jnp.sin(x) + x)
+    assert_array_equal(jax.vmap(both)(x)[0], jnp.sin(x) * 2.0)
+    assert_allclose(jax.grad(lambda x: jnp.sum(both(x)[0] + both(x)[1]))(x), 3 * jnp.cos(x) + 1, rtol=1e-14)
+    assert_allclose(jax.hessian(lambda x: both(x)[0])(0.7), -2 * np.sin(0.7), rtol=1e-14)
 
 
 def test_rates_mapped_over_states_are_linearised_inside_jit():
@@ -310,7 +311,7 @@ def test_rates_mapped_over_states_are_linearised_inside_jit():
     values, slope = jax.linearize(jax.jit(jax.vmap(rates)), y)
     for along, (value, expected) in ((y, jax.jvp(jax.vmap(rates), (y,), (y,))), (2 * y, jax.jvp(jax.vmap(rates), (y,), (2 * y,)))):
         for a, b in zip(jax.tree.leaves((values, slope(along))), jax.tree.leaves((value, expected)), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-14)
+            assert_allclose(a, b, rtol=1e-14)
 
 
 def test_loops_over_steps_are_compiled_into_one_function():
@@ -340,16 +341,16 @@ def test_derivatives_by_the_jacobian_on_the_graph_are_those_of_jax(order):
         known = dict(zip(program.variables, (*a, 0.0, *q, *y), strict=True))
         return jnp.stack([jnp.asarray(r) for r in run(program.graph, [*program.qdot, *program.ydot], known)])
 
-    np.testing.assert_allclose(by_rule(x), by_jax(x), rtol=1e-15)
+    assert_allclose(by_rule(x), by_jax(x), rtol=1e-15)
     for derivative in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(derivative(by_rule)(x), derivative(by_jax)(x), rtol=1e-12, atol=1e-12)
+        assert_allclose(derivative(by_rule)(x), derivative(by_jax)(x), rtol=1e-12, atol=1e-12)
     v = jnp.linspace(-1, 1, len(x))
     if order == 1:
         return
     second = lambda f: jax.jvp(lambda x: jax.jvp(f, (x,), (v,))[1], (x,), (v,))[1]  # noqa: E731
-    np.testing.assert_allclose(second(by_rule), second(by_jax), rtol=1e-11, atol=1e-11)
+    assert_allclose(second(by_rule), second(by_jax), rtol=1e-11, atol=1e-11)
     pull = lambda f: jax.grad(lambda x: jnp.vdot(jax.grad(lambda x: jnp.sum(jnp.sin(f(x))))(x), v))(x)  # noqa: E731
-    np.testing.assert_allclose(pull(by_rule), pull(by_jax), rtol=1e-11, atol=1e-11)
+    assert_allclose(pull(by_rule), pull(by_jax), rtol=1e-11, atol=1e-11)
 
 
 class OnNarrowEllipse(jj.Scene):
@@ -367,4 +368,4 @@ def test_a_parameter_near_the_end_of_its_range_does_not_keep_a_scene_from_its_pr
     s, c, b = np.sin(0.3), np.cos(0.3), 1 - 0.97**2
     motion = jj.simulate(OnNarrowEllipse(), {"angle": 0.3, "angle_rate": 2.0}, ts=[1.0], rtol=1e-11, atol=1e-11)
     angle, rate = float(motion.q_end[0]), float(motion.u_end[0])
-    np.testing.assert_allclose(rate**2 * (np.sin(angle) ** 2 + b * np.cos(angle) ** 2), 4.0 * (s**2 + b * c**2), rtol=1e-9)  # its speed is constant
+    assert_allclose(rate**2 * (np.sin(angle) ** 2 + b * np.cos(angle) ** 2), 4.0 * (s**2 + b * c**2), rtol=1e-9)  # its speed is constant

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.special import ndtri
 
 import jourdain_jax as jj
@@ -50,7 +51,7 @@ def test_gradients_are_those_of_the_closed_form():
         "gravity": np.full(COUNT, -0.5 * TIME**2),
     }
     assert found.names == tuple(moved)
-    np.testing.assert_allclose(found.mean, [height.mean(), 0.0, (height**2).mean()], rtol=1e-9, atol=1e-12)
+    assert_allclose(found.mean, [height.mean(), 0.0, (height**2).mean()], rtol=1e-9, atol=1e-12)
     for name, moves in moved.items():
         assert found.of("height", name) == pytest.approx(moves.mean(), rel=1e-8, abs=1e-9)
         assert found.of("square", name) == pytest.approx((2 * height * moves).mean(), rel=1e-8, abs=1e-7)
@@ -70,13 +71,13 @@ def test_values_of_distributions_have_their_derivatives(how):
         step = 1e-6
         up, down = (type(how)(**(vars(how) | {name: getattr(how, name) + sign * step})) for sign in ((1, 0) if name == "sigma" else (1, -1)))
         rough = (up.values(u) - down.values(u)) / (step if name == "sigma" else 2 * step)
-        np.testing.assert_allclose(how.derivatives(u)[name], rough, rtol=1e-4, atol=1e-6)
+        assert_allclose(how.derivatives(u)[name], rough, rtol=1e-4, atol=1e-6)
 
 
 def test_columns_of_a_table_are_shifted():
     found = thrown(np.linspace(19.0, 21.0, COUNT), np.linspace(1.0, 3.0, COUNT), sampler="random", samples=None, seed=0).mean_gradients(**HOW)
     assert found.names == ("z_at_start.shift", "z_rate_at_start.shift")
-    np.testing.assert_allclose(found.gradient[0], [1.0, TIME], rtol=1e-9)
+    assert_allclose(found.gradient[0], [1.0, TIME], rtol=1e-9)
 
 
 def test_where_lanes_end_in_different_ways_it_is_said_and_what_has_no_derivative_is_nan():

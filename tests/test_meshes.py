@@ -5,6 +5,7 @@ import struct
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from test_show import contents
 
 import jourdain_jax as jj
@@ -42,7 +43,7 @@ def test_a_mesh_of_a_file_has_its_faces_in_metres(name, tmp_path):
     WRITERS[name](tmp_path / name)
     look = jj.Visual.from_file(tmp_path / name, scale=0.001, at=(0.0, 0.0, 0.1), colour="#ff8000")
     assert (look.kind, look.colour) == ("mesh", "#ff8000")
-    np.testing.assert_allclose(look.position, [0.0, 0.0, 0.1])
+    assert_allclose(look.position, [0.0, 0.0, 0.1])
     assert triangles(look.faces.corners * np.asarray(look.size), look.faces.polygons) == triangles(0.001 * CORNERS, FACES)
 
 
@@ -64,7 +65,7 @@ def test_a_mesh_in_the_visuals_of_a_scene_is_drawn_with_its_body(tmp_path):
     (shape,) = part["shapes"]
     drawn = numbers(shape["mesh"]).reshape(-1, 3)
     assert triangles(drawn.astype(float), np.arange(12).reshape(4, 3)) == triangles(0.001 * CORNERS, FACES)
-    np.testing.assert_allclose(numbers(part["p"]).reshape(-1, 3)[:, 2], [1.0, 0.5, 0.0], atol=1e-6)
+    assert_allclose(numbers(part["p"]).reshape(-1, 3)[:, 2], [1.0, 0.5, 0.0], atol=1e-6)
     jj.animate(motion, tmp_path / "fall.gif")
     assert (tmp_path / "fall.gif").stat().st_size > 1000
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from small_scenes import OnLine
 
 import jourdain_jax as jj
@@ -54,12 +55,12 @@ def same(scene, data, free, pieces=4, **options):
     assert whole.converged
     assert cut.converged
     assert cut.shooting.continuity <= 1
-    np.testing.assert_allclose(cut.values, whole.values, atol=1e-3 * np.min(np.where(whole.standard_errors > 0, whole.standard_errors, np.inf)), rtol=1e-4)
-    np.testing.assert_allclose(cut.standard_errors, whole.standard_errors, rtol=1e-4)
-    np.testing.assert_allclose(cut.chi_square, whole.chi_square, rtol=1e-5)
+    assert_allclose(cut.values, whole.values, atol=1e-3 * np.min(np.where(whole.standard_errors > 0, whole.standard_errors, np.inf)), rtol=1e-4)
+    assert_allclose(cut.standard_errors, whole.standard_errors, rtol=1e-4)
+    assert_allclose(cut.chi_square, whole.chi_square, rtol=1e-5)
     for a, b in zip(cut.residuals, whole.residuals, strict=True):
         for name in b:
-            np.testing.assert_allclose(a[name], b[name], atol=1e-3)
+            assert_allclose(a[name], b[name], atol=1e-3)
     return whole, cut
 
 
@@ -74,8 +75,8 @@ def test_a_chaotic_motion_is_found_from_afar_with_the_intervals_of_single_shooti
     near = jj.fit(found.scene, jj.Experiment(run.ts, run.values, run.sigma, start=found.starts[0], unknown_start=tuple(run.start)), FREE, **TIGHT)
     assert near.converged
     assert not near.grown
-    np.testing.assert_allclose(found.values, near.values, atol=1e-2 * near.standard_errors.min())
-    np.testing.assert_allclose(found.standard_errors, near.standard_errors, rtol=1e-3)
+    assert_allclose(found.values, near.values, atol=1e-2 * near.standard_errors.min())
+    assert_allclose(found.standard_errors, near.standard_errors, rtol=1e-3)
     assert all(abs(found[name].value - float(getattr(truth, name))) < 4 * found[name].standard_error for name in FREE)
 
 
@@ -112,11 +113,11 @@ def test_a_step_of_joined_pieces_is_that_of_dense_least_squares():
         dense = np.concatenate(rows)
         J, r, free = dense[:, :-1], dense[:, -1] + dense[:, :-1] @ moved[b], ~held[b]
         right = np.linalg.solve(J[:, free].T @ J[:, free] + damping[b] * np.diag(D[b, free] ** 2), -J[:, free].T @ r)
-        np.testing.assert_allclose(step[b, free], right, rtol=1e-8, atol=1e-10)
-        np.testing.assert_allclose(step[b, held[b]], moved[b, held[b]])
-        np.testing.assert_allclose(arrow.change(step)[b], np.sum((J @ step[b]) ** 2))
-        np.testing.assert_allclose(arrow.gradient[b], J.T @ dense[:, -1], atol=1e-10)
-        np.testing.assert_allclose(arrow.column_norms[b], np.linalg.norm(J, axis=0))
+        assert_allclose(step[b, free], right, rtol=1e-8, atol=1e-10)
+        assert_allclose(step[b, held[b]], moved[b, held[b]])
+        assert_allclose(arrow.change(step)[b], np.sum((J @ step[b]) ** 2))
+        assert_allclose(arrow.gradient[b], J.T @ dense[:, -1], atol=1e-10)
+        assert_allclose(arrow.column_norms[b], np.linalg.norm(J, axis=0))
 
 
 def test_pieces_lie_along_the_fit_though_an_unknown_at_its_bound_was_moved():
@@ -128,7 +129,7 @@ def test_pieces_lie_along_the_fit_though_an_unknown_at_its_bound_was_moved():
     assert float(found["damping"].high) > 0.04
     begins = ts[[10, 20, 30]]
     motion = jj.simulate(found.scene, found.starts[0], ts=begins, t0=0.0, t1=4.0, **TIGHT)
-    np.testing.assert_allclose(np.sort(found.shooting.nodes[0].ravel()), np.sort(np.stack([motion["x"], motion["x_rate"]]).ravel()), atol=1e-6)
+    assert_allclose(np.sort(found.shooting.nodes[0].ravel()), np.sort(np.stack([motion["x"], motion["x_rate"]]).ravel()), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -215,7 +216,7 @@ def test_repeats_and_other_first_guesses_lead_to_the_same():
     one = jj.fit(Oscillator(stiffness=15.0), runs[0], ("stiffness", "damping"), shooting=jj.MultipleShooting(pieces=4))
     four = jj.fit(Oscillator(stiffness=15.0), runs[0], ("stiffness", "damping"), guesses=4, shooting=jj.MultipleShooting(pieces=4))
     assert four.agreeing >= 3
-    np.testing.assert_allclose(four.values, one.values, atol=1e-2 * one.standard_errors.min())
+    assert_allclose(four.values, one.values, atol=1e-2 * one.standard_errors.min())
 
 
 def test_a_fit_in_pieces_is_taken_up_again(tmp_path):
@@ -223,7 +224,7 @@ def test_a_fit_in_pieces_is_taken_up_again(tmp_path):
     found = jj.fit(Oscillator(stiffness=15.0), run, ("stiffness", "damping"), shooting=jj.MultipleShooting(duration=1.0))
     whole = jj.fit(Oscillator(stiffness=15.0), run, ("stiffness", "damping"))
     for name, profile in found.profiles(run).items():
-        np.testing.assert_allclose([profile.low, profile.high], [whole.profiles(run)[name].low, whole.profiles(run)[name].high], rtol=1e-3)
+        assert_allclose([profile.low, profile.high], [whole.profiles(run)[name].low, whole.profiles(run)[name].high], rtol=1e-3)
     found.report(tmp_path / "fit.html", run, held_out=other)
     assert "multiple shooting" in str(found)
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose
 from tolerances import tolerance
 
 import jourdain_jax as jj
@@ -76,7 +77,7 @@ def a_ball_on_a_turntable_is_given_the_power_of_its_contact():
     expected = np.array([dense(*state) for state in zip(t, q, u, strict=True)])
     assert np.min(np.abs(expected)) > 1e-3
     found = values(scene, program, t, q, u)([program.power])[0]
-    np.testing.assert_allclose(found, expected, rtol=tolerance("ill_conditioned"), err_msg="power")
+    assert_allclose(found, expected, rtol=tolerance("ill_conditioned"), err_msg="power")
 
 
 def a_quaternion_is_put_back_to_length_one():
@@ -84,7 +85,7 @@ def a_quaternion_is_put_back_to_length_one():
     t, q, u = (np.asarray(x) for x in jj.sample_states(scene, 2))
     ((first, _),) = scene.coordinates.quaternions
     put = values(scene, program, t, 1.001 * q, u)(program.projected_q)[first : first + 4]
-    np.testing.assert_allclose(np.sum(put**2, axis=0), 1.0, atol=tolerance("round_off"), err_msg="norm")
+    assert_allclose(np.sum(put**2, axis=0), 1.0, atol=tolerance("round_off"), err_msg="norm")
 
 
 def a_double_pendulum_of_rods_is_put_back_onto_them():
@@ -92,7 +93,7 @@ def a_double_pendulum_of_rods_is_put_back_onto_them():
     t, q, u = (np.asarray(x) for x in jj.sample_states(scene, 2))
     off = q + 1e-7 * np.cos(np.arange(q.size)).reshape(q.shape)
     expected = [project_positions(scene, *map(jnp.asarray, state)) for state in zip(t, off, strict=True)]
-    np.testing.assert_allclose(values(scene, program, t, off, u)(program.projected_q).T, expected, atol=tolerance("round_off"), err_msg="coordinates")
+    assert_allclose(values(scene, program, t, off, u)(program.projected_q).T, expected, atol=tolerance("round_off"), err_msg="coordinates")
 
 
 def a_snakeboard_is_put_back_onto_its_rows():
@@ -100,7 +101,7 @@ def a_snakeboard_is_put_back_onto_its_rows():
     t, q, u = (np.asarray(x) for x in jj.sample_states(scene, 2))
     off = u + 0.3 * np.cos(np.arange(u.size)).reshape(u.shape)
     expected = [project_speeds(scene, *map(jnp.asarray, state)) for state in zip(t, q, off, strict=True)]
-    np.testing.assert_allclose(values(scene, program, t, q, off)(program.projected_u).T, expected, atol=tolerance("ill_conditioned"), err_msg="speeds")
+    assert_allclose(values(scene, program, t, q, off)(program.projected_u).T, expected, atol=tolerance("ill_conditioned"), err_msg="speeds")
 
 
 def a_program_knows_where_rows_are_parallel():
@@ -149,7 +150,7 @@ def steps_follow_a_closed_form():
     goals = jnp.array([0.5, 1.1, 2.0])
     ys, end = jax.jit(loop("forward", lambda t, y, args: -2 * t * y, rtol=1e-10))(jnp.ones(1), jnp.array(0.0), goals, None)
     assert int(end.accepted + end.rejected) < 60, f"{end.accepted} steps and {end.rejected} rejected ones, too many for the order of the method"
-    np.testing.assert_allclose(ys[:, 0], np.exp(-(np.asarray(goals) ** 2)), atol=1e-8, err_msg="closed form")
+    assert_allclose(ys[:, 0], np.exp(-(np.asarray(goals) ** 2)), atol=1e-8, err_msg="closed form")
     assert int(end.rejected) > 0, "no step was rejected, as this check needs it"
 
 
@@ -159,20 +160,20 @@ def projected_steps_stay_on_a_circle():
 
     run = loop("forward", turning, rtol=1e-4, project=lambda t, y, args: y / jnp.sqrt(jnp.sum(y**2)), dt0=0.1)
     ys, _ = jax.jit(run)(jnp.array([1.0, 0.0]), jnp.array(0.0), jnp.array([1.0, 2.0]), None)
-    np.testing.assert_allclose(np.sum(np.asarray(ys) ** 2, axis=1), 1.0, atol=1e-14, err_msg="circle")
+    assert_allclose(np.sum(np.asarray(ys) ** 2, axis=1), 1.0, atol=1e-14, err_msg="circle")
 
 
 def steps_end_at_knots():
     run = loop("forward", lambda t, y, args: 2 * jnp.abs(t - 0.3)[None], rtol=1e-3, knots=[0.3, np.inf])
     ys, _ = jax.jit(run)(jnp.zeros(1), jnp.array(0.0), jnp.array([1.0]), None)
-    np.testing.assert_allclose(ys[0, 0], 0.3**2 + 0.7**2, atol=1e-14, err_msg="knot")
+    assert_allclose(ys[0, 0], 0.3**2 + 0.7**2, atol=1e-14, err_msg="knot")
 
 
 def an_event_within_a_step_ends_the_motion():
     run = loop("forward", lambda t, y, args: jnp.ones(1), rtol=1e-3, events=lambda t, y, args: (y - 0.52) ** 2 - 1e-4)
     _, end = jax.jit(run)(jnp.zeros(1), jnp.array(0.0), jnp.array([2.0]), None)
     assert int(end.code) == results.EVENT, "an event was passed over"
-    np.testing.assert_allclose(end.t, 0.51, atol=1e-10, err_msg="event")
+    assert_allclose(end.t, 0.51, atol=1e-10, err_msg="event")
 
 
 def steps_are_no_longer_than_allowed():
@@ -185,7 +186,7 @@ def a_motion_leaves_an_event_at_which_it_starts():
     run = jax.jit(loop("forward", lambda t, y, args: jnp.array([1.0 - t]), rtol=1e-8, dt0=1e-3, events=lambda t, y, args: y))
     for start, expected in ((0.0, 2.0), (-1e-5, 0.0)):
         _, end = run(jnp.full(1, start), jnp.array(0.0), jnp.array([4.0]), None)
-        np.testing.assert_allclose(end.t, expected, atol=1e-8, err_msg="leaves")
+        assert_allclose(end.t, expected, atol=1e-8, err_msg="leaves")
 
 
 def a_pulse_is_met():
@@ -198,7 +199,7 @@ def a_pulse_is_met():
     run = loop("forward", lambda t, y, args: within(t)[None], rtol=1e-6, longest=0.5, relations=watched)
     _, end = jax.jit(run)(jnp.zeros(1), jnp.array(0.0), jnp.array([2.0]), None)
     assert int(end.crossings.count) == 3, "crossings"
-    np.testing.assert_allclose(end.y, 0.02, atol=1e-4, err_msg="pulse")
+    assert_allclose(end.y, 0.02, atol=1e-4, err_msg="pulse")
     assert int(end.rejected) < 80, f"too many refused steps, {end.rejected}"
     assert int(end.accepted) < 100, "too many steps"
 
@@ -261,7 +262,7 @@ def differences(case: str) -> dict:
 def reverse_mode_agrees_with_differences(case: str) -> None:
     found, _ = jax.jit(jax.grad(weighed("reverse", case), has_aux=True))(arguments(case))
     for name, expected in differences(case).items():
-        np.testing.assert_allclose(found[name], expected, atol=1e-7, err_msg=f"derivative by {name}")
+        assert_allclose(found[name], expected, atol=1e-7, err_msg=f"derivative by {name}")
 
 
 def reverse_mode_through_saved_times():

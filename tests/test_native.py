@@ -11,6 +11,7 @@ import machine_code
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
 from jourdain_jax import structure_of
@@ -67,10 +68,10 @@ def test_motions_are_those_of_xla_step_by_step(name, options):
     ours, theirs = _motions(jj.models.MODELS[name](), **options)
     assert (int(ours.accepted), int(ours.rejected), int(ours.result)) == (int(theirs.accepted), int(theirs.rejected), int(theirs.result))
     for a, b in ((ours.q, theirs.q), (ours.u, theirs.u), (ours.q_end, theirs.q_end), (ours.u_end, theirs.u_end), (ours.t_end, theirs.t_end)):
-        np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
+        assert_allclose(a, b, rtol=1e-10, atol=1e-10)
     if ours.work is not None:
-        np.testing.assert_allclose(ours.work, theirs.work, rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(ours.smallest_pivot, theirs.smallest_pivot, rtol=1e-9)
+        assert_allclose(ours.work, theirs.work, rtol=1e-10, atol=1e-10)
+    assert_allclose(ours.smallest_pivot, theirs.smallest_pivot, rtol=1e-9)
 
 
 def test_a_disc_that_falls_stops_where_it_does_by_xla():
@@ -79,9 +80,9 @@ def test_a_disc_that_falls_stops_where_it_does_by_xla():
     assert int(ours.result) == int(theirs.result) == results.EVENT
     assert int(ours.event) == int(theirs.event) == 0
     assert (int(ours.accepted), int(ours.rejected)) == (int(theirs.accepted), int(theirs.rejected))
-    np.testing.assert_allclose(ours.t_end, theirs.t_end, rtol=1e-13)
-    np.testing.assert_allclose(ours.q_end, theirs.q_end, rtol=1e-10, atol=1e-12)
-    np.testing.assert_array_equal(np.isnan(ours.q), np.isnan(theirs.q))
+    assert_allclose(ours.t_end, theirs.t_end, rtol=1e-13)
+    assert_allclose(ours.q_end, theirs.q_end, rtol=1e-10, atol=1e-12)
+    assert_array_equal(np.isnan(ours.q), np.isnan(theirs.q))
 
 
 @pytest.mark.parametrize("options", [{"max_steps": 7}, {"rtol": 1e-300, "atol": 1e-300}])
@@ -118,10 +119,10 @@ def test_a_lane_does_not_depend_on_its_company(disc_kernel):
     for count in (1, 7, 9, 64):
         order = np.random.default_rng(count).permutation(100)[:count]
         for found, expected in zip(many(starts[order], goals[order]), (states, ends), strict=True):
-            np.testing.assert_array_equal(found, expected[order])
+            assert_array_equal(found, expected[order])
     for lane in (0, 3, 40, 77, 99):  # alone, in narrow registers
         for found, expected in zip(jax.jit(kernel.run)(starts[lane], goals[lane]), (states, ends), strict=True):
-            np.testing.assert_array_equal(found, expected[lane])
+            assert_array_equal(found, expected[lane])
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
@@ -133,7 +134,7 @@ def test_a_lane_does_not_depend_on_the_number_of_threads(disc_kernel, threads, m
     other = kernels.kernel(usual.form, TSIT5, order)
     assert other is not usual
     for found, expected in zip(jax.vmap(other.run)(starts, goals), jax.vmap(usual.run)(starts, goals), strict=True):
-        np.testing.assert_array_equal(found, expected)
+        assert_array_equal(found, expected)
 
 
 def test_no_bit_depends_on_the_effort_spent_on_machine_code(disc_kernel, monkeypatch):
@@ -145,7 +146,7 @@ def test_no_bit_depends_on_the_effort_spent_on_machine_code(disc_kernel, monkeyp
     monkeypatch.setattr(ffi, "registered", lambda *asked: names.setdefault(asked, much(*asked)))
     kernels.kernel.cache_clear()
     for found, by_little in zip(jax.vmap(kernels.kernel(usual.form, TSIT5, order).run)(starts, goals), expected, strict=True):
-        np.testing.assert_array_equal(found, by_little)
+        assert_array_equal(found, by_little)
     monkeypatch.undo()
     assert names
     assert all(ffi.registered(*asked) != name for asked, name in names.items())
@@ -159,17 +160,17 @@ def test_no_lanes_and_axes_of_lanes(disc_kernel):
     twice = jax.vmap(jax.vmap(kernel.run), in_axes=(0, None))(starts[:6].reshape(2, 3, -1), goals[:3])
     once = jax.vmap(kernel.run)(starts[:6], goals[:6])
     for a, b in zip(twice, once, strict=True):
-        np.testing.assert_array_equal(a.reshape(b.shape), b)
+        assert_array_equal(a.reshape(b.shape), b)
 
 
 def test_lanes_of_a_rollout_are_those_of_xla():
     disc = jj.models.TiltingDisc()
     starts = {"lean": jnp.asarray([0.1, 0.3, jnp.nan, 1.2, 0.2, 0.7, 0.0, 0.5, -0.4]), "spin_rate": jnp.linspace(-4.0, 0.0, 9)}
     ours, theirs = (jj.rollout(disc, starts, ts=[0.5, 1.0], backend=backend) for backend in ("native", "xla"))
-    np.testing.assert_array_equal(ours.result, theirs.result)
-    np.testing.assert_array_equal(ours.lanes.accepted, theirs.lanes.accepted)
-    np.testing.assert_array_equal(ours.lanes.rejected, theirs.lanes.rejected)
-    np.testing.assert_allclose(ours.lanes.q_end, theirs.lanes.q_end, rtol=1e-10, atol=1e-10)
+    assert_array_equal(ours.result, theirs.result)
+    assert_array_equal(ours.lanes.accepted, theirs.lanes.accepted)
+    assert_array_equal(ours.lanes.rejected, theirs.lanes.rejected)
+    assert_allclose(ours.lanes.q_end, theirs.lanes.q_end, rtol=1e-10, atol=1e-10)
 
 
 def test_it_is_said_why_machine_code_is_not_taken(monkeypatch):
@@ -213,7 +214,7 @@ def test_a_scene_is_integrated_without_llvmlite(monkeypatch):
     scene = Sleigh()
     expected = jj.simulate(jj.models.ChaplyginSleigh(), ts=[1.3, 1.4]).q[0]
     monkeypatch.setattr(host, "reason_against", lambda: "llvmlite is not installed")
-    np.testing.assert_allclose(jj.simulate(scene, ts=[1.3, 1.4]).q[0], expected, rtol=1e-7)
+    assert_allclose(jj.simulate(scene, ts=[1.3, 1.4]).q[0], expected, rtol=1e-7)
 
 
 @pytest.mark.parametrize(

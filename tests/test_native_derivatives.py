@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import machine_code
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from small_scenes import OnLine
 
 import jourdain_jax as jj
@@ -58,7 +59,7 @@ def _exact(x, events=False):
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_sensitivities_of_an_oscillator_are_those_of_its_closed_form(derivative, events, solver):
     found = jax.jit(derivative(lambda x: _ends(x, events=events, solver=solver)))(X)
-    np.testing.assert_allclose(found, jax.jacfwd(lambda x: _exact(x, events))(X), rtol=1e-9, atol=1e-9)
+    assert_allclose(found, jax.jacfwd(lambda x: _exact(x, events))(X), rtol=1e-9, atol=1e-9)
 
 
 LANES = X * (1 + 0.05 * np.random.default_rng(0).normal(size=(11, 6)))
@@ -72,7 +73,7 @@ def test_lanes_that_fail_or_are_no_numbers_do_not_touch_others(derivative):
         slope = derivative(lambda x, backend=backend: jnp.sum(_ends(x, backend, True, max_steps=20)[:4]))
         found[backend] = np.asarray(jax.jit(jax.vmap(slope))(x))
     good = [i for i in range(11) if i not in (2, 5)]
-    np.testing.assert_allclose(found["native"][good], found["xla"][good], rtol=1e-9, atol=1e-9)
+    assert_allclose(found["native"][good], found["xla"][good], rtol=1e-9, atol=1e-9)
     assert np.isfinite(found["native"][good]).all()
 
 
@@ -81,7 +82,7 @@ def test_cotangents_of_a_lane_do_not_depend_on_its_company():
     expected = np.asarray(every(LANES))
     for count in (3, 9):  # fewer than a register holds, and one more than the widest
         order = np.random.default_rng(count).permutation(11)[:count]
-        np.testing.assert_allclose(every(LANES[order]), expected[order], rtol=1e-13, atol=1e-14)
+        assert_allclose(every(LANES[order]), expected[order], rtol=1e-13, atol=1e-14)
 
 
 def test_cotangents_reach_back_over_more_steps_than_there_is_memory_for_at_first():
@@ -94,7 +95,7 @@ def test_cotangents_reach_back_over_more_steps_than_there_is_memory_for_at_first
     scene = Oscillator(mass=x[0], stiffness=x[1])
     assert int(jj.simulate(scene, {"x": x[3], "x_rate": x[4]}, ts=[40.0], rtol=1e-11, atol=1e-11, events=False).accepted) > 128
     found, expected = (jax.jit(jax.grad(lambda x, closed=closed: end(x, closed)))(x)[:5] for closed in (False, True))
-    np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
+    assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
 
 
 @pytest.mark.parametrize("derivative", [jax.jacrev, jax.jacfwd])
@@ -110,7 +111,7 @@ def test_derivatives_pass_through_motions_one_after_the_other(derivative):
         return jnp.concatenate([state.q, state.u])
 
     found = derivative(late)(X[1])
-    np.testing.assert_allclose(found, jax.jacfwd(lambda k: _exact(X.at[1].set(k))[2:4])(X[1]), rtol=1e-8)
+    assert_allclose(found, jax.jacfwd(lambda k: _exact(X.at[1].set(k))[2:4])(X[1]), rtol=1e-8)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -134,7 +135,7 @@ def test_cotangents_of_a_program_are_its_jacobian_transposed(seed):
     by_rows = [[row.get(n, graph.zero) for n in inputs] for row in jacobian(graph, outputs, inputs)]
     J = np.array(emit.run(graph, [n for row in by_rows for n in row], values), float).reshape(5, 4)
     found = np.array(emit.run(graph, cotangents(graph, outputs, weights, inputs), values), float)
-    np.testing.assert_allclose(found, np.asarray([values[n] for n in weights]) @ J, rtol=1e-11, atol=1e-13)
+    assert_allclose(found, np.asarray([values[n] for n in weights]) @ J, rtol=1e-11, atol=1e-13)
 
 
 def test_a_branch_that_is_not_taken_has_no_cotangent_however_steep_it_is():

@@ -8,6 +8,7 @@ import machine_code
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
 
@@ -53,20 +54,20 @@ def test_motions_and_derivatives_are_those_of_the_closed_form(derivative):
     X0 = {name: jnp.asarray(value) for name, value in X.items()}
     found = motion(**X0)
     assert found.reduction.endswith("machine code")
-    np.testing.assert_allclose(found["x"], position(TS, **X0), rtol=0, atol=1e-9)
+    assert_allclose(found["x"], position(TS, **X0), rtol=0, atol=1e-9)
     slopes = jax.jit(lambda x: derivative(lambda x: motion(**x)["x"])(x))(X0)
     for name, expected in jax.jacfwd(lambda x: position(TS, **x))(X0).items():
-        np.testing.assert_allclose(slopes[name], expected, rtol=0, atol=1e-8, err_msg=name)
+        assert_allclose(slopes[name], expected, rtol=0, atol=1e-8, err_msg=name)
 
 
 def test_lanes_have_functions_of_their_own():
     a = jnp.linspace(-1.0, 1.0, 11)
     found = jax.jit(jax.vmap(lambda a: motion(**X | {"a": a})["x"]))(a)
-    np.testing.assert_allclose(found, jax.vmap(lambda a: position(TS, **X | {"a": a}))(a), rtol=0, atol=1e-9)
+    assert_allclose(found, jax.vmap(lambda a: position(TS, **X | {"a": a}))(a), rtol=0, atol=1e-9)
     lanes = jj.rollout(Pushed(), {"x": jnp.linspace(0.1, 0.5, 5)}, ts=TS, inputs={"force": lambda t: 0.8 * jnp.sin(1.3 * t)}, **TIGHT).lanes
     assert lanes.reduction.endswith("machine code")
     expected = jax.vmap(lambda x: position(TS, **X | {"x": x}))(jnp.linspace(0.1, 0.5, 5))
-    np.testing.assert_allclose(lanes.q[..., 0], expected, rtol=0, atol=1e-9)
+    assert_allclose(lanes.q[..., 0], expected, rtol=0, atol=1e-9)
 
 
 @both_modes
@@ -75,12 +76,12 @@ def test_functions_samples_and_numbers_stand_side_by_side(derivative):
     for aside in (record, jnp.asarray(0.7)):
         found = motion(**X, aside=aside)
         assert found.reduction.endswith("machine code")
-        np.testing.assert_allclose(found["x"], position(TS, **X), rtol=0, atol=1e-9)
-    np.testing.assert_allclose(found["y"], 0.35 * TS**2, rtol=0, atol=1e-10)
+        assert_allclose(found["x"], position(TS, **X), rtol=0, atol=1e-9)
+    assert_allclose(found["y"], 0.35 * TS**2, rtol=0, atol=1e-10)
     slope = jax.jit(lambda f: derivative(lambda f: motion(**X, aside=f)["y"])(f))(0.7)
-    np.testing.assert_allclose(slope, TS**2 / 2, rtol=0, atol=1e-9)
+    assert_allclose(slope, TS**2 / 2, rtol=0, atol=1e-9)
     of_record = jax.jit(lambda a: derivative(lambda a: motion(**X | {"a": a}, aside=record)["x"])(a))(0.8)
-    np.testing.assert_allclose(of_record, position(TS, **X | {"a": 1.0}) - position(TS, **X | {"a": 0.0}), rtol=0, atol=1e-9)
+    assert_allclose(of_record, position(TS, **X | {"a": 1.0}) - position(TS, **X | {"a": 0.0}), rtol=0, atol=1e-9)
 
 
 @both_modes
@@ -97,7 +98,7 @@ def test_an_event_may_depend_on_a_function_of_time(derivative):
     assert abs(gap(found.t_end, 0.8)) < 1e-9
     by_t, by_a = jax.grad(gap, (0, 1))(found.t_end, 0.8)
     slope = jax.jit(lambda a: derivative(lambda a: end(a).t_end)(a))(0.8)
-    np.testing.assert_allclose(slope, -by_a / by_t, rtol=0, atol=1e-7)
+    assert_allclose(slope, -by_a / by_t, rtol=0, atol=1e-7)
 
 
 def test_arrays_that_a_function_closes_over_have_derivatives_beside_one_that_closes_over_nothing():
@@ -107,10 +108,10 @@ def test_arrays_that_a_function_closes_over_have_derivatives_beside_one_that_clo
 
     found, amplitudes = ends(jnp.array([0.8, 0.1])), jnp.array([0.8, 0.1])
     assert found.reduction.endswith("machine code")
-    np.testing.assert_allclose(found["y"], TS**3 / 3, rtol=0, atol=1e-9)
+    assert_allclose(found["y"], TS**3 / 3, rtol=0, atol=1e-9)
     slopes = jax.jit(jax.jacrev(lambda a: ends(a)["x"]))(amplitudes)
     for column, b in zip(slopes.T, (1.3, 0.5), strict=True):
-        np.testing.assert_allclose(column, position(TS, 0.0, 4.0, 1.0, b), rtol=0, atol=1e-8)
+        assert_allclose(column, position(TS, 0.0, 4.0, 1.0, b), rtol=0, atol=1e-8)
 
 
 def test_threads_that_make_the_same_machine_code_at_once_all_get_it():
@@ -121,4 +122,4 @@ def test_threads_that_make_the_same_machine_code_at_once_all_get_it():
         return np.asarray(jj.simulate(Fresh(), {"x": 0.1}, ts=TS, inputs={"force": lambda t: t}, **TIGHT)["x"])
 
     with ThreadPoolExecutor(2) as threads:
-        np.testing.assert_array_equal(*threads.map(end, range(2)))
+        assert_array_equal(*threads.map(end, range(2)))

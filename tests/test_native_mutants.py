@@ -12,6 +12,7 @@ import machine_code
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose
 from small_scenes import OnLine, OnPlane
 from test_mutants import Mutant
 
@@ -90,7 +91,7 @@ def pushed(x, v, k, level=-0.1, events=False, **options):
 
 def motions_follow_the_closed_form():
     found = jax.jit(lambda: pushed(**START))()
-    np.testing.assert_allclose(found.ys.q[:, 0], pushed_position(TIMES, **START), **CLOSE, err_msg="closed form")
+    assert_allclose(found.ys.q[:, 0], pushed_position(TIMES, **START), **CLOSE, err_msg="closed form")
     assert int(found.rejected) > 0, "no step was rejected, as this check needs it"
     assert int(found.accepted + found.rejected) < 30, f"{found.accepted} and {found.rejected} steps: too many for the order"
 
@@ -100,14 +101,14 @@ def lanes_of_a_batch_follow_their_own():
     spans = jnp.linspace(1.0, 0.5, 21)  # the first lanes end last
     found = jax.jit(jax.vmap(lambda x, span: pushed(**START | {"x": x}, ts=TIMES * span)))(x, spans)
     expected = jax.vmap(lambda x, span: pushed_position(TIMES * span, **START | {"x": x}))(x, spans)
-    np.testing.assert_allclose(found.ys.q[..., 0], expected, **CLOSE, err_msg="lanes")
+    assert_allclose(found.ys.q[..., 0], expected, **CLOSE, err_msg="lanes")
 
 
 def an_event_is_found():
     found = jax.jit(lambda: pushed(**START, events=True))()
     assert int(found.code) == results.EVENT, "the event was passed over"
     assert abs(pushed_position(found.t_end, **START) + 0.1) < 1e-9, "time of the event"
-    np.testing.assert_allclose(found.y_end.q[0], -0.1, **CLOSE, err_msg="state of the event")
+    assert_allclose(found.y_end.q[0], -0.1, **CLOSE, err_msg="state of the event")
 
 
 def an_event_within_a_step_is_found():
@@ -141,7 +142,7 @@ def a_motion_leaves_an_event_at_which_it_starts():
 def a_strip_is_met():
     found, v = strip(0.004, events=False), np.sqrt(1 - 6 * 0.008)
     assert int(found.crossings) == 3, "crossings"
-    np.testing.assert_allclose(found.y_end.q, 0.704 + v * (2 - 0.696 - (1 - v) / 3), atol=1e-3, err_msg="strip")
+    assert_allclose(found.y_end.q, 0.704 + v * (2 - 0.696 - (1 - v) / 3), atol=1e-3, err_msg="strip")
     assert int(found.rejected) < 80, f"too many refused steps, {found.rejected}"
     assert int(found.accepted) < 100, "too many steps"
 
@@ -163,7 +164,7 @@ def an_event_where_a_relation_changes_is_found():
 
 def a_bead_stays_on_its_circle():
     found = jax.jit(lambda: motion(Round(), {"x": 1.0, "y": 0.0, "y_rate": 2.0}, ts=TIMES, rtol=1e-4, atol=1e-4, first=0.1))()
-    np.testing.assert_allclose(jnp.sum(found.ys.q**2, axis=1), 1.0, atol=1e-13, err_msg="circle")
+    assert_allclose(jnp.sum(found.ys.q**2, axis=1), 1.0, atol=1e-13, err_msg="circle")
     assert int(found.accepted) < 60, "too many steps"
 
 
@@ -173,9 +174,9 @@ def a_start_is_put_onto_its_rows():
     assert usual.program is not None
     t, q, u = jnp.zeros(()), jnp.array([0.9, 0.7]), jnp.array([0.3, 1.1])
     q_near, _ = jax.jit(lambda q: put_on_rows.put_positions(scene, t, q, jnp.ones(2, bool), usual))(q)
-    np.testing.assert_allclose(q_near, q / jnp.linalg.norm(q), rtol=0, atol=1e-14, err_msg="coordinates")
+    assert_allclose(q_near, q / jnp.linalg.norm(q), rtol=0, atol=1e-14, err_msg="coordinates")
     u_near, _ = jax.jit(lambda u: put_on_rows.put_speeds(scene, t, q_near, u, jnp.zeros(0), jnp.ones(2, bool), usual))(u)
-    np.testing.assert_allclose(u_near, u - q_near * (q_near @ u), rtol=0, atol=1e-14, err_msg="speeds")
+    assert_allclose(u_near, u - q_near * (q_near @ u), rtol=0, atol=1e-14, err_msg="speeds")
 
 
 WEIGHTS = np.cos(1.0 + np.arange(5.0))
@@ -209,7 +210,7 @@ def _differentiated(mode: str, of: Callable, closed: Callable) -> None:
     derivative = jax.jacrev if mode == "reverse" else jax.jacfwd
     found = jax.jit(lambda x: derivative(of)(x))(START)
     for name, value in expected(jax.jacfwd, closed).items():
-        np.testing.assert_allclose(found[name], value, rtol=0, atol=1e-7, err_msg=f"derivative with respect to {name}")
+        assert_allclose(found[name], value, rtol=0, atol=1e-7, err_msg=f"derivative with respect to {name}")
 
 
 def _at_saved_times(mode: str) -> None:
@@ -246,7 +247,7 @@ def _differentiated_twice(of: Callable, end: Callable, closed: Callable, at: dic
     found = jax.jit(of(end))(at)
     for name, row in expected(jax.hessian, closed).items():
         for other, value in row.items():
-            np.testing.assert_allclose(found[name][other], value, rtol=0, atol=1e-7, err_msg=f"derivative with respect to {name} and {other}")
+            assert_allclose(found[name][other], value, rtol=0, atol=1e-7, err_msg=f"derivative with respect to {name} and {other}")
 
 
 def forward_mode_to_an_event_twice():
@@ -268,7 +269,7 @@ def a_hessian_with_respect_to_times():
 def reverse_mode_with_respect_to_times():
     found = jax.jit(jax.grad(lambda ts: WEIGHTS @ pushed(**START, ts=ts).ys.q[:, 0]))(jnp.asarray(TIMES))
     rates = jax.vmap(jax.grad(lambda t: pushed_position(t, **START)))(jnp.asarray(TIMES))
-    np.testing.assert_allclose(found, WEIGHTS * rates, rtol=0, atol=1e-7, err_msg="derivative with respect to times")
+    assert_allclose(found, WEIGHTS * rates, rtol=0, atol=1e-7, err_msg="derivative with respect to times")
 
 
 def reverse_mode_back_over_projections():
@@ -285,7 +286,7 @@ def reverse_mode_back_over_projections():
     expected = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * h)
     (_, steps), found = weighed(1.3)
     assert steps == 2, "no long steps, as this check needs them"
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7, err_msg="derivative with respect to the rate")
+    assert_allclose(found, expected, rtol=0, atol=1e-7, err_msg="derivative with respect to the rate")
 
 
 FORM, LANES, CIRCLE = motions_follow_the_closed_form, lanes_of_a_batch_follow_their_own, a_bead_stays_on_its_circle

@@ -10,6 +10,7 @@ import mpmath
 import numpy as np
 import pytest
 from in_mpmath import in_mpmath
+from numpy.testing import assert_allclose, assert_array_equal
 
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.native import angles, exponentials, host
@@ -92,7 +93,7 @@ def test_numbers_in_single_precision_give_what_they_give_by_xla():
     expected = emit.run(graph, outputs, dict(zip(inputs, jnp.asarray(points.T), strict=True)))
     with np.errstate(over="ignore"):
         for op, ours, theirs in zip(ONE + TWO, found.T.astype(np.float32), expected, strict=True):
-            np.testing.assert_allclose(ours, np.asarray(theirs, np.float32), rtol=1e-5, atol=2e-38, err_msg=op)
+            assert_allclose(ours, np.asarray(theirs, np.float32), rtol=1e-5, atol=2e-38, err_msg=op)
 
 
 GROWING = ("exp", "exp2", "expm1", "sinh", "cosh", "logistic")
@@ -159,7 +160,7 @@ def test_functions_of_our_own_are_the_same_beside_any_others(fused):
         order = np.random.default_rng(lanes).permutation(len(x))
         found = _our_own(lanes, fused)(x[order], y[order])
         for op, values in expected.items():
-            np.testing.assert_array_equal(found[op].view(np.int64), values[order].view(np.int64), err_msg=op)
+            assert_array_equal(found[op].view(np.int64), values[order].view(np.int64), err_msg=op)
 
 
 @pytest.mark.filterwarnings("ignore:Descending")
@@ -173,4 +174,4 @@ def test_polynomials_are_those_of_chebyshev():
     with mpmath.workdps(60):
         for numbers, (function, interval) in fits.items():
             found = [float(x) for x in mpmath.chebyfit(function, interval, len(numbers))]
-            np.testing.assert_allclose(numbers, found, rtol=1e-13)
+            assert_allclose(numbers, found, rtol=1e-13)

@@ -4,6 +4,7 @@ import evaluated_natively
 import machine_code
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from jourdain_jax.native import host, scalar_program
 from jourdain_jax.native.registers import turns
@@ -66,6 +67,6 @@ def test_no_bit_depends_on_which_values_wait_in_memory(monkeypatch):
         found.append(np.asarray(evaluated_natively.function(graph, outputs, inputs)(points)))
     steps = [(n, graph.args[n]) for n in graph.needed(outputs, inputs)]
     assert turns(steps, inputs, 5)[1] > 2 * 20  # more than one pointer reaches
-    np.testing.assert_array_equal(found[1], found[0])
-    np.testing.assert_array_equal(found[2], found[0])
+    assert_array_equal(found[1], found[0])
+    assert_array_equal(found[2], found[0])
     assert len(np.unique(found[0])) > 100

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import OnLine
 
 import jourdain_jax as jj
@@ -48,7 +49,7 @@ def test_steps_are_those_of_xla(more):
     options = OPTIONS | more
     ours, theirs = (jj.simulate(Pushed(), {"x": 0.5, "x_rate": 0.2}, inputs=inputs(), backend=backend, **options) for backend in ("native", "xla"))
     assert (ours.result, ours.accepted, ours.rejected, ours.event) == (theirs.result, theirs.accepted, theirs.rejected, theirs.event)
-    np.testing.assert_allclose(numbers(ours), numbers(theirs), rtol=1e-13, atol=1e-13)
+    assert_allclose(numbers(ours), numbers(theirs), rtol=1e-13, atol=1e-13)
 
 
 def test_a_record_far_from_time_zero_is_followed_as_at_zero():
@@ -57,7 +58,7 @@ def test_a_record_far_from_time_zero_is_followed_as_at_zero():
         record = jj.Sampled(t0 + np.arange(9) / 4, np.sin(np.arange(9.0)))
         motion = jj.simulate(Pushed(), {"x": 0.5}, t0=t0, ts=[t0 + 0.75, t0 + 2.0], inputs={"pull": record}, rtol=1e-10, atol=1e-10, backend="native")
         ends.append(motion.q)
-    np.testing.assert_array_equal(*ends)
+    assert_array_equal(*ends)
 
 
 def test_lanes_have_records_of_their_own_or_share_one():
@@ -70,13 +71,13 @@ def test_lanes_have_records_of_their_own_or_share_one():
     for axes in ((0, 0), (None, 0)):
         given = [a if axis == 0 else a[3] for a, axis in zip((scales, x), axes, strict=True)]
         ours, theirs = (jax.jit(jax.vmap(lambda *a, backend=backend: end(backend, *a), axes))(*given) for backend in ("native", "xla"))
-        np.testing.assert_allclose(ours[0], theirs[0], rtol=1e-13, atol=1e-13)
-        np.testing.assert_array_equal(ours[1], theirs[1])
+        assert_allclose(ours[0], theirs[0], rtol=1e-13, atol=1e-13)
+        assert_array_equal(ours[1], theirs[1])
         alone = end("native", *(a if axis is None else a[7] for a, axis in zip(given, axes, strict=True)))
-        np.testing.assert_array_equal(ours[0][7], alone[0])
+        assert_array_equal(ours[0][7], alone[0])
     # records of the outer lanes, starts of the inner ones
     nested = jax.vmap(lambda scale: jax.vmap(lambda x: end("native", scale, x)[0])(x[:3]))(scales[:4])
-    np.testing.assert_array_equal(nested[2, 1], end("native", scales[2], x[1])[0])
+    assert_array_equal(nested[2, 1], end("native", scales[2], x[1])[0])
 
 
 @pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
@@ -89,7 +90,7 @@ def test_derivatives_are_those_of_xla(derivative, events):
 
     x = jnp.array([1.5, 6.0, 0.8, 0.5, 0.2, 0.3])
     ours, theirs = (jax.jit(jax.vmap(lambda x, backend=backend: derivative(end)(x, backend)))(jnp.stack([x, 1.01 * x])) for backend in ("native", "xla"))
-    np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-10)
+    assert_allclose(ours, theirs, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("mode", [jax.grad, jax.jacfwd])
@@ -101,9 +102,9 @@ def test_derivatives_with_respect_to_samples_are_refused_by_a_text_that_names_th
 def test_a_blow_is_felt_and_one_sample_is_a_constant():
     blow = {"pull": jj.Sampled([0.5, 0.5005, 0.501], [0.0, 3000.0, 0.0])}  # 1.5 N s
     motion = jj.simulate(Pushed(), {"x": 0.0}, inputs=blow, t1=0.501, rtol=1e-9, atol=1e-9, backend="native")
-    np.testing.assert_allclose(motion.u_end, 1.0, rtol=1e-5)  # less what the spring has taken within the blow
+    assert_allclose(motion.u_end, 1.0, rtol=1e-5)  # less what the spring has taken within the blow
     constant, sampled = (jj.simulate(Pushed(), {"x": 0.3}, inputs={"pull": f}, backend="native", **OPTIONS) for f in (0.4, jj.Sampled([3.0], [0.4])))
-    np.testing.assert_array_equal(constant.q, sampled.q)
+    assert_array_equal(constant.q, sampled.q)
 
 
 def test_a_record_that_is_no_number_ends_its_lane_alone():
@@ -111,7 +112,7 @@ def test_a_record_that_is_no_number_ends_its_lane_alone():
     run = jax.vmap(lambda v: jj.simulate(Pushed(), {"x": 0.3}, inputs={"push": jj.Sampled(TIMES, v)}, events=False, backend="native", **OPTIONS))
     motion = run(values)
     assert motion.result[1] not in (results.SUCCESS, results.EVENT)
-    np.testing.assert_array_equal(motion.q[0], motion.q[2])
+    assert_array_equal(motion.q[0], motion.q[2])
     assert np.isfinite(motion.q[0]).all()
 
 

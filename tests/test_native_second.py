@@ -8,6 +8,7 @@ import machine_code
 import numpy as np
 import pytest
 from ends_of_models import end_of_model
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 from jourdain_jax import DifferentiationModeError
@@ -75,7 +76,7 @@ def test_what_machine_code_does_not_serve_is_left_to_xla(which):
 
     lower = jax.jit(jax.jacfwd(jax.jacfwd(height) if which == "a third time" else height))
     found, h = jax.jit(jax.jacfwd(lower))(1.0), 1e-4
-    np.testing.assert_allclose(found, (lower(1.0 + h) - lower(1.0 - h)) / (2 * h), rtol=1e-6)
+    assert_allclose(found, (lower(1.0 + h) - lower(1.0 - h)) / (2 * h), rtol=1e-6)
 
 
 MODES = {
@@ -95,8 +96,8 @@ MOTIONS = [
 def test_all_modes_are_those_of_the_closed_form(mode, events, solver):
     """With respect to parameters, a start, an input, the start's time, a time saved and the end; or up to an event."""
     found = np.asarray(jax.jit(jax.vmap(MODES[mode](lambda x: _seen(x, events, solver=solver, max_steps=1357))))(LANES))
-    np.testing.assert_allclose(found, seconds_of_the_closed_form(events), rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(found, np.swapaxes(found, 2, 3), rtol=1e-9, atol=1e-9)
+    assert_allclose(found, seconds_of_the_closed_form(events), rtol=1e-8, atol=1e-8)
+    assert_allclose(found, np.swapaxes(found, 2, 3), rtol=1e-9, atol=1e-9)
 
 
 def _lowest(x, wind, **options):
@@ -121,17 +122,17 @@ def test_hessians_of_sums_over_lanes_that_share_parameters():
     expected = np.asarray(jax.jit(jax.jacfwd(jax.jacfwd(loss)))(X))
     assert np.abs(expected[:5, :5]).min() > 0
     close = {"rtol": 1e-9, "atol": 1e-9 * np.abs(expected).max()}
-    np.testing.assert_allclose(jax.jit(jax.hessian(loss))(X), expected, **close)
-    np.testing.assert_allclose(jax.jit(jax.hessian(by_rollout))(X), expected, **close)
+    assert_allclose(jax.jit(jax.hessian(loss))(X), expected, **close)
+    assert_allclose(jax.jit(jax.hessian(by_rollout))(X), expected, **close)
     v = jnp.cos(jnp.arange(7.0))
-    np.testing.assert_allclose(jax.jit(lambda x: jax.jvp(jax.grad(loss), (x,), (v,))[1])(X), expected @ v, **close)
+    assert_allclose(jax.jit(lambda x: jax.jvp(jax.grad(loss), (x,), (v,))[1])(X), expected @ v, **close)
 
 
 def test_hessians_under_an_input_that_is_samples():
     """Up to an event whose time such an input moves."""
     wind = jj.Sampled([0.0, 0.3, 0.8, 2.0], [0.0, 1.5, -2.0, 1.0])
     found = jax.jit(jax.hessian(lambda x: _lowest(x, wind)))(X)
-    np.testing.assert_allclose(found, jax.jit(jax.jacfwd(jax.jacfwd(lambda x: _lowest(x, wind))))(X), rtol=1e-9, atol=1e-9)
+    assert_allclose(found, jax.jit(jax.jacfwd(jax.jacfwd(lambda x: _lowest(x, wind))))(X), rtol=1e-9, atol=1e-9)
     assert np.all(np.asarray(found)[:4, :4] != 0)
 
 
@@ -151,7 +152,7 @@ def test_all_modes_of_a_model_agree(name, mode):
     start, parameters, options = MODELS[name]
     end, x = end_of_model(name.split(",")[0], start, parameters, **options)
     found, expected = (np.asarray(jax.jit(MODES[of](end))(x)) for of in (mode, "forward of forward"))
-    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-9 * np.max(np.abs(expected)))
+    assert_allclose(found, expected, rtol=1e-8, atol=1e-9 * np.max(np.abs(expected)))
     assert np.any(expected != 0)
 
 

@@ -5,6 +5,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 from jourdain_jax import Lowered
@@ -37,7 +38,7 @@ def _by_both(scene: jj.Scene, program: Lowered):
 
 def _same(found, expected, tolerance=ROUND_OFF):
     for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(x, y, rtol=0, atol=tolerance * (1.0 + np.max(np.abs(y), initial=0.0)))
+        assert_allclose(x, y, rtol=0, atol=tolerance * (1.0 + np.max(np.abs(y), initial=0.0)))
 
 
 def _states(scene: jj.Scene, program: Lowered, count: int):
@@ -67,7 +68,7 @@ def test_what_is_usual_is_the_same_for_parameters_that_differ_from_lane_to_lane(
     lanes = jax.tree.unflatten(treedef, [scales * x for x in leaves])
     ours, theirs = (jax.vmap(f)(lanes) for f in (lambda s: seen.fixed_values(program, s), program.fixed_values))
     for x, y in zip(ours, theirs, strict=True):
-        np.testing.assert_allclose(x, y, rtol=ROUND_OFF)
+        assert_allclose(x, y, rtol=ROUND_OFF)
 
 
 @pytest.mark.parametrize("name", ["tilting-disc", "snakeboard", "trailer-chain"])  # the last has derivatives of speeds as machine code

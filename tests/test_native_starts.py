@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import rolling_scenes
 import small_scenes
+from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
 from jourdain_jax.eager.eager import eval_numpy
@@ -51,7 +52,7 @@ def _put(scene: jj.Scene, usual, held_q=(), held_u=()):
 
 def _same(found, expected, tolerance=TOLERANCE):
     for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(x, y, rtol=0, atol=tolerance * (1.0 + np.max(np.abs(y), initial=0.0)))
+        assert_allclose(x, y, rtol=0, atol=tolerance * (1.0 + np.max(np.abs(y), initial=0.0)))
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -63,7 +64,7 @@ def test_all_models_come_onto_the_rows_alike(name):
     for lane in (0, 7):  # by itself, in narrow registers
         alone = jax.jit(_put(scene, _both(scene)[0]))(q[lane], u[lane])
         for x, y in zip(alone, ours, strict=True):
-            np.testing.assert_array_equal(x, y[lane])
+            assert_array_equal(x, y[lane])
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -82,7 +83,7 @@ def test_lanes_of_a_batch_do_not_see_each_other(count):
     q, u = _near_rows(scene, 9)
     every = put(q, u)
     for some, of_all in zip(put(q[9 - count :], u[9 - count :]), every, strict=True):
-        np.testing.assert_array_equal(some, of_all[9 - count :])
+        assert_array_equal(some, of_all[9 - count :])
 
 
 def test_lanes_that_are_no_numbers_and_those_that_run_away():
@@ -92,8 +93,8 @@ def test_lanes_that_are_no_numbers_and_those_that_run_away():
     u = u.at[3].set(jnp.nan)
     ours, theirs = (eval_numpy(jax.vmap(_put(scene, usual)))(q, u) for usual in _both(scene))
     finite, expected = (np.all([np.all(np.isfinite(x), axis=1) for x in found], axis=0) for found in (ours, theirs))
-    np.testing.assert_array_equal(finite, expected)
-    np.testing.assert_array_equal(finite, [True, False, False, False, True])
+    assert_array_equal(finite, expected)
+    assert_array_equal(finite, [True, False, False, False, True])
     _same([x[0] for x in ours], [y[0] for y in theirs])
 
 
@@ -151,7 +152,7 @@ def test_where_machine_code_is_not_taken():
         jax.export.export(started)(jax.ShapeDtypeStruct((), jnp.float64))
     assert "jourdain_jax_" in started.lower(0.3).as_text()
     assert "jourdain_jax_" not in exported.mlir_module()
-    np.testing.assert_allclose(exported.call(0.3), jj.start(scene, lean=0.3, spin_rate=-3.0).u, atol=1e-14)
+    assert_allclose(exported.call(0.3), jj.start(scene, lean=0.3, spin_rate=-3.0).u, atol=1e-14)
     assert usual_sizes(scene, False, False).program is None
 
 
@@ -162,5 +163,5 @@ def test_failures_are_the_same():
     started = jj.consistent(scene, 0.0, jnp.zeros(5), jnp.zeros(5))
     lanes = jax.tree.map(lambda x: jnp.stack([x, x + jnp.nan]), started)  # named starts that are no numbers are in a test of `rollout` by machine code
     ours, theirs = (jj.rollout(scene, lanes, t1=0.1, backend=backend) for backend in ("native", "xla"))
-    np.testing.assert_array_equal(ours.result, theirs.result)
+    assert_array_equal(ours.result, theirs.result)
     assert len(set(np.asarray(ours.result).tolist())) > 1

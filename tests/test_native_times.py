@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import machine_code
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import OnLine
 
 import jourdain_jax as jj
@@ -63,7 +64,7 @@ def test_derivatives_with_respect_to_times_are_differences(name):
     differences = np.einsum("k,kij->ji", [1.0, -8.0, 8.0, -1.0], near) / (12.0 * h)
     for mode in MODES:
         found = jax.jit(getattr(jax, mode)(lambda t: _seen(name, t)))(times)
-        np.testing.assert_allclose(found, differences, rtol=1e-6, atol=1e-6)
+        assert_allclose(found, differences, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -75,7 +76,7 @@ def test_a_motion_that_fails_ends_at_a_number_after_its_start(mode):
     span = float(end(0.2, 3.0, max_steps=5)[-1]) - 0.2
     assert 0.0 < span < 3.0
     found, expected = (getattr(jax, mode)(lambda t0, x=x: end(t0, x[0], max_steps=x[1]))(0.2) for x in ((3.0, 5), (span, 4321)))
-    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
+    assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -85,4 +86,4 @@ def test_a_motion_that_starts_beyond_an_event_ends_where_and_when_it_starts(mode
         return jnp.concatenate([motion.q_end, motion.u_end, motion.t_end[None]])
 
     found = getattr(jax, mode)(end)(jnp.array([0.2, 0.5]))
-    np.testing.assert_array_equal(found, [[0.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
+    assert_array_equal(found, [[0.0, 0.0], [0.0, 0.0], [1.0, 0.0]])

@@ -6,6 +6,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 
@@ -91,9 +92,9 @@ def test_a_robot_pulls_its_trailer_straight_ahead():
     motion = jj.simulate(robot, t1=2.0, ts=jnp.linspace(0.0, 2.0, 5), inputs={"left_torque": torque, "right_torque": torque}).raise_if_failed()
     moved = 5.0 + 3.0 + 2 * 0.3 * (1 + 0.5)  # kg; a disc that rolls counts one and a half times
     acceleration = 2 * torque / float(robot.radius) / moved
-    np.testing.assert_allclose(motion["x"], acceleration * motion.ts**2 / 2, atol=1e-9)
+    assert_allclose(motion["x"], acceleration * motion.ts**2 / 2, atol=1e-9)
     for force in motion.contact_forces().values():
-        np.testing.assert_allclose(force.normal, (5.0 + 2 * 0.3) * G / 2, rtol=1e-9)  # the trailer stands on its own wheels
+        assert_allclose(force.normal, (5.0 + 2 * 0.3) * G / 2, rtol=1e-9)  # the trailer stands on its own wheels
         assert not np.any(force.pulls)
 
 
@@ -111,7 +112,7 @@ def test_a_trailer_that_is_carried_by_the_robot_lifts_a_wheel_and_the_summary_sa
 
 def test_a_ball_swings_in_a_bowl_as_fast_as_the_page_says():
     swings = np.sort(np.abs(jj.linearize(BowlInItsDomain(), {}).state_eigenvalues().imag))[-4:]
-    np.testing.assert_allclose(swings, np.sqrt(5 * G / (7 * 0.35)), rtol=1e-9)
+    assert_allclose(swings, np.sqrt(5 * G / (7 * 0.35)), rtol=1e-9)
 
 
 class Fresh(Bowl):
@@ -128,7 +129,7 @@ def test_a_scene_that_is_a_number_in_a_small_part_of_space_asks_for_a_domain():
 def test_a_scene_without_a_domain_starts_where_it_is_told():
     start = {"x": 0.12, "attitude_omega_x": -8.0, "attitude_omega_y": 0.5, "attitude_omega_z": 0.0}
     told, stated = (jj.simulate(kind(), start, ts=jnp.array([0.0, 1.0])) for kind in (Fresh, BowlInItsDomain))
-    np.testing.assert_allclose(told.q_end, stated.q_end, atol=1e-8)
+    assert_allclose(told.q_end, stated.q_end, atol=1e-8)
     _, q, u = jj.sample_states(Fresh(), 4)
     assert np.all(np.isfinite(u))
     assert np.all(q[:, 0] ** 2 + q[:, 1] ** 2 < 0.35**2)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.special import stdtrit
 from small_scenes import Bead
 
@@ -31,9 +32,9 @@ def test_few_samples_of_unknown_noise_give_the_textbook_intervals_of_regression(
     errors = np.sqrt(rss / (count - 2) * np.diag(np.linalg.inv(X.T @ X)))
     assert float(found.sigma["x"]) == pytest.approx(np.sqrt(rss / (count - 2)), rel=1e-6)
     assert float(found.reduced_chi_square) == pytest.approx(1.0)
-    np.testing.assert_allclose(found.values, b, rtol=1e-6)
-    np.testing.assert_allclose(found.standard_errors, errors, rtol=1e-6)
-    np.testing.assert_allclose(found.high - found.values, stdtrit(count - 2, 0.975) * errors, rtol=1e-6)
+    assert_allclose(found.values, b, rtol=1e-6)
+    assert_allclose(found.standard_errors, errors, rtol=1e-6)
+    assert_allclose(found.high - found.values, stdtrit(count - 2, 0.975) * errors, rtol=1e-6)
     profile = found.profiles(data)["run 0: x_rate"]
     assert profile.high - b[1] == pytest.approx(stdtrit(count - 2, 0.975) * errors[1], rel=0.02)  # ends of profiles are found to 1 % of the rise
 
@@ -45,7 +46,7 @@ def test_a_channel_with_a_known_sigma_keeps_its_own_beside_one_that_has_none():
     X = np.stack([np.ones(5), ts], axis=1)
     errors, (_, (rss,), *_) = np.sqrt(np.diag(np.linalg.inv(X.T @ X))), np.linalg.lstsq(X, y)
     reach = np.concatenate([stdtrit(3, 0.975) * np.sqrt(rss / 3) * errors, 1.959964 * 0.4 * errors])
-    np.testing.assert_allclose(found.high - found.values, reach, rtol=1e-5)
+    assert_allclose(found.high - found.values, reach, rtol=1e-5)
 
 
 def test_what_priors_tell_is_not_taken_from_the_samples():
@@ -60,7 +61,7 @@ def test_what_priors_tell_is_not_taken_from_the_samples():
     C = np.linalg.inv(X.T @ X / s**2 + P)
     left = 6 - np.trace(C @ X.T @ X) / s**2
     assert s**2 == pytest.approx(residuals @ residuals / left, rel=1e-6)
-    np.testing.assert_allclose(found.covariance, C, rtol=1e-6)
+    assert_allclose(found.covariance, C, rtol=1e-6)
     # more priors than samples are enough
     few = jj.fit(Bead(), run(ts, {"x": np.where(np.arange(6) < 2, y, np.nan)}, 0.1, prior))
     assert 0 < float(few.reduced_chi_square) < 5
@@ -94,8 +95,8 @@ def test_channels_that_share_unknowns_have_the_sigmas_of_restricted_likelihood(o
         doubt = doubt + (np.diag(C @ A @ C) / np.diag(C)) ** 2 / left
         # - sigma^4 d^2 C / d (sigma^2)^2, of C = (sum A)^-1
         more = more + 2 / left * 2 * np.diag(C @ A @ C - C @ A @ C @ A @ C) / np.diag(C)
-    np.testing.assert_allclose(found.standard_errors, np.sqrt(np.diag(C)), rtol=1e-6)
-    np.testing.assert_allclose((found.high - found.values) / found.standard_errors, stdtrit(1 / doubt, 0.975) * np.sqrt(1 + more), rtol=1e-5)
+    assert_allclose(found.standard_errors, np.sqrt(np.diag(C)), rtol=1e-6)
+    assert_allclose((found.high - found.values) / found.standard_errors, stdtrit(1 / doubt, 0.975) * np.sqrt(1 + more), rtol=1e-5)
 
 
 def test_a_channel_that_is_met_exactly_does_not_tell_its_sigma():
@@ -125,11 +126,11 @@ def test_errors_of_runs_under_a_robust_loss_hold_where_sigmas_are_far_too_small(
         bend.append((np.abs(r) <= loss.parameter) if loss.kind == "huber" else 5 * (4 - r**2) / (4 + r**2) ** 2)
     # H = J'J mean psi', with J'J from the weighted one
     H = sum(np.sum(w * slope**2) for w in weights) * np.mean(bend) / np.mean(weights)
-    np.testing.assert_allclose(found.standard_errors, [np.sqrt(np.sum(np.square(scores)) * 6 / 5) / H], rtol=1e-6)
+    assert_allclose(found.standard_errors, [np.sqrt(np.sum(np.square(scores)) * 6 / 5) / H], rtol=1e-6)
     # how runs differ says nothing of what is a run's own
     own = [run(ts, {"x": y}, 0.1, ("x",), t0=0.0) for y in ys]
     errors = [jj.fit(Bead(), own, errors=whence, loss=loss).standard_errors for whence in ("runs", "sigmas")]
-    np.testing.assert_allclose(*errors, rtol=1e-6)
+    assert_allclose(*errors, rtol=1e-6)
 
 
 def test_a_robust_loss_does_not_widen_what_a_prior_tells():
@@ -152,7 +153,7 @@ def test_a_repeat_without_samples_has_not_converged(sigma):
     ts, y = lines(10)
     found = jj.fit_batch(Bead(), run(ts, {"x": np.stack([y, np.full(10, np.nan)])}, sigma))
     assert found.converged.tolist() == [True, False]
-    np.testing.assert_allclose(found.standard_errors[0], jj.fit(Bead(), run(ts, {"x": y}, sigma)).standard_errors, rtol=1e-6)
+    assert_allclose(found.standard_errors[0], jj.fit(Bead(), run(ts, {"x": y}, sigma)).standard_errors, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("value", "sigma"), [(np.finfo(float).max, 0.1), (1.0, 1e-300)], ids=["value", "sigma"])

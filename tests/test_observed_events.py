@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from small_scenes import Oscillator
 
 import jourdain_jax as jj
@@ -35,13 +36,13 @@ def test_an_observed_time_tells_a_parameter_as_in_closed_form():
     # t = pi / 2 sqrt(m / k):   m = k (2 t / pi)^2,   sigma_m = 2 m sigma / t
     found = fit(run())
     mass = 5.0 * (2 * (STOP + 0.002) / np.pi) ** 2
-    np.testing.assert_allclose(found["mass"].value, mass, rtol=1e-7)
-    np.testing.assert_allclose(found["mass"].standard_error, 2 * mass * SIGMA / (STOP + 0.002), rtol=1e-6)
+    assert_allclose(found["mass"].value, mass, rtol=1e-7)
+    assert_allclose(found["mass"].standard_error, 2 * mass * SIGMA / (STOP + 0.002), rtol=1e-6)
     # samples may end long before it
     early = jj.Experiment(np.array([0.05, 0.1]), {}, {}, start={"x": 0.3, "x_rate": 0.0}, t0=0.0, events={"buffer": (STOP + 0.002, SIGMA)})
-    np.testing.assert_allclose(fit(early)["mass"].value, mass, rtol=1e-7)
+    assert_allclose(fit(early)["mass"].value, mass, rtol=1e-7)
     # to less than a round-off, whatever the amplitude
-    np.testing.assert_allclose(fit(run(0.6))["mass"].value, mass, rtol=1e-7)
+    assert_allclose(fit(run(0.6))["mass"].value, mass, rtol=1e-7)
 
 
 def test_runs_with_and_without_an_event_are_fitted_together_and_samples_after_it_do_not_count():
@@ -59,13 +60,13 @@ def test_runs_with_and_without_an_event_are_fitted_together_and_samples_after_it
     m, w = float(found["mass"].value), np.sqrt(5.0 / float(found["mass"].value))
     slopes = [0.3 * w * ts[:n] * np.sin(w * ts[:n]) / (2 * m) / 0.005 for n in (9, 8)]
     slopes += [np.full(2, np.pi / (4 * m * w) / SIGMA)]
-    np.testing.assert_allclose(found["mass"].standard_error, np.sum(np.concatenate(slopes) ** 2) ** -0.5, rtol=1e-6)
+    assert_allclose(found["mass"].standard_error, np.sum(np.concatenate(slopes) ** 2) ** -0.5, rtol=1e-6)
 
 
 def test_repeats_have_times_of_their_own():
     times = STOP + SIGMA * np.random.default_rng(1).normal(size=300)
     found = jj.fit_batch(SCENE.replace(mass=1.5), run(events={"buffer": (times, SIGMA)}), ("mass",), rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(found["mass"].value, 5.0 * (2 * times / np.pi) ** 2, rtol=1e-6)
+    assert_allclose(found["mass"].value, 5.0 * (2 * times / np.pi) ** 2, rtol=1e-6)
 
 
 def test_a_likelihood_has_the_slopes_of_the_time_in_both_modes():
@@ -75,10 +76,10 @@ def test_a_likelihood_has_the_slopes_of_the_time_in_both_modes():
     def told(mass):
         return jj.log_likelihood(SCENE.replace(mass=mass), run(), rtol=1e-10, atol=1e-10)
 
-    np.testing.assert_allclose(jax.jacfwd(told)(1.99), jax.grad(by_time)(1.99), rtol=1e-6)
+    assert_allclose(jax.jacfwd(told)(1.99), jax.grad(by_time)(1.99), rtol=1e-6)
     density = jj.log_density(SCENE, run(), ("mass",), rtol=1e-10, atol=1e-10)
     z, log = density.unconstrain({"mass": 1.99}), np.log(1.99)  # flat in the mass, whose logarithm z is
-    np.testing.assert_allclose(jax.grad(density)(z)[0], jax.grad(lambda z: by_time(jnp.exp(z)) + z)(log), rtol=1e-6)
+    assert_allclose(jax.grad(density)(z)[0], jax.grad(lambda z: by_time(jnp.exp(z)) + z)(log), rtol=1e-6)
 
 
 def test_a_motion_that_does_not_meet_the_event_is_named():

@@ -8,6 +8,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 from jourdain_jax.build.trace import event_values
@@ -127,8 +128,8 @@ def test_functions_of_jax_have_their_derivatives_where_their_branches_meet(law):
     assert "which has a derivative of its own" in jj.lower(scene).calls[0]
     (by_program, dense), (q, y) = rates_of(scene), (jnp.zeros(3), jnp.zeros(2))
     first, second = ([jax.jit(d(lambda y, f=f: f(scene, q, y)))(y) for f in (by_program, dense)] for d in (jax.jacfwd, jax.hessian))
-    np.testing.assert_allclose(*first, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(*second, rtol=1e-12, atol=1e-12)
+    assert_allclose(*first, rtol=1e-12, atol=1e-12)
+    assert_allclose(*second, rtol=1e-12, atol=1e-12)
 
 
 class Learned(ChaplyginSleigh):
@@ -153,7 +154,7 @@ def test_a_field_may_be_a_network_which_is_differentiated_by_its_weights():
     found = eqx.filter_jit(eqx.filter_grad(loss))(scene.net).layers[0].weight
     weight, h = (lambda net: net.layers[0].weight), 1e-5
     moved = [eqx.tree_at(weight, scene.net, weight(scene.net).at[1, 0].add(side)) for side in (h, -h)]
-    np.testing.assert_allclose(found[1, 0], (loss(moved[0]) - loss(moved[1])) / (2 * h), rtol=1e-7)
+    assert_allclose(found[1, 0], (loss(moved[0]) - loss(moved[1])) / (2 * h), rtol=1e-7)
     assert not jj.lower(scene).calls
 
 
@@ -173,9 +174,9 @@ def test_only_the_part_without_a_scalar_form_is_kept_and_the_rates_are_those_of_
     assert f"kept as a call of JAX, as it has no scalar form: {program.calls[0]}" in str(program)
     (by_program, dense), (q, y) = rates_of(scene), states_of(scene, 5)
     expected = jax.jit(jax.vmap(lambda q, y: dense(scene, q, y)))(q, y)
-    np.testing.assert_allclose(jax.jit(jax.vmap(lambda q, y: by_program(scene, q, y)))(q, y), expected, rtol=1e-12, atol=1e-12)
+    assert_allclose(jax.jit(jax.vmap(lambda q, y: by_program(scene, q, y)))(q, y), expected, rtol=1e-12, atol=1e-12)
     lanes_last = jax.jit(lambda q, y: by_program(scene, q, y))(q.T, y.T)
-    np.testing.assert_allclose(lanes_last.T, expected, rtol=1e-12, atol=1e-12)
+    assert_allclose(lanes_last.T, expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", SMOOTH_ENOUGH)
@@ -191,16 +192,16 @@ def test_derivatives_through_a_call_are_those_of_the_dense_path(name):
         return jax.jit(lambda x: (jax.jvp(of, (x,), (v,))[1], jax.grad(total)(x), jax.jvp(jax.grad(total), (x,), (v,))[1]))(flat)
 
     (along, gradient, second), expected = map(derivatives, functions)
-    np.testing.assert_allclose(along, expected[0], rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(gradient, expected[1], rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(second, expected[2], rtol=1e-9, atol=1e-9)
+    assert_allclose(along, expected[0], rtol=1e-10, atol=1e-10)
+    assert_allclose(gradient, expected[1], rtol=1e-10, atol=1e-10)
+    assert_allclose(second, expected[2], rtol=1e-9, atol=1e-9)
     assert np.any(gradient[: len(flat) - len(q[0]) - len(y[0])][3:] != 0)  # by the numbers of the law
 
 
 def test_an_iteration_has_derivatives_in_forward_mode_and_the_same_error_as_densely_in_reverse():
     scene = LAWS["iteration"][0]
     (by_program, dense), (q, y) = rates_of(scene), states_of(scene, 1)
-    np.testing.assert_allclose(*(jax.jit(jax.jacfwd(lambda y, f=f: f(scene, q[0], y)))(y[0]) for f in (by_program, dense)), rtol=1e-10, atol=1e-10)
+    assert_allclose(*(jax.jit(jax.jacfwd(lambda y, f=f: f(scene, q[0], y)))(y[0]) for f in (by_program, dense)), rtol=1e-10, atol=1e-10)
     for f in (by_program, dense):
         with pytest.raises(ValueError, match="Reverse-mode differentiation does not work"):
             jax.make_jaxpr(jax.jacrev(lambda y, f=f: f(scene, q[0], y)))(y[0])
@@ -215,11 +216,11 @@ def test_motions_with_a_call_are_the_dense_ones_alone_and_in_lockstep(name):
     scene = LAWS[name][0]
     program, dense = (jj.simulate(scene, START, backend=backend, **OPTIONS) for backend in ("auto", "dense"))
     assert "lowered" in program.reduction
-    np.testing.assert_allclose(program.q, dense.q, atol=1e-8)
-    np.testing.assert_allclose(program.work, dense.work, atol=1e-9)
+    assert_allclose(program.q, dense.q, atol=1e-8)
+    assert_allclose(program.work, dense.work, atol=1e-9)
     lanes = jj.rollout(scene, START | {"heading_rate": np.linspace(0.9, 1.2, 11)}, **OPTIONS)
-    np.testing.assert_allclose(lanes.lanes.q[0], dense.q, atol=1e-8)
-    np.testing.assert_allclose(lanes.lanes.q[10], jj.simulate(scene, START | {"heading_rate": 1.2}, **OPTIONS).q, atol=1e-8)
+    assert_allclose(lanes.lanes.q[0], dense.q, atol=1e-8)
+    assert_allclose(lanes.lanes.q[10], jj.simulate(scene, START | {"heading_rate": 1.2}, **OPTIONS).q, atol=1e-8)
     assert np.all(np.diff(lanes.lanes.q_end[:, 2]) != 0)
 
 
@@ -264,7 +265,7 @@ def test_a_part_of_a_pose_is_a_call_whose_derivatives_are_those_of_jax(scene, re
     by_program, dense = rates_of(scene)
     for derivative in (lambda f: f, lambda f: jax.jacfwd(f, argnums=(1, 2)), lambda f: jax.jacrev(f, argnums=(1, 2))):
         found, expected = (jax.vmap(jax.jit(derivative(f)), in_axes=(None, 0, 0))(scene, q, y) for f in (by_program, dense))
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12), found, expected)
+        jax.tree.map(lambda a, b: assert_allclose(a, b, rtol=1e-11, atol=1e-12), found, expected)
 
 
 class Effective(OnCam):
@@ -296,7 +297,7 @@ def test_what_a_call_depends_on_is_not_left_out_though_no_probe_shows_it():
     assert program.held == ()
     fixed = program.fixed_values(scene)
     _, ydot, _ = jax.jit(lambda x: program.rates(fixed, 0.0, (x,), (0.0 * x,), jnp.zeros(0)))(15.0)
-    np.testing.assert_allclose(ydot, [-25.0])
+    assert_allclose(ydot, [-25.0])
 
 
 class Twice(TiltingDisc):
@@ -342,11 +343,11 @@ def test_a_stop_event_without_a_scalar_form_is_a_call_and_leaves_the_program_as_
     assert program.calls == ("the operation `svd`",)
     (t,), (q,), (u,) = jj.sample_states(watched, 1)
     values = program.event_values(program.fixed_values(watched), t, tuple(q), tuple(u[np.array(program.independent)]), jnp.zeros(0))
-    np.testing.assert_allclose(values, event_values(watched, jj.motion_at(watched, t, q, u)), rtol=1e-14)
+    assert_allclose(values, event_values(watched, jj.motion_at(watched, t, q, u)), rtol=1e-14)
     found = jj.simulate(watched, {"lean": 0.1, "spin_rate": -3.0}, t1=2.0)
-    np.testing.assert_allclose(jnp.hypot(found.q_end[0], found.q_end[1]), 0.5, rtol=1e-9)
+    assert_allclose(jnp.hypot(found.q_end[0], found.q_end[1]), 0.5, rtol=1e-9)
     lanes = jj.rollout(watched, {"lean": np.full(3, 0.1), "spin_rate": -3.0}, t1=2.0)
-    np.testing.assert_allclose(lanes.lanes.t_end, found.t_end, rtol=1e-7)
+    assert_allclose(lanes.lanes.t_end, found.t_end, rtol=1e-7)
 
 
 # On the graph.
@@ -369,7 +370,7 @@ def test_parts_that_are_apart_are_calls_of_their_own_in_the_right_order():
     assert len(graph.calls(flat)) == 3  # sorting, and two iterations: the third is the first again
     x = np.random.default_rng(0).normal(size=(7, 3))
     values = Probes(graph, {f"0_{i}": x[:, i] for i in range(3)})(flat)
-    np.testing.assert_allclose(values, np.stack(jax.vmap(f)(x)), rtol=1e-12)
+    assert_allclose(values, np.stack(jax.vmap(f)(x)), rtol=1e-12)
 
 
 def test_functions_that_differ_in_a_constant_are_not_one_call():
@@ -378,7 +379,7 @@ def test_functions_that_differ_in_a_constant_are_not_one_call():
         return table([1.0, 2.0, 3.0]) + 10 * table([1.0, 2.0, 4.0])
 
     graph, (node,) = in_parts(f, 0.0)
-    np.testing.assert_allclose(Probes(graph, {"0_0": np.array([0.0, 1.0, 2.0])})([int(node)])[0], [11.0, 22.0, 43.0])
+    assert_allclose(Probes(graph, {"0_0": np.array([0.0, 1.0, 2.0])})([int(node)])[0], [11.0, 22.0, 43.0])
 
 
 def test_a_choice_that_is_known_is_made_and_numbers_stay_numbers():

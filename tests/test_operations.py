@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import OnPlane
 
 import jourdain_jax as jj
@@ -27,7 +28,7 @@ def to_second_order(f, point):
     nodes = [*value, *first, *second]
     found = Probes(graph, dict(zip("xyz", np.asarray(point)[:, None], strict=False)))(nodes)[:, 0]
     emitted = run(graph, nodes, dict(zip(x, map(jnp.float64, point), strict=True)))
-    np.testing.assert_allclose(np.array(emitted, float), found, rtol=1e-14, atol=1e-14)
+    assert_allclose(np.array(emitted, float), found, rtol=1e-14, atol=1e-14)
     return found
 
 
@@ -52,7 +53,7 @@ TRUTHS = {
 @pytest.mark.parametrize("name", TRUTHS)
 @pytest.mark.parametrize("point", [(1.0, 2.0), (-1.0, 2.0), (1.0, 4.0), (0.0, 0.0)])
 def test_what_holds_is_a_number_where_one_is_asked_for(name, point):
-    np.testing.assert_allclose(to_second_order(TRUTHS[name], point), by_jax(TRUTHS[name], point), atol=1e-14)
+    assert_allclose(to_second_order(TRUTHS[name], point), by_jax(TRUTHS[name], point), atol=1e-14)
 
 
 @pytest.mark.parametrize("f", [lambda n: n & 1, lambda n: n | 2, lambda n: ~n, lambda n: n // 2, lambda n: jnp.bitwise_and.reduce(n[None] | 4)])
@@ -73,11 +74,11 @@ def test_single_precision_among_double_is_not_computed_in_double(f):
 def test_smooth_functions_of_a_magnitude_have_their_second_derivatives_at_zero(f, y):
     expected = by_jax(f, (1.2, y))
     assert np.all(np.isfinite(expected))
-    np.testing.assert_allclose(to_second_order(f, (1.2, y)), expected, atol=1e-14)
+    assert_allclose(to_second_order(f, (1.2, y)), expected, atol=1e-14)
 
 
 def test_the_derivative_of_a_magnitude_at_zero_is_that_of_jax():
-    np.testing.assert_array_equal(to_second_order(lambda x: jnp.abs(x[0]), (0.0,)), [0.0, 1.0, 0.0])
+    assert_array_equal(to_second_order(lambda x: jnp.abs(x[0]), (0.0,)), [0.0, 1.0, 0.0])
 
 
 @pytest.mark.parametrize("exponent", [0.0, 1.0, 1.5, 2.0, 2.5])
@@ -89,14 +90,14 @@ def test_powers_have_the_derivatives_of_jax(base, exponent):
         found, expected = to_second_order(f, point), by_jax(f, point)
         finite = ~np.isnan(expected)  # 0^(b-1) b at b = 0 and its like are NaN in JAX
         assert base == 0.0 or np.all(finite)
-        np.testing.assert_allclose(found[finite], expected[finite], rtol=1e-13, atol=1e-13)
+        assert_allclose(found[finite], expected[finite], rtol=1e-13, atol=1e-13)
 
 
 @pytest.mark.parametrize("largest", [jnp.max, jnp.min])
 @pytest.mark.parametrize("point", [(1.0, 1.0, 1.0), (2.0, 1.0, 2.0), (1.0, 2.0, 2.0), (3.0, 1.0, 2.0), (0.1, 0.1, 0.1)])
 def test_the_derivative_of_an_extreme_is_shared_by_all_that_reach_it(largest, point):
     for f in (lambda x: largest(x), lambda x: largest(jnp.stack([x[0], x[1], x[2], 1.0, x[0] * x[1]])) ** 2):
-        np.testing.assert_allclose(to_second_order(f, point), by_jax(f, point), rtol=1e-14, atol=1e-14)
+        assert_allclose(to_second_order(f, point), by_jax(f, point), rtol=1e-14, atol=1e-14)
 
 
 def test_nothing_is_assumed_of_the_sign_of_a_parameter():
@@ -110,7 +111,7 @@ def test_nothing_is_assumed_of_the_sign_of_a_parameter():
     found = [forms.rebuilt(forms.expanded(n)) for n in nodes]
     assert forms.guards == {x, graph.call("cos", x)}
     negative = probes.with_inputs({"p": np.linspace(-2.0, -1.0, 8)})
-    np.testing.assert_allclose(negative(found), negative(nodes), rtol=1e-14)
+    assert_allclose(negative(found), negative(nodes), rtol=1e-14)
 
 
 class Weighed(OnPlane):
@@ -125,8 +126,8 @@ class Weighed(OnPlane):
 
 def test_a_parameter_of_the_other_sign_is_no_other_domain():
     motion = jax.vmap(lambda p: jj.simulate(Weighed(p=p), {"x": 1.0}, t1=1.0, rtol=1e-9, atol=1e-9))(jnp.array([1.5, -1.5]))
-    np.testing.assert_array_equal(motion.result, 0)
-    np.testing.assert_allclose(motion.q_end[:, 0], np.cos(np.sqrt(1.5)), rtol=1e-7)
+    assert_array_equal(motion.result, 0)
+    assert_allclose(motion.q_end[:, 0], np.cos(np.sqrt(1.5)), rtol=1e-7)
 
 
 def test_an_array_is_taken_apart_as_newer_versions_of_jax_do_where_it_is_iterated_over():
@@ -134,4 +135,4 @@ def test_an_array_is_taken_apart_as_newer_versions_of_jax_do_where_it_is_iterate
         a, b = jnp.unstack(x)  # from JAX 0.12 on also `a, b = x`
         return a * b**2
 
-    np.testing.assert_allclose(to_second_order(law, (2.0, 3.0)), by_jax(law, (2.0, 3.0)), rtol=1e-14)
+    assert_allclose(to_second_order(law, (2.0, 3.0)), by_jax(law, (2.0, 3.0)), rtol=1e-14)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import machine_code
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 from jourdain_jax.calculus import writing
@@ -109,8 +110,8 @@ def test_a_batch_is_shared_among_threads_also_where_registers_hold_two_numbers(m
     x = graph.input("x", True)
     sine = called.nodes_called(graph, [graph.call("sin", x)], [x])
     angles = np.linspace(0.0, 3.0, 301)[:, None]  # enough for three threads
-    np.testing.assert_allclose(jax.vmap(sine)(jnp.asarray(angles)), np.sin(angles), rtol=1e-15, atol=1e-16)
-    np.testing.assert_allclose(sine(jnp.asarray(angles[7])), np.sin(angles[7]), rtol=1e-15)
+    assert_allclose(jax.vmap(sine)(jnp.asarray(angles)), np.sin(angles), rtol=1e-15, atol=1e-16)
+    assert_allclose(sine(jnp.asarray(angles[7])), np.sin(angles[7]), rtol=1e-15)
     assert asked == [3, 1]
 
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from small_scenes import Cart
 
 import jourdain_jax as jj
@@ -22,9 +23,9 @@ def test_planned_covariance_is_that_of_a_fit():
     fit = jj.fit(Cart(damping=0.0), run, ("mass", "stiffness"))
     found = jj.planned_information(Cart(damping=0.0), plan(force=0.4, unknown=unknown), ("mass", "stiffness"))
     assert found.labels == fit.labels == ("mass", "stiffness", "run 0: x")
-    np.testing.assert_allclose(found.covariance, fit.covariance, rtol=1e-5)
-    np.testing.assert_allclose(found.log_det(), -np.linalg.slogdet(fit.covariance)[1], rtol=1e-6)
-    np.testing.assert_allclose(found.log_det("mass"), -np.log(fit.covariance[0, 0]), rtol=1e-6)
+    assert_allclose(found.covariance, fit.covariance, rtol=1e-5)
+    assert_allclose(found.log_det(), -np.linalg.slogdet(fit.covariance)[1], rtol=1e-6)
+    assert_allclose(found.log_det("mass"), -np.log(fit.covariance[0, 0]), rtol=1e-6)
     assert "mass" in str(found)
 
 
@@ -57,11 +58,11 @@ def of_stiffness(x):
 
 
 def test_information_has_a_closed_form():
-    np.testing.assert_allclose(of_stiffness(0.3), stated(0.3), rtol=1e-6)
+    assert_allclose(of_stiffness(0.3), stated(0.3), rtol=1e-6)
 
 
 def test_slope_in_the_start_has_a_closed_form():
-    np.testing.assert_allclose(jax.jit(jax.jacfwd(of_stiffness))(0.3), jax.grad(stated)(0.3), rtol=1e-6)
+    assert_allclose(jax.jit(jax.jacfwd(of_stiffness))(0.3), jax.grad(stated)(0.3), rtol=1e-6)
 
 
 def test_slope_in_the_samples_of_an_input_is_that_of_differences():
@@ -73,7 +74,7 @@ def test_slope_in_the_samples_of_an_input_is_that_of_differences():
     values, way = jnp.array([0.0, 0.5, -0.3, 0.8, 0.1]), jnp.array([0.3, -1.0, 0.5, 0.2, 0.0])
     _, slope = jax.jit(lambda v, w: jax.jvp(told, (v,), (w,)))(values, way)
     h = 1e-3
-    np.testing.assert_allclose(slope, (told(values + h * way) - told(values - h * way)) / (2 * h), rtol=1e-5)
+    assert_allclose(slope, (told(values + h * way) - told(values - h * way)) / (2 * h), rtol=1e-5)
 
 
 @pytest.mark.parametrize(

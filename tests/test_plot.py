@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import BeadOnTurningWire
 
 import jourdain_jax as jj
@@ -44,7 +45,7 @@ def test_values_are_drawn_in_the_units_that_are_asked_for(motions, name, unit, s
     energies = motions[0].energies()
     expected = energies.kinetic + energies.potential if name == "energy" else motions[0][name]
     (line,) = axes[0].lines
-    np.testing.assert_allclose(line.get_xydata(), np.stack([1000 * TS, size * expected], axis=1), rtol=1e-12, atol=1e-12)
+    assert_allclose(line.get_xydata(), np.stack([1000 * TS, size * expected], axis=1), rtol=1e-12, atol=1e-12)
     assert axes[0].get_ylabel() == f"{name} in {unit}"
     assert axes[0].get_xlabel() == "t in ms"
     assert figure is axes[0].figure
@@ -56,7 +57,7 @@ def test_the_energy_of_a_damped_motion_is_what_it_has_left():
     assert motion.work is not None
     _, axes = jj.plot(motion, "energy", "kinetic energy")
     total, kinetic = (axis.lines[0].get_ydata() for axis in axes)
-    np.testing.assert_array_equal(total, kinetic)
+    assert_array_equal(total, kinetic)
     assert total[-1] < 0.2 * total[0]
 
 
@@ -67,7 +68,7 @@ def test_several_motions_lie_in_one_figure_with_their_labels(motions):
         assert [line.get_label() for line in axis.lines] == ["slow", "fast"]
         assert len({line.get_color() for line in axis.lines}) == 2
         for line, motion in zip(axis.lines, motions, strict=True):
-            np.testing.assert_array_equal(line.get_ydata(), motion[name])
+            assert_array_equal(line.get_ydata(), motion[name])
     (legend,) = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["slow", "fast"]
     assert not overlap(figure, legend, axes[0].title, *axes)
@@ -76,12 +77,12 @@ def test_several_motions_lie_in_one_figure_with_their_labels(motions):
 def test_of_a_rollout_bands_hold_the_parts_that_are_asked_for(lanes):
     figure, axes = jj.plot(lanes, "heading", units={"heading": "deg"}, bands=(0.9, 0.5))
     (line,) = axes[0].lines
-    np.testing.assert_allclose(line.get_ydata(), np.rad2deg(np.median(lanes["heading"], axis=0)), atol=1e-12)
+    assert_allclose(line.get_ydata(), np.rad2deg(np.median(lanes["heading"], axis=0)), atol=1e-12)
     wide, narrow = (band.get_paths()[0].vertices for band in axes[0].collections)
     for band, part in ((wide, 0.9), (narrow, 0.5)):
         at_end = band[np.isclose(band[:, 0], 1.0), 1]
         expected = np.rad2deg(np.quantile(lanes["heading"][:, -1], [(1 - part) / 2, (1 + part) / 2]))
-        np.testing.assert_allclose([at_end.min(), at_end.max()], expected, atol=1e-9)
+        assert_allclose([at_end.min(), at_end.max()], expected, atol=1e-9)
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["90 % of lanes", "50 % of lanes", "median"]
     assert axes[0].get_title(loc="left") == "21 lanes; 0 stopped at an event, 0 failed"
     assert not overlap(figure, figure.legends[0], axes[0].title, *axes)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 from jourdain_jax.analysis.unknowns import unknowns_of
@@ -25,11 +26,11 @@ def test_every_cloud_of_points_has_its_numbers():
         inertia = sum(m * (p @ p * np.eye(3) - np.outer(p, p)) for m, p in zip(masses, r, strict=True))
         numbers = jj.log_cholesky(inertia)
         assert numbers.shape == (6,)
-        np.testing.assert_allclose(jj.inertia_from_log_cholesky(numbers), inertia, rtol=1e-12, atol=1e-12)
+        assert_allclose(jj.inertia_from_log_cholesky(numbers), inertia, rtol=1e-12, atol=1e-12)
     flat = np.array([[0.5, 0.0, 0.1], [0.0, 0.8, 0.0], [0.1, 0.0, 0.4]])
     four = jj.log_cholesky(flat, symmetric=True)
     assert four.shape == (4,)
-    np.testing.assert_allclose(jj.inertia_from_log_cholesky(four), flat, rtol=1e-13, atol=1e-15)
+    assert_allclose(jj.inertia_from_log_cholesky(four), flat, rtol=1e-13, atol=1e-15)
 
 
 def test_derivatives_are_finite_and_there_are_as_many_numbers_as_moments():
@@ -37,7 +38,7 @@ def test_derivatives_are_finite_and_there_are_as_many_numbers_as_moments():
     six = lambda x: jj.inertia_from_log_cholesky(x)[np.triu_indices(3)]  # noqa: E731
     J = jax.jacfwd(six)(numbers)
     assert np.linalg.matrix_rank(J) == 6
-    np.testing.assert_allclose(J @ jax.jacfwd(lambda v: jj.log_cholesky(of(v)))(six(numbers)), np.eye(6), atol=1e-12)
+    assert_allclose(J @ jax.jacfwd(lambda v: jj.log_cholesky(of(v)))(six(numbers)), np.eye(6), atol=1e-12)
 
 
 def of(v):
@@ -81,8 +82,8 @@ def test_a_fit_whose_moments_end_beyond_what_a_body_can_have_ends_at_a_body():
     by_name = jj.fit(Turning(), data, {"body": jj.possible_inertia()})
     assert free.impossible
     assert not by_name.impossible
-    np.testing.assert_allclose(by_name.scene.moments, jnp.diag(body.scene.inertia()), rtol=1e-6)
-    np.testing.assert_allclose(by_name.tied["moments"].value, by_name.scene.moments)
+    assert_allclose(by_name.scene.moments, jnp.diag(body.scene.inertia()), rtol=1e-6)
+    assert_allclose(by_name.tied["moments"].value, by_name.scene.moments)
     flat = by_name["body second moment[1]"]  # Iyy is at most Ixx + Izz
     assert flat.value == 0
     assert 0 < flat.high < 0.2
@@ -91,7 +92,7 @@ def test_a_fit_whose_moments_end_beyond_what_a_body_can_have_ends_at_a_body():
     moments = np.linalg.eigvalsh(np.asarray(body.scene.inertia()))
     assert moments[0] > 0
     assert moments[2] <= moments[:2].sum() * (1 + 1e-12)
-    np.testing.assert_allclose(np.sort(moments), np.sort(truth), atol=0.1)
+    assert_allclose(np.sort(moments), np.sort(truth), atol=0.1)
 
 
 NUMBERS_OF = [
@@ -110,7 +111,7 @@ def test_whatever_the_numbers_of_a_body_are_its_parameters_are_possible(scene, b
     assert layout.sizes == (count, 0)
     assert set(layout.following) == names
     for name in names:
-        np.testing.assert_allclose(getattr(layout.scene(scene, unknowns.guess), name), getattr(scene, name), rtol=1e-12)
+        assert_allclose(getattr(layout.scene(scene, unknowns.guess), name), getattr(scene, name), rtol=1e-12)
     positive = unknowns.ends[0] == 0
     for x in GENERATOR.normal(size=(5, count)) * 2.0:
         shared = np.where(positive, np.exp(x), x)
@@ -119,7 +120,7 @@ def test_whatever_the_numbers_of_a_body_are_its_parameters_are_possible(scene, b
         least, middle, largest = np.linalg.eigvalsh(I)
         assert least > 0
         assert largest <= (least + middle) * (1 + 1e-12)
-        np.testing.assert_allclose(np.concatenate(layout.bodies[0].numbers(moved)), shared, rtol=1e-6, atol=1e-6)  # as many as there are parameters
+        assert_allclose(np.concatenate(layout.bodies[0].numbers(moved)), shared, rtol=1e-6, atol=1e-6)  # as many as there are parameters
 
 
 def test_a_batch_of_numbers_makes_a_batch_of_parameters():
@@ -131,7 +132,7 @@ def test_a_batch_of_numbers_makes_a_batch_of_parameters():
     for index in np.ndindex(3, 2):
         one = layout.scene(scene, shared[index])
         for name in ("IRxx", "IRyy", "mB", "IFxx"):
-            np.testing.assert_allclose(getattr(many, name)[index], getattr(one, name), rtol=1e-14)
+            assert_allclose(getattr(many, name)[index], getattr(one, name), rtol=1e-14)
 
 
 class Planar(Turning):

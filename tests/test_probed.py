@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 from jourdain_jax import coordinate_rates, motion_at, pose_at, position_residual, structure_of, velocity_residual
@@ -99,12 +100,12 @@ def test_what_is_looked_at_on_the_graph_is_what_jax_finds(name):
     assert np.max(np.abs(expected["closure"][on_rows]), initial=0.0) < 1e-12
     for name in ("A", "A_other", "A_beyond", "M", "phi_at_rest", "potential_rates"):
         one, other = expected[name], getattr(found, name)
-        np.testing.assert_allclose(other, one, rtol=1e-11, atol=1e-11 * (1 + np.max(np.abs(one), initial=0.0)), err_msg=name)
+        assert_allclose(other, one, rtol=1e-11, atol=1e-11 * (1 + np.max(np.abs(one), initial=0.0)), err_msg=name)
     for name in TIMED:
         assert _moves(expected["timed"][name]) == _moves(found.timed[name]), name
     assert _moves(expected["motion_at_rest"]) == _moves(found.motion_at_rest)
     assert _moves(expected["inertia_rates"]) == _moves(found.inertia_rates)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11), expected["numbers"], found.numbers)
+    jax.tree.map(lambda a, b: assert_allclose(a, b, rtol=1e-11, atol=1e-11), expected["numbers"], found.numbers)
 
 
 @pytest.mark.parametrize("name", ["snakeboard", "ball-on-turntable", "double-pendulum-rods", "isokinetic-particle", "two-wheel-axle-redundant", "on a path"])
@@ -112,7 +113,7 @@ def test_speeds_put_on_the_rows_on_the_graph_are_those_of_jax(name):
     scene = SCENES[name] if name in SCENES else jj.models.MODELS[name]()
     t, q, u = random_states(scene, 32, np.random.default_rng(1))
     q, found, _ = sampled_on_graph(scene, t, q, u)
-    np.testing.assert_allclose(found, jax.vmap(lambda t, q, u: project_speeds(scene, t, q, u))(t, q, u), rtol=1e-11, atol=1e-11)
+    assert_allclose(found, jax.vmap(lambda t, q, u: project_speeds(scene, t, q, u))(t, q, u), rtol=1e-11, atol=1e-11)
 
 
 def test_what_a_call_in_a_pose_does_not_do_is_known():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 from jourdain_jax.program.emit import run
@@ -28,7 +29,7 @@ def test_models_take_fewer_products(name, before, after):
     assert products(graph, few) <= after
     values = dict(zip(inputs, np.random.default_rng(0).uniform(0.2, 0.9, len(inputs)), strict=True))
     old, new = (np.array([float(x) for x in run(graph, nodes, values)]) for nodes in (rates, few))
-    np.testing.assert_allclose(new, old, rtol=1e-13)
+    assert_allclose(new, old, rtol=1e-13)
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -51,7 +52,7 @@ def test_random_programs_keep_their_values(seed):
     assert products(graph, few) <= products(graph, outputs)
     values = dict(zip(inputs, random.uniform(0.5, 1.5, len(inputs)), strict=True))
     old, new = (np.array([float(x) for x in run(graph, nodes, values)]) for nodes in (outputs, few))
-    np.testing.assert_allclose(new, old, rtol=1e-11, atol=1e-11)
+    assert_allclose(new, old, rtol=1e-11, atol=1e-11)
 
 
 def test_what_cancels_or_does_not_vary_is_left():

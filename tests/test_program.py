@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.derivative import derivatives, directional_derivative
@@ -98,8 +99,8 @@ def test_a_traced_function_and_its_derivative_are_those_of_jax(graph, name):
     points = np.random.default_rng(0).uniform(0.2, 2.0, (2, 20)) * [[1], [-1]]
     probes = Probes(graph, {"x": points[0], "y": points[1]})
     value, dot = jax.vmap(lambda x, y: jax.jvp(f, (x, y), (0.3, -1.7)))(*points)
-    np.testing.assert_allclose(probes(nodes).T, value, rtol=1e-13, atol=1e-13)
-    np.testing.assert_allclose(probes(dots).T, dot, rtol=1e-12, atol=1e-12)
+    assert_allclose(probes(nodes).T, value, rtol=1e-13, atol=1e-13)
+    assert_allclose(probes(dots).T, dot, rtol=1e-12, atol=1e-12)
 
 
 def _derivative_at(f, value):
@@ -165,7 +166,7 @@ def test_determinants_cancel_what_is_common(graph):
     first, second = NormalForms(graph, 100).cramer(M, [graph.mul(a, graph.mul(c, y)), graph.mul(a, y)])
     assert second == y
     probes = Probes(graph, {"x": np.array([0.3]), "y": np.array([2.0]), "a": np.array([7.0])})
-    np.testing.assert_allclose(probes([first])[0], 2.0 / np.cos(0.3), rtol=1e-14)
+    assert_allclose(probes([first])[0], 2.0 / np.cos(0.3), rtol=1e-14)
     assert graph.operations([first]) <= 3
 
 
@@ -209,9 +210,9 @@ def test_sine_and_cosine_differentiate_to_second_order_in_both_modes():
         (lambda x: sine_and_cosine(x)[1], lambda x: -np.sin(x), lambda x: -np.cos(x)),
     ):
         for x in (0.0, 1.3, -40.0):
-            np.testing.assert_allclose(jax.grad(f)(x), first(x), atol=3e-16)
-            np.testing.assert_allclose(jax.jacfwd(jax.grad(f))(x), second(x), atol=3e-16)
-            np.testing.assert_allclose(jax.grad(jax.grad(f))(x), second(x), atol=3e-16)
+            assert_allclose(jax.grad(f)(x), first(x), atol=3e-16)
+            assert_allclose(jax.jacfwd(jax.grad(f))(x), second(x), atol=3e-16)
+            assert_allclose(jax.grad(jax.grad(f))(x), second(x), atol=3e-16)
 
 
 def _example(graph):
@@ -243,14 +244,14 @@ def test_jax_code_python_c_and_sympy_say_the_same(graph, tmp_path, example):
     sympy = pytest.importorskip("sympy")
     names, outputs = example(graph)
     expected = Probes(graph, {k: np.array([v]) for k, v in VALUES.items()})(outputs)[:, 0]
-    np.testing.assert_allclose(run(graph, outputs, {n: jnp.asarray(VALUES[k]) for k, n in names.items()}), expected, rtol=1e-15)
+    assert_allclose(run(graph, outputs, {n: jnp.asarray(VALUES[k]) for k, n in names.items()}), expected, rtol=1e-15)
     lines, last = statements(graph, outputs, {n: k for k, n in names.items()}, PYTHON)
     scope = {"math": math}
     exec("def f(x, y, a):\n" + "\n".join([*lines, f"    return {', '.join(last)}"]), scope)
-    np.testing.assert_allclose(scope["f"](**VALUES), expected, rtol=1e-15)
+    assert_allclose(scope["f"](**VALUES), expected, rtol=1e-15)
     symbols = sympy_expressions(graph, outputs, {n: k for k, n in names.items()})
     symbols = [e.replace(lambda f: str(getattr(f, "func", "")) == "round", lambda f: sympy.Integer(round(f.args[0].subs(VALUES)))) for e in symbols]
-    np.testing.assert_allclose([float(e.subs(VALUES)) for e in symbols], expected, rtol=1e-14)
+    assert_allclose([float(e.subs(VALUES)) for e in symbols], expected, rtol=1e-14)
     lines, last = statements(graph, outputs, {n: k for k, n in names.items()}, C)
     body = "\n".join([*lines, *(f'    printf("%.17g\\n", {e});' for e in last)])
     source = f"#include <math.h>\n#include <stdio.h>\nint main(void) {{ const double x = 0.7, y = -1.3, a = 2.5;\n{body}\n return 0; }}\n"
@@ -260,7 +261,7 @@ def test_jax_code_python_c_and_sympy_say_the_same(graph, tmp_path, example):
     except FileNotFoundError:
         pytest.skip("no C compiler")
     out = subprocess.run([str(tmp_path / "f")], check=True, capture_output=True, text=True).stdout
-    np.testing.assert_allclose([float(v) for v in out.split()], expected, rtol=1e-14)
+    assert_allclose([float(v) for v in out.split()], expected, rtol=1e-14)
 
 
 def test_operations_of_two_nodes_are_compared_by_what_they_do_not_share():
@@ -312,9 +313,9 @@ def test_an_operation_has_one_value_one_derivative_and_a_bound_of_its_round_off(
 
     value, rate = jax.jvp(in_jax, tuple(points), tuple(0.3 * points))
     probes = Probes(graph, dict(zip(names, given, strict=True)))
-    np.testing.assert_allclose(probes([node])[0], value, rtol=1e-14)
+    assert_allclose(probes([node])[0], value, rtol=1e-14)
     direction = {x: graph.zero if flag else graph.mul(graph.const(0.3), x) for x, flag in zip(variables, flags, strict=True)}
-    np.testing.assert_allclose(probes(derivatives(graph, [node], direction))[0], rate, rtol=1e-12, atol=1e-14)
+    assert_allclose(probes(derivatives(graph, [node], direction))[0], rate, rtol=1e-12, atol=1e-14)
     if operation.bounded:
         single = [np.concatenate([x.astype(np.float32).astype(float), 6e-8 * np.abs(x)]) for x in points]
         near, bound = np.split(operation.bounded(*single), 2)

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from linkages import Parallelogram, SliderCrank
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 from jourdain_jax import structure_of
@@ -44,13 +45,13 @@ def test_the_smallest_singular_value_goes_to_zero_with_the_distance(name, unit):
     distances = np.array([1e-1, 1e-3, 1e-5, 1e-7, 1e-9])
     values = np.array([float(_near(name, distance, unit)[2].smallest_singular_value) for distance in distances])
     assert np.all(np.diff(values) < 0)
-    np.testing.assert_allclose(values[1:] / distances[1:], values[1] / distances[1], rtol=1e-2)
+    assert_allclose(values[1:] / distances[1:], values[1] / distances[1], rtol=1e-2)
 
 
 @pytest.mark.parametrize("name", SINGULAR)
 def test_the_conditioning_does_not_depend_on_the_unit_of_a_row(name):
     values = [float(_near(name, 0.2, unit)[2].smallest_singular_value) for unit in UNITS]
-    np.testing.assert_allclose(values, values[0], rtol=1e-6)
+    assert_allclose(values, values[0], rtol=1e-6)
     choices = [structure_of(SINGULAR[name][0](unit=unit)) for unit in UNITS]
     assert len({(found.independent, found.ranks, found.rank_losses) for found in choices}) == 1
 
@@ -109,4 +110,4 @@ def test_a_mechanism_that_moves_where_others_of_its_assemblies_are_stiff_is_not_
     assert motions[1].warnings == ()
     (warning,) = motions[0].warnings
     assert "rows have rank 2 all along, but 3 at generic states" in warning
-    np.testing.assert_allclose(motions[0].q_end, motions[1].q_end, atol=1e-8)
+    assert_allclose(motions[0].q_end, motions[1].q_end, atol=1e-8)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 from jourdain_jax.motion.integrators import erk_loop, recorded_adjoint
@@ -84,7 +85,7 @@ def test_reverse_mode_has_the_derivatives_of_forward_mode(lanes, events, steps, 
     assert np.any(end.code == results.EVENT) == events
     expected = forward_mode(weighed(pendulum("forward", **options)), x)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-8)
+        assert_allclose(a, b, rtol=1e-8, atol=1e-8)
 
 
 def test_lanes_of_vmap_keep_their_own_events_and_derivatives(monkeypatch):
@@ -99,7 +100,7 @@ def test_lanes_of_vmap_keep_their_own_events_and_derivatives(monkeypatch):
     (_, end), found = jax.jit(jax.vmap(each, in_axes=(1, 0, 1, 0)))(y0, t0, goals, gravity)
     assert len(np.unique(end.code)) == 2
     expected = forward_mode(lambda gravity: weighed(pendulum("forward", **options))(y0, t0, goals, gravity), (gravity,))
-    np.testing.assert_allclose(found, expected[0], rtol=1e-8)
+    assert_allclose(found, expected[0], rtol=1e-8)
 
 
 def test_a_derivative_is_not_a_number_where_memory_does_not_hold_the_motion(monkeypatch):
@@ -129,4 +130,4 @@ def test_the_derivative_of_a_long_motion_at_round_off_is_right(backend):
     found, steps = jax.grad(turned, has_aux=True)(1.0)
     assert steps > recorded_adjoint.STEPS_ALONE
     _, expected = jax.jvp(lambda x: turned(x)[0], (1.0,), (1.0,))
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    assert_allclose(found, expected, rtol=1e-9)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
 
@@ -182,7 +183,7 @@ def test_elements_without_influence_on_the_motion_are_read_over():
     calm = URDF.replace("</link>", IDLE).replace("</robot>", "<gazebo>x<y/></gazebo><transmission name='t'/><ros2_control/></robot>")
     other = jj.from_urdf(calm, ignore=("gazebo", "transmission", "ros2_control"))()
     q, u = jj.start(own).q, jj.start(own).u
-    np.testing.assert_array_equal(jj.accelerations(own, 0.0, q, u).udot, jj.accelerations(other, 0.0, q, u).udot)
+    assert_array_equal(jj.accelerations(own, 0.0, q, u).udot, jj.accelerations(other, 0.0, q, u).udot)
     with pytest.raises(UserWarning, match=r"left out `gazebo`, `ros2_control`, `transmission`"):
         jj.from_urdf(calm)
 
@@ -298,14 +299,14 @@ def test_motors_are_clamped_as_they_are_by_mujoco(compiler, sections):
     for value in (-10.0, -0.25, 0.0, 0.25, 2.5, 10.0):
         data.ctrl[:] = value
         mujoco.mj_forward(model, data)
-        np.testing.assert_allclose(found(value), data.qfrc_actuator, rtol=1e-12, atol=1e-12)
+        assert_allclose(found(value), data.qfrc_actuator, rtol=1e-12, atol=1e-12)
 
 
 def test_motors_are_clamped_first_by_their_control_then_by_their_force():
     scene = jj.from_mjcf(swinging(['ctrlrange="-1 3" forcerange="-2 2" gear="-3"']))()
     rest = jnp.zeros(1)
     found = [float(jj.accelerations(scene, 0.0, rest, rest, {"m0": value}).udot[0]) for value in (-10.0, -0.5, 1.0, 2.5, 10.0)]
-    np.testing.assert_allclose(found, [3.0, 1.5, -3.0, -6.0, -6.0], rtol=1e-12)
+    assert_allclose(found, [3.0, 1.5, -3.0, -6.0, -6.0], rtol=1e-12)
     with pytest.raises(ValueError, match=r'`clampctrl="disable"` of `flag`'):
         jj.from_mjcf(swinging([""]).replace('<option gravity="0 0 0"/>', '<option><flag clampctrl="disable"/></option>'))
 
@@ -319,6 +320,6 @@ def test_a_clamped_motor_moves_in_lanes_and_has_derivatives():
 
     # j = gear clip(m) t^2/2
     values = jnp.array([-5.0, -0.5, 0.25, 5.0])
-    np.testing.assert_allclose(jax.jit(jax.vmap(end))(values), np.clip(values, -1, 1), rtol=1e-6)
+    assert_allclose(jax.jit(jax.vmap(end))(values), np.clip(values, -1, 1), rtol=1e-6)
     for derivative in (jax.grad, jax.jacfwd):
-        np.testing.assert_allclose([derivative(end)(value) for value in (0.25, 5.0)], [1.0, 0.0], atol=1e-6)
+        assert_allclose([derivative(end)(value) for value in (0.25, 5.0)], [1.0, 0.0], atol=1e-6)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
 
@@ -66,7 +67,7 @@ def test_a_tree_whose_tensors_are_traced_first_is_lowered_too():
     assert jj.lower(scene).operations > 0
     lanes = jj.rollout(scene, START, **SPAN, parameters={"l01_inertia": jnp.stack([BONE, 1.2 * BONE])}, progress=False)
     for k, scale in enumerate((1.0, 1.2)):
-        np.testing.assert_allclose(lanes["j01"][k], jj.simulate(scene.replace(l01_inertia=scale * BONE), START, **SPAN)["j01"], rtol=1e-9)
+        assert_allclose(lanes["j01"][k], jj.simulate(scene.replace(l01_inertia=scale * BONE), START, **SPAN)["j01"], rtol=1e-9)
 
 
 def bone():
@@ -98,7 +99,7 @@ PENDULUM = '<robot name="p"><link name="base"/><link name="arm">{}</link>' + JOI
 def test_round_off_in_a_tensor_of_zeros_is_no_moment(noise):
     arm = jj.from_urdf(PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), np.array([[0.0, noise, 0.0], [noise, 0.0, noise], [0.0, noise, 0.0]]))))()
     point = jj.from_urdf(PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), np.zeros((3, 3)))))()
-    np.testing.assert_array_equal(jj.simulate(arm, {"j": 0.3}, **SPAN).q_end, jj.simulate(point, {"j": 0.3}, **SPAN).q_end)
+    assert_array_equal(jj.simulate(arm, {"j": 0.3}, **SPAN).q_end, jj.simulate(point, {"j": 0.3}, **SPAN).q_end)
 
 
 class Point(jj.Scene):
@@ -113,7 +114,7 @@ class Point(jj.Scene):
 def test_round_off_in_a_tensor_of_a_scene_is_no_negative_moment():
     motion = jj.simulate(Point(), {"q_rate": 1.0}, **SPAN)
     assert int(motion.result) == 0
-    np.testing.assert_allclose(motion.q_end, [0.2], rtol=1e-9)
+    assert_allclose(motion.q_end, [0.2], rtol=1e-9)
     lanes = jj.rollout(Point(), {"q_rate": 1.0}, **SPAN, parameters={"noise": jnp.array([2e-35, -1e-33])}, progress=False)
     assert not np.any(np.asarray(lanes.result))
 
@@ -143,7 +144,7 @@ def test_moments_of_links_that_are_fixed_to_each_other_are_judged_together(momen
 
 def test_moments_that_no_body_has_are_taken_on_purpose():
     text = PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), np.diag((1.0, 1.0, 3.0))))
-    np.testing.assert_array_equal(jj.from_urdf(text, ignore="inertia")().arm_inertia, (1.0, 1.0, 3.0))
+    assert_array_equal(jj.from_urdf(text, ignore="inertia")().arm_inertia, (1.0, 1.0, 3.0))
 
 
 def _pendulum(form: str, moments):

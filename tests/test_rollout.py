@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose
 from small_scenes import OnLine
 
 import jourdain_jax as jj
@@ -28,7 +29,7 @@ def test_every_lane_is_the_motion_it_would_be_alone(sleighs):
     for i in (0, 3, 6):
         scene = ChaplyginSleigh(offset=offset[i])
         alone = jj.simulate(scene, {"x_rate": -0.6, "heading_rate": turning[i]}, **OPTIONS)
-        np.testing.assert_allclose(lanes.lane(i).q, alone.q, atol=1e-9)
+        assert_allclose(lanes.lane(i).q, alone.q, atol=1e-9)
         assert float(lanes.lane(i).scene.offset) == offset[i]
 
 
@@ -42,7 +43,7 @@ def test_bad_lanes_are_counted_and_named_and_harm_no_other(sleighs):
     assert "1 the start is not finite; check where its values were computed: lanes 2" in str(lanes)
     assert "1 a parameter is not finite or has the wrong sign (`offset`): lanes 5" in str(lanes)
     assert lanes.quantiles("heading", (0.5,)).shape == (1, 5)
-    np.testing.assert_allclose(lanes.quantiles("heading", (0.5,))[0], np.median(np.asarray(lanes["heading"])[good], axis=0))
+    assert_allclose(lanes.quantiles("heading", (0.5,))[0], np.median(np.asarray(lanes["heading"])[good], axis=0))
 
 
 def test_lanes_with_times_of_their_own_have_no_quantiles_in_common():
@@ -61,7 +62,7 @@ def test_lanes_with_parameters_of_the_wrong_sign_end_at_once_and_say_which():
     assert lanes.lane(1).message.endswith("(`mass`); check where it was computed")
     assert np.all(np.isnan(np.asarray(lanes["x"])[1:]))
     assert np.all(np.asarray(lanes.lanes.t_end)[1:] == 0.0)
-    np.testing.assert_allclose(lanes.lane(0).q, jj.simulate(ChaplyginSleigh(mass=1.0), **OPTIONS).q, atol=1e-9)
+    assert_allclose(lanes.lane(0).q, jj.simulate(ChaplyginSleigh(mass=1.0), **OPTIONS).q, atol=1e-9)
 
 
 def test_the_gradient_of_a_batch_is_the_sum_of_the_gradients_of_its_lanes():
@@ -75,7 +76,7 @@ def test_the_gradient_of_a_batch_is_the_sum_of_the_gradients_of_its_lanes():
         return jnp.sum(lanes.lanes.q_end[:, 2])
 
     each = sum(float(jax.grad(alone)(0.25, turning)) for turning in (0.4, 0.8))
-    np.testing.assert_allclose(jax.grad(together)(0.25), each, rtol=1e-8)
+    assert_allclose(jax.grad(together)(0.25), each, rtol=1e-8)
 
 
 def test_another_tolerance_longest_step_or_end_is_no_other_program():
@@ -92,13 +93,13 @@ def test_another_tolerance_longest_step_or_end_is_no_other_program():
     compiled.clear()
     tight, longer = ends(1.0, rtol=1e-10, atol=1e-10), ends(1.5, rtol=1e-7)
     short = ends(1.0, max_step=0.01)
-    np.testing.assert_allclose(tight.q_end, loose.q_end, rtol=1e-5)
+    assert_allclose(tight.q_end, loose.q_end, rtol=1e-5)
     assert not compiled
     assert np.all(short.accepted >= 100)
     assert np.all(tight.accepted > same.accepted)
     assert np.sum(same.accepted) > np.sum(loose.accepted)
-    np.testing.assert_allclose(tight.q_end, loose.q_end, rtol=1e-5)
-    np.testing.assert_allclose(longer.t_end, 1.5)
+    assert_allclose(tight.q_end, loose.q_end, rtol=1e-5)
+    assert_allclose(longer.t_end, 1.5)
 
 
 def test_states_made_by_hand_are_starts_of_lanes():
@@ -108,7 +109,7 @@ def test_states_made_by_hand_are_starts_of_lanes():
     options = {"ts": jnp.array([0.2]), "formulation": jj.Formulation(stabilisation=None)}
     lanes = jj.rollout(sleigh, starts, **options)
     for k, state in enumerate(made):
-        np.testing.assert_allclose(lanes.lanes.q_end[k], jj.simulate(sleigh, state, **options).q_end, rtol=1e-9, atol=1e-12)
+        assert_allclose(lanes.lanes.q_end[k], jj.simulate(sleigh, state, **options).q_end, rtol=1e-9, atol=1e-12)
 
 
 def test_lanes_that_are_given_to_devices_move_as_those_of_vmap():
@@ -118,7 +119,7 @@ def test_lanes_that_are_given_to_devices_move_as_those_of_vmap():
     speeds, lanes = jnp.array([0.4, 0.6]), jax.sharding.PartitionSpec("lanes")
     mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("lanes",))
     on_devices = jax.shard_map(jax.vmap(end), mesh=mesh, in_specs=lanes, out_specs=lanes, check_vma=False)
-    np.testing.assert_allclose(jax.jit(on_devices)(speeds), [end(speed) for speed in speeds], rtol=1e-12, atol=1e-15)
+    assert_allclose(jax.jit(on_devices)(speeds), [end(speed) for speed in speeds], rtol=1e-12, atol=1e-15)
 
 
 def test_a_number_in_a_plain_field_is_a_leaf_of_every_lane():
@@ -129,5 +130,5 @@ def test_a_number_in_a_plain_field_is_a_leaf_of_every_lane():
             return (jj.generalized_force(motion, x_rate=-self.stiffness * motion.q.x),)
 
     lanes = jj.rollout(Oscillator(), {"x": np.array([1.0, -2.0])}, **OPTIONS)
-    np.testing.assert_allclose(lanes["x"], np.outer([1.0, -2.0], np.cos(np.sqrt(2.0) * OPTIONS["ts"])), atol=1e-8)
+    assert_allclose(lanes["x"], np.outer([1.0, -2.0], np.cos(np.sqrt(2.0) * OPTIONS["ts"])), atol=1e-8)
     assert lanes.lane(1).scene.stiffness == 2.0

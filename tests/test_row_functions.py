@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import result_codes as results
 from jax.flatten_util import ravel_pytree
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 from jourdain_jax import structure_of
@@ -69,9 +70,9 @@ def test_rows_by_machine_code_have_the_derivatives_of_the_scenes_own(scene, orde
 
     found = derivatives(row_functions(program))
     for one, expected in zip(jax.jit(found)(x), eval_numpy(derivatives(BY_AUTODIFF))(x), strict=True):
-        np.testing.assert_allclose(one, expected, rtol=1e-11, atol=1e-11)
+        assert_allclose(one, expected, rtol=1e-11, atol=1e-11)
     for many, one in zip(jax.jit(jax.vmap(found))(jnp.stack([1.1 * x, x])), jax.jit(found)(x), strict=True):
-        np.testing.assert_allclose(many[1], one, rtol=1e-12, atol=1e-12)
+        assert_allclose(many[1], one, rtol=1e-12, atol=1e-12)
 
 
 @needs_llvmlite
@@ -105,7 +106,7 @@ def test_rows_of_a_large_scene_have_the_derivatives_of_the_scenes_own():
 
     found, expected = jax.jit(along(row_functions(row_program(scene))))(q), eval_numpy(along(BY_AUTODIFF))(q)
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+        assert_allclose(one, other, rtol=1e-12, atol=1e-12)
 
 
 def of_skate(y_rate):
@@ -119,8 +120,8 @@ def test_values_that_contradict_each_other_get_a_result_code_where_they_are_trac
         of_skate(0.5)
     for result, u, moved in (seen(1e-7), (lambda motion: (motion.result, motion.u[0], motion.moved_u))(of_skate(1e-7))):
         assert int(result) == results.SUCCESS
-        np.testing.assert_allclose(u, [1.0, 0.0, 0.1], atol=1e-15)  # what passes for round-off moves
-        np.testing.assert_allclose(moved, 1e-7, rtol=1e-6)
+        assert_allclose(u, [1.0, 0.0, 0.1], atol=1e-15)  # what passes for round-off moves
+        assert_allclose(moved, 1e-7, rtol=1e-6)
     lanes = jj.rollout(jj.models.Skate(), {"heading": 0.0, "x_rate": 1.0, "y_rate": jnp.array([0.0, 0.5, 1e-7]), "heading_rate": 0.1}, t1=0.5)
     assert np.asarray(lanes.result).tolist() == [results.SUCCESS, results.INCONSISTENT_START, results.SUCCESS]
 
@@ -167,4 +168,4 @@ def test_a_scene_whose_parameters_are_judged_by_an_unknown_operation_moves_witho
     none, found = moved()
     assert program is not None
     assert none is None
-    np.testing.assert_allclose(found, known, rtol=0, atol=1e-8)
+    assert_allclose(found, known, rtol=0, atol=1e-8)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 
@@ -82,7 +83,7 @@ def test_slow_motions_are_as_fast_ones(size):
 
     found = end((0.6 * size, 0.8 * size, 0.0), 2.0 * size)
     assert int(found.result) == results.SUCCESS
-    np.testing.assert_allclose(found.u_end[:2] / size, [0.69710104, -0.7169729], rtol=1e-6)
+    assert_allclose(found.u_end[:2] / size, [0.69710104, -0.7169729], rtol=1e-6)
 
 
 def test_derivatives_beyond_are_no_numbers():
@@ -92,5 +93,5 @@ def test_derivatives_beyond_are_no_numbers():
         return _end(_scene(row, stop), speeds, ts=[0.5, 2.0], backend="native")
 
     before = jax.jacfwd(lambda stop: end(stop).q[0, 0])(0.7), jax.grad(lambda stop: end(stop).q[0, 0])(0.7)
-    np.testing.assert_allclose(before, 0.6 * 0.5**2 / (2 * 0.7**2), rtol=1e-6)  # of x = 0.6 (t - t^2/(2 stop))
+    assert_allclose(before, 0.6 * 0.5**2 / (2 * 0.7**2), rtol=1e-6)  # of x = 0.6 (t - t^2/(2 stop))
     assert np.isnan([jax.jacfwd(lambda stop: end(stop).q_end[0])(0.7), jax.grad(lambda stop: end(stop).q_end[0])(0.7)]).all()

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose, assert_array_equal
 from test_along_batches import Oscillator
 
 import jourdain_jax as jj
@@ -50,9 +51,9 @@ def test_traced_times_that_do_not_go_together_end_in_a_code_of_their_own_and_no_
     assert lanes.result.tolist() == [results.BAD_TIMES] * wrong + [results.SUCCESS] * len(RIGHT)
     assert np.isnan(lanes.q[:wrong]).all()
     assert np.isnan(lanes.u[:wrong]).all()
-    np.testing.assert_array_equal(lanes.ts, stacked["ts"])
-    np.testing.assert_allclose(lanes.q[wrong:, :, 0], np.cos(2.0 * (stacked["ts"] - stacked["t0"][:, None]))[wrong:], atol=1e-5)
-    np.testing.assert_allclose(lanes.t_end[wrong:], stacked["t1"][wrong:], rtol=1e-14)
+    assert_array_equal(lanes.ts, stacked["ts"])
+    assert_allclose(lanes.q[wrong:, :, 0], np.cos(2.0 * (stacked["ts"] - stacked["t0"][:, None]))[wrong:], atol=1e-5)
+    assert_allclose(lanes.t_end[wrong:], stacked["t1"][wrong:], rtol=1e-14)
 
 
 def test_lanes_with_times_of_their_own_are_judged_one_by_one():
@@ -61,7 +62,7 @@ def test_lanes_with_times_of_their_own_are_judged_one_by_one():
     lanes = jj.rollout(Oscillator(), states, ts=[0.5, 1.0], progress=False)
     assert lanes.result.tolist() == [results.SUCCESS, results.SUCCESS, results.BAD_TIMES, results.BAD_TIMES]
     assert np.isnan(lanes.lanes.q[2:]).all()
-    np.testing.assert_allclose(lanes["x"][:2, -1], np.cos(2.0 * (1.0 - begun[:2])), atol=1e-6)
+    assert_allclose(lanes["x"][:2, -1], np.cos(2.0 * (1.0 - begun[:2])), atol=1e-6)
     assert "the times to save at leave the span or are not in order" in str(lanes)
     assert "lanes 2, 3" in str(lanes)
     with pytest.raises(jj.SimulationError, match="the times to save at"):
@@ -75,7 +76,7 @@ def test_a_lane_with_wrong_times_takes_no_part_in_derivatives():
         return jnp.sum(jnp.where(lanes.succeeded, lanes.q_end[:, 0], 0.0))
 
     slope = jax.grad(loss)(4.0, jnp.array([0.0, 0.7]))
-    np.testing.assert_allclose(slope, -np.sin(2.0) / 4.0, rtol=1e-6)
+    assert_allclose(slope, -np.sin(2.0) / 4.0, rtol=1e-6)
 
 
 def test_even_times_of_any_span_go_together():

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import Bead
 
 import jourdain_jax as jj
@@ -24,7 +25,7 @@ def at_rest(scene, **options):
 
 def test_one_load_counts_as_a_tuple_of_one():
     one = described(loads=lambda self, motion: jj.generalized_force(motion, x_rate=3.0))
-    np.testing.assert_allclose(at_rest(one).udot, [3.0, 0.0])
+    assert_allclose(at_rest(one).udot, [3.0, 0.0])
     jj.simulate(one, {}, t1=0.1)
 
 
@@ -62,25 +63,25 @@ def test_lists_and_integers_are_numbers():
     pulled = described(loads=lambda self, m: (jj.spring(m["bead"].point((0, 0, 0)), jj.fixed_point((0, 0, 1)), 2, 1),), prescribed=lambda self, t: {"y": 0})
     exact = jj.accelerations(pulled, 0.0, jnp.array([1.0, 0.0]), jnp.array([0.0, 0.0]), reduction="svd").udot
     for q in ([1, 0], (1.0, 0.0), np.array([1, 0]), jnp.array([1, 0], jnp.int32)):
-        np.testing.assert_allclose(jj.accelerations(pulled, 0, q, [0, 0], reduction="svd").udot, exact)
-        np.testing.assert_allclose(jj.unconstrained_equations(pulled, 0, q, [0, 0]).M, np.eye(2))
-        np.testing.assert_allclose(jj.position_residual(pulled, 0, q), [0.0])
-        np.testing.assert_allclose(jj.velocity_residual(pulled, 0, q, [0, 2]), [2.0])
-        np.testing.assert_allclose(jj.kinetic_energy(pulled, 0, q, [0, 2]), 2.0)
-        np.testing.assert_allclose(jj.gibbs_function(pulled, 0, q, [0, 0], [0, 2]), 2.0)
+        assert_allclose(jj.accelerations(pulled, 0, q, [0, 0], reduction="svd").udot, exact)
+        assert_allclose(jj.unconstrained_equations(pulled, 0, q, [0, 0]).M, np.eye(2))
+        assert_allclose(jj.position_residual(pulled, 0, q), [0.0])
+        assert_allclose(jj.velocity_residual(pulled, 0, q, [0, 2]), [2.0])
+        assert_allclose(jj.kinetic_energy(pulled, 0, q, [0, 2]), 2.0)
+        assert_allclose(jj.gibbs_function(pulled, 0, q, [0, 0], [0, 2]), 2.0)
         assert jj.newton_residual(pulled, 0, q, [0, 0], [0, 0]).linear.shape == (1, 3)
 
 
 def test_a_body_of_integers_has_velocities():
     whole = described(bodies=lambda self, t, q: {"bead": jj.Particle(1, [q.x, q.y, 0]), "post": jj.RigidBody(1, [1, 1, 1], [0, 0, 0], np.eye(3, dtype=int))})
-    np.testing.assert_allclose(at_rest(whole).udot, [0.0, 0.0])
+    assert_allclose(at_rest(whole).udot, [0.0, 0.0])
 
 
 def test_inputs_are_given_by_name_or_as_a_vector():
     chain = TrailerChain(trailers=1)
     q, u, _ = chain.named(**chain.example)
     by_name = jj.accelerations(chain, 0.0, q, u, {"turn": 2.0}).udot
-    np.testing.assert_array_equal(by_name, jj.accelerations(chain, 0.0, q, u, [0, 2]).udot)
+    assert_array_equal(by_name, jj.accelerations(chain, 0.0, q, u, [0, 2]).udot)
     with pytest.raises(ValueError, match="`TrailerChain` has no input `trun`; did you mean `turn`"):
         jj.accelerations(chain, 0.0, q, u, {"trun": 2.0})
     with pytest.raises(ValueError, match="input `turn` of `TrailerChain` is a function, expected real numbers; a function of time is for `simulate`"):

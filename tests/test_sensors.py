@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import machine_code
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import Cart, OnLine
 
 import jourdain_jax as jj
@@ -102,7 +103,7 @@ def test_a_command_through_a_low_pass_is_exact_at_its_samples(lag):
     for k, h in enumerate(np.diff(fine)):  # linear in each of these intervals: their integral in closed form
         slope, decay = (x[k + 1] - x[k]) / h, np.exp(-h / lag) if lag else 0.0
         y[k + 1] = x[k + 1] - lag * slope + (y[k] - x[k] + lag * slope) * decay
-    np.testing.assert_allclose(found, np.interp(ts, fine, y), atol=1e-12)
+    assert_allclose(found, np.interp(ts, fine, y), atol=1e-12)
 
 
 # Estimates. -------------------------------------------------------------------------------------------------------------
@@ -115,7 +116,7 @@ def test_numbers_of_a_sensor_are_found_with_the_parameters(names):
     assert found.converged
     assert found.labels == ("mass", "damping", *(f"gyro.{name}" for name in sorted(names)))
     expected = [MASS, DAMPING, *(TRUTH[name] for name in sorted(names))]
-    np.testing.assert_allclose(found.values, expected, rtol=1e-5)
+    assert_allclose(found.values, expected, rtol=1e-5)
     assert found.chi_square < 1e-8  # the square of the tolerance
     # covariance: from differences of the closed form
     counted = np.isfinite(run().values["gyro"])
@@ -125,7 +126,7 @@ def test_numbers_of_a_sensor_are_found_with_the_parameters(names):
         return np.concatenate([shown(TS, *theta[:2], order=0) / 0.002, shown(TS, *theta[:2], **numbers)[counted] / 0.005])
 
     J = np.stack([(residual(expected + h) - residual(expected - h)) / 2e-5 for h in 1e-5 * np.eye(len(expected))], axis=1)
-    np.testing.assert_allclose(found.covariance, np.linalg.inv(J.T @ J), rtol=1e-3)
+    assert_allclose(found.covariance, np.linalg.inv(J.T @ J), rtol=1e-3)
 
 
 def test_a_bias_of_each_run_and_a_delay_that_all_share():
@@ -146,7 +147,7 @@ def test_runs_with_other_sensors_of_one_channel_share_what_they_estimate():
     runs = [run(gain=GAIN), run(truth=TRUTH | {"gain": 2.0}), run(truth=IDEAL | {"gain": 1.2}, gain=GAIN)]
     found = jj.fit(Cart(mass=1.9), runs, ("mass",))
     assert found.labels == ("mass", "gyro.gain")
-    np.testing.assert_allclose(found.values, [MASS, 1.2], rtol=1e-5)
+    assert_allclose(found.values, [MASS, 1.2], rtol=1e-5)
 
 
 def test_a_sensor_shows_functions_and_coordinates_under_other_names():
@@ -154,12 +155,12 @@ def test_a_sensor_shows_functions_and_coordinates_under_other_names():
     x, v = shown(TS, order=0), shown(TS, gain=1.3)
     values = {"place": np.stack([x, 0 * x, 0 * x], axis=1), "encoder": x, "x_rate": v}
     found = jj.fit(Cart(mass=1.8), jj.Experiment(TS, values, 0.01, start={"x": 0.3, "x_rate": 0.0}, sensors=seen), ("mass",))
-    np.testing.assert_allclose(found.values, [MASS, 1.3], rtol=1e-6)
+    assert_allclose(found.values, [MASS, 1.3], rtol=1e-6)
     # a gain and a bias for each component
     each = jj.Sensor(lambda motion: motion["cart"].position, gain=jj.Estimate((1.0, 1.0, 1.0)), bias=jj.Estimate((0.0, 0.0, 0.0)), delay=0.0)
     bent = jj.Experiment(TS, {"place": values["place"] * 0.9 + np.array([0.1, 0.2, 0.3])}, 0.01, start={"x": 0.3, "x_rate": 0.0}, sensors={"place": each})
     found = jj.fit(Cart(), bent, ())
-    np.testing.assert_allclose([found[f"place.bias[{i}]"].value for i in range(3)], [0.1, 0.2, 0.3], atol=1e-6)
+    assert_allclose([found[f"place.bias[{i}]"].value for i in range(3)], [0.1, 0.2, 0.3], atol=1e-6)
     assert found["place.gain[0]"].value == pytest.approx(0.9, rel=1e-6)
     assert {"`place.gain[1]` does not show in any channel", "`place.gain[2]` does not show in any channel"} == set(found.not_identifiable)
 
@@ -185,7 +186,7 @@ def test_an_accelerometer_feels_centripetal_and_tangential_acceleration_and_grav
     felt = np.stack([-0.2 * rate**2, -16 * 0.2 * turn, 9.81 + 0 * TS], axis=1)
     seen = jj.Accelerometer("arm", (0.2, 0.0, 0.1))
     motion = jj.simulate(Swing(), {"turn": 0.7}, ts=TS, rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(seen.over_times(motion), felt, atol=1e-7)
+    assert_allclose(seen.over_times(motion), felt, atol=1e-7)
     sensor, missing, shown, rough = seen, TS < 0, felt, 0.0
     if late:
         sensor, missing = jj.Sensor(seen, delay=jj.Estimate(0.03, range=jj.bounds(0.0, 0.1))), TS < 0.1
@@ -205,7 +206,7 @@ def test_a_load_cell_shows_what_the_ground_bears_and_tells_a_mass():
     disc, start, cell = jj.models.TiltingDisc(mass=1.3), {"lean": 0.4, "spin_rate": -4.0, "yaw_rate": 0.5}, jj.LoadCell("rim")
     motion = jj.simulate(disc, start, ts=TS, rtol=1e-10, atol=1e-10)
     force, felt = cell.over_times(motion), jj.Accelerometer("disc").over_times(motion)
-    np.testing.assert_allclose(force, 1.3 * jnp.einsum("tij,tj->ti", motion.motions()["disc"].orientation, felt), atol=1e-9)  # F = m (a - g)
+    assert_allclose(force, 1.3 * jnp.einsum("tij,tj->ti", motion.motions()["disc"].orientation, felt), atol=1e-9)  # F = m (a - g)
     data = jj.Experiment(TS, {"plate": force}, 0.1, start=start, sensors={"plate": cell})
     found = jj.fit(disc.replace(mass=1.0), data, ("mass", "radius"))
     assert found["mass"].value == pytest.approx(1.3, rel=1e-6)
@@ -248,7 +249,7 @@ def test_a_lag_of_zero_is_left_where_a_delay_stands_in_for_it():
     assert far.converged
     assert not far.warnings
     assert float(far.chi_square) == pytest.approx(float(near.chi_square), rel=1e-6)
-    np.testing.assert_allclose(far.values, near.values, rtol=1e-3)
+    assert_allclose(far.values, near.values, rtol=1e-3)
     assert far["late.lag"].low < 0.1 < far["late.lag"].high
 
 
@@ -274,7 +275,7 @@ def test_a_likelihood_with_sensors_is_the_same_by_machine_code_and_by_xla():
         return jj.log_likelihood(Cart(mass=mass), data, backend=backend)
 
     native, xla = (jax.jit(lambda m, backend=backend: jax.jvp(lambda m: likelihood(m, backend), (m,), (1.0,)))(1.8) for backend in ("native", "xla"))
-    np.testing.assert_allclose(native, xla, rtol=1e-7)
+    assert_allclose(native, xla, rtol=1e-7)
 
 
 def test_other_numbers_of_a_sensor_compile_nothing(compilations):
@@ -303,8 +304,8 @@ def test_a_prior_counts_as_a_measurement():
 def test_a_prior_alone_is_an_estimate_with_it():
     data = run(7, sigma=0.01)
     long, short = (jj.fit(Cart(), data, {"mass": given}) for given in (jj.Estimate(prior=jj.Normal(2.005, 0.003)), jj.Normal(2.005, 0.003)))
-    np.testing.assert_array_equal(long.values, short.values)
-    np.testing.assert_array_equal(long.standard_errors, short.standard_errors)
+    assert_array_equal(long.values, short.values)
+    assert_array_equal(long.standard_errors, short.standard_errors)
 
 
 def test_priors_of_starts_and_of_numbers_of_single_runs():
@@ -320,8 +321,8 @@ def test_priors_of_starts_and_of_numbers_of_single_runs():
         assert tight[f"run {k}: x"].standard_error == pytest.approx(1e-6, rel=1e-3)
         assert loose[f"run {k}: x"].standard_error > 1e-4
     fixed = jj.fit(Cart(mass=1.9), [run(10 + k, sigma=0.01) for k in range(3)], ("mass",))
-    np.testing.assert_allclose(tight["mass"].value, fixed["mass"].value, rtol=1e-5)
-    np.testing.assert_allclose(tight["mass"].standard_error, fixed["mass"].standard_error, rtol=1e-3)
+    assert_allclose(tight["mass"].value, fixed["mass"].value, rtol=1e-5)
+    assert_allclose(tight["mass"].standard_error, fixed["mass"].standard_error, rtol=1e-3)
 
 
 # What cannot be told. -----------------------------------------------------------------------------------------------------
@@ -406,7 +407,7 @@ def test_a_command_that_holds_keeps_each_value_until_the_next():
     data = jj.Experiment(ts, {"x_rate": 1.3 * exact}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs={"push": actuator})
     found = jj.fit(Mass(), data, (), rtol=1e-9, atol=1e-9)
     assert found.converged
-    np.testing.assert_allclose([found["push.delay"].value, found["push.gain"].value], [delay, 1.3], atol=1e-6)
+    assert_allclose([found["push.delay"].value, found["push.gain"].value], [delay, 1.3], atol=1e-6)
     assert max(np.abs(found.residuals[0]["x_rate"])) < 0.05  # of a sigma: samples within half a passage see it
 
 
@@ -416,7 +417,7 @@ def test_a_lag_after_a_command_that_holds():
     actuator = jj.Actuator(jj.Sampled(knots, command), lag=jj.Estimate(0.05), hold=True)
     data = jj.Experiment(ts, {"x_rate": exact}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs={"push": actuator})
     found = jj.fit(Mass(), data, (), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(found["push.lag"].value, 0.1, rtol=0.03)  # linear between samples, of half a lag
+    assert_allclose(found["push.lag"].value, 0.1, rtol=0.03)  # linear between samples, of half a lag
 
 
 def test_numbers_of_an_actuator_are_found():
@@ -424,7 +425,7 @@ def test_numbers_of_an_actuator_are_found():
     data = driven(TRUTH, **asked)
     found = jj.fit(Cart(mass=1.9), data, ("mass",), rtol=1e-10, atol=1e-10)
     assert found.labels == ("mass", "push.bias", "push.delay", "push.gain", "push.lag")
-    np.testing.assert_allclose(found.values, [MASS, *(TRUTH[name] for name in sorted(TRUTH))], rtol=1e-4)
+    assert_allclose(found.values, [MASS, *(TRUTH[name] for name in sorted(TRUTH))], rtol=1e-4)
     # slopes: the curvature of log-likelihoods, by differences of simulations
     step = 1e-4
 
@@ -434,7 +435,7 @@ def test_numbers_of_an_actuator_are_found():
 
     J = np.stack([(states(**{n: TRUTH[n] + step}) - states(**{n: TRUTH[n] - step})) / (2 * step) for n in sorted(TRUTH)], axis=1)
     alone = jj.fit(Cart(), data, (), rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(alone.covariance, np.linalg.inv(J.T @ J), rtol=2e-3)
+    assert_allclose(alone.covariance, np.linalg.inv(J.T @ J), rtol=2e-3)
 
 
 def test_an_actuator_with_known_numbers_is_an_input_like_any_other():

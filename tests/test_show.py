@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from browser import needs_browser, screenshot
+from numpy.testing import assert_allclose
 from rolling_scenes import DiscOnHill, hill
 
 import jourdain_jax as jj
@@ -73,20 +74,20 @@ def test_a_page_holds_the_poses_that_the_scene_has(motion, shown):
     assert page["names"] == [{"name": "ball", "colour": RED}]
     assert page["span"] == [0.0, 2.0]
     (one,) = page["motions"]
-    np.testing.assert_allclose(numbers(one["ts"]), motion.ts, atol=1e-6)
+    assert_allclose(numbers(one["ts"]), motion.ts, atol=1e-6)
     ball, frame = one["bodies"]
     expected = motion.motions()["ball"]
-    np.testing.assert_allclose(numbers(ball["p"]).reshape(-1, 3), expected.position, atol=1e-6)
+    assert_allclose(numbers(ball["p"]).reshape(-1, 3), expected.position, atol=1e-6)
     for q, R in zip(numbers(ball["q"]).reshape(-1, 4), expected.orientation, strict=True):
-        np.testing.assert_allclose(matrix(q), R, atol=1e-6)
+        assert_allclose(matrix(q), R, atol=1e-6)
     assert [(shape["kind"], shape["size"]) for shape in ball["shapes"]] == [("ellipsoid", [0.1, 0.1, 0.1])]  # known from its contact
     rope, table = frame["shapes"]
-    np.testing.assert_allclose(numbers(rope["points"]).reshape(-1, 2, 3)[:, 1], expected.position, atol=1e-6)
+    assert_allclose(numbers(rope["points"]).reshape(-1, 2, 3)[:, 1], expected.position, atol=1e-6)
     assert (table["kind"], len(numbers(table["p"]))) == ("box", 3)
     (path,), (force,) = one["paths"], one["forces"]
-    np.testing.assert_allclose(numbers(path["points"]).reshape(-1, 3), np.asarray(expected.position) - [0, 0, 0.1], atol=1e-6)
+    assert_allclose(numbers(path["points"]).reshape(-1, 3), np.asarray(expected.position) - [0, 0, 0.1], atol=1e-6)
     arrows = numbers(force["vectors"]).reshape(-1, 3)
-    np.testing.assert_allclose(arrows / np.linalg.norm(arrows, axis=1)[:, None], np.tile([0.0, 0.0, 1.0], (9, 1)), atol=1e-6)
+    assert_allclose(arrows / np.linalg.norm(arrows, axis=1)[:, None], np.tile([0.0, 0.0, 1.0], (9, 1)), atol=1e-6)
     assert "longest arrow: 19.6 N" in page["note"]  # 2 kg
     (ground,) = page["grounds"]
     assert (ground["kind"], ground["p"][2]) == ("plane", 0.0)
@@ -114,7 +115,7 @@ def test_arrows_of_usual_forces_are_seen_beside_a_force_that_is_far_larger():
     lengths = np.linalg.norm(numbers(force["vectors"]).reshape(-1, 3), axis=1)
     weight = 2.0 * 9.81
     assert "longest arrow: 39.2 N and more, up to 1e+04 N" in page["note"]
-    np.testing.assert_allclose(lengths[[0, -1]], lengths.max() * weight / (2 * weight), rtol=1e-5)
+    assert_allclose(lengths[[0, -1]], lengths.max() * weight / (2 * weight), rtol=1e-5)
     assert lengths.argmax() == 20
 
 
@@ -132,7 +133,7 @@ def test_a_ride_of_ten_seconds_is_one_file_below_a_megabyte(tmp_path):
     assert {shape["kind"] for body in wheels.values() for shape in body["shapes"]} == {"wheel"}
     expected = ride.motions()
     for name, body in wheels.items():
-        np.testing.assert_allclose(numbers(body["p"]).reshape(-1, 3), expected[name].position, atol=1e-5)
+        assert_allclose(numbers(body["p"]).reshape(-1, 3), expected[name].position, atol=1e-5)
 
 
 def test_a_notebook_shows_the_page_in_a_frame(shown):
@@ -176,20 +177,20 @@ def test_bodies_are_guessed_from_contacts_lines_and_inertias():
     bare = eqx.tree_at(lambda b: b.outline, box, jnp.zeros((0, 3)))
     (by_inertia,) = guessed(bare, [], 0.01)
     assert by_inertia.kind == "box"
-    np.testing.assert_allclose(np.sort(by_inertia.size), [0.2, 0.3, 0.5], rtol=1e-6)
+    assert_allclose(np.sort(by_inertia.size), [0.2, 0.3, 0.5], rtol=1e-6)
     (by_lines,) = guessed(box, [], 0.01)
-    np.testing.assert_allclose(np.ptp(by_lines.faces.corners, axis=0), [0.2, 0.3, 0.5])
+    assert_allclose(np.ptp(by_lines.faces.corners, axis=0), [0.2, 0.3, 0.5])
     disc = jj.RigidBody.thin_disc(1.0, 0.4, axis="x", position=place, orientation=turned)
     (wheel,) = guessed(disc, [], 0.01)
     assert (wheel.kind, float(wheel.size[0])) == ("wheel", pytest.approx(0.4))
-    np.testing.assert_allclose(np.abs(wheel.orientation[:, 2]), [1, 0, 0], atol=1e-9)
+    assert_allclose(np.abs(wheel.orientation[:, 2]), [1, 0, 0], atol=1e-9)
     pose = jj.pose_at(jj.models.Rattleback(), 0.0, jnp.array([0.0, 0.0, 0.1, 0.2, 0.3]))
     contact = jj.models.Rattleback().contacts(pose)["sole"]
     stone = pose["stone"].body
     (egg,) = guessed(stone, [contact.shape], 0.01)
     assert egg.kind == "ellipsoid"
-    np.testing.assert_allclose(egg.position, [0, 0, -0.01], atol=1e-12)
-    np.testing.assert_allclose(egg.orientation, np.eye(3), atol=1e-12)
+    assert_allclose(egg.position, [0, 0, -0.01], atol=1e-12)
+    assert_allclose(egg.orientation, np.eye(3), atol=1e-12)
     (dot,) = guessed(jj.Particle(1.0, place), [], 0.01)
     assert float(dot.size[0]) == 0.01
 
@@ -234,7 +235,7 @@ def test_grounds_of_every_kind_are_drawn_where_they_are(make, lowest):
     (drawn,) = page["grounds"]
     corners = numbers(drawn["mesh"]).reshape(-1, 3)
     assert corners[:, 2].min() == pytest.approx(lowest, abs=2e-3)
-    np.testing.assert_allclose([float(make().value(corner)) for corner in corners[:: len(corners) // 20]], 0.0, atol=1e-5)
+    assert_allclose([float(make().value(corner)) for corner in corners[:: len(corners) // 20]], 0.0, atol=1e-5)
 
 
 def test_what_cannot_be_shown_is_refused_with_advice(motion, tmp_path):

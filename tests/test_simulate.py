@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose
 from small_scenes import Upright
 
 import jourdain_jax as jj
@@ -38,8 +39,8 @@ def test_an_event_stops_the_motion_at_the_closed_form_time():
     motion = jj.simulate(Falling(), t1=3.0, rtol=1e-10, atol=1e-10)
     assert int(motion.result) == results.EVENT
     assert "`landed`" in motion.message
-    np.testing.assert_allclose(motion.t_end, flight_time(5.0), rtol=1e-12)
-    np.testing.assert_allclose(motion.q_end, [2 * flight_time(5.0), -0.5], rtol=1e-11)
+    assert_allclose(motion.t_end, flight_time(5.0), rtol=1e-12)
+    assert_allclose(motion.q_end, [2 * flight_time(5.0), -0.5], rtol=1e-11)
     later = np.asarray(motion.ts) > float(motion.t_end)
     assert np.all(np.isnan(np.asarray(motion.q)[later]))
     assert np.all(np.isfinite(np.asarray(motion.q)[~later]))
@@ -49,7 +50,7 @@ def test_an_event_time_does_not_depend_on_the_times_saved():
     def landing(longer):
         return jj.simulate(Falling(), ts=longer * jnp.linspace(0.0, 2.0, 5)).t_end
 
-    np.testing.assert_allclose(jax.grad(landing)(1.0), 0.0, atol=1e-10)
+    assert_allclose(jax.grad(landing)(1.0), 0.0, atol=1e-10)
 
 
 def test_a_motion_that_starts_beyond_an_event_does_not_start():
@@ -77,7 +78,7 @@ def test_minimal_and_full_state_give_the_same_motion():
     options = {"t1": 3.0, "rtol": 1e-10, "atol": 1e-10}
     minimal, full = (jj.simulate(ChaplyginSleigh(), formulation=jj.Formulation(form), **options) for form in ("minimal", "full"))
     assert (minimal.state_form, full.state_form) == ("minimal", "full")
-    np.testing.assert_allclose(minimal.q, full.q, atol=1e-8)
+    assert_allclose(minimal.q, full.q, atol=1e-8)
     assert float(jnp.max(jnp.abs(minimal.residuals()[1]))) < 1e-14
     assert float(jnp.max(jnp.abs(full.residuals()[1]))) < 1e-13  # by projection
 
@@ -127,7 +128,7 @@ def test_reversed_time_runs_back_to_the_start():
     scene = there.scene
     end = jj.consistent(scene, 2.0, there.q_end, there.u_end)
     back = jj.simulate(scene, end, t0=2.0, t1=0.0, rtol=1e-11, atol=1e-11)
-    np.testing.assert_allclose(back.q_end, there.q[0], atol=1e-8)
+    assert_allclose(back.q_end, there.q[0], atol=1e-8)
 
 
 def test_simulate_traces_once_for_different_numbers():
@@ -180,7 +181,7 @@ def test_a_reduction_by_privileged_speeds_too_light_for_the_precision_is_warned_
     by_wheel = jj.Privileged((2,))
     for inertia, reduction in ((0.25, by_wheel), (1e-8, by_wheel), (1e-20, "qr")):
         motion = pulled(inertia, reduction)
-        np.testing.assert_allclose(motion.q_end, 2 / (1 + inertia) * np.array([1.0, 0.0, 1.0]), rtol=1e-7)
+        assert_allclose(motion.q_end, 2 / (1 + inertia) * np.array([1.0, 0.0, 1.0]), rtol=1e-7)
         assert motion.warnings == ()
     # one digit is left of the wheel's acceleration: what its turning would be off by, the projection of its rate does not show
     assert int(pulled(1e-30, "qr").result) == results.MAX_STEPS

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose
 from small_scenes import Upright
 
 import jourdain_jax as jj
@@ -31,7 +32,7 @@ def test_any_solver_lands_on_the_saved_times(solver):
     ts = jnp.array([0.11, 0.123, 0.3])
     motion = jj.simulate(Falling(), {"x_rate": 2.0}, ts=ts, solver=solver)
     assert int(motion.result) == results.SUCCESS
-    np.testing.assert_allclose(motion["x"], 2.0 * ts, rtol=1e-12)
+    assert_allclose(motion["x"], 2.0 * ts, rtol=1e-12)
 
 
 def test_an_implicit_solver_serves_a_projected_scene():
@@ -39,19 +40,19 @@ def test_an_implicit_solver_serves_a_projected_scene():
     options = {"t1": 0.5, "rtol": 1e-8, "atol": 1e-8}
     implicit, explicit = jj.simulate(scene, solver=diffrax.Kvaerno5(), **options), jj.simulate(scene, **options)
     assert int(implicit.result) == results.SUCCESS
-    np.testing.assert_allclose(implicit.q_end, explicit.q_end, atol=1e-6)
+    assert_allclose(implicit.q_end, explicit.q_end, atol=1e-6)
 
 
 def test_a_motion_starts_at_the_time_of_its_state():
     start = jj.start(Falling(), t0=3.0, x_rate=1.0)
     motion = jj.simulate(Falling(), start, t1=3.5)
     assert float(motion.ts[0]) == 3.0
-    np.testing.assert_allclose(motion.q_end[0], 0.5, rtol=1e-12)
+    assert_allclose(motion.q_end[0], 0.5, rtol=1e-12)
 
 
 def test_a_start_given_by_names_says_how_far_it_was_moved():
     motion = jj.simulate(MODELS["skate"](), {"heading": 0.5, "x_rate": 1.0}, t1=0.1)
-    np.testing.assert_allclose(motion.moved_u, np.tan(0.5), rtol=1e-9)  # y_rate, from zero
+    assert_allclose(motion.moved_u, np.tan(0.5), rtol=1e-9)  # y_rate, from zero
 
 
 class Tied(jj.Scene):
@@ -72,4 +73,4 @@ class Tied(jj.Scene):
 def test_a_batch_is_probed_near_its_own_parameters():
     lanes = jj.rollout(Tied(length=6.0), {"x": np.array([4.0, 5.2]), "z_rate": 1.0}, parameters={"length": np.array([5.0, 6.0])}, t1=0.5)
     assert list(lanes.result) == [results.SUCCESS, results.SUCCESS]
-    np.testing.assert_allclose(lanes.lanes.q_end, [[4.0, 3.0, 0.5], [np.sqrt(27.0), 3.0, 0.5]], atol=1e-9)
+    assert_allclose(lanes.lanes.q_end, [[4.0, 3.0, 0.5], [np.sqrt(27.0), 3.0, 0.5]], atol=1e-9)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from oracles import rolling_disc
 from small_scenes import OnLine
 
@@ -50,36 +51,36 @@ def test_derivatives_of_a_steady_motion_are_those_of_the_closed_form():
     h = 1e-4
     expected = [(closed(0.5 + h, 0.3) - closed(0.5 - h, 0.3)) / (2 * h), (closed(0.5, 0.3 + h) - closed(0.5, 0.3 - h)) / (2 * h)]
     reverse = jax.jit(jax.grad(_spin, (0, 1)))(0.5, 0.3)
-    np.testing.assert_allclose(reverse, expected, rtol=1e-6)
-    np.testing.assert_allclose(jax.jit(jax.jacfwd(_spin, (0, 1)))(0.5, 0.3), reverse, rtol=1e-12)
+    assert_allclose(reverse, expected, rtol=1e-6)
+    assert_allclose(jax.jit(jax.jacfwd(_spin, (0, 1)))(0.5, 0.3), reverse, rtol=1e-12)
 
 
 @pytest.mark.slow
 def test_second_derivatives_of_a_steady_motion_are_those_of_the_closed_form():
     h = 1e-4
     second = (_circle(0.3, 2.0, radius=0.5 + h) + _circle(0.3, 2.0, radius=0.5 - h) - 2 * _circle(0.3, 2.0, radius=0.5)) / h**2
-    np.testing.assert_allclose(jax.jit(jax.jacfwd(jax.jacfwd(_spin)))(0.5, 0.3), second, rtol=1e-5)  # differences of second order at 1e-4
+    assert_allclose(jax.jit(jax.jacfwd(jax.jacfwd(_spin)))(0.5, 0.3), second, rtol=1e-5)  # differences of second order at 1e-4
 
 
 def test_steady_motions_are_found_in_batches():
     leans = jnp.array([0.2, 0.5, 0.8])
     found = jax.jit(jax.vmap(lambda lean: steady(TiltingDisc(**DISC), {**GUESS, "lean": lean}, held=HELD)))(leans)
-    np.testing.assert_allclose(found["spin_rate"], [_circle(float(lean), 2.0) for lean in leans], rtol=1e-11)
+    assert_allclose(found["spin_rate"], [_circle(float(lean), 2.0) for lean in leans], rtol=1e-11)
     assert bool(jnp.all(found.converged))
 
 
 def test_a_pendulum_comes_to_rest_at_an_equilibrium():
     pendulum = DoublePendulumAngles()
     found = steady(pendulum, {"theta1": 0.4, "theta2": -0.3, "theta1_rate": 0.5})
-    np.testing.assert_allclose(jnp.concatenate([found.state.q, found.state.u]), np.zeros(4), atol=1e-12)
+    assert_allclose(jnp.concatenate([found.state.q, found.state.u]), np.zeros(4), atol=1e-12)
     inverted = steady(pendulum, {"theta1": 3.0, "theta2": 0.1})
-    np.testing.assert_allclose(inverted.state.q, [np.pi, 0.0], atol=1e-12)
+    assert_allclose(inverted.state.q, [np.pi, 0.0], atol=1e-12)
 
 
 def test_a_free_body_spins_steadily_about_the_nearest_axis():
     found = steady(FreeRigidBody(), {"attitude_omega_z": 2.0, "attitude_omega_x": 0.1}, held=("attitude_omega_z",))
     assert bool(found.converged)
-    np.testing.assert_allclose(found["attitude_omega"], [0.0, 0.0, 2.0], atol=1e-10)
+    assert_allclose(found["attitude_omega"], [0.0, 0.0, 2.0], atol=1e-10)
 
 
 def test_where_there_is_no_steady_motion_the_residual_says_so():
@@ -92,7 +93,7 @@ def test_where_there_is_no_steady_motion_the_residual_says_so():
 
 def test_a_motion_forbidden_to_move_comes_to_rest():
     found = steady(TiltingDisc(**DISC), {"lean": 0.1, "yaw_rate": 1.0, "spin_rate": 1.0}, moving=())
-    np.testing.assert_allclose(found.state.u, np.zeros(5), atol=1e-10)
+    assert_allclose(found.state.u, np.zeros(5), atol=1e-10)
     assert float(found["lean"]) == pytest.approx(0.0, abs=1e-10)
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose
 from oracles import skate
 from small_scenes import OnLine
 from tolerances import tolerance
@@ -66,7 +67,7 @@ def test_a_stiff_motion_is_run_again_by_an_implicit_solver_and_says_so(damped):
     assert int(damped.raise_if_failed().fallback) == results.IMPLICIT
     assert damped.solver == "RadauIIA"
     assert "with an implicit solver: the motion is stiff" in str(damped)
-    np.testing.assert_allclose(damped["x"], np.sin(TS), rtol=0, atol=1e-8)  # as asked
+    assert_allclose(damped["x"], np.sin(TS), rtol=0, atol=1e-8)  # as asked
     assert int(damped.accepted) < 1000  # an explicit method needs some 3e6 for stability
 
 
@@ -100,7 +101,7 @@ def test_a_derivative_through_a_stiff_motion_is_that_of_what_it_follows():
     def end(pace):  # x_rate of the start is forgotten at once, x is not
         return jj.simulate(Damped(), {"x": pace, "x_rate": pace}, ts=TS[[0, -1]], retry=True).q_end[0]
 
-    np.testing.assert_allclose(jax.grad(end)(1.0), 1.0, rtol=0, atol=tolerance("gradient_simulation"))
+    assert_allclose(jax.grad(end)(1.0), 1.0, rtol=0, atol=tolerance("gradient_simulation"))
 
 
 @pytest.mark.slow
@@ -110,7 +111,7 @@ def test_stiff_lanes_of_a_rollout_are_run_again_and_the_others_are_kept():
     assert [batch.lane(i).solver for i in range(3)] == ["Dopri8", "RadauIIA", "RadauIIA"]
     assert "2 are stiff and were run with an implicit solver" in str(batch)
     for i in range(3):
-        np.testing.assert_allclose(batch.lane(i)["x"], np.sin(TS), rtol=0, atol=1e-7)
+        assert_allclose(batch.lane(i)["x"], np.sin(TS), rtol=0, atol=1e-7)
 
 
 class TurnedSkate(jj.models.Skate):
@@ -149,7 +150,7 @@ def test_a_lane_that_is_stiff_and_leaves_its_domain_is_run_with_the_full_state_a
     assert int(alone.raise_if_failed().fallback) == both
     expected = skate.motion(ts, slope=0.3, gravity=9.81, u0=0.0, th0=0.0, th_rate=1.3)["x"]
     for motion in (alone, batch.lane(0), batch.lane(1)):
-        np.testing.assert_allclose(motion["x"], expected, rtol=0, atol=1e-7)
+        assert_allclose(motion["x"], expected, rtol=0, atol=1e-7)
 
 
 def test_steps_that_shrink_towards_a_singularity_are_named():
@@ -157,7 +158,7 @@ def test_steps_that_shrink_towards_a_singularity_are_named():
     assert int(motion.result) == results.SHRANK
     assert "shrunk" in motion.message
     assert 0 < float(motion.last_step) < 1e-3
-    np.testing.assert_allclose(motion.t_end, np.pi / np.sqrt(8), rtol=1e-3)
+    assert_allclose(motion.t_end, np.pi / np.sqrt(8), rtol=1e-3)
 
 
 def said(derivative, x) -> list[str]:
@@ -205,8 +206,8 @@ def test_an_implicit_solver_that_tries_steps_beyond_an_event_has_the_derivative_
     else:
         found, slope, (code, rejected) = jax.jvp(landing_speed, (1.0,), (1.0,), has_aux=True)
     assert (int(code), int(rejected) > 0) == (results.EVENT, True)
-    np.testing.assert_allclose(found, speed, rtol=1e-7)
-    np.testing.assert_allclose(slope, (9.81 - np.sqrt(1.02)) / speed, rtol=1e-6)
+    assert_allclose(found, speed, rtol=1e-7)
+    assert_allclose(slope, (9.81 - np.sqrt(1.02)) / speed, rtol=1e-6)
 
 
 def test_zero_is_no_attitude():

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose, assert_array_equal
 from test_inputs import OnBelt
 
 import jourdain_jax as jj
@@ -88,18 +89,18 @@ def test_inputs_come_back_as_samples_at_the_saved_times(tmp_path):
     lanes = jj.rollout(OnBelt(), {"y": np.array([0.1, 0.2])}, ts=TS[::-1], t0=0.5, inputs=inputs, progress=False)  # in reversed time
     jj.save(lanes, tmp_path / "belt.npz")
     loaded = jj.load_rollout(tmp_path / "belt.npz", OnBelt)
-    np.testing.assert_array_equal(loaded["x"], lanes["x"])
+    assert_array_equal(loaded["x"], lanes["x"])
     for i in range(2):
-        np.testing.assert_allclose(jax.vmap(loaded.lane(i).inputs)(TS), jax.vmap(lanes.lane(i).inputs)(TS), rtol=1e-15)
-    np.testing.assert_allclose(loaded.lane(0).inputs(0.125), [1.125, 0.25], rtol=1e-15)
+        assert_allclose(jax.vmap(loaded.lane(i).inputs)(TS), jax.vmap(lanes.lane(i).inputs)(TS), rtol=1e-15)
+    assert_allclose(loaded.lane(0).inputs(0.125), [1.125, 0.25], rtol=1e-15)
 
 
 def test_a_motion_of_equal_steps_comes_back_with_its_inputs(tmp_path):
     steps = jj.simulate(OnBelt(), {"y": 0.1}, t1=0.5, ts=[0.0, 0.2], inputs={"speed": 1.0}, solver=jj.ImplicitMidpoint(step=0.1))
     jj.save(steps, tmp_path / "steps.npz")
     loaded = jj.load_trajectory(tmp_path / "steps.npz", OnBelt)
-    np.testing.assert_array_equal(loaded.q, steps.q)
-    np.testing.assert_array_equal(loaded.inputs(0.3), [1.0, 0.0])
+    assert_array_equal(loaded.q, steps.q)
+    assert_array_equal(loaded.inputs(0.3), [1.0, 0.0])
 
 
 def test_files_of_the_wrong_kind_are_refused_with_what_reads_them(files):

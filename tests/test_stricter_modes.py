@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 
@@ -45,12 +46,12 @@ def test_motions_and_their_derivatives_are_found_where_types_and_ranks_of_the_us
         jax.config.update(name, mode)
     try:
         motion = jj.simulate(Spring(), {"x": 1}, t1=1)
-        np.testing.assert_allclose(motion["x"][-1], np.cos(RATE), atol=1e-7)
+        assert_allclose(motion["x"][-1], np.cos(RATE), atol=1e-7)
         assert "reached" in str(motion)
         assert motion.accelerations().udot.shape == (201, 2)
         lanes = jj.rollout(Spring(), {"x": np.ones(2)}, parameters={"stiffness": np.array([1.0, 4.0])}, t1=1.0)
-        np.testing.assert_allclose(lanes["x"][:, -1], np.cos([1.0, 2.0]), atol=1e-7)
-        np.testing.assert_allclose(jax.grad(jax.jit(_end))(RATE**2), SLOPE, atol=1e-6)  # rules of derivatives are asked for once `simulate` has returned
+        assert_allclose(lanes["x"][:, -1], np.cos([1.0, 2.0]), atol=1e-7)
+        assert_allclose(jax.grad(jax.jit(_end))(RATE**2), SLOPE, atol=1e-6)  # rules of derivatives are asked for once `simulate` has returned
         assert {name: getattr(jax.config, name) for name in modes} == modes
     finally:
         for name, mode in before.items():
@@ -79,7 +80,7 @@ def test_classes_of_scenes_may_be_written_in_several_threads_at_once():
 def test_numbers_of_extended_precision_are_rounded_and_complex_ones_named():
     wide = np.array([1.0, 4.0], np.longdouble)
     lanes = jj.rollout(Spring(), {"x": wide[:1].repeat(2)}, parameters={"stiffness": wide}, ts=wide - 1)
-    np.testing.assert_allclose(lanes["x"][:, -1], np.cos([3.0, 6.0]), atol=1e-6)
+    assert_allclose(lanes["x"][:, -1], np.cos([3.0, 6.0]), atol=1e-6)
     assert jj.Sampled(wide, wide)(2.0) == 2.0
     assert all(scene.stiffness.dtype == np.float64 for scene in (Spring(stiffness=wide[1]), Spring().replace(stiffness=np.array(4.0, np.longdouble))))
     with pytest.raises(ValueError, match="`ts` of `Sampled` is of type complex256, expected real numbers"):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import result_codes as results
 from long_runs_scenes import ContactOscillator, GaugeTwin
+from numpy.testing import assert_allclose, assert_array_equal
 from oracles import chaplygin_sleigh, skate
 from small_scenes import DrivenPendulum
 from tolerances import tolerance
@@ -62,7 +63,7 @@ def test_discrete_forces_and_prescribed_coordinates_are_of_second_order_too():
     for part in ("q_end", "u_end", "work"):
         errors = [np.max(np.abs(getattr(end, part) - getattr(exact, part))) for end in ends]
         assert 1.9 < order(errors) < 2.1, part
-    np.testing.assert_allclose(ends[-1].q_end[0], 0.3 * np.sin(2.0), atol=tolerance("round_off"))  # the prescribed pivot
+    assert_allclose(ends[-1].q_end[0], 0.3 * np.sin(2.0), atol=tolerance("round_off"))  # the prescribed pivot
 
 
 def test_rows_that_depend_on_each_other_are_left_out():
@@ -109,8 +110,8 @@ def test_steps_back_undo_the_steps_forth(solver):
     end = jj.State(there.t_end, there.q_end, there.u_end, start.moved_q, start.moved_u, start.residual, start.names)
     back = run(twin, end, solver, t0=4.0, t1=0.0, step=0.2)
     assert np.max(np.abs(there.q_end - start.q)) > 0.1
-    np.testing.assert_allclose(back.q_end, start.q, rtol=0, atol=tolerance("round_off"))
-    np.testing.assert_allclose(back.u_end, start.u, rtol=0, atol=tolerance("round_off"))
+    assert_allclose(back.q_end, start.q, rtol=0, atol=tolerance("round_off"))
+    assert_allclose(back.u_end, start.u, rtol=0, atol=tolerance("round_off"))
 
 
 def test_the_discrete_gradient_keeps_the_energy():
@@ -137,7 +138,7 @@ def test_a_gauge_changes_no_motion_but_that_of_the_discrete_lagrangian():
     oscillator, twin = ContactOscillator(), GaugeTwin()
     start = jj.start(oscillator, **oscillator.example)
     found, of_twin = (jj.accelerations(scene, 0.0, start.q, start.u) for scene in (oscillator, twin))
-    np.testing.assert_array_equal(found.udot, of_twin.udot)
+    assert_array_equal(found.udot, of_twin.udot)
     for solver, told_apart in ((MIDPOINT, False), (DLA, True)):
         ends = [run(scene, start, solver, t1=4.0, step=0.2).q_end for scene in (oscillator, twin)]
         assert (float(jnp.max(jnp.abs(ends[0] - ends[1]))) > 1e-4) == told_apart, named(solver)
@@ -173,8 +174,8 @@ def test_derivatives_through_fifty_steps_are_right_in_both_modes(solver):
     at = jnp.asarray(at)
     forward = jax.jvp(end, (at,), (jnp.ones_like(at),))[1]
     backward = jax.grad(end)(at)
-    np.testing.assert_allclose(forward, difference, rtol=tolerance("gradient_fd"))
-    np.testing.assert_allclose(backward, forward, rtol=1e-9)
+    assert_allclose(forward, difference, rtol=tolerance("gradient_fd"))
+    assert_allclose(backward, forward, rtol=1e-9)
 
 
 def test_a_rollout_solves_every_lane_and_names_those_whose_step_was_not_solved():
@@ -187,7 +188,7 @@ def test_a_rollout_solves_every_lane_and_names_those_whose_step_was_not_solved()
     assert not np.isfinite(np.asarray(rolled.lanes.q[3, -1])).any()
     assert np.isfinite(np.asarray(rolled.lanes.q_end)).all()
     alone = run(oscillator.replace(strength=0.6), jj.start(oscillator, x=1.0, y=1.0, z=0.5, y_rate=0.3), DLA, t1=4.0, step=0.2)
-    np.testing.assert_allclose(rolled.lanes.q_end[2], alone.q_end, rtol=0, atol=tolerance("round_off"))
+    assert_allclose(rolled.lanes.q_end[2], alone.q_end, rtol=0, atol=tolerance("round_off"))
 
 
 # Steps, time and errors. -----------------------------------------------------------------------------------------------
@@ -212,8 +213,8 @@ def test_reversed_time_is_what_projections_and_events_are_given():
     start = jj.start(pendulum, t0=1.0, angle=0.3)
     back = jj.simulate(pendulum, start, t1=0.0, ts=[1.0, 0.0], rtol=1e-8, atol=1e-8, solver=diffrax.Bosh3(), work=False)
     assert int(back.result) == results.EVENT
-    np.testing.assert_allclose(back.t_end, 0.5, rtol=1e-12)
-    np.testing.assert_allclose(back.q_end[0], 0.3 * np.sin(1.0), rtol=0, atol=1e-9)  # the prescribed pivot
+    assert_allclose(back.t_end, 0.5, rtol=1e-12)
+    assert_allclose(back.q_end[0], 0.3 * np.sin(1.0), rtol=0, atol=1e-9)  # the prescribed pivot
 
 
 WRONG = {

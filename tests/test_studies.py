@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import result_codes as results
 import xarray
+from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
 
@@ -40,15 +41,15 @@ def assert_same(found, expected):
     one, other = found.to_xarray().load(), expected.to_xarray().load()
     assert set(one.variables) == set(other.variables)
     for name in one.variables:
-        np.testing.assert_array_equal(one[name].values, other[name].values, err_msg=name)
+        assert_array_equal(one[name].values, other[name].values, err_msg=name)
     assert_same_statistics(found, expected)
 
 
 def assert_same_statistics(found, expected):
     for name in ("mean", "covariance", "counts", "extremes", "lanes"):
-        np.testing.assert_array_equal(getattr(found.statistics, name), getattr(expected.statistics, name), err_msg=name)
+        assert_array_equal(getattr(found.statistics, name), getattr(expected.statistics, name), err_msg=name)
     assert found.counts == expected.counts
-    np.testing.assert_array_equal(found.failed, expected.failed)
+    assert_array_equal(found.failed, expected.failed)
 
 
 def test_every_lane_is_the_motion_that_simulate_gives(whole):
@@ -76,7 +77,7 @@ def test_the_bars_of_a_yes_and_a_no_are_equally_wide(whole):
     counts, edges = whole.histogram("fell")
     assert counts[0] + counts[-1] == counts.sum()
     assert counts[-1] == np.sum(whole.to_xarray()["fell"].values == 1.0) > 0
-    np.testing.assert_allclose(np.diff(edges), edges[1] - edges[0])
+    assert_allclose(np.diff(edges), edges[1] - edges[0])
 
 
 def test_a_failed_lane_is_named_and_left_out_of_statistics(whole):
@@ -112,7 +113,7 @@ def test_netcdf_holds_the_same(whole, tmp_path):
     whole.to_netcdf(tmp_path / "discs.nc")
     with xarray.open_dataset(tmp_path / "discs.nc") as arrays:
         for name in whole.to_xarray().variables:
-            np.testing.assert_array_equal(arrays[name].values, whole.to_xarray()[name].values)
+            assert_array_equal(arrays[name].values, whole.to_xarray()[name].values)
         assert arrays["final lean"].attrs["units"] == "rad"
 
 
@@ -148,10 +149,10 @@ def test_trajectories_of_some_lanes_are_kept(whole, tmp_path):
     assert_same_statistics(found, whole)
     arrays = found.to_xarray()
     assert arrays["lean"].dims == ("saved_lane", "time")
-    np.testing.assert_array_equal(arrays["saved_lane"].values, np.arange(0, COUNT, 12))
-    np.testing.assert_array_equal(arrays["time"].values, ASKED["ts"])
+    assert_array_equal(arrays["saved_lane"].values, np.arange(0, COUNT, 12))
+    assert_array_equal(arrays["time"].values, ASKED["ts"])
     for place in (0, 5, 12):
-        np.testing.assert_allclose(arrays["lean"][place].values, found.lane(12 * place).simulate()["lean"], rtol=1e-9, atol=1e-9)
+        assert_allclose(arrays["lean"][place].values, found.lane(12 * place).simulate()["lean"], rtol=1e-9, atol=1e-9)
 
 
 def test_a_study_is_opened_without_its_scene(whole):
@@ -182,8 +183,8 @@ def test_a_study_shows_its_table_and_a_histogram_of_each_output_in_a_notebook(wh
     assert axes["final lean (rad)"].lines[0].get_xdata() == [whole.mean("final lean")] * 2
     counts, edges = whole.histogram("distance", cells=40)
     bars = axes["distance (m)"].patches[0].get_data()
-    np.testing.assert_array_equal(bars.values, counts)
-    np.testing.assert_array_equal(bars.edges, edges)
+    assert_array_equal(bars.values, counts)
+    assert_array_equal(bars.edges, edges)
 
 
 def test_an_output_that_is_no_number_or_unknown_is_named(whole, tmp_path):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from test_study_faults import run, study
 
 from jourdain_jax.ensembles import memory, task
@@ -40,8 +41,8 @@ def test_blocks_and_chunks_fit_into_the_bound_and_lanes_are_the_same(tmp_path, m
     assert (tight.store.study["block"], tight.store.chunk) == (8, 8)
     one, other = free.to_xarray().load(), tight.to_xarray().load()
     for name in one.variables:
-        np.testing.assert_allclose(one[name].values, other[name].values, rtol=1e-12, atol=1e-14, err_msg=name)
-    np.testing.assert_allclose(free.statistics.mean, tight.statistics.mean, rtol=1e-12, atol=1e-14)
+        assert_allclose(one[name].values, other[name].values, rtol=1e-12, atol=1e-14, err_msg=name)
+    assert_allclose(free.statistics.mean, tight.statistics.mean, rtol=1e-12, atol=1e-14)
 
 
 def test_a_study_goes_on_with_the_blocks_with_which_it_began(tmp_path, monkeypatch):
@@ -53,7 +54,7 @@ def test_a_study_goes_on_with_the_blocks_with_which_it_began(tmp_path, monkeypat
     begun = run(path, **TIMES)  # without a bound
     assert begun.complete
     assert begun.store.study["block"] == 16
-    np.testing.assert_array_equal(begun.statistics.mean, whole.statistics.mean)
+    assert_array_equal(begun.statistics.mean, whole.statistics.mean)
     with pytest.raises(ValueError, match="blocks of 16 lanes and chunks of 16 take up to"):
         run(path, memory=bounded(monkeypatch, 1000), **TIMES)
 

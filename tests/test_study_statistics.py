@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy import special
 
 import jourdain_jax as jj
@@ -46,7 +47,7 @@ def test_means_and_covariances_are_those_of_all_values():
 def test_the_order_of_blocks_does_not_change_a_bit():
     one, other = _statistics(range(10)), _statistics([3, 9, 0, 1, 8, 2, 7, 4, 6, 5])
     for name in ("mean", "covariance", "counts", "extremes", "lanes"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        assert_array_equal(getattr(one, name), getattr(other, name))
 
 
 @pytest.mark.parametrize("level", [0.0, 0.025, 0.5, 0.975, 0.9999, 1.0])
@@ -66,7 +67,7 @@ def test_a_histogram_holds_every_value():
     assert counts.sum() == len(values)
     assert edges[-1] == 1e6
     expected, _ = np.histogram(values[:, 0], edges)
-    np.testing.assert_array_equal(counts, expected)
+    assert_array_equal(counts, expected)
 
 
 def test_what_never_has_a_value_has_no_statistics():
@@ -106,9 +107,9 @@ def test_the_indices_are_those_of_salib():
     found = jj.sobol_indices(values, design.names)
     problem = {"num_vars": 3, "names": list(design.names), "bounds": [[-np.pi, np.pi]] * 3}
     other = sobol.analyze(problem, values, calc_second_order=False, seed=1)
-    np.testing.assert_allclose(found.first, other["S1"], atol=1e-2)  # it takes out the mean of all samples, not of A and B
-    np.testing.assert_allclose(found.total, other["ST"], atol=1e-2)
-    np.testing.assert_allclose(found.total_half_width, other["ST_conf"], rtol=0.4)
+    assert_allclose(found.first, other["S1"], atol=1e-2)  # it takes out the mean of all samples, not of A and B
+    assert_allclose(found.total, other["ST"], atol=1e-2)
+    assert_allclose(found.total_half_width, other["ST_conf"], rtol=0.4)
 
 
 def test_groups_without_a_value_are_left_out_and_counted():
@@ -156,7 +157,7 @@ def test_the_indices_of_a_pendulums_period_lie_within_their_limits(tmp_path):
 
     at = study.design.values()
     found = result.to_xarray()["quarter"].values
-    np.testing.assert_allclose(found, quarter(*at.values()), rtol=1e-7)
+    assert_allclose(found, quarter(*at.values()), rtol=1e-7)
 
     nodes, weights = np.polynomial.legendre.leggauss(40)
     points = [low + (high - low) * (nodes + 1) / 2 for low, high in ranges.values()]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import result_codes as results
 from in_mpmath import in_mpmath
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import OnLine
 
 import jourdain_jax as jj
@@ -59,7 +60,7 @@ def test_recurrences_of_functions_give_their_taylor_series():
     found = coefficients(graph, s, [graph.call(op, inner[op]) for op in UNARY], at)
     for op, series in zip(UNARY, found.T, strict=True):
         true = expected(lambda s, op=op: in_mpmath(op)(mpmath.mpf(base[op]) + mpmath.mpf(0.3) * s * s), at)
-        np.testing.assert_allclose(series, true, rtol=1e-13, atol=1e-14 * np.max(np.abs(true)), err_msg=op)
+        assert_allclose(series, true, rtol=1e-13, atol=1e-14 * np.max(np.abs(true)), err_msg=op)
 
 
 @pytest.mark.parametrize("op", ["add", "sub", "mul", "div", "atan2", "pow"])
@@ -70,9 +71,9 @@ def test_recurrences_of_two_arguments_give_their_taylor_series(op):
     found = coefficients(graph, s, [graph.call(op, a, b), graph.call(op, b, a) if op != "pow" else a], 0.7)
     f = in_mpmath(op)
     other = (lambda s: mpmath.mpf(2.7)) if op == "pow" else mpmath.exp
-    np.testing.assert_allclose(found[:, 0], expected(lambda s: f(mpmath.sin(s), other(s)), 0.7), rtol=1e-13, atol=1e-13)
+    assert_allclose(found[:, 0], expected(lambda s: f(mpmath.sin(s), other(s)), 0.7), rtol=1e-13, atol=1e-13)
     second = mpmath.sin if op == "pow" else lambda s: f(mpmath.exp(s), mpmath.sin(s))
-    np.testing.assert_allclose(found[:, 1], expected(second, 0.7), rtol=1e-13, atol=1e-13)
+    assert_allclose(found[:, 1], expected(second, 0.7), rtol=1e-13, atol=1e-13)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -93,7 +94,7 @@ def test_series_of_random_programs_are_those_of_mpmath(seed):
     found = coefficients(graph, s, outputs, 0.6, {p: 1.5})
     for i, (_, f) in enumerate(nodes[3:]):
         true = expected(f, 0.6)
-        np.testing.assert_allclose(found[:, i], true, rtol=1e-11, atol=1e-12 * np.max(np.abs(true)))
+        assert_allclose(found[:, i], true, rtol=1e-11, atol=1e-12 * np.max(np.abs(true)))
 
 
 def _composed(h, *inner):
@@ -147,8 +148,8 @@ def test_a_disc_rolls_to_where_its_extended_precision_motion_does():
     motion = jj.simulate(scene, start, ts=times, rtol=1e-11, atol=1e-11, solver=jj.Taylor())
     assert int(motion.result) == 0
     assert int(motion.accepted) < 80  # steps do not end at times to save
-    np.testing.assert_allclose(motion["lean"], true["theta"] - np.pi / 2, atol=1e-9)
-    np.testing.assert_allclose(motion["yaw"], true["psi"], atol=1e-9)
+    assert_allclose(motion["lean"], true["theta"] - np.pi / 2, atol=1e-9)
+    assert_allclose(motion["yaw"], true["psi"], atol=1e-9)
 
 
 @pytest.mark.parametrize("span", [2.0, -2.0])
@@ -158,9 +159,9 @@ def test_motions_with_projection_and_work_are_those_of_dopri8(span):
     ours, theirs = (jj.simulate(scene, solver=solver, **options) for solver in (jj.Taylor(), diffrax.Dopri8()))
     assert ours.solver == "Taylor"
     for a, b in ((ours.q, theirs.q), (ours.u, theirs.u), (ours.q_end, theirs.q_end)):
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+        assert_allclose(a, b, rtol=1e-9, atol=1e-9)
     if ours.work is not None:
-        np.testing.assert_allclose(ours.work, theirs.work, atol=1e-9)
+        assert_allclose(ours.work, theirs.work, atol=1e-9)
     # states between the ends of steps are on the rows, too
     moved = [jj.consistent(scene, 0.0, q, u).moved_q for q, u in zip(ours.q, ours.u, strict=True)]
     assert np.max(moved) < 1e-12
@@ -170,20 +171,20 @@ def test_a_disc_that_falls_stops_where_it_does_by_dopri8():
     options = {"ts": np.linspace(0.0, 5.0, 51), "rtol": 1e-11, "atol": 1e-11}
     ours, theirs = (jj.simulate(DISC, {"lean": 0.6, "spin_rate": -0.1}, solver=solver, **options) for solver in (jj.Taylor(), diffrax.Dopri8()))
     assert int(ours.result) == int(theirs.result) == results.EVENT
-    np.testing.assert_allclose(ours.t_end, theirs.t_end, rtol=1e-11)
-    np.testing.assert_allclose(ours.q_end, theirs.q_end, rtol=1e-9, atol=1e-10)
-    np.testing.assert_array_equal(np.isnan(ours.q), np.isnan(theirs.q))
-    np.testing.assert_allclose(ours.q, theirs.q, rtol=1e-9, atol=1e-10)
+    assert_allclose(ours.t_end, theirs.t_end, rtol=1e-11)
+    assert_allclose(ours.q_end, theirs.q_end, rtol=1e-9, atol=1e-10)
+    assert_array_equal(np.isnan(ours.q), np.isnan(theirs.q))
+    assert_allclose(ours.q, theirs.q, rtol=1e-9, atol=1e-10)
 
 
 def test_lanes_of_a_rollout_end_each_for_itself():
     lean = jnp.asarray([0.1, 0.3, jnp.nan, 1.2, 0.2, 0.7, jnp.inf, 0.5, -0.4])
     starts = {"lean": lean, "spin_rate": jnp.linspace(-4.0, 0.0, 9)}
     ours, theirs = (jj.rollout(DISC, starts, ts=[0.25, 0.5, 1.0], solver=solver) for solver in (jj.Taylor(), diffrax.Dopri8()))
-    np.testing.assert_array_equal(ours.result, theirs.result)
-    np.testing.assert_allclose(ours.lanes.q, theirs.lanes.q, rtol=1e-6, atol=1e-6)
+    assert_array_equal(ours.result, theirs.result)
+    assert_allclose(ours.lanes.q, theirs.lanes.q, rtol=1e-6, atol=1e-6)
     alone = jj.rollout(DISC, {name: x[1:2] for name, x in starts.items()}, ts=[0.25, 0.5, 1.0], solver=jj.Taylor())
-    np.testing.assert_array_equal(alone.lanes.q[0], ours.lanes.q[1])
+    assert_array_equal(alone.lanes.q[0], ours.lanes.q[1])
 
 
 @pytest.mark.parametrize(

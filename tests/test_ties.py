@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 
@@ -35,9 +36,9 @@ def test_a_tied_parameter_follows_and_its_interval_with_it(found):
     assert found.labels == ("offset",)
     assert found.converged
     tied, offset = found.tied["inertia"], found["offset"]
-    np.testing.assert_allclose(found.scene.inertia, found.scene.offset, rtol=1e-15)  # 0.5 * 2 kg * offset
+    assert_allclose(found.scene.inertia, found.scene.offset, rtol=1e-15)  # 0.5 * 2 kg * offset
     for name in ("value", "standard_error", "low", "high"):
-        np.testing.assert_allclose(getattr(tied, name), getattr(offset, name), rtol=1e-12)
+        assert_allclose(getattr(tied, name), getattr(offset, name), rtol=1e-12)
     assert tied.unit == "kg m^2"
     assert "(tied)" in str(found)
 
@@ -54,7 +55,7 @@ def test_the_fit_is_at_the_greatest_likelihood_along_the_tie(found, data):
     best, step = float(found.scene.offset), float(found["offset"].standard_error)
     below, at, above = (along(best + k * step) for k in (-1, 0, 1))
     assert abs(above - below) < 0.02 * (2 * at - above - below)  # the parabola's top is within a hundredth of a standard error
-    np.testing.assert_allclose(2 * at - above - below, 1.0, rtol=0.05)  # one standard error is half a unit down to either side
+    assert_allclose(2 * at - above - below, 1.0, rtol=0.05)  # one standard error is half a unit down to either side
 
 
 def test_a_density_has_the_slope_along_the_tie(data):
@@ -62,23 +63,23 @@ def test_a_density_has_the_slope_along_the_tie(data):
     step = 1e-5
     slope = [float(density(density.unconstrain({"offset": 0.3 + k * step}))) for k in (-1, 1)]
     found = jax.grad(density)(density.unconstrain({"offset": 0.3}))
-    np.testing.assert_allclose(found[0], (slope[1] - slope[0]) / (2 * step), rtol=1e-6)
-    np.testing.assert_allclose(density.scene_at(density.unconstrain({"offset": 0.3})).inertia, 0.3, rtol=1e-14)
+    assert_allclose(found[0], (slope[1] - slope[0]) / (2 * step), rtol=1e-6)
+    assert_allclose(density.scene_at(density.unconstrain({"offset": 0.3})).inertia, 0.3, rtol=1e-14)
 
 
 def test_ties_of_a_batch_and_in_pieces_are_those_of_one_fit(found, data):
     batch = jj.fit_batch(Sleigh(mass=2.0), measured(0, (3,)), free=TIED)
-    np.testing.assert_allclose(batch.scene.inertia, batch.scene.offset, rtol=1e-15)
-    np.testing.assert_allclose(batch.tied["inertia"].standard_error, batch["offset"].standard_error, rtol=1e-12)
+    assert_allclose(batch.scene.inertia, batch.scene.offset, rtol=1e-15)
+    assert_allclose(batch.tied["inertia"].standard_error, batch["offset"].standard_error, rtol=1e-12)
     pieces = jj.fit(Sleigh(mass=2.0), data, free=TIED, shooting=jj.MultipleShooting(pieces=2))
-    np.testing.assert_allclose(pieces.scene.inertia, found.scene.inertia, rtol=1e-4)
+    assert_allclose(pieces.scene.inertia, found.scene.inertia, rtol=1e-4)
 
 
 def test_ties_follow_from_ties_before_them(data):
     free = {"offset": None, "inertia": lambda scene: scene.offset * 1.0, "mass": lambda scene: 8.0 * scene.inertia}
     density = jj.log_density(Sleigh(), data, free=free)
     scene = density.scene_at(density.unconstrain({"offset": 0.3}))
-    np.testing.assert_allclose(scene.mass, 8.0 * scene.offset, rtol=1e-15)
+    assert_allclose(scene.mass, 8.0 * scene.offset, rtol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -105,13 +106,13 @@ def test_a_combination_is_told_whose_parts_are_not(data):
     known = jj.fit(Sleigh(mass=2.0), data, free=("inertia", "offset"))
     ratio = together.derived(lambda scene: scene.inertia / scene.mass, "m^2")
     assert np.isnan(together["inertia"].standard_error)
-    np.testing.assert_allclose(ratio.value, known["inertia"].value / 2.0, rtol=1e-5)
-    np.testing.assert_allclose(ratio.standard_error, known["inertia"].standard_error / 2.0, rtol=1e-3)
-    np.testing.assert_allclose((ratio.high - ratio.low) / 2, 1.959963985 * ratio.standard_error, rtol=1e-8)
+    assert_allclose(ratio.value, known["inertia"].value / 2.0, rtol=1e-5)
+    assert_allclose(ratio.standard_error, known["inertia"].standard_error / 2.0, rtol=1e-3)
+    assert_allclose((ratio.high - ratio.low) / 2, 1.959963985 * ratio.standard_error, rtol=1e-8)
     several = together.derived(lambda scene: jnp.stack([scene.mass, scene.offset, scene.offset**2]))
     assert np.isnan(several.standard_error[0])
-    np.testing.assert_allclose(several.standard_error[1], together["offset"].standard_error, rtol=1e-9)
-    np.testing.assert_allclose(several.standard_error[2], 2 * together["offset"].value * together["offset"].standard_error, rtol=1e-9)
+    assert_allclose(several.standard_error[1], together["offset"].standard_error, rtol=1e-9)
+    assert_allclose(several.standard_error[2], 2 * together["offset"].value * together["offset"].standard_error, rtol=1e-9)
 
 
 def test_a_derived_number_of_a_batch_spreads_as_its_error_says():

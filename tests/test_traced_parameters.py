@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
+from numpy.testing import assert_allclose
 from small_scenes import OnPlane, Upright
 
 import jourdain_jax as jj
@@ -101,10 +102,10 @@ def test_parameters_with_defaults_may_be_traced():
 
     numbers = (jnp.array([0.7, 2.0]), jnp.array([0.1, 0.9]))
     alone = np.stack([end(m, a) for m, a in zip(*numbers, strict=True)])
-    np.testing.assert_allclose(jax.jit(jax.vmap(end))(*numbers), alone, atol=1e-9)
+    assert_allclose(jax.jit(jax.vmap(end))(*numbers), alone, atol=1e-9)
     gradient = jax.jit(jax.grad(lambda m: end(m, 0.1)[2]))(0.7)
     difference = (end(0.7 + 1e-5, 0.1)[2] - end(0.7 - 1e-5, 0.1)[2]) / 2e-5
-    np.testing.assert_allclose(gradient, difference, rtol=1e-5)
+    assert_allclose(gradient, difference, rtol=1e-5)
 
 
 def test_parameters_without_defaults_may_be_traced():
@@ -113,12 +114,12 @@ def test_parameters_without_defaults_may_be_traced():
         return jj.simulate(scene, {"angle": 0.4}, **OPTIONS).q_end[0]
 
     alone = end(0.3, 2.0, 0.5)
-    np.testing.assert_allclose(jax.jit(end)(0.3, 2.0, 0.5), alone, rtol=1e-9)
-    np.testing.assert_allclose(jax.vmap(end)(*(jnp.array([x, 1.0]) for x in (0.3, 2.0, 0.5)))[0], alone, rtol=1e-9)
+    assert_allclose(jax.jit(end)(0.3, 2.0, 0.5), alone, rtol=1e-9)
+    assert_allclose(jax.vmap(end)(*(jnp.array([x, 1.0]) for x in (0.3, 2.0, 0.5)))[0], alone, rtol=1e-9)
     along = jax.jit(jax.grad(end, (0, 1, 2)))(0.3, 2.0, 0.5)
-    np.testing.assert_allclose(along[1], along[2], rtol=1e-9)  # only their sum counts
-    np.testing.assert_allclose(along[0], 0.0, atol=1e-9)
-    np.testing.assert_allclose(along[1], (end(0.3, 2.0 + 1e-4, 0.5) - end(0.3, 2.0 - 1e-4, 0.5)) / 2e-4, rtol=1e-6)
+    assert_allclose(along[1], along[2], rtol=1e-9)  # only their sum counts
+    assert_allclose(along[0], 0.0, atol=1e-9)
+    assert_allclose(along[1], (end(0.3, 2.0 + 1e-4, 0.5) - end(0.3, 2.0 - 1e-4, 0.5)) / 2e-4, rtol=1e-6)
 
 
 def test_a_traced_parameter_without_default_that_fits_no_state_of_the_domain_is_refused():
@@ -131,11 +132,11 @@ def test_defaults_at_which_rows_are_dependent_do_not_decide_for_traced_parameter
     q, code = jax.jit(lambda front, rear: sliding(front=front, rear=rear))(0.3, 0.5)
     assert int(code) == results.SUCCESS
     forward = 0.7 * np.cos(0.3) + 0.4 * np.sin(0.3)  # the one speed that two blades at two places let the plate keep
-    np.testing.assert_allclose(q, [0.8 * forward * np.cos(0.3), 0.8 * forward * np.sin(0.3), 0.3], atol=1e-9)
+    assert_allclose(q, [0.8 * forward * np.cos(0.3), 0.8 * forward * np.sin(0.3), 0.3], atol=1e-9)
     many, codes = jax.vmap(lambda front, rear: sliding(front=front, rear=rear))(jnp.array([0.3, 0.1]), jnp.array([0.5, 0.9]))
-    np.testing.assert_allclose(many, np.stack([q, q]), atol=1e-9)
+    assert_allclose(many, np.stack([q, q]), atol=1e-9)
     assert codes.tolist() == [results.SUCCESS] * 2
-    np.testing.assert_allclose(jax.jacrev(lambda front, rear: sliding(front=front, rear=rear)[0], (0, 1))(0.3, 0.5), np.zeros((2, 3)), atol=1e-9)
+    assert_allclose(jax.jacrev(lambda front, rear: sliding(front=front, rear=rear)[0], (0, 1))(0.3, 0.5), np.zeros((2, 3)), atol=1e-9)
 
 
 def test_traced_parameters_at_which_rows_become_dependent_are_flagged_or_right():
@@ -144,12 +145,12 @@ def test_traced_parameters_at_which_rows_become_dependent_are_flagged_or_right()
     for same in (0.3, -0.2):
         q, code = jax.jit(lambda front, rear: sliding(front=front, rear=rear))(same, same)
         if int(code) == results.SUCCESS:
-            np.testing.assert_allclose(q, sliding(front=same, rear=same)[0], atol=1e-8)
+            assert_allclose(q, sliding(front=same, rear=same)[0], atol=1e-8)
         else:
             assert int(code) == results.SINGULAR_PARTITION
     lanes, codes = jax.vmap(lambda rear: sliding(front=0.3, rear=rear))(jnp.array([0.3, 0.5]))
     assert int(codes[1]) == results.SUCCESS
-    np.testing.assert_allclose(lanes[1], sliding(front=0.3, rear=0.5)[0], atol=1e-9)
+    assert_allclose(lanes[1], sliding(front=0.3, rear=0.5)[0], atol=1e-9)
 
 
 def test_defaults_at_which_a_coordinate_does_not_matter_do_not_decide_for_traced_parameters():
@@ -162,12 +163,12 @@ def test_defaults_at_which_a_coordinate_does_not_matter_do_not_decide_for_traced
     # the wind alone moves the bead across: its work is all of the kinetic energy there
     work = 0.5 * 2.0 * 1.3**2 * ((1 + x) ** 2 - 1.5**2)
     expected = [x, y, work]
-    np.testing.assert_allclose(jax.jit(end)(0.7, 1.3), expected, atol=1e-8)
-    np.testing.assert_allclose(jax.vmap(end)(jnp.array([0.7, 0.0]), jnp.array([1.3, 0.0])), [expected, [0.5, 0.0, 0.0]], atol=1e-8)
+    assert_allclose(jax.jit(end)(0.7, 1.3), expected, atol=1e-8)
+    assert_allclose(jax.vmap(end)(jnp.array([0.7, 0.0]), jnp.array([1.3, 0.0])), [expected, [0.5, 0.0, 0.0]], atol=1e-8)
     slopes = jax.jit(jax.jacrev(end, (0, 1)))(0.7, 1.3)
     h = 1e-5
-    np.testing.assert_allclose(slopes[0], (end(0.7 + h, 1.3) - end(0.7 - h, 1.3)) / (2 * h), atol=1e-5)
-    np.testing.assert_allclose(slopes[1], (end(0.7, 1.3 + h) - end(0.7, 1.3 - h)) / (2 * h), atol=1e-5)
+    assert_allclose(slopes[0], (end(0.7 + h, 1.3) - end(0.7 - h, 1.3)) / (2 * h), atol=1e-5)
+    assert_allclose(slopes[1], (end(0.7, 1.3 + h) - end(0.7, 1.3 - h)) / (2 * h), atol=1e-5)
 
 
 def test_a_blade_under_the_mass_centre_is_flagged_where_another_offset_was_expected():
@@ -179,7 +180,7 @@ def test_a_blade_under_the_mass_centre_is_flagged_where_another_offset_was_expec
     assert int(code) == results.SUCCESS
     q, code = jax.jit(turned)(0.0)
     if int(code) == results.SUCCESS:
-        np.testing.assert_allclose(q, eager, atol=1e-8)
+        assert_allclose(q, eager, atol=1e-8)
     else:
         assert int(code) == results.SINGULAR_PARTITION
 
@@ -202,7 +203,7 @@ def test_a_program_made_where_rows_do_no_work_is_not_taken_where_they_do():
     still, blown = (jj.simulate(Slope(slope=0.7, wind=wind), {"x": 0.5}, **OPTIONS) for wind in (0.0, 1.3))
     assert still.work is None
     assert "lowered" in blown.reduction
-    np.testing.assert_allclose(blown.work[-1], 0.5 * 2.0 * 1.3**2 * ((1 + blown["x"][-1]) ** 2 - 1.5**2), rtol=1e-8)
+    assert_allclose(blown.work[-1], 0.5 * 2.0 * 1.3**2 * ((1 + blown["x"][-1]) ** 2 - 1.5**2), rtol=1e-8)
 
 
 def test_a_start_that_is_known_is_put_onto_the_rows_while_other_numbers_are_traced():
@@ -213,7 +214,7 @@ def test_a_start_that_is_known_is_put_onto_the_rows_while_other_numbers_are_trac
     within = jax.jit(lambda t1: jj.simulate(skate, jj.start(skate, **skate.example), t1=t1).q_end)
     of_tolerance = jax.jit(lambda rtol: jj.simulate(skate, start, t1=t1, rtol=rtol, solver=diffrax.Dopri8()).q_end)
     for found in (of_time(t1), within(t1), of_tolerance(1e-10)):
-        np.testing.assert_allclose(found, alone, rtol=1e-7)
+        assert_allclose(found, alone, rtol=1e-7)
 
 
 def test_a_traced_tolerance_needs_a_solver():

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
 from jourdain_jax.models import TiltingDisc
@@ -14,9 +15,9 @@ def rolling():
 
 
 def test_named_access_reaches_coordinates_speeds_and_time(rolling):
-    np.testing.assert_array_equal(rolling["lean"], rolling.q[:, 3])
-    np.testing.assert_array_equal(rolling["spin_rate"], rolling.u[:, 4])
-    np.testing.assert_array_equal(rolling["t"], rolling.ts)
+    assert_array_equal(rolling["lean"], rolling.q[:, 3])
+    assert_array_equal(rolling["spin_rate"], rolling.u[:, 4])
+    assert_array_equal(rolling["t"], rolling.ts)
     with pytest.raises(KeyError, match="did you mean `lean`"):
         rolling["laen"]
 
@@ -31,8 +32,8 @@ def test_the_summary_prints_steps_drift_residuals_contact_and_result(rolling):
 
 def test_the_path_of_a_point_is_where_the_body_says_it_is(rolling):
     centre = np.asarray(rolling.point("disc"))
-    np.testing.assert_allclose(centre[:, 2], 0.5 * np.cos(np.asarray(rolling["lean"])), atol=1e-14)
-    np.testing.assert_array_equal(centre, rolling.motions()["disc"].position)
+    assert_allclose(centre[:, 2], 0.5 * np.cos(np.asarray(rolling["lean"])), atol=1e-14)
+    assert_array_equal(centre, rolling.motions()["disc"].position)
     with pytest.raises(KeyError, match=r'`disc` is a body of `TiltingDisc`.*`motion\.point\("disc"\)`.*`motion\.motions\(\)\["disc"\]`'):
         rolling["disc"]
 
@@ -43,15 +44,15 @@ def test_a_motion_goes_on_from_the_end_of_another():
     second = jj.simulate(scene, first.end, ts=jnp.array([1.5]))
     whole = jj.simulate(scene, start, t1=1.5)
     assert float(second.ts[0]) == 1.5
-    np.testing.assert_allclose(second.q[-1], whole.q_end, atol=2e-8)
-    np.testing.assert_allclose(second.u[-1], whole.u_end, atol=2e-8)
+    assert_allclose(second.q[-1], whole.q_end, atol=2e-8)
+    assert_allclose(second.u[-1], whole.u_end, atol=2e-8)
 
 
 def test_the_end_is_the_state_at_an_event():
     fallen = jj.simulate(TiltingDisc(), {"lean": 0.3}, t1=5.0)
     assert fallen.event_names[int(fallen.event)] == "fallen"
     assert float(fallen.end.t) == float(fallen.t_end) < 5.0
-    np.testing.assert_allclose(fallen.end.q, fallen.q_end, atol=1e-12)
+    assert_allclose(fallen.end.q, fallen.q_end, atol=1e-12)
 
 
 def test_a_batch_goes_on_from_its_ends():
@@ -61,4 +62,4 @@ def test_a_batch_goes_on_from_its_ends():
     assert ends.q.shape == first.lanes.q_end.shape
     second = jj.rollout(scene, ends, t1=1.5)
     whole = jj.rollout(scene, starts, t1=1.5)
-    np.testing.assert_allclose(second.lanes.q_end, whole.lanes.q_end, atol=2e-8)
+    assert_allclose(second.lanes.q_end, whole.lanes.q_end, atol=2e-8)

@@ -2,8 +2,8 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 
@@ -36,9 +36,9 @@ def test_values_and_gradients(way):
         return found, back(jnp.sin(found))[0]
 
     for found, expected in zip(jax.jit(both, static_argnums=0)(way), jax.jit(both, static_argnums=0)(jax.vmap(_place)), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-12)
+        assert_allclose(found, expected, rtol=1e-12)
 
 
 def test_with_floats_checked():
     with jax.debug_nans(True):
-        np.testing.assert_allclose(jax.jit(_place)(1.0), _place(1.0), rtol=1e-12)
+        assert_allclose(jax.jit(_place)(1.0), _place(1.0), rtol=1e-12)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 from jourdain_jax.models import ChaplyginSleigh
@@ -46,7 +47,7 @@ class Limited(Plane):
 def test_calls_whose_operands_are_equal_at_the_probes_only_stay_two():
     scene = Limited()
     assert len(jj.lower(scene).graph.calls(jj.lower(scene).ydot)) == 2
-    np.testing.assert_allclose(*ends(scene.replace(limit=0.2), {"x": 1.8}), atol=1e-8)
+    assert_allclose(*ends(scene.replace(limit=0.2), {"x": 1.8}), atol=1e-8)
 
 
 class Fading(Plane):
@@ -73,7 +74,7 @@ class Filtered(Plane):
 
 
 def test_calls_of_what_different_calls_made_stay_two():
-    np.testing.assert_allclose(*ends(Filtered(), {"x": 1.0, "y": -0.4, "x_rate": 0.3}), atol=1e-7)
+    assert_allclose(*ends(Filtered(), {"x": 1.0, "y": -0.4, "x_rate": 0.3}), atol=1e-7)
 
 
 class Pushed(Plane):
@@ -107,7 +108,7 @@ def test_a_force_that_sets_in_later_acts_and_one_program_serves_all_parameters()
     later, spring = Pushed(PUSHES["switched on"]), Pushed(PUSHES["tiny by its parameter"])
     assert jj.simulate(later, {"x": 1.0}, t1=3.0, rtol=1e-9, atol=1e-9).q_end[0] == pytest.approx(np.cos(2.0), abs=1e-7)
     lanes = jj.rollout(spring, {"x": 1.0}, parameters={"size": jnp.array([1e-10, 4.0])}, t1=1.0, rtol=1e-9, atol=1e-9).lanes
-    np.testing.assert_allclose(lanes.q_end[:, 0], [1.0, np.cos(2.0)], atol=1e-7)
+    assert_allclose(lanes.q_end[:, 0], [1.0, np.cos(2.0)], atol=1e-7)
 
 
 class Ground(jj.Scene):
@@ -130,7 +131,7 @@ class Ground(jj.Scene):
 def test_states_are_put_back_onto_rows_as_they_are_for_other_parameters_and_elsewhere(scene):
     jj.lower(Ground(with_bump=scene.with_bump))  # built where the ground is flat
     lowered, dense = ends(scene, {"x": 5.5, "x_rate": 1.0})
-    np.testing.assert_allclose(lowered, dense, atol=1e-7)
+    assert_allclose(lowered, dense, atol=1e-7)
 
 
 class Small(Plane):
@@ -145,7 +146,7 @@ class Small(Plane):
 
 
 def test_operands_are_compared_relative_to_their_size():
-    np.testing.assert_allclose(*ends(Small(), {"x": 1.0}), atol=1e-8)
+    assert_allclose(*ends(Small(), {"x": 1.0}), atol=1e-8)
 
 
 class Belt(ChaplyginSleigh):
@@ -165,7 +166,7 @@ class Belt(ChaplyginSleigh):
 
 def test_a_branch_in_a_row_is_not_lost():
     lowered, dense = ends(Belt(), {"px": 11.0, "px_rate": 1.0, "heading_rate": 0.9, "x_rate": -0.6})
-    np.testing.assert_allclose(lowered, dense, atol=1e-7)
+    assert_allclose(lowered, dense, atol=1e-7)
     assert lowered[4] == pytest.approx(1.0)
 
 
@@ -186,7 +187,7 @@ class Called(Plane):
 
 
 def test_a_callback_that_knows_no_batches_runs_alone_and_is_refused_by_name_in_batches():
-    np.testing.assert_allclose(*ends(Called(), {"x": 1.0}, formulation=jj.Formulation(stabilisation=None)), atol=1e-7)
+    assert_allclose(*ends(Called(), {"x": 1.0}, formulation=jj.Formulation(stabilisation=None)), atol=1e-7)
     with pytest.raises(NotImplementedError, match="vmap"):
         jj.rollout(Called(), {"x": jnp.array([1.0, 1.1])}, t1=0.1)
 
@@ -242,7 +243,7 @@ def test_tables_are_parameters_and_differ_between_lanes():
     tables = jnp.stack([1e-11 * jnp.array([5.0, 3.0, 2.0, 0.0, -2.0, -3.0, -5.0]) * k for k in (1.0, -2.0)])
     lanes = jj.rollout(Small(), {"x": 1.0}, parameters={"table": tables}, t1=1.0).lanes.q_end
     for end, table in zip(lanes, tables, strict=True):
-        np.testing.assert_allclose(end, jj.simulate(Small(table=table), {"x": 1.0}, t1=1.0).q_end, atol=1e-6)
+        assert_allclose(end, jj.simulate(Small(table=table), {"x": 1.0}, t1=1.0).q_end, atol=1e-6)
     assert abs(float(lanes[0, 0] - lanes[1, 0])) > 0.1
 
 
@@ -306,7 +307,7 @@ def test_the_work_of_what_begins_late_or_far_off_is_counted(scene, start, end, f
     motion = jj.simulate(scene, start, ts=np.linspace(0.0, end, 41), rtol=1e-10, atol=1e-10).raise_if_failed()
     changed = float(np.ptp(motion.energies().kinetic + motion.energies().potential))
     assert changed > 0.05
-    np.testing.assert_allclose(motion.energies().balance, motion.energies().balance[0], atol=1e-4 * changed)
+    assert_allclose(motion.energies().balance, motion.energies().balance[0], atol=1e-4 * changed)
 
 
 class FastRow(Plane):
@@ -323,7 +324,7 @@ class FastRow(Plane):
 def test_rows_that_are_nonlinear_at_speeds_beyond_the_probed_ones_hold():
     for backend in ("auto", "dense"):
         motion = jj.simulate(FastRow(), {"x_rate": 4.0}, t1=2.0, backend=backend).raise_if_failed()
-        np.testing.assert_allclose(motion.u_end, [4.0, 1.0], atol=1e-8)  # (1 + 4 (v-3)^2) vdot = 1 - (v-3), at rest where v = 4
+        assert_allclose(motion.u_end, [4.0, 1.0], atol=1e-8)  # (1 + 4 (v-3)^2) vdot = 1 - (v-3), at rest where v = 4
 
 
 class Terrain(Plane):
