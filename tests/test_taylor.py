@@ -27,6 +27,7 @@ UNARY = [name for name, f in TABLE.items() if f.kind in ("analytic", "flat") and
 
 def coefficients(graph: Graph, s: int, outputs, at, known=None) -> np.ndarray:
     """Taylor coefficients, (orders, outputs), of functions of s about a point, as machine code has them; `known`: values of other inputs."""
+    assert not ffi.reason_against()
     w = Writer(host.lanes(), host.fuses())
 
     def block(arguments, found):

@@ -7,7 +7,6 @@ import numpy as np
 from jourdain_jax.program.source import PYTHON, C, statements, sympy_expressions
 
 DIGITS = 6  # significant ones of a long number in LaTeX
-SHORT, FEW = 60, 8  # characters of an expression in the summary, and how many there may be
 _IN_C = {"auto", "char", "const", "default", "do", "double", "enum", "extern", "float", "goto", "inline", "int", "long", "register", "restrict", "short"}
 _IN_C |= {"signed", "sizeof", "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "case"} | C.names
 _ARGUMENTS = ("parameters", "t", "coordinates", "speeds", "inputs", "out")
@@ -37,10 +36,10 @@ def _parameters(lowered) -> str:
 
 
 def _shown(lowered, nodes) -> str:
-    """The nodes as expressions where these are short, otherwise how many there are."""
+    """The nodes as expressions where these are short (60 characters, of 8 nodes at most), otherwise how many there are."""
     names = identifiers(lowered)
-    written = [statements(lowered.graph, [n], names, PYTHON) for n in nodes if len(nodes) <= FEW and not lowered.graph.calls([n])]
-    short = [text.replace("math.", "") for lines, (text,) in written if not lines and len(text) <= SHORT]
+    written = [statements(lowered.graph, [n], names, PYTHON) for n in nodes if len(nodes) <= 8 and not lowered.graph.calls([n])]
+    short = [text.replace("math.", "") for lines, (text,) in written if not lines and len(text) <= 60]
     more = len(nodes) - len(short)
     return ", ".join([*short, *([f"{more} longer expression{'s' if more > 1 else ''}"] if more else [])]) or "none"
 

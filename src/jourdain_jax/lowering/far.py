@@ -12,10 +12,6 @@ from jourdain_jax.lowering.pivots import turns
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.onto_rows import onto_rows
 
-MANY, FEW = 96, 24  # probes; the latter where there are more coordinates than
-LARGE = 16
-STEPS, CLOSED = 12, 1e-9  # of Gauss-Newton
-
 
 def full_turns(probes: Probes, traced: TracedScene) -> Callable[[], Probes]:
     """Probes with coordinates up to half a turn away from those given, put onto the geometric rows where Newton's method arrives; made when first asked for.
@@ -27,7 +23,8 @@ def full_turns(probes: Probes, traced: TracedScene) -> Callable[[], Probes]:
 
 def _at_full_turns(probes: Probes, traced: TracedScene) -> Probes:
     coordinates = traced.q.tolist()
-    count, generator = MANY if len(coordinates) <= LARGE else FEW, np.random.default_rng(3)
+    # fewer probes where there are many coordinates
+    count, generator = 96 if len(coordinates) <= 16 else 24, np.random.default_rng(3)
     places = np.arange(count) % probes.count
     inputs = {name: np.broadcast_to(value, probes.count)[places] for name, value in probes.inputs.items()}
     attitudes = {first + i for first in traced.quaternions for i in range(4)}
@@ -44,8 +41,8 @@ def _at_full_turns(probes: Probes, traced: TracedScene) -> Probes:
 
 def _on_rows(probes: Probes, rows: list[int], coordinates: list[int]) -> Probes:
     """Return the probes with coordinates on rows = 0; NaN where Gauss-Newton does not converge."""
-    found = onto_rows(probes, rows, {f"q_{i}": n for i, n in enumerate(coordinates)}, most=STEPS)
-    off = ~(np.max(np.abs(found.probes(rows)), axis=0, initial=0.0) <= CLOSED)
+    found = onto_rows(probes, rows, {f"q_{i}": n for i, n in enumerate(coordinates)}, most=12)
+    off = ~(np.max(np.abs(found.probes(rows)), axis=0, initial=0.0) <= 1e-9)
     return found.probes.with_inputs({name: np.where(off, np.nan, found.probes.inputs[name]) for name in found.moved})
 
 

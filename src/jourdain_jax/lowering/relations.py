@@ -18,8 +18,7 @@ from jourdain_jax.program.graph import Graph
 
 MOST_WATCHED = 32  # of a scene
 COMPARED = {"lt": (False, True), "le": (False, True), "gt": (True, False), "ge": (True, False)}  # the truth where a > b, and where a < b
-PLACES, HALVINGS = 6, 40  # for each relation, between probes
-ASIDE, CLOSER, AGREE = 1e-5, 1e-9, 1e-7  # of the way between two probes; of the size of a rate
+ASIDE, AGREE = 1e-5, 1e-7  # of the way between two probes; of the size of a rate
 _WHOLE = {"floor": "sin", "ceil": "sin", "round": "cos", "rem": "sin"}
 
 
@@ -112,7 +111,7 @@ def jumps(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: 
         return np.abs(behind - before)
 
     def jumps_at(number: int) -> bool:
-        near = [(change(place(CLOSER)), change(place(ASIDE))) for place in _places(number, probes)]
+        near = [(change(place(1e-9)), change(place(ASIDE))) for place in _places(number, probes)]
         return any(np.any((closer > AGREE * size) & (closer > 0.5 * wide)) for closer, wide in near)
 
     return tuple(n for n in numbers if jumps_at(n))
@@ -122,14 +121,14 @@ def _places(number: int, probes: Probes) -> Iterator[Callable[[float], tuple[Pro
     """Places where a number vanishes, as functions: states on either side of it, this far away."""
     values = probes([number])[0]
     positive, negative = np.flatnonzero(values > 0), np.flatnonzero(values < 0)
-    for i, j in list(zip(positive, negative, strict=False))[:PLACES]:
+    for i, j in list(zip(positive, negative, strict=False))[:6]:
         a, b = ({name: np.atleast_1d(np.broadcast_to(x, probes.count)[k]) for name, x in probes.inputs.items()} for k in (i, j))
 
         def at(share: float, a=a, b=b) -> Probes:
             return probes.with_inputs({name: a[name] + share * (b[name] - a[name]) for name in a})
 
         low, high = 0.0, 1.0
-        for _ in range(HALVINGS):
+        for _ in range(40):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if at(middle)([number])[0, 0] > 0 else (low, middle)
         yield lambda aside, at=at, low=low, high=high: (at(low - aside), at(high + aside))

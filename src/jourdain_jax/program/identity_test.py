@@ -25,9 +25,7 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.onto_rows import onto_rows
 
-STEPS, CLOSED = 30, 1e3  # of Newton's method; bounds of round-off that rows may be off
 DIGITS = 40  # binary ones, that numbers in the code of a scene may span among themselves
-RADIX = 1.5, 3.0  # in the place of 2^DIGITS
 SURE = 16.0  # bounds of round-off that equal values may differ by: bounds are of first order
 FEWEST = 6  # probes at which an expression is a number
 
@@ -48,7 +46,8 @@ class IdentityProbes:
         self.graph, self.inputs, self._errors = graph, dict(inputs), dict(errors)
         self.count = max((np.size(x) for x in self.inputs.values()), default=1)
         both = {name: np.concatenate([np.broadcast_to(x, self.count), np.broadcast_to(self._errors.get(name, 0.0), self.count)]) for name, x in inputs.items()}
-        self._radix = radix = np.random.default_rng(4).uniform(*RADIX, self.count) if radix is None else radix
+        # numbers in the place of 2^DIGITS
+        self._radix = radix = np.random.default_rng(4).uniform(1.5, 3.0, self.count) if radix is None else radix
         # the bounds follow the values in one array, as if they were further probes
         self._both = Probes(graph, both, _SCALARS, _ARRAYS, lambda value: _moderate(value, radix))
 
@@ -179,14 +178,15 @@ def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinat
     if any(graph.op[n] not in _KNOWN for n in graph.reachable(rows)):
         return probes
     begun = probes.with_inputs({name: near.inputs[name] for name in coordinates}, dict.fromkeys(coordinates, 0.0))
-    found = onto_rows(begun, rows, coordinates, most=STEPS, longest=1.0)
+    found = onto_rows(begun, rows, coordinates, most=30, longest=1.0)
     if not found.moved:
         return probes
     values, J = found.probes(rows), np.asarray(found.probes(found.slopes)).T
     q = np.stack([found.probes.inputs[name] for name in found.moved])
     off = np.abs(np.asarray(values))
     errors = np.einsum("pqr,rp->qp", np.abs(pseudo_inverses(found.pattern.dense(J))), off + values.error) + EPS * np.abs(q)
-    errors[:, ~np.all(off <= CLOSED * values.error, axis=0)] = np.inf
+    # rows may be off by 1,000 bounds of round-off
+    errors[:, ~np.all(off <= 1e3 * values.error, axis=0)] = np.inf
     return probes.with_inputs(dict(zip(found.moved, q, strict=True)), dict(zip(found.moved, errors, strict=True)))
 
 

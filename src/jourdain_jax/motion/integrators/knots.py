@@ -19,8 +19,6 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jourdain_jax.motion.inputs import Inputs, Sampled
 
-_SHARE, _LOOSEST = 0.1, 1e-4
-
 
 def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> Float[Array, "knots"] | None:
     """Times since `t0`, in the order of the motion to `t1`, of the knots of all samples in `holders` at which steps must end, but for the saved times `ts`.
@@ -32,8 +30,8 @@ def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> F
         return None
     t1, ts = jax.lax.stop_gradient((t1, ts))
     direction, span = jax.lax.stop_gradient((jnp.sign(t1 - t0), jnp.abs(t1 - t0)))
-    # 1e-12 of the span: times nearer to each other than this are one
-    share, near = _SHARE * jnp.minimum(rtol, _LOOSEST), 1e-12 * span
+    # so far off the straight lines may be, in parts of the range of values; 1e-12 of the span: times nearer to each other than this are one
+    share, near = 0.1 * jnp.minimum(rtol, 1e-4), 1e-12 * span
     # which times these are is a number to differentiation, the times are not: steps end where a knot is moved to
     since = jnp.concatenate([jnp.where(bends(x, share), (x.ts - t0) * direction, jnp.inf) for x in samples])
     ends = jnp.sort(jnp.concatenate([(ts - jax.lax.stop_gradient(t0)) * direction, jnp.stack([jnp.zeros_like(span), span])]))

@@ -20,8 +20,6 @@ from jourdain_jax.native.series import Coefficients, Series
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.products import with_few_products
 
-SAFETY = 0.9
-
 
 @dataclass(frozen=True)
 class TaylorSteps:
@@ -128,7 +126,7 @@ def radius(w: Writer, layout: Layout, p: Lanes, rows: Sequence[Coefficients]) ->
                 square = w.fma(relative, relative, square)
         least = w.smaller(least, (-0.5 / k) * logarithm(w, square * (1.0 / count)))
     reach = w.where(least < math.inf, exponential(w, least), least)
-    return SAFETY * w.where(w.is_nan(reach), 0.0, reach)
+    return 0.9 * w.where(w.is_nan(reach), 0.0, reach)
 
 
 def at_time(w: Writer, series: Coefficients, s: Value) -> Value:
