@@ -26,7 +26,7 @@ CEILINGS = {
     "ways: damped least squares": 3,
     "code tokens of tests": 352_950,
     "code tokens of bench": 121_000,
-    "test files that reach private names": 65,
+    "test files that reach private names": 63,
 }
 
 

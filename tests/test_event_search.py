@@ -12,7 +12,7 @@ from small_scenes import OnLine
 
 import jourdain_jax as jj
 from jourdain_jax.motion.integrators import erk_loop
-from jourdain_jax.motion.integrators.tableaus import method_of
+from jourdain_jax.motion.integrators.tableaus import DOPRI5, DOPRI8, TSIT5, method_of
 
 GRAVITY = 9.81
 
@@ -116,3 +116,28 @@ def test_the_time_of_an_event_whose_value_has_no_slope_has_no_derivative(options
     assert_allclose(met(1.5, 3), [1.5, 1.5, 0.75], rtol=1e-7)
     assert_allclose(derivative(met)(1.5, 1), [1.0, 1.0, 0.5], rtol=1e-9)
     assert_allclose(derivative(met)(1.5, 3), [np.nan, np.nan, 0.5], rtol=1e-9)  # what was saved on the way is none of the event's
+
+
+# Solvers of our own. --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", [TSIT5, DOPRI5, DOPRI8], ids=lambda method: method.name)
+def test_our_tableaus_are_those_of_the_solvers_of_that_name(method):
+    solver = getattr(diffrax, method.name)()
+    tableau = solver.tableau
+    for row, theirs in zip(method.A[1:], tableau.a_lower, strict=True):
+        assert np.array_equal(row[: len(theirs)], theirs)
+        assert not row[len(theirs) :].any()
+    assert np.array_equal(method.b, tableau.b_sol)
+    assert np.array_equal(method.b_error, tableau.b_error)
+    assert np.array_equal(method.c[1:], tableau.c)
+    assert method.order == solver.order(None)
+    assert method_of(solver) is method
+
+
+def test_only_a_solver_itself_has_its_tableau():
+    class Tsit5(diffrax.Tsit5):
+        pass
+
+    assert method_of(Tsit5()) is None
+    assert method_of(diffrax.Bosh3()) is None

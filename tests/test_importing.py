@@ -8,12 +8,9 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
-import diffrax
-import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.motion.integrators.tableaus import DOPRI5, DOPRI8, TSIT5, method_of
 
 PROGRAM = """
 import gc
@@ -79,25 +76,3 @@ def test_the_registry_holds_all_models():
     assert "sledge" not in jj.models.MODELS
     with pytest.raises(KeyError):
         jj.models.MODELS["sledge"]
-
-
-@pytest.mark.parametrize("method", [TSIT5, DOPRI5, DOPRI8], ids=lambda method: method.name)
-def test_our_tableaus_are_those_of_the_solvers_of_that_name(method):
-    solver = getattr(diffrax, method.name)()
-    tableau = solver.tableau
-    for row, theirs in zip(method.A[1:], tableau.a_lower, strict=True):
-        assert np.array_equal(row[: len(theirs)], theirs)
-        assert not row[len(theirs) :].any()
-    assert np.array_equal(method.b, tableau.b_sol)
-    assert np.array_equal(method.b_error, tableau.b_error)
-    assert np.array_equal(method.c[1:], tableau.c)
-    assert method.order == solver.order(None)
-    assert method_of(solver) is method
-
-
-def test_only_a_solver_itself_has_its_tableau():
-    class Tsit5(diffrax.Tsit5):
-        pass
-
-    assert method_of(Tsit5()) is None
-    assert method_of(diffrax.Bosh3()) is None

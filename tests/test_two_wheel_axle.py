@@ -12,7 +12,6 @@ from solved_states import solved_at_random_states
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.dynamics.reactions import contact_forces
 from jourdain_jax.models import TwoWheelAxleCoordinates, TwoWheelAxleFree, TwoWheelAxleQuasi, TwoWheelAxleRedundant
 
 ROUND_OFF = tolerance("round_off")
@@ -61,8 +60,7 @@ def test_the_motion_is_the_closed_form(method, turn_rate):
 def test_each_wheel_carries_its_own_weight(method):
     # from the height rows of the free bodies, from Newton's equation where the height is in the coordinates
     scene = method(**PARAMETERS)
-    _, q, u = (jnp.asarray(x) for x in jj.sample_states(scene, 5))
-    forces = jax.jit(jax.vmap(lambda q, u: contact_forces(scene, 0.0, q, u, jj.accelerations(scene, 0.0, q, u))))(q, u)
+    forces = jj.simulate(scene, ts=jnp.linspace(0.0, 1.0, 5)).contact_forces()
     weight = scene.mass * scene.gravity * jnp.cos(scene.slope)
     assert set(forces) == {"wheel1", "wheel2"}
     for wheel, force in forces.items():
