@@ -62,7 +62,8 @@ def triangle(whole: Float[np.ndarray, "*batch samples width"]) -> Float[np.ndarr
     if whole.shape[-2] < width:
         whole = np.concatenate([whole, np.zeros((*whole.shape[:-2], width - whole.shape[-2], width))], axis=-2)
     reflected, _ = np.linalg.qr(whole, mode="raw")  # as LAPACK leaves it: the transposed triangle, and reflectors beyond its diagonal
-    return np.triu(reflected[..., :width].swapaxes(-1, -2))
+    index = np.arange(width)
+    return reflected[..., :width].swapaxes(-1, -2) * (index[:, None] <= index)
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,8 @@ class Arrow(ByMember):
     def _columns(self, x: Shaped[np.ndarray, "members unknowns"]) -> list[np.ndarray]:
         """Return the entries of x that belong to the columns of each block; before the first piece of a run, which joins nothing, any."""
         shared, own = self.split(x)
+        if len(self._blocks) == 1:
+            return [shared]
         each = np.broadcast_to(shared[:, None], (*own.shape[:2], shared.shape[1]))
         leading = ([], [own], [own, np.roll(own, 1, axis=1)])[: len(self._blocks)]
         return [np.concatenate([*parts, each], axis=-1) if parts else shared for parts in leading]

@@ -39,6 +39,7 @@ from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.scene.scene import Scene
 
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
 _ARRAYS = ("singular_values", "least_part", "rank", "identifiable", "standard_errors", "shared", "own", "follow")
 _WHOLE = 0.01  # how far from a multiple of one half an exponent may be, to be taken as that, and two changes from being equal
 
@@ -100,10 +101,9 @@ def variances(shared: np.ndarray, own: np.ndarray, follow: np.ndarray) -> Float[
 def students_t_95(degrees):
     """97.5 % quantile q of Student's t with one degree of freedom or more: q = sqrt(n) tan a,   2 c integral_0^a cos^(n - 1) = 0.95."""
     n = np.clip(np.asarray(degrees, float), 1.0, 1e7)  # degrees of freedom, beyond which Student's t is normal
-    nodes, weights = np.polynomial.legendre.leggauss(40)
     c, a = np.vectorize(lambda x: np.exp(math.lgamma((x + 1) / 2) - math.lgamma(x / 2)) / np.sqrt(np.pi))(n), np.zeros(n.shape)
     for _ in range(12):  # Newton's method, from below: what is integrated falls
-        area = a / 2 * (np.cos(a[..., None] * (nodes + 1) / 2) ** (n[..., None] - 1) @ weights)
+        area = a / 2 * (np.cos(a[..., None] * (_NODES + 1) / 2) ** (n[..., None] - 1) @ _WEIGHTS)
         a = a + (0.475 / c - area) / np.cos(a) ** (n - 1)
     return np.asarray(np.sqrt(n) * np.tan(a))
 
