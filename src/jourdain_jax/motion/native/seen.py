@@ -1,8 +1,8 @@
 """Numbers beside the steps of a motion, as machine code: those that depend on parameters alone, and all speeds, pivots and energies at saved states.
 
-Each is a function of JAX on one state or scene; under `vmap` all lanes go to one call. Derivatives of what parameters
-fix, and of speeds that take many operations, are machine code too (`values_of_nodes.py`); those of other speeds are derivatives of the same by XLA
-(`lowering/lowered.py`).
+Each is a function of JAX on one state or scene; under `vmap` all lanes go to one call. In batches of motions XLA sees the states: machine code, for which
+rows of numbers are put together, takes twice as long there. Derivatives of what parameters fix, and of speeds that take many operations, are machine code
+too (`values_of_nodes.py`); those of other speeds are derivatives of the same by XLA (`lowering/lowered.py`).
 """
 
 import math
@@ -19,7 +19,7 @@ from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as, wi
 from jourdain_jax.calculus.entries import entries_of
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.motion.native.called import called, nodes_called
+from jourdain_jax.motion.native.called import called, nodes_called, unless_batched
 from jourdain_jax.motion.native.values_of_nodes import Derivatives, values_of_nodes
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.math_functions import FUNCTIONS
@@ -101,13 +101,14 @@ def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Ar
         parts = jnp.split(found, np.cumsum([jnp.size(x) for x in arguments])[:-1])
         return tuple(jnp.reshape(part, jnp.shape(x)) for x, part in zip(arguments, parts, strict=True))
 
+    run = unless_batched(1, by_machine_code, by_xla)
     # Operations from which on derivatives are machine code. Measured, gradients of batches over all saved states,
     # by XLA and here: 5 operations, 28 and 42 ms; 66, 98 and 69; 228, 405 and 108. One motion of 16 trailers
     # compiles in 16 to 19 s and 4.5 s.
     if program.graph.operations(program.z) >= 60:
-        values = with_rules(by_machine_code, Rules(push, pull))
+        values = with_rules(run, Rules(push, pull))
     else:
-        values = differentiated_as(by_xla, by_machine_code)
+        values = differentiated_as(by_xla, run)
     return values(_stacked(fixed), jnp.asarray(t, real_type()), q, y, inputs)
 
 
@@ -122,7 +123,13 @@ def _derivatives_of_speeds(program: Lowered) -> Derivatives:
 def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
     """As `Lowered.energy_values`."""
 
-    return _kernel_of_seen(program)(_in_a_row(*jax.lax.stop_gradient((_stacked(fixed), t, q, y, inputs))))[0][-2:]
+    def by_xla(fixed, t, q, y, inputs):
+        return program.energy_values(entries_of(fixed), t, tuple(q), tuple(y), inputs)
+
+    def by_machine_code(*state):
+        return _kernel_of_seen(program)(_in_a_row(*state))[0][-2:]
+
+    return differentiated_as(by_xla, unless_batched(1, by_machine_code, by_xla))(*jax.lax.stop_gradient((_stacked(fixed), t, q, y, inputs)))
 
 
 def is_right(program: RowProgram, scene: Scene, t, q) -> Bool[Array, ""]:
