@@ -17,8 +17,6 @@ from jourdain_jax.native.exponentials import exponential, logarithm
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.scalar_program import as_real, written
 from jourdain_jax.native.series import Coefficients, Series
-from jourdain_jax.program.graph import Graph
-from jourdain_jax.program.products import with_few_products
 
 
 @dataclass(frozen=True)
@@ -69,16 +67,9 @@ def jet(w: Writer, form: Form, p: Lanes, t: Value, order: int) -> Jet:
     moved = [n for part in (states, *own.states) for n in with_work(part, None)]
     nodes = [n for part in (own.values[: len(rates)], *own.tangents) for n in with_work(part, own.graph.zero)]
     start = [w.load(w.real, y, i) for i in range(layout.integrated)]
-    # on a graph whose inputs are what is given, so that it is known of each whether it varies along the motion
-    graph, clock, monitored = Graph(), own.variables[first], own.values[len(rates) :]
-    varying = dict.fromkeys([clock, *(n for n in moved if n is not None)])
-    inputs = {n: graph.input(str(n), n in varying) for n in (*varying, *given)}
-    new = graph.copied([*nodes, *monitored], own.graph, inputs)
-    few = with_few_products(graph, [new[n] for n in nodes])
-    given, moved = {inputs[n]: x for n, x in given.items()}, [None if n is None else inputs[n] for n in moved]
-    found = Series(w, graph, given, moved, few, start, order, inputs[clock])
+    found = Series(w, own.graph, given, moved, nodes, start, order, own.variables[first])
     values = {n: w.number(0.0) if x[0] is None else x[0] for n, x in found.of.items()}
-    return Jet(found.state, _evaluated(w, form, graph, [new[n] for n in monitored], values, known))
+    return Jet(found.state, _evaluated(w, form, own.graph, own.values[len(rates) :], values, known))
 
 
 def products(form: Form, order: int) -> int:
