@@ -256,9 +256,10 @@ def test_a_bound_on_memory_is_refused_where_there_is_no_library_of_c_to_ask(monk
         memory.give_back_at_once()
 
 
-def test_a_study_whose_workers_cannot_begin_says_so(tmp_path):
+def test_a_study_whose_workers_cannot_begin_says_so(tmp_path, monkeypatch):
     sent = b"\x80\x04\x8c\x08__main__\x8c\x04Mine\x93."  # a class of the program that was started, which a worker does not have
     store = Store.make(tmp_path / "study", {"samples": 4, "chunk": 2, "block": 2}, {}, {}, {})
-    found = workers._until_a_worker_dies(sent, store, [0, 1], 1, lambda: False)
+    monkeypatch.setattr(workers, "sent_to_others", lambda _: sent)
+    found = workers.in_processes(object.__new__(workers.Task), 1)(store, [0, 1], lambda: False)
     with pytest.raises(RuntimeError, match=r"no worker of this study could begin.*__main__"):
         next(found)
