@@ -36,7 +36,6 @@ BEGUN = (
 def cold(code: str) -> float:
     """Processor time of a call in a fresh process, imports and a start left out."""
     script = f"{BEGUN}; {code}; print(time.process_time() - begin)"
-
     return float(subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout)
 
 

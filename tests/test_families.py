@@ -158,6 +158,24 @@ def test_a_bead_on_a_turning_hoop_leaves_the_bottom_at_a_pitchfork():
     assert [point["turning"] for point in both.special] == pytest.approx([critical] * 2, abs=1e-9)
 
 
+class SplineBead(Bead):
+    """The bead with a field of many numbers, which is no parameter, before the one that varies."""
+
+    weight: jj.Spline = jj.Spline(jnp.linspace(0.0, 1.0, 5), jnp.full(5, 9.81))
+    pace: float = jj.parameter(3.0, unit="rad/s")
+
+    def bodies(self, t, q):
+        return Bead(self.radius, self.pace).bodies(t, q)
+
+    def loads(self, motion):
+        return jj.gravity(motion, self.weight(0.5))
+
+
+def test_the_parameter_that_varies_is_found_among_other_numbers_of_a_scene():
+    (branch,) = jj.family(SplineBead(), {"angle": 0.0}, vary="pace", until={"pace": 6.0}).branches
+    assert branch["pace"] == pytest.approx(np.sqrt(9.81 / 0.5), abs=1e-9)
+
+
 def test_a_family_in_arrays_and_in_text(turns):
     found = turns.to_xarray()
     assert dict(found.sizes) == {"point": len(turns), "mode": 4}

@@ -20,6 +20,7 @@ from jourdain_jax.build.row_program import row_program
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.dynamics.reduced import DEPENDS, PROBES, ignorable_coordinates
 from jourdain_jax.lowering.lower import lower
+from jourdain_jax.lowering.lowered import NotLowered
 from jourdain_jax.motion.native.called import nodes_called
 from jourdain_jax.native import host
 from jourdain_jax.native.scalar_program import unsupported
@@ -47,18 +48,16 @@ class SteadyEquations:
     """R, J, F and the rows of (q, y) of one scene as functions of z."""
 
     def __init__(self, scene: Scene, guess: tuple[float, np.ndarray, np.ndarray], inputs: np.ndarray, vary: str | None) -> None:
-        self.scene, self.vary, (t, q, u) = scene, vary, guess
-        self.t = t
+        self.scene, self.vary, (self.t, q, u) = scene, vary, guess
         self.names = (*scene.coordinate_names.entries, *scene.speed_names.entries)
         leaves = [np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(scene)]
-        self._given = np.concatenate([*leaves, [t], q, u, inputs])
+        self._given = np.concatenate([*leaves, [self.t], q, u, inputs])
         self._counts = sum(map(len, leaves)), len(q), len(u)
         kept, resting = _coordinates(scene)
         first, n = self._counts[0] + 1, len(q)
         self.places = np.array([*(first + k for k in kept), *range(first + n, first + n + len(u)), *self._place_of(vary)], int)
         self.unknowns = (*(self.names[k] for k in kept), *scene.speed_names.entries, *([] if vary is None else [vary]))
         self.size = _sizes(scene, kept, self._given[self.places])
-        self._kept = len(kept)
         self._program(kept, resting)
 
     @property
@@ -73,24 +72,26 @@ class SteadyEquations:
         return self.unknowns.index(name)
 
     def _place_of(self, vary: str | None) -> list[int]:
+        """The place of a parameter among all numbers of the scene."""
         if vary is None:
             return []
         place = 0
-        for name, value, _ in parameters_of(self.scene):
-            if name == vary and np.ndim(value) == 0:
+        for path, leaf in jax.tree_util.tree_flatten_with_path(self.scene)[0]:
+            if path == (jax.tree_util.GetAttrKey(vary),) and np.ndim(leaf) == 0:
                 return [place]
-            place += np.size(value)
-        scalar = [name for name, value, _ in parameters_of(self.scene) if np.ndim(value) == 0]
-        raise ValueError(f"`vary` names `{vary}`, expected a parameter of `{type(self.scene).__name__}` that is one number; {nearest(vary, scalar)}")
+            place += np.size(leaf)
+        advice = nearest(vary, [name for name, value, _ in parameters_of(self.scene) if np.ndim(value) == 0])
+        raise ValueError(f"`vary` names `{vary}`, expected a parameter of `{type(self.scene).__name__}` that is one number; {advice}")
 
     def _program(self, kept: Sequence[int], resting: Sequence[int]) -> None:
         """One graph of rows and rates, and the values of its nodes as a function of everything given."""
         program, rows = lower(self.scene), row_program(self.scene)
+        if rows is None:
+            raise NotLowered(f"the rows of `{type(self.scene).__name__}` have no scalar program, which its families of steady motions need")
         graph, of = Graph(), program.traced
         every = [graph.input(f"x{k}", True) for k in range(len(self._given))]
-        new = graph.copied([*program.qdot, *program.ydot], program.graph, _known((of.parameters, of.t, of.q, of.u, of.inputs), every))
-        row_nodes = [*rows.g, *rows.phi]
-        new_rows = graph.copied(row_nodes, rows.graph, _known((rows.parameters, rows.t, rows.q, rows.u, rows.inputs), every))
+        new = graph.copied([*program.qdot, *program.ydot, *program.guards], program.graph, _known((of.parameters, of.t, of.q, of.u, of.inputs), every))
+        new_rows = graph.copied([*rows.g, *rows.phi], rows.graph, _known((rows.parameters, rows.t, rows.q, rows.u, rows.inputs), every))
         g, phi = [new_rows[n] for n in rows.g], [new_rows[n] for n in rows.phi]
         qdot, ydot = [new[n] for n in program.qdot], [new[n] for n in program.ydot]
         held = [*g, *phi, *ydot, *(qdot[k] for k in resting)]
@@ -108,13 +109,16 @@ class SteadyEquations:
             where = np.array([entry[:2] for entry in entries], int).reshape(-1, 2).T
             self._entries[name] = (len(outputs), len(variables)), tuple(where), slice(len(nodes), len(nodes) + len(entries))
             nodes += [node for *_, node in entries]
-        self._values = _evaluated(graph, nodes, every)
+        self._guards = slice(len(nodes), None)
+        self._values = _evaluated(graph, [*nodes, *map(new.__getitem__, program.guards)], every)
 
     def __call__(self, z: Vector) -> Look:
         """The equations at z."""
         given = self._given.copy()
         given[self.places] = z * self.size
         values = self._values(given)
+        if np.any(values[self._guards] <= 0):
+            values = np.full(len(values), np.nan)  # where the rates are not defined
         matrices = {}
         for name, (shape, where, here) in self._entries.items():
             matrices[name] = np.zeros(shape)
@@ -133,7 +137,8 @@ class SteadyEquations:
         """q, u and the parameter that varies (or NaN)."""
         given = self._given.copy()
         given[self.places] = z * self.size
-        first, n, m = self._counts[0] + 1, self._counts[1], self._counts[2]
+        first = self._counts[0] + 1
+        n, m = self._counts[1:]
         return given[first : first + n], given[first + n : first + n + m], float(given[self.places[-1]]) if self.vary else np.nan
 
 
@@ -141,7 +146,6 @@ def _coordinates(scene: Scene) -> tuple[list[int], list[int]]:
     """Numbers of the coordinates that are unknowns, and of those that must rest."""
     groups = {group: scene.coordinate_names.entries[first : first + length] for group, first, length in scene.coordinate_names.groups}
     entries, on_rows = scene.coordinate_names.entries, _on_rows(scene)
-
     ignorable = {entries.index(entry) for name in ignorable_coordinates(scene) for entry in groups.get(name, (name,))}
     every = range(len(entries))
     return [k for k in every if k not in ignorable or on_rows[k]], [k for k in every if k not in ignorable]
@@ -183,5 +187,4 @@ def _evaluated(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> 
     if jax.config.jax_enable_x64 and not host.reason_against() and not unsupported(graph, nodes):
         kernel = jax.jit(nodes_called(graph, nodes, variables, effort=0))
         return lambda given: np.asarray(kernel(given))
-    names = [graph.value[n] for n in variables]
-    return lambda given: Probes(graph, dict(zip(names, given[:, None], strict=True)))(nodes)[:, 0]
+    return lambda given: Probes(graph, dict(zip([graph.value[n] for n in variables], given[:, None], strict=True)))(nodes)[:, 0]

@@ -191,8 +191,8 @@ def family(
       default: the `mode_names` of the scene, or "mode 1", ...
     - `max_points`: at most, in each direction.
 
-    **Returns** a `Family`. Special points are located to round-off. By pseudo-arclength; two special points within one step are seen where the step is
-    halved until neighbours differ by little, but a pair of folds closer than 1e-3 of the sizes of the unknowns may be passed.
+    **Returns** a `Family`, traced by pseudo-arclength, with special points located to round-off. Two special points of one kind within one step may be
+    missed; steps are at most 0.1 of the sizes of the unknowns (of a coordinate the width of its domain, of a speed 10 SI units) and turn by at most 10 degrees.
 
     **Raises** ValueError: an unknown name; no steady motion near the guess; none or several freedoms (the error names what may be held); a start that is a
     branch point itself; `NotLowered` where the scene has no scalar program. `DifferentiationModeError` inside `jit`: differentiate `steady` or `linearize`.
