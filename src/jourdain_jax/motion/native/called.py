@@ -5,7 +5,7 @@ not depend on the width.
 """
 
 from collections.abc import Callable, Sequence
-from functools import cache, lru_cache, partial
+from functools import cache, lru_cache
 
 import jax
 import jax.numpy as jnp
@@ -118,16 +118,3 @@ def nodes_called(graph: Graph, nodes: Sequence[int], variables: Sequence[int], e
 
     kernel = called(write, lambda *_: ((len(nodes),),), effort=effort)
     return lambda x: kernel(x)[0]
-
-
-def unless_batched(times: int, function: Callable, by_xla: Callable) -> Callable:
-    """`function`, which `vmap` may batch so many times; in a further one, `by_xla` takes its place, which must return the same."""
-    run = jax.custom_batching.custom_vmap(function)
-
-    @run.def_vmap
-    def in_lanes(count, batched: list, *arguments):
-        mapped = partial(jax.vmap, in_axes=jax.tree.map(lambda has_axis: 0 if has_axis else None, tuple(batched)), axis_size=count)
-        found = (unless_batched(times - 1, mapped(function), mapped(by_xla)) if times else mapped(by_xla))(*arguments)
-        return found, jax.tree.map(lambda _: True, found)
-
-    return run

@@ -1,8 +1,7 @@
-"""Numbers beside the steps of a motion, as machine code: those that depend on parameters alone, and all speeds, pivots and energies at saved states.
+"""Numbers beside the steps of a motion, as machine code: those that depend on parameters alone, and derivatives of all speeds at saved states.
 
-Each is a function of JAX on one state or scene; under `vmap` all lanes go to one call. In batches of motions XLA sees the states: machine code, for which
-rows of numbers are put together, takes twice as long there. Derivatives of what parameters fix, and of speeds that take many operations, are machine code
-too (`values_of_nodes.py`); those of other speeds are derivatives of the same by XLA (`lowering/lowered.py`).
+Each is a function of JAX on one state or scene; under `vmap` all lanes go to one call. Speeds and energies at saved states are XLA's (`lowering/lowered.py`):
+machine code, for which rows of numbers are put together, takes longer there.
 """
 
 import math
@@ -15,11 +14,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.row_program import RowProgram
-from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as, with_rules
+from jourdain_jax.calculus.differentiated_as import Rules, with_rules
 from jourdain_jax.calculus.entries import entries_of
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.motion.native.called import called, nodes_called, unless_batched
+from jourdain_jax.motion.native.called import called, nodes_called
 from jourdain_jax.motion.native.values_of_nodes import Derivatives, values_of_nodes
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.math_functions import FUNCTIONS
@@ -35,7 +34,7 @@ _TRUTHS = frozenset(("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is
 @lru_cache(maxsize=MOST_KERNELS)
 def is_supported(program: Lowered) -> bool:
     """Whether all this can be machine code."""
-    graph, nodes = program.graph, [*_seen_nodes(program), *program.fixed, *program.usual.values()]
+    graph, nodes = program.graph, [*program.z, *program.fixed, *program.usual.values()]
     truths = any(_is_truth(graph, n) for n in program.fixed)  # which XLA hands on as such
     # 60_000 operations
     return not truths and graph.operations(nodes) <= 60_000 and not unsupported(graph, nodes)
@@ -80,36 +79,31 @@ def _usual(program: Lowered) -> Callable[[Array], Array]:
 
 
 def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
-    """As `Lowered.speeds_and_pivot`."""
-    count = len(program.independent) + len(program.dependent)
+    """As `Lowered.speeds_and_pivot`; where speeds take many operations, derivatives are machine code."""
 
     def by_xla(fixed, t, q, y, inputs):
         return program.speeds_and_pivot(entries_of(fixed), t, tuple(q), tuple(y), inputs)
 
-    def by_machine_code(*state):
-        found = _kernel_of_seen(program)(_in_a_row(*state))[0]
-        return found[:-3], found[-3]
-
     def push(arguments, tangents):
         along = [jnp.zeros_like(x) if dx is None else dx for x, dx in zip(arguments, tangents, strict=True)]
-        found = _derivatives_of_speeds(program).along(_in_a_row(*arguments), _in_a_row(*along))
-        return values(*arguments), (found[:count], found[count])
+        found = derivatives.along(_in_a_row(*arguments), _in_a_row(*along))
+        return values(*arguments), (found[:-1], found[-1])
 
     def pull(perturbed, arguments, found, g):
         x = _in_a_row(*arguments)
-        found = _derivatives_of_speeds(program).back(x, jnp.concatenate([g[0], jnp.zeros_like(x, shape=(1,))]))
+        found = derivatives.back(x, jnp.concatenate([g[0], jnp.zeros_like(x, shape=(1,))]))
         parts = jnp.split(found, np.cumsum([jnp.size(x) for x in arguments])[:-1])
         return tuple(jnp.reshape(part, jnp.shape(x)) for x, part in zip(arguments, parts, strict=True))
 
-    run = unless_batched(1, by_machine_code, by_xla)
+    given = jnp.stack(fixed) if fixed else jnp.zeros(0, real_type()), jnp.asarray(t, real_type()), q, y, inputs
     # Operations from which on derivatives are machine code. Measured, gradients of batches over all saved states,
     # by XLA and here: 5 operations, 28 and 42 ms; 66, 98 and 69; 228, 405 and 108. One motion of 16 trailers
     # compiles in 16 to 19 s and 4.5 s.
-    if program.graph.operations(program.z) >= 60:
-        values = with_rules(run, Rules(push, pull))
-    else:
-        values = differentiated_as(by_xla, run)
-    return values(_stacked(fixed), jnp.asarray(t, real_type()), q, y, inputs)
+    if program.graph.operations(program.z) < 60:
+        return by_xla(*given)
+    derivatives = _derivatives_of_speeds(program)
+    values = with_rules(by_xla, Rules(push, pull))
+    return values(*given)
 
 
 @lru_cache(maxsize=MOST_KERNELS)
@@ -118,18 +112,6 @@ def _derivatives_of_speeds(program: Lowered) -> Derivatives:
     every = [*(int(program.traced.u[k]) for k in program.independent), *program.z]
     speeds = dict(zip([*program.independent, *program.dependent], every, strict=True))
     return Derivatives(program.graph, speeds, len(every) + 1, program.variables)
-
-
-def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
-    """As `Lowered.energy_values`."""
-
-    def by_xla(fixed, t, q, y, inputs):
-        return program.energy_values(entries_of(fixed), t, tuple(q), tuple(y), inputs)
-
-    def by_machine_code(*state):
-        return _kernel_of_seen(program)(_in_a_row(*state))[0][-2:]
-
-    return differentiated_as(by_xla, unless_batched(1, by_machine_code, by_xla))(*jax.lax.stop_gradient((_stacked(fixed), t, q, y, inputs)))
 
 
 def is_right(program: RowProgram, scene: Scene, t, q) -> Bool[Array, ""]:
@@ -144,43 +126,8 @@ def _kernel_of_right(program: RowProgram):
     return nodes_called(program.graph, [program.right], given)
 
 
-def _stacked(fixed) -> Float[Array, "fixed"]:
-    return jnp.stack(fixed) if fixed else jnp.zeros(0, real_type())
-
-
 def _in_a_row(fixed, t, q, y, inputs) -> Float[Array, "given"]:
     return jnp.concatenate([jnp.asarray(x, real_type()) for x in (fixed, jnp.asarray(t)[None], q, y, inputs)])
-
-
-def _seen_nodes(program: Lowered) -> list[int]:
-    return [*program.z, *program.pivots, *program.energies]
-
-
-@lru_cache(maxsize=MOST_KERNELS)
-def _kernel_of_seen(program: Lowered):
-    count = len(program.independent) + len(program.dependent) + 3
-    return called(partial(_write_seen, program, count), lambda *_: ((count,),), effort=1)
-
-
-def _write_seen(program: Lowered, count: int, w: Writer) -> None:
-    """`row(state, found)`: all speeds, the smallest pivot relative to its usual size, kinetic and potential energy."""
-    given = program.variables
-    with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
-        known = {n: w.load(w.real, state, k) for k, n in enumerate(given)}
-        values = [as_real(w, x) for x in written(w, program.graph, _seen_nodes(program), known)]
-        z, pivots, of_energy = len(program.z), len(program.pivots), len(program.energies)
-        first = len(given) - len(program.inputs) - len(program.independent)
-        every = [*(w.load(w.real, state, first + k) for k in range(len(program.independent))), *values[:z]]
-        for i, k in enumerate(np.argsort([*program.independent, *program.dependent])):
-            w.store(every[k], found, i)
-        sign, pivot = FUNCTIONS["sign"], w.number(1.0)
-        for value, size in zip(values[z : z + pivots], program.sizes, strict=True):
-            ratio = value / known[size]
-            pivot = sign(w, pivot) * sign(w, ratio) * w.smaller(w.magnitude(pivot), w.magnitude(ratio))
-        for i, value in enumerate([pivot, *values[len(values) - of_energy :]]):
-            w.store(value, found, count - 3 + i)
-        w.give()
-    write_rows(w, len(given), count)
 
 
 def _needed(program: Lowered) -> tuple[tuple[int, ...], ...]:

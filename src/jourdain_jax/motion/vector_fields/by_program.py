@@ -15,7 +15,7 @@ class ByProgram(VectorField):
 
     program: Lowered = eqx.field(static=True)
     affine: bool = eqx.field(static=True)  # rows are, in the speeds
-    native: bool = eqx.field(static=True, default=False)  # machine code of our own says what is seen of a motion
+    native: bool = eqx.field(static=True, default=False)  # machine code of our own works out what stands beside the steps
 
     @property
     def lowered(self) -> Lowered:
@@ -54,8 +54,6 @@ class ByProgram(VectorField):
         return self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)
 
     def energies(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "2"]:
-        if self.native:
-            return seen.energies(self.program, fixed, t, y.q, y.v, inputs)
         return self.program.energy_values(fixed, t, tuple(y.q), tuple(y.v), inputs)
 
     def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:

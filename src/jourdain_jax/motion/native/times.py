@@ -1,0 +1,101 @@
+"""Times that vary: machine code goes from one number to others, and states are moved to the times that these stand for, along their own rates.
+
+z: all that the rates of a state are given, beside that state; G: how fast each of these numbers changes. Where z is moved by a time d that is zero,
+
+    dz_1 = (1 + G' d)(dz + G dd),   G' = dG/dz,   to the second order
+
+A start is moved by less than its time, t_0 = number - d, what is found by more.
+"""
+
+from collections.abc import Callable
+from functools import lru_cache, partial
+
+import jax
+import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.differentiated_as import Rules, with_rules
+from jourdain_jax.lowering.jacobian import on_its_own
+from jourdain_jax.motion.native.functions import Form
+from jourdain_jax.motion.native.pulled import rates_of
+from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
+
+
+@lru_cache(maxsize=64)
+def moved(form: Form) -> Callable[[Float[Array, "z"], Float[Array, ""]], Float[Array, "z"]]:
+    """Return z itself as a function of z and of the time by which it is moved, which is zero.
+
+    z: the state, time, the numbers known, and how fast those of them change that samples give.
+    """
+    rates = _rates(form)
+
+    @jax.custom_jvp
+    def along(z, d, v):
+        return v
+
+    @partial(along.defjvp, symbolic_zeros=True)
+    def along_rule(at, tangents):
+        (z, _, v), (_, dd, dv) = at, tangents
+        return along(*at), _sum(dv, dd, lambda: jax.jvp(rates, (z,), (v,))[1])
+
+    @jax.custom_jvp
+    def back(z, d, g):
+        return g
+
+    @partial(back.defjvp, symbolic_zeros=True)
+    def back_rule(at, tangents):
+        (z, _, g), (_, dd, dg) = at, tangents
+        return back(*at), _sum(dg, dd, lambda: jax.vjp(rates, z)[1](g)[0])
+
+    def push(arguments, tangents):
+        (z, d), (dz, dd) = arguments, tangents
+        dz = jnp.zeros_like(z) if dz is None else dz
+        return z, along(z, d, dz if dd is None else dz + scaled(rates(z), dd))
+
+    def pull(perturbed, arguments, found, g):
+        (z, d), (_, varies) = arguments, perturbed
+        g = back(z, d, g)
+        return g, jnp.sum(scaled(rates(z), g)) if varies else None
+
+    return with_rules(lambda z, d: z, Rules(push, pull))
+
+
+def _rates(form: Form) -> Callable[[Float[Array, "z"]], Float[Array, "z"]]:
+    """G(z), which is zero but for the state, time and what samples give."""
+    program, layout = form.program, form.layout
+    graph, rates, variables = on_its_own(program.graph, rates_of(form), program.variables)
+    first, count = len(program.fixed), layout.coordinates + layout.speeds
+    work = [graph.input("work", True)] if layout.with_work else []
+    slopes = [graph.input(f"slope of input {i}", True) for i in form.sampled]
+    z = [*variables[first + 1 : first + 1 + count], *work, variables[first], *variables[:first], *variables[first + 1 + count :], *slopes]
+    places = dict(enumerate(rates)) | {layout.y: graph.one}
+    places |= {layout.y + 1 + first + i: slope for i, slope in zip(form.sampled, slopes, strict=True)}
+    return values_of_nodes(graph, places, len(z), z)
+
+
+def _sum(tangent, by, slope: Callable):
+    """`tangent + slope() by`; what is zero is left out."""
+    tangent = filled(tangent)
+    return tangent if is_zero(by) else tangent + scaled(slope(), filled(by))
+
+
+def is_zero(tangent) -> bool:
+    """Whether nothing changes."""
+    return isinstance(tangent, SymbolicZero)
+
+
+def filled(tangent):
+    """The tangent as an array."""
+    return jnp.zeros(tangent.shape, tangent.dtype) if is_zero(tangent) else tangent
+
+
+@jax.custom_jvp
+def scaled(slope: Float[Array, "y"], by: Float[Array, "..."]) -> Float[Array, "y"]:
+    """Their product; zero, whatever the slope, where it is multiplied by zero."""
+    return jnp.where(by == 0.0, 0.0, slope * by)
+
+
+@scaled.defjvp
+def _scaled_jvp(primals, tangents):
+    return scaled(*primals), scaled(tangents[0], primals[1]) + scaled(primals[0], tangents[1])
