@@ -370,20 +370,11 @@ MUTANTS = [
         TIMES_BENT,
         WRONG,
     ),
-    Mutant("goals that do not move cotangents", native_motion, "flow_back", "dg + by_states[:, :n]", "dg", TIMES_BENT, WRONG),
-    Mutant("numbers known that do not feel goals", native_motion, "flow_back", "jnp.sum(by_states[:, n:], axis=0)", "0.0", TIMES_BENT, WRONG),
-    Mutant(
-        "goals that do not move states",
-        native_motion,
-        "cotangents_of_times",
-        "goals = jnp.where(at.by_goal, by_states, 0.0)",
-        "goals = jnp.where(at.by_goal, 0 * by_states, 0.0)",
-        TIME,
-        WRONG,
-    ),
+    Mutant("goals that do not move cotangents", native_motion, "moved", "jax.vjp(rates, z)[1](g)[0]", "0 * g", TIMES_BENT, WRONG),
+    Mutant("goals that do not move states", native_motion, "moved", "jnp.sum(scaled(rates(z), g))", "0 * jnp.sum(g)", TIME, WRONG),
 ]
 CHECKS = list(dict.fromkeys(mutant.check for mutant in MUTANTS))
-KEPT = (kernel.kernel, kernel.kernel_back, kernel.kernel_of_rates, kernel.kernel_of_pulled_rates, put_on_rows._kernel, pulled.reason_against_derivatives)
+KEPT = (kernel.kernel, kernel.kernel_back, put_on_rows._kernel, pulled.reason_against_derivatives)
 
 
 @pytest.fixture(autouse=True)

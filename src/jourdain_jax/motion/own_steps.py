@@ -55,7 +55,7 @@ class OwnSteps(Integrator):
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
         if not setup.reason_against_machine_code:
-            return (_by_machine_code if self.alongside else with_rules(_by_machine_code, _rules(setup)))(setup, begun)
+            return _on_times(_by_machine_code if self.alongside else with_rules(_by_machine_code, _rules(setup)), setup, begun)
         return self._in_modes(_by_xla)(setup, begun)
 
     def lanes_solved(self, setups: Setup, begun: Begun) -> Solved:
@@ -130,6 +130,36 @@ def _by_machine_code(setup: Setup, begun: Begun) -> Solved:
     return _as_solved(motion.goals, *native_motion.integrate(motion))
 
 
+def _on_times(run: Callable[[Setup, Begun], Solved], setup: Setup, begun: Begun) -> Solved:
+    """The motion that `run` finds from a number to others, its start and states moved to the times of the setup.
+
+    A time is the goal where that was reached, is found by the loop itself where a stop event ended the motion before, and lies at a number after the start
+    otherwise.
+    """
+    numbers, (field, scene, inputs, fixed, start) = jax.lax.stop_gradient, begun.args
+    form = native_motion.form_of(field, inputs, bool(_own(setup).event_names))
+    moved = partial(native_motion.moved_by, begun.args, form)
+    goals, later = _goals(setup, setup.ts), start - numbers(start)
+    y0 = moved(begun.y0, start, -later)
+    setup = setup._replace(**{name: numbers(getattr(setup, name)) for name in ("ts", "t0", "t1")})
+    found = run(setup, eqx.tree_at(lambda b: (b.y0, b.args), begun, (y0, (field, scene, inputs, fixed, numbers(start)))))
+    event = (found.code == results.EVENT) & (found.accepted > 0)
+    t_end, number = numbers(found.t_end), numbers(goals)
+    by_goal = jnp.append(found.reached, t_end == number[-1]) & ~(event & (number == t_end))
+    by = jnp.where(by_goal, goals - number + later, jnp.where(event, 0.0, later))
+    at = numbers(start) + jnp.where(by_goal, number, t_end)
+    return eqx.tree_at(
+        lambda s: (s.ts, s.ys, s.y_end, s.t_end),
+        found,
+        (
+            goals[:-1],
+            jax.vmap(moved)(found.ys, at[:-1], by[:-1]),
+            moved(found.y_end, at[-1], by[-1]),
+            found.t_end + jnp.where(event, -later, jnp.where(by_goal[-1], goals[-1] - number[-1], 0.0)),
+        ),
+    )
+
+
 def _motion(setup: Setup, begun: Begun) -> native_motion.Motion:
     own, knots = _own(setup), setup.knots
     rtol, atol = setup.tolerances
@@ -160,18 +190,10 @@ def _pulled(perturbed: tuple, setup: Setup, begun: Begun, found: Solved, g: Solv
     if any(jax.tree.leaves(sampled)):
         raise DifferentiationModeError(OF_SAMPLES)
     states = jax.tree.map(lambda g: jnp.concatenate([g, jnp.zeros((1, *g.shape[1:]))]), g.ys)  # nobody asks for the last one: it is that of the end
-    varies, asked = perturbed[0], [bool(varies) for varies in native_motion.known_of(perturbed[1].args)]
-    ys, reached = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), (found.ys, found.reached), (found.y_end, found.t_end == motion.goals[-1]))
-    ended = native_motion.stopped(ys, reached, found.t_end, (found.code == results.EVENT) & (found.accepted > 0))
-    by_start, by_known = native_motion.cotangents(motion, asked, ended, states, g.y_end, g.t_end)
+    asked = [bool(varies) for varies in native_motion.known_of(perturbed[1].args)]
+    by_start, by_known = native_motion.cotangents(motion, asked, states, g.y_end, g.t_end)
     none_else = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, (setup, begun))
     by_setup, (field, scene, inputs, fixed, origin) = none_else[0], none_else[1].args
-    if varies.ts or varies.t0 or varies.t1 or perturbed[1].args[-1]:
-        times = native_motion.cotangents_of_times(motion, ended, by_start, states, g.y_end, g.t_end)
-        goals = times.goals.at[:-1].add(g.ts)
-        given = {"ts": goals[:-1], "t0": -jnp.sum(goals), "t1": goals[-1]}
-        by_setup = by_setup._replace(**{name: by for name, by in given.items() if getattr(varies, name)})
-        origin = times.origin if perturbed[1].args[-1] else None
     y0 = jax.tree.map(lambda varies, by: by if varies else None, perturbed[1].y0, by_start)
     inputs = native_motion.with_known(inputs, by_known[len(fixed) :])
     args = field, scene, inputs, tuple(by_known[: len(fixed)]), origin

@@ -53,6 +53,12 @@ class Form:
         )
 
     @property
+    def rates(self) -> list[int]:
+        """The rates of the state."""
+        program = self.program
+        return [*program.qdot, *program.ydot, *([program.power] if self.with_work else [])]
+
+    @property
     def relations(self) -> tuple[int, ...]:
         """The numbers whose signs are watched; none where there are too many."""
         found = self.program.watched(self.has_events)
@@ -85,8 +91,7 @@ class Form:
         program = self.program
         projected = [*program.projected_q, *program.projected_u] if self.projects else []
         events = program.events if self.has_events else ()
-        power = [program.power] if self.with_work else []
-        return [*program.qdot, *program.ydot, *power, *program.guards, *program.pivots, *program.directions, *projected, *events, *self.watched]
+        return [*self.rates, *program.guards, *program.pivots, *program.directions, *projected, *events, *self.watched]
 
 
 class Outputs(NamedTuple):
@@ -165,13 +170,8 @@ def write_rates(w: Writer, form: Form) -> None:
     how = "alwaysinline" if program.operations <= 120 else "noinline"
     arguments = {"state": "ptr", "tau": w.real, "y": "ptr", "k": "ptr", "pivots": "ptr"}
     with w.function("rates", "void", arguments, attributes=how) as (state, tau, y, k, pivots):
-        power = [program.power] if form.with_work else []
-        rates = [*program.qdot, *program.ydot, *power]
         known = known_values(w, form, state, tau, y)
-        found, tangents = _found(w, form, outputs_of(form, [*rates, *program.guards, *form.monitored], len(rates)), known, state, tau, y)
-        if form.with_work and not power:
-            found.insert(layout.coordinates + layout.speeds, w.number(0.0))
-            tangents = [[*part, w.number(0.0)] for part in tangents]
+        found, tangents = _found(w, form, outputs_of(form, [*form.rates, *program.guards, *form.monitored], layout.y), known, state, tau, y)
         for guard in found[layout.y : layout.y + len(program.guards)]:
             found[0] = w.where(guard > 0.0, found[0], float("nan"))
         for i, x in enumerate([*found[: layout.y], *(x for part in tangents for x in part)]):

@@ -14,12 +14,11 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.motion.integrators.erk_step import RUNNING
 from jourdain_jax.motion.integrators.tableaus import Method
-from jourdain_jax.motion.native import back, loop, samples, slopes
+from jourdain_jax.motion.native import back, loop, samples
 from jourdain_jax.motion.native.called import called
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.layout import Layout
 from jourdain_jax.motion.native.taylor import TaylorSteps
-from jourdain_jax.native.ir import Writer
 
 MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the process
 
@@ -34,11 +33,11 @@ class Start(NamedTuple):
     y: tuple[Float[Array, "y"], ...]
     known: tuple[tuple[Float[Array, ""], ...], ...]
 
-    def rows(self, t, dt: Sequence) -> Float[Array, "given"]:
-        """The rows of a lane at the time t since the start, which has tangents."""
+    def rows(self, dt: Sequence) -> Float[Array, "given"]:
+        """The rows of a lane at the start, whose time has tangents."""
         rtol, atol, shortest, longest, first, most = self.control
         zero, one = jnp.zeros(()), jnp.ones(())
-        progress = [t, jnp.minimum(jnp.abs(first), longest), RUNNING * one, zero, zero, -one, jnp.inf * one, zero, jnp.inf * one, *dt]
+        progress = [zero, jnp.minimum(jnp.abs(first), longest), RUNNING * one, zero, zero, -one, jnp.inf * one, zero, jnp.inf * one, *dt]
         limits = [jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, longest, most, self.origin]
         known = [jnp.stack(part) for part in self.known if part]  # each tangent by itself: values may have no lanes where tangents have
         return jnp.concatenate([*self.y, jnp.stack(progress), jnp.stack(limits), *known])
@@ -87,7 +86,7 @@ def _motion(layout: Layout, run: Callable) -> Callable[[Start], Found]:
 
     @jax.custom_batching.custom_vmap
     def motion(start: Start) -> Found:
-        states, end = run(*start.of_samples, start.rows(jnp.zeros(()), [jnp.zeros(())] * (parts - 1)), start.goals)
+        states, end = run(*start.of_samples, start.rows([jnp.zeros(())] * (parts - 1)), start.goals)
         progress, dt, count = end[n * parts : -parts], end[-parts:-1], end[-1:]
         every = [slice(k * n, (k + 1) * n) for k in range(parts)]
         return Found(
@@ -116,22 +115,6 @@ def kernel_back(form: Form, method: Method, asked: tuple[int, ...]) -> Callable:
 
     It returns cotangents of the state at the start, and of the numbers `asked` for of those that the rates are given. A state has its tangent after it.
     """
-    return _one_row(lambda w: back.write(w, form, method, asked), form, form.layout.integrated + len(asked))
-
-
-@lru_cache(maxsize=MOST_KERNELS)
-def kernel_of_rates(form: Form) -> Callable:
-    """A function of samples, rows as those of a start, and their times as an array of one: the rates of the states in these rows, and of their tangents."""
-    return _one_row(lambda w: slopes.write(w, form), form, form.layout.integrated)
-
-
-@lru_cache(maxsize=MOST_KERNELS)
-def kernel_of_pulled_rates(form: Form, asked: tuple[int, ...]) -> Callable:
-    """As `kernel_of_rates`, of cotangents of the rates in place of the times: those of the state, and of the numbers `asked` for."""
-    return _one_row(lambda w: slopes.write_back(w, form, asked), form, form.layout.y + len(asked))
-
-
-def _one_row(write: Callable[[Writer], None], form: Form, count: int) -> Callable:
-    """Machine code that returns a row of so many numbers for each lane."""
-    run_rows = called(write, lambda *_: ((count,),), samples.arguments(form.layout))
+    count = form.layout.integrated + len(asked)
+    run_rows = called(lambda w: back.write(w, form, method, asked), lambda *_: ((count,),), samples.arguments(form.layout))
     return lambda *arguments: run_rows(*arguments)[0]

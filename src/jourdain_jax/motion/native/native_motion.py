@@ -18,14 +18,14 @@ from jourdain_jax.motion.integrators.crossings import Crossings
 from jourdain_jax.motion.integrators.erk_loop import ended
 from jourdain_jax.motion.integrators.erk_step import Progress
 from jourdain_jax.motion.integrators.tableaus import Method
-from jourdain_jax.motion.native.flow import Stopped, flow, on_times, rates, scaled, slopes_of
+from jourdain_jax.motion.native.flow import flow
 from jourdain_jax.motion.native.flow_back import flow_back
 from jourdain_jax.motion.native.functions import Form, event_program
 from jourdain_jax.motion.native.functions_of_time import numbers_of, parts_from, with_functions
 from jourdain_jax.motion.native.kernel import MOST_KERNELS, Found, Start
 from jourdain_jax.motion.native.layout import Layout
 from jourdain_jax.motion.native.pulled import check_derivatives
-from jourdain_jax.motion.native.taylor import rates_of
+from jourdain_jax.motion.native.times import moved
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.native import ffi, series
@@ -108,7 +108,7 @@ def reason_against_series(field: VectorField, inputs: Inputs, has_events: bool, 
 def _reason_against_series(form: Form, order: int) -> str:
     if form.sampled:
         return "an input is given by samples"
-    graph, rates = form.program.graph, rates_of(form)
+    graph, rates = form.program.graph, form.rates
     if reason := series.reason_against(graph, rates):
         return reason
     count = series.products(graph, rates, order)
@@ -142,40 +142,26 @@ def integrate(motion: Motion) -> tuple[Integrated, Bool[Array, "times"], Progres
     return _unpacked(form.layout, motion.goals, flow(form, motion.method, motion.order)(_start(motion)))
 
 
-class AlongTimes(NamedTuple):
-    """Cotangents of what the times of a motion depend on."""
-
-    goals: Float[Array, "times"]  # times since the start
-    origin: Float[Array, ""]  # the start
-
-
-def cotangents(motion: Motion, asked: Sequence[bool], found: Stopped, ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> tuple[Integrated, list]:
+def cotangents(motion: Motion, asked: Sequence[bool], ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> tuple[Integrated, list]:
     """Cotangents of the start, and of each of the numbers that the rates are given, where it is `asked` for, from those of the states and of the end."""
     which = tuple(i for i, is_asked in enumerate(asked) if is_asked)
     form, start = _form_of(motion), _start(motion)
     check_derivatives(form, 1)
     ends = jnp.concatenate([_packed(y_end), t_end[None]])
-    found = flow_back(form, motion.method, which)(start, found, jax.vmap(_packed)(ys), ends)
+    found = flow_back(form, motion.method, which)(start, jax.vmap(_packed)(ys), ends)
     known = dict(zip(which, entries_of(found[form.layout.y :]), strict=True))
     return _state(form.layout, found[: form.layout.y]), [known.get(i) for i in range(len(asked))]
 
 
-def stopped(states: Integrated, reached: Bool[Array, "times"], t_end: Float[Array, ""], event: Bool[Array, ""]) -> Stopped:
-    """How a motion ended: its states at the goals, which of those were reached, the time of the end, and whether that was an event."""
-    return Stopped((jax.vmap(_packed)(states),), reached, t_end, event)
-
-
-def cotangents_of_times(motion: Motion, found: Stopped, by_start: Integrated, ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> AlongTimes:
-    """Cotangents of the times, from those of the start (as `cotangents` has it), of the states and of the end."""
-    form, start = _form_of(motion), _start(motion)
-    at = on_times(start, found)
-    (slopes,), (first,) = slopes_of(form, start, found.y, at), rates(form)(start, (jnp.zeros(()),))
-    by_states = jnp.sum(jax.vmap(scaled)(slopes, jax.vmap(_packed)(ys)), axis=1)
-    by_end = jnp.sum(scaled(slopes[-1], _packed(y_end)))
-    goals = jnp.where(at.by_goal, by_states, 0.0).at[-1].add(jnp.where(at.by_goal[-1], by_end + t_end, 0.0))
-    of_event = jnp.sum(jnp.where(at.by_goal, by_states, 0.0)) - t_end
-    origin = jnp.where(at.event, of_event, jnp.sum(by_states) + by_end)
-    return AlongTimes(goals, origin - jnp.sum(scaled(first, _packed(by_start))))
+def moved_by(args: tuple, form: Form, y: Integrated, t: Float[Array, ""], d: Float[Array, ""]) -> Integrated:
+    """The state at a time, as a function of a time d that is zero, by which it is moved along its rates (`times.py`)."""
+    others, fixed = _others(args[2]), len(form.program.fixed)
+    known = known_of(args)
+    values, slopes = zip(*(jax.jvp(others[i], (t,), (jnp.ones_like(t),)) for i in form.sampled), strict=True) if form.sampled else ((), ())
+    for i, value in zip(form.sampled, values, strict=True):
+        known[fixed + i] = value
+    z = jnp.concatenate([_packed(y), jnp.stack([jnp.asarray(x, real_type()) for x in (t, *known, *slopes)])])
+    return _state(form.layout, moved(form)(z, d)[: form.layout.y])
 
 
 def _start(motion: Motion) -> Start:

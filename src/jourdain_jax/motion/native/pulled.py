@@ -58,12 +58,6 @@ def reason_against_derivatives(form: Form, order: int) -> str:
     return ""
 
 
-def rates_of(form: Form) -> list[int]:
-    """The nodes whose values are the rates of the state; that of the work may be zero, and is left out then."""
-    program = form.program
-    return [*program.qdot, *program.ydot, *([program.power] if form.with_work else [])]
-
-
 def write_pulled(w: Writer, form: Form, asked: Sequence[int]) -> None:
     """`pull_rates`, `pull_q`, `pull_u` and `pull_events`, each `(state, tau, y, g, to_y, to_known)`; `asked`: which of the numbers known.
 
@@ -75,17 +69,11 @@ def write_pulled(w: Writer, form: Form, asked: Sequence[int]) -> None:
         _write(w, form, "pull_moved", _moved(form, asked))
 
 
-def write_pulled_rates(w: Writer, form: Form, asked: Sequence[int]) -> None:
-    """`pull_rates` alone."""
-    nodes = rates_of(form)
-    _write(w, form, "pull_rates", pulled_program(form, nodes, asked, len(nodes)))
-
-
 def steps_of(form: Form) -> dict[str, list[int]]:
     """What a step consists of: rates, all of a state after either part of a projection, stop events."""
     program, count = form.program, form.layout.coordinates
     q, u = _state_nodes(form)[:count], _state_nodes(form)[count:]
-    found = {"rates": rates_of(form)}
+    found = {"rates": form.rates}
     if form.projects:
         found["q"] = [*program.projected_q, *u]
         found |= {"u": [*q, *program.projected_u]} if program.projected_u else {}
@@ -117,7 +105,7 @@ def _moved(form: Form, asked: Sequence[int]) -> Pulled:
 
     The row after the state is that of dt; after what is asked for comes the derivative of all along time.
     """
-    nodes, layout, program = rates_of(form), form.layout, form.program
+    nodes, layout, program = form.rates, form.layout, form.program
     own = outputs_of(form, [*nodes, *program.events], len(nodes) + layout.events)
     graph, first, count = own.graph, len(program.fixed), layout.coordinates + layout.speeds
     f, c, dc = own.values[: len(nodes)], own.values[len(nodes) :], own.tangents[0][len(nodes) :]

@@ -53,7 +53,7 @@ class Jet(NamedTuple):
 def jet(w: Writer, form: Form, p: Lanes, t: Value, order: int) -> Jet:
     """The Taylor series of the lanes' states, and of their tangents, at the time t."""
     program, layout, y = form.program, form.layout, p.pointer
-    rates = rates_of(form)
+    rates = form.rates
     own = outputs_of(form, [*rates, *_monitored(form)], len(rates))
     first = len(program.fixed)  # time, then the state
     known = dict(zip(own.variables, known_values(w, form, y, t, y).values(), strict=True))
@@ -74,14 +74,8 @@ def jet(w: Writer, form: Form, p: Lanes, t: Value, order: int) -> Jet:
 
 def products(form: Form, order: int) -> int:
     """About how many multiplications a step takes, tangents and all."""
-    own = outputs_of(form, rates_of(form), len(rates_of(form)))
+    own = outputs_of(form, form.rates, form.layout.y)
     return series.products(own.graph, [*own.values, *(n for part in own.tangents for n in part)], order)
-
-
-def rates_of(form: Form) -> list[int]:
-    """The nodes of the rates of all that is integrated; the last may be missing, where work is and is zero."""
-    program = form.program
-    return [*program.qdot, *program.ydot, *([program.power] if form.with_work else [])]
 
 
 def _monitored(form: Form) -> list[int]:

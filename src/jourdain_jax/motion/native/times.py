@@ -18,7 +18,6 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.differentiated_as import Rules, with_rules
 from jourdain_jax.lowering.jacobian import on_its_own
 from jourdain_jax.motion.native.functions import Form
-from jourdain_jax.motion.native.pulled import rates_of
 from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
 
 
@@ -64,7 +63,7 @@ def moved(form: Form) -> Callable[[Float[Array, "z"], Float[Array, ""]], Float[A
 def _rates(form: Form) -> Callable[[Float[Array, "z"]], Float[Array, "z"]]:
     """G(z), which is zero but for the state, time and what samples give."""
     program, layout = form.program, form.layout
-    graph, rates, variables = on_its_own(program.graph, rates_of(form), program.variables)
+    graph, rates, variables = on_its_own(program.graph, form.rates, program.variables)
     first, count = len(program.fixed), layout.coordinates + layout.speeds
     work = [graph.input("work", True)] if layout.with_work else []
     slopes = [graph.input(f"slope of input {i}", True) for i in form.sampled]
