@@ -13,11 +13,11 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 455_726,
+    "code tokens of src": 455_448,
     "code tokens of docs": 11_441,
     "code tokens of notebooks": 7_444,
-    "caches": 84,
-    "named numbers": 424,
+    "caches": 79,
+    "named numbers": 422,
     "tests for a tracer": 124,
     "functions with more than 8 parameters": 4,
     "ways: state put onto its constraints": 3,

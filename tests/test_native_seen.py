@@ -51,7 +51,7 @@ def test_all_programs_are_seen_alike(name):
     program = lowered(scene)
     if not isinstance(program, Lowered):
         pytest.skip("it has no scalar program")
-    assert seen.is_supported(program)
+    assert seen.beside(program)
     q, y = _states(scene, program, 9)
     ours, theirs = (jax.jit(jax.vmap(f, in_axes=(None, 0, 0)))(scene, q, y) for f in _by_both(scene, program))
     _same(ours, theirs, 1e-12)

@@ -87,3 +87,13 @@ def test_a_motion_that_starts_beyond_an_event_ends_where_and_when_it_starts(mode
 
     found = getattr(jax, mode)(end)(jnp.array([0.2, 0.5]))
     assert_array_equal(found, [[0.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
+
+
+def test_second_derivatives_with_respect_to_times_are_differences_of_the_first():
+    def weighed(times):
+        return jnp.sum(jnp.sin(_seen("driven, up to a wall", times)))
+
+    h = 1e-4
+    first, second = jax.jit(jax.grad(weighed)), jax.jit(jax.hessian(weighed))(TIMES)
+    differences = [(first(TIMES + step) - first(TIMES - step)) / (2.0 * h) for step in h * np.eye(4)]
+    assert_allclose(second, differences, rtol=1e-5, atol=1e-5)

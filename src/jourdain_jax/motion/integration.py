@@ -67,7 +67,7 @@ def _prepared(setup: Setup) -> Setup:
 def _with_machine_code(setup: Setup) -> Setup:
     """The setup, where machine code integrates it also with machine code for what is seen of it, if that can be made."""
     field = setup.field
-    if setup.reason_against_machine_code or not isinstance(field, ByProgram) or not seen.is_supported(field.program):
+    if setup.reason_against_machine_code or not isinstance(field, ByProgram) or seen.beside(field.program) is None:
         return setup
     return setup._replace(field=replace(field, native=True))
 

@@ -10,7 +10,7 @@ from typing import ClassVar, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import PyTree
 
 from jourdain_jax.calculus.differentiated_as import Rules, by_modes, pushed_by_jax, with_rules
 from jourdain_jax.calculus.guards import SECOND_ORDER_MESSAGE, DifferentiationModeError
@@ -21,7 +21,8 @@ from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, Impl
 from jourdain_jax.motion.integrators.problem import Problem
 from jourdain_jax.motion.integrators.tableaus import Method, method_of
 from jourdain_jax.motion.native import native_motion
-from jourdain_jax.motion.native.flow import OF_SAMPLES
+from jourdain_jax.motion.native.flow import OF_SAMPLES, flow
+from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.pulled import reason_against_derivatives
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
@@ -100,7 +101,7 @@ def _lanes_by_xla(mode: Mode, setups: Setup, begun: Begun) -> Solved:
 
 def _loop(mode: Mode, setup: Setup, y0, args, ts, knots) -> Solved:
     field, own = setup.field, _own(setup)
-    goals = _goals(setup, ts)
+    goals = setup.goals(ts)
     args = args if knots is None else integrands.within(jnp.full_like(setup.t0, jnp.inf), args)
     relations, relation_count = watched(field, setup.inputs, bool(own.event_names))
     problem = Problem(
@@ -126,8 +127,9 @@ def _loop(mode: Mode, setup: Setup, y0, args, ts, knots) -> Solved:
 
 
 def _by_machine_code(setup: Setup, begun: Begun) -> Solved:
-    motion = _motion(setup, begun)
-    return _as_solved(motion.goals, *native_motion.integrate(motion))
+    own, form, start = _own(setup), _form(setup), native_motion.start_of(setup, begun)
+    assert isinstance(own.solver, Method)
+    return native_motion.solved(form.layout, start.goals, flow(form, own.solver, own.order)(start))
 
 
 def _on_times(run: Callable[[Setup, Begun], Solved], setup: Setup, begun: Begun) -> Solved:
@@ -137,9 +139,8 @@ def _on_times(run: Callable[[Setup, Begun], Solved], setup: Setup, begun: Begun)
     otherwise.
     """
     numbers, (field, scene, inputs, fixed, start) = jax.lax.stop_gradient, begun.args
-    form = native_motion.form_of(field, inputs, bool(_own(setup).event_names))
-    moved = partial(native_motion.moved_by, begun.args, form)
-    goals, later = _goals(setup, setup.ts), start - numbers(start)
+    moved = partial(native_motion.moved_by, begun.args, _form(setup))
+    goals, later = setup.goals(setup.ts), start - numbers(start)
     y0 = moved(begun.y0, start, -later)
     setup = setup._replace(**{name: numbers(getattr(setup, name)) for name in ("ts", "t0", "t1")})
     found = run(setup, eqx.tree_at(lambda b: (b.y0, b.args), begun, (y0, (field, scene, inputs, fixed, numbers(start)))))
@@ -160,22 +161,18 @@ def _on_times(run: Callable[[Setup, Begun], Solved], setup: Setup, begun: Begun)
     )
 
 
-def _motion(setup: Setup, begun: Begun) -> native_motion.Motion:
-    own, knots = _own(setup), setup.knots
-    rtol, atol = setup.tolerances
-    control = native_motion.Control(rtol, atol, setup.shortest, setup.longest, setup.dt0, setup.most_steps(knots))
-    assert isinstance(own.solver, Method)
-    return native_motion.Motion(begun.args, own.solver, own.order, bool(own.event_names), begun.y0, _goals(setup, setup.ts), knots, control)
-
-
 def _own(setup: Setup) -> OwnSteps:
     assert isinstance(setup.integrator, OwnSteps)
     return setup.integrator
 
 
+def _form(setup: Setup) -> Form:
+    return native_motion.form_of(setup.field, setup.inputs, bool(setup.integrator.event_names))
+
+
 def _rules(setup: Setup) -> Rules:
     """Derivatives of `_by_machine_code`."""
-    form = native_motion.form_of(setup.field, setup.inputs, bool(setup.integrator.event_names))
+    form = _form(setup)
 
     def pull(perturbed, arguments, found, g):
         return _pulled(perturbed, *arguments, found, g)
@@ -185,24 +182,17 @@ def _rules(setup: Setup) -> Rules:
 
 def _pulled(perturbed: tuple, setup: Setup, begun: Begun, found: Solved, g: Solved) -> tuple:
     """Cotangents of what varies, from those of the motion that was found."""
-    motion = _motion(setup, begun)
     sampled = [channel for channel in (*perturbed[0].inputs.channels, *perturbed[1].args[2].channels) if isinstance(channel, Sampled)]
     if any(jax.tree.leaves(sampled)):
         raise DifferentiationModeError(OF_SAMPLES)
-    states = jax.tree.map(lambda g: jnp.concatenate([g, jnp.zeros((1, *g.shape[1:]))]), g.ys)  # nobody asks for the last one: it is that of the end
     asked = [bool(varies) for varies in native_motion.known_of(perturbed[1].args)]
-    by_start, by_known = native_motion.cotangents(motion, asked, states, g.y_end, g.t_end)
+    by_start, by_known = native_motion.cotangents(_form(setup), _own(setup).solver, native_motion.start_of(setup, begun), asked, g)
     none_else = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, (setup, begun))
     by_setup, (field, scene, inputs, fixed, origin) = none_else[0], none_else[1].args
     y0 = jax.tree.map(lambda varies, by: by if varies else None, perturbed[1].y0, by_start)
     inputs = native_motion.with_known(inputs, by_known[len(fixed) :])
     args = field, scene, inputs, tuple(by_known[: len(fixed)]), origin
     return by_setup, eqx.tree_at(lambda b: (b.y0, b.args), none_else[1], (y0, args), is_leaf=lambda x: x is None)
-
-
-def _goals(setup: Setup, ts) -> Float[Array, "times *lanes"]:
-    """Times since the start to go to."""
-    return jnp.concatenate([ts, setup.t1[None]]) - setup.t0
 
 
 def _as_solved(goals, ys: PyTree, reached, end: erk_loop.Progress) -> Solved:

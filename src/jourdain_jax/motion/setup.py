@@ -110,6 +110,10 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
         """How many steps may be taken; those that end at knots do not count."""
         return self.integrator.max_steps + (0 if knots is None else len(knots))
 
+    def goals(self, ts) -> Float[Array, "times *lanes"]:
+        """Times since the start to go to: those to save at, and the end."""
+        return jnp.concatenate([ts, self.t1[None]]) - self.t0
+
     @property
     def shortest(self) -> Float[Array, "*lanes"]:
         """The shortest step, s."""

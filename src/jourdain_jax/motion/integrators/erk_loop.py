@@ -11,7 +11,7 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.motion.integrators import recorded_adjoint
 from jourdain_jax.motion.integrators.erk_step import RUNNING, Progress, advanced, begun, running
@@ -32,16 +32,15 @@ def integrate(
         ys, reached, end = _motion(problem, method, y0, t0, goals, dt0)
     else:
         ys, reached, end = recorded_adjoint.motion(_motion, problem, method, y0, t0, goals, dt0)
-    return ys, reached, ended(end, t0)
+    return ys, reached, eqx.tree_at(lambda p: p.code, end, code_at_end(end.code, end.h, end.accepted, end.t - t0))
 
 
-def ended(end: Progress, t0) -> Progress:
-    """Progress with the code of how the motion from `t0` ended, where no time is left to go to."""
+def code_at_end(code, h, accepted, span) -> Int[Array, "*lanes"]:
+    """The code of how a motion ended after a `span`, where no time is left to go to; `h`: of the step that would be next."""
     # the last steps against the average one
     # 0.01 of the average step: a singularity is near
-    shrank = (end.code == results.MAX_STEPS) & (end.h * end.accepted < 0.01 * jnp.abs(end.t - t0))
-    code = jnp.where(shrank, results.SHRANK, jnp.where(end.code == RUNNING, results.SUCCESS, end.code))
-    return eqx.tree_at(lambda p: p.code, end, code)
+    shrank = (code == results.MAX_STEPS) & (h * accepted < 0.01 * jnp.abs(span))
+    return jnp.where(shrank, results.SHRANK, jnp.where(code == RUNNING, results.SUCCESS, code))
 
 
 def _motion(problem: Problem, method: Method | ImplicitMethod, y0: PyTree, t0, goals, dt0) -> tuple[PyTree, Bool[Array, "times *lanes"], Progress]:

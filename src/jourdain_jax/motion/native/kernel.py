@@ -27,7 +27,7 @@ class Start(NamedTuple):
     """A motion as a kernel is given it; the state and what is known are followed by their tangents (`Layout`)."""
 
     of_samples: tuple[Array, ...]  # as `samples.py` has them
-    control: tuple[Float[Array, ""], ...]  # as `native_motion.Control`
+    control: tuple[Float[Array, ""], ...]  # rtol, atol, shortest, longest and first step, most steps
     goals: Float[Array, "times"]  # since the start
     origin: Float[Array, ""]  # the time of the start
     y: tuple[Float[Array, "y"], ...]

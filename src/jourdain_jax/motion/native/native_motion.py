@@ -1,24 +1,21 @@
-"""One motion by machine code, and when: the rows of its lane from what `erk_loop.integrate` is given, and what that returns from the rows of the end."""
+"""One motion by machine code, and when: what a kernel is given of it, and what is found from what the kernel returns."""
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from jourdain_jax.calculus.entries import entries_of
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.input_programs import FunctionOfTime
 from jourdain_jax.motion.inputs import Constant, Inputs, Sampled
-from jourdain_jax.motion.integrators.crossings import Crossings
-from jourdain_jax.motion.integrators.erk_loop import ended
-from jourdain_jax.motion.integrators.erk_step import Progress
+from jourdain_jax.motion.integrators.erk_loop import code_at_end
 from jourdain_jax.motion.integrators.tableaus import Method
-from jourdain_jax.motion.native.flow import flow
 from jourdain_jax.motion.native.flow_back import flow_back
 from jourdain_jax.motion.native.functions import Form, event_program
 from jourdain_jax.motion.native.functions_of_time import numbers_of, parts_from, with_functions
@@ -26,6 +23,7 @@ from jourdain_jax.motion.native.kernel import MOST_KERNELS, Found, Start
 from jourdain_jax.motion.native.layout import Layout
 from jourdain_jax.motion.native.pulled import check_derivatives
 from jourdain_jax.motion.native.times import moved
+from jourdain_jax.motion.setup import Begun, Setup, Solved
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.native import ffi, series
@@ -36,30 +34,6 @@ from jourdain_jax.program.graph import Unsupported
 # 18,000 of a chain of 23 joint angles in 1.2 s.
 LARGEST_PROGRAM = 60_000
 MOST_PRODUCTS = 12_000  # of coefficients in a step by Taylor series, which is written out
-
-
-class Control(NamedTuple):
-    """How well and how far to integrate."""
-
-    rtol: Float[Array, ""]
-    atol: Float[Array, ""]
-    shortest: Float[Array, ""]
-    longest: Float[Array, ""]
-    dt0: Float[Array, ""]
-    max_steps: int
-
-
-class Motion(NamedTuple):
-    """What is integrated from where, to which times since the start, and how well."""
-
-    args: tuple  # as rates take them
-    method: Method
-    order: int | None  # of Taylor series, in place of the tableau
-    has_events: bool
-    y0: Integrated
-    goals: Float[Array, "times"]
-    knots: Float[Array, "knots"] | None  # times since the start at which steps must end
-    control: Control
 
 
 def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events: bool) -> str:
@@ -131,24 +105,13 @@ def form_of(field: VectorField, inputs: Inputs, has_events: bool) -> Form:
     return Form(program, field.with_work, field.projects, field.affine, has_events, field.pivots, sampled=sampled)
 
 
-def _form_of(motion: Motion) -> Form:
-    field, _, inputs, *_ = motion.args
-    return form_of(field, inputs, motion.has_events)
-
-
-def integrate(motion: Motion) -> tuple[Integrated, Bool[Array, "times"], Progress]:
-    """As `erk_loop.integrate`, of one motion from time zero; JAX differentiates it in forward mode."""
-    form = _form_of(motion)
-    return _unpacked(form.layout, motion.goals, flow(form, motion.method, motion.order)(_start(motion)))
-
-
-def cotangents(motion: Motion, asked: Sequence[bool], ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> tuple[Integrated, list]:
-    """Cotangents of the start, and of each of the numbers that the rates are given, where it is `asked` for, from those of the states and of the end."""
+def cotangents(form: Form, method: Method, start: Start, asked: Sequence[bool], g: Solved) -> tuple[Integrated, list]:
+    """Cotangents of the start, and of each of the numbers that the rates are given, where it is `asked` for, from those of what was found."""
     which = tuple(i for i, is_asked in enumerate(asked) if is_asked)
-    form, start = _form_of(motion), _start(motion)
     check_derivatives(form, 1)
-    ends = jnp.concatenate([_packed(y_end), t_end[None]])
-    found = flow_back(form, motion.method, which)(start, jax.vmap(_packed)(ys), ends)
+    states = jax.vmap(_packed)(g.ys)
+    states = jnp.concatenate([states, jnp.zeros_like(states[:1])])  # nobody asks for the last one: it is that of the end
+    found = flow_back(form, method, which)(start, states, jnp.concatenate([_packed(g.y_end), g.t_end[None]]))
     known = dict(zip(which, entries_of(found[form.layout.y :]), strict=True))
     return _state(form.layout, found[: form.layout.y]), [known.get(i) for i in range(len(asked))]
 
@@ -164,11 +127,13 @@ def moved_by(args: tuple, form: Form, y: Integrated, t: Float[Array, ""], d: Flo
     return _state(form.layout, moved(form)(z, d)[: form.layout.y])
 
 
-def _start(motion: Motion) -> Start:
+def start_of(setup: Setup, begun: Begun) -> Start:
     """What a kernel is given of a motion."""
-    known = tuple(jnp.zeros(()) if x is None else jnp.asarray(x, real_type()) for x in known_of(motion.args))  # what samples say is looked up
-    control, origin = jax.tree.map(lambda x: jnp.asarray(x, real_type()), (tuple(motion.control), motion.args[-1]))
-    return Start(_samples(motion), control, motion.goals, origin, (_packed(motion.y0),), (known,))
+    knots, goals = setup.knots, setup.goals(setup.ts)
+    known = tuple(jnp.zeros(()) if x is None else x for x in known_of(begun.args))  # what samples say is looked up
+    control = *setup.tolerances, setup.shortest, setup.longest, setup.dt0, setup.most_steps(knots)
+    control, origin, known = jax.tree.map(lambda x: jnp.asarray(x, real_type()), (control, begun.args[-1], known))
+    return Start(_samples(begun.args, goals, knots), control, goals, origin, (_packed(begun.y0),), (known,))
 
 
 def known_of(args: tuple) -> list:
@@ -197,9 +162,9 @@ def _others(inputs: Inputs) -> list[Callable]:
     return [channel for channel in inputs.channels if not isinstance(channel, FunctionOfTime)]
 
 
-def _samples(motion: Motion) -> tuple[Array, ...]:
+def _samples(args: tuple, goals: Float[Array, "times"], knots: Float[Array, "knots"] | None) -> tuple[Array, ...]:
     """Tables of the inputs that are given by samples, and the knots, as the kernel takes them; nothing where there are none."""
-    _, _, inputs, _, origin = motion.args
+    _, _, inputs, _, origin = args
     origin = jax.lax.stop_gradient(origin)  # what samples say at a time since the start is that of a number
     channels = [channel for channel in inputs.channels if isinstance(channel, Sampled)]
     if not channels:
@@ -210,22 +175,21 @@ def _samples(motion: Motion) -> tuple[Array, ...]:
         return jnp.concatenate([x, jnp.full(count - len(x), with_what, x.dtype)])
 
     tables = jnp.stack([jnp.stack([padded(channel.ts - origin, jnp.inf), padded(channel.values, channel.values[-1])]) for channel in channels])
-    never = jnp.sign(motion.goals[-1]) * jnp.inf
-    return tables, jnp.full(1, never) if motion.knots is None else motion.knots
+    return tables, jnp.full(1, jnp.sign(goals[-1]) * jnp.inf) if knots is None else knots
 
 
 def _packed(y: Integrated) -> Float[Array, "y"]:
     return jnp.concatenate([y.q, y.v, *([] if y.work is None else [y.work[None]])])
 
 
-def _unpacked(layout: Layout, goals, found: Found) -> tuple[Integrated, Bool[Array, "times"], Progress]:
+def solved(layout: Layout, goals: Float[Array, "times"], found: Found) -> Solved:
+    """What a kernel found, in words."""
     h, code, accepted, rejected, event, pivot, crossings, together, count = found.rest
     (states,), (end,), (t,) = found[:3]
-    reached = (jnp.arange(len(goals)) < count) | (goals == t)
     code, accepted, rejected, event, crossings = (x.astype(jnp.int32) for x in (code, accepted, rejected, event, crossings))
-    seen = Crossings(None, None, crossings, together) if layout.watched else None
-    last = Progress(t, _state(layout, end), h, code, jnp.zeros((), jnp.int32), accepted, rejected, event, None, pivot, None, seen)
-    return jax.vmap(lambda y: _state(layout, y))(states), reached, ended(last, 0.0)
+    reached = (jnp.arange(len(goals)) < count) | (goals == t)
+    ys, code = jax.vmap(lambda y: _state(layout, y))(states[:-1]), code_at_end(code, h, accepted, t)
+    return Solved(goals[:-1], ys, reached[:-1], t, _state(layout, end), code, event, accepted, rejected, h, pivot, crossings, together)
 
 
 def _state(layout: Layout, y: Float[Array, "y"]) -> Integrated:

@@ -7,6 +7,7 @@ machine code, for which rows of numbers are put together, takes longer there.
 import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,17 +28,39 @@ from jourdain_jax.native.threads import write_rows
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.scene.scene import Scene
 
-MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the process
 _TRUTHS = frozenset(("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite"))
 
 
-@lru_cache(maxsize=MOST_KERNELS)
-def is_supported(program: Lowered) -> bool:
-    """Whether all this can be machine code."""
+class Beside(NamedTuple):
+    """Machine code of what stands beside the steps of a program."""
+
+    needed: tuple[tuple[int, ...], ...]  # nodes of those entries of the scene's parameters on which something that is fixed depends, -1 for others
+    fixed: Callable[[Array], Array]  # of those entries and of what is usual
+    usual: Callable[[Array], Array] | None  # of those entries; JAX does not differentiate it
+    speeds: Derivatives | None  # of all speeds, and of the pivot, a number to differentiation; None where XLA's are quicker
+
+
+@lru_cache(maxsize=64)
+def beside(program: Lowered) -> Beside | None:
+    """All this; None where it cannot be machine code."""
     graph, nodes = program.graph, [*program.z, *program.fixed, *program.usual.values()]
     truths = any(_is_truth(graph, n) for n in program.fixed)  # which XLA hands on as such
     # 60_000 operations
-    return not truths and graph.operations(nodes) <= 60_000 and not unsupported(graph, nodes)
+    if truths or graph.operations(nodes) > 60_000 or unsupported(graph, nodes):
+        return None
+    used = set(graph.reachable([*program.fixed, *program.usual.values()]))
+    needed = tuple(tuple(n if n in used else -1 for n in np.ravel(leaf).tolist()) for leaf in program.traced.parameters)
+    given = [n for leaf in needed for n in leaf if n >= 0]
+    usual = called(partial(_write_usual, program, given), lambda *_: ((len(program.usual),),), effort=1) if program.usual else None
+    fixed = values_of_nodes(graph, dict(enumerate(program.fixed)), len(program.fixed), [*given, *program.usual])
+    # Operations from which on derivatives are machine code. Measured, gradients of batches over all saved states,
+    # by XLA and here: 5 operations, 28 and 42 ms; 66, 98 and 69; 228, 405 and 108. One motion of 16 trailers
+    # compiles in 16 to 19 s and 4.5 s.
+    if graph.operations(program.z) < 60:
+        return Beside(needed, fixed, usual, None)
+    every = [*(int(program.traced.u[k]) for k in program.independent), *program.z]
+    places = dict(zip([*program.independent, *program.dependent], every, strict=True))
+    return Beside(needed, fixed, usual, Derivatives(graph, places, len(every) + 1, program.variables))
 
 
 def _is_truth(graph: Graph, node: int) -> bool:
@@ -57,25 +80,13 @@ def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:
 
 def fixed_values(program: Lowered, scene: Scene) -> tuple[Float[Array, ""], ...]:
     """As `Lowered.fixed_values`."""
-    parameters = entries(scene, _needed(program))
-    if not program.fixed or not parameters:  # nothing to hand over, or nothing asked for
+    own = beside(program)
+    parameters = [] if own is None else entries(scene, own.needed)
+    if own is None or not program.fixed or not parameters:  # nothing to hand over, or nothing asked for
         return program.fixed_values(scene)
     x = jnp.concatenate(parameters)
-    usual = [_usual(program)(jax.lax.stop_gradient(x))] if program.usual else []
-    return entries_of(_of_parameters(program)(jnp.concatenate([x, *usual])))
-
-
-@lru_cache(maxsize=MOST_KERNELS)
-def _of_parameters(program: Lowered) -> Callable[[Array], Array]:
-    """What is fixed, as a function of those parameters that are needed and of what is usual."""
-    return values_of_nodes(program.graph, dict(enumerate(program.fixed)), len(program.fixed), [*_places_of(program), *program.usual])
-
-
-@lru_cache(maxsize=MOST_KERNELS)
-def _usual(program: Lowered) -> Callable[[Array], Array]:
-    """What is usual at the states that were probed, as a function of those parameters that are needed; JAX does not differentiate it."""
-    kernel = called(partial(_write_usual, program), lambda *_: ((len(program.usual),),), effort=1)
-    return lambda x: kernel(x)[0]
+    usual = [] if own.usual is None else own.usual(jax.lax.stop_gradient(x))
+    return entries_of(own.fixed(jnp.concatenate([x, *usual])))
 
 
 def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
@@ -96,22 +107,10 @@ def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Ar
         return tuple(jnp.reshape(part, jnp.shape(x)) for x, part in zip(arguments, parts, strict=True))
 
     given = jnp.stack(fixed) if fixed else jnp.zeros(0, real_type()), jnp.asarray(t, real_type()), q, y, inputs
-    # Operations from which on derivatives are machine code. Measured, gradients of batches over all saved states,
-    # by XLA and here: 5 operations, 28 and 42 ms; 66, 98 and 69; 228, 405 and 108. One motion of 16 trailers
-    # compiles in 16 to 19 s and 4.5 s.
-    if program.graph.operations(program.z) < 60:
+    if (own := beside(program)) is None or (derivatives := own.speeds) is None:
         return by_xla(*given)
-    derivatives = _derivatives_of_speeds(program)
     values = with_rules(by_xla, Rules(push, pull))
     return values(*given)
-
-
-@lru_cache(maxsize=MOST_KERNELS)
-def _derivatives_of_speeds(program: Lowered) -> Derivatives:
-    """Those of all speeds; the pivot after them is a number to differentiation."""
-    every = [*(int(program.traced.u[k]) for k in program.independent), *program.z]
-    speeds = dict(zip([*program.independent, *program.dependent], every, strict=True))
-    return Derivatives(program.graph, speeds, len(every) + 1, program.variables)
 
 
 def is_right(program: RowProgram, scene: Scene, t, q) -> Bool[Array, ""]:
@@ -120,7 +119,7 @@ def is_right(program: RowProgram, scene: Scene, t, q) -> Bool[Array, ""]:
     return _kernel_of_right(program)(jax.lax.stop_gradient(jnp.concatenate([jnp.asarray(x, real_type()) for x in parts])))[0] > 0
 
 
-@lru_cache(maxsize=MOST_KERNELS)
+@lru_cache(maxsize=64)
 def _kernel_of_right(program: RowProgram):
     given = [*(n for leaf in program.parameters for n in leaf if n >= 0), program.t, *program.q]
     return nodes_called(program.graph, [program.right], given)
@@ -130,20 +129,9 @@ def _in_a_row(fixed, t, q, y, inputs) -> Float[Array, "given"]:
     return jnp.concatenate([jnp.asarray(x, real_type()) for x in (fixed, jnp.asarray(t)[None], q, y, inputs)])
 
 
-def _needed(program: Lowered) -> tuple[tuple[int, ...], ...]:
-    """The entries of the scene's parameters on which something that is fixed depends."""
-    needed = set(program.graph.reachable([*program.fixed, *program.usual.values()]))
-    return tuple(tuple(n if n in needed else -1 for n in np.ravel(leaf).tolist()) for leaf in program.traced.parameters)
-
-
-def _places_of(program: Lowered) -> list[int]:
-    """Nodes of the parameters that are needed."""
-    return [n for leaf in _needed(program) for n in leaf if n >= 0]
-
-
-def _write_usual(program: Lowered, w: Writer) -> None:
+def _write_usual(program: Lowered, given: Sequence[int], w: Writer) -> None:
     """`row(state, found)`: as `Lowered.usual_values`, of the magnitudes at the probed states."""
-    given, nodes, states = _places_of(program), list(program.usual.values()), list(program.states)
+    nodes, states = list(program.usual.values()), list(program.states)
     probes = len(next(iter(program.states.values()), (None,)))
     table = w.constants("probed", (x[p] for p in range(probes) for x in program.states.values())) if states else Value(w, "ptr", "null")
     log, exp = FUNCTIONS["log"], FUNCTIONS["exp"]
