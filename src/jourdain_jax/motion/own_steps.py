@@ -186,7 +186,9 @@ def _pulled(perturbed: tuple, setup: Setup, begun: Begun, found: Solved, g: Solv
     if any(jax.tree.leaves(sampled)):
         raise DifferentiationModeError(OF_SAMPLES)
     asked = [bool(varies) for varies in native_motion.known_of(perturbed[1].args)]
-    by_start, by_known = native_motion.cotangents(_form(setup), _own(setup).solver, native_motion.start_of(setup, begun), asked, g)
+    method = _own(setup).solver
+    assert isinstance(method, Method)
+    by_start, by_known = native_motion.cotangents(_form(setup), method, native_motion.start_of(setup, begun), asked, g)
     none_else = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, (setup, begun))
     by_setup, (field, scene, inputs, fixed, origin) = none_else[0], none_else[1].args
     y0 = jax.tree.map(lambda varies, by: by if varies else None, perturbed[1].y0, by_start)
