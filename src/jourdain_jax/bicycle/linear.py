@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.linearize import linearize
-from jourdain_jax.bicycle.characteristic import BicycleMatrices
+from jourdain_jax.bicycle.stability import BicycleMatrices
 from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 from jourdain_jax.motion.start import State

@@ -1,12 +1,24 @@
 """Eigenvalues of the linear bicycle, and the speeds at which its stability changes.
 
-    M q'' + v C1 q' + (g K0 + v^2 K2) q = 0,   q = (lean, steer),   p(s; v) its characteristic polynomial
+    M q'' + v C1 q' + (g K0 + v^2 K2) q = 0,   q = (lean, steer)
+    p(s; v) = det(s^2 M + s v C1 + g K0 + v^2 K2) = a4 s^4 + a3 s^3 + a2 s^2 + a1 s + a0
 
-Each event is a root of a polynomial in v^2 (`characteristic.py`). All its positive roots are found, the one meant is told
-by how the eigenvalue moves there, ds/dv = - (dp/dv) / (dp/ds), and polished on its defining equation by Newton.
+With x = v^2 the coefficients are a4 = b4, a3 = v b3, a2 = b2(x), a1 = v b1(x), a0 = b0(x), and polynomials in x tell
 
-Source: Meijaard, Papadopoulos, Ruina & Schwab, Proc. R. Soc. A 463 (2007), sections 6-8.
+    where an eigenvalue is zero             b0 = 0
+    where two eigenvalues sum to zero       b1 b2 b3 - b4 b1^2 - b0 b3^2 = 0     (+-i omega if omega^2 = b1/b3 > 0)
+    where two eigenvalues coincide          4 D0^3 - D1^2 = 0, with
+        D0 = b2^2 - 3 x b3 b1 + 12 b4 b0,
+        D1 = 2 b2^3 - 9 x b3 b2 b1 + 27 x b3^2 b0 + 27 x b4 b1^2 - 72 b4 b2 b0
+
+All their positive roots are found, the one meant is told by how the eigenvalue moves there, ds/dv = - (dp/dv) / (dp/ds), and polished on its
+defining equation by Newton. Coefficients stand highest power first.
+
+Source: Meijaard, Papadopoulos, Ruina & Schwab, Proc. R. Soc. A 463 (2007), sections 6-8; Hurwitz determinant and discriminant of a quartic are textbook.
 """
+
+from functools import reduce
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,17 +30,18 @@ from jaxtyping import Bool, Complex, Float
 from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.calculus.newton import newton_root
 
-from .characteristic import (
-    BicycleMatrices,
-    bicycle_matrices,
-    characteristic_polynomial,
-    discriminant_polynomial,
-    hurwitz_polynomial,
-    speed_polynomials,
-)
-from .polynomial_roots import evaluate, real_roots
-
 Scalar = Float[Array, ""]
+Polynomial = Float[Array, " coefficients"]
+
+
+class BicycleMatrices(NamedTuple):
+    """The linear bicycle; unpacks into the arguments below: `stability_speeds(*matrices)`."""
+
+    M: Float[Array, "2 2"]  # kg m^2
+    C1: Float[Array, "2 2"]  # kg m
+    K0: Float[Array, "2 2"]  # kg m
+    K2: Float[Array, "2 2"]  # kg
+    g: Scalar  # m/s^2
 
 
 class StabilitySpeeds(eqx.Module):
@@ -58,7 +71,7 @@ def eigenvalues(
     real eigenvalues on either side of a pair the lower is castering, the higher capsize, and the pair is weave. A pair
     has its negative frequency first.
     """
-    matrices = bicycle_matrices(M, C1, K0, K2, g)
+    matrices = _as_matrices(M, C1, K0, K2, g)
     speeds = jnp.asarray(speeds, matrices.M.dtype)[:, None, None]
     # d/dt (q, q') = [[0, I], [-M^-1 (g K0 + v^2 K2), -M^-1 v C1]] (q, q')
     stiffness = matrices.g * matrices.K0 + speeds**2 * matrices.K2
@@ -90,24 +103,25 @@ def stability_speeds(
     **Returns:** a `StabilitySpeeds`. Derivatives follow from the implicit function theorem; where a speed does not exist
     its value is NaN and its derivative zero.
     """
-    matrices = bicycle_matrices(M, C1, K0, K2, g)
+    matrices = _as_matrices(M, C1, K0, K2, g)
     return _speeds(matrices, jax.lax.stop_gradient(jnp.asarray(max_speed, matrices.M.dtype)))
 
 
 def _stability_speeds(matrices: BicycleMatrices, top: Scalar) -> StabilitySpeeds:
     fixed = jax.lax.stop_gradient(matrices)
-    polynomials = speed_polynomials(fixed)
-    zero_crossings = _roots_in_speed(polynomials[0], top)
-    pair_crossings = _roots_in_speed(hurwitz_polynomial(polynomials), top)
+    zero, opposite, coincident = (_speeds_at(polynomial, top) for polynomial in _in_speed(fixed))
+    growth = jax.vmap(lambda s, v: _growth(fixed, s, v).real)
+    upward = growth(jnp.zeros_like(zero), zero) > 0
+    downward = growth(1j * jax.vmap(lambda v: _pair_frequency(fixed, v))(opposite), opposite) < 0
 
-    capsize_speed = _polished(_zero_eigenvalue, _lowest_upward(fixed, zero_crossings), matrices)
-    weave_speed = _polished(_opposite_eigenvalues, _highest_downward(fixed, pair_crossings), matrices)
+    capsize_speed = _polished(lambda v, m: jnp.polyval(_in_speed(m)[0], v**2), jnp.where(upward, zero, jnp.inf).min(), matrices)
+    weave_speed = _polished(lambda v, m: jnp.polyval(_in_speed(m)[1], v**2), jnp.where(downward, opposite, -jnp.inf).max(), matrices)
     has_weave = ~jnp.isnan(weave_speed)
     weave_frequency = _pair_frequency(matrices, jnp.where(has_weave, weave_speed, 1.0))
 
     below = jnp.where(has_weave, jax.lax.stop_gradient(weave_speed), top)
-    double_root_eigenvalue, double_root_speed = _double_root(matrices, fixed, below, top)
-    stable_from, stable_to = _widest_stable_range(fixed, jnp.concatenate([zero_crossings, pair_crossings]), top)
+    double_root_eigenvalue, double_root_speed = _double_root(matrices, fixed, coincident, below)
+    stable_from, stable_to = _widest_stable_range(fixed, jnp.concatenate([zero, opposite]), top)
     return StabilitySpeeds(
         weave_speed=weave_speed,
         capsize_speed=capsize_speed,
@@ -131,60 +145,87 @@ def _name_modes(values: Complex[Array, " 4"]) -> Complex[Array, " 4"]:
     return jnp.where(pair_between, values[jnp.array([0, 3, 1, 2])], values)
 
 
-def _roots_in_speed(polynomial: list[Scalar], top: Scalar) -> Float[Array, " degree"]:
-    """The speeds (m/s) up to `top` at which a polynomial in v^2 is zero, NaN where there are fewer than its degree."""
-    return jnp.sqrt(real_roots(polynomial, jnp.zeros_like(top), top**2))
+def _as_matrices(M, C1, K0, K2, g) -> BicycleMatrices:
+    """The matrices as arrays of one floating-point type."""
+    dtype = jnp.result_type(float, *(jnp.asarray(matrix).dtype for matrix in (M, C1, K0, K2)))
+    return BicycleMatrices(*(jnp.asarray(value, dtype) for value in (M, C1, K0, K2, g)))
 
 
-def _first_derivative(coefficients: Float[Array, " n"]) -> Float[Array, " n-1"]:
-    return coefficients[1:] * jnp.arange(1, coefficients.size)
+def _coefficients(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
+    """b4, b3, b2(x), b1(x), b0(x) of the module's head."""
+    M, C1, K0, K2, g = matrices
+
+    def mixed(A, B):  # det(A + B) - det A - det B
+        return A[0, 0] * B[1, 1] + A[1, 1] * B[0, 0] - A[0, 1] * B[1, 0] - A[1, 0] * B[0, 1]
+
+    def det(A):
+        return mixed(A, A) / 2
+
+    found = (
+        [det(M)],
+        [mixed(M, C1)],
+        [mixed(M, K2) + det(C1), g * mixed(M, K0)],
+        [mixed(C1, K2), g * mixed(C1, K0)],
+        [det(K2), g * mixed(K0, K2), g**2 * det(K0)],
+    )
+    return tuple(map(jnp.stack, found))
 
 
-def _expand(matrices: BicycleMatrices, v: Scalar) -> tuple[Float[Array, " 5"], Float[Array, " 5"]]:
-    """Coefficients of p and of dp/dv at speed `v`."""
-    return jax.jvp(lambda v: characteristic_polynomial(matrices, v), (v,), (jnp.ones_like(v),))
+def _characteristic(matrices: BicycleMatrices, v: ArrayLike) -> Polynomial:
+    """a4, a3, a2, a1, a0 at one speed."""
+    b4, b3, b2, b1, b0 = (jnp.polyval(b, jnp.asarray(v) ** 2) for b in _coefficients(matrices))
+    return jnp.stack([b4, v * b3, b2, v * b1, b0])
+
+
+def _in_speed(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
+    """Polynomials in x of the module's head: zero where an eigenvalue is, where two sum to zero, and where two coincide."""
+    b4, b3, b2, b1, b0 = _coefficients(matrices)
+    x = jnp.array([1.0, 0.0], b0.dtype)
+
+    def combined(*terms):
+        """The sum of products, each a factor and polynomials."""
+        return reduce(jnp.polyadd, (factor * reduce(jnp.polymul, parts) for factor, *parts in terms))
+
+    opposite = combined((1, b1, b2, b3), (-1, b4, b1, b1), (-1, b0, b3, b3))
+    D0 = combined((1, b2, b2), (-3, x, b3, b1), (12, b4, b0))
+    D1 = combined((2, b2, b2, b2), (-9, x, b3, b2, b1), (27, x, b3, b3, b0), (27, x, b4, b1, b1), (-72, b4, b2, b0))
+    return b0, opposite, combined((4, D0, D0, D0), (-1, D1, D1))
+
+
+def _speeds_at(polynomial: Polynomial, top: Scalar) -> Float[Array, " degree"]:
+    """The speeds (m/s) up to `top` at which a polynomial in v^2 is zero, NaN where there are fewer than its degree; to some digits.
+
+    Found as 1/v^2: coefficients of the highest powers may vanish.
+    """
+    inverse = jnp.roots(polynomial[::-1], strip_zeros=False)
+    there = (inverse.imag == 0) & (inverse.real * top**2 > 1)
+    return jnp.where(there, 1 / jnp.sqrt(jnp.where(there, inverse.real, 1.0)), jnp.nan)
 
 
 def _growth(matrices: BicycleMatrices, s: Array, v: Scalar) -> Array:
     """ds/dv = - (dp/dv) / (dp/ds) of the eigenvalue `s`, real or complex."""
-    coefficients, slopes = _expand(matrices, v)
-    return -evaluate(slopes, s) / evaluate(_first_derivative(coefficients), s)
+    coefficients, slopes = _with_slopes(matrices, v)
+    return -jnp.polyval(slopes, s) / jnp.polyval(jnp.polyder(coefficients), s)
 
 
-def _lowest_upward(matrices: BicycleMatrices, speeds: Float[Array, " crossings"]) -> Scalar:
-    """The lowest of the speeds with a zero eigenvalue at which it grows; infinite if there is none."""
-    growth = jax.vmap(lambda v: _growth(matrices, jnp.zeros_like(v), v))(speeds)
-    return jnp.where((speeds > 0) & (growth > 0), speeds, jnp.inf).min()
-
-
-def _highest_downward(matrices: BicycleMatrices, speeds: Float[Array, " crossings"]) -> Scalar:
-    """The highest of the speeds with two opposite eigenvalues where these are +-i omega and their real part falls."""
-    frequencies = jax.vmap(lambda v: _pair_frequency(matrices, v))(speeds)
-    growth = jax.vmap(lambda s, v: _growth(matrices, s, v))(1j * frequencies, speeds).real
-    return jnp.where((speeds > 0) & (growth < 0), speeds, -jnp.inf).max()
+def _with_slopes(matrices: BicycleMatrices, v: Scalar) -> tuple[Polynomial, Polynomial]:
+    """Coefficients of p and of dp/dv at speed `v`."""
+    return jax.jvp(lambda v: _characteristic(matrices, v), (v,), (jnp.ones_like(v),))
 
 
 def _pair_frequency(matrices: BicycleMatrices, v: Scalar) -> Scalar:
     """omega = sqrt(a1/a3) where +-i omega are eigenvalues; NaN, without derivative, where the two are real."""
-    coefficients = characteristic_polynomial(matrices, v)
-    a1, a3 = coefficients[1], coefficients[3]
+    _, a3, _, a1, _ = _characteristic(matrices, v)
     is_pair = a1 * a3 > 0
     squared = jnp.where(is_pair, a1, 1.0) / jnp.where(is_pair, a3, 1.0)
     return jnp.where(is_pair, jnp.sqrt(squared), jnp.nan)
 
 
-def _zero_eigenvalue(v, matrices):
-    return evaluate(speed_polynomials(matrices)[0], v**2)
-
-
-def _opposite_eigenvalues(v, matrices):
-    return evaluate(hurwitz_polynomial(speed_polynomials(matrices)), v**2)
-
-
 def _coincident_eigenvalues(s_and_v, matrices):
     """p and dp/ds, both zero at a double root."""
-    coefficients = characteristic_polynomial(matrices, s_and_v[1])
-    return jnp.stack([evaluate(coefficients, s_and_v[0]), evaluate(_first_derivative(coefficients), s_and_v[0])])
+    s, v = s_and_v
+    coefficients = _characteristic(matrices, v)
+    return jnp.stack([jnp.polyval(coefficients, s), jnp.polyval(jnp.polyder(coefficients), s)])
 
 
 def _polished(residual, guess: Scalar, matrices: BicycleMatrices) -> Scalar:
@@ -200,28 +241,22 @@ def _root(residual, guess: Float[Array, " n"], matrices: BicycleMatrices, presen
     return jnp.where(present, found.x, jnp.nan)
 
 
-def _double_root(matrices: BicycleMatrices, fixed: BicycleMatrices, below: Scalar, top: Scalar) -> tuple[Scalar, Scalar]:
+def _double_root(matrices: BicycleMatrices, fixed: BicycleMatrices, candidates: Float[Array, " speeds"], below: Scalar) -> tuple[Scalar, Scalar]:
     """Eigenvalue (1/s) and speed (m/s) where two positive real eigenvalues last become a pair at a speed < `below`."""
-    candidates = _roots_in_speed(discriminant_polynomial(speed_polynomials(fixed)), top)
-    small = 64 * jnp.sqrt(jnp.finfo(top.dtype).eps)  # 1e-6 in float64
 
     def examine(v):
-        coefficients, slopes = _expand(fixed, v)
-        first = _first_derivative(coefficients)
-        bound = 1.0 + jnp.max(jnp.abs(first[:-1])) / jnp.abs(first[-1])  # Cauchy: no root of dp/ds lies beyond it
-        extrema = real_roots(list(first), jnp.zeros_like(v), bound)
-        # |p| over the sum of its terms: at a double root an extremum of p touches the axis.
-        height = jnp.abs(evaluate(coefficients, extrema)) / evaluate(jnp.abs(coefficients), extrema)
-        height = jnp.where(extrema > 0, height, jnp.inf)
-        s = extrema[jnp.argmin(height)]
+        coefficients, slopes = _with_slopes(fixed, jnp.where(jnp.isnan(v), 1.0, v))
+        roots = jnp.roots(coefficients, strip_zeros=False)
+        i, j = jnp.triu_indices(4, 1)
+        pair = jnp.argmin(jnp.abs(roots[i] - roots[j]))
+        s = (roots[i[pair]] + roots[j[pair]]).real / 2
         # 0 = p_ss ds^2 / 2 + p_v dv: a pair above v where p_ss and p_v have one sign.
-        becomes_pair = evaluate(slopes, s) * evaluate(_first_derivative(first), s) > 0
-        return s, (height.min() < small) & becomes_pair & (v > 0) & (v < below)
+        becomes_pair = jnp.polyval(slopes, s) * jnp.polyval(jnp.polyder(coefficients, 2), s) > 0
+        return s, (s > 0) & becomes_pair & (v < below)
 
     roots, merges = jax.vmap(examine)(candidates)
     chosen = jnp.argmax(jnp.where(merges, candidates, -jnp.inf))
-    present = merges[chosen]
-    s, v = _root(_coincident_eigenvalues, jnp.stack([roots[chosen], candidates[chosen]]), matrices, present)
+    s, v = _root(_coincident_eigenvalues, jnp.stack([roots[chosen], candidates[chosen]]), matrices, merges[chosen])
     return s, v
 
 
@@ -230,7 +265,7 @@ def _widest_stable_range(matrices: BicycleMatrices, crossings: Float[Array, " cr
     ends = jnp.concatenate([jnp.zeros_like(top)[None], crossings, top[None]])
     ends = jnp.sort(jnp.where(jnp.isnan(ends), top, ends))
     middles = 0.5 * (ends[:-1] + ends[1:])
-    a0, a1, a2, a3, a4 = jax.vmap(lambda v: characteristic_polynomial(matrices, v))(middles).T
+    a4, a3, a2, a1, a0 = jax.vmap(lambda v: _characteristic(matrices, v))(middles).T
     # Lienard & Chipart: a0, a1, a3, a4 and the third Hurwitz determinant positive.
     stable = (a0 > 0) & (a1 > 0) & (a3 > 0) & (a4 > 0) & (a1 * a2 * a3 - a4 * a1**2 - a0 * a3**2 > 0)
     widths = jnp.where(stable, ends[1:] - ends[:-1], 0.0)
