@@ -3,7 +3,7 @@
     python bench/families.py [--quick] [--json FILE]
 
 Processor time in seconds. Digits: Meijaard et al. (2007), and Newton-Euler equations in the turning frame for the turns without hands. `--quick`: without
-the derivative of eigenvalues. The JSON is a list of {"figure", "model", "value", "required", "met"}.
+derivatives of eigenvalues and of critical speeds. The JSON is a list of {"figure", "model", "value", "required", "met"}.
 """
 
 import argparse
@@ -24,18 +24,20 @@ TURN = {"steer": 0.162268296301, "pitch": 0.004456954662, "yaw_rate": 0.85437950
 COLD = {
     "closed curve of turns, cold": 'jj.family(bicycle, {"rear_spin_rate": 20.0, "lean": 1e-3}, until={"lean": 1.5})',
     "linearize, first call after the start": 'jj.linearize(bicycle, start, ("lean", "steer"))',
-    "derivative of eigenvalues by the trail, first call": (
-        'jax.jacfwd(lambda c: jj.linearize(bicycle.replace(c=c), start, ("lean", "steer")).eigenvalues())(bicycle.c)'
-    ),
+    "derivatives of eigenvalues by all parameters, first call": 'small.sensitivities("weave")',
+    "derivative of the weave speed by the trail, first call": 'jax.grad(lambda c: jj.critical(bicycle.replace(c=c), straight, "weave").speed)(bicycle.c)',
 }
-BEGUN = (
-    "import time, jax, jourdain_jax as jj; bicycle = jj.models.WhippleBicycle(); start = jj.start(bicycle, **bicycle.upright(5.0)); begin = time.process_time()"
-)
+BEGUN = {
+    "sensitivities": 'small = jj.linearize(bicycle, start, ("lean", "steer"))',
+    "critical": 'straight = jj.family(bicycle, {"x_rate": 5.0, "rear_spin_rate": 16.7, "front_spin_rate": 14.3}, until={"x_rate": 1.0})',
+}
 
 
 def cold(code: str) -> float:
-    """Processor time of a call in a fresh process, imports and a start left out."""
-    script = f"{BEGUN}; {code}; print(time.process_time() - begin)"
+    """Processor time of a call in a fresh process; imports, a start, and what it is called on are left out."""
+    first = next((begun for name, begun in BEGUN.items() if f".{name}(" in code), "pass")
+    bicycle = "bicycle = jj.models.WhippleBicycle(); start = jj.start(bicycle, **bicycle.upright(5.0))"
+    script = f"import time, jax, jourdain_jax as jj; {bicycle}; {first}; begin = time.process_time(); {code}; print(time.process_time() - begin)"
     return float(subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout)
 
 
@@ -58,11 +60,11 @@ def warm(bicycle: jj.Scene) -> tuple[float, float, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="without the derivative of eigenvalues")
+    parser.add_argument("--quick", action="store_true", help="without derivatives")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    required = dict(zip(COLD, (3.0, 1.5, 1.5), strict=True))
-    figures = [(name, cold(code), required[name]) for name, code in list(COLD.items())[: 2 if arguments.quick else 3]]
+    required = dict(zip(COLD, (3.0, 1.5, 1.5, 3.0), strict=True))
+    figures = [(name, cold(code), required[name]) for name, code in list(COLD.items())[: 2 if arguments.quick else 4]]
     seconds, turn, speeds = warm(jj.models.WhippleBicycle())
     figures += [
         ("a further point with its eigenvalues, warm", seconds, 3e-3),

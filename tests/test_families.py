@@ -5,8 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from small_scenes import OnLine
 
 import jourdain_jax as jj
+from jourdain_jax.bicycle import linear_matrices, stability_speeds
+from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
 
 NAMES = ("lean", "steer", "pitch", "yaw_rate", "rear_spin_rate", "front_spin_rate")
 FIRST_HALF = {
@@ -223,6 +226,122 @@ def test_a_motion_that_stands_alone_and_points_that_are_no_branch_points(turns, 
         turns.at(lean=0.1, steer=0.1)
     with pytest.raises(KeyError, match="did you mean `lean`"):
         turns["leam"]
+
+
+AT_5 = {  # of the eigenvalues of weave and capsize, of the weave and of the capsize speed, by Meijaard's formulas in 40 digits
+    "w": (0.5784301836667 + 11.04402541662j, 1.873378311812, -0.4776030485691, -4.393049781489),
+    "c": (12.18560145265 - 4.418538571895j, -9.374190592203, 11.47995745126, 28.88866886342),
+    "lam": (2.459557200396 - 13.16293523872j, -3.350671972655, 4.17667019102, 4.308855800463),
+    "IHxz": (6.303428046764 + 0.2400400242343j, -0.01621194815966, 3.543504519167, 0.0),
+    "rF": (5.201300621719 - 13.39003429778j, -4.130519197482, 5.060813989216, 10.27615086865),
+    "IFyy": (-6.103847637971 + 13.04502488696j, 4.513883751204, -5.797062739492, -11.41978760738),
+}
+
+
+def test_all_derivatives_of_eigenvalues_are_those_of_the_formulas(bicycle):
+    small = jj.linearize(bicycle, jj.start(bicycle, **bicycle.upright(5.0)), ("lean", "steer"))
+    weave, capsize = small.sensitivities("weave"), small.sensitivities("capsize")
+    for name, (of_weave, of_capsize, *_) in AT_5.items():
+        assert weave[name] == pytest.approx(of_weave, rel=1e-10)
+        assert capsize[name] == pytest.approx(of_capsize, rel=1e-10)
+    assert weave.held == ("x_rate",)
+    assert len(weave.by_parameter) == 26
+    assert "12.1856-4.41854i" in str(weave)
+    with pytest.raises(ValueError, match="did you mean `weave`"):
+        small.sensitivities("weve")
+
+
+def test_shapes_of_modes_from_both_sides(bicycle):
+    small = jj.linearize(bicycle, jj.start(bicycle, **bicycle.upright(5.0)), ("lean", "steer"))
+    modes = small.modes()
+    assert modes.names == ("castering", "weave", "weave", "capsize")
+    for s, right, left in zip(modes.eigenvalues, modes.shapes.T, modes.left.T, strict=True):
+        P = small.M * s**2 + small.C * s + small.K
+        assert_allclose(P @ right, 0.0, atol=1e-9)
+        assert_allclose(left.conj() @ P, 0.0, atol=1e-9)
+    assert np.all(modes.condition > 0.1)
+    assert small.modes(("a", "b", "c", "d")).names == ("a", "b", "c", "d")
+    with pytest.raises(ValueError, match="expected one for each of the 4 modes"):
+        _ = small.modes(("a",)).names
+
+
+def test_a_double_eigenvalue_has_no_derivative(bicycle, straight):
+    point = jj.critical(bicycle, straight, "double root")
+    small = jj.linearize(bicycle, point.state, ("lean", "steer"))
+    found = small.sensitivities("weave")
+    assert found.code != 0
+    assert found.condition < 1e-6
+    assert np.all(np.isnan(list(found.by_parameter.values())))
+    assert "eigenvalues meet" in str(found)
+
+
+@pytest.mark.parametrize(("what", "speed"), [("weave", WEAVE), ("capsize", CAPSIZE), ("double root", DOUBLE)])
+def test_critical_speeds_are_the_published_ones(bicycle, straight, what, speed):
+    point = jj.critical(bicycle, straight, what)
+    assert point.code == 0
+    assert float(point.speed) == pytest.approx(speed, abs=2e-12)
+    assert point.eigenvalue.real == (pytest.approx(3.78290405129, abs=1e-9) if what == "double root" else 0.0)
+    assert point.message == "found"
+
+
+def test_critical_speeds_have_derivatives_by_all_parameters(bicycle, straight):
+    for what, k in (("weave", 2), ("capsize", 3)):
+        by_all = jax.jit(jax.grad(lambda scene, what=what: jj.critical(scene, straight, what).speed))(bicycle)
+        for name, derivatives in AT_5.items():
+            assert float(getattr(by_all, name)) == pytest.approx(derivatives[k], rel=1e-10, abs=1e-10)
+
+
+def test_a_batch_says_which_bicycles_have_no_such_speed(bicycle, straight):
+    trails = jnp.array([0.02, 0.08, 0.3, -0.5, jnp.nan])
+    found = jax.vmap(lambda c: jj.critical(bicycle.replace(c=c), straight, "capsize"))(trails)
+    for k, c in enumerate(trails):
+        linear = stability_speeds(*linear_matrices({name: c if name == "c" else getattr(bicycle, name) for name in PARAMETER_NAMES}))
+        assert (found.code[k] == 0) == bool(jnp.isfinite(linear.capsize_speed))
+        assert_allclose(found.speed[k], linear.capsize_speed, rtol=1e-9)
+
+
+class Fluttering(OnLine):
+    """A particle on a stiffening spring under a constant push, with a drag and a gain that feeds its speed back."""
+
+    gain: float = jj.parameter(0.5)
+    drag: float = jj.parameter(1.0)
+    stiffness: float = jj.parameter(4.0)
+
+    def loads(self, motion):
+        force = (self.gain - self.drag) * motion.u.x_rate - self.stiffness * motion.q.x - motion.q.x**3 + 1.0
+        return (jj.generalized_force(motion, x_rate=force),)
+
+
+def frequency(stiffness):
+    """Of small motions about the equilibrium without damping, of a unit mass."""
+    x = 0.2
+    for _ in range(20):
+        x = x - (stiffness * x + x**3 - 1.0) / (stiffness + 3 * x**2)
+    return jnp.sqrt(stiffness + 3 * x**2)
+
+
+def test_critical_points_along_a_parameter_have_derivatives_of_both_orders():
+    curve = jj.family(Fluttering(), {"x": 0.2}, vary="gain", until={"gain": 3.0})
+    critical = lambda drag, stiffness: jj.critical(Fluttering(drag=drag, stiffness=stiffness), curve, "pair on the imaginary axis")  # noqa: E731
+    assert float(critical(1.5, 5.0)["gain"]) == pytest.approx(1.5, rel=1e-12)
+    assert_allclose(jax.grad(lambda x: critical(*x)["gain"])(jnp.array([1.5, 5.0])), [1.0, 0.0], atol=1e-11)
+    of_stiffness = jax.hessian(lambda k: critical(1.5, k).eigenvalue.imag)(5.0)
+    assert float(of_stiffness) == pytest.approx(float(jax.hessian(frequency)(5.0)), rel=1e-9)
+
+
+def test_points_that_meet_are_no_functions_of_parameters():
+    """The bead's pair meets where its equilibria branch: any asymmetry takes this point away."""
+    bottom = jj.family(Bead(), {"angle": 0.0}, vary="turning", until={"turning": 6.0})
+    point = jj.critical(Bead(radius=0.8), bottom, "double root")
+    assert point.code != 0
+    assert np.isnan(point["turning"])
+
+
+def test_critical_points_that_are_not_there_are_refused(bicycle, straight):
+    with pytest.raises(ValueError, match=r"no such special point; it has: .*weave"):
+        jj.critical(bicycle, straight, "fold in lean")
+    with pytest.raises(ValueError, match="the family is one of `WhippleBicycle`"):
+        jj.critical(jj.models.TiltingDisc(), straight, "weave")
 
 
 def test_families_are_no_functions_to_be_traced(bicycle):

@@ -80,6 +80,7 @@ if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
     from jourdain_jax.analysis.estimate import Estimate, bounds, joint_normal, positive, unbounded
     from jourdain_jax.analysis.experiment import Experiment
+    from jourdain_jax.analysis.families.critical import critical
     from jourdain_jax.analysis.families.family import family
     from jourdain_jax.analysis.filtering import filtered_log_likelihood
     from jourdain_jax.analysis.fit import fit, fit_batch
@@ -124,6 +125,7 @@ _ON_FIRST_USE = {
     "analysis.energy": "Energy EnergyBalance energy energy_balance",
     "analysis.estimate": "Estimate bounds joint_normal positive unbounded",
     "analysis.experiment": "Experiment",
+    "analysis.families.critical": "critical",
     "analysis.families.family": "family",
     "analysis.filtering": "filtered_log_likelihood",
     "analysis.fit": "fit fit_batch",
@@ -259,6 +261,7 @@ __all__ = [
     "constraint_rows",
     "coordinate_rates",
     "coordinates",
+    "critical",
     "damper",
     "derivative_exists",
     "diagnose",

@@ -9,7 +9,6 @@ Source: Wang and Pao (2003), eqs. (25)-(31), (41); D. L. Peterson, G. Gede and M
 """
 
 import warnings
-from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
@@ -18,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from jourdain_jax.analysis.families.critical import Sensitivities, sensitivities
+from jourdain_jax.analysis.families.spectrum import mode_names
 from jourdain_jax.analysis.table import linearization_text
 from jourdain_jax.analysis.tangent import (
     Flow,
@@ -41,7 +42,7 @@ from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.start import State
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
-from jourdain_jax.scene.names import as_names
+from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines, users_level
@@ -50,10 +51,19 @@ _compiled = partial(compiled, options=RUN_SELDOM)  # of a bicycle in 2.3 s of pr
 
 
 class Modes(eqx.Module):
-    """Free small motions `p(t) = shape exp(s t)`."""
+    """Free small motions `p(t) = shape exp(s t)`, one column per mode; the largest entry of a shape is 1."""
 
     eigenvalues: Complex[Array, "modes"]  # s, in 1/s
-    shapes: Complex[Array, "parts modes"]  # one column per mode, its largest entry 1
+    shapes: Complex[Array, "parts modes"]  # (M s^2 + C s + K) shape = 0
+    left: Complex[Array, "parts modes"]  # conj(left)' (M s^2 + C s + K) = 0
+    condition: Float[Array, "modes"]  # |y' x| of unit left and right vectors of the first-order form: zero at a double root
+    scene: Scene
+    named: tuple[str, ...] | None = eqx.field(static=True)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the modes, in the order of the eigenvalues."""
+        return mode_names(self.scene, self.named, np.asarray(self.eigenvalues))
 
 
 class Linearization(Printed, eqx.Module):
@@ -72,21 +82,35 @@ class Linearization(Printed, eqx.Module):
     states: tuple[str, ...] = eqx.field(static=True)  # names of the entries of x
     inputs: tuple[str, ...] = eqx.field(static=True)
     coordinates: tuple[str, ...] = eqx.field(static=True)  # names of p
+    about: tuple[Scene, State, Float[Array, "inputs"]]  # what was linearized
 
     def _text(self) -> str:
         return linearization_text(self)
 
     def eigenvalues(self) -> Complex[Array, "modes"]:
         """Roots of `det(M s^2 + C s + K) = 0`, 1/s, by ascending real part. Differentiable where distinct."""
-        return _roots(self, Linearization._companion)
+        return _roots(self._companion())
 
-    def modes(self) -> Modes:
-        """Eigenvalues, as `eigenvalues` gives them, with the shapes of the modes in the named coordinates (no derivative)."""
-        values, vectors = jnp.linalg.eig(jax.lax.stop_gradient(self._companion()))
-        order = jnp.lexsort((values.imag, values.real))
-        shapes = vectors[: len(self.coordinates), order]
-        largest = jnp.argmax(jnp.abs(shapes), axis=0)
-        return Modes(values[order], shapes / jnp.take_along_axis(shapes, largest[None], axis=0))
+    def modes(self, names: tuple[str, ...] | None = None) -> Modes:
+        """Eigenvalues, as `eigenvalues` gives them, with the shapes of the modes in the named coordinates (no derivative).
+
+        `names`: of the modes in this order; default: the `mode_names` of the scene, or "mode 1", ...
+        """
+        values, shapes, left, condition = _decomposed(self)
+        return Modes(values, shapes, left, condition, self.about[0], names)
+
+    def sensitivities(self, mode: str, held: str | tuple[str, ...] = (), names: tuple[str, ...] | None = None) -> Sensitivities:
+        """Derivatives of a mode's eigenvalue (of a pair the one above the real axis) by every parameter, as machine code: `small.sensitivities("weave")["c"]`.
+
+        The steady motion changes with the parameters, too. `held`: names of coordinates and speeds that keep their values, as many as steady motions beside
+        this one have freedoms; default: speeds in the scene's order, of a bicycle `x_rate`. `names`: as of `modes`. At a double root all is NaN, and `code`
+        is not 0. ValueError: an unknown mode, a motion that is not steady; `NotLowered` where the scene has no scalar program.
+        """
+        found = self.modes(names)
+        if mode not in found.names:
+            raise ValueError(f"no mode `{mode}`; {nearest(mode, dict.fromkeys(found.names))}")
+        eigenvalues = [complex(s) for s, name in zip(found.eigenvalues, found.names, strict=True) if name == mode]
+        return sensitivities(self.about, mode, max(eigenvalues, key=lambda s: s.imag), held)
 
     def state_eigenvalues(self) -> Complex[Array, "states"]:
         """Eigenvalues of A, 1/s, by ascending real part.
@@ -94,7 +118,7 @@ class Linearization(Printed, eqx.Module):
         Ignorable coordinates, and speeds that a steady motion may have at will, add zeros, often in Jordan blocks: a root of
         round-off then stands in their place. `eigenvalues` is free of them.
         """
-        return _roots(self, _state_matrix)
+        return _roots(self.A)
 
     def _companion(self) -> Float[Array, "modes modes"]:
         k = len(self.coordinates)
@@ -218,6 +242,7 @@ def _linearize(
         states=(*independent, *(scene.speed_names.entries[i] for i in y)),
         inputs=scene.inputs.entries,
         coordinates=coordinates,
+        about=(scene, state, f),
     )
 
 
@@ -243,14 +268,24 @@ def _relative(neglected, kept):
     return jnp.max(jnp.abs(neglected), initial=0.0) / jnp.where(size > 0, size, 1.0)
 
 
-def _state_matrix(found: Linearization) -> Float[Array, "states states"]:
-    return found.A
+@_compiled
+def _decomposed(found: Linearization) -> tuple[Array, Array, Array, Array]:
+    """What `Modes` holds of the second-order form."""
+    values, left, right = jax.lax.linalg.eig(jax.lax.stop_gradient(found._companion()))
+    order, k = jnp.lexsort((values.imag, values.real)), len(found.coordinates)
+    values, left, right = values[order], left[:, order], right[:, order]
+    condition = jnp.abs(jnp.sum(left.conj() * right, axis=0))
+    return values, _largest_one(right[:k]), _largest_one(jnp.linalg.solve(found.M, left[k:])), condition
+
+
+def _largest_one(shapes: Complex[Array, "parts modes"]) -> Complex[Array, "parts modes"]:
+    return shapes / jnp.take_along_axis(shapes, jnp.argmax(jnp.abs(shapes), axis=0)[None], axis=0)
 
 
 @_compiled
-def _roots(found: Linearization, matrix: Callable) -> Complex[Array, "modes"]:
-    """Eigenvalues of a matrix of a linearization, by ascending real part."""
-    values = jnp.linalg.eigvals(matrix(found))
+def _roots(matrix: Float[Array, "states states"]) -> Complex[Array, "modes"]:
+    """Eigenvalues by ascending real part."""
+    values = jnp.linalg.eigvals(matrix)
     return values[jnp.lexsort((values.imag, values.real))]
 
 

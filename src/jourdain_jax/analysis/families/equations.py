@@ -5,29 +5,34 @@
 y: the independent speeds of the scalar program; j: the coordinates that must rest. Coordinates on which nothing of this depends, a heading say, stay out.
 Unknowns are measured in units of their size, rows in SI units. Small motions about a steady one:
 
-    x = (dq, dy) = E s,   ds/dt = A s,   A = E' F E        E: orthonormal, spans the x that the rows allow;   F = d(dq/dt, dy/dt)/d(q, y)
+    x = (dq, dy) = E s,   ds/dt = A s,   A = E' F E        E: orthonormal, spans the x that the rows allow, C x = 0;   F = d(dq/dt, dy/dt)/d(q, y)
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Complex, Float
 
 from jourdain_jax.build.domain import coordinate_bounds
+from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.build.sampling import sample_states
-from jourdain_jax.dynamics.reduced import DEPENDS, PROBES, ignorable_coordinates
+from jourdain_jax.dynamics.reduced import DEPENDS, PROBES
 from jourdain_jax.lowering.lower import lower
-from jourdain_jax.lowering.lowered import NotLowered
+from jourdain_jax.lowering.lowered import Lowered, NotLowered
 from jourdain_jax.motion.native.called import nodes_called
-from jourdain_jax.native import host
+from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
+from jourdain_jax.native import ffi
 from jourdain_jax.native.scalar_program import unsupported
-from jourdain_jax.program.derivative import jacobian
+from jourdain_jax.program.derivative import derivatives, jacobian
+from jourdain_jax.program.emit import run
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
@@ -44,6 +49,65 @@ class Look:
     C: Float[np.ndarray, "rows_of_states states"]  # rows that (dq, dy) meet
 
 
+class SteadyProgram:
+    """One graph of rows and rates of a class of scenes, with slopes; functions of all numbers in a row: parameters, t, q, u, inputs."""
+
+    def __init__(self, scene: Scene, program: Lowered, kept: tuple[int, ...], resting: tuple[int, ...], places: tuple[int, ...]) -> None:
+        rows = row_program(scene)
+        if rows is None:
+            raise NotLowered(f"the rows of `{type(scene).__name__}` have no scalar program, which its families of steady motions need")
+        graph, of, n = Graph(), program.traced, len(program.coordinates)
+        parameters = sum(np.size(leaf) for leaf in jax.tree.leaves(scene))
+        every = [graph.input(f"x{k}", True) for k in range(parameters + 1 + n + len(program.speeds) + len(scene.inputs))]
+        new = graph.copied([*program.qdot, *program.ydot, *program.guards], program.graph, _known((of.parameters, of.t, of.q, of.u, of.inputs), every))
+        new_rows = graph.copied([*rows.g, *rows.phi], rows.graph, _known((rows.parameters, rows.t, rows.q, rows.u, rows.inputs), every))
+        g, phi = [new_rows[n] for n in rows.g], [new_rows[n] for n in rows.phi]
+        qdot, ydot, guards = ([new[n] for n in nodes] for nodes in (program.qdot, program.ydot, program.guards))
+        held = [*g, *phi, *ydot, *(qdot[k] for k in resting)]
+        rates = [*(qdot[k] for k in kept), *ydot]
+        states = [*(every[parameters + 1 + k] for k in kept), *(every[parameters + 1 + n + k] for k in program.independent)]
+        self.in_states = [*range(len(kept)), *(len(kept) + k for k in program.independent)]
+        of_states = [*g, *(phi if len(program.independent) == len(program.speeds) else [])]
+        self.rows, self.rates = len(held), len(held) + len(rates)  # where they end among the results of `_moved`
+        self.entries, nodes = {}, list(held)
+        for name, outputs, variables in (("J", held, [every[k] for k in places]), ("F", rates, states), ("C", of_states, states)):
+            column = {x: k for k, x in enumerate(variables)}
+            entries = [(i, column[x], node) for i, row in enumerate(jacobian(graph, outputs, variables)) for x, node in row.items()]
+            where = np.array([entry[:2] for entry in entries], int).reshape(-1, 2).T
+            self.entries[name] = (len(outputs), len(variables)), tuple(where), slice(len(nodes), len(nodes) + len(entries))
+            nodes += [node for *_, node in entries]
+        self.guards = slice(len(nodes), None)
+        self.values = _evaluated(graph, [*nodes, *guards], every)
+        direction = [graph.input(f"a{k}", True) for k in range(len(states))]
+        moved = [*held, *derivatives(graph, [*rates, *of_states], dict(zip(states, direction, strict=True))), *guards]
+        self._moved, self._defined = _differentiable(graph, moved, [*every, *direction]), len(moved) - len(guards)
+        self._pulled = jax.jit(jax.jacrev(self._weighted))
+
+    def along(self, numbers: Float[Array, "numbers"], directions: Float[Array, "directions states"]) -> tuple[Array, Array, Array]:
+        """R, and F a and C a for each direction a of (q, y), as JAX differentiates them."""
+        found = self._along(numbers, directions)
+        found = jnp.where(jnp.all(found[:, self._defined :] > 0), found[:, : self._defined], jnp.nan)
+        return found[0, : self.rows], found[:, self.rows : self.rates], found[:, self.rates :]
+
+    def _along(self, numbers, directions) -> Float[Array, "directions results"]:
+        return jax.vmap(lambda a: self._moved(jnp.concatenate([numbers, a])))(directions)
+
+    def _weighted(self, numbers, directions, of_rows, of_rates) -> Float[Array, "2"]:
+        real, imag = self._along(numbers, directions)
+        total = of_rows @ real[: self.rows] + of_rates @ (real + 1j * imag)[self.rows : self.rates]
+        return jnp.stack([total.real, total.imag])
+
+    def pulled(self, numbers: np.ndarray, directions: np.ndarray, of_rows: np.ndarray, of_rates: np.ndarray) -> Complex[np.ndarray, "numbers"]:
+        """Derivatives of `of_rows . R + of_rates . F (a + i b)` by all numbers, given the directions a and b."""
+        real, imag = np.asarray(self._pulled(numbers, directions, of_rows, of_rates))
+        return real + 1j * imag
+
+
+@once_per_class
+def _steady_program(scene: Scene, *parts) -> SteadyProgram:
+    return SteadyProgram(scene, *parts)
+
+
 class SteadyEquations:
     """R, J, F and the rows of (q, y) of one scene as functions of z."""
 
@@ -51,19 +115,20 @@ class SteadyEquations:
         self.scene, self.vary, (self.t, q, u) = scene, vary, guess
         self.names = (*scene.coordinate_names.entries, *scene.speed_names.entries)
         leaves = [np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(scene)]
-        self._given = np.concatenate([*leaves, [self.t], q, u, inputs])
+        self.given = np.concatenate([*leaves, [self.t], q, u, inputs])
         self._counts = sum(map(len, leaves)), len(q), len(u)
-        kept, resting = _coordinates(scene)
+        program = lower(scene)
+        kept, resting = _coordinates(scene, program)
         first, n = self._counts[0] + 1, len(q)
         self.places = np.array([*(first + k for k in kept), *range(first + n, first + n + len(u)), *self._place_of(vary)], int)
         self.unknowns = (*(self.names[k] for k in kept), *scene.speed_names.entries, *([] if vary is None else [vary]))
-        self.size = _sizes(scene, kept, self._given[self.places])
-        self._program(kept, resting)
+        self.size = _sizes(scene, kept, self.given[self.places])
+        self.program = _steady_program(scene, program, tuple(kept), tuple(resting), tuple(self.places.tolist()))
 
     @property
     def start(self) -> Vector:
         """The guess, in units of the unknowns' sizes."""
-        return self._given[self.places] / self.size
+        return self.given[self.places] / self.size
 
     def index(self, name: str) -> int:
         """Number of an unknown; a ValueError with the nearest names where there is none."""
@@ -83,74 +148,50 @@ class SteadyEquations:
         advice = nearest(vary, [name for name, value, _ in parameters_of(self.scene) if np.ndim(value) == 0])
         raise ValueError(f"`vary` names `{vary}`, expected a parameter of `{type(self.scene).__name__}` that is one number; {advice}")
 
-    def _program(self, kept: Sequence[int], resting: Sequence[int]) -> None:
-        """One graph of rows and rates, and the values of its nodes as a function of everything given."""
-        program, rows = lower(self.scene), row_program(self.scene)
-        if rows is None:
-            raise NotLowered(f"the rows of `{type(self.scene).__name__}` have no scalar program, which its families of steady motions need")
-        graph, of = Graph(), program.traced
-        every = [graph.input(f"x{k}", True) for k in range(len(self._given))]
-        new = graph.copied([*program.qdot, *program.ydot, *program.guards], program.graph, _known((of.parameters, of.t, of.q, of.u, of.inputs), every))
-        new_rows = graph.copied([*rows.g, *rows.phi], rows.graph, _known((rows.parameters, rows.t, rows.q, rows.u, rows.inputs), every))
-        g, phi = [new_rows[n] for n in rows.g], [new_rows[n] for n in rows.phi]
-        qdot, ydot = [new[n] for n in program.qdot], [new[n] for n in program.ydot]
-        held = [*g, *phi, *ydot, *(qdot[k] for k in resting)]
-        rates = [*(qdot[k] for k in kept), *ydot]
-        parameters, n, _ = self._counts
-        y = [every[parameters + 1 + n + k] for k in program.independent]
-        self._in_states = [*range(len(kept)), *(len(kept) + k for k in program.independent)]
-        states = [*(every[parameters + 1 + k] for k in kept), *y]
-        of_states = [*g, *(phi if len(y) == len(program.speeds) else [])]
-        self._rows = len(held)
-        self._entries, nodes = {}, list(held)
-        for name, outputs, variables in (("J", held, [every[k] for k in self.places]), ("F", rates, states), ("C", of_states, states)):
-            column = {x: k for k, x in enumerate(variables)}
-            entries = [(i, column[x], node) for i, row in enumerate(jacobian(graph, outputs, variables)) for x, node in row.items()]
-            where = np.array([entry[:2] for entry in entries], int).reshape(-1, 2).T
-            self._entries[name] = (len(outputs), len(variables)), tuple(where), slice(len(nodes), len(nodes) + len(entries))
-            nodes += [node for *_, node in entries]
-        self._guards = slice(len(nodes), None)
-        self._values = _evaluated(graph, [*nodes, *map(new.__getitem__, program.guards)], every)
-
     def __call__(self, z: Vector) -> Look:
         """The equations at z."""
-        given = self._given.copy()
-        given[self.places] = z * self.size
-        values = self._values(given)
-        if np.any(values[self._guards] <= 0):
+        program, values = self.program, self.program.values(self.at(z))
+        if np.any(values[program.guards] <= 0):
             values = np.full(len(values), np.nan)  # where the rates are not defined
         matrices = {}
-        for name, (shape, where, here) in self._entries.items():
+        for name, (shape, where, here) in program.entries.items():
             matrices[name] = np.zeros(shape)
             matrices[name][where] = values[here]
-        return Look(values[: self._rows], matrices["J"] * self.size, matrices["F"], matrices["C"])
+        return Look(values[: program.rows], matrices["J"] * self.size, matrices["F"], matrices["C"])
+
+    def at(self, z: Vector) -> np.ndarray:
+        """All numbers, those of the unknowns by z."""
+        given = self.given.copy()
+        given[self.places] = z * self.size
+        return given
 
     def in_states(self, directions: Float[np.ndarray, "unknowns directions"]) -> Float[np.ndarray, "states directions"]:
         """Directions of z, without a parameter, as ones of (q, y) in SI units."""
-        return (directions * self.size[: len(directions), None])[self._in_states]
+        return (directions * self.size[: len(directions), None])[self.program.in_states]
 
     def value_at_start(self, name: str) -> float:
         """The value of a coordinate or speed that is no unknown."""
-        return float(self._given[self._counts[0] + 1 + self.names.index(name)])
+        return float(self.given[self._counts[0] + 1 + self.names.index(name)])
 
-    def state(self, z: Vector) -> tuple[Float[np.ndarray, "coordinates"], Float[np.ndarray, "speeds"], float]:
+    def place(self, point) -> Vector:
+        """z of what has the values of the unknowns by name."""
+        return np.array([point[name] for name in self.unknowns]) / self.size
+
+    def split(self, numbers):
         """q, u and the parameter that varies (or NaN)."""
-        given = self._given.copy()
-        given[self.places] = z * self.size
-        first = self._counts[0] + 1
-        n, m = self._counts[1:]
-        return given[first : first + n], given[first + n : first + n + m], float(given[self.places[-1]]) if self.vary else np.nan
+        parameters, n, m = self._counts
+        q, u = (numbers[first : first + length] for first, length in ((parameters + 1, n), (parameters + 1 + n, m)))
+        return q, u, numbers[self.places[-1]] if self.vary else 0 * numbers[0] + np.nan
 
 
-def _coordinates(scene: Scene) -> tuple[list[int], list[int]]:
-    """Numbers of the coordinates that are unknowns, and of those that must rest."""
-    groups = {group: scene.coordinate_names.entries[first : first + length] for group, first, length in scene.coordinate_names.groups}
-    entries, on_rows = scene.coordinate_names.entries, _on_rows(scene)
-    ignorable = {entries.index(entry) for name in ignorable_coordinates(scene) for entry in groups.get(name, (name,))}
-    every = range(len(entries))
-    return [k for k in every if k not in ignorable or on_rows[k]], [k for k in every if k not in ignorable]
+def _coordinates(scene: Scene, program: Lowered) -> tuple[list[int], list[int]]:
+    """Numbers of the coordinates that are unknowns, and of those that must rest: accelerations depend on them."""
+    on_rows, ignorable = _on_rows(scene), [name in program.held for name in program.coordinates]
+    every = range(len(ignorable))
+    return [k for k in every if not ignorable[k] or on_rows[k]], [k for k in every if not ignorable[k]]
 
 
+@once_per_values
 def _on_rows(scene: Scene) -> np.ndarray:
     """Which coordinates geometric rows depend on, at some state of the domain."""
     rows = row_program(scene)
@@ -184,7 +225,18 @@ def _known(variables, inputs: Sequence[int]) -> dict[int, int]:
 
 def _evaluated(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[np.ndarray], np.ndarray]:
     """Values of nodes as a function of those of the variables: by machine code where it is made, otherwise by NumPy, operation by operation."""
-    if jax.config.jax_enable_x64 and not host.reason_against() and not unsupported(graph, nodes):
+    if jax.config.jax_enable_x64 and _is_made(graph, nodes):
         kernel = jax.jit(nodes_called(graph, nodes, variables, effort=0))
         return lambda given: np.asarray(kernel(given))
     return lambda given: Probes(graph, dict(zip([graph.value[n] for n in variables], given[:, None], strict=True)))(nodes)[:, 0]
+
+
+def _differentiable(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[Array], Array]:
+    """Values of nodes as a function that JAX differentiates: by machine code where it is made, otherwise by XLA."""
+    if _is_made(graph, nodes):
+        return values_of_nodes(graph, dict(enumerate(nodes)), len(nodes), variables)
+    return lambda x: jnp.stack([jnp.asarray(value, x.dtype) for value in run(graph, nodes, dict(zip(variables, x, strict=True)))])
+
+
+def _is_made(graph: Graph, nodes: Sequence[int]) -> bool:
+    return not ffi.reason_against() and not unsupported(graph, nodes)

@@ -12,7 +12,7 @@ from jourdain_jax.analysis.families.curve import Point, located
 from jourdain_jax.analysis.families.equations import SteadyEquations, Vector
 from jourdain_jax.analysis.families.followed import Followed, across, first_point, with_held
 from jourdain_jax.analysis.families.special import SURE
-from jourdain_jax.analysis.families.spectrum import Modes, matched
+from jourdain_jax.analysis.families.spectrum import Modes, matched, mode_names
 from jourdain_jax.analysis.steady import guessed
 from jourdain_jax.analysis.table import complex_numbers, table
 from jourdain_jax.calculus.on_first_use import needed
@@ -129,7 +129,7 @@ class Family(Printed):
 
     def point(self, point: Point, kind: str = "", columns: tuple[int, ...] = ()) -> FamilyPoint:
         """A point of the curve with its state and eigenvalues."""
-        q, u, value = self.equations.state(point.z)
+        q, u, value = self.equations.split(self.equations.at(point.z))
         near = min(self.points, key=lambda p: np.max(np.abs(p.z - point.z)))
         left, none = jnp.asarray(np.max(np.abs(point.look.R), initial=0.0)), jnp.zeros(())
         scene = self.equations.scene
@@ -215,21 +215,12 @@ def family(
     else:
         begin = first_point(looked, equations, named, [*held, *until])
     targets = {equations.index(name): (name, float(value) / equations.size[equations.index(name)]) for name, value in until.items()}
-    by = Followed(equations, looked, len(held), targets)
+    by = Followed(equations, looked, held, targets)
     points, ends = by.followed(begin, max_points)
     first = next(k for k, point in enumerate(points) if point.z is begin.z)
     if isinstance(guess, FamilyPoint):  # between its neighbours the branch point is found as any other
         del points[first]
-    found = Family(by, tuple(points), ends, _mode_names(scene, names, points[min(first, len(points) - 1)].modes))
+    found = Family(by, tuple(points), ends, mode_names(scene, names, points[min(first, len(points) - 1)].modes))
     turning = {name: equations.index(name) for name in dict.fromkeys([*named, *until, *([vary] if vary else [])]) if name not in held}
     special = [found.point(point, crossing.kind, crossing.columns) for crossing, point in by.special(points, turning)]
     return replace(found, special=tuple(special))
-
-
-def _mode_names(scene: Scene, names: tuple[str, ...] | None, at_start: Modes) -> tuple[str, ...]:
-    """Names of the columns: as stated by the user, by the scene, or by number."""
-    named = getattr(scene, "mode_names", None)
-    names = tuple(names) if names is not None else named(at_start) if named else tuple(f"mode {k + 1}" for k in range(len(at_start)))
-    if len(names) != len(at_start):
-        raise ValueError(f"`names` holds {len(names)} names, expected one for each of the {len(at_start)} modes")
-    return names

@@ -18,17 +18,19 @@ class Followed:
 
     equations: SteadyEquations
     looked: Callable[[Vector], Look]  # with rows for what is held
-    held: int  # how many these are
+    held: tuple[str, ...]  # their names
     targets: dict[int, tuple[str, float]]  # number of an unknown -> its name, and its value at the end in units of its size
+
+    def freedoms(self, look: Look) -> np.ndarray:
+        """Directions of (q, y) along which steady motions go on at the same parameters, in columns."""
+        state = look.J.shape[1] - (self.equations.vary is not None)
+        J, count = look.J[: self.equations.program.rows, :state], len(self.held) + (self.equations.vary is None)
+        return self.equations.in_states(np.linalg.svd(J)[2][state - count :].T)
 
     def spectrum(self, point: Point) -> Modes:
         """Eigenvalues at a point, in any order, without the zeros of going on along the family or along what is held."""
-        state = point.look.J.shape[1] - (self.equations.vary is not None)
-        J = point.look.J[: len(point.look.J) - self.held, :state]
-        freedoms = self.held + (self.equations.vary is None)
-        V = np.linalg.svd(J)[2]
-        T = point.tangent[:, None] if freedoms == 1 and state == len(point.z) else V[state - freedoms :].T
-        return eigenvalues_at(point.look, self.equations.in_states(T))
+        alone = not self.held and self.equations.vary is None
+        return eigenvalues_at(point.look, self.equations.in_states(point.tangent[:, None]) if alone else self.freedoms(point.look))
 
     def ended(self, first: Point) -> Callable[[Point, Point], str]:
         """Whether the curve has reached what it is followed to, or its own start."""

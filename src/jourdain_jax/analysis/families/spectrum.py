@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from jourdain_jax.analysis.families.equations import Look
+from jourdain_jax.scene.scene import Scene
 
 Modes = Complex[np.ndarray, "modes"]
 
@@ -69,3 +70,12 @@ def surely_matched(before: Modes, now: Modes) -> bool:
 def _partners(before, now, k: int, j: int) -> bool:
     """Whether two columns are a complex pair at one end at least."""
     return any(v[k].imag != 0 and v[j] == np.conj(v[k]) for v in (before, now))
+
+
+def mode_names(scene: Scene, names: tuple[str, ...] | None, values: Modes) -> tuple[str, ...]:
+    """Names of the columns: as stated by the user, by the scene, or by number."""
+    named = getattr(scene, "mode_names", None)
+    names = tuple(names) if names is not None else named(values) if named else tuple(f"mode {k + 1}" for k in range(len(values)))
+    if len(names) != len(values):
+        raise ValueError(f"`names` holds {len(names)} names, expected one for each of the {len(values)} modes")
+    return names

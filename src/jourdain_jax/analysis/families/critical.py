@@ -1,0 +1,274 @@
+"""Eigenvalues and special points of steady motions as functions of the scene's parameters p, by the implicit function theorem.
+
+    eigenvalue s     ds = y' dF x,    F x = s x,  y' F = s y',  y' x = 1,    dF with the change of the steady motion, J dz = -R_p dp
+    special point    G(X, p) = 0,     dX = -G_X+ G_p dp,                     X = (z, a, b, w),  G = (R, C a, C b, size and phase of a and b, and
+
+    pair on the imaginary axis     F (a + i b) = i w (a + i b)
+    zero eigenvalue                F a = 0,  F b = 0           b: along the steady motions that go on at the same parameters
+    double root                    F a = w a,  F b = w b + a
+
+R, J, F, C, z: as in `equations.py`. G has more rows than it needs, and they agree: G_X has full column rank, and its pseudo-inverse comes from Q R.
+"""
+
+from functools import partial
+from itertools import combinations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int
+
+from jourdain_jax.analysis.families.equations import Look, SteadyEquations
+from jourdain_jax.analysis.families.family import Family, FamilyPoint
+from jourdain_jax.analysis.families.special import SURE
+from jourdain_jax.analysis.families.spectrum import null_space
+from jourdain_jax.analysis.table import complex_numbers, table
+from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
+from jourdain_jax.motion.start import State
+from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers
+from jourdain_jax.scene.names import as_names
+from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.printing import Printed
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.tracebacks import shown_from_users_lines
+
+FOUND, NOT_FOUND, SINGULAR = range(3)
+MEANINGS = (
+    "found",
+    "not found: there is none that the one of the family goes over into as parameters change to these",
+    "no smooth function of the parameters here: eigenvalues meet, or several special points do",
+)
+PAIR, ZERO, DOUBLE = "pair on the imaginary axis", "zero eigenvalue", "double root"
+
+
+class Sensitivities(Printed, eqx.Module):
+    """Derivatives of one eigenvalue by every parameter, the change of the steady motion included; `found["c"]`."""
+
+    mode: str = eqx.field(static=True)
+    eigenvalue: complex  # 1/s
+    condition: float  # |y' x| of unit left and right vectors: zero at a double root, where there is no derivative
+    by_parameter: dict[str, Complex[np.ndarray, "*entries"]]
+    code: int
+    held: tuple[str, ...] = eqx.field(static=True)  # what tells the motion apart and keeps its value
+
+    def __getitem__(self, name: str) -> Complex[np.ndarray, "*entries"]:
+        """The derivative by a parameter."""
+        return self.by_parameter[name]
+
+    def _text(self) -> str:
+        head = f"{self.mode}: {complex_numbers([self.eigenvalue])[0]} 1/s, condition {self.condition:.2g}, {MEANINGS[self.code]}"
+        rows = [(name, ", ".join(complex_numbers(np.ravel(value)))) for name, value in self.by_parameter.items()]
+        return "\n".join([head, f"  derivatives, where {', '.join(self.held) or 'nothing'} keeps its value:", *table(rows)])
+
+
+@of_known_numbers
+def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held: str | tuple[str, ...]) -> Sensitivities:
+    """Derivatives of the eigenvalue s of small motions about a steady state, all by two reverse passes."""
+    scene, state, f = small
+    equations = SteadyEquations(scene, (float(state.t), np.asarray(state.q), np.asarray(state.u)), np.asarray(f), None)
+    z = equations.start
+    look = equations(z)
+    if not np.max(np.abs(look.R), initial=0.0) < 1e-6:
+        raise ValueError(f"this motion of `{type(scene).__name__}` is not steady, and its eigenvalues have no derivatives; `jj.steady` finds one that is")
+    fixed = _held(equations, look, as_names(held))
+    (values, right), (same, left) = np.linalg.eig(look.F), np.linalg.eig(look.F.T)
+    apart = np.abs(values - s)
+    x, y = right[:, np.argmin(apart)], left[:, np.argmin(np.abs(same - s))]
+    condition = float(np.abs(y @ x))
+    single = condition > 1e-6 and np.partition(np.append(apart, np.inf), 1)[1] > SURE * (1 + abs(s))
+    numbers, directions, y = equations.at(z), np.stack([x.real, x.imag]), y / (y @ x)
+
+    by_all = equations.program.pulled(numbers, directions, np.zeros(len(look.R), complex), y)
+    inverse = np.linalg.pinv(np.vstack([look.J, np.eye(len(z))[fixed]]), rcond=1e-9)
+    adjoint = -(by_all[equations.places] * equations.size) @ inverse[:, : len(look.R)]
+    by_all = by_all + equations.program.pulled(numbers, directions, adjoint, 0 * y)
+    if not single:
+        by_all = by_all * np.nan
+    leaves, treedef = jax.tree.flatten(scene)
+    parts = np.split(by_all, np.cumsum([np.size(leaf) for leaf in leaves]))
+    shaped = [np.reshape(part, np.shape(leaf)) for part, leaf in zip(parts, leaves, strict=False)]
+    by_parameter = {name: value for name, value, _ in parameters_of(jax.tree.unflatten(treedef, shaped))}
+    return Sensitivities(mode, s, condition, by_parameter, FOUND if single else SINGULAR, tuple(equations.unknowns[k] for k in fixed))
+
+
+def _held(equations: SteadyEquations, look: Look, named: tuple[str, ...]) -> list[int]:
+    """Unknowns that tell a steady motion apart from those beside it: those named, otherwise speeds in their order, then coordinates."""
+    beside = null_space(look.J)
+    count, first = beside.shape[1], len(equations.unknowns) - len(equations.scene.speed_names.entries)
+    chosen: list[int] = []
+    for k in map(equations.index, named or (*equations.unknowns[first:], *equations.unknowns[:first])):
+        if len(chosen) < count and np.linalg.matrix_rank(beside[[*chosen, k]], tol=1e-6) > len(chosen):
+            chosen.append(k)
+    if not len(chosen) == count >= len(named):
+        raise ValueError(f"the steady motions near this one have {count} freedoms; name as many in `held` that tell them apart ({', '.join(named)} do not)")
+    return chosen
+
+
+class CriticalPoint(Printed, eqx.Module):
+    """A special point of a family; `point["lean"]`, `point.speed`. All is NaN unless `code` is 0."""
+
+    state: State
+    parameter: Float[Array, "*batch"]  # the one that varies along the family; NaN where none does
+    eigenvalue: Complex[Array, "*batch"]  # 1/s, that passes the axis or is double
+    condition: Float[Array, "*batch"]  # least pivot of the equations over the largest; near zero, special points are close together
+    code: Int[Array, "*batch"]
+    kind: str = eqx.field(static=True)
+    vary: str | None = eqx.field(static=True)
+
+    def __getitem__(self, name: str) -> Float[Array, "*batch"]:
+        """A coordinate, a speed, or the parameter that varies."""
+        return self.parameter if name == self.vary else self.state[name]
+
+    @property
+    def speed(self) -> Float[Array, "*batch"]:
+        """How fast the point (x, y) of the scene moves, m/s."""
+        return jnp.hypot(self.state["x_rate"], self.state["y_rate"])
+
+    @property
+    def message(self) -> str:
+        """What the code says."""
+        return MEANINGS[int(self.code)]
+
+    def _text(self) -> str:
+        if self.code.ndim:
+            return f"{self.kind}: {int((self.code == FOUND).sum())} of {self.code.size} found"
+        varied = f", {self.vary} = {self.parameter:.6g}" if self.vary else ""
+        return f"{self.kind}{varied}: {self.message}; eigenvalue {complex_numbers(self.eigenvalue[None])[0]} 1/s\n{self.state}"
+
+
+class _Special(eqx.Module):
+    """The equations of a special point, and the point of the family from which it is followed as parameters change."""
+
+    equations: SteadyEquations = eqx.field(static=True)
+    held: tuple[int, ...] = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+    goes_on: bool = eqx.field(static=True)  # whether steady motions do at the same parameters
+    X: Float[Array, "all_unknowns"]
+
+    def parts(self, X: Float[Array, "all_unknowns"]) -> list[Array]:
+        """z, a, b and w."""
+        n, m = len(self.equations.places), len(self.equations.program.in_states)
+        return jnp.split(X, [n, n + m, n + 2 * m])
+
+    def numbers(self, scene: Scene, X: Float[Array, "all_unknowns"]) -> Float[Array, "numbers"]:
+        """Parameters, t, q, u and inputs in a row."""
+        of, parameters = self.equations, jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(scene)])
+        return jnp.concatenate([parameters, of.given[len(parameters) :]]).at[of.places].set(self.parts(X)[0] * of.size)
+
+    def rows(self, scene: Scene, X: Float[Array, "all_unknowns"]) -> Float[Array, "rows"]:
+        """G."""
+        (z, a, b, w), (z0, a0, b0, _) = self.parts(X), self.parts(self.X)
+        R, (Fa, Fb), C = self.equations.program.along(self.numbers(scene, X), jnp.stack([a, b]))
+        if self.kind == PAIR:
+            small = [Fa + w * b, Fb - w * a, jnp.stack([a0 @ a + b0 @ b - 1, a0 @ b - b0 @ a])]
+        elif self.kind == DOUBLE:
+            small = [Fa - w * a, Fb - w * b - a, jnp.stack([a0 @ a - 1, a0 @ b])]
+        else:
+            small = [Fa, Fb if self.goes_on else b, w, jnp.stack([a0 @ a - 1, b0 @ a, a0 @ b, b0 @ (b - b0)])]
+        held = np.array(self.held, int)
+        return jnp.concatenate([R, z[held] - z0[held], *small, jnp.ravel(C)])
+
+    def correction(self, scene: Scene, X: Float[Array, "all_unknowns"]) -> tuple[Array, Array, Array]:
+        """The step of Gauss and Newton, the pseudo-inverse of G_X, and its least pivot over the largest."""
+        Q, T = jnp.linalg.qr(jax.jacfwd(partial(self.rows, scene))(X))
+        inverse, pivots = jax.scipy.linalg.solve_triangular(T, Q.T), jnp.abs(jnp.diagonal(T))
+        return inverse @ self.rows(scene, X), inverse, jnp.min(pivots) / jnp.max(pivots)
+
+
+@partial(compiled, options=RUN_SELDOM)
+def _found(special: _Special, scene: Scene) -> tuple[Array, Array, Array, Array]:
+    """X, the pseudo-inverse of G_X, its least pivot over the largest, and a code.
+
+    Parameters go straight from those of the family to these; steps are cut where corrections do not shrink at once, so that none leads to another point.
+    """
+
+    def once(carried):
+        X, done, step, count = carried
+        share = jnp.minimum(done + step, 1.0)
+        there = jax.tree.map(lambda a, b: a + share * (b - a), special.equations.scene, scene)
+
+        def corrected(X, _):
+            change = special.correction(there, X)[0]
+            return X - change, jnp.max(jnp.abs(change))
+
+        new, (first, second, third) = jax.lax.scan(corrected, X, length=3)
+        good = (first < 0.3) & (second <= 0.2 * first + 1e-9) & (third <= 0.2 * second + 1e-9)
+        return jnp.where(good, new, X), jnp.where(good, share, done), jnp.where(good, 2 * step, step / 4), count + 1
+
+    start = special.X, jnp.zeros(()), jnp.ones(()), jnp.zeros((), jnp.int32)
+    X, done, *_ = jax.lax.while_loop(lambda c: (c[1] < 1) & (c[2] > 1e-3) & (c[3] < 100), once, start)
+    change, inverse, condition = special.correction(scene, X)
+    left = jnp.max(jnp.abs(special.rows(scene, X - change)))
+    return X - change, inverse, condition, jnp.where((done == 1) & (left < 1e-8), jnp.where(condition < 1e-6, SINGULAR, FOUND), NOT_FOUND)
+
+
+@shown_from_users_lines
+def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint") -> CriticalPoint:
+    """A special point of a family as a function of the scene's parameters: where a mode passes the axis of stability, or two modes meet.
+
+        straight = jj.family(bicycle, {"x_rate": 5.0, "rear_spin_rate": 16.7, "front_spin_rate": 14.3})
+        jax.grad(lambda c: jj.critical(bicycle.replace(c=c), straight, "weave").speed)(0.08)
+
+    **Arguments**
+    - `scene`: of the class of the family's; its parameters may be traced, and be others: the point is followed from the family's to them.
+    - `motions`: the family, with the inputs that it was followed with.
+    - `what`: the name of a mode, a kind ("double root"), or one of the family's `changes`. Of several the one nearest to the family's guess is meant.
+
+    **Returns** a `CriticalPoint`, by the implicit function theorem: runs under `jit` and `vmap` and is differentiable twice. Where the point does not exist
+    for these parameters, or is no smooth function of them, its numbers and their derivatives are NaN, and `code` is not 0.
+
+    **Raises** ValueError: no such point on the family, or one that is a fold or a branch point only; a scene of another class.
+    """
+    scene, equations = as_scene(scene), motions.equations
+    if type(scene) is not type(equations.scene):
+        raise ValueError(f"the family is one of `{type(equations.scene).__name__}`, and the scene a `{type(scene).__name__}`")
+    with jax.ensure_compile_time_eval():
+        point = _chosen(motions, what)
+        special = _special(motions, point)
+    X, inverse, condition, code = jax.lax.stop_gradient(_found(special, jax.lax.stop_gradient(scene)))
+    for _ in range(2):  # each carries one order of derivatives
+        X = X - inverse @ special.rows(scene, X)
+    X = X * jnp.where(code == FOUND, 1.0, jnp.nan)
+    numbers, w, none = special.numbers(scene, X), special.parts(X)[-1][0], jnp.zeros(())
+    q, u, varied = equations.split(numbers)
+    state = State(jnp.asarray(equations.t), q, u, none, none, none, (scene.coordinate_names, scene.speed_names))
+    return CriticalPoint(state, varied, jax.lax.complex(*((0 * w, w) if point.kind == PAIR else (w, 0 * w))), condition, code, point.kind, equations.vary)
+
+
+def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:
+    """The point of a family that is meant."""
+    known = {point: {point.kind, *(point.modes if point.kind != DOUBLE else ())} for point in curve.changes if point.kind in (PAIR, ZERO, DOUBLE)}
+    found = [point for point, names in known.items() if what is point or what in names]
+    if not found:
+        names = ", ".join(sorted(set().union(*known.values())))
+        raise ValueError(f"the family of `{type(curve.equations.scene).__name__}` has no such special point; it has: {names or 'none'}")
+    start = curve.equations.start
+    return min(found, key=lambda point: np.max(np.abs(curve.equations.place(point) - start)))
+
+
+def _special(curve: Family, point: FamilyPoint) -> _Special:
+    """The equations, with vectors a and b at the point of the family."""
+    equations, held = curve.equations, curve.by.held
+    z, s = equations.place(point), point.eigenvalues
+    look = equations(z)
+    E = null_space(look.C)
+    A, w, b = E.T @ look.F @ E, 0.0, np.zeros(len(E))
+    freedoms = curve.by.freedoms(look)
+    if point.kind == ZERO:
+        if freedoms.shape[1] > 1:
+            raise ValueError(f"steady motions go on in {freedoms.shape[1]} ways at the same parameters: there a zero eigenvalue is no special point")
+        if freedoms.shape[1]:
+            b = freedoms[:, 0] / np.linalg.norm(freedoms)
+        a = E @ np.linalg.svd(np.vstack([A, b @ E]))[2][-1]
+    elif point.kind == PAIR:
+        w = min((x for x in s if x.imag > 0), key=lambda x: abs(x.real)).imag
+        x = E @ np.linalg.svd(A - 1j * w * np.eye(len(A)))[2][-1].conj()
+        a, b = x.real, x.imag
+    else:
+        w = np.mean(min(combinations(s, 2), key=lambda pair: abs(pair[0] - pair[1]))).real
+        moved = A - w * np.eye(len(A))
+        a = np.linalg.svd(moved)[2][-1]
+        a, b = E @ a, E @ np.linalg.lstsq(np.vstack([moved, a]), np.append(a, 0.0), rcond=None)[0]
+    X = jnp.asarray(np.concatenate([z, a, b, [w]]))
+    return _Special(equations, tuple(equations.index(name) for name in held), point.kind, freedoms.shape[1] > 0, X)
