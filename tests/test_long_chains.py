@@ -1,6 +1,6 @@
 """Long chains of bodies take a time in proportion to their length: counted in operations and entries, not in seconds.
 
-Elimination in a narrow band is compared with dense matrices.
+Sparse matrices are compared with dense matrices.
 """
 
 from dataclasses import replace
@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import jourdain_jax as jj
 from jourdain_jax.build import structure
 from jourdain_jax.build.assembling import assemble
-from jourdain_jax.calculus import sparse_slopes
+from jourdain_jax.calculus.gauss_newton import shortest
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.lowering import ignorable
 from jourdain_jax.models import TrailerChain
@@ -45,49 +45,43 @@ def looking(pattern: Pattern, squares: np.ndarray):
     return look
 
 
-def test_rows_of_a_chain_lie_in_a_narrow_band_whatever_their_order():
-    short, long = (links(count)[0].band for count in (100, 200))
-    assert short.width == long.width == 1
-    assert len(long.places) < 2.05 * len(short.places)
-    assert links(30)[0].band is None  # few rows are dense
-    everywhere = Pattern.of([(i, k) for i in range(70) for k in range(80)], (70, 80))
-    assert everywhere.band is None
+def test_rows_of_a_chain_are_sparse_and_few_or_full_ones_are_not():
+    assert links(100)[0].is_sparse
+    assert not links(30)[0].is_sparse
+    assert not Pattern.of([(i, k) for i in range(70) for k in range(80)], (70, 80)).is_sparse
 
 
-def test_chains_are_assembled_in_a_band_as_by_dense_matrices():
+def test_chains_are_assembled_by_sparse_matrices_as_by_dense_ones():
     pattern, points = links(80)
     q = points + 0.4 * np.random.default_rng(1).normal(size=(6, len(points)))
     low, high, generic = np.full(len(points), -2.0), np.full(len(points), 82.0), np.ones(6, bool)
     look = looking(pattern, np.full(80, 1.09))
     found = assemble(look, pattern, q, low, high, generic)
     dense = replace(pattern, fewest=1000)
-    assert pattern.band is not None
-    assert dense.band is None
+    assert pattern.is_sparse
+    assert not dense.is_sparse
     expected = assemble(look, dense, q, low, high, generic)
     assert found.on_rows.all()
     assert_array_equal(found.on_rows, expected.on_rows)
     assert_allclose(found.q, expected.q, rtol=0, atol=1e-9)
 
 
-def test_a_band_knows_rows_that_depend_on_each_other():
-    pattern, _ = links(64)
-    values = np.random.default_rng(3).uniform(0.5, 1.0, (2, len(pattern.rows)))
+def test_rows_that_depend_on_each_other_have_the_shortest_solution_of_least_squares():
+    pattern, _ = links(80)
+    values = np.random.default_rng(3).uniform(0.5, 1.0, (3, len(pattern.rows)))
     values[1, pattern.rows == pattern.rows[40]] = 0.0  # no row at all
-    values /= np.where(pattern.lengths(values) > 0, pattern.lengths(values), 1.0)[:, pattern.rows]
-    f = np.ones((2, 64))
-    x, size = pattern.band.solved(values, np.zeros(2), f)
-    G = pattern.dense(values)[0]
-    assert_allclose(x[0], np.linalg.solve(G @ G.T, f[0]), rtol=1e-10)
-    exact = np.linalg.norm(np.linalg.inv(G @ G.T), np.inf)
-    assert 0.1 * exact < size[0] < 1.001 * exact
-    assert not size[1] < sparse_slopes.REGULAR
+    values[2] = np.nan
+    f = np.ones((3, 80))
+    assert_allclose(pattern.shortest(values, f), shortest(pattern.dense(values), f), rtol=1e-7, atol=1e-12)
 
 
 def test_nearly_dependent_rows_are_known_although_every_pivot_is_large():
     n = 120  # pivots of 1/4, the inverse grows with 3^n
     pattern = Pattern.of([(i, i) for i in range(n)] + [(i + 1, i) for i in range(n - 1)], (n, n))
     values = np.concatenate([[1.0], np.full(n - 1, 0.5), np.full(n - 1, np.sqrt(0.75))])[None]
-    assert not pattern.band.solved(values, np.zeros(1), np.ones((1, n)))[1][0] < sparse_slopes.REGULAR
+    f = np.random.default_rng(4).normal(size=(1, n))
+    assert pattern.is_sparse
+    assert_allclose(pattern.shortest(values, f), shortest(pattern.dense(values), f), rtol=1e-6)
 
 
 def test_what_acts_by_less_than_round_off_is_not_left_out():

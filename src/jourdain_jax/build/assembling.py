@@ -142,8 +142,8 @@ def _damped(rows: _Rows, q: np.ndarray, which: np.ndarray) -> np.ndarray:
 
 def _damped_step(pattern: Pattern, J: np.ndarray, f: np.ndarray, damping: np.ndarray) -> np.ndarray:
     """`-J' (J J' + damping)^-1 f` at every state."""
-    if pattern.band is not None:
-        return -pattern.transposed_times(J, pattern.band.solved(J, damping, f)[0])
+    if pattern.is_sparse:
+        return -pattern.transposed_times(J, pattern.solved(J, damping, f))
     J = pattern.dense(J)
     system, diagonal = J @ np.swapaxes(J, 1, 2), np.arange(J.shape[1])
     system[:, diagonal, diagonal] += damping[:, None]

@@ -12,8 +12,8 @@ from jourdain_jax.calculus.reals import is_array_type, nothing_is_traced
 
 # Where a function's costs are those of its compilation. Before jaxlib 0.11.1, XLA's new emitters can be left out: a first motion of a disc
 # from kept object code then takes 1.55 s in place of 1.75; later versions have these emitters alone.
-_OLD: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jaxlib.version.__version_info__ < (0, 11, 1) else {}
-RUN_SELDOM = _OLD | {"xla_backend_optimization_level": 0}
+_EMITTERS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jaxlib.version.__version_info__ < (0, 11, 1) else {}
+RUN_SELDOM = {"xla_backend_optimization_level": 0} | _EMITTERS
 
 
 def compiled(f: Callable, options: dict | Callable | None = None) -> Callable:

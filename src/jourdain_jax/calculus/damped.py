@@ -14,9 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-MOST_STEPS = 80
-MOST_ENTRIES = 50_000  # of all slopes that are held at once, for each lane: of 96 trailers those of all guesses and 17 lanes took 57 GB
-
 
 class Nearest(eqx.Module):
     """Where a search ended, and what is left of the rows there."""
@@ -44,7 +41,7 @@ class Search(eqx.Module):
 
 
 def damped_search(
-    rows: Callable, guess: Float[Array, "unknowns"], size: Float[Array, "unknowns"], tolerance: float, low=-np.inf, high=np.inf, most_steps=MOST_STEPS
+    rows: Callable, guess: Float[Array, "unknowns"], size: Float[Array, "unknowns"], tolerance: float, low=-np.inf, high=np.inf, most_steps=80
 ) -> Search:
     """Search for x near `guess` from `low` to `high` at which no row exceeds the `tolerance`; it ends where they are smallest. J is per size of an unknown.
 
@@ -80,7 +77,8 @@ def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, 
     A root leaves at most `good`; all else, also the `bounds`, is as for `damped_search`.
     """
     count = guesses.shape[0]
-    block = max(1, min(count, MOST_ENTRIES // max(1, jax.eval_shape(rows, guesses[0])[1].size)))
+    # 50_000 slopes are held at once, for each lane: of 96 trailers those of all guesses and 17 lanes took 57 GB
+    block = max(1, min(count, 50_000 // max(1, jax.eval_shape(rows, guesses[0])[1].size)))
     blocks = -(-count // block)
     places = np.minimum(np.arange(blocks * block), count - 1).reshape(blocks, block)  # the last one may stand there several times
 

@@ -9,13 +9,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-MOST_STEPS = 25
-
 # x of some states, and their numbers -> g, G in the form that `solve` takes
 Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
-def nearest_root(look: Look, solve: Callable, x: np.ndarray, *, most: int = MOST_STEPS, longest: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
+def nearest_root(look: Look, solve: Callable, x: np.ndarray, *, most: int = 25, longest: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
     """Return x with g(x) = 0 near the given x, shape (states, unknowns), and the last corrections relative to 1 + |x|, infinite where they are no numbers.
 
     `solve`: from G and g to the shortest d with G d = g. No step is longer than `longest` in an entry.

@@ -6,8 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-SOME, ALL = 24, 48  # halvings after which a smooth function shows no jump that counts, and after which an interval has no width
-
 
 def jumps(
     values: Callable[[np.ndarray], np.ndarray], a: Float[np.ndarray, "intervals variables"], b: Float[np.ndarray, "intervals variables"]
@@ -20,13 +18,14 @@ def jumps(
     at_a, at_b = values(a), values(b)
     largest = np.nanmax(np.abs(np.concatenate([at_a, at_b])), axis=0, initial=0.0)
     size = np.maximum(largest, floor * np.max(largest, initial=0.0)) + np.finfo(largest.dtype).tiny
-    for turn in range(ALL):
+    # 24 halvings after which a smooth function shows no jump that counts, 48 after which an interval has no width
+    for turn in range(48):
         middle = (a + b) / 2
         at_middle = values(middle)
         left, right = _off(at_a, at_middle, size), _off(at_middle, at_b, size)
         first = np.max(left, axis=1, initial=0.0) >= np.max(right, axis=1, initial=0.0)
         off = np.where(first[:, None], left, right)
-        if turn >= SOME and not np.any(off > least):
+        if turn >= 24 and not np.any(off > least):
             return
         a, b = np.where(first[:, None], a, middle), np.where(first[:, None], middle, b)
         at_a, at_b = np.where(first[:, None], at_a, at_middle), np.where(first[:, None], at_middle, at_b)

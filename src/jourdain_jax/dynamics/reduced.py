@@ -35,7 +35,6 @@ from jourdain_jax.equations.virtual_power import resultants
 from jourdain_jax.scene.scene import Scene
 
 PROBES = 8
-DISPLACEMENT = 0.1
 DEPENDS = 1e-9  # change relative to the size of the quantity; larger means that the quantity depends on the coordinate
 
 
@@ -101,8 +100,8 @@ def dependence(scene: Scene) -> Dependence:
     """
     generator = np.random.default_rng(0)
     t, q, u = sample_states(scene, PROBES)
-    q = q + DISPLACEMENT * generator.uniform(-1, 1, q.shape)
-    shifts = DISPLACEMENT * generator.uniform(0.5, 1, q.shape)
+    q = q + generator.uniform(-0.1, 0.1, q.shape)
+    shifts = generator.uniform(0.05, 0.1, q.shape)
     values, one_speed = _probe(scene, t, q, u, shifts)
     changed = {name: _changed(value) for name, value in values.items()}
     appears = [changed[name].any(axis=0) for name in values if name not in ("rates", "accelerations")]

@@ -5,14 +5,15 @@
 
     M = sum m beta' beta + gamma' I gamma
     f = sum beta' (F - m a_0) + gamma' (L - I alpha_0 - omega x I omega) + Q_direct
-    udot = Z zeta + c,   A Z = 0,   A c = -drift,   Z' (M udot - f) = 0            (71)-(73)
+    M udot - A' lambda = f,   A udot = -drift                                        (68)-(70)
 
 Source: Wang and Pao (2003).
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
@@ -21,115 +22,72 @@ from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import VelocityQuantities, jaxpr_of_scene
 from jourdain_jax.calculus.gauss_newton import shortest
 from jourdain_jax.calculus.jaxprs import needed_only
-from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 from jourdain_jax.eager.lanes import uncompiled_lanes
 from jourdain_jax.equations.virtual_power import mass_matrix
 from jourdain_jax.scene.scene import Scene
 
-LANES = 2048  # states times directions that are worked out at once
-_DIFFERENTIATED = ("v", "omega", "phi")
-_VALUES = ("qdot", "omega", "force", "torque", "direct", "mass", "inertia", "events")
 
+def dense_rates(scene: Scene, structure: Structure, independent: tuple[int, ...], parameters: Scene, t, q, u, inputs) -> tuple[np.ndarray, ...]:
+    """Rates of coordinates and of the independent speeds, and values of the stop events, at many states; NaN where accelerations are not determined.
 
-@dataclass
-class DenseRates:
-    """Rates of coordinates, of the independent speeds, and values of the stop events at some states; NaN where accelerations are not determined."""
-
-    qdot: np.ndarray  # (states, coordinates)
-    ydot: np.ndarray  # (states, independent)
-    events: np.ndarray  # (states, events)
-
-
-def dense_rates(scene: Scene, structure: Structure, independent: tuple[int, ...], parameters: Scene, t, q, u, inputs) -> DenseRates:
-    """Rates at many states, each with parameters of its own (all arrays with an axis of states first).
-
-    `independent`: speeds in the state; where these are not all, the others follow from the rows.
+    All arrays have an axis of states first, parameters too. `independent`: speeds in the state; where these are not all, the others follow from the rows.
     """
-    traced = _Traced(scene, structure.potentials_of_inputs)
-    kept = list(structure.kept_rows)
-    parts = range(0, len(t), max(1, LANES // max(1, u.shape[1])))
-    found = [_rates(traced, structure, kept, independent, jax.tree.map(lambda x, i=i: x[i : i + parts.step], (parameters, t, q, u, inputs))) for i in parts]
-    return DenseRates(*(np.concatenate([getattr(x, name) for x in found]) for name in ("qdot", "ydot", "events")))
+    closed, shape = jaxpr_of_scene(scene, structure.potentials_of_inputs)
+    numbers: VelocityQuantities = jax.tree.unflatten(jax.tree.structure(shape), range(len(jax.tree.leaves(shape))))[0]
+
+    def of_state(*names: str) -> Callable:
+        function = jaxpr_as_fun(needed_only(closed, [getattr(numbers, name) for name in names]))
+        return lambda scene, t, q, u, inputs: function(*jax.tree.leaves(scene), t, q, u, inputs)
+
+    values, level = of_state("qdot", "omega", "force", "torque", "direct", "mass", "inertia", "events"), of_state("v", "omega", "phi")
+
+    def by_speeds(scene, t, q, u, inputs):
+        return level(scene, t, q, u, inputs)[2], jax.jacfwd(lambda u: level(scene, t, q, u, inputs))(u)
+
+    def along_motion(scene, t, q, u, inputs):
+        found = values(scene, t, q, u, inputs)
+        return found, jax.jvp(lambda t, q: level(scene, t, q, u, inputs), (t, q), (jnp.ones_like(t), found[0]))[1]
+
+    functions, states = (uncompiled_lanes(by_speeds), uncompiled_lanes(along_motion)), (parameters, t, q, u, inputs)
+    # 4096 states times directions are worked out at once
+    size = -(-len(t) // (1 + u.size // 4096))
+    found = [_rates(functions, structure, independent, *jax.tree.map(lambda x, i=i: x[i : i + size], states)) for i in range(0, len(t), size)]
+    return tuple(map(np.concatenate, zip(*found, strict=True)))
 
 
-class _Traced:
-    """The quantities of a scene at the level of velocities and their derivatives along directions in (t, q, u), at many states."""
-
-    def __init__(self, scene: Scene, of_inputs: tuple[int, ...]):
-        closed, shape = jaxpr_of_scene(scene, of_inputs)
-        numbers: VelocityQuantities = jax.tree.unflatten(jax.tree.structure(shape), range(len(jax.tree.leaves(shape))))[0]
-        quantities = lambda names: jaxpr_as_fun(needed_only(closed, [getattr(numbers, name) for name in names]))  # noqa: E731
-        values, differentiated = quantities(_VALUES), quantities(_DIFFERENTIATED)
-        self._values = uncompiled_lanes(lambda leaves, t, q, u, inputs: values(*leaves, t, q, u, inputs))
-
-        def along(leaves, t, q, u, inputs, direction):
-            return jax.jvp(lambda t, q, u: differentiated(*leaves, t, q, u, inputs), (t, q, u), direction)
-
-        self._along = uncompiled_lanes(along)
-
-    def values(self, parameters: Scene, t, q, u, inputs) -> dict[str, np.ndarray]:
-        return dict(zip(_VALUES, self._values(jax.tree.leaves(parameters), t, q, u, inputs), strict=True))
-
-    def along(self, direction, parameters: Scene, t, q, u, inputs) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """v, omega, phi and their derivatives, at every state along its own direction (dt, dq, du)."""
-        return self._along(jax.tree.leaves(parameters), t, q, u, inputs, direction)
-
-    def by_speeds(self, parameters: Scene, t, q, u, inputs) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """v, omega, phi, and beta, gamma, A; these with the axis of speeds last."""
-        states, count = u.shape
-        repeated = jax.tree.map(lambda x: np.repeat(x, count, axis=0), (parameters, t, q, u, inputs))
-        direction = (np.zeros(states * count), np.zeros((states * count, q.shape[1])), np.tile(np.eye(count), (states, 1)))
-        found = self.along(direction, *repeated)
-        values, slopes = ([x.reshape(states, count, *x.shape[1:]) for x in part] for part in found)
-        return [x[:, 0] for x in values], [np.moveaxis(x, 1, -1) for x in slopes]
-
-
-def _rates(traced: _Traced, structure: Structure, kept: list[int], independent: tuple[int, ...], states: tuple) -> DenseRates:
-    parameters, t, q, u, inputs = states
-    every = np.arange(u.shape[1])
-    dependent = np.setdiff1d(every, independent)
-    u = np.where(np.isin(every, dependent), 0.0, u)
-    (_, _, phi), (beta, gamma, A) = traced.by_speeds(parameters, t, q, u, inputs)
+def _rates(functions: tuple[Callable, Callable], structure: Structure, independent: tuple[int, ...], parameters, t, q, u, inputs) -> tuple[np.ndarray, ...]:
+    by_speeds, along_motion = functions
+    kept, dependent = list(structure.kept_rows), np.setdiff1d(np.arange(u.shape[1]), independent)
+    u = np.where(np.isin(np.arange(u.shape[1]), dependent), 0.0, u)
+    phi, (beta, gamma, A) = by_speeds(parameters, t, q, u, inputs)
+    A = A[:, kept]
     if dependent.size:  # A (u - y) = -phi(y)
-        A_z = A[:, kept][:, :, dependent]
+        A_z = A[:, :, dependent]
         u[:, dependent] = -shortest(A_z, phi[:, kept], typical_lengths(np.linalg.norm(A_z, axis=2)))
-    at = traced.values(parameters, t, q, u, inputs)
-    _, (a, alpha, drift) = traced.along((np.ones(len(u)), at["qdot"], np.zeros_like(u)), parameters, t, q, u, inputs)
-    # M and f = Q - h
-    m, I, omega = at["mass"], at["inertia"], at["omega"]
+    (qdot, omega, force, torque, direct, m, I, events), (a, alpha, drift) = along_motion(parameters, t, q, u, inputs)
     turned = lambda x: np.einsum("sbij,sbj->sbi", I, x)  # noqa: E731
-    M = mass_matrix(m, I, beta, gamma)
-    force, torque = at["force"] - m[..., None] * a, at["torque"] - turned(alpha) - np.cross(omega, turned(omega))
-    f = np.einsum("sbik,sbi->sk", beta, force) + np.einsum("sbik,sbi->sk", gamma, torque) + at["direct"]
-    udot = _accelerations(M, f, A[:, kept], drift[:, kept], structure.row_lengths[kept], structure.rank)
-    return DenseRates(at["qdot"], udot[:, list(independent)], at["events"])
+    force, torque = force - m[..., None] * a, torque - turned(alpha) - np.cross(omega, turned(omega))
+    f = np.einsum("sbik,sbi->sk", beta, force) + np.einsum("sbik,sbi->sk", gamma, torque) + direct
+    udot = accelerations(mass_matrix(m, I, beta, gamma), f, A, drift[:, kept], structure.row_lengths[kept], structure.rank)
+    return qdot, udot[:, list(independent)], events
 
 
-def _accelerations(M, f, A, drift, row_lengths: np.ndarray, rank: int) -> np.ndarray:
-    """`udot = Z zeta + c`, in speeds scaled by their inertia and rows by their length; NaN where it is not determined."""
-    scale = speed_scales(M)
-    M, f, A = scale[:, :, None] * M * scale[:, None], scale * f, A * scale[:, None]
-    Z, c = np.broadcast_to(np.eye(f.shape[1]), M.shape), np.zeros_like(f)
-    if A.shape[1]:
-        length = np.maximum(np.linalg.norm(A, axis=2), row_lengths)
-        d = 1 / np.where(length > 0, length, 1.0)
-        Z, c = _null_space(d[..., None] * A, -d * drift, rank)
-    S = Z.mT @ M @ Z + np.all(Z == 0, axis=1)[:, None] * np.eye(Z.shape[2])  # columns that stand for nothing
-    determined = np.min(np.linalg.eigvalsh(np.nan_to_num(S)), axis=1, initial=1.0) > 16 * S.shape[1] * np.finfo(S.dtype).eps
-    zeta = np.linalg.solve(np.where(determined[:, None, None], S, np.eye(S.shape[1])), Z.mT @ (f[..., None] - M @ c[..., None]))
-    return np.where(determined[:, None], scale * ((Z @ zeta)[..., 0] + c), np.nan)
+def accelerations(M, f, A, drift, row_lengths: np.ndarray, rank: int) -> np.ndarray:
+    """Return udot of `M udot - A' lambda = f`, `A udot = -drift` at many states; NaN where it is not determined.
 
-
-def _null_space(A: np.ndarray, b: np.ndarray, rank: int) -> tuple[np.ndarray, np.ndarray]:
-    """An orthonormal basis of the null space, in as many columns as there are speeds (the others are zero), and the shortest c with `A c = b`.
-
-    At most `rank` rows count: at coordinates that were rounded to single precision, rows that depend on each other are independent by some 1e-8.
+    `rank`: of the rows. No more count: at coordinates that were rounded to single precision, rows that depend on each other are independent by some 1e-8.
     """
-    finite = np.all(np.isfinite(A), axis=(1, 2)) & np.all(np.isfinite(b), axis=1)
-    U, sigma, V = np.linalg.svd(np.where(finite[:, None, None], A, 0.0), full_matrices=True)
-    counts = (sigma > rank_cutoff(A.dtype) * sigma[:, :1]) & (np.arange(sigma.shape[1]) < rank)
-    inverse = np.where(counts, 1 / np.where(counts, sigma, 1.0), 0.0)
-    most = sigma.shape[1]
-    c = (V[:, :most].mT @ (inverse[..., None] * (U[:, :, :most].mT @ b[..., None])))[..., 0]
-    free = np.arange(A.shape[2]) >= np.count_nonzero(counts, axis=1)[:, None]
-    return V.mT * free[:, None], np.where(finite[:, None], c, np.nan)
+    c = speed_scales(M)
+    A = A * c[:, None]
+    length = np.maximum(np.linalg.norm(A, axis=2), row_lengths)
+    d = 1 / np.where(length > 0, length, 1.0)
+    A = d[..., None] * A
+    system = np.block([[c[:, :, None] * M * c[:, None], A.mT], [A, np.zeros((*A.shape[:2], A.shape[1]))]])
+    right = np.concatenate([c * f, -d * drift], axis=1)
+    finite = np.all(np.isfinite(system), axis=(1, 2)) & np.all(np.isfinite(right), axis=1)
+    size, V = np.linalg.eigh(np.where(finite[:, None, None], system, 0.0))
+    largest = np.argsort(-np.abs(size), axis=1)[:, : f.shape[1] + rank]
+    size, V = np.take_along_axis(size, largest, 1), np.take_along_axis(V, largest[:, None], 2)
+    determined = finite & np.all(np.abs(size) > 16 * V.shape[1] * np.finfo(float).eps * np.abs(size[:, :1]), axis=1)
+    along = (V.mT @ np.where(finite[:, None], right, 0.0)[..., None])[..., 0] / np.where(determined[:, None], size, 1.0)
+    return np.where(determined[:, None], c * (V @ along[..., None])[:, : f.shape[1], 0], np.nan)

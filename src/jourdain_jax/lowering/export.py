@@ -6,7 +6,6 @@ import numpy as np
 
 from jourdain_jax.program.source import PYTHON, C, statements, sympy_expressions
 
-DIGITS = 6  # significant ones of a long number in LaTeX
 _IN_C = {"auto", "char", "const", "default", "do", "double", "enum", "extern", "float", "goto", "inline", "int", "long", "register", "restrict", "short"}
 _IN_C |= {"signed", "sizeof", "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "case"} | C.names
 _ARGUMENTS = ("parameters", "t", "coordinates", "speeds", "inputs", "out")
@@ -172,7 +171,7 @@ def expressions(lowered) -> dict:
 
 
 def latex(lowered) -> str:
-    """The equations for an `align` environment, long numbers with `DIGITS` digits; needs SymPy.
+    """The equations for an `align` environment, long numbers with six digits; needs SymPy.
 
     Speeds that are the rate of a coordinate stand as its derivative, which needs no equation.
     """
@@ -186,7 +185,7 @@ def latex(lowered) -> str:
     left = [rf"\dot{{{shown[int(n)]}}}" for n in traced.q]
     left += [rf"\ddot{{{rate_of[n]}}}" if n in rate_of else rf"\dot{{{shown[n]}}}" for n in (int(traced.u[i]) for i in lowered.independent)]
     symbols = {sympy.Symbol(names[n]): symbol for n, symbol in shown.items()}
-    values = [value.replace(_is_long, lambda number: sympy.Float(number, DIGITS)) for value in expressions(lowered).values()]
+    values = [value.replace(_is_long, lambda number: sympy.Float(number, 6)) for value in expressions(lowered).values()]
     lines = [f"{rate} &= {sympy.latex(value, symbol_names=symbols)}" for rate, value in zip(left, values, strict=True)]
     return " \\\\\n".join(line for line in lines if len(set(line.split(" &= "))) > 1)
 

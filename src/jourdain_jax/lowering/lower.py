@@ -34,15 +34,12 @@ from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
-PROBES = 56  # at most
-SHARES = (1.0, -1.0, *(0.1**k for k in range(1, 9)))  # of the usual differences from the values of parameters: the first with which these can be
 # Of the program before simplification; beyond, the dense path is taken. By XLA, the program needs a minute more than dense matrices there (24 joint angles,
 # 20,762 operations: 71 and 7.5 s), though an evaluation takes 0.15 of the time (in a batch 0.22). Below, the dense path lost everywhere (bench/README.md).
 # As machine code it wins beyond, too (a quadruped of 20,550 operations: 11 s of processor time to the first motion, 50 s by dense matrices; then 0.02 and
 # 5.5 s); of 60,000 operations, those of the steps included, there is none.
 MOST_OPERATIONS, MOST_IN_MACHINE_CODE = 20_000, 50_000
 MOST_TERMS = 200  # of one normal form
-SMALL = 1000  # operations: below, further ways are tried
 _NODES = (
     "qdot",
     "ydot",
@@ -161,7 +158,8 @@ def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
     inertia that no body has.
     """
     generator = np.random.default_rng(1)
-    t, q = structure.times[:PROBES], np.array(structure.coordinates[:PROBES], np.float64)
+    # 56 probes at most
+    t, q = structure.times[:56], np.array(structure.coordinates[:56], np.float64)
     for first, _ in scene.coordinates.quaternions:  # in single precision they are unit ones to seven digits
         q[:, first : first + 4] /= np.linalg.norm(q[:, first : first + 4], axis=1, keepdims=True)
     u = random_states(scene, len(t), generator)[2]
@@ -176,7 +174,8 @@ def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
         return Probes(traced.graph, {name: np.asarray(value, np.float64) for name, value in (values | parameters).items()})  # whatever precision motions have
 
     share, possible, least = np.zeros(len(t)), False, _least_moments(traced, probes(np.zeros(len(t)))) / 2
-    for tried in SHARES:
+    # shares of the usual differences from the values of parameters: the first with which these can be
+    for tried in (1.0, -1.0, *(0.1**k for k in range(1, 9))):
         share = np.where(possible, share, tried)
         here = probes(share)
         finite = np.all(np.isfinite(here([n for part in traced.motion for n in part.ravel().tolist()])), axis=0)
@@ -203,20 +202,21 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
         raise NotLowered(f"its scalar program has {fewest} operations, more than {most}")
     expected = values_at(best, probes)
     check_against_dense(scene, structure, builder, best, expected)
-    held = ignorable(scene, builder, best, expected)
+    # 1000 operations: below, further ways are tried
+    held, small = ignorable(scene, builder, best, expected), 1000
     stages = [Stage("scalar program: structural zeros and ones removed, repeated parts shared", fewest)]
     plainly_held = fewest
     # 4000 operations: holding ignorable coordinates leaves no small program of so many
     if held and fewest < 4000:
         plainly_held = graph.operations(rates_of(builder.build(replace(first, held=held))))
         stages.append(Stage("ignorable coordinates held in the accelerations", plainly_held))
-    for strategy in _strategies(builder, held, plainly_held < SMALL, fewest):
+    for strategy in _strategies(builder, held, plainly_held < small, fewest):
         candidate = builder.build(strategy)
         count = graph.operations(graph.with_quotients(rates_of(candidate)))
         if count < fewest and agree(values_at(candidate, probes), expected):
             best, fewest, way = candidate, count, strategy
     stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors taken out", fewest))
-    put_q, put_u = builder.projection(MOST_TERMS if fewest < SMALL else 0, held)
+    put_q, put_u = builder.projection(MOST_TERMS if fewest < small else 0, held)
     groups = {name: getattr(best, name) for name in ("qdot", "ydot", "z", "pivots", "directions", "guards", "power", "events", "energies")}
     of_rates = [] if scene.speeds is None else _divisors(graph, builder.traced.at.qdot.tolist())
     groups |= {"power": [best.power], "projected_q": put_q, "projected_u": put_u, "pivots": [*of_rates, *best.pivots]}

@@ -181,7 +181,7 @@ class Lowered:
 
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
         """
-        out = self._stacked([*self.z, *self.pivots], fixed, t, q, y, inputs)
+        out = self.values([*self.z, *self.pivots], fixed, t, q, y, inputs)
         order = np.argsort([*self.independent, *self.dependent])
         real, count = jnp.result_type(*q), len(self.z)
         every = [*y, *out[:count]]
@@ -194,7 +194,7 @@ class Lowered:
 
     def energy_values(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "2 *lanes"]:
         """Kinetic and potential energy, J: numbers to differentiation. `fixed`, `q`, `y`, `inputs`: as in `rates`."""
-        return self._stacked(self.energies, *jax.lax.stop_gradient((fixed, t, q, y, inputs)))
+        return self.values(self.energies, *jax.lax.stop_gradient((fixed, t, q, y, inputs)))
 
     def projected(self, fixed, t, q: Sequence, y: Sequence, inputs, affine: bool) -> tuple[tuple, tuple]:
         """Coordinates and integrated speeds put back onto the rows; `affine`: rows are, so that one step is exact for the speeds.
@@ -221,7 +221,7 @@ class Lowered:
 
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
         """
-        return self._stacked(self.events, fixed, t, q, y, inputs)
+        return self.values(self.events, fixed, t, q, y, inputs)
 
     def watched(self, has_events: bool) -> tuple[int, ...]:
         """The numbers whose signs are watched over every step, in the rates and, where it `has_events`, in those."""
@@ -229,9 +229,6 @@ class Lowered:
 
     def values(self, nodes: Sequence[int], fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "nodes *lanes"]:
         """Values of `nodes`; `fixed`, `t`, `q`, `y`, `inputs`: as in `rates`."""
-        return self._stacked(nodes, fixed, t, q, y, inputs)
-
-    def _stacked(self, nodes: Sequence[int], fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "nodes *lanes"]:
         out, like = run(self.graph, nodes, self._known(fixed, t, q, y, inputs)), q[0]
         return jnp.stack([jnp.broadcast_to(jnp.asarray(c, like.dtype), jnp.shape(like)) for c in out]) if nodes else jnp.zeros((0, *like.shape), like.dtype)
 

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jourdain_jax.calculus.gauss_newton import MOST_STEPS, nearest_root
+from jourdain_jax.calculus.gauss_newton import nearest_root
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.graph import Graph
@@ -20,8 +20,8 @@ class Projected(NamedTuple):
     slopes: list[int]  # their nodes
 
 
-def onto_rows(probes, rows: Sequence[int], inputs: Mapping[str, int], *, most: int = MOST_STEPS, longest: float = np.inf) -> Projected:
-    """Return the probes with `inputs` (names, their nodes) on rows = 0, nearest to where they are; steps as of `nearest_root`."""
+def onto_rows(probes, rows: Sequence[int], inputs: Mapping[str, int], **limits) -> Projected:
+    """Return the probes with `inputs` (names, their nodes) on rows = 0, nearest to where they are; `limits` of steps as of `nearest_root`."""
     graph = probes.graph
     needed = set(graph.reachable(rows))
     moved = {name: n for name, n in inputs.items() if n in needed}
@@ -37,7 +37,7 @@ def onto_rows(probes, rows: Sequence[int], inputs: Mapping[str, int], *, most: i
         here = at(x, which)
         return np.asarray(here(rows)).T[which], np.asarray(here(slopes)).T[which]
 
-    x = nearest_root(look, pattern.shortest, given, most=most, longest=longest)[0] if moved else given
+    x = nearest_root(look, pattern.shortest, given, **limits)[0] if moved else given
     return Projected(at(x, slice(None)), list(moved), pattern, slopes)
 
 

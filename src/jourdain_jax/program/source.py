@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.graph import Graph
 
-LONGEST = 110  # characters of an expression before it is given a name
-
 
 @dataclass(frozen=True)
 class Language:
@@ -45,7 +43,8 @@ def statements(graph: Graph, outputs: Sequence[int], names: Mapping[int, str], l
     lines: list[str] = []
     for node in nodes:
         text, binds = _expression(graph, node, written, language)
-        if graph.args[node] and (uses[node] > 1 or len(text) > LONGEST) and binds < 9:
+        # 110 characters of an expression before it is given a name
+        if graph.args[node] and (uses[node] > 1 or len(text) > 110) and binds < 9:
             name = f"{prefix}{len(lines)}"
             lines.append(language.assignment.format(name=name, value=text))
             text, binds = name, 9
