@@ -9,12 +9,15 @@ from tolerances import relative_error
 import jourdain_jax as jj
 
 
-def end_error(scene: jj.Scene, start: dict, expected: Callable[[np.ndarray], dict], span: float) -> float:
+def end_error(scene: jj.Scene, start: dict, motion: Callable[..., dict], run: dict, same: str = "", **columns: str) -> float:
     """Largest error at the end of a run, of each quantity relative to the largest value that it takes during the run.
 
-    **Arguments:** `start`, values by name; `expected(times)`, name of a coordinate or speed -> its true values; `span` in s.
+    **Arguments:** `start`, values by name; `motion(times, **run)`, true values by name, to `run["t_end"]` in s; names of coordinates and speeds that are
+    the `same` there, and others with theirs.
     """
-    times = np.linspace(0.0, span, 101)
+    span = run["t_end"]
+    exact = motion(np.linspace(0.0, span, 101), **run)
+    expected = {name: exact[name] for name in same.split()} | {name: exact[other] for name, other in columns.items()}
     ends = jnp.asarray([0.0, span])  # no time between, where the solver interpolates less accurately than it steps
     trajectory = jj.simulate(scene, start, ts=ends, rtol=1e-12, atol=1e-12).raise_if_failed()
-    return max(relative_error(trajectory[name][-1], values[-1], size=float(np.max(np.abs(values)))) for name, values in expected(times).items())
+    return max(relative_error(trajectory[name][-1], values[-1], size=float(np.max(np.abs(values)))) for name, values in expected.items())

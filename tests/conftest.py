@@ -4,6 +4,7 @@
 """
 
 import ctypes
+import functools
 import gc
 import importlib.metadata
 import os
@@ -29,10 +30,10 @@ LAYERS = ("equations", "dynamics", "motion", "analysis", "ensembles", "models", 
 
 # What takes longest for its number of tests, longest first: started last, one of these would keep one worker busy while the others have nothing to do.
 LONGEST = """
-every_model sensors identify native_mutants native_seen mutants exported native plain_numbers float32 multiple_shooting native_starts
+every_model sensors identify native_mutants mutants exported native plain_numbers float32 multiple_shooting native_starts
 native_functions feasible_starts linearize simulate lowering differentiation_guards long_chains native_derivatives native_second along_batches
 native_samples studies derivatives_of_starts log_density what_probes_do_not_show row_functions piecewise_motion malformed_inputs rank_of_vanishing_rows stiff
-knots names_read verify power native_operations call_costs build inertia joint_prior both_ways trajectory inputs energy_lost operations program readme
+knots names_read verify power native_operations call_costs build inertia joint_prior both_ways inputs energy_lost operations program readme
 events_in_one_step study_faults cluster notebooks
 """
 
@@ -68,14 +69,15 @@ def _less_effort():
         yield
 
 
-MOST_RESIDENT = 1e9  # bytes of a process between files: workers of two, with what a file adds, stay below 5 GB
+MOST_RESIDENT = 1.3e9  # bytes of a process between files: workers of two, with what a file adds, stay below 5 GB
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _compiled_programs_are_dropped():
     """Compiled programs are dropped after a file where they hold much memory: machine code and its memory maps, of which a process may have 65530.
 
-    What a file leaves behind is kept by caches: it is not looked through for garbage until these are emptied, which would take seconds each time.
+    What a file leaves behind is kept by caches: it is not looked through for garbage until these are emptied, those of the package too, or else what
+    there is to look through grows from file to file, and with it the time that it takes.
     """
     yield
     if psutil.Process().memory_info().rss > MOST_RESIDENT:
@@ -83,6 +85,9 @@ def _compiled_programs_are_dropped():
 
         jax.clear_caches()
         gc.unfreeze()
+        for kept in gc.get_objects():
+            if isinstance(kept, functools._lru_cache_wrapper) and str(kept.__module__).startswith("jourdain_jax.") and ".native" not in kept.__module__:
+                kept.cache_clear()
         gc.collect()
         if sys.platform == "linux":
             ctypes.CDLL(None).malloc_trim(0)  # glibc keeps what was freed otherwise

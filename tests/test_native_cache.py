@@ -161,7 +161,7 @@ from jourdain_jax.native import host
 host.EFFORT = 0
 for name in sys.argv[1:]:
     scene = jj.models.MODELS[name]()
-    jax.grad(lambda scene: jnp.sum(jj.simulate(scene, scene.example, t1=0.2).q_end))(scene)
+    jax.jit(jax.grad(lambda scene: jnp.sum(jj.simulate(scene, scene.example, t1=0.2).q_end))).lower(scene)
 """
 
 

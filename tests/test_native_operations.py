@@ -13,7 +13,7 @@ from in_mpmath import in_mpmath
 from numpy.testing import assert_allclose, assert_array_equal
 
 from jourdain_jax.calculus.scalar_operations import TABLE
-from jourdain_jax.native import angles, exponentials, host
+from jourdain_jax.native import host
 from jourdain_jax.native.math_functions import BY_POLYNOMIALS
 from jourdain_jax.program import emit
 from jourdain_jax.program.graph import Graph
@@ -161,17 +161,3 @@ def test_functions_of_our_own_are_the_same_beside_any_others(fused):
         found = _our_own(lanes, fused)(x[order], y[order])
         for op, values in expected.items():
             assert_array_equal(found[op].view(np.int64), values[order].view(np.int64), err_msg=op)
-
-
-@pytest.mark.filterwarnings("ignore:Descending")
-def test_polynomials_are_those_of_chebyshev():
-    fits = {
-        exponentials.EXP: (lambda r: mpmath.hyp1f1(1, 3, r) / 2, [-mpmath.log(2) / 2, mpmath.log(2) / 2]),
-        exponentials.LOG: (lambda z: mpmath.hyp2f1(1, 3.5, 4.5, z) / 7, [0, (3 - 2 * mpmath.sqrt(2)) ** 2]),
-        angles.ATAN: (lambda z: -mpmath.hyp2f1(1, 1.5, 2.5, -z) / 3, [0, 3 - 2 * mpmath.sqrt(2)]),
-        angles.ASIN: (lambda z: (mpmath.asin(mpmath.sqrt(z)) / mpmath.sqrt(z) - 1) / z, [0, 0.25]),
-    }
-    with mpmath.workdps(60):
-        for numbers, (function, interval) in fits.items():
-            found = [float(x) for x in mpmath.chebyfit(function, interval, len(numbers))]
-            assert_allclose(numbers, found, rtol=1e-13)

@@ -61,25 +61,6 @@ def test_a_record_far_from_time_zero_is_followed_as_at_zero():
     assert_array_equal(*ends)
 
 
-def test_lanes_have_records_of_their_own_or_share_one():
-    scales, x = jnp.linspace(-1.0, 1.0, 11), jnp.linspace(-0.3, 0.5, 11)
-
-    def end(backend, scale, x):
-        motion = jj.simulate(Pushed(), {"x": x}, inputs=inputs(scale), backend=backend, **OPTIONS)
-        return numbers(motion), motion.accepted
-
-    for axes in ((0, 0), (None, 0)):
-        given = [a if axis == 0 else a[3] for a, axis in zip((scales, x), axes, strict=True)]
-        ours, theirs = (jax.jit(jax.vmap(lambda *a, backend=backend: end(backend, *a), axes))(*given) for backend in ("native", "xla"))
-        assert_allclose(ours[0], theirs[0], rtol=1e-13, atol=1e-13)
-        assert_array_equal(ours[1], theirs[1])
-        alone = end("native", *(a if axis is None else a[7] for a, axis in zip(given, axes, strict=True)))
-        assert_array_equal(ours[0][7], alone[0])
-    # records of the outer lanes, starts of the inner ones
-    nested = jax.vmap(lambda scale: jax.vmap(lambda x: end("native", scale, x)[0])(x[:3]))(scales[:4])
-    assert_array_equal(nested[2, 1], end("native", scales[2], x[1])[0])
-
-
 @pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
 @pytest.mark.parametrize("events", [False, True], ids=["to the end", "to a wall"])
 def test_derivatives_are_those_of_xla(derivative, events):

@@ -87,17 +87,6 @@ def test_code_on_the_page_about_contacts_runs():
     assert made["motion"].q_end[2] > 0  # the right wheel is driven harder: it turns to the left
 
 
-def test_a_robot_pulls_its_trailer_straight_ahead():
-    torque, robot = 0.2, RobotWithTrailer()
-    motion = jj.simulate(robot, t1=2.0, ts=jnp.linspace(0.0, 2.0, 5), inputs={"left_torque": torque, "right_torque": torque}).raise_if_failed()
-    moved = 5.0 + 3.0 + 2 * 0.3 * (1 + 0.5)  # kg; a disc that rolls counts one and a half times
-    acceleration = 2 * torque / float(robot.radius) / moved
-    assert_allclose(motion["x"], acceleration * motion.ts**2 / 2, atol=1e-9)
-    for force in motion.contact_forces().values():
-        assert_allclose(force.normal, (5.0 + 2 * 0.3) * G / 2, rtol=1e-9)  # the trailer stands on its own wheels
-        assert not np.any(force.pulls)
-
-
 def test_a_trailer_that_is_carried_by_the_robot_lifts_a_wheel_and_the_summary_says_what_to_do():
     class Whole(RobotWithTrailer):
         carried = None

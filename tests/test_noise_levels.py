@@ -12,7 +12,7 @@ START = {"x": 1.0, "x_rate": 2.0, "y": 0.0, "y_rate": 0.0}
 BOTH = ("x", "x_rate")
 
 
-def lines(count: int, seed: int = 0, sigma: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
+def lines(count: int = 6, seed: int = 0, sigma: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
     """Times, and a noisy straight line."""
     ts = np.linspace(0.0, 1.0, count)
     return ts, 1.0 + 2.0 * ts + sigma * np.random.default_rng(seed).normal(size=count)
@@ -23,8 +23,8 @@ def run(ts, values, sigma, unknown=BOTH, **options) -> jj.Experiment:
 
 
 def test_few_samples_of_unknown_noise_give_the_textbook_intervals_of_regression():
-    count = 4
-    ts, y = lines(count)
+    count = 6
+    ts, y = lines()
     data = run(ts, {"x": y}, None)
     found = jj.fit(Bead(), data)
     X = np.stack([np.ones(count), ts], axis=1)
@@ -40,17 +40,17 @@ def test_few_samples_of_unknown_noise_give_the_textbook_intervals_of_regression(
 
 
 def test_a_channel_with_a_known_sigma_keeps_its_own_beside_one_that_has_none():
-    ts, y = lines(5)
-    other = 0.4 * np.random.default_rng(1).normal(size=5)
+    ts, y = lines()
+    other = 0.4 * np.random.default_rng(1).normal(size=6)
     found = jj.fit(Bead(), run(ts, {"x": y, "y": other}, {"x": None, "y": 0.4}, (*BOTH, "y", "y_rate")))
-    X = np.stack([np.ones(5), ts], axis=1)
+    X = np.stack([np.ones(6), ts], axis=1)
     errors, (_, (rss,), *_) = np.sqrt(np.diag(np.linalg.inv(X.T @ X))), np.linalg.lstsq(X, y)
-    reach = np.concatenate([stdtrit(3, 0.975) * np.sqrt(rss / 3) * errors, 1.959964 * 0.4 * errors])
+    reach = np.concatenate([stdtrit(4, 0.975) * np.sqrt(rss / 4) * errors, 1.959964 * 0.4 * errors])
     assert_allclose(found.high - found.values, reach, rtol=1e-5)
 
 
 def test_what_priors_tell_is_not_taken_from_the_samples():
-    ts, y = lines(6)
+    ts, y = lines()
     prior = {"x": jj.Normal(1.0, 0.03), "x_rate": jj.Normal(2.0, 0.1)}
     X, P = np.stack([np.ones(6), ts], axis=1), np.diag([0.03**-2, 0.1**-2])
     known = jj.fit(Bead(), run(ts, {"x": y}, 0.1, prior))
@@ -100,16 +100,16 @@ def test_channels_that_share_unknowns_have_the_sigmas_of_restricted_likelihood(o
 
 
 def test_a_channel_that_is_met_exactly_does_not_tell_its_sigma():
-    ts, x = lines(20)
-    y = np.full(20, np.nan)
-    y[[3, 15]] = 0.1, 0.3
+    ts, x = lines()
+    y = np.full(6, np.nan)
+    y[[1, 4]] = 0.1, 0.3
     found = jj.fit(Bead(), run(ts, {"x": x, "y": y}, None, (*BOTH, "y", "y_rate")))
     assert "channel `y` has no degrees of freedom left" in found.warning
     assert np.isnan(found["run 0: y"].standard_error)
-    X = np.stack([np.ones(20), ts], axis=1)
+    X = np.stack([np.ones(6), ts], axis=1)
     _, (rss,), *_ = np.linalg.lstsq(X, x)
-    error = np.sqrt(rss / 18 * np.linalg.inv(X.T @ X)[0, 0])
-    assert float(found["run 0: x"].high - found["run 0: x"].value) == pytest.approx(stdtrit(18, 0.975) * error, rel=1e-5)
+    error = np.sqrt(rss / 4 * np.linalg.inv(X.T @ X)[0, 0])
+    assert float(found["run 0: x"].high - found["run 0: x"].value) == pytest.approx(stdtrit(4, 0.975) * error, rel=1e-5)
 
 
 @pytest.mark.parametrize("loss", [jj.huber(), jj.student_t(4.0)])
@@ -150,15 +150,15 @@ def test_a_robust_loss_does_not_widen_what_a_prior_tells():
 
 @pytest.mark.parametrize("sigma", [0.1, None], ids=["sigma known", "sigma estimated"])
 def test_a_repeat_without_samples_has_not_converged(sigma):
-    ts, y = lines(10)
-    found = jj.fit_batch(Bead(), run(ts, {"x": np.stack([y, np.full(10, np.nan)])}, sigma))
+    ts, y = lines()
+    found = jj.fit_batch(Bead(), run(ts, {"x": np.stack([y, np.full(6, np.nan)])}, sigma))
     assert found.converged.tolist() == [True, False]
     assert_allclose(found.standard_errors[0], jj.fit(Bead(), run(ts, {"x": y}, sigma)).standard_errors, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("value", "sigma"), [(np.finfo(float).max, 0.1), (1.0, 1e-300)], ids=["value", "sigma"])
 def test_residuals_beyond_all_measure_are_not_called_a_motion_that_fails(value, sigma):
-    ts, y = lines(5)
+    ts, y = lines()
     y[2] = value
     assert jj.fit(Bead(), run(ts, {"x": y}, sigma)).warning.startswith("residuals overflow at the first guess")
 
@@ -171,7 +171,7 @@ def test_a_memory_needs_neighbours():
 
 def test_limits_at_a_bound_and_profiles_from_it_are_those_of_students_t_where_sigmas_are_estimated():
     # of a straight line whose slope may not be less than it is found to be without a bound
-    ts, y = lines(6)
+    ts, y = lines()
     X = np.stack([np.ones(6), ts], axis=1)
     (_, slope), (rss,), *_ = np.linalg.lstsq(X, y)
     error = np.sqrt(rss / 4 * np.linalg.inv(X.T @ X)[1, 1])
@@ -186,10 +186,10 @@ def test_limits_at_a_bound_and_profiles_from_it_are_those_of_students_t_where_si
 
 
 def test_a_bound_that_decides_is_named_where_its_misfit_counts_as_noise():
-    ts, y = lines(8)
-    X = np.stack([np.ones(8), ts], axis=1)
+    ts, y = lines()
+    X = np.stack([np.ones(6), ts], axis=1)
     (_, slope), (rss,), *_ = np.linalg.lstsq(X, y)
-    for sigma, error in ((None, np.sqrt(rss / 6 * np.linalg.inv(X.T @ X)[1, 1])), (0.1, 0.1 * np.sqrt(np.linalg.inv(X.T @ X)[1, 1]))):
+    for sigma, error in ((None, np.sqrt(rss / 4 * np.linalg.inv(X.T @ X)[1, 1])), (0.1, 0.1 * np.sqrt(np.linalg.inv(X.T @ X)[1, 1]))):
         for far in (2.0, 8.0):
             bounded = jj.Estimate(slope + 10 * error, range=jj.bounds(slope + far * error, 90.0))
             found = jj.fit(Bead(), run(ts, {"x": y}, sigma, {"x": None, "x_rate": bounded}))

@@ -8,7 +8,6 @@ from rolling_scenes import GRAVITY, Cart, CartOnRows
 from tolerances import tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.dynamics.normal_forces import Wrenches, normal_forces
 from jourdain_jax.dynamics.reactions import contact_forces
 from jourdain_jax.eager.eager import eval_numpy
 
@@ -75,18 +74,6 @@ def test_four_wheels_share_the_weight_by_minimum_norm_and_say_that_they_do(shift
     assert not any(bool(force.determined) for force in found.values())
 
 
-@pytest.mark.parametrize("ahead", [0.0, 0.1, -0.2])
-def test_two_balls_in_line_share_the_weight_by_moments(ahead):
-    cart = TwoBalls(places=((0.6, 0.0), (-0.4, 0.0)), load=(ahead, 0.0, 0.2), slope=0.0, push=(0.0, 0.0, 0.0), balls=2)
-    found = forces(cart)
-    front, rear = (float(found[f"ball{i}"].normal) for i in range(2))
-    chassis = 10.0 * GRAVITY
-    assert np.isclose(front, GRAVITY + chassis * (ahead + 0.4), rtol=1e-12)
-    assert np.isclose(rear, GRAVITY + chassis * (0.6 - ahead), rtol=1e-12)
-    assert found["ball0"].determined
-    assert found["ball1"].determined
-
-
 class TwoBalls(Cart):
     """A cart on two balls."""
 
@@ -151,16 +138,3 @@ def test_contacts_that_carry_bodies_of_their_own_share_nothing():
     found = forces(scene)
     for force in found.values():
         assert np.isclose(force.normal, scene.mass * GRAVITY * np.cos(scene.slope), rtol=1e-12)
-
-
-def test_the_shares_have_gradients():
-    # a weight at x on a beam of two contacts: N_front = W (x + 0.4)
-    contacts = {name: jj.Contact("beam", (x, 0.0, 0.0)) for name, x in (("front", 0.6), ("rear", -0.4))}
-    nothing = Wrenches(jnp.zeros((0, 1, 3)), jnp.zeros((0, 1, 3)))
-
-    def front(x):
-        held = Wrenches(jnp.array([[0.0, 0.0, 20.0]]), jnp.zeros((1, 3)))
-        return normal_forces(contacts, ("beam",), jnp.stack([x, 0.0, 0.3])[None], held, nothing, jnp.asarray(20.0))["front"].normal
-
-    assert np.isclose(front(0.1), 10.0, rtol=1e-12)
-    assert np.isclose(jax.grad(front)(0.1), 20.0, rtol=1e-12)

@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
 from small_scenes import Oscillator
 
@@ -87,28 +86,3 @@ def test_a_motion_that_does_not_meet_the_event_is_named():
     assert not other.converged
     assert "the motion of run 0 does not meet `far` before 4 times the observed time" in "".join(other.warnings)
     assert jj.log_likelihood(SCENE, run(events={"far": (0.9, SIGMA)})) == -np.inf
-
-
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        ({"events": {"bufer": (0.9, SIGMA)}}, "names `bufer`, which is no event of the scene; did you mean `buffer`"),
-        ({"events": {"buffer": (0.9, SIGMA), "far": (1.0, SIGMA)}}, "`events` names `buffer`, `far`, but a motion stops at the first"),
-        ({"events": {"buffer": 0.9}}, r"event `buffer` was given 0.9, expected \(time, sigma\)"),
-        ({"events": {"buffer": (0.0, SIGMA)}}, "the time of event `buffer` is 0.0 s, expected one after the start"),
-        ({"events": {"buffer": (0.9, 0.0)}}, "sigma of channel `buffer` must be above zero"),
-        ({"events": {"x": (0.9, SIGMA)}, "values": np.ones(5)}, "`x` is both a channel and an event"),
-        ({"sensors": {"buffer": "x"}}, "`buffer` is an event, whose time has no sensor"),
-    ],
-)
-def test_what_is_no_time_of_an_event_is_named(change, named):
-    with pytest.raises(ValueError, match=named):
-        fit(run(**change))
-
-
-def test_shooting_and_filters_name_an_event_that_they_do_not_use():
-    one = run(values=np.full(9, 0.3))
-    with pytest.raises(ValueError, match="run 0 gives the time of its event `buffer`, which `shooting` does not use"):
-        fit(one, shooting=jj.MultipleShooting(pieces=2))
-    with pytest.raises(ValueError, match="run 0 gives the time of its event `buffer`, which a filter does not use"):
-        jj.filtered_log_likelihood(SCENE, one, process_noise={"x_rate": 0.1})

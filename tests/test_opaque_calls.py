@@ -132,32 +132,6 @@ def test_functions_of_jax_have_their_derivatives_where_their_branches_meet(law):
     assert_allclose(*second, rtol=1e-12, atol=1e-12)
 
 
-class Learned(ChaplyginSleigh):
-    """A sleigh with a field that is a network, and one that is a function."""
-
-    net: eqx.nn.MLP = eqx.field(default_factory=lambda: eqx.nn.MLP(1, 1, 3, 1, activation=jnp.tanh, key=jax.random.key(0)))
-    share: Callable = jnp.square
-
-    def loads(self, motion):
-        sleigh = motion["sleigh"]
-        along = sleigh.orientation[:, 0]
-        return (jj.point_force(sleigh.point(jnp.zeros(3)), self.share(self.net((sleigh.velocity @ along)[None])[0]) * along),)
-
-
-def test_a_field_may_be_a_network_which_is_differentiated_by_its_weights():
-    scene = Learned()
-    start = jj.start(scene, **scene.example)
-
-    def loss(net):
-        return jj.simulate(scene.replace(net=net), start, t1=0.5).q_end[0]
-
-    found = eqx.filter_jit(eqx.filter_grad(loss))(scene.net).layers[0].weight
-    weight, h = (lambda net: net.layers[0].weight), 1e-5
-    moved = [eqx.tree_at(weight, scene.net, weight(scene.net).at[1, 0].add(side)) for side in (h, -h)]
-    assert_allclose(found[1, 0], (loss(moved[0]) - loss(moved[1])) / (2 * h), rtol=1e-7)
-    assert not jj.lower(scene).calls
-
-
 def states_of(scene, count):
     _, q, u = jj.sample_states(scene, count)
     return jnp.asarray(q), jnp.asarray(u[:, np.array(jj.lower(scene).independent)])
@@ -298,24 +272,6 @@ def test_what_a_call_depends_on_is_not_left_out_though_no_probe_shows_it():
     fixed = program.fixed_values(scene)
     _, ydot, _ = jax.jit(lambda x: program.rates(fixed, 0.0, (x,), (0.0 * x,), jnp.zeros(0)))(15.0)
     assert_allclose(ydot, [-25.0])
-
-
-class Twice(TiltingDisc):
-    """Resistance in roll and in yaw from one table of the spin, looked up wherever it is needed."""
-
-    def loads(self, motion):
-        return (*super().loads(motion), *(jj.generalized_force(motion, **{name: -self.resistance(motion)}) for name in ("spin_rate", "yaw_rate")))
-
-    def resistance(self, motion):
-        wheel = motion["disc"]
-        return by_table(wheel.angular_velocity @ wheel.orientation[:, 1], 0.01 * jnp.arange(9.0))
-
-
-def test_equal_calls_of_equal_operands_are_one_and_the_rest_is_as_short_as_without():
-    program, plain = jj.lower(Twice()), jj.lower(TiltingDisc())
-    assert len(program.graph.calls([*program.qdot, *program.ydot, program.power])) == 1
-    assert {"x", "y", "yaw"} <= set(program.held)
-    assert program.operations <= plain.operations + 25
 
 
 def test_the_report_and_the_summary_say_what_is_kept_and_why_and_printed_sources_refuse_it():

@@ -220,12 +220,6 @@ def test_a_spline_differentiates_with_respect_to_its_values():
     assert float(slopes @ direction) == pytest.approx(float(both[0] - both[1]) / 2.0, rel=1e-9)
 
 
-@pytest.mark.parametrize("given", [([0.0, 2.0, 1.0], [0.0, 1.0, 2.0]), ([0.0, 1.0], [0.0, np.nan]), ([0.0, 1.0], [0.0, 1.0, 2.0]), (0.0, 1.0), (["a"], [0])])
-def test_malformed_splines_are_refused(given):
-    with pytest.raises(ValueError, match="`Spline`"):
-        jj.Spline(*given)
-
-
 class OnBelt(jj.Scene):
     """A skate on a belt, and a wheel in it that no row holds: it turns back where the belt jerks the skate. `way`: how the belt runs."""
 

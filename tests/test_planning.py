@@ -61,10 +61,6 @@ def test_information_has_a_closed_form():
     assert_allclose(of_stiffness(0.3), stated(0.3), rtol=1e-6)
 
 
-def test_slope_in_the_start_has_a_closed_form():
-    assert_allclose(jax.jit(jax.jacfwd(of_stiffness))(0.3), jax.grad(stated)(0.3), rtol=1e-6)
-
-
 def test_slope_in_the_samples_of_an_input_is_that_of_differences():
     knots = jnp.linspace(0.0, 3.0, 5)
 
@@ -75,18 +71,3 @@ def test_slope_in_the_samples_of_an_input_is_that_of_differences():
     _, slope = jax.jit(lambda v, w: jax.jvp(told, (v,), (w,)))(values, way)
     h = 1e-3
     assert_allclose(slope, (told(values + h * way) - told(values - h * way)) / (2 * h), rtol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [({"sigma": None}, "sigma of channel `x` is None"), ({"correlation_time": 0.1}, "has a correlation time")],
-)
-def test_a_plan_needs_to_know_its_noise(change, message):
-    run = jj.Experiment(TS, {"x": TS}, **({"sigma": 0.01, "start": {"x": 0.3}} | change))
-    with pytest.raises(ValueError, match=message):
-        jj.planned_information(Cart(damping=0.0), run, ("mass",))
-
-
-def test_an_unknown_name_is_answered():
-    with pytest.raises(KeyError, match="`mas` is not among the unknowns"):
-        jj.planned_information(Cart(damping=0.0), plan(), ("mass",)).log_det("mas")

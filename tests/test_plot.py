@@ -100,30 +100,3 @@ def test_rollouts_and_motions_share_a_figure_and_the_axes_of_a_user(lanes, motio
     written = (tmp_path / "two.svg").read_text()
     assert "motion 0" in written
     assert "motion 1" in written
-
-
-@pytest.mark.parametrize(
-    ("asked", "error", "message"),
-    [
-        ({"units": {"heading": "degrees"}}, ValueError, "`degrees` is no unit of the coordinate `heading` .* did you mean `deg`"),
-        ({"units": {"heading": "deg/s"}}, ValueError, "`deg/s` is no unit of the coordinate `heading`"),
-        ({"units": {"heading_rate": "deg"}}, ValueError, "`deg` is no unit of the speed `heading_rate`"),
-        ({"units": {"heding": "deg"}}, KeyError, "`units` names `heding`.* did you mean `heading`"),
-        ({"units": "deg"}, ValueError, r'`units` is .*, expected a dictionary from names to units, such as \{"lean": "deg"\}'),
-        ({"labels": "one"}, ValueError, "`labels` is 'one', expected a list of as many as there are motions, 2"),
-        ({"labels": ["one"]}, ValueError, "expected a list of as many as there are motions, 2"),
-        ({"bands": 0.5}, ValueError, "`bands` is 0.5, expected parts of the lanes between 0 and 1"),
-        ({"bands": (50,)}, ValueError, r"`bands` is \(50,\), expected parts"),
-        ({"axes": [None, None]}, ValueError, "`axes` holds 2 axes for 1 names, expected one for each of heading"),
-    ],
-)
-def test_what_cannot_be_plotted_is_refused_by_its_name(motions, asked, error, message):
-    with pytest.raises(error, match=message):
-        jj.plot(motions, "heading", **asked)
-
-
-def test_a_list_of_other_things_is_refused(motions):
-    with pytest.raises(ValueError, match=r"`plot` was given .* in place 1, expected a motion"):
-        jj.plot([motions[0], SLEIGH], "x")
-    with pytest.raises(ValueError, match="`plot` was given an empty list"):
-        jj.plot([], "x")

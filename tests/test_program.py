@@ -53,29 +53,11 @@ def test_what_is_known_while_building_is_folded(graph):
     assert graph.mul(root, root) == x
 
 
-def test_squares_of_a_sine_and_a_cosine_leave_what_they_multiply(graph):
-    w, x, y = (graph.input(name, True) for name in "wxy")
-    s, c = graph.call("sin", w), graph.call("cos", w)
-    assert graph.add(graph.mul(s, s), graph.mul(c, c)) == graph.one
-    left, right = graph.mul(graph.mul(s, x), graph.mul(y, s)), graph.mul(graph.mul(c, y), graph.mul(c, x))
-    assert graph.add(left, right) == graph.mul(x, y)
-    assert graph.op[graph.add(left, graph.mul(right, x))] == "add"
-    assert graph.op[graph.add(graph.mul(s, s), graph.mul(graph.call("cos", x), graph.call("cos", x)))] == "add"
-
-
 def test_only_operations_on_varying_quantities_count(graph):
     (x,) = _x(graph, "x")
     a = graph.input("a", False)
     y = graph.add(graph.mul(graph.mul(a, a), x), graph.call("sin", x))
     assert graph.operations([y]) == 3
-
-
-def test_a_reciprocal_that_serves_once_is_one_division(graph):
-    x, y = _x(graph, "x", "y")
-    once = graph.mul(x, graph.div(graph.one, y))
-    assert graph.operations(graph.with_quotients([once])) == 1
-    twice = [once, graph.mul(graph.add(x, graph.one), graph.div(graph.one, y))]
-    assert graph.operations(graph.with_quotients(twice)) == graph.operations(twice)
 
 
 FUNCTIONS = {
@@ -130,16 +112,6 @@ def test_an_operation_without_scalar_form_is_named(graph):
 # Normal forms.
 
 
-def test_sines_and_cosines_are_reduced(graph):
-    x, y = _x(graph, "x", "y")
-    s, c = graph.call("sin", x), graph.call("cos", x)
-    forms = NormalForms(graph, 100)
-    total = graph.add(graph.mul(s, graph.mul(s, y)), graph.mul(c, graph.mul(c, y)))
-    assert forms.simplified(total) == y
-    difference = graph.sub(graph.mul(graph.add(x, y), graph.add(x, y)), graph.add(graph.mul(x, x), graph.mul(y, y)))
-    assert graph.operations([forms.simplified(difference)]) <= 3
-
-
 def test_a_root_of_a_square_is_a_magnitude_and_a_known_sign_a_guard(graph):
     (x,) = _x(graph, "x")
     s, c = graph.call("sin", x), graph.call("cos", x)
@@ -149,25 +121,6 @@ def test_a_root_of_a_square_is_a_magnitude_and_a_known_sign_a_guard(graph):
     forms = NormalForms(graph, 100, sign=probes.sign)
     assert forms.simplified(root) == c
     assert forms.guards == {c}
-
-
-def test_coefficients_of_parameters_are_gathered(graph):
-    (x,) = _x(graph, "x")
-    a, b = graph.input("a", False), graph.input("b", False)
-    expression = graph.add(graph.mul(a, x), graph.add(graph.mul(b, x), graph.mul(graph.mul(a, b), x)))
-    assert graph.operations([NormalForms(graph, 100).simplified(expression)]) == 1
-
-
-def test_determinants_cancel_what_is_common(graph):
-    x, y = _x(graph, "x", "y")
-    a = graph.input("a", False)
-    c = graph.call("cos", x)
-    M = [[graph.mul(a, graph.mul(c, c)), graph.zero], [graph.zero, a]]
-    first, second = NormalForms(graph, 100).cramer(M, [graph.mul(a, graph.mul(c, y)), graph.mul(a, y)])
-    assert second == y
-    probes = Probes(graph, {"x": np.array([0.3]), "y": np.array([2.0]), "a": np.array([7.0])})
-    assert_allclose(probes([first])[0], 2.0 / np.cos(0.3), rtol=1e-14)
-    assert graph.operations([first]) <= 3
 
 
 def test_a_form_does_not_depend_on_what_was_simplified_before(graph):
@@ -215,15 +168,6 @@ def test_sine_and_cosine_differentiate_to_second_order_in_both_modes():
             assert_allclose(jax.grad(jax.grad(f))(x), second(x), atol=3e-16)
 
 
-def _example(graph):
-    x, y = _x(graph, "x", "y")
-    a = graph.input("a", False)
-    r = graph.call("sqrt", graph.add(graph.mul(x, x), graph.const(1.0)))
-    first = graph.sub(graph.div(graph.mul(a, graph.call("sin", x)), r), graph.sub(y, graph.mul(graph.neg(x), r)))
-    second = graph.call("select", graph.call("gt", x, y), graph.call("max", x, r), graph.neg(graph.call("abs", y)))
-    return {"x": x, "y": y, "a": a}, [first, second]
-
-
 def _every_function(graph):
     x, y, a = *_x(graph, "x", "y"), graph.input("a", False)
     of_one = ["sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "atanh", "exp", "exp2", "expm1", "log", "log1p"]
@@ -233,16 +177,16 @@ def _every_function(graph):
         graph.call("acosh", a),
         *(graph.call(name, graph.neg(graph.mul(a, a)), y) for name in ("rem", "atan2", "max", "min")),
         graph.call("pow", a, y),
+        graph.call("select", graph.call("gt", x, y), graph.div(graph.neg(x), a), y),
     ]
 
 
 VALUES = {"x": 0.7, "y": -1.3, "a": 2.5}
 
 
-@pytest.mark.parametrize("example", [_example, _every_function])
-def test_jax_code_python_c_and_sympy_say_the_same(graph, tmp_path, example):
+def test_jax_code_python_c_and_sympy_say_the_same(graph, tmp_path):
     sympy = pytest.importorskip("sympy")
-    names, outputs = example(graph)
+    names, outputs = _every_function(graph)
     expected = Probes(graph, {k: np.array([v]) for k, v in VALUES.items()})(outputs)[:, 0]
     assert_allclose(run(graph, outputs, {n: jnp.asarray(VALUES[k]) for k, n in names.items()}), expected, rtol=1e-15)
     lines, last = statements(graph, outputs, {n: k for k, n in names.items()}, PYTHON)

@@ -3,13 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from linkages import Parallelogram, SliderCrank
+from linkages import Parallelogram, SliderCrank, Windows, bennett, bricard
 from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
 from jourdain_jax import structure_of
-from jourdain_jax.build.structure import plain_row_lengths
-from jourdain_jax.dynamics.reactions import _spare_multipliers
 
 SINGULAR = {
     "parallelogram": (Parallelogram, {"a": np.pi / 2, "b": 0.0, "c": np.pi / 2}, {"a": 1.0, "c": 1.0}),
@@ -32,11 +30,9 @@ def _near(name: str, distance: float, unit: float = 1.0):
 @pytest.mark.parametrize("unit", UNITS)
 @pytest.mark.parametrize("name", SINGULAR)
 def test_rank_is_lost_where_a_row_is_round_off(name, unit):
-    scene, q, found = _near(name, 0.0, unit)
+    scene, _, found = _near(name, 0.0, unit)
     assert (structure_of(scene).rank, int(found.rank)) == (2, 1)
     assert float(found.smallest_singular_value) < 1e-12
-    A = jj.constraint_rows(scene, 0.0, q, jnp.zeros(3)).A
-    assert np.sum(np.diagonal(_spare_multipliers(A, plain_row_lengths(scene))) == 0) == 1
 
 
 @pytest.mark.parametrize("unit", UNITS)
@@ -111,3 +107,47 @@ def test_a_mechanism_that_moves_where_others_of_its_assemblies_are_stiff_is_not_
     (warning,) = motions[0].warnings
     assert "rows have rank 2 all along, but 3 at generic states" in warning
     assert_allclose(motions[0].q_end, motions[1].q_end, atol=1e-8)
+
+
+LINKAGES = {
+    "Bennett": (bennett(0.7, 1.2), 3),
+    "another Bennett": (bennett(1.1, 0.4, 0.8), 3),
+    "Bricard": (bricard(1.0, 1.2, 0.8, 0.9, 1.1), 5),
+    "another Bricard": (bricard(1.0, 0.9, 1.1, 1.0, 0.8), 5),
+    "parallelogram": (Parallelogram(), 2),
+    "slider-crank": (SliderCrank(), 2),
+    "windows": (Windows(3), 9),
+}
+
+
+@pytest.mark.parametrize("name", LINKAGES)
+def test_a_linkage_of_one_freedom_a_loop_has_its_rank_and_freedoms(name):
+    scene, rank = LINKAGES[name]
+    found = structure_of(scene)
+    assert found.rank == rank
+    assert found.degrees_of_freedom == len(scene.coordinate_names) - rank
+
+
+def bounds(scene) -> np.ndarray:
+    """Lowest and highest values of the coordinates of its domain."""
+    return np.array([scene.domain.get(name, (-3.2, 3.2)) for name in scene.coordinate_names.entries]).T
+
+
+@pytest.mark.parametrize("name", LINKAGES)
+def test_probed_configurations_are_on_the_rows_and_in_the_domain(name):
+    scene, _ = LINKAGES[name]
+    found, (low, high) = structure_of(scene), bounds(scene)
+    closures = [np.max(np.abs(jj.position_residual(scene, t, q))) for t, q in zip(found.times[:8], found.coordinates[:8], strict=True)]
+    assert max(closures) < 1e-11
+    outside = np.maximum(low - found.coordinates, found.coordinates - high) / (high - low)
+    assert found.random >= 4
+    assert np.max(outside) <= 0.1
+
+
+@pytest.mark.parametrize("name", ["Bennett", "parallelogram", "windows"])
+def test_sampled_states_are_on_the_rows_and_in_the_domain(name):
+    scene, _ = LINKAGES[name]
+    t, q, _ = jj.sample_states(scene, 5, seed=3)
+    low, high = bounds(scene)
+    assert max(np.max(np.abs(jj.position_residual(scene, *state))) for state in zip(t, q, strict=True)) < 1e-11
+    assert np.all((q >= low - 0.1 * (high - low)) & (q <= high + 0.1 * (high - low)))

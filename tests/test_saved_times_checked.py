@@ -38,10 +38,6 @@ def test_known_times_are_refused_alike_alone_in_lanes_and_inside_jit(times):
     assert len(set(sentences)) == 1
 
 
-def moved(x, times):
-    return jj.simulate(Oscillator(), {"x": x}, rtol=1e-7, atol=1e-7, **times)
-
-
 @pytest.mark.parametrize("solver", [None, diffrax.Kvaerno5()], ids=["lean", "diffrax"])
 def test_traced_times_that_do_not_go_together_end_in_a_code_of_their_own_and_no_state(solver):
     every = [{"t0": 0.0, "t1": times["ts"][-1]} | times for times in (WRONG | SHUFFLED | RIGHT).values()]
@@ -67,16 +63,6 @@ def test_lanes_with_times_of_their_own_are_judged_one_by_one():
     assert "lanes 2, 3" in str(lanes)
     with pytest.raises(jj.SimulationError, match="the times to save at"):
         lanes.lane(2).raise_if_failed()
-
-
-def test_a_lane_with_wrong_times_takes_no_part_in_derivatives():
-    def loss(stiffness, begun):
-        states = jax.vmap(lambda t: jj.start(Oscillator(), x=1.0, t0=t))(begun)
-        lanes = jj.rollout(Oscillator(stiffness=stiffness), states, ts=[0.5, 1.0], progress=False).lanes
-        return jnp.sum(jnp.where(lanes.succeeded, lanes.q_end[:, 0], 0.0))
-
-    slope = jax.grad(loss)(4.0, jnp.array([0.0, 0.7]))
-    assert_allclose(slope, -np.sin(2.0) / 4.0, rtol=1e-6)
 
 
 def test_even_times_of_any_span_go_together():

@@ -62,32 +62,6 @@ def test_a_large_number_elsewhere_hides_nothing():
     assert judged(f) == [True, False, True]
 
 
-class TwoMasses(jj.Scene):
-    """Two masses on a line that do not know of one another; one force is `scale` times the other."""
-
-    coordinates = jj.coordinates("x y")
-    scale = 1.0
-    law = "exp"
-    mass: jax.Array = jj.parameter(1.0)
-
-    def bodies(self, t, q):
-        return {name: jj.Particle(self.mass, jnp.stack([z, 0.0 * z, 0.0 * z])) for name, z in (("one", q.x), ("two", q.y))}
-
-    def loads(self, motion):
-        x, y = motion.q.x, motion.q.y
-        return (jj.Load(generalized={"x_rate": -self.scale * jnp.exp(x / 0.1), "y_rate": -jnp.sin(y)}),)
-
-
-@pytest.mark.parametrize("scale", [1e-30, 1e-24, 1e-9, 1e16, 1e30])
-def test_coordinates_are_ignorable_at_no_scale_where_they_are_not(scale, monkeypatch):
-    monkeypatch.setattr(TwoMasses, "scale", scale)
-    program = jj.lower(TwoMasses())
-    assert program.held == ()
-    fixed = program.fixed_values(TwoMasses())
-    rates = [program.rates(fixed, 0.0, (x, 0.3), (0.0, 0.0), jnp.zeros(0))[1] for x in (0.0, 0.2)]
-    assert np.allclose(rates, [[-scale, -np.sin(0.3)], [-scale * np.exp(2.0), -np.sin(0.3)]], rtol=1e-12, atol=0.0)
-
-
 class Sleigh(jj.Scene):
     """A knife edge with a row nonlinear in the speeds or not, a drive and a load; lengths, masses and times in any units."""
 

@@ -37,23 +37,6 @@ def test_a_method_whose_name_is_misspelt_does_not_drop_physics_silently(name, me
         described(**{name: lambda self, motion: {}})()
 
 
-def test_an_attribute_whose_name_is_misspelt_is_named():
-    with pytest.raises(ValueError, match=r"`Described` has an attribute `priviledged`, which nothing calls; did you mean `privileged`\?"):
-        described(priviledged=("x_rate",))()
-    with pytest.raises(ValueError, match=r"has a method `exemple`, .* did you mean `example`\?"):
-        described(exemple=property(lambda self: {}))()
-
-
-def test_a_parameter_that_is_overridden_without_an_annotation_is_refused():
-    with pytest.raises(ValueError, match=r"`Described` sets `mass`, a field of a class that it extends, without an annotation, which has no effect"):
-        described(mass=5.0)()
-
-    class Heavy(Bead):
-        mass: object = jj.parameter(5.0, unit="kg")
-
-    assert float(Heavy().mass) == 5.0
-
-
 def test_a_helper_of_a_base_class_may_be_overridden():
     class Pushed(Bead):
         def loads(self, motion):
@@ -100,29 +83,6 @@ def test_own_methods_parameters_and_helpers_beside_the_real_method_are_left_alon
             return cls()
 
     assert float(Own().load) == 2.0
-
-
-@pytest.mark.parametrize(
-    ("members", "sentence"),
-    [
-        ({"domain": {"xx": (0.0, 1.0)}}, "`domain` of `Described` names `xx`, which is no coordinate or speed; did you mean `x`"),
-        ({"domain": {"x": (1.0, -1.0)}}, r"`domain` of `Described` gives \(1.0, -1.0\) for `x`, expected two finite numbers \(low, high\) with low <= high"),
-        ({"domain": {"x": 1.0}}, "gives 1.0 for `x`, expected two finite numbers"),
-        ({"domain": {"x": (0.0, jnp.inf)}}, "for `x`, expected two finite numbers"),
-        ({"domain": ("x", 0.0, 1.0)}, "`domain` of `Described` is a tuple, expected a dictionary"),
-        ({"example": {"x_rat": 1.0}}, "`example` of `Described` names `x_rat`, which is no coordinate or speed; did you mean `x_rate`"),
-        ({"speeds": jj.speeds("a b c")}, r"`Described` has speeds of its own \(a, b, c\) but .*; define `coordinate_rates\(self, t, q, u\)`"),
-        ({"speeds": "a b"}, r"`speeds` of `Described` is the text 'a b', expected names; write speeds = jj.speeds\('a b c'\)"),
-        ({"inputs": ("drive",)}, r"`inputs` of `Described` is a tuple, expected names; write inputs = jj.inputs"),
-        (
-            {"speeds": jj.speeds("x w"), "coordinate_rates": lambda self, t, q, u: u.array},
-            "has a coordinate and a speed of the name `x`; give one of them another name",
-        ),
-    ],
-)
-def test_what_a_class_says_wrongly_is_named_when_a_scene_is_made_of_it(members, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        described(**members)()
 
 
 def test_a_scene_with_an_init_of_its_own_takes_its_own_arguments():

@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+import struct
 import zlib
 
 import equinox as eqx
@@ -11,10 +12,8 @@ import numpy as np
 import pytest
 from browser import needs_browser, screenshot
 from numpy.testing import assert_allclose
-from rolling_scenes import DiscOnHill, hill
 
 import jourdain_jax as jj
-from jourdain_jax.plotting.grounds_drawn import grounds_of
 from jourdain_jax.plotting.guesses import guessed
 from jourdain_jax.plotting.looks import looks_of
 from jourdain_jax.plotting.still import draw_still
@@ -119,23 +118,6 @@ def test_arrows_of_usual_forces_are_seen_beside_a_force_that_is_far_larger():
     assert lengths.argmax() == 20
 
 
-@pytest.mark.slow
-def test_a_ride_of_ten_seconds_is_one_file_below_a_megabyte(tmp_path):
-    bicycle = jj.models.WhippleBicycle()
-    ride = jj.simulate(bicycle, jj.start(bicycle, **bicycle.upright(4.6), lean_rate=0.3), t1=10.0)
-    path = tmp_path / "ride.html"
-    jj.show(ride, path, forces=False)
-    assert [file.name for file in tmp_path.iterdir()] == ["ride.html"]
-    assert 100_000 < path.stat().st_size < 1_000_000
-    page, numbers = contents(path.read_text())
-    assert page["follow"]
-    wheels = {body["name"]: body for body in page["motions"][0]["bodies"] if "wheel" in body["name"]}
-    assert {shape["kind"] for body in wheels.values() for shape in body["shapes"]} == {"wheel"}
-    expected = ride.motions()
-    for name, body in wheels.items():
-        assert_allclose(numbers(body["p"]).reshape(-1, 3), expected[name].position, atol=1e-5)
-
-
 def test_a_notebook_shows_the_page_in_a_frame(shown):
     frame = shown._repr_html_()
     assert frame.startswith('<iframe srcdoc="&lt;!doctype html&gt;')
@@ -238,33 +220,6 @@ def test_grounds_of_every_kind_are_drawn_where_they_are(make, lowest):
     assert_allclose([float(make().value(corner)) for corner in corners[:: len(corners) // 20]], 0.0, atol=1e-5)
 
 
-def test_what_cannot_be_shown_is_refused_with_advice(motion, tmp_path):
-    with pytest.raises(ValueError, match=r"`show` was given .*expected a motion from `jj.simulate`"):
-        jj.show(Rolling())
-    with pytest.raises(ValueError, match=r"a 3D view is a .html file; for a .gif use `jj.animate`"):
-        jj.show(motion, "ride.gif")
-    with pytest.raises(ValueError, match="there is no folder"):
-        jj.show(motion, tmp_path / "missing" / "ride.html")
-    with pytest.raises(ValueError, match="`colours` names `bal`, which is no body; did you mean `ball`"):
-        jj.show(motion, colours={"bal": RED})
-    with pytest.raises(ValueError, match="expected elevation and azimuth"):
-        jj.show(motion, view=(1.0, 2.0, 3.0))
-
-
-def test_looks_of_bodies_that_do_not_exist_are_refused(motion):
-    class Misnamed(Rolling):
-        def visuals(self, pose):
-            return {"bal": jj.Visual.ball(0.1)}
-
-    class Wrong(Rolling):
-        def visuals(self, pose):
-            return {"ball": 0.1}
-
-    for kind, message in ((Misnamed, "names `bal`, which is no body"), (Wrong, "gives .* for `ball`, expected shapes")):
-        with pytest.raises(ValueError, match=message):
-            jj.show(eqx.tree_at(lambda m: m.scene, motion, kind()))
-
-
 @needs_browser
 def test_a_browser_draws_the_ball_where_it_is(shown, motion, tmp_path):
     # seen along y, the ball goes from left to right through the middle of the picture
@@ -281,29 +236,6 @@ def test_a_browser_draws_the_ball_where_it_is(shown, motion, tmp_path):
     assert places[0] < 0.3
 
 
-class DiscOnUnnamedHill(DiscOnHill):
-    """The disc on a hill, of which its contact states the tangent planes alone."""
-
-    def contacts(self, pose):
-        found = super().contacts(pose)["rim"]
-        return {"rim": jj.Contact(found.body, found.point, found.plane)}
-
-
-def test_a_hill_is_drawn_where_a_contact_names_it():
-    """Its triangles lie on the hill; where tangent planes alone are known, none of them is drawn as if it were the ground."""
-    scene, low, high = DiscOnHill(), np.array([-0.3, -0.3, 0.0]), np.array([0.3, 0.3, 0.2])
-    motion = jj.simulate(scene, {"x": 0.1, "spin_rate": 2.0}, t1=0.2)
-    (drawn,) = grounds_of(motion, looks_of(motion), low, high)
-    x, y, z = drawn["triangles"].reshape(-1, 3).T
-    assert drawn["kind"] == "mesh"
-    assert len(x) > 1000
-    assert np.abs(z - np.asarray(hill(x, y))).max() < 1e-12
-    other = eqx.tree_at(lambda motion: motion.scene, motion, DiscOnUnnamedHill())
-    (floor,) = grounds_of(other, looks_of(other), low, high)
-    assert floor["kind"] == "plane"
-    assert np.array_equal(floor["axes"], np.eye(3))
-
-
 @pytest.mark.parametrize(("view", "hidden"), [("above", "z"), ("side", "y"), ("space", ""), ((20.0, -50.0), "")])
 def test_a_still_picture_holds_all_bodies_within_axes_in_metres(motion, tmp_path, drawn, view, hidden):
     draw_still(motion, tmp_path / "ball.png", view=view, at=2)
@@ -313,3 +245,73 @@ def test_a_still_picture_holds_all_bodies_within_axes_in_metres(motion, tmp_path
     assert np.all((shown > 0.0) & (shown < 1.0))
     for name in "xyz":
         assert getattr(axes, f"get_{name}label")() == ("" if name == hidden else f"{name} in m")
+
+
+CORNERS = np.array([[0.0, 0.0, 0.0], [200.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 50.0]])  # mm
+FACES = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
+
+
+def write_obj(path):
+    lines = [f"v {x} {y} {z}" for x, y, z in CORNERS] + ["f " + " ".join(str(i + 1) for i in face) for face in FACES]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def write_stl(path):
+    facets = ["facet normal 0 0 0\nouter loop\n" + "\n".join("vertex {} {} {}".format(*CORNERS[i]) for i in face) + "\nendloop\nendfacet" for face in FACES]
+    path.write_text("solid part\n" + "\n".join(facets) + "\nendsolid part\n")
+
+
+def write_binary_stl(path):
+    facets = b"".join(struct.pack("<12fH", 0, 0, 0, *CORNERS[list(face)].ravel(), 0) for face in FACES)
+    path.write_bytes(b"\0" * 80 + struct.pack("<I", len(FACES)) + facets)
+
+
+WRITERS = {"part.obj": write_obj, "part.stl": write_stl, "binary.stl": write_binary_stl}
+
+
+def triangles(corners, faces):
+    """Triangles as a set: each a set of corners given in m, as whole numbers of micrometres."""
+    return {frozenset(tuple(np.rint(1e6 * corners[i]).astype(int).tolist()) for i in face) for face in faces}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_mesh_of_a_file_has_its_faces_in_metres(name, tmp_path):
+    WRITERS[name](tmp_path / name)
+    look = jj.Visual.from_file(tmp_path / name, scale=0.001, at=(0.0, 0.0, 0.1), colour="#ff8000")
+    assert (look.kind, look.colour) == ("mesh", "#ff8000")
+    assert_allclose(look.position, [0.0, 0.0, 0.1])
+    assert triangles(look.faces.corners * np.asarray(look.size), look.faces.polygons) == triangles(0.001 * CORNERS, FACES)
+
+
+def test_a_mesh_in_the_visuals_of_a_scene_is_drawn_with_its_body(tmp_path):
+    write_stl(tmp_path / "part.stl")
+
+    class Falling(jj.Scene):
+        coordinates = jj.coordinates("z")
+
+        def bodies(self, t, q):
+            return {"part": jj.RigidBody(1.0, jnp.ones(3), jnp.stack([0.0 * q.z, 0.0 * q.z, q.z]), jj.rot_z(0.0 * q.z))}
+
+        def visuals(self, pose):
+            return {"part": jj.Visual.from_file(tmp_path / "part.stl", scale=0.001)}
+
+    motion = jj.simulate(Falling(), {"z": 1.0, "z_rate": -1.0}, ts=jnp.linspace(0.0, 1.0, 3))
+    page, numbers = contents(jj.show(motion).html)
+    (part,) = page["motions"][0]["bodies"]
+    (shape,) = part["shapes"]
+    drawn = numbers(shape["mesh"]).reshape(-1, 3)
+    assert triangles(drawn.astype(float), np.arange(12).reshape(4, 3)) == triangles(0.001 * CORNERS, FACES)
+    assert_allclose(numbers(part["p"]).reshape(-1, 3)[:, 2], [1.0, 0.5, 0.0], atol=1e-6)
+    jj.animate(motion, tmp_path / "fall.gif")
+    assert (tmp_path / "fall.gif").stat().st_size > 1000
+
+
+def test_a_file_without_a_mesh_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"cannot read a mesh from `.*gone\.stl`: there is no such file"):
+        jj.Visual.from_file(tmp_path / "gone.stl")
+    (tmp_path / "part.xyzw").write_text("1 2 3\n")
+    with pytest.raises(ValueError, match=r"cannot read a mesh from `.*part\.xyzw`: .*not supported.*; give a file such as \.stl or \.obj"):
+        jj.Visual.from_file(tmp_path / "part.xyzw")
+    (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\n")
+    with pytest.raises(ValueError, match=r"`.*points\.obj` holds no faces, expected a mesh"):
+        jj.Visual.from_file(tmp_path / "points.obj")

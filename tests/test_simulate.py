@@ -1,15 +1,16 @@
 """Simulation: right to tolerance in every state form, honest about how it ended, differentiable in every supported mode."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import Upright
 
 import jourdain_jax as jj
-from jourdain_jax.models import ChaplyginSleigh, DoublePendulumRods, Skate
+from jourdain_jax.models import MODELS, ChaplyginSleigh, DoublePendulumRods, Skate, TiltingDisc
 
 
 class Falling(Upright):
@@ -188,3 +189,129 @@ def test_a_reduction_by_privileged_speeds_too_light_for_the_precision_is_warned_
     lost = pulled(1e-30, by_wheel)  # the scaled row of the wheel hardly holds x: A_z is singular in 64-bit floats
     assert float(lost.q_end[0]) < 1e-3
     assert any("hardly determine the others, pivot 1.0e-15" in text for text in lost.warnings)
+
+
+@pytest.fixture(scope="module")
+def rolling():
+    return jj.simulate(TiltingDisc(), t1=1.0, ts=jnp.linspace(0.0, 1.0, 11))
+
+
+def test_named_access_reaches_coordinates_speeds_and_time(rolling):
+    assert_array_equal(rolling["lean"], rolling.q[:, 3])
+    assert_array_equal(rolling["spin_rate"], rolling.u[:, 4])
+    assert_array_equal(rolling["t"], rolling.ts)
+    with pytest.raises(KeyError, match="did you mean `lean`"):
+        rolling["laen"]
+
+
+def test_the_summary_prints_steps_drift_residuals_contact_and_result(rolling):
+    text = str(rolling)
+    for part in ("Trajectory of TiltingDisc", "reached the end", "Dopri8", "minimal", "drift", "velocity", "friction coefficient needed", "N"):
+        assert part in text
+    assert rolling._repr_html_().startswith(f"<pre>{text[:60]}")
+    assert "drift is not seen: one time was saved" in str(jj.simulate(rolling.scene, {"lean": 0.3}, ts=[0.1]))
+
+
+def test_the_path_of_a_point_is_where_the_body_says_it_is(rolling):
+    centre = np.asarray(rolling.point("disc"))
+    assert_allclose(centre[:, 2], 0.5 * np.cos(np.asarray(rolling["lean"])), atol=1e-14)
+    assert_array_equal(centre, rolling.motions()["disc"].position)
+    with pytest.raises(KeyError, match=r'`disc` is a body of `TiltingDisc`.*`motion\.point\("disc"\)`.*`motion\.motions\(\)\["disc"\]`'):
+        rolling["disc"]
+
+
+def test_a_motion_goes_on_from_the_end_of_another():
+    scene, start = TiltingDisc(), {"lean": 0.3, "spin_rate": 4.0}
+    first = jj.simulate(scene, start, t1=0.7)
+    second = jj.simulate(scene, first.end, ts=jnp.array([1.5]))
+    whole = jj.simulate(scene, start, t1=1.5)
+    assert float(second.ts[0]) == 1.5
+    assert_allclose(second.q[-1], whole.q_end, atol=2e-8)
+    assert_allclose(second.u[-1], whole.u_end, atol=2e-8)
+
+
+def test_the_end_is_the_state_at_an_event():
+    fallen = jj.simulate(TiltingDisc(), {"lean": 0.3}, t1=5.0)
+    assert fallen.event_names[int(fallen.event)] == "fallen"
+    assert float(fallen.end.t) == float(fallen.t_end) < 5.0
+    assert_allclose(fallen.end.q, fallen.q_end, atol=1e-12)
+
+
+SLEIGH, START, TS = jj.models.ChaplyginSleigh(), {"x_rate": 0.6, "heading_rate": 0.9}, np.array([0.5, 1.0])
+DATA = jj.Experiment(TS, {"x": np.array([0.3, 0.5])}, 0.01, start=START)
+
+
+def test_an_object_and_its_fields_by_name_ask_for_the_same_and_names_replace_fields():
+    coarse = jj.Options(rtol=1e-4, atol=1e-4, max_step=np.inf)
+    by_name = jj.simulate(SLEIGH, START, ts=TS, rtol=1e-4, atol=1e-4, max_step=np.inf)
+    mixed = jj.simulate(SLEIGH, START, ts=TS, options=jj.Options(rtol=1e-4, atol=1e-9), atol=1e-4, max_step=np.inf)
+    for motion in (jj.simulate(SLEIGH, START, ts=TS, options=coarse), mixed):
+        np.testing.assert_array_equal(motion.q, by_name.q)
+        assert int(motion.accepted) == int(by_name.accepted)
+    lanes = jj.rollout(SLEIGH, START | {"x_rate": np.array([0.6, 0.7])}, ts=TS, options=coarse)
+    assert int(lanes.lane(0).accepted) == int(by_name.accepted)
+    assert float(jj.log_likelihood(SLEIGH, DATA, options=coarse)) == float(jj.log_likelihood(SLEIGH, DATA, rtol=1e-4, atol=1e-4, max_step=np.inf))
+
+
+def test_options_are_a_tree_whose_numbers_may_be_traced():
+    def end(options):
+        return jj.simulate(SLEIGH, START, ts=TS, options=options, solver=jj.RadauIIA()).q_end
+
+    options = jj.Options(rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(jax.jit(end)(options), end(options), rtol=0, atol=1e-12)
+    assert len(jax.tree.leaves(jax.tree.map(jnp.asarray, options))) == 2
+
+
+def test_a_step_that_ends_a_little_before_a_saved_time_leaves_no_sliver():
+    motion = jj.simulate(MODELS["ball-on-turntable"]())  # ended at 4.9 of 10 s with a step size that shrank to nothing
+    assert int(motion.result) == results.SUCCESS
+    assert float(motion.t_end) == 10.0
+
+
+@pytest.mark.parametrize("solver", [diffrax.Bosh3(), jj.ImplicitMidpoint(step=0.01)])
+def test_any_solver_lands_on_the_saved_times(solver):
+    ts = jnp.array([0.11, 0.123, 0.3])
+    motion = jj.simulate(Falling(), {"x_rate": 2.0}, ts=ts, solver=solver, work=False)
+    assert int(motion.result) == results.SUCCESS
+    assert_allclose(motion["x"], 2.0 * ts, rtol=1e-12)
+
+
+def test_an_implicit_solver_serves_a_projected_scene():
+    scene = MODELS["double-pendulum-rods"]()
+    options = {"t1": 0.5, "rtol": 1e-8, "atol": 1e-8}
+    implicit, explicit = jj.simulate(scene, solver=diffrax.Kvaerno5(), **options), jj.simulate(scene, **options)
+    assert int(implicit.result) == results.SUCCESS
+    assert_allclose(implicit.q_end, explicit.q_end, atol=1e-6)
+
+
+def test_a_motion_starts_at_the_time_of_its_state():
+    start = jj.start(Falling(), t0=3.0, x_rate=1.0)
+    motion = jj.simulate(Falling(), start, t1=3.2)
+    assert float(motion.ts[0]) == 3.0
+    assert_allclose(motion.q_end[0], 0.2, rtol=1e-12)
+
+
+def test_a_start_given_by_names_says_how_far_it_was_moved():
+    motion = jj.simulate(MODELS["skate"](), {"heading": 0.5, "x_rate": 1.0}, t1=0.1)
+    assert_allclose(motion.moved_u, np.tan(0.5), rtol=1e-9)  # y_rate, from zero
+
+
+class Tied(jj.Scene):
+    """A bead at height z, tied to the origin by a rod and to the line y = 3: its default rod is too short to be assembled."""
+
+    mass: jnp.ndarray = jj.parameter(1.0, positive=True)
+    length: jnp.ndarray = jj.parameter(1.0, positive=True)
+    coordinates = jj.coordinates("x y z")
+    domain = {"x": (3.0, 6.0), "y": (2.0, 4.0)}
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(self.mass, q.array)}
+
+    def geometric_constraints(self, pose):
+        return {"rod": pose.q.x**2 + pose.q.y**2 - self.length**2, "line": pose.q.y - 3.0}
+
+
+def test_a_batch_is_probed_near_its_own_parameters():
+    lanes = jj.rollout(Tied(length=6.0), {"x": np.array([4.0, 5.2]), "z_rate": 1.0}, parameters={"length": np.array([5.0, 6.0])}, t1=0.5)
+    assert list(lanes.result) == [results.SUCCESS, results.SUCCESS]
+    assert_allclose(lanes.lanes.q_end, [[4.0, 3.0, 0.5], [np.sqrt(27.0), 3.0, 0.5]], atol=1e-9)

@@ -64,24 +64,14 @@ def test_privileged_velocities_say_that_they_do_not_apply_across_the_slope():
 
 def test_the_skate_drifts_across_the_slope():
     run = skate.RUN
-    scene = Skate(run["mass"], run["inertia"], run["slope"], run["gravity"])
-
-    def expected(times):  # passes heading 90 degrees, where x' is no privileged speed
-        motion = skate.motion(times, **run)
-        return {"x": motion["x"], "y": motion["y"], "heading": motion["th"]}
-
-    assert end_error(scene, {"heading_rate": run["th_rate"]}, expected, run["t_end"]) <= tolerance("closed_form")
+    scene = Skate(run["mass"], run["inertia"], run["slope"], run["gravity"])  # passes heading 90 degrees, where x' is no privileged speed
+    assert end_error(scene, {"heading_rate": run["th_rate"]}, skate.motion, run, "x y", heading="th") <= tolerance("closed_form")
 
 
 def test_a_moving_skate_follows_its_closed_form():
     run = skate.RUN | {"u0": 0.9, "th0": 0.4, "th_rate": -0.7}
     start = {"heading": 0.4, "x_rate": 0.9 * np.cos(0.4), "y_rate": 0.9 * np.sin(0.4), "heading_rate": -0.7}
-
-    def expected(times):
-        motion = skate.motion(times, **run)
-        return {"x": motion["x"], "y": motion["y"], "heading": motion["th"]}
-
-    assert end_error(Skate(), start, expected, run["t_end"]) <= tolerance("closed_form")
+    assert end_error(Skate(), start, skate.motion, run, "x y", heading="th") <= tolerance("closed_form")
 
 
 def test_the_sleighs_blade_obeys_the_reduced_equations():
@@ -100,9 +90,4 @@ def test_the_sleigh_turns_round_and_runs_straight(turn):
     run = chaplygin_sleigh.RUN | {"w0": turn}
     scene = ChaplyginSleigh(run["mass"], run["inertia"], run["a"])
     start = {"x_rate": run["v0"], "y_rate": run["a"] * turn, "heading_rate": turn}
-
-    def expected(times):
-        motion = chaplygin_sleigh.motion(times, **run)
-        return {"x": motion["x"], "y": motion["y"], "heading": motion["th"], "heading_rate": motion["w"]}
-
-    assert end_error(scene, start, expected, run["t_end"]) <= tolerance("closed_form")
+    assert end_error(scene, start, chaplygin_sleigh.motion, run, "x y", heading="th", heading_rate="w") <= tolerance("closed_form")

@@ -131,11 +131,4 @@ def test_a_search_of_one_step_says_that_it_did_not_arrive():
     assert float(found.residual) > 1e-4
 
 
-def test_wrong_names_are_answered_with_valid_ones():
-    with pytest.raises(ValueError, match="did you mean `lean`"):
-        steady(TiltingDisc(), GUESS, held=("leen",))
-    with pytest.raises(ValueError, match="did you mean `spin`"):
-        steady(TiltingDisc(), GUESS, moving=("spinn",))
-
-
 # Minutes of compilation, and not yet run together with the rest: kept out of the short run until it has been.

@@ -103,15 +103,6 @@ def test_a_motion_of_equal_steps_comes_back_with_its_inputs(tmp_path):
     assert_array_equal(loaded.inputs(0.3), [1.0, 0.0])
 
 
-def test_files_of_the_wrong_kind_are_refused_with_what_reads_them(files):
-    with pytest.raises(ValueError, match=r"holds a rollout, expected a trajectory; read it with `jj.load_rollout\(path, scene\)`"):
-        jj.load_trajectory(files / "rollout.npz", TiltingDisc)
-    with pytest.raises(ValueError, match=r"holds a trajectory, expected a rollout; read it with `jj.load_trajectory\(path, scene\)`"):
-        jj.load_rollout(files / "trajectory.npz", TiltingDisc)
-    with pytest.raises(ValueError, match="holds a rollout of `TiltingDisc`, expected `ChaplyginSleigh`"):
-        jj.load_rollout(files / "rollout.npz", ChaplyginSleigh)
-
-
 def test_a_field_that_cannot_be_stored_is_named(tmp_path):
     class Labelled(ChaplyginSleigh):
         labels: tuple = eqx.field(static=True, default=("a",))

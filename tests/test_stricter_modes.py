@@ -1,7 +1,9 @@
 """Modes of JAX that a user sets for their own code, and threads of their own, leave the package's results as they are."""
 
 import sys
+import traceback
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from threading import Barrier
 
 import jax
@@ -85,3 +87,101 @@ def test_numbers_of_extended_precision_are_rounded_and_complex_ones_named():
     assert all(scene.stiffness.dtype == np.float64 for scene in (Spring(stiffness=wide[1]), Spring().replace(stiffness=np.array(4.0, np.longdouble))))
     with pytest.raises(ValueError, match="`ts` of `Sampled` is of type complex256, expected real numbers"):
         jj.Sampled(wide.astype(np.clongdouble), wide)
+
+
+SKATE = jj.models.Skate()
+SPEEDS = jnp.array([0.5, 1.0])
+
+
+def _place(speed):
+    return jj.simulate(SKATE, {"x_rate": speed, "heading_rate": 0.7}, ts=[0.5]).q[0]
+
+
+def _converted(speed):
+    function, constants = jax.closure_convert(lambda x: _place(x * speed), 1.0)
+    return function(1.0, *constants)
+
+
+WAYS = {
+    "checkpoint": jax.vmap(jax.checkpoint(_place)),
+    "scan": lambda speeds: jax.lax.scan(lambda none, speed: (none, _place(speed)), None, speeds)[1],
+    "map": lambda speeds: jax.lax.map(_place, speeds, batch_size=2),
+    "cond": jax.vmap(lambda speed: jax.lax.cond(speed > 0.0, _place, lambda speed: jnp.zeros(3), speed)),
+    "closure_convert": jax.vmap(_converted),
+}
+
+
+@pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+def test_values_and_gradients(way):
+    def both(function):
+        found, back = jax.vjp(function, SPEEDS)
+        return found, back(jnp.sin(found))[0]
+
+    for found, expected in zip(jax.jit(both, static_argnums=0)(way), jax.jit(both, static_argnums=0)(jax.vmap(_place)), strict=True):
+        assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_with_floats_checked():
+    with jax.debug_nans(True):
+        assert_allclose(jax.jit(_place)(1.0), _place(1.0), rtol=1e-12)
+
+
+class Slider(jj.Scene):
+    """A bead on a plane whose load has a mistake."""
+
+    coordinates = jj.coordinates("x y")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.point_force(motion["bead"].point(), self.pull(motion)),)
+
+
+class WrongShapes(Slider):
+    """Its mistake is noticed by JAX."""
+
+    def pull(self, motion):
+        return jnp.ones((3, 4)) @ jnp.ones(3)  # the mistake
+
+
+class WrongName(Slider):
+    """Its mistake is noticed by the package."""
+
+    def pull(self, motion):
+        return motion.q.z * jnp.ones(3)  # the mistake
+
+
+def lines(error) -> list[str]:
+    """The lines of the traceback below the one that called, without those of what wraps public functions (in tests, jaxtyping too)."""
+    wrappers = (str(Path("scene", "tracebacks.py")), str(Path("jaxtyping", "_decorator.py")))
+    return [frame.line for frame in traceback.extract_tb(error.__traceback__)[1:] if not frame.filename.endswith(wrappers)]
+
+
+@pytest.mark.parametrize("scene", [WrongShapes(), WrongName()], ids=["noticed by JAX", "noticed here"])
+@pytest.mark.parametrize("call", [lambda s: jj.simulate(s, {}, t1=1.0), jj.report, lambda s: jj.start(s, x=0.1)], ids=["simulate", "report", "start"])
+def test_the_traceback_of_a_mistake_in_a_method_shows_the_lines_of_its_author(scene, call):
+    with pytest.raises((TypeError, AttributeError)) as caught:
+        call(scene)
+    shown = lines(caught.value)
+    assert shown[-1].endswith("# the mistake")
+    assert shown[-2].startswith("return (jj.point_force")
+    assert len(shown) <= 3  # with a lambda above
+    assert any("JAX_TRACEBACK_FILTERING=off shows them" in note for note in caught.value.__notes__)
+
+
+def test_all_lines_are_shown_where_jax_is_told_to_show_its_own():
+    before = jax.config.jax_traceback_filtering
+    jax.config.update("jax_traceback_filtering", "off")
+    try:
+        with pytest.raises(AttributeError) as caught:
+            jj.simulate(WrongName(), {}, t1=1.0)
+    finally:
+        jax.config.update("jax_traceback_filtering", before)
+    assert len(lines(caught.value)) > 10
+
+
+def test_errors_of_the_package_itself_keep_their_lines():
+    with pytest.raises(ValueError, match="no coordinate or speed `z`") as caught:
+        jj.simulate(jj.models.Skate(), {"z": 1.0}, t1=1.0)
+    assert len(lines(caught.value)) > 2

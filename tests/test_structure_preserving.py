@@ -127,13 +127,6 @@ def test_midpoint_rules_keep_a_quadratic_integral(solver):
     assert 1e-6 < change(oscillator, solver, energy_of(oscillator), 0.2) < 0.1  # which they do not keep
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "step"), [("free-rigid-body", 0.02), ("chaplygin-sleigh", 0.02), ("tilting-disc", 0.01)])
-def test_the_discrete_gradient_keeps_the_energy_of_models(name, step):
-    scene = MODELS[name]()
-    assert change(scene, GRADIENT, energy_of(scene), step) < tolerance("round_off")
-
-
 def test_a_gauge_changes_no_motion_but_that_of_the_discrete_lagrangian():
     oscillator, twin = ContactOscillator(), GaugeTwin()
     start = jj.start(oscillator, **oscillator.example)
@@ -215,25 +208,3 @@ def test_reversed_time_is_what_projections_and_events_are_given():
     assert int(back.result) == results.EVENT
     assert_allclose(back.t_end, 0.5, rtol=1e-12)
     assert_allclose(back.q_end[0], 0.3 * np.sin(1.0), rtol=0, atol=1e-9)  # the prescribed pivot
-
-
-WRONG = {
-    "jj.ImplicitMidpoint(step=0.0)": r"`step` of `ImplicitMidpoint` is 0, expected a positive finite length of steps in s",
-    "jj.simulate(oscillator, max_step=0.1, solver=jj.ImplicitMidpoint(step=0.2))": r"whose steps are at most as long as its `step`: jj.ImplicitMidpoint\(step=",
-    "jj.DiscreteLagrangeDAlembert('midpiont', step=0.1)": r"unknown rule `midpiont` of `DiscreteLagrangeDAlembert`; did you mean `midpoint`",
-    "jj.simulate(oscillator, solver=jj.DiscreteLagrangeDAlembert(step=0.1), formulation=jj.Formulation('minimal'))": r"leave the `state` of its `Formulation`",
-    "jj.simulate(model('free-rigid-body'), solver=jj.DiscreteLagrangeDAlembert(step=0.1))": (
-        r"does not apply to `FreeRigidBody`: its speeds are quasi-velocities or angular velocities.*; use solver=jj.ImplicitMidpoint\(step="
-    ),
-    "jj.simulate(model('isokinetic-particle'), solver=jj.DiscreteLagrangeDAlembert(step=0.1))": r"its rows are nonlinear in the speeds",
-    "jj.simulate(DrivenPendulum(), solver=jj.DiscreteGradient(step=0.1))": r"does not apply to `DrivenPendulum`: its T \+ V is not constant",
-    "jj.simulate(model('double-pendulum-rods'), solver=jj.DiscreteGradient(step=0.1))": r"its geometric rows would have to be projected",
-    "jj.simulate(model('skate'), solver=jj.DiscreteGradient(step=0.1))": r"needs the minimal state \(`jj.Formulation\('minimal'\)` keeps to the privileged",
-}
-
-
-@pytest.mark.parametrize("call", WRONG)
-def test_a_method_that_does_not_apply_says_so_and_what_to_do(call):
-    names = {"jj": jj, "oscillator": ContactOscillator(), "model": lambda name: MODELS[name](), "DrivenPendulum": DrivenPendulum}
-    with pytest.raises(ValueError, match=WRONG[call]):
-        eval(call, names)

@@ -68,9 +68,20 @@ def test_every_lane_is_the_motion_that_simulate_gives(whole):
     assert "stopped at an event" in str(whole.lane(int(fell[0])))
 
 
-def test_a_lane_shows_outputs_that_are_called_as_what_it_starts_with(tmp_path):
-    found = jj.Study(jj.models.TiltingDisc(), start={"lean": [0.1, 0.2]}).run(tmp_path / "d.zarr", t1=0.1, outputs={"lean": jj.End("lean")}, progress=False)
+def test_a_lane_shows_outputs_that_are_called_as_what_it_starts_with_and_what_never_has_a_value_has_no_statistics(tmp_path):
+    outputs = {"lean": jj.End("lean"), "never": jj.EventTime("fallen")}
+    found = jj.Study(jj.models.TiltingDisc(), start={"lean": [0.1, 0.2]}).run(tmp_path / "d.zarr", t1=0.1, outputs=outputs, progress=False)
+    assert np.isnan([found.mean("never"), *found.quantile("never", 0.5)]).all()
     assert f"  lean = {float(found.to_xarray()['lean'][1]):.6g}" in str(found.lane(1)).splitlines()
+
+
+@pytest.mark.parametrize("level", [0.0, 0.025, 0.5, 0.975, 0.9999, 1.0])
+def test_a_quantile_lies_within_its_stated_limits(whole, level):
+    for name in ("final lean", "fall time", "distance"):
+        own = np.sort(whole.to_xarray()[name].values)
+        own = own[np.isfinite(own)]
+        low, high = whole.quantile(name, level)
+        assert low <= own[max(1, int(np.ceil(level * own.size))) - 1] <= high
 
 
 def test_the_bars_of_a_yes_and_a_no_are_equally_wide(whole):
@@ -90,6 +101,8 @@ def test_a_failed_lane_is_named_and_left_out_of_statistics(whole):
     assert whole.mean("distance") == pytest.approx(own.mean(), rel=1e-13)
     assert whole.deviation("distance") == pytest.approx(own.std(ddof=1), rel=1e-12)
     assert whole.statistics.lanes[0, 0] == COUNT - 1
+    values = [np.delete(arrays[name].values, BAD) for name in ("final lean", "distance")]
+    assert whole.statistics.covariance[0, 4] == pytest.approx(np.cov(*values)[0, 1], rel=1e-9)
     assert f"failed: lanes {BAD}" in str(whole)
     with pytest.raises(ValueError, match="radius"):
         whole.lane(BAD).simulate()
@@ -121,19 +134,6 @@ def test_netcdf_holds_the_same(whole, tmp_path):
 def test_chunks_do_not_change_a_bit(whole, chunk, tmp_path):
     assert whole.store.chunk == 32
     assert_same(discs().run(tmp_path / "discs.zarr", outputs=OUTPUTS, chunk=chunk, **ASKED), whole)
-
-
-def test_shares_of_several_machines_make_one_study(whole, tmp_path):
-    study = discs()
-    folders = [tmp_path / f"share{k}" for k in (1, 2, 3)]
-    parts = [study.run(folder, outputs=OUTPUTS, shard=(k, 3), **ASKED) for k, folder in enumerate(folders, start=1)]
-    assert not any(part.complete for part in parts)
-    assert "run it again" in str(parts[0])
-    assert_same(jj.merge_studies(folders[0], folders[1:]), whole)
-    vary = study.vary | {"radius": study.vary["radius"] + 0.01}
-    other = jj.Study(study.scene, vary, study.start).run(tmp_path / "other", outputs=OUTPUTS, **ASKED)
-    with pytest.raises(ValueError, match="no share"):
-        jj.merge_studies(folders[0], [other.store.path])
 
 
 def test_statistics_need_no_lanes(whole, tmp_path):

@@ -136,23 +136,6 @@ def test_errors_of_a_sleigh_fall_with_the_tolerance_and_steps_with_the_order():
     assert steps[-1] / steps[0] == pytest.approx(10 ** (7 / 10), rel=0.15)
 
 
-def test_a_disc_rolls_to_where_its_extended_precision_motion_does():
-    from oracles import rolling_disc
-
-    run = rolling_disc.RUN
-    scene = jj.models.TiltingDisc(mass=run["mass"], radius=run["radius"], gravity=run["gravity"])
-    start = {name: run[name] for name in ("lean", "yaw_rate", "lean_rate", "spin_rate")}
-    times = np.linspace(0.0, 4.0, 33)
-    theta = np.pi / 2 + run["lean"]
-    own = {"theta": theta, "w1": run["lean_rate"], "w2": run["yaw_rate"] * np.sin(theta), "w3": -run["spin_rate"] + run["yaw_rate"] * np.cos(theta)}
-    true = rolling_disc.motion(times, mass=run["mass"], radius=run["radius"], gravity=run["gravity"], **own)
-    motion = jj.simulate(scene, start, ts=times, rtol=1e-11, atol=1e-11, solver=jj.Taylor())
-    assert int(motion.result) == 0
-    assert int(motion.accepted) < 80  # steps do not end at times to save
-    assert_allclose(motion["lean"], true["theta"] - np.pi / 2, atol=1e-9)
-    assert_allclose(motion["yaw"], true["psi"], atol=1e-9)
-
-
 @pytest.mark.parametrize("span", [2.0, -2.0])
 def test_motions_with_projection_and_work_are_those_of_dopri8(span):
     scene = jj.models.MODELS["double-pendulum-rods"]()
@@ -176,16 +159,6 @@ def test_a_disc_that_falls_stops_where_it_does_by_dopri8():
     assert_allclose(ours.q_end, theirs.q_end, rtol=1e-9, atol=1e-10)
     assert_array_equal(np.isnan(ours.q), np.isnan(theirs.q))
     assert_allclose(ours.q, theirs.q, rtol=1e-9, atol=1e-10)
-
-
-def test_lanes_of_a_rollout_end_each_for_itself():
-    lean = jnp.asarray([0.1, 0.3, jnp.nan, 1.2, 0.2, 0.7, jnp.inf, 0.5, -0.4])
-    starts = {"lean": lean, "spin_rate": jnp.linspace(-4.0, 0.0, 9)}
-    ours, theirs = (jj.rollout(DISC, starts, ts=[0.25, 0.5, 1.0], solver=solver) for solver in (jj.Taylor(), diffrax.Dopri8()))
-    assert_array_equal(ours.result, theirs.result)
-    assert_allclose(ours.lanes.q, theirs.lanes.q, rtol=1e-6, atol=1e-6)
-    alone = jj.rollout(DISC, {name: x[1:2] for name, x in starts.items()}, ts=[0.25, 0.5, 1.0], solver=jj.Taylor())
-    assert_array_equal(alone.lanes.q[0], ours.lanes.q[1])
 
 
 @pytest.mark.parametrize(

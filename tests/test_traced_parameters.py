@@ -4,7 +4,6 @@ What holds of a scene is found before anything is compiled, at numbers that stan
 default, where rows are dependent, a coordinate does not matter, or nothing does work, and are given generic ones; or the other way round.
 """
 
-from dataclasses import fields
 
 import diffrax
 import jax
@@ -16,7 +15,6 @@ from numpy.testing import assert_allclose
 from small_scenes import OnPlane, Upright
 
 import jourdain_jax as jj
-from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.models import ChaplyginSleigh
 
 
@@ -95,19 +93,6 @@ def sliding(**parameters):
     return motion.q_end, motion.result
 
 
-def test_parameters_with_defaults_may_be_traced():
-    def end(mass, offset):
-        scene = ChaplyginSleigh(mass=mass, offset=offset)
-        return jj.simulate(scene, {"x_rate": 0.6, "heading_rate": 0.9}, **OPTIONS).q_end
-
-    numbers = (jnp.array([0.7, 2.0]), jnp.array([0.1, 0.9]))
-    alone = np.stack([end(m, a) for m, a in zip(*numbers, strict=True)])
-    assert_allclose(jax.jit(jax.vmap(end))(*numbers), alone, atol=1e-9)
-    gradient = jax.jit(jax.grad(lambda m: end(m, 0.1)[2]))(0.7)
-    difference = (end(0.7 + 1e-5, 0.1)[2] - end(0.7 - 1e-5, 0.1)[2]) / 2e-5
-    assert_allclose(gradient, difference, rtol=1e-5)
-
-
 def test_parameters_without_defaults_may_be_traced():
     def end(mass, upper, lower):
         scene = Hanging(mass=mass, upper=upper, lower=lower)
@@ -137,20 +122,6 @@ def test_defaults_at_which_rows_are_dependent_do_not_decide_for_traced_parameter
     assert_allclose(many, np.stack([q, q]), atol=1e-9)
     assert codes.tolist() == [results.SUCCESS] * 2
     assert_allclose(jax.jacrev(lambda front, rear: sliding(front=front, rear=rear)[0], (0, 1))(0.3, 0.5), np.zeros((2, 3)), atol=1e-9)
-
-
-def test_traced_parameters_at_which_rows_become_dependent_are_flagged_or_right():
-    _, code = sliding(front=0.3, rear=0.3)
-    assert int(code) == results.SUCCESS
-    for same in (0.3, -0.2):
-        q, code = jax.jit(lambda front, rear: sliding(front=front, rear=rear))(same, same)
-        if int(code) == results.SUCCESS:
-            assert_allclose(q, sliding(front=same, rear=same)[0], atol=1e-8)
-        else:
-            assert int(code) == results.SINGULAR_PARTITION
-    lanes, codes = jax.vmap(lambda rear: sliding(front=0.3, rear=rear))(jnp.array([0.3, 0.5]))
-    assert int(codes[1]) == results.SUCCESS
-    assert_allclose(lanes[1], sliding(front=0.3, rear=0.5)[0], atol=1e-9)
 
 
 def test_defaults_at_which_a_coordinate_does_not_matter_do_not_decide_for_traced_parameters():
@@ -185,20 +156,6 @@ def test_a_blade_under_the_mass_centre_is_flagged_where_another_offset_was_expec
         assert int(code) == results.SINGULAR_PARTITION
 
 
-@pytest.mark.parametrize("kind", [TwoBlades, Hanging])
-def test_stand_ins_of_parameters_with_equal_defaults_differ(kind):
-    names = [field.name for field in fields(kind) if field.init]
-    seen = {}
-
-    def look(*values):
-        seen["scene"] = with_reference_parameters(kind(**dict(zip(names, values, strict=True))))
-        return 0.0
-
-    jax.eval_shape(look, *np.ones(len(names)))
-    numbers = [float(x) for x in jax.tree.leaves(seen["scene"])]
-    assert len(set(numbers)) == len(names)
-
-
 def test_a_program_made_where_rows_do_no_work_is_not_taken_where_they_do():
     still, blown = (jj.simulate(Slope(slope=0.7, wind=wind), {"x": 0.5}, **OPTIONS) for wind in (0.0, 1.3))
     assert still.work is None
@@ -215,9 +172,3 @@ def test_a_start_that_is_known_is_put_onto_the_rows_while_other_numbers_are_trac
     of_tolerance = jax.jit(lambda rtol: jj.simulate(skate, start, t1=t1, rtol=rtol, solver=diffrax.Dopri8()).q_end)
     for found in (of_time(t1), within(t1), of_tolerance(1e-10)):
         assert_allclose(found, alone, rtol=1e-7)
-
-
-def test_a_traced_tolerance_needs_a_solver():
-    skate = jj.models.Skate()
-    with pytest.raises(ValueError, match=r"`rtol` is traced, .* give a `solver` too"):
-        jax.jit(lambda rtol: jj.simulate(skate, t1=0.5, rtol=rtol).q_end)(1e-8)

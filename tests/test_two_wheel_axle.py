@@ -43,28 +43,12 @@ def test_the_accelerations_obey_appells_equations_64(method):
 @every_method
 @pytest.mark.parametrize("turn_rate", [two_wheel_axle.RUN["phi_rate"], 0.0], ids=["turning", "straight"])
 def test_the_motion_is_the_closed_form(method, turn_rate):
-    run = two_wheel_axle.RUN | {"phi_rate": turn_rate}
+    run = two_wheel_axle.RUN | {"phi_rate": turn_rate, "y1": 0.0}
     scene = method(**{name: run[name] for name in ("radius", "length", "mass", "rim_mass", "slope", "gravity")})
     _, rolling, turning = NAMES[method]
     start = {"y2": run["length"], rolling: run["psi1_rate"], turning: turn_rate}
-
-    def expected(times):
-        motion = two_wheel_axle.motion(times, **run, y1=0.0)
-        compared = ("x1", "psi1", "x2", "psi2", "y2") if turn_rate == 0.0 else ("x1", "y1", "psi1", "x2", "y2", "psi2")
-        return {name: motion[name] for name in compared} | {rolling: motion["psi1_rate"], turning: motion["phi_rate"]}
-
-    assert end_error(scene, start, expected, run["t_end"]) <= tolerance("closed_form")
-
-
-@pytest.mark.parametrize("method", [TwoWheelAxleFree, TwoWheelAxleRedundant, TwoWheelAxleCoordinates])
-def test_each_wheel_carries_its_own_weight(method):
-    # from the height rows of the free bodies, from Newton's equation where the height is in the coordinates
-    scene = method(**PARAMETERS)
-    forces = jj.simulate(scene, ts=jnp.linspace(0.0, 1.0, 5)).contact_forces()
-    weight = scene.mass * scene.gravity * jnp.cos(scene.slope)
-    assert set(forces) == {"wheel1", "wheel2"}
-    for wheel, force in forces.items():
-        assert relative_error(force.normal, jnp.full(5, weight)) <= ROUND_OFF, wheel
+    columns = {rolling: "psi1_rate", turning: "phi_rate"} | ({"y1": "y1"} if turn_rate else {})
+    assert end_error(scene, start, two_wheel_axle.motion, run, "x1 psi1 x2 y2 psi2", **columns) <= tolerance("closed_form")
 
 
 def _rank_of_eleven_rows(heading, without=None):

@@ -95,99 +95,73 @@ def test_a_potential_that_does_not_give_the_force_is_found_at_its_load():
     assert failed(found) == {"potentials", "energy"}
 
 
-@pytest.mark.parametrize(
-    "energy",
-    [
-        with_slope(lambda x: 2.0 * x**2, lambda x, dx: 2.2 * x * dx),  # wrong by a factor
-        lambda x: 2.0 * jax.lax.stop_gradient(x) * x,  # part of it is missing
-        lambda x: jnp.abs(x - 1.1),  # a kink just here
-        lambda x: jnp.sqrt((x - 1.1) ** 2),  # its gradient is not a number here
-        lambda x: jnp.floor(10 * (x - 1.1)),  # a step just here
-    ],
-    ids=["wrong factor", "stopped gradient", "kink", "not a number", "step"],
-)
-def test_a_potential_without_the_right_gradient_is_found(energy):
-    refused(statements(*wrong(potential=lambda self, pose: energy(pose["bead"].position[0]))), "derivatives", "the scene's `potential`")
+PUSH = with_slope(lambda x: 1.0 + 0.3 * jnp.sin(x), lambda x, dx: 0.3 * jnp.sin(x) * dx)
+BRAKE = with_slope(lambda u: -jnp.tanh(u), lambda u, du: -du)  # right at rest
+ACROSS = with_slope(lambda x: jnp.stack([-jnp.sin(x), jnp.cos(x), 0 * x]), lambda x, dx: 0.5 * jnp.stack([-jnp.cos(x), -jnp.sin(x), 0 * x]) * dx)
+LENGTH = with_slope(lambda d: jnp.sqrt(d @ d), lambda d, dd: jnp.array([1.0, 0.7, 1.0]) * d @ dd / jnp.sqrt(d @ d))
+BENT = with_slope(jnp.sin, lambda x, dx: 0.9 * jnp.cos(x) * dx)
 
 
-def test_a_force_with_a_wrong_derivative_is_found_at_its_load_and_body():
-    push = with_slope(lambda x: 1.0 + 0.3 * jnp.sin(x), lambda x, dx: 0.3 * jnp.sin(x) * dx)
-
-    def loads(self, motion):
-        along = jnp.stack([push(motion.q.bead_x), 0.2 * push(motion.u.x_rate), 0.0 * motion.t])
-        return (*Sledge.loads(self, motion), jj.point_force(motion["bead"].point(), along))
-
-    found = jj.verify(*wrong(loads=loads))
-    refused(found, "derivatives", "load 4 (on `bead`): its force on `bead`")
-    assert failed(found) == {"derivatives", "differences"}
+def energy(of):
+    return {"potential": lambda self, pose: of(pose["bead"].position[0])}, "derivatives", "the scene's `potential`"
 
 
-def test_a_generalized_force_with_a_wrong_derivative_is_found_at_its_speed():
-    brake = with_slope(lambda u: -jnp.tanh(u), lambda u, du: -du)
-    found = wrong(loads=lambda self, motion: (jj.generalized_force(motion, yaw_rate=brake(motion.u.yaw_rate)),))
-    refused(statements(*found), "derivatives", "its force on `yaw_rate`")
+def inertia(entries, sentence="body `sledge`"):
+    entries = tuple(map(tuple, entries))
+    return {"inertia": lambda self: jnp.array(entries)}, "inertia", sentence
+
+
+def bead(mass, x):
+    return {"bodies": lambda self, t, q: Sledge.bodies(self, t, q) | {"bead": jj.Particle(mass, jnp.stack([x(q.bead_x), q.bead_y, 0.0 * q.x]))}}
+
+
+def stretched(self, t, q):
+    sledge = Sledge.bodies(self, t, q)["sledge"]
+    return Sledge.bodies(self, t, q) | {"sledge": jj.RigidBody(sledge.mass, sledge.inertia, sledge.position, 1.1 * sledge.orientation)}
+
+
+def pushed(self, motion):
+    along = jnp.stack([PUSH(motion.q.bead_x), 0.2 * PUSH(motion.u.x_rate), 0.0 * motion.t])
+    return (*Sledge.loads(self, motion), jj.point_force(motion["bead"].point(), along))
+
+
+NEGATIVE = "body `sledge`: a principal moment of inertia is negative"
+WRONG = {  # methods of the sledge, the check that must fail, and what it must name
+    "a factor of a potential": energy(with_slope(lambda x: 2.0 * x**2, lambda x, dx: 2.2 * x * dx)),
+    "a potential with a stopped gradient": energy(lambda x: 2.0 * jax.lax.stop_gradient(x) * x),
+    "a kink just here": energy(lambda x: jnp.abs(x - 1.1)),
+    "a gradient that is not a number here": energy(lambda x: jnp.sqrt((x - 1.1) ** 2)),
+    "a step just here": energy(lambda x: jnp.floor(10 * (x - 1.1))),
+    "a force": ({"loads": pushed}, "derivatives", "load 4 (on `bead`): its force on `bead`"),
+    "a generalized force": (
+        {"loads": lambda self, motion: (jj.generalized_force(motion, yaw_rate=BRAKE(motion.u.yaw_rate)),)},
+        "derivatives",
+        "its force on `yaw_rate`",
+    ),
+    "the drift of a velocity row": ({"blade": lambda self, motion: motion["sledge"].velocity @ ACROSS(motion.q.yaw)}, "derivatives", "row `blade`"),
+    "the gradient of a geometric row": ({"bar": lambda self, a, b: LENGTH(b - a) - 0.9}, "derivatives", "row `bar`"),
+    "a pose": (bead(0.3, BENT), "derivatives", "body `bead`: its position"),
+    "an inertia that is not symmetric": inertia([[0.2, 0.05, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 0.4]], "body `sledge`: its inertia is not symmetric"),
+    "a negative moment": inertia([[0.2, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, -0.1]], NEGATIVE),
+    "a large product of inertia": inertia([[0.2, 0.5, 0.0], [0.5, 0.3, 0.0], [0.0, 0.0, 0.4]], NEGATIVE),
+    "an inertia that is not a number": inertia([[0.2, 0.0, 0.0], [0.0, jnp.nan, 0.0], [0.0, 0.0, 0.4]]),
+    "a negative mass": (bead(-0.3, lambda x: x), "inertia", "body `bead`: its mass is negative"),
+    "an orientation that is no rotation": ({"bodies": stretched}, "inertia", "body `sledge`: its orientation is no rotation matrix"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_what_is_wrong_is_found_where_it_is(what):
+    methods, check, culprit = WRONG[what]
+    refused(statements(*wrong(**methods)), check, culprit)
 
 
 def test_without_an_example_a_scene_is_checked_in_motion():
-    brake = with_slope(lambda u: -jnp.tanh(u), lambda u, du: -du)  # right at rest
-
     class Slider(OnLine):
         def loads(self, motion):
-            return (jj.generalized_force(motion, x_rate=brake(motion.u.x_rate)),)
+            return (jj.generalized_force(motion, x_rate=BRAKE(motion.u.x_rate)),)
 
     refused(jj.verify(Slider()), "derivatives", "its force on `x_rate`")
-
-
-def test_a_velocity_row_with_a_wrong_drift_is_found_by_name():
-    turned = with_slope(lambda x: jnp.stack([-jnp.sin(x), jnp.cos(x), 0 * x]), lambda x, dx: 0.5 * jnp.stack([-jnp.cos(x), -jnp.sin(x), 0 * x]) * dx)
-    found = wrong(blade=lambda self, motion: motion["sledge"].velocity @ turned(motion.q.yaw))
-    refused(jj.verify(*found), "derivatives", "row `blade`")
-
-
-def test_a_geometric_row_with_a_wrong_gradient_is_found_by_name():
-    length = with_slope(lambda d: jnp.sqrt(d @ d), lambda d, dd: jnp.array([1.0, 0.7, 1.0]) * d @ dd / jnp.sqrt(d @ d))
-    found = wrong(bar=lambda self, a, b: length(b - a) - 0.9)
-    refused(statements(*found), "derivatives", "row `bar`")
-
-
-def test_a_pose_with_a_wrong_derivative_is_found_at_its_body():
-    bent = with_slope(jnp.sin, lambda x, dx: 0.9 * jnp.cos(x) * dx)
-
-    def bodies(self, t, q):
-        found = Sledge.bodies(self, t, q)
-        return found | {"bead": jj.Particle(0.3, jnp.stack([bent(q.bead_x), q.bead_y, 0.0 * q.x]))}
-
-    refused(statements(*wrong(bodies=bodies)), "derivatives", "body `bead`: its position")
-
-
-@pytest.mark.parametrize(
-    ("inertia", "sentence"),
-    [
-        ([[0.2, 0.05, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 0.4]], "body `sledge`: its inertia is not symmetric"),
-        ([[0.2, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, -0.1]], "body `sledge`: a principal moment of inertia is negative"),
-        ([[0.2, 0.5, 0.0], [0.5, 0.3, 0.0], [0.0, 0.0, 0.4]], "body `sledge`: a principal moment of inertia is negative"),
-        ([[0.2, 0.0, 0.0], [0.0, jnp.nan, 0.0], [0.0, 0.0, 0.4]], "body `sledge`"),
-    ],
-)
-def test_an_inertia_that_no_body_has_is_found_at_its_body(inertia, sentence):
-    entries = tuple(map(tuple, inertia))
-    refused(statements(*wrong(inertia=lambda self: jnp.array(entries))), "inertia", sentence)
-
-
-def test_a_negative_mass_is_found_at_its_body():
-    def bodies(self, t, q):
-        return Sledge.bodies(self, t, q) | {"bead": jj.Particle(-0.3, jnp.stack([q.bead_x, q.bead_y, 0.0 * q.x]))}
-
-    refused(statements(*wrong(bodies=bodies)), "inertia", "body `bead`: its mass is negative")
-
-
-def test_an_orientation_that_is_no_rotation_is_found_at_its_body():
-    def bodies(self, t, q):
-        sledge = Sledge.bodies(self, t, q)["sledge"]
-        stretched = jj.RigidBody(sledge.mass, sledge.inertia, sledge.position, 1.1 * sledge.orientation)
-        return Sledge.bodies(self, t, q) | {"sledge": stretched}
-
-    refused(statements(*wrong(bodies=bodies)), "inertia", "body `sledge`: its orientation is no rotation matrix")
 
 
 def test_the_result_for_machines_has_no_numbers_that_json_lacks():

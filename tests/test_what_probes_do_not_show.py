@@ -10,7 +10,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
-from jourdain_jax.models import ChaplyginSleigh
 
 KNOTS = jnp.linspace(-3.0, 3.0, 7)
 
@@ -31,23 +30,6 @@ class Plane(jj.Scene):
 def ends(scene, start, **options):
     """Of the lowered and of the dense motion."""
     return [jj.simulate(scene, start, t1=1.0, rtol=1e-9, atol=1e-9, backend=backend, **options).q_end for backend in ("auto", "dense")]
-
-
-class Limited(Plane):
-    """Two look-ups whose operands are equal until a limit, beyond all probes, is reached."""
-
-    limit: object = jj.parameter(5.0)
-
-    def loads(self, motion):
-        force = lambda x: -looked_up(x)  # noqa: E731
-        x = motion.q.x
-        return (jj.generalized_force(motion, x_rate=force(x), y_rate=force(jnp.clip(x, -self.limit, self.limit))),)
-
-
-def test_calls_whose_operands_are_equal_at_the_probes_only_stay_two():
-    scene = Limited()
-    assert len(jj.lower(scene).graph.calls(jj.lower(scene).ydot)) == 2
-    assert_allclose(*ends(scene.replace(limit=0.2), {"x": 1.8}), atol=1e-8)
 
 
 class Fading(Plane):
@@ -149,27 +131,6 @@ def test_operands_are_compared_relative_to_their_size():
     assert_allclose(*ends(Small(), {"x": 1.0}), atol=1e-8)
 
 
-class Belt(ChaplyginSleigh):
-    """Beside the sleigh a particle is carried along where x > 10, by a row."""
-
-    coordinates = jj.coordinates("x y heading px py")
-
-    def bodies(self, t, q):
-        return super().bodies(t, q) | {"particle": jj.Particle(1.0, jnp.stack([q.px, q.py, 0.0 * q.x]))}
-
-    def velocity_constraints(self, motion):
-        return super().velocity_constraints(motion) | {"belt": motion.u.py_rate - jnp.where(motion.q.px > 10.0, 1.0, 0.0)}
-
-    def invariants(self, motion):
-        return {}
-
-
-def test_a_branch_in_a_row_is_not_lost():
-    lowered, dense = ends(Belt(), {"px": 11.0, "px_rate": 1.0, "heading_rate": 0.9, "x_rate": -0.6})
-    assert_allclose(lowered, dense, atol=1e-7)
-    assert lowered[4] == pytest.approx(1.0)
-
-
 @jax.custom_jvp
 def half_as_steep(x):
     return jnp.sin(x)
@@ -206,18 +167,6 @@ class Sorted(Plane):
 def test_every_call_says_why_it_is_one():
     assert all(jj.lower(Sorted()).calls)
     assert ";  has" not in jj.report(Sorted()).lowering
-
-
-class Random(Plane):
-    """A load that draws a number."""
-
-    def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=motion.q.x * jax.random.normal(jax.random.key(0))),)
-
-
-def test_a_load_that_draws_numbers_is_refused_by_name():
-    with pytest.raises(ValueError, match="draws random numbers"):
-        jj.simulate(Random(), {"x": 1.0}, t1=1.0)
 
 
 class Oscillator(Plane):

@@ -1,8 +1,6 @@
 """The work-precision charts: what a record holds, how an error is judged, and what is said of peers that are not installed."""
 
-import importlib
 import json
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,9 +13,6 @@ from work_precision_cases import curve, disc_body, measure, peer_exudyn, peer_he
 from work_precision_cases.problems import PROBLEMS
 
 SLEIGH, DISC = PROBLEMS["chaplygin-sleigh"], PROBLEMS["tilting-disc"]
-EIGHT = (
-    "tilting-disc", "chaplygin-sleigh", "rattleback", "whipple-bicycle", "two-wheel-axle", "ball-on-turntable", "snakeboard", "trailer-chain",
-)  # fmt: skip
 
 
 def _exact_sleigh():
@@ -33,10 +28,6 @@ def _without_end(run):
 
 def _constant(y):
     return lambda problem: curve.Prepared(lambda setting: y, lambda raw: curve.Solved(y=raw, steps=1.0))
-
-
-def test_the_eight_problems_are_there():
-    assert tuple(PROBLEMS) == EIGHT
 
 
 def test_the_error_of_the_sleigh_is_its_distance_from_the_closed_form():
@@ -103,14 +94,6 @@ def test_peers_that_are_not_installed_are_skipped_with_a_message(monkeypatch, mo
         assert ready is None
     assert said
     assert all("not measured" in text and word in text for text in said)
-
-
-def test_importing_a_peer_that_is_not_there_leaves_its_module_usable(monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco", None)  # `import mujoco` raises ImportError
-    monkeypatch.delitem(sys.modules, "work_precision_cases.peer_mujoco")
-    fresh = importlib.import_module("work_precision_cases.peer_mujoco")
-    assert fresh.mujoco is None
-    assert fresh.curves(DISC, True)
 
 
 def test_a_free_body_is_read_as_the_disc_that_it_is():

@@ -28,8 +28,6 @@ RUN = {
     "t_end": 10.0,
 }
 NEAR_FALL = {"mass": 1.0, "radius": 0.3, "gravity": 9.81, "theta0": 0.3}  # start at rest but for w2 = eps
-NEAR_FALL_RESULTS = {1e-2: (3.465e-4, 7.0425), 1e-3: (3.463e-5, 7.0272), 1e-4: (3.463e-6, 7.0251)}  # eps: (theta_min, swing)
-NEAR_FALL_BOUNCE_TIME = 0.153997
 
 
 def uniform_inertia(mass: float, radius: float) -> tuple[float, float]:
@@ -140,12 +138,6 @@ def steady_circle(theta: float, yaw_rate: float, *, mass, radius, gravity, inert
     }
 
 
-def resting_centre_yaw_rate(theta: float, *, mass, radius, gravity, inertia=None) -> float:
-    """psidot of the steady motion with the centre at rest: psidot^2 = m g a/(A sin theta)."""
-    a_moment, _ = uniform_inertia(mass, radius) if inertia is None else inertia
-    return float(np.sqrt(mass * gravity * radius / (a_moment * np.sin(theta))))
-
-
 def upright_rolling_frequency_squared(spin: float, *, mass, radius, gravity, inertia=None) -> float:
     """Square of the lean frequency when rolling straight at w3 = spin; stable where positive. Uniform: 12/5 spin^2 - 4g/5a."""
     a_moment, c_moment = uniform_inertia(mass, radius) if inertia is None else inertia
@@ -163,9 +155,3 @@ def spinning_threshold(*, mass, radius, gravity, inertia=None) -> float:
     """Smallest stable yaw rate of upright spinning on the spot; uniform: sqrt(4g/5a)."""
     a_moment, _ = uniform_inertia(mass, radius) if inertia is None else inertia
     return float(np.sqrt(mass * gravity * radius / (a_moment + mass * radius**2)))
-
-
-def near_fall_swing(*, mass, radius, inertia=None) -> float:
-    """Angle by which the contact point turns in a bounce as eps -> 0: pi sqrt((A + m a^2)/A); uniform: pi sqrt 5."""
-    a_moment, _ = uniform_inertia(mass, radius) if inertia is None else inertia
-    return float(np.pi * np.sqrt((a_moment + mass * radius**2) / a_moment))

@@ -124,10 +124,3 @@ def exact_polynomial(v, parts: dict, gravity) -> list:
 
     left, right = product(entry(0, 0), entry(1, 1)), product(entry(0, 1), entry(1, 0))
     return [a - b for a, b in zip(left, right, strict=True)]
-
-
-def wheel_loads(p: dict) -> dict[str, float]:
-    """Static normal forces (N)."""
-    total = p["mR"] + p["mB"] + p["mH"] + p["mF"]
-    front = p["g"] * (p["xB"] * p["mB"] + p["xH"] * p["mH"] + p["w"] * p["mF"]) / p["w"]
-    return {"rear": p["g"] * total - front, "front": front}
