@@ -30,11 +30,11 @@ LAYERS = ("equations", "dynamics", "motion", "analysis", "ensembles", "models", 
 
 # What takes longest for its number of tests, longest first: started last, one of these would keep one worker busy while the others have nothing to do.
 LONGEST = """
-every_model sensors identify native_mutants mutants exported native plain_numbers float32 multiple_shooting native_starts
-native_functions feasible_starts linearize simulate lowering differentiation_guards long_chains native_derivatives native_second along_batches
-native_samples studies derivatives_of_starts log_density what_probes_do_not_show row_functions piecewise_motion malformed_inputs rank_of_vanishing_rows stiff
-knots names_read verify power native_operations call_costs build inertia joint_prior both_ways inputs energy_lost operations program readme
-events_in_one_step study_faults cluster notebooks
+diffrax load_jumps every_model sensors identify native_mutants mutants exported native plain_numbers float32 multiple_shooting native_starts
+native_functions feasible_starts linearize simulate lowering derivatives_of_failed long_chains native_derivatives native_second along_batches
+native_samples studies log_density what_probes_do_not_show row_functions piecewise_motion malformed_inputs rank_of_vanishing_rows stiff
+names_read verify power native_operations call_costs build inertia joint_prior inputs result_codes operations program readme
+events study_faults cluster notebooks
 """
 
 

@@ -18,7 +18,6 @@ class PlanarRobot(jj.Scene):
     trailers: int = eqx.field(static=True, default=0)
     maximal: bool = eqx.field(static=True, default=False)
     by_rate: bool = eqx.field(static=True, default=False)
-    narrow: bool = eqx.field(static=True, default=False)
     turned: object = jj.parameter(0.0, unit="rad")
     hitch: object = jj.parameter(0.0, unit="m")
     length: object = jj.parameter(0.8, unit="m", positive=True)
@@ -30,10 +29,6 @@ class PlanarRobot(jj.Scene):
     def coordinates(self):
         trailers = (f"x{i} y{i} h{i}" if self.maximal else f"h{i}" for i in range(self.trailers))
         return jj.coordinates("x y heading left right", *trailers)
-
-    @property
-    def domain(self):
-        return {"heading": (-0.4, 0.4)} | {f"h{i}": (-0.4, 0.4) for i in range(self.trailers)} if self.narrow else {}
 
     def bodies(self, t, q):
         o, R = 0 * q.x, jj.rot_z(q.heading)
@@ -96,15 +91,11 @@ class BeadOnCurve(jj.Scene):
     """A bead on an ellipse in the plane, by a geometric row or one of velocity, whose way round a slider `s` follows by a row; `turned` axes."""
 
     by_rate: bool = eqx.field(static=True, default=False)
-    narrow: bool = eqx.field(static=True, default=False)
     a: object = jj.parameter(1.0, unit="m", positive=True)
     b: object = jj.parameter(1.0, unit="m", positive=True)
     turned: object = jj.parameter(0.0, unit="rad")
     coordinates = jj.coordinates("x y s")
-
-    @property
-    def domain(self):
-        return {"x": (0.7, 1.2), "y": (-0.4, 0.4)} if self.narrow else {"x": (-1.2, 1.2), "y": (-1.2, 1.2)}
+    domain = {"x": (-1.2, 1.2), "y": (-1.2, 1.2)}
 
     def bodies(self, t, q):
         o = 0 * q.x
@@ -131,18 +122,14 @@ class BeadOnCurve(jj.Scene):
         return {"x": float(self.a * c), "y": float(self.a * s), "s_rate": speed}
 
 
-def drawn(seed: int, narrow: bool | None = None):
-    """The scene with this number; `narrow`: whether its domain is, default drawn too."""
+def drawn(seed: int):
+    """The scene with this number."""
     draw = np.random.default_rng(seed)
     turned = float(draw.uniform(-3, 3))
     if seed % 4 == 3:
-        sides = draw.uniform(0.7, 1.4, 2)
-        return BeadOnCurve(
-            by_rate=bool(draw.integers(2)), narrow=bool(draw.integers(2)) if narrow is None else narrow, a=float(sides[0]), b=float(sides[1]), turned=turned
-        )
-    maximal, by_rate, small, massless = draw.integers(2, size=4).astype(bool).tolist()
-    narrow = small if narrow is None else narrow
+        a, b = draw.uniform(0.7, 1.4, 2).tolist()
+        return BeadOnCurve(by_rate=bool(draw.integers(2)), a=a, b=b, turned=turned)
+    maximal, by_rate, _, massless = draw.integers(2, size=4).astype(bool).tolist()
     weight = {"trailer_mass": 0.0, "trailer_inertia": 0.0} if massless else {}
     hitch, length = draw.uniform([0.0, 0.6], [0.2, 1.0]).tolist()
-    trailers = int(draw.integers(3))
-    return PlanarRobot(trailers=trailers, maximal=maximal, by_rate=by_rate, narrow=narrow, turned=turned, hitch=hitch, length=length, **weight)
+    return PlanarRobot(trailers=int(draw.integers(3)), maximal=maximal, by_rate=by_rate, turned=turned, hitch=hitch, length=length, **weight)

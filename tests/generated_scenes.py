@@ -84,7 +84,7 @@ LENGTHS = {"x", "y", "z"}
 
 
 def coordinates_of(kind: str):
-    """Stems and middles of the coordinates of a body of this kind."""
+    """Stems and middles of the coordinates of a body of this kind; methods of scenes may not read the dictionary itself."""
     return KINDS[kind]
 
 
@@ -436,12 +436,7 @@ def _anchors(scene, q):
             other = None if part.on[1] == GROUND else pose[body_name(part.on[1])]
             held = own if other is None else other.orientation.T @ (own - other.position)
         elif part.kind == "curve":
-            r, s = pose[body_name(on)].position, recipe_index(scene.recipe, part)
+            r, s = pose[body_name(on)].position, scene.recipe.rows.index(part)
             held = (r[1] - scene.factors[s] * jnp.sin(r[0])) * jnp.ones(3)
         found.append(held)
     return jnp.stack(found)
-
-
-def recipe_index(recipe: Recipe, part: Part) -> int:
-    """The number of a row."""
-    return recipe.rows.index(part)

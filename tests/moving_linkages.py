@@ -101,15 +101,3 @@ class NarrowPendulum(jj.Scene):
 
     def geometric_constraints(self, pose):
         return {"rod": jj.rod(jnp.zeros(3), pose["bob"].position, self.length)}
-
-
-def pendulum_angles(speeds, ts) -> np.ndarray:
-    """Angles (rad, from hanging) of `NarrowPendulum` from its example's place with the given rates of x, shape (lanes, times), by SciPy."""
-    from scipy.integrate import solve_ivp
-
-    a_0 = np.arcsin(0.3)
-    lanes = [
-        solve_ivp(lambda t, y: [y[1], -9.81 * np.sin(y[0])], (0.0, ts[-1]), [a_0, v / np.cos(a_0)], method="DOP853", rtol=1e-12, atol=1e-12, t_eval=ts).y[0]
-        for v in speeds
-    ]
-    return np.array(lanes)

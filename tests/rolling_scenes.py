@@ -135,27 +135,24 @@ class BallInBowl(jj.Scene):
 
 
 class BallInDrum(jj.Scene):
-    """A ball within a cylinder about a level or upright axis: angle around it, place along it; the gap is built in."""
+    """A ball within a cylinder about an upright axis: angle around it, place along it; the gap is built in."""
 
     mass: object = jj.parameter(0.7)
     radius: object = jj.parameter(0.05)
     drum: object = jj.parameter(0.4)
-    upright: bool = eqx.field(static=True, default=True)
 
     coordinates = jj.coordinates("angle along", jj.quaternion("attitude"))
 
     def bodies(self, t, q):
         arm = self.drum - self.radius
-        across, down = arm * jnp.sin(q.angle), arm * jnp.cos(q.angle)
-        centre = jnp.stack([across, down, q.along]) if self.upright else jnp.stack([across, q.along, -down])
+        centre = jnp.stack([arm * jnp.sin(q.angle), arm * jnp.cos(q.angle), q.along])
         return {"ball": jj.RigidBody.ball(self.mass, self.radius, position=centre, orientation=jj.quaternion_to_matrix(q.attitude))}
 
     def loads(self, motion):
         return (jj.gravity(motion, GRAVITY),)
 
     def contacts(self, pose):
-        axis = (0.0, 0.0, 1.0) if self.upright else (0.0, 1.0, 0.0)
-        return {"wall": jj.ball_contact(pose["ball"], self.radius, ground=jj.Cylinder(self.drum, axis, side="inside"))}
+        return {"wall": jj.ball_contact(pose["ball"], self.radius, ground=jj.Cylinder(self.drum, (0.0, 0.0, 1.0), side="inside"))}
 
 
 class RouthSphere(jj.Scene):
@@ -211,29 +208,6 @@ class DiscOnHill(jj.Scene):
         land = jj.HeightMap(hill)
         point = land.point_at(pose.q.x, pose.q.y)
         return {"rim": jj.Contact(pose["body"], point, ground=land)}
-
-
-class TyredWheel(jj.Scene):
-    """A wheel with a tyre on a level plane, in angles; a thin disc where the tyre is zero."""
-
-    mass: object = jj.parameter(1.3)
-    radius: object = jj.parameter(0.35)
-    tyre: object = jj.parameter(0.05)
-
-    coordinates = jj.coordinates("x y yaw lean spin")
-    domain = {"yaw": (-3.2, 3.2), "lean": (-1.2, 1.2), "spin": (-3.2, 3.2)}
-
-    def bodies(self, t, q):
-        frame = jj.rot_z(q.yaw) @ jj.rot_x(q.lean)
-        o = 0.0 * q.x
-        centre = jnp.stack([q.x, q.y, o + self.tyre]) + (self.radius - self.tyre) * frame[:, 2]
-        return {"wheel": jj.RigidBody.thin_disc(self.mass, self.radius, axis="y", position=centre, orientation=frame @ jj.rot_y(q.spin))}
-
-    def loads(self, motion):
-        return (jj.gravity(motion, GRAVITY),)
-
-    def contacts(self, pose):
-        return {"tread": jj.wheel_contact(pose["wheel"], self.radius, self.tyre)}
 
 
 class TyredBicycle(jj.models.WhippleBicycle):

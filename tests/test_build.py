@@ -9,9 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
-from jourdain_jax.models import MODELS, ChaplyginSleigh, DoublePendulumRods, TiltingDisc
-
-OFTEN = 12  # more than any number of calls that once changed the way
+from jourdain_jax.models import ChaplyginSleigh, DoublePendulumRods, TiltingDisc
 
 
 @pytest.fixture(scope="module")
@@ -48,20 +46,18 @@ def test_what_was_built_is_pickled_as_its_scene(disc):
 
 
 def test_what_was_built_stands_wherever_its_scene_does():
-    sleigh = ChaplyginSleigh()
-    built = jj.build(sleigh)
     start, ts = {"x_rate": 0.5, "heading_rate": 0.3}, jnp.array([0.5, 1.0])
-    assert_array_equal(jj.simulate(built, start, ts=ts).q, jj.simulate(sleigh, start, ts=ts).q)
-    many = {"x_rate": jnp.array([0.5, 0.6])}
-    assert_array_equal(jj.rollout(built, many, ts=ts).lanes.q, jj.rollout(sleigh, many, ts=ts).lanes.q)
-    state = jj.start(built, **start)
-    assert_array_equal(state.u, jj.start(sleigh, **start).u)
-    assert_array_equal(jj.linearize(built, state).A, jj.linearize(sleigh, state).A)
-    assert str(jj.report(built)) == str(jj.report(sleigh))
-    assert jj.lower(built) is jj.lower(sleigh)
     data = jj.Experiment(ts, {"heading": jnp.array([0.1, 0.2])}, 0.01, start=start)
-    fits = [jj.fit(scene, data, free=["offset"]) for scene in (built, sleigh)]
-    assert fits[0].estimates == fits[1].estimates
+
+    def asked(scene):
+        state = jj.start(scene, **start)
+        lanes = jj.rollout(scene, {"x_rate": jnp.array([0.5, 0.6])}, ts=ts).lanes
+        numbers = jj.simulate(scene, start, ts=ts).q, lanes.q, state.u, jj.linearize(scene, state).A, jj.fit(scene, data, free=["offset"]).values
+        return jax.tree.map(np.asarray, numbers), str(jj.report(scene)), jj.lower(scene)
+
+    of_model, of_scene = asked(jj.build(ChaplyginSleigh())), asked(ChaplyginSleigh())
+    jax.tree.map(assert_array_equal, of_model[0], of_scene[0])
+    assert of_model[1:] == of_scene[1:]
 
 
 def test_a_model_says_each_choice_with_its_reason():
@@ -81,11 +77,13 @@ def test_a_model_says_each_choice_with_its_reason():
 
 def test_a_model_with_other_parameters_keeps_its_choices_and_is_differentiated_under_jit_and_vmap():
     start, ts = {"x_rate": 0.5, "heading_rate": 0.3}, jnp.array([0.5, 1.0])
-    model = jj.build(ChaplyginSleigh(), jj.Formulation("full"), backend="xla")
+    model = jj.build(ChaplyginSleigh(), jj.Formulation("full"))
+    by_xla = jj.build(ChaplyginSleigh(), backend="xla").replace(offset=0.2)
+    assert "machine code" not in jj.simulate(by_xla, start, ts=ts).reduction
 
     def end(model, offset):
         motion = jj.simulate(model.replace(offset=offset), start, ts=ts)
-        assert (motion.state_form, "machine code" in motion.reduction) == ("full", False)
+        assert motion.state_form == "full"
         return motion.q_end[0]
 
     offsets = jnp.array([0.2, 0.3])
@@ -94,32 +92,6 @@ def test_a_model_with_other_parameters_keeps_its_choices_and_is_differentiated_u
     assert_allclose(slopes, expected, rtol=1e-6)
     assert len(jax.tree.leaves(model)) == len(jax.tree.leaves(model.scene))
     assert_allclose(jj.start(model, **start).u, jj.start(model.scene, **start).u, rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_a_start_and_a_diagnosis_are_bit_equal_however_often_they_are_asked_for(name):
-    scene = MODELS[name]()
-    starts = [jj.start(scene, **scene.example) for _ in range(OFTEN)]
-    for start in starts[1:]:
-        assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(start), jax.tree.leaves(starts[0]), strict=True))
-    found = jj.accelerations(scene, starts[0].t, starts[0].q, starts[0].u).udot
-    jj.sample_states(scene, 2)  # anything in between
-    assert np.array_equal(found, jj.accelerations(scene, starts[-1].t, starts[-1].q, starts[-1].u).udot)
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_a_motion_and_its_diagnosis_are_bit_equal_however_often_they_are_asked_for(name):
-    scene = MODELS[name]()
-    ts = jnp.linspace(0.0, 0.5, 4)
-    motions = [jj.simulate(scene, scene.example, ts=ts) for _ in range(OFTEN)]
-    inside = jax.jit(lambda start: jj.simulate(scene, start, ts=ts))
-    start = jj.start(scene, **scene.example)
-    compiled = [inside(start) for _ in range(3)]
-    for first, *others in (motions, compiled):
-        for other in others:
-            assert np.array_equal(first.q, other.q)
-            assert np.array_equal(first.u, other.u)
-    assert len({str(motion) for motion in motions for _ in range(10)}) == 1
 
 
 def test_a_function_that_takes_scenes_only_says_what_to_pass(disc):
@@ -158,13 +130,18 @@ def batch(scene, ts, start) -> list:
     return np.asarray(jj.rollout(scene, {**start, "x": jnp.array([0.1, 0.2])}, ts=ts, progress=False)["y"]).tolist()
 
 
+def alone(scene, ts, start) -> list:
+    motion = jj.simulate(scene, start, ts=ts)
+    return [int(motion.result), int(motion.fallback), float(motion.smallest_pivot), *motion.q_end.tolist(), *motion.u_end.tolist()]
+
+
 def fitted(scene, ts, start) -> list:
     data = jj.Experiment(ts, {"x": 0.1 + ts, "z": 0.02 * ts}, 0.01, start=start)
     return np.asarray(jj.fit(scene, data, free={"arm": None}, max_iterations=2).values).tolist()
 
 
-@pytest.mark.parametrize("run", [batch, fitted])
-def test_what_a_batch_or_a_fit_runs_is_not_decided_by_the_call_before_it(run):
+@pytest.mark.parametrize("run", [alone, batch, fitted])
+def test_what_a_motion_a_batch_or_a_fit_runs_is_not_decided_by_the_call_before_it(run):
     ts = jnp.linspace(0.0, 1.0, 6)
     start = {"x": 0.1, "x_rate": 1.0, "y_rate": 0.5}
     found = []

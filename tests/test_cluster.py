@@ -2,6 +2,7 @@
 
 import os
 import sys
+from contextlib import ExitStack
 
 import jax
 import numpy as np
@@ -9,7 +10,6 @@ import pytest
 from test_studies import assert_same
 
 import jourdain_jax as jj
-from jourdain_jax.ensembles import task
 
 distributed = pytest.importorskip("distributed")
 COUNT = 150  # lanes, in five chunks
@@ -44,22 +44,6 @@ def test_a_cluster_computes_what_one_process_computes(client, tmp_path):
     assert all(file.stat().st_mtime_ns == time for file, time in kept.items())
 
 
-def test_an_error_of_a_chunk_is_that_of_the_study_and_what_is_kept_stays(client, tmp_path, monkeypatch):
-    before = task.Task.run_block
-
-    def failing(self, number):
-        if number == 3:
-            raise OSError("no block 3")
-        return before(self, number)
-
-    monkeypatch.setattr(task.Task, "run_block", failing)
-    with pytest.raises(OSError, match="no block 3"):
-        run(tmp_path / "discs.zarr", client=client)
-    monkeypatch.undo()
-    monkeypatch.setattr(task, "LARGEST_BLOCK", 32)
-    assert_same(run(tmp_path / "discs.zarr", client=client), run(tmp_path / "whole.zarr"))
-
-
 def test_what_is_no_cluster_is_refused(client, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"`client` is the text 'tcp://10.0.0.1', expected a `dask.distributed.Client`"):
         run(tmp_path / "discs.zarr", client="tcp://10.0.0.1")
@@ -88,41 +72,25 @@ def deadly(motion):
     return jax.pure_callback(lean, jax.ShapeDtypeStruct((), last.dtype), motion.scene.radius, last, vmap_method="sequential")
 
 
-def study_with_deadly_lanes(*deadly_lanes):
-    radius = np.full(LANES, 0.5)
-    radius[list(deadly_lanes)] = NUMBER
-    return jj.Study(jj.models.TiltingDisc(), vary={"radius": radius}, start={"lean": 0.3, "spin_rate": -3.0})
-
-
-def assert_left_out(found, chunk):
-    """All lanes but those of one chunk are there."""
-    first, last = found.store.span(chunk)
-    assert not found.complete
-    assert found.counts == {"success": LANES - (last - first)}
-    arrays = found.to_xarray()
-    assert np.isnan(arrays["lean"].values[first:last]).all()
-    assert np.isfinite(np.delete(arrays["lean"].values, np.s_[first:last])).all()
-
-
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_chunk_on_which_workers_of_a_cluster_die_is_named_and_left_out(tmp_path, monkeypatch):
+@pytest.mark.parametrize("workers", ["processes of a cluster", "processes of the study"])
+def test_a_chunk_on_which_workers_die_is_named_and_left_out(workers, tmp_path, monkeypatch):
     monkeypatch.undo()  # workers are processes of their own
-    study = study_with_deadly_lanes(DEADLY)
-    with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        options = {"t1": 1.0, "rtol": 1e-6, "atol": 1e-6, "progress": False, "outputs": {"lean": deadly}, "client": client}
+    radius = np.where(np.arange(LANES) == DEADLY, NUMBER, 0.5)
+    study = jj.Study(jj.models.TiltingDisc(), vary={"radius": radius}, start={"lean": 0.3, "spin_rate": -3.0})
+    options = {"t1": 1.0, "rtol": 1e-6, "atol": 1e-6, "progress": False, "outputs": {"lean": deadly}}
+    with ExitStack() as stack:
+        if workers == "processes of a cluster":
+            cluster = stack.enter_context(distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50))
+            options["client"] = stack.enter_context(distributed.Client(cluster))
+        else:
+            options["processes"] = 2
         with pytest.warns(UserWarning, match="processes died 3 times on lanes 6144 to 8191 of"):
             found = study.run(tmp_path / "discs.zarr", **options)
-    assert_left_out(found, 3)
-
-
-@pytest.mark.slow
-def test_a_chunk_on_which_processes_die_is_named_and_left_out(tmp_path, monkeypatch):
-    monkeypatch.undo()
-    study = study_with_deadly_lanes(DEADLY)
-    with pytest.warns(UserWarning, match="processes died 3 times on lanes 6144 to 8191 of"):
-        found = study.run(tmp_path / "discs.zarr", t1=1.0, rtol=1e-6, atol=1e-6, progress=False, outputs={"lean": deadly}, processes=2)
-    assert_left_out(found, 3)
+    first, last = found.store.span(3)
+    assert not found.complete
+    assert found.counts == {"success": LANES - (last - first)}
+    lean = found.to_xarray()["lean"].values
+    assert np.isnan(lean[first:last]).all()
+    assert np.isfinite(np.delete(lean, np.s_[first:last])).all()

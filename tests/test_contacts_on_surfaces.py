@@ -1,15 +1,21 @@
-"""Bodies that roll on planes, cylinders, spheres, surfaces and height maps: where they touch, how they move, and what presses them."""
+"""Bodies that roll on planes, cylinders, spheres, surfaces and height maps; and what cannot be a contact, which is refused by name."""
+
+import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rolling_scenes import GRAVITY, GROUNDS, BallInBowl, BallInDrum, DiscOnHill, Rolls, RouthSphere, TyredBicycle, TyredWheel
+from rolling_scenes import GRAVITY, GROUNDS, BallInBowl, BallInDrum, Rolls, RouthSphere, TyredBicycle
 from tolerances import tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.dynamics.reactions import contact_forces
 from jourdain_jax.eager.eager import eval_numpy
+
+# Bodies that roll on planes, cylinders, spheres, surfaces and height maps: where they touch, how they move, and what presses them.
+
 
 UP = np.array([0.0, 0.0, 1.0])
 SHAPES = ("ball", "ellipsoid", "disc", "wheel")
@@ -136,14 +142,6 @@ def test_one_force_at_the_contact_moves_and_turns_a_body_that_rolls(ground, shap
     assert np.all(force.determined)
 
 
-def test_a_ball_in_a_bowl_swings_with_the_frequency_of_five_sevenths_of_gravity():
-    bowl = BallInBowl()
-    length = bowl.bowl - bowl.radius
-    found = jj.linearize(bowl, {})
-    fastest = np.sort(np.abs(found.state_eigenvalues().imag))[-4:]
-    assert np.allclose(fastest, np.sqrt(5 * GRAVITY / (7 * length)), rtol=tolerance("linearization"))
-
-
 @pytest.mark.parametrize("spin", [0.0, 12.0])
 def test_a_ball_circles_in_a_bowl_at_the_rate_of_its_slope_and_spin(spin):
     # (1 + k) l cos(theta) W^2 + k a w_n W = g, k = 2/5: Routh's equations with n turning at W
@@ -172,18 +170,6 @@ def test_a_ball_in_an_upright_cylinder_rises_again_with_the_rate_of_the_golf_bal
     assert np.allclose(motion.contact_forces()["wall"].normal, drum.mass * W**2 * (drum.drum - drum.radius), rtol=1e-8)
 
 
-def test_a_ball_in_a_level_cylinder_swings_as_a_pendulum_of_seven_fifths_of_its_length():
-    drum = BallInDrum(upright=False)
-    arm = float(drum.drum - drum.radius)
-    motion = jj.simulate(drum, {"angle": 1.0}, ts=np.linspace(0.0, 2.0, 9), rtol=1e-11, atol=1e-11)
-    # (7/10) (l angle')^2 = g l (cos angle - cos angle_0)
-    angle, rate = np.asarray(motion["angle"]), np.asarray(motion["angle_rate"])
-    assert np.allclose(0.7 * arm * rate**2, GRAVITY * (np.cos(angle) - np.cos(1.0)), atol=1e-8)
-    assert np.ptp(angle) > 1.9
-    force = motion.contact_forces()["wall"]
-    assert np.allclose(force.normal, drum.mass * GRAVITY * (17 * np.cos(angle) - 10 * np.cos(1.0)) / 7, rtol=1e-8)
-
-
 def test_rouths_sphere_keeps_the_integrals_of_jellett_and_routh():
     motion = jj.simulate(
         RouthSphere(), {"attitude": jj.quaternion_from_axis_angle((0.6, 0.8, 0.0), 0.9), "attitude_omega": (1.0, 2.0, 9.0)}, t1=3.0, rtol=1e-11, atol=1e-11
@@ -191,47 +177,6 @@ def test_rouths_sphere_keeps_the_integrals_of_jellett_and_routh():
     drifts = jj.diagnose(motion).invariant_drifts
     assert max(float(drift) for drift in drifts.values()) <= tolerance("drift")
     assert float(jj.diagnose(motion).energy_drift) <= tolerance("drift")
-
-
-def test_a_disc_on_a_hill_moves_by_its_angles_as_by_the_search_for_its_contact():
-    by_angles, by_search = DiscOnHill(), Rolls(make_ground=GROUNDS["on a hill"], shape="disc", radius=0.1, moments=(0.25, 0.5, 0.25))
-    motion = jj.simulate(by_angles, {"x": 0.1, "lean": 0.2, "yaw": 0.3, "spin_rate": 9.0, "yaw_rate": 0.4}, ts=np.linspace(0.0, 0.6, 5), rtol=1e-11, atol=1e-11)
-    assert float(jj.diagnose(motion).energy_drift) <= tolerance("drift")
-
-    @eval_numpy
-    @jax.vmap
-    def both(t, q, u):
-        pose = jj.motion_at(by_angles, t, q, u)["body"]
-        q7, u6 = jnp.concatenate([pose.position, quaternion_of(pose.orientation)]), jnp.concatenate([pose.velocity, pose.angular_velocity_body])
-        udot = jj.accelerations(by_search, t, q7, u6).udot
-        found = jj.accelerations(by_angles, t, q, u)
-        # the angles' accelerations as those of the mass centre
-        rate = lambda q, u: jj.motion_at(by_angles, t, q, u)["body"].velocity  # noqa: E731
-        centre = jax.jvp(rate, (q, u), (jj.coordinate_rates(by_angles, t, q, u), found.udot))[1]
-        return centre - udot[:3], jj.velocity_residual(by_search, t, q7, u6)
-
-    difference, residual = both(motion.ts, motion.q, motion.u)
-    assert np.max(np.abs(residual)) <= 1e-8
-    assert np.max(np.abs(difference)) <= 1e-6
-
-
-def quaternion_of(R):
-    """A quaternion of a rotation that is less than half a turn."""
-    w = jnp.sqrt(1 + jnp.trace(R)) / 2
-    return jnp.stack([w, (R[2, 1] - R[1, 2]) / (4 * w), (R[0, 2] - R[2, 0]) / (4 * w), (R[1, 0] - R[0, 1]) / (4 * w)])
-
-
-@pytest.mark.parametrize("tyre", [0.0, 0.05, 0.2])
-def test_a_wheel_with_a_tyre_topples_by_its_slender_part_alone(tyre):
-    # lean: (I + m R^2) s^2 = m g (R - r) - (J + m R^2) J W^2/I; rolling straight at W
-    W, wheel = 3.0, TyredWheel(tyre=tyre)
-    m, R = float(wheel.mass), float(wheel.radius)
-    I, J = m * R**2 / 4, m * R**2 / 2
-    squared = (m * GRAVITY * (R - tyre) - (J + m * R**2) * J * W**2 / I) / (I + m * R**2)
-    found = jj.linearize(wheel, {"spin_rate": W})
-    roots = np.asarray(found.state_eigenvalues())
-    largest = roots[np.argmax(np.abs(roots))]
-    assert np.isclose(largest**2, squared, rtol=1e-9)
 
 
 def test_a_bicycle_with_tyres_is_the_whipple_bicycle_whose_wheels_widen():
@@ -249,3 +194,96 @@ def test_a_bicycle_with_tyres_is_the_whipple_bicycle_whose_wheels_widen():
         found = np.asarray(jj.linearize(bicycle, bicycle.upright(v), coordinates=("lean", "steer")).eigenvalues())
         nearest = np.min(np.abs(expected[:, None] - found[None, :]), axis=1)
         assert np.max(nearest) <= 1e-8 * np.max(np.abs(expected))
+
+
+# What cannot be a contact is refused by name: where it is known at once, otherwise when a scene is looked at.
+
+
+@pytest.mark.parametrize(
+    ("ground", "sentence"),
+    [
+        (
+            lambda scene, pose: jj.Plane(normal=jnp.stack([0.0 * scene.size, 0.0 * scene.size, 2.4 * scene.size])),
+            "contact `touch` of `Rolls` has a normal whose length differs from 1 by 0.2",
+        ),
+        (
+            lambda scene, pose: jj.Sphere(0.09 * scene.size, side="inside"),
+            "a ball is larger than the cylinder or sphere that it rolls in",
+        ),
+    ],
+    ids=["normal", "room"],
+)
+def test_what_turns_out_to_be_no_ground_is_named_when_its_scene_is_looked_at(ground, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        jj.structure_of(Rolls(make_ground=ground))
+
+
+class BesideTheBowl(BallInBowl):
+    """A ball whose coordinates keep it at a wrong height above the bowl."""
+
+    def bodies(self, t, q):
+        ball = super().bodies(t, q)["ball"]
+        return {"ball": jj.RigidBody.ball(ball.mass, self.radius, position=ball.position + jnp.array([0.0, 0.0, 0.01]), orientation=ball.orientation)}
+
+
+class TooLarge(BallInBowl):
+    """A ball that is larger than its bowl."""
+
+    def contacts(self, pose):
+        return {"bowl": jj.ball_contact(pose["ball"], self.radius, ground=jj.Sphere(0.9 * self.radius, side="inside"))}
+
+
+class OnACusp(BallInBowl):
+    """A ball at a point of a surface where its gradient vanishes."""
+
+    def contacts(self, pose):
+        point = pose["ball"].position
+        return {"bowl": jj.Contact(pose["ball"], point, jj.Surface(lambda x, y, z: (z - point[2]) ** 3).plane_at(point))}
+
+
+@pytest.mark.parametrize(
+    ("scene", "sentence"),
+    [
+        (TooLarge(), "contact `bowl` of `TooLarge` finds no point where body and ground touch at any probed state; a ball must be smaller"),
+        (OnACusp(), "contact `bowl` of `OnACusp` (finds no point|has a normal whose length differs from 1)"),
+    ],
+)
+def test_a_contact_that_touches_nowhere_is_named(scene, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        jj.structure_of(scene)
+
+
+def test_coordinates_that_do_not_keep_a_body_on_its_ground_are_named():
+    with pytest.raises(ValueError, match=r'contact `bowl` of `BesideTheBowl` has height="coordinates", but at a probed state its body is -?0.0.* m off'):
+        jj.simulate(BesideTheBowl(), {}, t1=0.1)
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+def test_a_plane_turned_by_a_rotation_is_the_plane_of_its_normal(axis):
+    R = {"x": jj.rot_x, "y": jj.rot_y, "z": jj.rot_z}[axis](0.4) @ jj.rot_y(0.2)
+    turned, by_normal = jj.Plane(tilt=R), jj.Plane(normal=R[:, 2], along=R[:, 0])
+    for part in ("normal", "tangents", "axes"):
+        assert np.allclose(getattr(turned, part), getattr(by_normal, part), atol=1e-15)
+
+
+def test_the_tangents_of_any_normal_are_a_right_handed_frame():
+    normals = np.random.default_rng(0).normal(size=(50, 3))
+    normals = np.vstack([normals / np.linalg.norm(normals, axis=1)[:, None], np.eye(3), -np.eye(3)])
+    axes = jax.vmap(lambda n: jj.Plane(normal=n).axes)(normals)
+    assert np.allclose(np.swapaxes(axes, 1, 2) @ axes, np.eye(3), atol=1e-14)
+    assert np.allclose(np.linalg.det(axes), 1.0)
+    assert np.allclose(axes[:, :, 2], normals)
+
+
+def test_the_scenes_of_the_guide_to_contacts_roll_on_their_grounds():
+    text = (Path(__file__).parents[1] / "docs" / "contacts.md").read_text()
+    names = {"jj": jj, "jnp": jnp}
+    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(block, names)
+    assert np.allclose([names["pushed"][name][-1] for name in ("plank", "x")], [0.65625, 0.1875], rtol=1e-9)
+    for scene, contact, values in ((names["Bowl"](), "bowl", {"x": 0.1, "y": -0.05}), (names["DiscOnHill"](), "rim", {"x": 0.1, "y": 0.2, "lean": 0.3})):
+        pose = jj.pose_at(scene, 0.0, scene.named(**values)[0])
+        found = scene.contacts(pose)[contact]
+        assert abs(float(found.gap())) <= 1e-15
+        assert np.isclose(np.linalg.norm(found.point - next(iter(pose.bodies.values())).position), {"bowl": 0.05, "rim": 0.1}[contact], rtol=1e-12)
+

@@ -1,6 +1,5 @@
 """Noise with a memory: whitening against the dense covariance, correlation times known and estimated, and advice on bad input."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -48,30 +47,6 @@ def test_the_likelihood_is_the_dense_normal_one_at_uneven_times_and_across_gaps(
     assert float(jj.log_likelihood(truth, data, rtol=1e-10, atol=1e-10)) == pytest.approx(expected, abs=1e-4 * abs(expected))
 
 
-def test_a_known_correlation_time_gives_the_generalised_least_squares_of_the_dense_covariance():
-    data = sleigh_run(1, TAU, missing=(3, 4, 17))
-    found = jj.fit(GUESS, data, ("inertia", "offset"))
-
-    def predicted(theta):
-        motion = jj.simulate(GUESS.replace(inertia=theta[0], offset=theta[1]), START, ts=TS)
-        return jnp.stack([motion[name] for name in ("x", "y", "heading")])
-
-    h = 1e-5
-    slopes = [(predicted(found.values + h * d) - predicted(found.values - h * d)) / (2 * h) for d in np.eye(2)]
-    information, gradient, chi_square = np.zeros((2, 2)), np.zeros(2), 0.0
-    at = np.asarray(predicted(found.values))
-    for k, name in enumerate(("x", "y", "heading")):
-        known = np.isfinite(np.asarray(data.values[name]))
-        V = SIGMA**2 * np.exp(-np.abs(TS[known][:, None] - TS[known]) / TAU)
-        J, r = np.stack([np.asarray(s)[k][known] for s in slopes], axis=1), at[k][known] - np.asarray(data.values[name])[known]
-        information += J.T @ np.linalg.solve(V, J)
-        gradient += J.T @ np.linalg.solve(V, r)
-        chi_square += r @ np.linalg.solve(V, r)
-    assert_allclose(found.covariance, np.linalg.inv(information), rtol=1e-3)
-    assert_allclose(float(found.chi_square), chi_square, rtol=1e-4)
-    assert np.all(np.abs(np.linalg.solve(information, gradient)) < 1e-3 * found.standard_errors)
-
-
 @pytest.mark.parametrize("sigma", [SIGMA, None], ids=["sigmas known", "sigmas estimated"])
 def test_a_memory_of_the_noise_is_found_and_the_warning_goes(sigma):
     ts = np.linspace(0.0, 8.0, 161)
@@ -89,18 +64,6 @@ def test_a_memory_of_the_noise_is_found_and_the_warning_goes(sigma):
         assert found[name].standard_error > 1.5 * white[name].standard_error
     assert np.isnan(found.whitened[0]["x"][7:10]).all()
     assert np.isfinite(found.whitened[0]["x"][10])
-
-
-def test_intervals_cover_the_truth_where_noise_has_a_memory():
-    data = sleigh_run(6, None, None, ts=np.linspace(0.0, 16.0, 161), repeats=(150,))
-    found = jj.fit_batch(GUESS, data, ("inertia", "offset"))
-    assert np.mean(found.converged) > 0.98
-    for name, truth in TRUTH.items():
-        share = np.mean((found[name].low < truth) & (truth < found[name].high))
-        assert 0.89 <= share <= 0.995, name  # of 150, three standard deviations about 95 %
-    one = jj.Experiment(data.ts, {name: x[4] for name, x in data.values.items()}, None, start=START, correlation_time=None)
-    single = jj.fit(GUESS, one, ("inertia", "offset"))
-    assert np.all(np.abs(single.values - found.values[4]) < 0.02 * single.standard_errors)
 
 
 class Coasting(OnLine):
@@ -130,7 +93,3 @@ def test_intervals_are_those_of_all_correlation_times_by_their_restricted_likeli
     best = int(np.argmax(logs))
     assert_allclose(found.standard_errors, np.sqrt(variances[best]), rtol=0.01)
     assert_allclose(found.high - found.values, 1.98 * np.sqrt(whole), rtol=0.02)
-
-
-def one(correlation_time) -> jj.Experiment:
-    return jj.Experiment(TS, {"x": np.zeros(41)}, SIGMA, start=START, correlation_time=correlation_time)

@@ -1,11 +1,9 @@
-"""Relations of loads, poses, inputs and rows are watched over each step: what acts in a part of the way is not stepped over.
+"""What acts in a part of the way is not stepped over: relations are watched over each step, and no step is longer than a part of the span."""
 
-Motions are compared with such of steps of 1/2,000 of the span, which miss nothing; both loops take the same steps.
-"""
-
-import dataclasses
+from collections.abc import Callable
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,16 +11,19 @@ import pytest
 import result_codes as results
 from machine_code import BACKENDS
 from numpy.testing import assert_allclose, assert_array_equal
-from small_scenes import OnPlane
+from small_scenes import OnLine, OnPlane
 
 import jourdain_jax as jj
 
+# Relations of loads, poses, inputs and rows are watched over each step: what acts in a part of the way is not stepped over.
+
 
 class Sliding(jj.Scene):
-    """A bead that slides freely but for what acts between `a` and `a + width` of its way, or of time."""
+    """A bead that slides freely but for what acts between `a` and `a + width` of its way, or of time: `law(scene, t, x, v)` is its force."""
 
     a: float = jj.parameter(0.7)
     width: float = jj.parameter(0.03)
+    law: Callable = eqx.field(static=True, default=lambda s, t, x, v: 0 * x)
     coordinates = jj.coordinates("x")
 
     def bodies(self, t, q):
@@ -32,40 +33,7 @@ class Sliding(jj.Scene):
         return 0 * x
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=self.force(motion.t, motion.q.x, motion.u.x_rate)), jj.gravity(motion, 9.81))
-
-    def force(self, t, x, v):
-        return 0 * x
-
-
-class Strip(Sliding):
-    def force(self, t, x, v):
-        return jnp.where((x > self.a) & (x < self.a + self.width), -3.0, 0.0)
-
-
-class StripByDistance(Sliding):
-    def force(self, t, x, v):
-        return jnp.where(jnp.abs(x - self.a - 0.5 * self.width) < 0.5 * self.width, -3.0 * v, 0.0)
-
-
-class Pulse(Sliding):
-    def force(self, t, x, v):
-        return jnp.where((t > self.a) & (t < self.a + self.width), 20.0, 0.0)
-
-
-class Hat(Sliding):
-    def force(self, t, x, v):
-        return -40.0 * jnp.maximum(0.0, 1.0 - jnp.abs((x - self.a) / self.width - 0.5) * 2)
-
-
-class Signs(Sliding):
-    def force(self, t, x, v):
-        return -3.0 * (jnp.sign(x - self.a) - jnp.sign(x - self.a - self.width))
-
-
-class Floors(Sliding):
-    def force(self, t, x, v):
-        return -3.0 * (jnp.floor(x - self.a + 7.0) - jnp.floor(x - self.a - self.width + 7.0))
+        return (jj.generalized_force(motion, x_rate=self.law(self, motion.t, motion.q.x, motion.u.x_rate)), jj.gravity(motion, 9.81))
 
 
 class Bump(Sliding):
@@ -76,7 +44,21 @@ class Bump(Sliding):
         return jnp.where((s > 0) & (s < 1), 0.3 * self.width * (1 - jnp.cos(2 * jnp.pi * s)), 0.0)
 
 
-KINDS = (Strip, StripByDistance, Pulse, Hat, Signs, Floors, Bump)
+def rises_and_falls(step):
+    """A force between two places by a function that steps up."""
+    return Sliding(law=lambda s, t, x, v: -3.0 * (step(x - s.a) - step(x - s.a - s.width)))
+
+
+STRIP = Sliding(law=lambda s, t, x, v: jnp.where((x > s.a) & (x < s.a + s.width), -3.0, 0.0))
+KINDS = {
+    "Strip": STRIP,
+    "StripByDistance": Sliding(law=lambda s, t, x, v: jnp.where(jnp.abs(x - s.a - 0.5 * s.width) < 0.5 * s.width, -3.0 * v, 0.0)),
+    "Pulse": Sliding(law=lambda s, t, x, v: jnp.where((t > s.a) & (t < s.a + s.width), 20.0, 0.0)),
+    "Hat": Sliding(law=lambda s, t, x, v: -40.0 * jnp.maximum(0.0, 1.0 - jnp.abs((x - s.a) / s.width - 0.5) * 2)),
+    "Signs": rises_and_falls(jnp.sign),
+    "Floors": rises_and_falls(lambda x: jnp.floor(x + 7.0)),
+    "Bump": Bump(),
+}
 START, SPAN = {"x": 0.0, "x_rate": 1.0}, 2.0
 
 
@@ -84,9 +66,9 @@ def motion(scene, start=START, **options):
     return jj.simulate(scene, start, **{"ts": [SPAN], "rtol": 1e-9, "atol": 1e-9} | options)
 
 
-@pytest.mark.parametrize("kind", [kind if kind in (StripByDistance, Pulse, Bump) else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS])
+@pytest.mark.parametrize("kind", [kind if kind in ("StripByDistance", "Pulse", "Bump") else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS])
 def test_what_acts_in_a_part_of_the_way_is_met_by_the_same_steps_of_both_loops(kind):
-    scene, loose = kind(), {"rtol": 1e-6, "atol": 1e-6}  # at tight ones round-off alone sets the length of steps of a free bead
+    scene, loose = KINDS[kind], {"rtol": 1e-6, "atol": 1e-6}  # at tight ones round-off alone sets the length of steps of a free bead
     exact = motion(scene, max_step=SPAN / 2000, **loose)
     found = [motion(scene, backend=backend, **loose) for backend in BACKENDS]
     assert abs(float(exact.q_end[0]) - SPAN) > 5e-3, "nothing acted"
@@ -104,8 +86,8 @@ def test_neighbours_in_lanes_are_right_or_flagged(kind):
     a, width = generator.uniform(0.2, 1.4, 200), 10 ** generator.uniform(-4, -0.5, 200)
     options = {"parameters": {"a": a, "width": width}, "ts": [SPAN], "rtol": 1e-8, "atol": 1e-8, "progress": False}
     starts = {"x": np.zeros(200), "x_rate": 1.0}
-    found = jj.rollout(kind(), starts, **options)
-    exact = jj.rollout(kind(), starts, **options | {"max_step": 1e-4, "rtol": 1e-10, "atol": 1e-10})
+    found = jj.rollout(KINDS[kind], starts, **options)
+    exact = jj.rollout(KINDS[kind], starts, **options | {"max_step": 1e-4, "rtol": 1e-10, "atol": 1e-10})
     assert not exact.failed.size
     wrong = np.abs(found.lanes.q_end - exact.lanes.q_end)[:, 0] > 1e-5
     assert not np.any(np.delete(wrong, found.crossed_together)), "wrong in silence"
@@ -113,7 +95,7 @@ def test_neighbours_in_lanes_are_right_or_flagged(kind):
 
 
 def test_a_load_that_is_passed_in_one_step_is_named():
-    scene = Strip(width=1e-5)
+    scene = STRIP.replace(width=1e-5)
     assert np.isfinite(motion(scene).together)
     assert "changed in the one step" in " ".join(motion(scene).warnings)
     lanes = jj.rollout(scene, {"x": np.zeros(3), "x_rate": np.array([1.0, 0.1, -1.0])}, ts=[SPAN], rtol=1e-3, atol=1e-3, progress=False)
@@ -122,7 +104,7 @@ def test_a_load_that_is_passed_in_one_step_is_named():
 
 
 def test_crossings_are_counted_under_jit_back_in_time_and_by_both_modes_of_derivatives():
-    scene = Strip()
+    scene = STRIP
     assert int(jax.jit(lambda: motion(scene).crossings)()) == 2
     assert int(motion(scene, {"x": 2.0, "x_rate": 1.0}, ts=[-SPAN]).crossings) == 2
     assert int(motion(scene, {"x": 0.71, "x_rate": 1.0}).crossings) == 1
@@ -140,66 +122,48 @@ def test_crossings_are_counted_under_jit_back_in_time_and_by_both_modes_of_deriv
             assert counted(backend) == (2, 2)
 
 
-def test_inputs_that_are_functions_of_time_are_watched():
-    @dataclasses.dataclass(frozen=True)
-    class Pushed:
-        start: float
+class Cart(Sliding):
+    inputs = jj.inputs("push")
 
-        def __call__(self, t):
-            return jnp.where((t > self.start) & (t < self.start + 0.03), 20.0, 0.0)
-
-    class Cart(Sliding):
-        inputs = jj.inputs("push")
-
-        def force(self, t, x, v):
-            return 0 * x
-
-        def loads(self, motion):
-            return (jj.generalized_force(motion, x_rate=motion.inputs.push),)
-
-    found = [motion(Cart(), inputs={"push": Pushed(0.9)}, backend=backend) for backend in BACKENDS]
-    for one in found:
-        assert_allclose(one.q_end[0], 2.0 + 0.6 * (2.0 - 0.915), atol=1e-6)
-        assert int(one.crossings) == 2
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=motion.inputs.push),)
 
 
-class Guarded(Sliding):
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_inputs_that_are_functions_of_time_are_watched(backend):
+    found = motion(Cart(), inputs={"push": lambda t: jnp.where((t > 0.9) & (t < 0.93), 20.0, 0.0)}, backend=backend)
+    assert_allclose(found.q_end[0], 2.0 + 0.6 * (2.0 - 0.915), atol=1e-6)
+    assert int(found.crossings) == 2
+
+
+def guarded(s, t, x, v):
     """Guards whose branches agree, and smooth functions of relations."""
-
-    def force(self, t, x, v):
-        squared = x * x + v * v
-        length = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
-        return -length * v - v * jnp.abs(v) + jnp.maximum(x, 0.0) - jnp.maximum(-x, 0.0)
+    squared = x * x + v * v
+    length = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
+    return -length * v - v * jnp.abs(v) + jnp.maximum(x, 0.0) - jnp.maximum(-x, 0.0)
 
 
 def test_guards_and_smooth_functions_do_not_count():
-    assert jj.lower(Guarded()).relations == ()
-    assert int(motion(Guarded(), {"x": -1.0, "x_rate": 1.5}).crossings) == 0
-
-
-class Many(Sliding):
-    def force(self, t, x, v):
-        return sum(jnp.sign(x - 0.01 * k) for k in range(40))
+    scene = Sliding(law=guarded)
+    assert jj.lower(scene).relations == ()
+    found = motion(scene, {"x": -1.0, "x_rate": 1.5})
+    assert int(found.crossings) == 0
+    assert not found.unwatched
 
 
 def test_what_is_not_watched_is_said():
-    assert "not watched: they are 40, more than 32" in str(motion(Many()))
-    dense = motion(Strip(), backend="dense")
-    with pytest.warns(UserWarning, match="Heun does not watch the relations .* of `Strip`.* the default solver does"):
-        by_diffrax = motion(Strip(), solver=diffrax.Heun(), rtol=1e-4, atol=1e-4, work=False)
+    many = Sliding(law=lambda s, t, x, v: sum(jnp.sign(x - 0.01 * k) for k in range(40)))
+    assert "not watched: they are 40, more than 32" in str(motion(many))
+    dense = motion(STRIP, backend="dense")
+    with pytest.warns(UserWarning, match="Heun does not watch the relations .* of `Sliding`.* the default solver does"):
+        by_diffrax = motion(STRIP, solver=diffrax.Heun(), rtol=1e-4, atol=1e-4, work=False)
     assert int(dense.crossings) == int(by_diffrax.crossings) == -1
     assert "not watched: the scene has no scalar program" in str(dense)
     assert "solvers of diffrax do not" in by_diffrax.unwatched
-    assert not motion(Guarded()).unwatched
-
-
-class Friction(Sliding):
-    def force(self, t, x, v):
-        return -2.0 * jnp.sign(v)
 
 
 def test_a_motion_that_burns_its_steps_names_the_load_that_jumps():
-    stuck = motion(Friction(), max_steps=2000)
+    stuck = motion(Sliding(law=lambda s, t, x, v: -2.0 * jnp.sign(v)), max_steps=2000)
     assert not stuck.succeeded
     assert "the force along `x_rate` jumps, or has a kink, at the last state" in stuck.message
 
@@ -214,3 +178,58 @@ def test_a_tolerance_that_the_precision_does_not_hold_is_the_cause_that_is_told(
     lost = jj.simulate(Ring(), {"x": 1.0, "y_rate": 1.0}, ts=[1.0], rtol=1e-60, atol=1e-60, backend=backend, formulation=jj.Formulation("full"))
     assert int(lost.result) == results.UNRESOLVED
     assert "`rtol` is less than this precision resolves" in lost.message
+
+
+# No step is longer than a part of the span: in machine code, in XLA's loop, by Taylor series and by diffrax; the same steps in the first two.
+
+
+class Bead(OnLine):
+    """m x'' = -k x"""
+
+    stiffness: float = jj.parameter(0.0)
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=-self.stiffness * motion.q.x),)
+
+
+FREE = Bead()
+BEGIN = {"x": 1.0, "x_rate": 0.5}
+WAYS = {"native": {}, "xla": {"backend": "xla"}, "dense": {"backend": "dense"}, "Taylor": {"solver": jj.Taylor()}, "Tsit5": {"solver": diffrax.Tsit5()}}
+WAYS |= {"implicit": {"solver": jj.RadauIIA()}, "diffrax": {"solver": diffrax.Kvaerno3(), "work": False}}
+
+
+def steps(**options):
+    motion = jj.simulate(FREE, BEGIN, ts=[3.0], **options)
+    assert np.isclose(float(motion.q_end[0]), 2.5, rtol=1e-9)
+    return int(motion.accepted)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_steps_are_no_longer_than_a_part_of_the_span(way):
+    unbound, usual, short = (steps(**WAYS[way], **more) for more in ({"max_step": np.inf}, {}, {"max_step": 0.01}))
+    assert unbound < 16 <= usual < 40
+    assert 300 <= short < 330
+
+
+def test_both_loops_take_the_same_steps_in_lanes_and_under_jit_and_back_in_time():
+    starts = {"x": 1.0, "x_rate": jnp.linspace(-1.0, 2.0, 5)}
+    lanes = [jj.rollout(FREE, starts, ts=[-3.0], max_step=0.3, backend=backend, progress=False).lanes for backend in ("native", "xla")]
+    one = jax.jit(lambda longest: jj.simulate(FREE, BEGIN, ts=[-3.0], max_step=longest).accepted)(0.3)
+    for motion in lanes:
+        np.testing.assert_array_equal(motion.accepted, int(one))
+
+
+@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
+def test_derivatives_go_through_bounded_steps(derivative):
+    def end(x):
+        return jj.simulate(Bead(x), BEGIN, ts=[1.0], max_step=0.02).q_end[0]
+
+    w = np.sqrt(2.0)
+    expected = (-np.sin(w) + 0.5 * np.cos(w) / w - 0.5 * np.sin(w) / w**2) / (2 * w)
+    assert np.isclose(derivative(end)(2.0), expected, atol=1e-7)
+
+
+def test_a_step_of_one_length_has_its_own_bound():
+    with pytest.raises(ValueError, match="`max_step`"):
+        jj.simulate(FREE, BEGIN, ts=[3.0], max_step=0.1, solver=jj.ImplicitMidpoint(step=0.1))
+

@@ -12,48 +12,6 @@ from jourdain_jax.program.graph import Graph
 LINKS = 30
 
 
-def logistic(length: int):
-    """x <- a x (1 - x) + sin x, some hundred operations deep; every value is used by several others."""
-    graph = Graph()
-    a, x = graph.input("a", False), graph.input("x", True)
-    end = x
-    for _ in range(length):
-        end = graph.add(graph.mul(a, graph.mul(end, graph.sub(graph.one, end))), graph.mul(graph.const(0.1), graph.call("sin", end)))
-    return graph, a, x, end
-
-
-def by_hand(a, x, length):
-    for _ in range(length):
-        x = a * (x * (1 - x)) + 0.1 * jnp.sin(x)
-    return x
-
-
-def test_values_and_derivatives_of_a_deep_program_are_those_of_the_plain_one():
-    length = emit.DEEP
-    graph, a, x, end = logistic(length)
-    assert emit._depth(graph, graph.needed([end], {a, x})) > emit.DEEP
-
-    def program(a_value, x_value):
-        return emit.run(graph, [end, x], {a: a_value, x: x_value})[0]
-
-    lanes = jnp.linspace(0.1, 0.8, 5)
-    for run in (program, lambda a, x: by_hand(a, x, length)):
-        assert jax.eval_shape(run, 2.0, lanes).shape == (5,)
-    expected = by_hand(2.0, lanes, length)
-    assert_allclose(jax.jit(program)(2.0, lanes), expected, rtol=1e-12)
-    assert_allclose(jax.jit(jax.vmap(program, (None, 0)))(2.0, lanes), expected, rtol=1e-12)
-    slopes = [jax.jit(jax.vmap(jax.grad(f), (None, 0)))(2.0, lanes) for f in (program, lambda a, x: by_hand(a, x, length))]
-    assert_allclose(*slopes, rtol=1e-11)
-    forward = jax.jit(lambda a: jax.jvp(lambda a: program(a, lanes), (a,), (1.0,))[1])(2.0)
-    assert_allclose(forward, slopes[1], rtol=1e-11)
-
-
-def test_pieces_are_kept_apart_in_the_compiled_program():
-    graph, a, x, end = logistic(emit.DEEP)
-    compiled = jax.jit(lambda v: emit.run(graph, [end], {a: 2.0, x: v})[0]).lower(jnp.ones(4)).compile().as_text()
-    assert compiled.count("reduce(") >= emit.DEEP // emit.PIECE
-
-
 def chain(links: int):
     """A recursion outwards, one back inwards over its results, and a sum over both; every link has its own length and angle.
 
@@ -82,31 +40,43 @@ def recursed(values):
     return jnp.concatenate([outwards, inwards, jnp.sum(outwards * inwards[::-1], axis=0)[None]])
 
 
-@pytest.fixture(scope="module")
-def program():
-    graph, inputs, outputs = chain(LINKS)
-    return lambda values: jnp.stack(emit.run(graph, outputs, dict(zip(inputs, values, strict=True))))
+GRAPH, INPUTS, OUTPUTS = chain(LINKS)
+VALUES = jnp.asarray(np.random.default_rng(0).uniform(0.1, 0.5, 2 * LINKS))
+LANES = VALUES * jnp.linspace(0.9, 1.1, 5)[:, None]
 
 
-@pytest.fixture(scope="module")
-def values():
-    return jnp.asarray(np.random.default_rng(0).uniform(0.1, 0.5, 2 * LINKS))
+def program(values):
+    return jnp.stack(emit.run(GRAPH, OUTPUTS, dict(zip(INPUTS, values, strict=True))))
 
 
-def test_batches_are_those_of_single_lanes(program, values):
-    lanes = values * jnp.linspace(0.9, 1.1, 5)[:, None]
-    expected = recursed(lanes.T)
-    assert_allclose(jax.jit(program)(lanes.T), expected, rtol=1e-13)  # lanes last
-    assert_allclose(jax.jit(jax.vmap(program))(lanes).T, expected, rtol=1e-13)
+def test_batches_are_those_of_single_lanes():
+    assert emit._depth(GRAPH, GRAPH.needed(OUTPUTS, set(INPUTS))) > emit.DEEP
+    assert jax.eval_shape(program, LANES.T).shape == (len(OUTPUTS), 5)
+    expected = recursed(LANES.T)
+    assert_allclose(jax.jit(program)(LANES.T), expected, rtol=1e-13)  # lanes last
+    assert_allclose(jax.jit(jax.vmap(program))(LANES).T, expected, rtol=1e-13)
 
 
-def test_numbers_may_be_given_for_arrays(values):
-    graph, inputs, outputs = chain(LINKS)
-    found = emit.run(graph, outputs, dict(zip(inputs, values.tolist(), strict=True)))
-    assert_allclose(jnp.stack([jnp.asarray(x) for x in found]), recursed(values), rtol=1e-13)
+@pytest.mark.slow
+def test_derivatives_of_a_deep_program_are_those_of_the_plain_one():
+    weights = jnp.sin(jnp.arange(len(OUTPUTS)))
+    found, expected = (jax.jit(jax.vmap(jax.grad(lambda values, f=f: weights @ f(values))))(LANES) for f in (program, recursed))
+    assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
+    forward = jax.jit(lambda x: jax.jvp(program, (x,), (x,))[1])(VALUES)
+    assert_allclose(weights @ forward, jax.grad(lambda x: weights @ recursed(x))(VALUES) @ VALUES, rtol=1e-10)
 
 
-def test_single_precision_stays_so(program, values):
-    found = jax.jit(program)(values.astype(jnp.float32))
+def test_pieces_are_kept_apart_in_the_compiled_program():
+    compiled = jax.jit(program).lower(VALUES).compile().as_text()
+    assert compiled.count("reduce(") >= emit.DEEP // emit.PIECE
+
+
+def test_numbers_may_be_given_for_arrays():
+    found = emit.run(GRAPH, OUTPUTS, dict(zip(INPUTS, VALUES.tolist(), strict=True)))
+    assert_allclose(jnp.stack([jnp.asarray(x) for x in found]), recursed(VALUES), rtol=1e-13)
+
+
+def test_single_precision_stays_so():
+    found = jax.jit(program)(VALUES.astype(jnp.float32))
     assert found.dtype == jnp.float32
-    assert_allclose(found, recursed(values), rtol=2e-4)
+    assert_allclose(found, recursed(VALUES), rtol=2e-4)

@@ -1,15 +1,15 @@
-"""Derivatives of motions that failed: NaN for what lies after the failure, right before it, and zero where nobody
-asks, so that lanes left out of a loss disturb none.
-"""
+"""Derivatives of motions that failed, and what is answered inside of a derivative, jit or vmap where numbers are not known."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from small_scenes import OnLine
+from small_scenes import BeadOnTurningWire, OnLine
 
 import jourdain_jax as jj
+
+# Derivatives of motions that failed: NaN for what lies after the failure, right before it, and zero where nobody
 
 
 class Slider(OnLine):
@@ -100,13 +100,46 @@ def test_they_are_nan_after_the_failure_right_before_it_and_zero_where_nobody_as
         assert np.isnan(twice[2:]).all()
 
 
-def test_a_single_motion_that_failed_has_no_derivative_at_its_end():
-    def end(p, name):
-        motion = jj.simulate(Slider(stiffness=40.0 * p, edge=0.3), {"x": 0.5 * p}, ts=TIMES, max_steps=60, backend="native")
-        return getattr(motion, name)[0].sum()
+# What is not known inside a derivative, `jit` or `vmap` is answered by an error of our own, and a wrong parameter by NaN.
 
-    assert np.isnan(jax.grad(end)(1.0, "q_end"))
-    assert np.isnan(jax.jacfwd(end)(1.0, "u_end"))
-    assert np.isnan(jax.grad(jax.grad(end))(1.0, "q_end"))
-    before = _alone((1.0, 40.0, 1.0, 0.3), TIMES[0])
-    assert_allclose(jax.grad(end)(1.0, "u"), jax.grad(lambda p: before(p, "u_end"))(1.0), rtol=1e-6)
+
+@pytest.mark.parametrize("ask", [jj.report, jj.verify, jj.energy_balance, jj.sample_states])
+@pytest.mark.parametrize("inside", [jax.jit, jax.vmap, lambda f: lambda x: jax.jvp(f, (x,), (x,))])
+def test_functions_that_need_numbers_say_so_by_name(ask, inside):
+    with pytest.raises(jj.DifferentiationModeError, match=rf"`{ask.__name__}` was called inside jit, vmap or a derivative.*outside"):
+        inside(lambda radius: ask(jj.models.TiltingDisc(radius=radius)))(jnp.array([0.5]) if inside is jax.vmap else 0.5)
+
+
+def test_what_a_motion_says_in_words_and_pictures_needs_its_numbers(tmp_path):
+    motion = jj.simulate(BeadOnTurningWire(), {"r": 0.5}, ts=[0.1])
+    written = {jj.save: "motion.npz", jj.show: "motion.html", jj.plot: "motion.png", jj.animate: "motion.gif"}
+    asks = {ask.__name__: lambda motion, ask=ask, name=name: ask(motion, path=tmp_path / name) for ask, name in written.items()}
+    asks |= {"message": lambda motion: motion.message, "warnings": lambda motion: motion.warnings, "raise_if_failed": lambda motion: motion.raise_if_failed()}
+    for name, ask in asks.items():
+        with pytest.raises(jj.DifferentiationModeError, match=f"`{name}` was called inside jit"):
+            jax.jit(ask)(motion)
+    assert not list(tmp_path.iterdir())
+
+
+def test_functions_that_need_numbers_take_known_ones_where_others_are_traced():
+    wire, found = BeadOnTurningWire(), []
+    motion = jj.simulate(wire, {"r": 0.5}, ts=[0.1])
+    jax.jit(lambda x: found.extend([jj.energy_balance(wire), motion.raise_if_failed().message, jj.sample_states(wire, 1)[1].shape]) or x)(0.5)
+    assert found == [jj.energy_balance(wire), motion.message, (1, 1)]
+
+
+@pytest.mark.parametrize("derivative", [jax.jacrev, jax.jacfwd])
+@pytest.mark.parametrize("backend", ["auto", "xla"])
+def test_a_wrong_parameter_has_derivatives_that_are_nan(derivative, backend):
+    scene = jj.models.Skate()
+
+    def place(gravity_and_speed):
+        mass, speed = gravity_and_speed
+        return jj.simulate(scene.replace(mass=mass), {"x_rate": speed, "heading_rate": 0.7}, ts=[0.5], backend=backend).q[0]
+
+    numbers = jnp.array([[1.0, 0.5], [jnp.nan, 0.5], [-1.0, 0.5]])
+    slopes = jax.jit(jax.vmap(derivative(place)))(numbers)
+    alone = jax.jit(derivative(place))(numbers[0])
+    np.testing.assert_allclose(slopes[0], alone, rtol=1e-10, atol=1e-12)
+    assert np.isfinite(alone).all()
+    assert np.isnan(slopes[1:, :, 0]).all()

@@ -27,7 +27,6 @@ from jourdain_jax.scene.parameters import parameters_of
 
 DRAWS, STATES = 5, 20
 QUICK = {"skate", "chaplygin-sleigh"}  # a full state with projection, a minimal state
-SPAN = 0.4
 
 natively = machine_code.needed
 
@@ -170,29 +169,3 @@ def test_verification_passes(name):
     scene = MODELS[name]()
     found = jj.verify(scene, jj.start(scene, **scene.example))
     assert found.passed, str(found)
-
-
-@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name == "skate" else pytest.mark.slow) for name in sorted(MODELS)])
-def test_derivatives_through_simulation_by_every_parameter(name):
-    scene = MODELS[name]()
-    flat, unravel = ravel_pytree({key: value for key, value, _ in parameters_of(scene)})
-    flat = jnp.where(flat == 0, 0.01, flat)  # differences need both sides, and some parameters may not be negative
-
-    def end(flat):
-        own = scene.replace(**unravel(flat))
-        start = jj.start(own, **scene.example)
-        motion = jj.simulate(own, start, ts=jnp.array([SPAN]), rtol=1e-11, atol=1e-11, work=False, events=False)
-        return jnp.concatenate([motion.q_end, motion.u_end])
-
-    forward = np.asarray(jax.jit(jax.jacfwd(end))(flat))
-    weights = jnp.asarray(np.random.default_rng(0).normal(size=forward.shape[0]))
-    reverse = np.asarray(jax.jit(jax.grad(lambda x: weights @ end(x)))(flat))
-    # fourth-order central differences, all in one batch
-    unit = np.where(np.asarray(flat) == 0, 1.0, np.abs(flat))
-    steps = 1e-3 * unit
-    points = jnp.stack([flat + k * np.diag(steps) for k in (-2, -1, 1, 2)])
-    ends = np.asarray(jax.jit(jax.vmap(jax.vmap(end)))(points))
-    differences = ((ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * steps[:, None])).T
-    size = np.max(np.abs(forward * unit)) + 1e-3 * np.max(np.abs(ends))
-    assert np.max(np.abs((forward - differences) * unit)) <= tolerance("gradient_simulation") * size
-    assert np.max(np.abs((np.asarray(weights) @ forward - reverse) * unit)) <= tolerance("gradient_simulation") * size

@@ -1,11 +1,16 @@
-"""Values that some state on the rows has are a start: what was not given is found, and where it was not found near the reference, the state says so."""
+"""Values that some state on the rows has are a start: what was not given is found, and has derivatives."""
+
+from itertools import pairwise
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import linkages
+import moving_linkages
 import numpy as np
 import pytest
 import result_codes as results
+import small_scenes
 from jax.flatten_util import ravel_pytree
 from linkages import Parallelogram, SliderCrank, Windows, bennett, bricard
 from numpy.testing import assert_allclose, assert_array_equal
@@ -13,8 +18,10 @@ from small_scenes import DiscWithHeightRow
 
 import jourdain_jax as jj
 from jourdain_jax import structure_of
-from jourdain_jax.build.sampling import NoStateFoundError
 from jourdain_jax.eager.eager import eval_numpy
+
+# Values that some state on the rows has are a start: what was not given is found, and where it was not found near the reference, the state says so
+
 
 SCENES = {
     "disc with quaternion": jj.models.TiltingDiscQuaternion(),
@@ -180,16 +187,9 @@ def test_starts_in_lanes_find_what_single_ones_find_and_have_derivatives():
     assert_allclose(q, np.stack([np.asarray(state.q) for state in single]), atol=1e-8)
     assert max(int(state.guess) for state in single) > 0
     # r^2 + x^2 - 2 r x cos(a) = l^2
-    assert_allclose(slope, (np.cos(a) - places) / (places * np.sin(a)), rtol=1e-7)
-
-
-def test_a_start_found_elsewhere_has_a_derivative_in_reverse_mode():
-    def crank(x):
-        return jj.start(SCENES["slider-crank"], x=x)["a"]
-
-    x = -1.5
-    a = float(crank(x))
-    assert jax.jit(jax.grad(crank))(x) == pytest.approx((np.cos(a) - x) / (x * np.sin(a)), rel=1e-9)
+    expected = (np.cos(a) - places) / (places * np.sin(a))
+    assert_allclose(slope, expected, rtol=1e-7)
+    assert_allclose(jax.jit(jax.grad(lambda x: crank(x)[0]))(places[0]), expected[0], rtol=1e-7)
 
 
 class Hidden(jj.Scene):
@@ -209,7 +209,7 @@ def test_states_near_the_example_serve_where_none_was_found_at_random():
     class Shown(Hidden):
         example = {"x": 0.3, "y": 0.2}
 
-    with pytest.raises(NoStateFoundError, match=r"no admissible state .* or an `example` on the rows"):
+    with pytest.raises(ValueError, match=r"no admissible state .* or an `example` on the rows"):
         structure_of(Hidden())
     assert structure_of(Shown()).degrees_of_freedom == 2
     assert float(jj.start(Shown(), x=0.3, y=0.2, y_rate=1.0).residual) < 1e-12
@@ -275,3 +275,75 @@ def test_a_state_that_newtons_method_does_not_bring_onto_the_rows_is_searched_fo
     sound = jj.simulate(scene, eqx.tree_at(lambda s: s.q, start, jnp.array([0.6, -0.8, 0.6, -1.7])), t1=0.1)  # the lower rod is too long
     assert int(sound.result) == results.SUCCESS
     assert 0.01 < float(sound.moved_q) < 0.1
+
+
+# Derivatives of what is put onto the rows, of a start off them by some finite amount, against differences of what is computed.
+
+
+STEP = 2e-3
+
+
+def _slope(function, s: float = 0.0) -> np.ndarray:
+    """The derivative by Richardson's extrapolation of central differences, of order 6."""
+    D = [(np.asarray(function(s + h)) - np.asarray(function(s - h))) / (2 * h) for h in (STEP, STEP / 2, STEP / 4)]
+    D = [(4 * b - a) / 3 for a, b in pairwise(D)]
+    return (16 * D[1] - D[0]) / 15
+
+
+def _along(scene: jj.Scene, held: tuple[str, ...], off: float):
+    """What is put onto the rows as a function of one number, on which parameters, time, coordinates and speeds depend."""
+    generator = np.random.default_rng(2)
+    _, q, u = jj.sample_states(scene, 1)
+    numbers, restored = ravel_pytree((jax.tree.map(jnp.asarray, scene), jnp.asarray(0.2), jnp.asarray(q[0]), jnp.asarray(u[0])))
+    moved = jnp.asarray(off * generator.normal(size=len(q[0]) + len(u[0])))
+    numbers = numbers.at[-moved.size :].add(moved)
+    direction = jnp.asarray(generator.normal(size=numbers.size)) * (0.1 + 0.1 * jnp.abs(numbers))
+
+    def put(s):
+        here, t, q, u = restored(numbers + s * direction)
+        state = jj.consistent(here, t, q, u, jnp.full(len(scene.inputs), 0.3), held=held)
+        return jnp.concatenate([state.q, state.u])
+
+    return put
+
+
+@pytest.mark.parametrize(
+    ("scene", "held", "off"),
+    [
+        (jj.models.DoublePendulumRods(), ("x1", "x2"), 0.02),
+        (linkages.Parallelogram(), (), 1e-2),
+        (small_scenes.BeadOnTurningWire(), (), 0.1),
+    ],
+    ids=["held", "redundant rows", "rows of time"],
+)
+def test_derivatives_are_those_of_what_is_computed(scene, held, off):
+    put = _along(scene, held, off)
+    weights = jnp.asarray(np.random.default_rng(3).normal(size=put(0.0).size))
+    forward = jax.jit(jax.jacfwd(put))(0.0)
+    assert_allclose(forward, _slope(jax.jit(put)), atol=1e-8 * np.max(np.abs(forward)))
+    assert_allclose(jax.jit(jax.grad(lambda s: weights @ put(s)))(0.0), weights @ forward, rtol=1e-10)
+
+
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+def test_values_that_are_all_given_move_with_the_rows_in_derivatives(derivative):
+    """A longer rod moves the bob outwards, a rate along the rod is taken away: x = l sin a, z = -l cos a, also where x, z and both rates are given."""
+    sin, cos = 0.28, 0.96
+
+    def begins(length, along):
+        scene = moving_linkages.NarrowPendulum(length=length)
+        rates = {"x_rate": cos + along * sin, "z_rate": sin - along * cos}
+        state = jj.start(scene, {"x": sin, "z": -cos, **rates})
+        return jnp.concatenate([state.q, state.u])
+
+    assert_allclose(begins(1.0, 0.0), [sin, -cos, cos, sin], atol=1e-15)
+    by_length, by_rate = jax.jit(derivative(begins, argnums=(0, 1)))(1.0, 0.0)
+    assert_allclose(by_length, [sin, -cos, 0.0, 0.0], atol=1e-12)
+    assert_allclose(by_rate, np.zeros(4), atol=1e-12)
+
+
+def test_second_derivatives_are_differences_of_first_ones():
+    put = _along(small_scenes.BeadOnTurningWire(), (), 0.1)
+    expected = _slope(jax.jit(jax.jacfwd(put)))
+    for second in (jax.jacfwd(jax.jacfwd(put)), jax.jacfwd(jax.jacrev(put)), jax.jacrev(jax.jacrev(put))):
+        assert_allclose(jax.jit(second)(0.0), expected, atol=1e-7 * np.max(np.abs(expected)))
+

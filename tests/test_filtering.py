@@ -73,21 +73,21 @@ def test_derivatives_are_those_of_kalmans_filter():
     assert_allclose(found, [differences(i) for i in range(3)], rtol=1e-5)
 
 
-def test_undisturbed_sleigh_has_the_plain_likelihood():
-    sleigh, start, ts = jj.models.ChaplyginSleigh(), {"x_rate": -0.6, "heading_rate": 0.9}, np.linspace(0.0, 2.0, 9)
+def undisturbed():
+    """Scenes with their runs: a sleigh with a sensor that is a vector, and two particles and a rod between them, some of whose coordinates follow."""
+    ts = np.linspace(0.1, 1.6, 7)
     values = {"x": -0.5 * ts, "nose": np.stack([-0.5 * ts, 0.1 * ts, 0.0 * ts], axis=1)}
-    sensors = {"nose": lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))}
-    runs = [jj.Experiment(ts + t0, values, 0.05, start=start, sensors=sensors) for t0 in (0.0, 1.0)]
-    found = jj.filtered_log_likelihood(sleigh, runs, process_noise={})
-    assert_allclose(found, jj.log_likelihood(sleigh, runs), rtol=1e-6)
+    asked = {"start": {"x_rate": -0.6, "heading_rate": 0.9}, "sensors": {"nose": lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))}}
+    yield jj.models.ChaplyginSleigh(), [jj.Experiment(ts + t0, values, 0.05, t0=t0, **asked) for t0 in (0.0, 1.0)]
+    rods, ts = jj.models.SpringAndRod(), np.linspace(0.1, 0.6, 6)
+    motion = jj.simulate(rods, rods.example, t0=0.0, ts=ts)
+    yield rods, jj.Experiment(ts, {name: np.asarray(motion[name]) + 0.01 for name in ("z1", "x2", "z2")}, 0.02, start=rods.example, t0=0.0)
 
 
-def test_dependent_coordinates_follow():
-    """Two particles and a rod between them, undisturbed and with a start that is known."""
-    scene, ts = jj.models.SpringAndRod(), np.linspace(0.1, 0.6, 6)
-    motion = jj.simulate(scene, scene.example, t0=0.0, ts=ts)
-    run = jj.Experiment(ts, {name: np.asarray(motion[name]) + 0.01 for name in ("z1", "x2", "z2")}, 0.02, start=scene.example, t0=0.0)
-    assert_allclose(jj.filtered_log_likelihood(scene, run, process_noise={}), jj.log_likelihood(scene, run), rtol=1e-6)
+@pytest.mark.slow
+def test_undisturbed_motions_have_the_plain_likelihood():
+    for scene, runs in undisturbed():
+        assert_allclose(jj.filtered_log_likelihood(scene, runs, process_noise={}), jj.log_likelihood(scene, runs), rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The HTML report of a fit: its numbers are those of the fit, its drawings those of data and simulation, and it loads nothing."""
+"""What a fit tells beyond its estimates: profiles, what informs which unknown, predictions of other runs, and its HTML report."""
 
 import pickle
 import re
@@ -9,12 +9,15 @@ from xml.etree import ElementTree
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.information import hidden_combinations, weak_combinations
 
-START = {"x_rate": -0.6, "heading_rate": 0.9}
+# The HTML report of a fit: its numbers are those of the fit, its drawings those of data and simulation, and it loads nothing.
+
+
+START, OTHER = {"x_rate": -0.6, "heading_rate": 0.9}, {"x_rate": -0.4, "heading_rate": 0.6}
 TS = jnp.linspace(0.0, 4.0, 41)
 TRUTH = jj.models.ChaplyginSleigh(offset=0.25)
 
@@ -68,14 +71,24 @@ def captions(path: Path) -> list[str | None]:
     return [figure.findtext("figcaption") for figure in page(path).iter("figure")]
 
 
-def test_report_holds_the_numbers_of_the_fit(fitted, tmp_path):
+@pytest.fixture(scope="module")
+def written(fitted, tmp_path_factory):
+    """A report with a run held out and profiles: its file, the run, and what was drawn."""
     fit, data = fitted
-    fit.report(tmp_path / "fit.html", data)
-    found = sections(tmp_path / "fit.html")
-    assert (page(tmp_path / "fit.html").find(".//pre").text) == str(fit)
+    path, held_out, figures, save = tmp_path_factory.mktemp("report") / "fit.html", measured(1, OTHER), [], Figure.savefig
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", lambda self, *given, **named: figures.append(self) or save(self, *given, **named))
+        fit.report(path, data, held_out=held_out, profiles=True, units={"x": "m"})
+    return path, held_out, figures
+
+
+def test_report_holds_the_numbers_of_the_fit(fitted, written):
+    (fit, data), (path, _, _) = fitted, written
+    found = sections(path)
+    assert page(path).find(".//pre").text == str(fit)
     assert float(found["Correlations"]["offset"][1]) == pytest.approx(float(fit.correlation[0, 1]), abs=0.0051)
-    error = np.asarray(jj.simulate(fit.scene, START, ts=TS)["heading"]) - np.asarray(data.values["heading"])
     value = np.asarray(data.values["heading"])
+    error = np.asarray(jj.simulate(fit.scene, START, ts=TS)["heading"]) - value
     (told,) = (line for line in found["Data (dots) and prediction (line)"] if "`heading`" in line)
     samples, rms, r_squared = re.search(r": (\d+) samples .* rms of (\S+); R\^2 (\S+)", told).groups()
     assert samples == "41"
@@ -87,30 +100,37 @@ def test_report_holds_the_numbers_of_the_fit(fitted, tmp_path):
         assert cells[2] == "yes"
 
 
-def test_what_is_drawn_are_the_data_and_a_simulation(fitted, tmp_path, drawn):
-    fit, data = fitted
-    fit.report(tmp_path / "fit.html", data, units={"x": "m"})
-    panels, motion = {figure.axes[0].get_ylabel(): figure for figure in drawn}, jj.simulate(fit.scene, START, ts=TS)
-    assert {"run 0: x", "run 0: heading"} <= set(captions(tmp_path / "fit.html"))
+def test_what_is_drawn_are_the_data_and_a_simulation(fitted, written):
+    (fit, data), (path, _, figures) = fitted, written
+    panels, motion = {}, jj.simulate(fit.scene, START, ts=TS)
+    for figure in figures:
+        panels.setdefault(figure.axes[0].get_ylabel(), figure)
+    assert {f"{run}: {name}" for run in ("run 0", "held out, run 0") for name in ("x", "heading")} <= set(captions(path))
     for name, label, sigma in (("x", "x in m", 0.01), ("heading", "heading in SI units", float(fit.sigma["heading"]))):
         above, below = panels[label].axes
         dots, line = (of.get_xydata() for of in above.lines)
         assert_array_equal(dots, np.stack([TS, data.values[name]], axis=1))  # a missing sample has no dot
         assert np.isfinite(dots).all() == (name == "heading")
-        predicted = np.asarray(motion[name])[np.isin(TS, line[:, 0])]
-        assert_allclose(line[:, 1], predicted, rtol=0, atol=1e-7)
+        assert_allclose(line[:, 1], np.asarray(motion[name])[np.isin(TS, line[:, 0])], rtol=0, atol=1e-7)
         assert len(line) >= np.isfinite(data.values[name]).sum()
         assert_allclose(below.lines[-1].get_ydata(), (np.asarray(motion[name]) - data.values[name]) / sigma, atol=1e-3)
 
 
-def test_report_loads_nothing_and_is_small(fitted, tmp_path):
-    fit, data = fitted
-    fit.report(tmp_path / "fit.html", data, held_out=measured(1), profiles=True, units={"x": "m"})
-    text = (tmp_path / "fit.html").read_text(encoding="utf-8")
+def test_report_loads_nothing_and_is_small(written):
+    text = written[0].read_text(encoding="utf-8")
     # two channels with data and two held out, two autocorrelations, two profiles, widths of intervals, what informs, the way to the minimum
     assert text.count("<img") == text.count('src="data:image/png;base64,') == 11
     assert not re.search(r"(https?:|src=\"(?!data:)|href=|url\(|@import|<script)", text)
     assert len(text) < 1e6
+
+
+def test_runs_held_out_are_predicted(fitted, written):
+    path, other, _ = written
+    lines, motion = sections(path)["Runs held out"], jj.simulate(fitted[0].scene, OTHER, ts=TS)
+    for name, line in zip(("heading", "x"), lines, strict=True):
+        error = np.asarray(motion[name]) - np.asarray(other.values[name])
+        assert line.startswith(f"`{name}` of held out, run 0")
+        assert float(re.search(r"rms of (\S+);", line)[1]) == pytest.approx(np.sqrt(np.nanmean(error**2)), rel=6e-3)
 
 
 def test_a_report_without_matplotlib_has_all_words_and_says_what_to_install(fitted, tmp_path, monkeypatch):
@@ -132,19 +152,6 @@ def test_many_long_runs_stay_below_two_megabytes(tmp_path):
     # span, eight runs of thirty, two channels, priors
     assert len(sections(tmp_path / "fit.html")["What informs which unknown"]["unknown"]) == 1 + 8 + 2 + 1
     assert "20 more are not drawn" in (tmp_path / "fit.html").read_text(encoding="utf-8")
-
-
-def test_runs_held_out_are_predicted_in_table_and_drawing(fitted, tmp_path):
-    fit, data = fitted
-    other_start = {"x_rate": -0.4, "heading_rate": 0.6}
-    other = measured(1, other_start)
-    fit.report(tmp_path / "fit.html", data, held_out=other)
-    lines, motion = sections(tmp_path / "fit.html")["Runs held out"], jj.simulate(fit.scene, other_start, ts=TS)
-    for name, line in zip(("heading", "x"), lines, strict=True):
-        error = np.asarray(motion[name]) - np.asarray(other.values[name])
-        assert line.startswith(f"`{name}` of held out, run 0")
-        assert float(re.search(r"rms of (\S+);", line)[1]) == pytest.approx(np.sqrt(np.nanmean(error**2)), rel=6e-3)
-    assert {"held out, run 0: x", "held out, run 0: heading"} <= set(captions(tmp_path / "fit.html"))
 
 
 def test_profiles_stand_in_the_report_and_the_bootstrap_has_gone(fitted, tmp_path):
@@ -189,32 +196,6 @@ def test_residuals_that_are_not_white_are_told_with_what_that_means(tmp_path):
     assert "intervals from the sigmas are too narrow" in (tmp_path / "fit.html").read_text(encoding="utf-8")
 
 
-def test_weak_directions_are_named_by_what_changes_along_them():
-    sizes, labels = np.array([2.0, 4.0, 1.0]), ("a", "b", "c")
-    values = np.array([2.0, -4.0, 0.0])
-    poor, good = np.array([3.0, 4.0, 0.0]) / 5, np.array([[4.0, -3.0, 0.0], [0.0, 0.0, 5.0]]) / 5
-    relative = 0.5**2 * np.outer(poor, poor) + 0.01**2 * good.T @ good
-    (told,) = weak_combinations(relative * sizes * sizes[:, None], values, sizes, labels)
-    assert told.startswith("a change of `b` by 40 % and a change of `a` by 30 % together")
-    lone = np.diag([1e-6, 1e-6, 0.2**2])
-    (told,) = weak_combinations(lone * sizes * sizes[:, None], values, sizes, labels)
-    assert told.startswith("a change of `c` by 0.2 is one standard error")
-    assert weak_combinations(np.full((3, 3), np.nan), values, sizes, labels) == ()
-
-
-def test_two_hidden_directions_and_a_parameter_that_does_nothing():
-    # d theta_0/theta_0 = d theta_2/theta_2, with theta_1 = 0 counted in its own unit; theta_3 does nothing
-    directions = np.linalg.qr(np.array([[1.0, 0.5, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]).T)[0].T
-    turned = np.array([[0.6, 0.8], [-0.8, 0.6]]) @ directions
-    sentences = hidden_combinations(turned, 1e-3, np.ones(4), np.array([1.0, 0.0, 1.0, 1.0]), tuple("abcd"))
-    assert len(sentences) == 2
-    assert "`d` does not show in any channel" in sentences
-    assert any("`a` and `b` and `c`" in s and "d a/a : d b : d c/c = 1 : 0.5 : 1" in s for s in sentences)
-    # where two directions share an unknown, no product of powers of two unknowns shows
-    rows = np.linalg.qr(np.array([[1.0, 0.0, 0.4], [0.0, 1.0, 0.3]]).T)[0].T
-    assert all("`c` do not show separately" in s and "what shows" not in s for s in hidden_combinations(rows, 1e-3, np.ones(3), np.ones(3), tuple("abc")))
-
-
 def test_names_that_no_data_tell_stand_in_the_report(tmp_path, drawn):
     data = measured(0)
     fit = jj.fit(TRUTH.replace(offset=0.3), data, free=("offset", "inertia", "mass"))
@@ -246,3 +227,165 @@ def test_report_answers_what_it_cannot_write(fitted, tmp_path):
         fit.report(tmp_path / "fit.html", measured(7))
     with pytest.raises(ValueError, match="computed from the runs that were fitted"):
         fit.report(tmp_path / "fit.html", profiles=True)
+
+
+# Profiles of unknowns against fits with the unknown held; shares of information against variances with changed sigmas; predictions of other runs.
+
+
+RISE = 3.841458820694124  # 95 % quantile of chi-square with one degree of freedom
+
+
+def run(start=START, sigma=0.01, noise: int | None = 0, unknown=("heading_rate",), **more) -> jj.Experiment:
+    motion, generator = jj.simulate(TRUTH, start, ts=TS), np.random.default_rng(noise or 0)
+    values = {name: np.asarray(motion[name]) + (0 if noise is None else 0.01 * generator.normal(size=41)) for name in ("x", "heading")}
+    return jj.Experiment(TS, values, sigma, start=start, unknown_start=unknown, **more)
+
+
+def test_the_profile_of_a_linear_unknown_is_the_parabola_of_its_standard_error():
+    sensor = jj.Sensor("heading", gain=jj.Estimate(1.1), bias=jj.Estimate(0.1))
+    motion, noise = jj.simulate(TRUTH, START, ts=TS), np.random.default_rng(2)
+    data = jj.Experiment(TS, {"shown": np.asarray(motion["heading"]) + 0.05 * noise.normal(size=41)}, 0.05, start=START, sensors={"shown": sensor})
+    fit = jj.fit(TRUTH, data)
+    for one in fit.profiles(data).values():
+        e = fit[one.name]
+        assert one.kind == "bounded"
+        assert_allclose(one.rise, ((one.values - e.value) / e.standard_error) ** 2, atol=2e-3)
+        assert_allclose([one.low, one.high], [e.low, e.high], atol=0.01 * e.standard_error)
+        assert "bounded" in str(one)
+
+
+@pytest.mark.parametrize("sigma", [0.1, None], ids=["sigma known", "sigma estimated"])
+def test_the_interval_ends_where_a_fit_with_the_unknown_held_is_that_much_worse(sigma):
+    # few and noisy samples, so that the profile is no parabola; more of them where they are to tell the sigmas, too
+    ts, names, skew = (TS[::10], ("x",), 0.1) if sigma else (TS[::5], ("x", "heading"), 0.04)
+    motion, noise = jj.simulate(TRUTH, START, ts=ts), np.random.default_rng(4)
+    values = {name: np.asarray(motion[name]) + (sigma or 0.05) * noise.normal(size=len(ts)) for name in names}
+    data = jj.Experiment(ts, values, sigma, start=START)
+    fit = jj.fit(TRUTH, data, ("offset", "inertia"))
+    (one,) = fit.profiles(data, "offset").values()
+    assert abs((one.high - one.estimate) / (one.estimate - one.low) - 1) > skew
+    for end, closed in zip((one.low, one.high), one.is_closed, strict=True):
+        if not closed:
+            continue
+        held = jj.fit(fit.scene.replace(offset=end), data, ("inertia",), tolerance=1e-6)
+        if sigma:
+            rise = float(held.chi_square - fit.chi_square)
+        else:  # 2 F = 2 sum n log sigma, of sigmas that allow for no unknowns
+            likeliest = [{e.channel: e.rms * float(found.sigma[e.channel]) for e in found.residual_summary()} for found in (held, fit)]
+            rise = sum(2 * len(ts) * np.log(likeliest[0][name] / likeliest[1][name]) for name in names) / fit.statistics.of_rise[0]
+        assert rise == pytest.approx(RISE, rel=0.02)
+    assert any(one.is_closed)
+
+
+def test_what_does_not_show_has_a_flat_profile():
+    fit = jj.fit(TRUTH.replace(offset=0.3), data := run(), ("offset", "inertia", "mass"))
+    found = fit.profiles(data)
+    assert [one.kind for one in found.values()] == ["bounded", "flat", "flat"]
+    assert found["mass"].high == np.inf
+    assert np.max(found["mass"].rise) < 0.05
+    assert np.ptp(np.log(found["mass"].values)) > np.log(100)
+
+
+def test_profiles_answer_wrong_names_and_other_data():
+    fit = jj.fit(TRUTH, data := run(), ("offset",))
+    with pytest.raises(KeyError, match="`ofset` was not estimated; did you mean `offset`"):
+        fit.profiles(data, "ofset")
+    with pytest.raises(ValueError, match="are not those of the fit"):
+        fit.profiles(run(noise=9))
+    with pytest.raises(ValueError, match="expected those of the fit"):
+        fit.profiles(run(unknown=()))
+
+
+# What informs which unknown. --------------------------------------------------------------------------------------------
+
+
+def shares(fit, runs):
+    from jourdain_jax.analysis.resumed import informed, taken_up
+
+    return informed(taken_up(fit, runs), 20)
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.3], ids=["white", "with a memory"])
+def test_a_share_is_by_how_much_the_variance_falls_with_the_weight_of_the_samples(memory):
+    """d log C_ii / d log w, by central differences of fits to exact data with changed sigmas."""
+    other = {"x_rate": -0.8, "heading_rate": 0.4}
+
+    def fitted(change: float, where: str):
+        sigma = [{"x": np.full(41, 0.01), "heading": np.full(41, 0.02)} for _ in range(2)]
+        slower = np.exp(-change / 2)  # sigma = w^(-1/2)
+        if where == "run 1":
+            sigma[1] = {name: slower * s for name, s in sigma[1].items()}
+        elif where == "heading":
+            for of_run in sigma:
+                of_run["heading"] *= slower
+        elif where == "a sample":
+            sigma[0]["x"][25] *= slower
+        runs = [run(start, s, None, correlation_time=memory) for start, s in zip((START, other), sigma, strict=True)]
+        return jj.fit(TRUTH, runs, ("offset", "inertia")), runs
+
+    fit, runs = fitted(0.0, "")
+    found = shares(fit, runs)
+    assert_allclose(found.of_runs.sum(axis=1), 1.0, rtol=1e-9)
+    told = {"run 1": found.of_runs[:, 1], "heading": found.of_channels["heading"], "a sample": found.of_samples[0]["x"][:, 25]}
+    for where, share in told.items():
+        if memory and where == "a sample":
+            continue  # with a memory, the sample after it is whitened with the sigma of this one
+        more, less = (fitted(h, where)[0].standard_errors ** 2 for h in (0.01, -0.01))
+        assert_allclose(share, -(np.log(more) - np.log(less)) / 0.02, rtol=1e-3, atol=1e-5, err_msg=where)
+
+
+def test_a_prior_takes_what_the_data_do_not_tell():
+    data = run(noise=None)
+    alone = jj.fit(TRUTH, data, ("offset",))
+    s = 2 * float(alone["offset"].standard_error)
+    fit = jj.fit(TRUTH, data, {"offset": jj.Estimate(prior=jj.Normal(0.25, s))})
+    found = shares(fit, data)
+    assert found.of_priors[0] == pytest.approx(float(fit["offset"].standard_error) ** 2 / s**2, rel=1e-6)
+
+
+def test_the_span_that_holds_half_of_the_information_is_the_shortest_one():
+    fit = jj.fit(TRUTH, data := run(), ("offset",))
+    found = shares(fit, data)
+    told = sum(of[0] for of in found.of_samples[0].values())
+    _, begin, end = found.half(0)
+    inside = lambda a, b: told[(a - 1e-9 <= TS) & (b + 1e-9 >= TS)].sum()  # noqa: E731
+    assert inside(begin, end) >= 0.5 * told.sum() * (1 - 1e-8)
+    shorter = end - begin - 0.1
+    assert max(inside(a, a + shorter) for a in TS) < 0.5 * told.sum()
+
+
+# Runs held out. ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_run_held_out_is_predicted_with_its_own_start_fitted_to_it():
+    gyro = jj.Sensor("heading_rate", gain=jj.Estimate(1.0), bias=jj.Estimate(0.0, per_run=True))
+
+    def with_gyro(start, bias: float, seed: int):
+        motion, noise = jj.simulate(TRUTH, start, ts=TS), np.random.default_rng(seed)
+        values = {"x": np.asarray(motion["x"]) + 0.01 * noise.normal(size=41)}
+        values["gyro"] = 1.1 * np.asarray(motion["heading_rate"]) + bias + 0.01 * noise.normal(size=41)
+        begin = start | {"heading_rate": start["heading_rate"] + 0.05}
+        return jj.Experiment(TS, values, {"x": 0.01, "gyro": None}, start=begin, unknown_start=("heading_rate",), sensors={"gyro": gyro})
+
+    fit = jj.fit(TRUTH.replace(offset=0.3), [with_gyro(START, 0.02, 0), with_gyro({"x_rate": -0.8, "heading_rate": 0.4}, -0.03, 1)], ("offset",))
+    other = with_gyro({"x_rate": -0.5, "heading_rate": 0.6}, 0.05, 2)
+    (found,) = fit.predict(other)
+    # the same by a fit whose shared unknowns are known
+    known = jj.Sensor("heading_rate", gain=float(fit["gyro.gain"].value), bias=jj.Estimate(0.0))
+    by_hand = jj.fit(
+        fit.scene, jj.Experiment(TS, other.values, other.sigma | {"gyro": None}, start=other.start, unknown_start=("heading_rate",), sensors={"gyro": known})
+    )
+    for name, sigma in (("x", 0.01), ("gyro", float(by_hand.sigma["gyro"]))):
+        assert_allclose(found[name].error, sigma * by_hand.residuals[0][name], atol=2e-5)
+        assert found[name].rms == pytest.approx(float(np.sqrt(np.mean(found[name].error ** 2))))
+        assert 0.99 < found[name].r_squared < 1
+    assert 0.5 < found["x"].rms / 0.01 < 1.5
+    assert_allclose(found["gyro"].sigma, float(fit.sigma["gyro"]))
+
+
+def test_runs_held_out_that_cannot_be_predicted_are_answered():
+    fit = jj.fit(TRUTH, run(unknown=()), ("offset",))
+    scaled = jj.Experiment(TS, {"gyro": np.zeros(41)}, 0.01, start=START, sensors={"gyro": jj.Sensor("heading_rate", gain=jj.Estimate(1.0))})
+    with pytest.raises(ValueError, match=r"runs held out share `gyro\.gain`, which was not estimated"):
+        fit.predict(scaled)
+

@@ -1,7 +1,7 @@
 """In single precision: motions, accelerations and gradients are right to what float32 holds, and nothing turns into float64 on the way.
 
 The precision is chosen before JAX starts, so that all of it runs in one process of its own; its findings come back as JSON. By default it looks at the skate;
-at other models, reductions, gradients, a verification and a motion that nothing continues where slow tests run. Motions are integrated by machine code, which
+at other models, reductions, a verification and a motion that nothing continues where slow tests run. Motions are integrated by machine code, which
 works in double precision and rounds what it returns, and by XLA, which works in single precision.
 """
 
@@ -24,7 +24,6 @@ import jourdain_jax as jj
 from jourdain_jax.models import MODELS
 
 NAMES = ("skate", "chaplygin-sleigh", "tilting-disc-quaternion")
-WITH_GRADIENT = ("chaplygin-sleigh",)
 TS = np.linspace(0.1, 2.0, 20)
 SINGLE = 1e-4  # relative: rtol is 1e-5 per step, over some 30 steps
 GRADIENT = 1e-3
@@ -35,10 +34,9 @@ import jax, jax.numpy as jnp, numpy as np
 import jourdain_jax as jj
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.scene.parameters import parameters_of
 
 gc.disable()  # a process of a minute
-names, with_gradient, ts, slow = json.loads(input())
+names, ts, slow = json.loads(input())
 
 
 def types(tree):
@@ -76,13 +74,6 @@ for name in names:
         "spread": {way: float(jnp.max(jnp.abs(a.udot - middle)) / (1 + jnp.max(jnp.abs(middle)))) for way, a in by_reduction.items()},
         "applicable": bool(jnp.all(jnp.stack([a.applicable for a in by_reduction.values()]))),
     }
-    if name in with_gradient:
-        by_scene, by_state = jax.grad(lambda pair: jnp.sum(motion_of(*pair, work=False).q_end[:3]))((scene, state))
-        found[name] |= {
-            "by_scene": {key: float(getattr(by_scene, key)) for key, _, _ in parameters_of(scene)},
-            "by_state": [by_state.q.tolist(), by_state.u.tolist()],
-            "types of gradients": types((by_scene, by_state)),
-        }
 
 sleigh = MODELS["chaplygin-sleigh"]()
 with warnings.catch_warnings(record=True) as caught:
@@ -176,7 +167,7 @@ def single(request):
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
         "PYTHONPATH": os.pathsep.join([str(source), os.environ.get("PYTHONPATH", "")]),
     }
-    text = json.dumps([NAMES if slow else NAMES[:1], WITH_GRADIENT if slow else [], TS.tolist(), slow])
+    text = json.dumps([NAMES if slow else NAMES[:1], TS.tolist(), slow])
     run = subprocess.run([sys.executable, "-c", PROGRAM], input=text, env=environment, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     return json.loads(run.stdout.splitlines()[-1])
@@ -236,23 +227,6 @@ def test_reductions_agree_in_single_precision(compared):
     t, q, u = (jnp.asarray(x) for x in found["states"])
     exact = jax.vmap(lambda t, q, u: jj.accelerations(scene, t, q, u).udot)(t, q, u)
     assert relative_error(found["udot"], exact) <= SINGLE
-
-
-@pytest.mark.parametrize("name", WITH_GRADIENT)
-def test_gradients_in_single_precision_are_those_of_double_precision(name, single):
-    scene, found = MODELS[name](), single[name]
-
-    def end(pair):
-        return jnp.sum(jj.simulate(*pair, ts=TS, rtol=1e-6, atol=1e-8, work=False).q_end[:3])
-
-    by_scene, by_state = jax.grad(end)((scene, jj.start(scene, **scene.example)))
-    exact = {key: float(getattr(by_scene, key)) for key in found["by_scene"]}
-    size = max(map(abs, exact.values()))
-    for key, value in found["by_scene"].items():
-        assert abs(value - exact[key]) <= GRADIENT * size, key
-    for value, expected in zip(found["by_state"], (by_state.q, by_state.u), strict=True):
-        assert relative_error(value, expected) <= GRADIENT
-    assert found["types of gradients"] == ["float32"]
 
 
 def test_tolerances_below_single_precision_are_warned_of(single):

@@ -1,8 +1,11 @@
-"""Scenes from SymPy's mechanics: their accelerations are those of SymPy's own equations."""
+"""Scenes from SymPy's mechanics: their accelerations are those of SymPy's own equations; and the page on scenes from other tools."""
 
+import functools
 import inspect
+import re
 import sys
 import textwrap
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -11,6 +14,9 @@ from numpy.testing import assert_allclose
 from tolerances import tolerance
 
 import jourdain_jax as jj
+
+# Scenes from SymPy's mechanics: their accelerations are those of SymPy's own equations.
+
 
 sympy = pytest.importorskip("sympy")
 mechanics = pytest.importorskip("sympy.physics.mechanics")
@@ -205,41 +211,19 @@ def test_functions_of_many_kinds_have_values_on_jax():
     assert_allclose(np.array(values, float), expected, rtol=1e-12)
 
 
-def _angular_velocity_of_its_own():
-    kane, origin, values = systems.double_pendulum()
-    kane.bodies[1].frame.set_ang_vel(kane.bodies[0].frame, 3 * kane.u[0] * kane.bodies[0].frame.z)
+def _changed(system, change):
+    kane, origin, values = system()
+    change(kane)
     return kane, origin, values
 
 
-def _without_orientation():
-    kane, origin, values = systems.slipping_disc()
-    F = mechanics.ReferenceFrame("loose")
-    kane.bodies[0].frame = F
-    return kane, origin, values
-
-
-def _inertia_in_another_frame():
-    kane, origin, values = systems.double_pendulum()
+def _inertia_in(kane, frame):
     rod = kane.bodies[1]
-    rod.inertia = (mechanics.inertia(kane._inertial, 1, 2, 3), rod.masscenter)
-    return kane, origin, values
-
-
-def _inertia_in_a_loose_frame():
-    kane, origin, values = systems.double_pendulum()
-    rod = kane.bodies[1]
-    rod.inertia = (mechanics.inertia(mechanics.ReferenceFrame("loose"), 1, 2, 3), rod.masscenter)
-    return kane, origin, values
-
-
-def _called_alike():
-    kane, origin, values = systems.double_pendulum()
-    kane._bodylist = [kane.bodies[0]] * 2
-    return kane, origin, values
+    rod.inertia = (mechanics.inertia(frame, 1, 2, 3), rod.masscenter)
 
 
 def _with(kane, origin, values, **changes):
-    return kane, changes.pop("origin", origin), values | changes
+    return kane, origin, values | changes
 
 
 t, y = (mechanics.dynamicsymbols._t, mechanics.dynamicsymbols("y"))
@@ -260,12 +244,21 @@ BAD = {
     "imaginary-load": (lambda: systems.pendulum_with(lambda q, N: sympy.I * q * N.x), r"`I` is no real number"),
     "acceleration-in-a-load": (lambda: systems.pendulum_with(lambda q, N: mechanics.dynamicsymbols("u").diff() * N.x), r"not on their rates"),
     "rate-of-an-input": (lambda: systems.pendulum_with(lambda q, N: y.diff() * N.x), r"`Derivative\(y\(t\), t\)` occurs.*make `y\(t\)` a coordinate"),
-    "two-angular-velocities": (_angular_velocity_of_its_own, r"another angular velocity than its orientation"),
-    "no-orientation": (_without_orientation, r"frame `loose` has no orientation in `N`"),
-    "inertia-that-changes": (_inertia_in_another_frame, r"inertia of body `rod 2` in its own frame `B` changes in time"),
-    "inertia-in-a-loose-frame": (_inertia_in_a_loose_frame, r"inertia of body `rod 2` is stated in a frame that has no orientation"),
-    "two-bodies-of-a-name": (_called_alike, r"two bodies are called `rod 1`"),
 }
+
+LOOSE = mechanics.ReferenceFrame("loose")
+CHANGED = {
+    "no-orientation": (systems.slipping_disc, lambda kane: setattr(kane.bodies[0], "frame", LOOSE), r"frame `loose` has no orientation in `N`"),
+    "two-angular-velocities": (
+        systems.double_pendulum,
+        lambda kane: kane.bodies[1].frame.set_ang_vel(kane.bodies[0].frame, 3 * kane.u[0] * kane.bodies[0].frame.z),
+        r"another angular velocity than its orientation",
+    ),
+    "inertia-that-changes": (systems.double_pendulum, lambda kane: _inertia_in(kane, kane._inertial), r"body `rod 2` in its own frame `B` changes in time"),
+    "inertia-in-a-loose-frame": (systems.double_pendulum, lambda kane: _inertia_in(kane, LOOSE), r"body `rod 2` is stated in a frame that has no orientation"),
+    "two-bodies-of-a-name": (systems.double_pendulum, lambda kane: setattr(kane, "_bodylist", [kane.bodies[0]] * 2), r"two bodies are called `rod 1`"),
+}
+BAD |= {name: (functools.partial(_changed, system, change), message) for name, (system, change, message) in CHANGED.items()}
 
 
 @pytest.mark.parametrize("case", BAD)
@@ -281,26 +274,22 @@ def test_without_sympy_the_error_says_how_to_get_it(monkeypatch):
         jj.from_sympy(None, None, {})
 
 
-def test_the_bicycle_of_symbrim_moves_as_sympy_says():
-    symbrim = pytest.importorskip("symbrim")
-    bicycle = symbrim.WhippleBicycle("bicycle")
-    bicycle.rear_frame, bicycle.front_frame = symbrim.RigidRearFrame("rear_frame"), symbrim.RigidFrontFrame("front_frame")
-    bicycle.rear_wheel, bicycle.front_wheel = symbrim.KnifeEdgeWheel("rear_wheel"), symbrim.KnifeEdgeWheel("front_wheel")
-    bicycle.rear_tire, bicycle.front_tire = symbrim.NonHolonomicTire("rear_tire"), symbrim.NonHolonomicTire("front_tire")
-    bicycle.ground = symbrim.FlatGround("ground")
-    bicycle.define_all()
-    system = bicycle.to_system()
-    system.apply_uniform_gravity(-systems.g * bicycle.ground.get_normal(bicycle.ground.origin))
-    system.q_ind, system.q_dep = [*bicycle.q[:4], *bicycle.q[5:]], [bicycle.q[4]]
-    system.u_ind, system.u_dep = [bicycle.u[3], *bicycle.u[5:7]], [*bicycle.u[:3], bicycle.u[4], bicycle.u[7]]
-    sizes = {"rear_frame": {"d1": 0.95, "l1": 0.4, "l2": -0.5, "ixx": 7.2, "iyy": 11.0, "izx": 1.8, "izz": 4.8, "body_mass": 85.0}}
-    sizes["front_frame"] = {"d2": 0.27, "d3": 0.1, "l3": -0.02, "l4": -0.3, "ixx": 0.059, "iyy": 0.06, "izx": 0.007, "izz": 0.01, "body_mass": 4.0}
-    sizes["front_wheel"] = {"ixx": 0.14, "iyy": 0.28, "mass": 3.0, "r": 0.35}
-    sizes["rear_wheel"] = {"ixx": 0.06, "iyy": 0.12, "mass": 2.0, "r": 0.3}
-    values = {f"{part}_{name}": value for part, known in sizes.items() for name, value in known.items()} | {"g": 9.81}
-    scene = jj.from_sympy(system, values=values)()
-    system.form_eoms(constraint_solver="CRAMER")
-    kane = system.eom_method
-    assert len(scene.coordinate_names) == len(kane.q)
-    symbols = {x for x in kane.mass_matrix_full.free_symbols | kane.forcing_full.free_symbols if str(x) in values}
-    assert errors(kane, scene, {x: values[str(x)] for x in symbols}) < tolerance("closed_form")
+# The page on scenes from other tools: its code runs as it stands, in order, beside the files that it shows.
+
+
+pytest.importorskip("sympy")
+PAGE = Path(__file__).parents[1] / "docs" / "howto" / "from_other_tools.md"
+
+
+def test_the_code_of_the_page_runs(tmp_path, monkeypatch, capsys):
+    text = PAGE.read_text(encoding="utf-8")
+    for name, content in re.findall(r"```\{code-block\} xml\n:caption: (\S+)\n\n(.*?)```", text, re.DOTALL):
+        (tmp_path / name).write_text(content, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    scope: dict = {}
+    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(compile(block, str(PAGE), "exec"), scope)
+    printed = capsys.readouterr().out
+    assert printed.count("reached the end of its span") == text.count("print(motion)")
+    assert [scope[name]().coordinate_names.entries[0] for name in ("Disc", "Robot", "Arm")] == ["yaw", "x", "shoulder"]
+

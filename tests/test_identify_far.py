@@ -1,6 +1,5 @@
 """Fits from first guesses that are far from the minimum: over growing spans."""
 
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -49,35 +48,6 @@ def test_a_frequency_far_from_the_guess_is_found_over_growing_spans(factor):
     assert_allclose(found.values, near.values, atol=1e-3 * near.standard_errors.min())
 
 
-def test_spans_that_a_motion_follows_already_are_left_out(monkeypatch):
-    quick = jj.fit(Oscillator(stiffness=54.0), data(0), FREE)
-    monkeypatch.setattr("jourdain_jax.analysis.fit._FOLLOWED", 0.0)
-    every = jj.fit(Oscillator(stiffness=54.0), data(0), FREE)
-    assert quick.grown
-    assert every.grown
-    assert quick.steps < every.steps
-    assert_allclose(quick.values, every.values, atol=1e-3 * every.standard_errors.min())
-
-
-def test_whole_runs_that_lead_nowhere_are_given_up_soon(monkeypatch):
-    quick = jj.fit(Oscillator(stiffness=54.0), data(0), FREE)
-    monkeypatch.setattr("jourdain_jax.analysis.fit._PATIENCE", None)
-    patient = jj.fit(Oscillator(stiffness=54.0), data(0), FREE)
-    assert quick.grown
-    assert patient.grown
-    assert len(quick.trace[0][1]) < len(patient.trace[0][1])
-    assert_allclose(quick.values, patient.values, atol=1e-3 * patient.standard_errors.min())
-
-
-def test_a_fit_that_is_far_off_goes_on_where_growing_spans_do_not_help(monkeypatch):
-    measured = data(0, more=0.05)  # no parameters give this
-    monkeypatch.setattr("jourdain_jax.analysis.fit._STEPS", 1)
-    found = jj.fit(Oscillator(stiffness=18.9), measured, FREE)
-    monkeypatch.setattr("jourdain_jax.analysis.fit._STEPS", 50)
-    at_once = jj.fit(Oscillator(stiffness=18.9), measured, FREE)
-    assert found.chi_square < at_once.chi_square * (1 + 1e-6)
-
-
 def test_repeats_that_end_in_a_local_minimum_are_fitted_again_alone():
     measured = data(1, (5,), more=3.0 * (np.arange(5) == 3)[:, None])  # no parameters give the fourth
     found = jj.fit_batch(Oscillator(stiffness=50.0), measured, FREE)
@@ -117,22 +87,6 @@ def test_a_minimum_that_one_guess_alone_leads_to_is_warned_of():
 def test_a_number_of_guesses_that_is_none_is_refused(guesses):
     with pytest.raises(ValueError, match=r"`guesses` is .*, expected a whole number of at least 1"):
         jj.fit(Oscillator(), data(0), FREE, guesses=guesses)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 4, 12])
-def test_an_unstable_motion_is_fitted_over_growing_spans(seed, monkeypatch):
-    """A bicycle below its weave speed, whose motion grows a hundredfold: single shooting from these first guesses finds no minimum."""
-    monkeypatch.syspath_prepend(Path(__file__).parent.parent / "bench")
-    from identification import unstable_run
-
-    found = jj.fit(*unstable_run(seed), ("IBxx", "c", "mB"), rtol=1e-8, atol=1e-8)
-    assert found.converged
-    assert found.grown
-    assert found.chi_square < 250  # of 202 samples
-    exact = jj.models.WhippleBicycle()
-    for name in ("IBxx", "c", "mB"):
-        assert abs(found[name].value - float(getattr(exact, name))) < 4 * found[name].standard_error
 
 
 class Resting(OnLine):

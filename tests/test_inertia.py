@@ -1,4 +1,4 @@
-"""What has no inertia has no acceleration: it is refused by name where it never has any, and a lane says so where it has none."""
+"""Bodies without inertia and bodies that cannot be: refused by name, and a result code of their lane where no error can be raised."""
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,8 @@ from numpy.testing import assert_allclose
 from tolerances import tolerance
 
 import jourdain_jax as jj
+
+# What has no inertia has no acceleration: it is refused by name where it never has any, and a lane says so where it has none.
 
 
 class Weightless(jj.Scene):
@@ -162,3 +164,85 @@ class BurningRocket(jj.Scene):
 def test_mass_that_leaves_takes_its_momentum_with_it():
     motion = jj.simulate(BurningRocket(), {"x_rate": 1.0, "angle_rate": 2.0}, t1=2.0, rtol=1e-10, atol=1e-10)
     assert_allclose(motion.u_end, [1.0 + 6.0 * np.log(2.0), 2.0], atol=1e-9)  # m x'' = F, I angle'' = 0
+
+
+# Bodies that cannot be end a lane with a result code, where no error can be raised: negative masses, and inertias that no body has.
+
+
+def test_an_inertia_is_impossible_where_an_eigenvalue_is_negative():
+    generator = np.random.default_rng(0)
+    turns = np.linalg.qr(generator.normal(size=(300, 3, 3)))[0]
+    moments = generator.uniform(0.01, 1.0, size=(300, 3)) * np.where(generator.uniform(size=(300, 3)) < 0.25, -1.0, 1.0)
+    moments *= 10.0 ** generator.uniform(-9, 9, (300, 1))
+    inertias = np.einsum("kij,kj,klj->kil", turns, moments, turns)
+    lanes = jj.rollout(Tumbling(), {"attitude_omega_x": 1e-3}, parameters={"inertia": (inertias + inertias.mT) / 2}, ts=[1e-6], progress=False)
+    np.testing.assert_array_equal(lanes.result == results.BAD_PARAMETER, moments.min(axis=1) < 0)
+
+
+class Wheel(jj.Scene):
+    """A wheel that rolls on a plane, each of its numbers open to mistakes."""
+
+    mass: jnp.ndarray = jj.parameter(1.0)
+    moment: jnp.ndarray = jj.parameter(0.3)
+    lopsided: jnp.ndarray = jj.parameter(0.0)
+    stretch: jnp.ndarray = jj.parameter(1.0)
+    mirror: jnp.ndarray = jj.parameter(1.0)
+    radius: jnp.ndarray = jj.parameter(0.1)
+    height: jnp.ndarray = jj.parameter(0.1)
+    tyre: jnp.ndarray = jj.parameter(0.02)
+    down: jnp.ndarray = jj.parameter((0.0, 0.0, -1.0))
+    coordinates = jj.coordinates("x roll")
+
+    def bodies(self, t, q):
+        o = 0.0 * q.x
+        inertia = jnp.diag(jnp.stack([self.moment, 0.3 + o, 0.3 + o])) + self.lopsided * jnp.eye(3, k=1)
+        turned = jj.rot_y(q.roll) @ jnp.diag(jnp.stack([self.stretch, self.stretch * self.mirror, self.stretch]))
+        return {"wheel": jj.RigidBody(self.mass, inertia, jnp.stack([q.x, o, o + self.height]), turned)}
+
+    def contacts(self, pose):
+        return {"rim": jj.wheel_contact(pose["wheel"], self.radius, self.tyre)}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, 9.81, direction=self.down),)
+
+
+WRONG = {
+    "mass": (-0.5, "a negative mass: body `wheel`"),
+    "lopsided": (0.01, "an inertia that is not symmetric: body `wheel`"),
+    "moment": (-0.3, "a negative moment of inertia: body `wheel`"),
+    "stretch": (2.0, "an orientation that is no rotation: body `wheel`"),
+    "mirror": (-1.0, "a reflected orientation: body `wheel`"),
+    "height": (0.2, "a body off its ground: contact `rim`"),
+    "radius": (0.12, "a body off its ground: contact `rim`"),
+    "tyre": (-0.01, "a negative tyre: contact `rim`"),
+    "down": ((0.0, 0.0, -2.0), "a direction of gravity that is no unit vector: load 1"),
+}
+
+
+@pytest.mark.parametrize("backend", ["auto", pytest.param("dense", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", WRONG)
+def test_what_a_single_motion_refuses_is_a_code_in_lanes(name, backend):
+    sound, start, (value, fault) = Wheel(), {"x_rate": 0.1}, WRONG[name]
+    with pytest.raises(ValueError, match=r"`wheel`|`rim`|gravity"):
+        jj.simulate(sound.replace(**{name: value}), start, ts=[0.1])
+    lanes = jj.rollout(sound, start, parameters={name: jnp.array([value, getattr(sound, name)])}, ts=[0.1], backend=backend, progress=False)
+    assert lanes.result.tolist() == [results.BAD_PARAMETER, results.SUCCESS]
+    assert fault in str(lanes)
+    assert f"({fault.partition(':')[0]}" in lanes.lane(0).message
+    assert np.isnan(lanes.lanes.q[0]).all()
+    assert np.isfinite(lanes.lanes.q[1]).all()
+
+
+@pytest.mark.parametrize("values", [{"radius": -0.1, "height": -0.1}, {"tyre": -0.01}, {"tyre": 0.2}])
+def test_lengths_of_contacts_that_parameters_make_negative_are_refused(values):
+    with pytest.raises(ValueError, match=r"contact `rim` of `Wheel` (is|has a tyre of) -"):
+        jj.simulate(Wheel(**values), {"x_rate": 0.1}, ts=[0.1])
+
+
+def test_wrong_numbers_inside_jit_and_vmap_are_a_code():
+    def code(values):
+        return jj.simulate(Wheel(stretch=values[0], radius=values[1]), {"x_rate": 0.1}, ts=[0.1]).result
+
+    given = jnp.array([[1.0, 0.1], [2.0, 0.1], [1.0, 0.12]])
+    assert jax.jit(jax.vmap(code))(given).tolist() == [results.SUCCESS, results.BAD_PARAMETER, results.BAD_PARAMETER]
+    assert [int(jax.jit(code)(values)) for values in given[:2]] == [results.SUCCESS, results.BAD_PARAMETER]

@@ -2,7 +2,6 @@
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
@@ -148,45 +147,6 @@ def test_a_driven_coordinate_needs_the_force_of_the_closed_form_and_does_its_wor
     assert relative_error(motion.constraint_forces().multipliers[:, 0], force) <= tolerance("closed_form")
     balance = motion.energies().balance  # T + V less the work of the actuator
     assert relative_error(balance, jnp.broadcast_to(balance[0], ts.shape), 0.1) <= tolerance("drift")
-
-
-class BallOnPlane(jj.Scene):
-    """A ball with six coordinates' worth of freedom, rolling on a plane that tilts, moves or turns."""
-
-    tilt: jnp.ndarray = jj.parameter(0.0, unit="rad")
-    drift: jnp.ndarray = jj.parameter(0.0, unit="m/s")
-    radius: jnp.ndarray = jj.parameter(0.2, unit="m", positive=True)
-    coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
-
-    def bodies(self, t, q):
-        return {"ball": jj.RigidBody.ball(1.3, self.radius, position=q.array[:3], orientation=jj.quaternion_to_matrix(q["attitude"]))}
-
-    def loads(self, motion):
-        return (jj.gravity(motion, GRAVITY),)
-
-    def contacts(self, pose):
-        plane = jj.Plane(tilt=self.tilt, velocity=jnp.stack([0.0 * self.drift, self.drift, 0.0 * self.drift]))
-        return {"floor": jj.ball_contact(pose["ball"], self.radius, ground=plane, height="row")}
-
-
-@pytest.mark.parametrize(("tilt", "drift"), [(0.0, 0.0), (0.3, 0.0), (0.3, 0.7)])
-def test_a_ball_rolls_down_a_plane_with_five_sevenths_of_gravity_and_known_contact_forces(tilt, drift):
-    scene = BallOnPlane(tilt=tilt, drift=drift)
-    assert jj.structure_of(scene).degrees_of_freedom == 3
-    height = 0.2 / np.cos(tilt)
-    motion = jj.simulate(scene, {"x": 0.0, "y": 0.0, "z": height}, ts=jnp.linspace(0.0, 1.5, 4), **TIGHT)
-    motion.raise_if_failed()
-    # no slip: the ball's point on the plane moves as the plane does
-    ball, n = motion.motions()["ball"], jnp.array([np.sin(tilt), 0.0, np.cos(tilt)])
-    touching = ball.velocity + jnp.cross(ball.angular_velocity, -0.2 * n)
-    assert relative_error(touching, jnp.broadcast_to(jnp.array([0.0, drift, 0.0]), (4, 3)), 1.0) <= tolerance("residual")
-    along = 5 / 7 * GRAVITY * np.sin(tilt)
-    down = motion["x"] * np.cos(tilt) - (motion["z"] - height) * np.sin(tilt)
-    assert relative_error(down, 0.5 * along * motion.ts**2, 1.0) <= tolerance("closed_form")
-    assert relative_error(motion["y"], motion["y_rate"][0] * motion.ts, 1.0) <= tolerance("closed_form")
-    contact = motion.contact_forces()["floor"]
-    assert relative_error(contact.normal, jnp.full(4, 1.3 * GRAVITY * np.cos(tilt))) <= tolerance("closed_form")
-    assert relative_error(contact.friction_needed, jnp.full(4, 2 / 7 * np.tan(tilt)), 1.0) <= tolerance("closed_form")
 
 
 def test_baumgartes_terms_pull_a_start_off_the_constraints_back_as_their_own_oscillator():

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from small_scenes import OnLine
 
 import jourdain_jax as jj
 
@@ -62,24 +63,18 @@ def test_tables_have_one_row_for_each_time_of_each_lane(motion, lanes):
     assert_array_equal(many.loc[2]["x1"], lanes.lane(2)["x1"])
 
 
-class _Timed(jj.Scene):
-    """A coordinate and a parameter with names that a dataset has for other things."""
-
+class _Named(OnLine):
     steps: jnp.ndarray = jj.parameter(1.0, unit="m")
+
+
+class _Timed(jj.Scene):
     coordinates = jj.coordinates("time")
 
     def bodies(self, t, q):
         return {"ball": jj.Particle(1.0, jnp.stack([q.time, 0.0 * q.time, 0.0 * q.time]))}
 
 
-class _Stepped(_Timed):
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"ball": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
-
-
-@pytest.mark.parametrize(("scene", "name"), [(_Timed(), "time"), (_Stepped(), "steps")])
+@pytest.mark.parametrize(("scene", "name"), [(_Timed(), "time"), (_Named(), "steps")])
 def test_a_name_of_two_arrays_is_refused(scene, name):
     """The coordinate would take the place of the axis, the parameter would be left out."""
     with pytest.raises(ValueError, match=f"`{name}` would name two arrays of the dataset"):
@@ -136,14 +131,6 @@ def test_a_motion_shows_its_coordinates_as_lines_in_a_notebook(motion, drawn):
     axes = {axes.get_title(): axes for axes in drawn[0].axes}
     assert len(axes) == len(motion.scene.coordinate_names.entries)
     assert np.ptp(axes[f"x: {low:.3g} to {high:.3g}"].lines[0].get_ydata()) == high - low
-
-
-def test_figures_are_replaced_by_a_sentence_where_matplotlib_is_missing(motion, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    shown = motion._repr_html_()
-    assert shown.startswith("<pre>Trajectory of ")
-    assert "a figure needs the package `matplotlib`" in shown
-    assert "jourdain-jax[plot]" in shown
 
 
 def test_a_rollout_shows_medians_and_bands_of_its_coordinates_in_a_notebook(lanes, drawn):

@@ -1,17 +1,22 @@
-"""Linearisation on the constraint manifold, against published bicycles, closed forms, and what a state that is not steady must show."""
+"""Linearisation on the constraint manifold, and families of steady motions: against published bicycles and closed forms."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from oracles import rolling_disc, whipple_bicycle
-from small_scenes import DrivenPendulum
+from small_scenes import DrivenPendulum, OnLine
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
 from jourdain_jax import linearize
+from jourdain_jax.bicycle import linear_matrices, stability_speeds
+from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
 from jourdain_jax.models import DoublePendulumAngles, FreeRigidBody, TiltingDisc, WhippleBicycle
+
+# Linearisation on the constraint manifold, against published bicycles, closed forms, and what a state that is not steady must show.
+
 
 SPEEDS = np.arange(11.0)
 DISC = {"mass": 1.0, "radius": 0.5, "gravity": 9.81}
@@ -39,16 +44,12 @@ def test_the_nonlinear_bicycle_has_the_published_matrices(bicycles):
     assert relative_error(bicycles.M, np.broadcast_to(whipple_bicycle.M, (11, 2, 2))) < limit
     assert relative_error(bicycles.C, v * whipple_bicycle.C1) < limit
     assert relative_error(bicycles.K, 9.81 * whipple_bicycle.K0 + v**2 * whipple_bicycle.K2) < limit
-    assert relative_error(bicycles.C[1], whipple_bicycle.C1) < limit
-    assert relative_error(bicycles.K[0] / 9.81, whipple_bicycle.K0) < limit
-    assert relative_error((bicycles.K[10] - bicycles.K[0]) / 100, whipple_bicycle.K2) < limit
 
 
-@pytest.mark.parametrize("v", range(11))
-def test_the_nonlinear_bicycle_has_the_published_eigenvalues(bicycles, v):
-    expected = whipple_bicycle.EIGENVALUES[v]
-    expected = expected[np.lexsort((expected.imag, expected.real))]
-    assert np.max(np.abs(np.asarray(_lane(bicycles, v).eigenvalues()) - expected)) < tolerance("linearization")
+def test_the_nonlinear_bicycle_has_the_published_eigenvalues(bicycles):
+    for v, expected in whipple_bicycle.EIGENVALUES.items():
+        expected = expected[np.lexsort((expected.imag, expected.real))]
+        assert np.max(np.abs(np.asarray(_lane(bicycles, v).eigenvalues()) - expected)) < tolerance("linearization"), v
 
 
 def test_the_bicycle_is_steady_and_lean_and_steer_are_a_system_of_their_own(bicycles):
@@ -92,8 +93,8 @@ def test_modes_solve_the_second_order_form(bicycles):
 
 def test_a_bicycle_that_leans_is_not_steady_and_says_so():
     bicycle = WhippleBicycle()
-    small = linearize(bicycle, _running(bicycle, 5.0, lean=0.2), ("lean", "steer"), dependent=("pitch",))
     leant = _running(bicycle, 5.0, lean=0.2)
+    small = linearize(bicycle, leant, ("lean", "steer"), dependent=("pitch",))
     udot = jj.accelerations(bicycle, 0.0, leant.q, leant.u).udot
     y = [bicycle.speed_names.index(name, "speed") for name in bicycle.privileged]
     assert float(small.acceleration) == pytest.approx(float(jnp.max(jnp.abs(udot[np.array(y)]))), rel=1e-12)
@@ -124,16 +125,6 @@ def test_a_double_pendulum_has_its_normal_frequencies():
     assert relative_error(small.M, M) < tolerance("round_off")
     assert relative_error(small.K, K) < tolerance("round_off")
     assert relative_error(small.C, np.zeros((2, 2)), size=1.0) < tolerance("round_off")
-
-
-@pytest.mark.parametrize("spin", [4.0, 2.0, 6.0])
-def test_upright_rolling_has_the_classical_frequency(spin):
-    disc = TiltingDisc(**DISC)
-    squared = rolling_disc.upright_rolling_frequency_squared(spin, **DISC)
-    values = linearize(disc, jj.start(disc, spin_rate=spin)).eigenvalues()
-    fastest = values[jnp.argmax(jnp.abs(values))]
-    assert complex(fastest**2).real == pytest.approx(-squared, rel=1e-9)
-    assert (squared > 0) == (spin > rolling_disc.rolling_threshold(**DISC))
 
 
 def test_upright_spinning_is_stable_beyond_the_classical_threshold():
@@ -185,22 +176,20 @@ def test_derivatives_pass_through_linearisation(derivative):
     assert_allclose(jax.jit(derivative(terms))(0.5), [-9.81, -3.0 * 0.5 * 4.0], rtol=tolerance("round_off"))
 
 
-def test_wrong_names_are_answered_with_valid_ones():
+@pytest.mark.parametrize(
+    ("asked", "options", "message"),
+    [
+        (("learn",), {}, "no coordinate `learn` to perturb; did you mean `lean`"),
+        (("pitch",), {"dependent": ("pitch",)}, "said to be dependent"),
+        (("yaw",), {}, "not among the privileged speeds"),
+        (("lean",), {"privileged": ("lean_rte",)}, "unknown privileged speed"),
+        (("lean", "pitch"), {}, "tie the asked coordinates"),
+    ],
+)
+def test_wrong_names_are_answered_with_valid_ones(asked, options, message):
     bicycle = WhippleBicycle()
-    state = _running(bicycle, 5.0)
-    with pytest.raises(ValueError, match="no coordinate `learn` to perturb; did you mean `lean`"):
-        linearize(bicycle, state, ("learn",))
-    with pytest.raises(ValueError, match="said to be dependent"):
-        linearize(bicycle, state, ("pitch",), dependent=("pitch",))
-    with pytest.raises(ValueError, match="not among the privileged speeds"):
-        linearize(bicycle, state, ("yaw",))
-    with pytest.raises(ValueError, match="unknown privileged speed"):
-        linearize(bicycle, state, ("lean",), privileged=("lean_rte",))
-    with pytest.raises(ValueError, match="tie the asked coordinates"):
-        linearize(bicycle, state, ("lean", "pitch"))
-
-
-# Minutes of compilation, and not yet run together with the rest: kept out of the short run until it has been.
+    with pytest.raises(ValueError, match=message):
+        linearize(bicycle, _running(bicycle, 5.0), asked, **options)
 
 
 class TwoSkates(jj.Scene):
@@ -232,3 +221,344 @@ def test_speeds_are_chosen_at_the_state_where_those_of_the_domain_do_not_serve(h
     assert np.isnan(in_jit.A).all()
     with pytest.raises(ValueError, match="do not follow from its rows at this state"):
         linearize(scene, state, (), privileged=("heading_rate", "steer_rate"))
+
+
+# Families of steady motions: whole curves, their special points, stability; digits from independent equations (Newton-Euler in the turning frame).
+
+
+NAMES = ("lean", "steer", "pitch", "yaw_rate", "rear_spin_rate", "front_spin_rate")
+FIRST_HALF = {
+    0.1: (0.029108418746, 0.000225908884, 0.163649429132, 19.992685363213, 17.144262359656),
+    0.4: (0.162268296301, 0.004456954662, 0.854379503493, 17.191526326526, 14.976429620126),
+}
+SECOND_HALF = {
+    0.4: (0.297819270847, 0.006882298771, 1.205454357838, 12.954777370022, 11.727228530998),
+    0.1: (0.996950578614, 0.007853261055, 1.268104999035, 2.991071968509, 4.723275315848),
+}
+WEAVE, CAPSIZE, DOUBLE = 4.292382536341, 6.024262015388, 0.684283078892  # m/s
+
+
+@pytest.fixture(scope="module")
+def bicycle():
+    return jj.models.WhippleBicycle()
+
+
+@pytest.fixture(scope="module")
+def turns(bicycle):
+    return jj.family(bicycle, {"rear_spin_rate": 20.0, "lean": 1e-3}, until={"lean": 1.5})
+
+
+@pytest.fixture(scope="module")
+def straight(bicycle, turns):
+    return jj.family(bicycle, turns.branches[-1])
+
+
+def magnitudes(point) -> np.ndarray:
+    return np.abs([point[name] for name in NAMES])
+
+
+def test_hands_free_turns_are_one_closed_curve_with_every_digit(turns):
+    assert turns.ends == ("the curve is closed",) * 2
+    for lean in (0.1, 0.4):
+        points = sorted(turns.at(lean=lean), key=lambda point: -point["rear_spin_rate"])
+        assert len(points) == 4  # two ways of turning, forward and backward
+        for point, expected in zip(points, (FIRST_HALF[lean], SECOND_HALF[lean], SECOND_HALF[lean], FIRST_HALF[lean]), strict=True):
+            assert_allclose(magnitudes(point), (lean, *expected), rtol=0, atol=2e-11)
+            assert point.state.residual < 1e-10
+
+
+def test_folds_and_rest_of_the_turns(turns):
+    first = turns.folds[0]
+    assert first.kind == "fold in lean"
+    assert_allclose(magnitudes(first)[[0, 2, 3]], (0.420089250821, 0.005834627, 1.043780887), atol=2e-9)
+    assert_allclose(magnitudes(first)[[1, 4, 5]], (0.218993988, 15.321918729, 13.533293415), atol=1e-7)
+    rest = turns.folds[1]
+    assert_allclose(magnitudes(rest), (0, 1.339739911491, 0.007806882108, 0, 0, 0), atol=1e-9)
+
+
+def test_the_third_family_runs_through_its_fold_to_the_other_side(bicycle):
+    found = jj.family(bicycle, {"lean": 0.9, "steer": 0.25, "yaw_rate": -2.57, "rear_spin_rate": 22.2, "front_spin_rate": 20.6})
+    (point,) = found.at(lean=0.9)
+    expected = (0.9, 0.253265658718, 0.005858374011, 2.569920264555, 22.179528967864, 20.642557477777)
+    assert_allclose(magnitudes(point), expected, atol=1e-10)
+    assert min(abs(abs(fold["lean"]) - 0.4811) for fold in found.folds if fold.kind == "fold in lean") < 5e-5
+    assert abs(np.max(np.abs(found["steer"])) - 2.635) < 2e-3
+    assert "without bound" in found.ends[0] + found.ends[1]
+
+
+def test_straight_running_crosses_the_turns_at_the_capsize_speed(turns, straight):
+    assert [abs(point["x_rate"]) for point in turns.branches] == pytest.approx([CAPSIZE, CAPSIZE], abs=1e-9)
+    assert [point["x_rate"] for point in straight.branches] == pytest.approx([-CAPSIZE, CAPSIZE], abs=1e-9)
+    assert not any(point.differentiable for point in straight.branches)
+
+
+def test_speeds_of_the_modes_are_the_published_ones(straight):
+    changes = {(point.kind, name): point["x_rate"] for point in straight.changes for name in point.modes if point["x_rate"] > 0}
+    assert changes["pair on the imaginary axis", "weave"] == pytest.approx(WEAVE, abs=1e-9)
+    assert changes["zero eigenvalue", "capsize"] == pytest.approx(CAPSIZE, abs=1e-9)
+    assert changes["double root", "weave"] == pytest.approx(DOUBLE, abs=1e-9)
+    speeds = straight["x_rate"]
+    stable = (speeds > WEAVE) & (speeds < CAPSIZE)
+    assert stable.any()
+    assert_array_equal(straight.stable, stable)
+
+
+def test_columns_are_those_of_the_modes(straight, bicycle):
+    (point,) = straight.at(x_rate=5.0)
+    found = dict(zip(straight.mode_names, point.eigenvalues, strict=True))
+    assert found["castering"] == pytest.approx(-14.0783896927982, abs=1e-9)
+    assert found["capsize"] == pytest.approx(-0.322866429004087, abs=1e-9)
+    assert found["weave"].real == pytest.approx(-0.775341882195845, abs=1e-9)
+    small = jj.linearize(bicycle, point.state, ("lean", "steer"))
+    assert_allclose(np.sort_complex(point.eigenvalues), np.sort_complex(small.eigenvalues()), atol=1e-9)
+
+
+def test_the_same_turn_ridden_backward_has_opposite_eigenvalues(turns):
+    forward, backward = (sorted(turns.at(lean=0.3), key=lambda point: point["rear_spin_rate"])[k] for k in (3, 0))
+    assert_allclose(np.sort_complex(backward.eigenvalues), np.sort_complex(-forward.eigenvalues), atol=1e-8)
+
+
+def test_turns_from_the_capsize_point_on_are_unstable_by_a_real_eigenvalue(turns):
+    for lean, growth in ((0.1927, 0.0618), (0.3658, 0.3335), (0.4186, 0.994)):
+        point = max(turns.at(lean=lean), key=lambda point: point["rear_spin_rate"])
+        if lean == 0.4186:
+            point = sorted(turns.at(lean=lean), key=lambda point: -point["rear_spin_rate"])[1]
+        real = point.eigenvalues[point.eigenvalues.imag == 0].real
+        assert np.max(real) == pytest.approx(growth, abs=0.02)
+
+
+def test_an_upright_disc_is_stable_above_its_critical_spin():
+    disc = jj.models.TiltingDisc()
+    found = jj.family(disc, {"spin_rate": -4.0}, held="lean", until={"spin_rate": -0.5})
+    (change,) = found.changes
+    assert change.kind == "double root"
+    assert change["spin_rate"] == pytest.approx(-np.sqrt(9.81 / (3 * 0.5)), abs=1e-9)
+    assert_array_equal(found.stable, found["spin_rate"] < change["spin_rate"])
+
+
+def test_steady_turns_of_a_disc_meet_their_closed_form():
+    found = jj.family(jj.models.TiltingDisc(), {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, held="lean", until={"yaw_rate": 6.0})
+    lean, yaw, spin, R, g = found["lean"], found["yaw_rate"], found["spin_rate"], 0.5, 9.81
+    # moments about the contact point: (5/4) yaw^2 sin cos - (-3/2) yaw spin cos ... of a thin disc
+    left = 1.25 * R * yaw**2 * np.sin(lean) * np.cos(lean) + 1.5 * R * yaw * spin * np.cos(lean) + g * np.sin(lean)
+    assert_allclose(left, 0.0, atol=1e-9)
+
+
+class Bead(jj.Scene):
+    """A bead on a hoop that turns about its vertical diameter."""
+
+    radius: float = jj.parameter(0.5, unit="m", positive=True)
+    turning: float = jj.parameter(3.0, unit="rad/s")
+    coordinates = jj.coordinates("angle")
+    domain = {"angle": (-3.0, 3.0)}
+
+    def bodies(self, t, q):
+        x, heading = self.radius * jnp.sin(q.angle), self.turning * t
+        return {"bead": jj.Particle(0.2, jnp.stack([x * jnp.cos(heading), x * jnp.sin(heading), -self.radius * jnp.cos(q.angle)]))}
+
+    def loads(self, motion):
+        return jj.gravity(motion, 9.81)
+
+
+def test_a_bead_on_a_turning_hoop_leaves_the_bottom_at_a_pitchfork():
+    bottom = jj.family(Bead(), {"angle": 0.0}, vary="turning", until={"turning": 6.0})
+    (branch,) = bottom.branches
+    critical = np.sqrt(9.81 / 0.5)
+    assert branch["turning"] == pytest.approx(critical, abs=1e-9)
+    assert bottom["turning"][-1] == pytest.approx(6.0, abs=1e-9)
+    assert_array_equal(bottom.stable, bottom["turning"] < critical)
+    aside = jj.family(Bead(), branch, vary="turning", until={"turning": 8.0})
+    assert_allclose(np.cos(aside["angle"]), 9.81 / (aside["turning"] ** 2 * 0.5), atol=1e-9)
+    both = jj.family(Bead(), branch, vary="turning")
+    assert both["angle"].min() < -1.5
+    assert both["angle"].max() > 1.5
+    assert {point.kind for point in both.special} == {"branch point", "fold in turning"}
+    assert [point["turning"] for point in both.special] == pytest.approx([critical] * 2, abs=1e-9)
+
+
+class SplineBead(Bead):
+    """The bead with a field of many numbers, which is no parameter, before the one that varies."""
+
+    weight: jj.Spline = jj.Spline(jnp.linspace(0.0, 1.0, 5), jnp.full(5, 9.81))
+    pace: float = jj.parameter(3.0, unit="rad/s")
+
+    def bodies(self, t, q):
+        return Bead(self.radius, self.pace).bodies(t, q)
+
+    def loads(self, motion):
+        return jj.gravity(motion, self.weight(0.5))
+
+
+def test_the_parameter_that_varies_is_found_among_other_numbers_of_a_scene():
+    (branch,) = jj.family(SplineBead(), {"angle": 0.0}, vary="pace", until={"pace": 6.0}).branches
+    assert branch["pace"] == pytest.approx(np.sqrt(9.81 / 0.5), abs=1e-9)
+
+
+def test_a_family_in_arrays_and_in_text(turns):
+    found = turns.to_xarray()
+    assert dict(found.sizes) == {"point": len(turns), "mode": 4}
+    assert_array_equal(found["lean"], turns["lean"])
+    text = str(turns)
+    assert "the curve is closed" in text
+    assert "fold in lean" in text
+    assert "castering" in text
+    assert "hands" not in str(turns.folds[0])
+
+
+def test_a_family_is_drawn_against_its_own_values(turns, straight):
+    _, (axis,) = jj.plot(turns, "x_rate", "lean", units={"lean": "deg"})
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("x_rate", "lean in deg")
+    assert max(axis.lines[0].get_ydata()) == pytest.approx(np.rad2deg(0.4200892), abs=0.2)
+    assert {text.get_text() for text in axis.get_legend().get_texts()} == {"unstable", "fold", "branch point", "eigenvalues meet or cross"}
+    stable = jj.plot(straight, "x_rate", "rear_spin_rate")[1][0].lines[1].get_ydata()
+    assert np.isfinite(stable).sum() == straight.stable.sum() > 0
+    with pytest.raises(ValueError, match="1 were given"):
+        jj.plot(turns, "lean")
+
+
+@pytest.mark.parametrize(
+    ("guess", "options", "error", "says"),
+    [
+        ({"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, {}, ValueError, "2 freedoms.*name 1 of `lean`.*`held`"),
+        ({"leen": 0.3}, {}, ValueError, "did you mean `lean`"),
+        ({"lean": 0.3}, {"vary": "radios"}, ValueError, "did you mean `radius`"),
+        ({"lean": 0.3}, {"until": {"x": 1.0}}, ValueError, "`x` is no unknown"),
+        ({"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, {"held": "lean", "names": ("one",)}, ValueError, "expected one for each of the 2 modes"),
+        ({"lean": float("nan")}, {}, ValueError, "undefined near the guess"),
+    ],
+)
+def test_what_cannot_be_followed_is_refused(guess, options, error, says):
+    with pytest.raises(error, match=says):
+        jj.family(jj.models.TiltingDisc(), guess, **options)
+
+
+def test_a_motion_that_stands_alone_and_points_that_are_no_branch_points(turns, bicycle):
+    with pytest.raises(ValueError, match="stands alone"):
+        jj.family(Bead(), {"angle": 0.0})
+    with pytest.raises(ValueError, match="expected a branch point"):
+        jj.family(bicycle, turns.folds[0])
+    with pytest.raises(ValueError, match="one name with its value"):
+        turns.at(lean=0.1, steer=0.1)
+    with pytest.raises(KeyError, match="did you mean `lean`"):
+        turns["leam"]
+
+
+AT_5 = {  # of the eigenvalues of weave and capsize, of the weave and of the capsize speed, by Meijaard's formulas in 40 digits
+    "w": (0.5784301836667 + 11.04402541662j, 1.873378311812, -0.4776030485691, -4.393049781489),
+    "c": (12.18560145265 - 4.418538571895j, -9.374190592203, 11.47995745126, 28.88866886342),
+    "lam": (2.459557200396 - 13.16293523872j, -3.350671972655, 4.17667019102, 4.308855800463),
+    "IHxz": (6.303428046764 + 0.2400400242343j, -0.01621194815966, 3.543504519167, 0.0),
+    "rF": (5.201300621719 - 13.39003429778j, -4.130519197482, 5.060813989216, 10.27615086865),
+    "IFyy": (-6.103847637971 + 13.04502488696j, 4.513883751204, -5.797062739492, -11.41978760738),
+}
+
+
+def test_all_derivatives_of_eigenvalues_are_those_of_the_formulas(bicycle):
+    small = jj.linearize(bicycle, jj.start(bicycle, **bicycle.upright(5.0)), ("lean", "steer"))
+    weave, capsize = small.sensitivities("weave"), small.sensitivities("capsize")
+    for name, (of_weave, of_capsize, *_) in AT_5.items():
+        assert weave[name] == pytest.approx(of_weave, rel=1e-10)
+        assert capsize[name] == pytest.approx(of_capsize, rel=1e-10)
+    assert weave.held == ("x_rate",)
+    assert len(weave.by_parameter) == 26
+    assert "12.1856-4.41854i" in str(weave)
+    with pytest.raises(ValueError, match="did you mean `weave`"):
+        small.sensitivities("weve")
+
+
+def test_shapes_of_modes_from_both_sides(bicycle):
+    small = jj.linearize(bicycle, jj.start(bicycle, **bicycle.upright(5.0)), ("lean", "steer"))
+    modes = small.modes()
+    assert modes.names == ("castering", "weave", "weave", "capsize")
+    for s, right, left in zip(modes.eigenvalues, modes.shapes.T, modes.left.T, strict=True):
+        P = small.M * s**2 + small.C * s + small.K
+        assert_allclose(P @ right, 0.0, atol=1e-9)
+        assert_allclose(left.conj() @ P, 0.0, atol=1e-9)
+    assert np.all(modes.condition > 0.1)
+    assert small.modes(("a", "b", "c", "d")).names == ("a", "b", "c", "d")
+    with pytest.raises(ValueError, match="expected one for each of the 4 modes"):
+        _ = small.modes(("a",)).names
+
+
+def test_a_double_eigenvalue_has_no_derivative(bicycle, straight):
+    point = jj.critical(bicycle, straight, "double root")
+    small = jj.linearize(bicycle, point.state, ("lean", "steer"))
+    found = small.sensitivities("weave")
+    assert found.code != 0
+    assert found.condition < 1e-6
+    assert np.all(np.isnan(list(found.by_parameter.values())))
+    assert "eigenvalues meet" in str(found)
+
+
+@pytest.mark.parametrize(("what", "speed"), [("weave", WEAVE), ("capsize", CAPSIZE), ("double root", DOUBLE)])
+def test_critical_speeds_are_the_published_ones(bicycle, straight, what, speed):
+    point = jj.critical(bicycle, straight, what)
+    assert point.code == 0
+    assert float(point.speed) == pytest.approx(speed, abs=2e-12)
+    assert point.eigenvalue.real == (pytest.approx(3.78290405129, abs=1e-9) if what == "double root" else 0.0)
+    assert point.message == "found"
+
+
+def test_critical_speeds_have_derivatives_by_all_parameters(bicycle, straight):
+    for what, k in (("weave", 2), ("capsize", 3)):
+        by_all = jax.jit(jax.grad(lambda scene, what=what: jj.critical(scene, straight, what).speed))(bicycle)
+        for name, derivatives in AT_5.items():
+            assert float(getattr(by_all, name)) == pytest.approx(derivatives[k], rel=1e-10, abs=1e-10)
+
+
+def test_a_batch_says_which_bicycles_have_no_such_speed(bicycle, straight):
+    trails = jnp.array([0.02, 0.08, 0.3, -0.5, jnp.nan])
+    found = jax.vmap(lambda c: jj.critical(bicycle.replace(c=c), straight, "capsize"))(trails)
+    for k, c in enumerate(trails):
+        linear = stability_speeds(*linear_matrices({name: c if name == "c" else getattr(bicycle, name) for name in PARAMETER_NAMES}))
+        assert (found.code[k] == 0) == bool(jnp.isfinite(linear.capsize_speed))
+        assert_allclose(found.speed[k], linear.capsize_speed, rtol=1e-9)
+
+
+class Fluttering(OnLine):
+    """A particle on a stiffening spring under a constant push, with a drag and a gain that feeds its speed back."""
+
+    gain: float = jj.parameter(0.5)
+    drag: float = jj.parameter(1.0)
+    stiffness: float = jj.parameter(4.0)
+
+    def loads(self, motion):
+        force = (self.gain - self.drag) * motion.u.x_rate - self.stiffness * motion.q.x - motion.q.x**3 + 1.0
+        return (jj.generalized_force(motion, x_rate=force),)
+
+
+def frequency(stiffness):
+    """Of small motions about the equilibrium without damping, of a unit mass."""
+    x = 0.2
+    for _ in range(20):
+        x = x - (stiffness * x + x**3 - 1.0) / (stiffness + 3 * x**2)
+    return jnp.sqrt(stiffness + 3 * x**2)
+
+
+def test_critical_points_along_a_parameter_have_derivatives_of_both_orders():
+    curve = jj.family(Fluttering(), {"x": 0.2}, vary="gain", until={"gain": 3.0})
+    critical = lambda drag, stiffness: jj.critical(Fluttering(drag=drag, stiffness=stiffness), curve, "pair on the imaginary axis")  # noqa: E731
+    assert float(critical(1.5, 5.0)["gain"]) == pytest.approx(1.5, rel=1e-12)
+    assert_allclose(jax.grad(lambda x: critical(*x)["gain"])(jnp.array([1.5, 5.0])), [1.0, 0.0], atol=1e-11)
+    of_stiffness = jax.hessian(lambda k: critical(1.5, k).eigenvalue.imag)(5.0)
+    assert float(of_stiffness) == pytest.approx(float(jax.hessian(frequency)(5.0)), rel=1e-9)
+
+
+def test_points_that_meet_are_no_functions_of_parameters():
+    """The bead's pair meets where its equilibria branch: any asymmetry takes this point away."""
+    bottom = jj.family(Bead(), {"angle": 0.0}, vary="turning", until={"turning": 6.0})
+    point = jj.critical(Bead(radius=0.8), bottom, "double root")
+    assert point.code != 0
+    assert np.isnan(point["turning"])
+
+
+def test_critical_points_that_are_not_there_are_refused(bicycle, straight):
+    with pytest.raises(ValueError, match=r"no such special point; it has: .*weave"):
+        jj.critical(bicycle, straight, "fold in lean")
+    with pytest.raises(ValueError, match="the family is one of `WhippleBicycle`"):
+        jj.critical(jj.models.TiltingDisc(), straight, "weave")
+
+
+def test_families_are_no_functions_to_be_traced(bicycle):
+    with pytest.raises(jj.DifferentiationModeError, match="`family` was called inside jit"):
+        jax.jit(lambda w: jj.family(bicycle.replace(w=w), {"rear_spin_rate": 20.0}).points[0].z)(1.02)

@@ -9,13 +9,10 @@ from types import SimpleNamespace
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
-import jourdain_jax as jj
-from jourdain_jax.build import structure
 from jourdain_jax.build.assembling import assemble
 from jourdain_jax.calculus.gauss_newton import shortest
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.lowering import ignorable
-from jourdain_jax.models import TrailerChain
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.identity_test import identity_probes
@@ -97,11 +94,3 @@ def test_what_acts_by_less_than_round_off_is_not_left_out():
     sine, cosine = (graph.call(name, headings[1]) for name in ("sin", "cos"))
     none = graph.add(graph.mul(sine, sine), graph.mul(cosine, cosine))
     assert ignorable._with_slopes(builder, [none], headings[1:2], np.ones(12, bool)) == set()
-
-
-def test_a_motion_finds_the_structure_of_its_scene_once(monkeypatch):
-    looked, probed = [], structure._probed_structure
-    monkeypatch.setattr(structure, "_probed_structure", lambda scene: looked.append(scene) or probed(scene))
-    motion = jj.simulate(TrailerChain(trailers=2, car_mass=1.2345), t1=0.1)
-    motion.raise_if_failed()
-    assert len(looked) == 1

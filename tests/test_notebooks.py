@@ -12,7 +12,7 @@ FOLDER = Path(__file__).parent.parent / "notebooks"
 SOURCES = sorted(FOLDER.glob("*.py"))
 
 
-# what these show is also looked at in `test_bicycle_job.py`, `test_bicycle_stability.py` and `test_studies.py`
+# what these show is also looked at in `test_bicycle.py` and `test_studies.py`
 @pytest.mark.parametrize(
     "source", [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * path.stem.startswith(("02", "04", "05", "06"))) for path in SOURCES]
 )

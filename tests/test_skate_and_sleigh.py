@@ -36,7 +36,7 @@ def _applies(name, heading):
     return not (name in ("privileged", "gibbs-appell") and abs(np.cos(heading)) < 1e-9)
 
 
-# those that are slow here factorise the rows of an upright disc in `test_discs.py`; the Gibbs function's own second derivatives take longest to compile
+# those that are slow here factorise the rows of an upright disc in `test_discs_and_chains.py`; those of the Gibbs function take longest to compile
 SKATES = ["privileged", "qr", *(pytest.param(name, marks=pytest.mark.slow) for name in ("svd", "kkt", "udwadia-kalaba", "gibbs-appell"))]
 
 

@@ -1,0 +1,493 @@
+"""Stop events: found in their step to round-off, the first of several, in short windows, and again from where they stopped; with derivatives."""
+
+import itertools
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import result_codes as results
+from machine_code import BACKENDS
+from numpy.testing import assert_allclose, assert_array_equal
+from small_scenes import OnLine, Upright
+
+import jourdain_jax as jj
+from jourdain_jax.motion.integrators import erk_loop
+from jourdain_jax.motion.integrators.tableaus import DOPRI5, DOPRI8, TSIT5, method_of
+
+# Stop events located inside the loop over steps: to round-off, with derivatives up to the third, and never outside of the step they lie in.
+
+
+GRAVITY = 9.81
+
+
+def stopped(y0, value, *, rates, longest=2.0, solver=None, kind="forward", lanes=(), max_steps=500):
+    """Where a motion from `y0` at t = 0 stopped; `value(t, y)` of the one event."""
+    real = lambda x: jnp.full(lanes, x)  # noqa: E731
+    problem = erk_loop.Problem(
+        rates=lambda t, y, args: rates(t, y),
+        args=None,
+        project=None,
+        events=lambda t, y, args: value(t, y)[None],
+        norm=lambda y: jnp.sqrt(jnp.mean(y**2, axis=0)),
+        rtol=real(1e-9),
+        atol=real(1e-9),
+        shortest=real(1e-14),
+        longest=real(jnp.inf),
+        span=real(longest),
+        max_steps=max_steps,
+    )
+    goals = jnp.stack([real(0.5 * longest), real(longest)])
+    method = method_of(diffrax.Dopri8() if solver is None else solver)
+    return erk_loop.integrate(problem, method, y0, real(0.0), goals, 1e-2, kind)[2]
+
+
+def falling(t, y):
+    return jnp.stack([y[1], -GRAVITY * jnp.ones_like(y[1])])
+
+
+@pytest.mark.parametrize("solver", [pytest.param(diffrax.Dopri8(), id="Dopri8", marks=pytest.mark.slow), pytest.param(diffrax.Tsit5(), id="Tsit5")])
+def test_a_fall_is_located_with_derivatives_up_to_the_third(solver):
+    def fall_time(height):
+        return stopped(jnp.stack([height, 0.0 * height]), lambda t, y: y[0], rates=falling, solver=solver).t
+
+    height = 2.0
+    exact = np.sqrt(2 * height / GRAVITY)
+    for expected in (exact, exact / (2 * height), -exact / (4 * height**2), 3 * exact / (8 * height**3)):
+        assert_allclose(fall_time(height), expected, rtol=1e-9)
+        fall_time = jax.jacfwd(fall_time)
+
+
+def test_reverse_mode_to_an_event_does_not_depend_on_derivatives_beyond_it():
+    depth, stiffness, height = 0.05, 5e-3, 2.0
+    beyond = []
+
+    def push(x):  # k x^9.5 above -depth, zero below it, where reverse mode divides by sqrt(0)
+        return stiffness * x**9 * jnp.sqrt(jnp.maximum(x, 0.0))
+
+    def rates(t, y):
+        jax.debug.callback(lambda y: beyond.append(y < -depth), y[0])
+        return jnp.stack([y[1], -GRAVITY + push(y[0] + depth)])
+
+    def landing_speed(height):
+        return stopped(jnp.stack([height, 0.0 * height]), lambda t, y: y[0], rates=rates, kind="reverse", solver=diffrax.Tsit5()).y[1]
+
+    # v^2/2 + g z - k (z + d)^10.5/10.5 is constant
+    work = lambda z: GRAVITY * z - stiffness * (z + depth) ** 10.5 / 10.5  # noqa: E731
+    speed = np.sqrt(2 * (work(height) - work(0.0)))
+    assert np.isnan(jax.grad(push)(-depth))
+    assert_allclose(landing_speed(height), -speed, rtol=1e-9)
+    assert any(beyond)
+    assert_allclose(jax.grad(landing_speed)(height), -(GRAVITY - push(height + depth)) / speed, rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("value", "digits"),
+    [
+        (lambda t, y: 0.7 - y[0], 1e-14),
+        (lambda t, y: jnp.tanh(40 * (0.7 - y[0])), 1e-14),
+        (lambda t, y: jnp.expm1(30 * (0.7 - y[0])), 1e-14),
+        (lambda t, y: jnp.where(y[0] < 0.7, 1e3, 1.0) * (0.7 - y[0]), 1e-14),
+        (lambda t, y: (0.7 - y[0]) ** 3, 1e-2),  # its slope vanishes there
+        (lambda t, y: jnp.where(y[0] < 0.7, 1.0, -1.0), 1e-2),  # a jump has no slope at all
+    ],
+    ids=["straight", "saturated", "steep", "kinked", "flat", "jump"],
+)
+def test_an_event_is_found_in_its_step_whatever_its_shape(value, digits):
+    end = stopped(jnp.array([0.0]), value, rates=lambda t, y: jnp.ones_like(y))
+    assert int(end.code) == results.EVENT
+    assert_allclose(end.t, 0.7, atol=digits)
+    assert_allclose(end.y[0], end.t, rtol=1e-13)
+
+
+class Flat(OnLine):
+    """A particle that meets a wall; the value of the event has a root of three fold there, or one of one fold."""
+
+    wall: object = jj.parameter(1.5)
+    order: int = eqx.field(static=True, default=3)
+
+    def events(self, motion):
+        return {"wall": (self.wall - motion.q.x) ** self.order}
+
+
+@pytest.mark.parametrize("options", [{"backend": "native"}, {"backend": "xla"}, {"backend": "dense"}, {"solver": jj.RadauIIA()}], ids=str)
+@pytest.mark.parametrize("derivative", [jax.jacrev, jax.jacfwd])
+def test_the_time_of_an_event_whose_value_has_no_slope_has_no_derivative(options, derivative):
+    def met(wall, order):
+        motion = jj.simulate(Flat(wall=wall, order=order), {"x": 0.0, "x_rate": 1.0}, t1=4.0, ts=[0.5], **options)
+        return jnp.stack([motion.t_end, motion.q_end[0], motion.q[0, 0] * wall])
+
+    assert_allclose(met(1.5, 3), [1.5, 1.5, 0.75], rtol=1e-7)
+    assert_allclose(derivative(met)(1.5, 1), [1.0, 1.0, 0.5], rtol=1e-9)
+    assert_allclose(derivative(met)(1.5, 3), [np.nan, np.nan, 0.5], rtol=1e-9)  # what was saved on the way is none of the event's
+
+
+# Solvers of our own. --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", [TSIT5, DOPRI5, DOPRI8], ids=lambda method: method.name)
+def test_our_tableaus_are_those_of_the_solvers_of_that_name(method):
+    solver = getattr(diffrax, method.name)()
+    tableau = solver.tableau
+    for row, theirs in zip(method.A[1:], tableau.a_lower, strict=True):
+        assert np.array_equal(row[: len(theirs)], theirs)
+        assert not row[len(theirs) :].any()
+    assert np.array_equal(method.b, tableau.b_sol)
+    assert np.array_equal(method.b_error, tableau.b_error)
+    assert np.array_equal(method.c[1:], tableau.c)
+    assert method.order == solver.order(None)
+    assert method_of(solver) is method
+
+
+def test_only_a_solver_itself_has_its_tableau():
+    class Tsit5(diffrax.Tsit5):
+        pass
+
+    assert method_of(Tsit5()) is None
+    assert method_of(diffrax.Bosh3()) is None
+
+
+# Stop events whose values are negative in a short part of the way are met: the relations in them are watched over each step.
+
+
+A, W = 0.9, 0.006  # where a bead of 1 m/s that begins at 0 meets them; 0.3 % of the span
+
+# value of (x, t, a, w), and where it stops
+KINDS = {
+    "distance": (lambda x, t, a, w: jnp.abs(x - a) - w, A - W),
+    "window": (lambda x, t, a, w: jnp.where((x > a) & (x < a + w), -1.0, 1.0), A),
+    "window by distance": (lambda x, t, a, w: jnp.where(jnp.abs(x - a) < w, -1.0, 1.0), A - W),
+    "larger of two": (lambda x, t, a, w: jnp.maximum(x - a, a - x) - w, A - W),
+    "before or behind": (lambda x, t, a, w: jnp.maximum(a - x, x - a - w), A),
+    "sign": (lambda x, t, a, w: jnp.sign(jnp.abs(x - a) - w) + 0.5, A - W),
+    "floor": (lambda x, t, a, w: jnp.abs(jnp.floor((x - a) / w)), A),
+    "clock": (lambda x, t, a, w: jnp.abs(t - a) - w, A - W),
+    "window of time": (lambda x, t, a, w: jnp.where((t > a) & (t < a + w), -1.0, 1.0), A),
+    "smaller of two": (lambda x, t, a, w: jnp.minimum(1.0, jnp.abs(x - a) - w), A - W),
+    "root of a square": (lambda x, t, a, w: jnp.sqrt((x - a) ** 2) - w, A - W),
+    "fresh start": (lambda x, t, a, w: jnp.where(x > a, x - a - w, 1.0), A),
+    "scaled": (lambda x, t, a, w: (jnp.abs(x - a) - w) * (2.0 + x), A - W),
+    "either of two": (lambda x, t, a, w: jnp.minimum(jnp.abs(x - a), jnp.abs(x - 1.5)) - w, A - W),
+}
+USUAL = ("distance", "window", "clock")
+
+
+def scene_of(kind: str):
+    value, _ = KINDS[kind]
+
+    class Passing(OnLine):
+        a: float = jj.parameter(A)
+        w: float = jj.parameter(W)
+
+        def events(self, motion):
+            return {"met": value(motion.q.x, motion.t, self.a, self.w), "far": 30.0 - jnp.abs(motion.q.x)}
+
+    return Passing
+
+
+@pytest.mark.parametrize("kind", [kind if kind in USUAL else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS])
+def test_a_short_window_is_met(kind):
+    scene, start = scene_of(kind)(), {"x": 0.0, "x_rate": 1.0}
+    assert jj.lower(scene).event_relations
+    for backend in BACKENDS:
+        motion = jj.simulate(scene, start, ts=[2.0], backend=backend)
+        assert motion.event_names[int(motion.event)] == "met"
+        assert abs(float(motion.t_end) - KINDS[kind][1]) < 1e-9
+    lanes = jj.rollout(scene, {"x": 0.0, "x_rate": jnp.linspace(0.5, 1.5, 7)}, ts=[4.0], progress=False).lanes
+    np.testing.assert_array_equal(lanes.result, results.EVENT)
+
+
+@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
+def test_the_time_of_a_short_window_has_derivatives(derivative):
+    def time(a):
+        return jj.simulate(scene_of("distance")(a=a), {"x": 0.0, "x_rate": 1.0}, ts=[2.0]).t_end
+
+    assert abs(derivative(time)(A) - 1.0) < 1e-8
+
+
+def test_values_with_a_peak_where_a_relation_changes_are_not_watched():
+    """As of a disc that falls to either side, or of a rod between two walls."""
+
+    class Leaning(scene_of("distance")):
+        def events(self, motion):
+            return {"low": 1.5 - jnp.abs(motion.q.x), "walls": jnp.minimum(2.0 - motion.q.x, motion.q.x + 2.0)}
+
+    assert jj.lower(Leaning()).event_relations == ()
+    assert jj.lower(jj.models.TiltingDisc()).event_relations == jj.lower(jj.models.WhippleBicycle()).event_relations == ()
+
+
+# Of several stop events in one step the first in time ends the motion, whatever its name; one whose value ends at its boundary is found there.
+
+
+LOOPS = {"lean": {}, "diffrax": {"solver": diffrax.Bosh3()}}
+
+
+class Thrown(Upright):
+    """A particle under gravity between a floor, a wall and two more planes: all its coordinates are polynomials in time, which steps follow at any length."""
+
+    floor: object = jj.parameter(0.0)
+    wall: object = jj.parameter(2.0)
+    roof: object = jj.parameter(9.0)
+    slope: object = jj.parameter(9.0)
+    example = {"z": 1.0, "x_rate": 4.5}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, GRAVITY),)
+
+    def events(self, motion):
+        q = motion.q
+        return {"a floor": q.z - self.floor, "b wall": self.wall - q.x, "c roof": self.roof - q.z, "d slope": self.slope - q.x - q.z}
+
+
+def first_crossing(x_rate, z_rate, floor, wall, roof, slope):
+    """Index and time of the first event from x = 0, z = 1."""
+
+    def least(*coefficients):
+        roots = np.roots(coefficients)
+        return min((r.real for r in roots if abs(r.imag) < 1e-12 and r.real > 0), default=np.inf)
+
+    fall = [-GRAVITY / 2, z_rate, 1.0]
+    times = least(*np.subtract(fall, [0, 0, floor])), wall / x_rate, least(*np.subtract(fall, [0, 0, roof])), least(*np.subtract(fall, [0, -x_rate, slope]))
+    return int(np.argmin(times)), min(times)
+
+
+def generated_throws(count=48):
+    random = np.random.default_rng(13)
+    throws = [
+        (random.uniform(2, 6), random.uniform(-2, 3), random.uniform(-1, 0.9), random.uniform(0.3, 3), random.uniform(1.05, 3), random.uniform(1.3, 6))
+        for _ in range(count)
+    ]
+    # one shortly after the other, in every order
+    for floor, wall, slope in itertools.permutations([0.20, 0.21, 0.22]):
+        throws.append((4.0, 0.0, 1 - GRAVITY * floor**2 / 2, 4.0 * wall, 9.0, 1 + 4.0 * slope - GRAVITY * slope**2 / 2))
+    return np.array(throws)
+
+
+@pytest.mark.parametrize("options", LOOPS.values(), ids=LOOPS)
+def test_the_first_of_several_events_in_one_long_step_ends_the_motion(options):
+    throws = generated_throws()
+    if options:
+        throws[:, 4] = 100.0  # a hump over the roof is found by our explicit Runge-Kutta loop; by diffrax not where it is over at the end of a step
+    starts = {"x": np.zeros(len(throws)), "z": np.ones(len(throws)), "x_rate": throws[:, 0], "z_rate": throws[:, 1]}
+    walls = dict(zip(("floor", "wall", "roof", "slope"), throws[:, 2:].T, strict=True))
+    lanes = jj.rollout(Thrown(), starts, parameters=walls, ts=[5.0], max_step=np.inf, progress=False, **options).lanes  # some step is beyond all of them
+    expected = [first_crossing(*throw) for throw in throws]
+    assert_array_equal(lanes.event, [event for event, _ in expected])
+    assert_allclose(lanes.t_end, [t for _, t in expected], rtol=1e-12)
+    assert set(np.asarray(lanes.event)) >= {0, 1, 3}
+    assert np.all(np.asarray(lanes.result) == results.EVENT)
+    assert_allclose(lanes.q_end[:, 0], throws[:, 0] * lanes.t_end, rtol=1e-12)
+
+
+# where a stone from z = 1 with the speeds 4.5 and 2 m/s meets a plane: its place, and the value a t^2 + b t + c
+MEETS = {
+    "floor": (0.6, lambda place: (-GRAVITY / 2, 2.0, 1.0 - place)),
+    "wall": (0.8, lambda place: (0.0, -4.5, place)),
+    "roof": (1.1, lambda place: (GRAVITY / 2, -2.0, place - 1.0)),
+    "slope": (1.9, lambda place: (GRAVITY / 2, -6.5, place - 1.0)),
+}
+
+
+@pytest.mark.parametrize("plane", MEETS)
+def test_the_second_derivative_of_one_of_several_events_is_its_own(plane):
+    place, value = MEETS[plane]
+
+    def end(place):
+        walls = {"floor": -9.0, "wall": 9.0} | {plane: place}
+        motion = jj.simulate(Thrown(**walls), {"z": 1.0, "x_rate": 4.5, "z_rate": 2.0}, t1=1.0)
+        return jnp.stack([motion.t_end, *motion.q_end])
+
+    def closed(place):
+        a, b, c = value(place)
+        t = 2 * c / (-b + jnp.sqrt(b**2 - 4 * a * c))
+        return jnp.stack([t, 4.5 * t, 1.0 + 2.0 * t - GRAVITY * t**2 / 2])
+
+    assert_allclose(end(place), closed(place), rtol=1e-9)
+    assert_allclose(jax.hessian(end)(place), jax.hessian(closed)(place), rtol=1e-6, atol=1e-9)
+
+
+class Bounded(OnLine):
+    """A particle without forces; event values that are no numbers beyond edges of their own."""
+
+    arc: object = jj.parameter(1.0)
+    root: object = jj.parameter(1e3)
+    jump: object = jj.parameter(1e3)
+    positive: object = jj.parameter(1e3)
+    example = {"x_rate": 1.0}
+
+    def events(self, motion):
+        x = motion.q.x
+        return {
+            "arc": 1 - jnp.arcsin(x / self.arc) / (jnp.pi / 2),
+            "root": jnp.sqrt(1 - x / self.root),
+            "jump": 1 + jnp.sqrt(1 - x / self.jump),
+            "positive": jnp.arccosh(2 - x / self.positive) + 1e-3,
+        }
+
+
+def test_an_event_that_is_no_number_beyond_its_boundary_stops_the_motion_there():
+    edges, kinds = (x.ravel() for x in np.meshgrid([0.3, 1.0, 1.7], [0, 1, 2, 3]))
+    own = {name: np.where(kinds == k, edges, 1e3) for k, name in enumerate(("arc", "root", "jump", "positive"))}
+    lanes = jj.rollout(Bounded(), {"x_rate": np.full(12, 1.3)}, parameters=own, ts=[5.0], progress=False).lanes
+    assert np.all(np.asarray(lanes.result) == results.EVENT)
+    assert_array_equal(lanes.event, np.array([0, 3, 1, 2])[kinds])  # in the order of the alphabet
+    assert_allclose(lanes.q_end[:, 0], edges, rtol=1e-13)
+    assert_allclose(lanes.t_end, edges / 1.3, rtol=1e-13)
+
+
+def test_the_time_at_which_a_value_ends_has_the_derivative_of_its_boundary():
+    def end(edge):
+        return jj.simulate(Bounded(arc=edge), {"x_rate": 1.3}, ts=[5.0]).t_end
+
+    assert_allclose(jax.grad(end)(0.7), 1 / 1.3, rtol=1e-6)
+    assert_allclose(jax.jacfwd(end)(0.7), 1 / 1.3, rtol=1e-6)
+
+
+def test_a_start_whose_event_is_no_number_is_beyond_it_and_a_state_that_is_none_is_a_failure():
+    beyond = jj.simulate(Bounded(), {"x": 1.5, "x_rate": 1.0}, ts=[5.0])
+    assert (int(beyond.result), float(beyond.t_end)) == (results.EVENT, 0.0)
+    lost = eqx.tree_at(lambda s: s.q, jj.start(Bounded(), x_rate=1.0), jnp.array([jnp.nan]))
+    assert int(jj.simulate(Bounded(), lost, t1=5.0).result) == results.BAD_START
+
+
+def test_a_value_that_falls_below_zero_and_rises_again_within_a_step_is_an_event():
+    """A stone thrown up against a roof that it passes by little: a step would take it there and back."""
+    passes, longest = np.array([1e-4, 1e-2, 0.3]), 2.5
+    top = 1.0 + 5.0**2 / (2 * GRAVITY)
+    starts = {"z": np.ones(3), "z_rate": np.full(3, 5.0)}
+    scene = Thrown(floor=-100.0, wall=100.0, slope=100.0)
+    lanes = jj.rollout(scene, starts, parameters={"roof": top - passes}, ts=[longest], max_step=np.inf, progress=False).lanes
+    expected = 5.0 / GRAVITY - np.sqrt(2 * passes / GRAVITY)
+    assert_array_equal(lanes.event, np.full(3, 2))
+    assert_allclose(lanes.t_end, expected, rtol=1e-9)
+
+
+def test_a_value_that_ends_a_step_just_below_zero_was_zero_where_it_fell_not_there():
+    """A roof that a stone passes by some nm, and a value that decays to next to nothing; both are flat where the first step of the search ends."""
+
+    class Decaying(Bounded):
+        def events(self, motion):
+            return {"decayed": jnp.exp(-50.0 * motion.t) - 1e-10}
+
+    found = jj.simulate(Decaying(), {"x_rate": 1.0}, ts=[5.0])
+    assert_allclose(found.t_end, np.log(1e10) / 50, rtol=1e-9)
+    by, top = 3e-9, 1.0 + 5.0**2 / (2 * GRAVITY)
+
+    def end(roof):
+        motion = jj.simulate(Thrown(floor=-100.0, wall=100.0, roof=roof, slope=100.0), {"z": 1.0, "x_rate": 0.0, "z_rate": 5.0}, ts=[2.0])
+        return motion.t_end
+
+    assert_allclose(end(top - by), 5.0 / GRAVITY - np.sqrt(2 * by / GRAVITY), rtol=1e-9)
+    assert_allclose(jax.grad(end)(top - by), 1 / np.sqrt(2 * GRAVITY * by), rtol=1e-4)
+
+
+def test_an_event_is_no_mistake_to_a_search_for_nan_and_a_mistake_still_is():
+    class Wrong(Thrown):
+        def loads(self, motion):
+            return (jj.gravity(motion, GRAVITY * jnp.sqrt(motion.q.z - 0.9)),)
+
+    with jax.debug_nans(True):
+        motion = jj.simulate(Thrown(), t1=5.0)
+        assert int(motion.result) == results.EVENT
+        assert np.isnan(np.asarray(motion["x"])[-1])
+        assert "stopped at an event" in str(motion)
+        with pytest.raises(FloatingPointError):
+            jj.simulate(Wrong(), t1=5.0)
+
+
+WITH_MARKS = {
+    "energies": lambda motion, path: motion.energies().balance,
+    "a point": lambda motion, path: motion.point("mass", jnp.zeros(3)),
+    "a rollout": lambda motion, path: jj.rollout(Thrown(), {"x_rate": jnp.array([0.5, 1.0])}, t1=5.0).lanes.q,
+    "a file": lambda motion, path: (jj.save(motion, path), jj.load_trajectory(path, Thrown).q)[1],
+    "a derivative": lambda motion, path: jax.grad(lambda z: jj.simulate(Thrown(), {"z": z}, t1=5.0).t_end)(1.5),
+}
+
+
+@pytest.mark.parametrize("what", WITH_MARKS)
+def test_times_that_were_not_reached_are_no_mistake_to_a_search_for_nan(what, tmp_path):
+    motion = jj.simulate(Thrown(), t1=5.0)
+    with jax.debug_nans(True):
+        found = np.asarray(WITH_MARKS[what](motion, tmp_path / "motion.npz"))
+    assert np.isnan(found).any() == (what != "a derivative")
+
+
+# A motion that starts at a stop event goes on where the value of the event rises there, as after a bounce; it stops where that falls through zero.
+
+
+class Ball(Upright):
+    """A ball above a floor at `level`, between walls."""
+
+    level: float = jj.parameter(0.0)
+    mass = 0.5
+
+    def loads(self, motion):
+        return (jj.gravity(motion, GRAVITY),)
+
+    def events(self, motion):
+        return {"floor": motion.q.z - self.level, "walls": 5.0 - jnp.abs(motion.q.x)}
+
+
+def thrown_back(scene, motion, restitution):
+    end = motion.end
+    return jj.start(scene, t0=end.t, x=end["x"], z=end["z"], x_rate=end["x_rate"], z_rate=-restitution * end["z_rate"])
+
+
+@pytest.mark.parametrize(("backend", "level"), [(BACKENDS[-1], 0.0), (BACKENDS[-1], 1e3), ("xla", 0.3)])
+def test_bounces_go_on_from_the_end(backend, level):
+    scene, restitution = Ball(level), 0.8
+    motion = jj.simulate(scene, {"z": level + 1.0, "x_rate": 0.5}, ts=[10.0], backend=backend)
+    fall = np.sqrt(2 / GRAVITY)
+    expected = fall
+    for k in range(1, 7):
+        motion = jj.simulate(scene, thrown_back(scene, motion, restitution), ts=[10.0], backend=backend)
+        expected += 2 * fall * restitution**k
+        assert motion.event_names[int(motion.event)] == "floor"
+        assert abs(float(motion.t_end) - expected) < 1e-9 * max(1.0, level)
+
+
+def test_lanes_and_jit_start_at_an_event():
+    starts = {"x": 0.0, "z": 0.0, "z_rate": jnp.array([3.0, 1e-3, 0.0, -1.0]), "x_rate": 0.1}
+    for backend in BACKENDS:
+        lanes = jj.rollout(Ball(), starts, ts=[2.0], backend=backend, progress=False).lanes
+        np.testing.assert_array_equal(lanes.result, results.EVENT)
+        np.testing.assert_allclose(lanes.t_end, [6 / GRAVITY, 2e-3 / GRAVITY, 0.0, 0.0], atol=1e-9)
+        assert int(jnp.sum(lanes.accepted[2:])) == 0
+    one = jax.jit(lambda rate: jj.simulate(Ball(), {"z": 0.0, "z_rate": rate}, ts=[2.0]).t_end)(2.0)
+    assert abs(float(one) - 4 / GRAVITY) < 1e-9
+
+
+def test_back_in_time_a_value_rises_where_its_rate_is_negative():
+    motion = jj.simulate(Ball(), {"z": 0.0, "z_rate": -2.0}, ts=[-2.0])
+    assert abs(float(motion.t_end) + 4 / GRAVITY) < 1e-9
+    assert float(jj.simulate(Ball(), {"z": 0.0, "z_rate": 2.0}, ts=[-2.0]).t_end) == 0.0
+
+
+@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
+def test_derivatives_go_through_bounces(derivative):
+    def second(height):
+        first = jj.simulate(Ball(), {"z": height}, ts=[10.0])
+        return jj.simulate(Ball(), thrown_back(Ball(), first, 0.8), ts=[10.0]).t_end
+
+    assert abs(derivative(second)(1.0) - 2.6 * np.sqrt(1 / (2 * GRAVITY))) < 1e-7
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_bounce_that_is_over_has_happened(backend):
+    """Whatever round-off is left of the height, and of the speed."""
+    height, rate = (x.ravel() for x in np.meshgrid([0.0, -1e-13, 1e-13], [0.0, 1e-14, 1e-12]))
+    starts = {"z": np.append(height, -1e-3), "z_rate": np.append(rate, 5.0)}
+    lanes = jj.rollout(Ball(), starts, ts=[1.0], backend=backend, progress=False).lanes
+    assert {lanes.event_names[event] for event in np.asarray(lanes.event)} == {"floor"}
+    assert np.all(lanes.t_end < 1e-6)
+    assert lanes.t_end[-1] == 0.0
+
+
+def test_solvers_of_diffrax_start_at_an_event_too():
+    for solver in (diffrax.Tsit5(), diffrax.Bosh3()):
+        motion = jj.simulate(Ball(), {"z": 0.0, "z_rate": 3.0}, ts=[2.0], solver=solver)
+        assert abs(float(motion.t_end) - 6 / GRAVITY) < 1e-6
+        assert float(jj.simulate(Ball(), {"z": 0.0, "z_rate": -3.0}, ts=[2.0], solver=solver).t_end) == 0.0
+
