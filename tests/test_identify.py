@@ -484,6 +484,14 @@ def test_a_fit_inside_a_transformation_is_refused():
 # What cannot be told. ---------------------------------------------------------------------------------------------------------
 
 
+def test_ratios_that_show_are_told_as_such():
+    found = fit(Cart(mass=1.9), cart_run(push=0.0), THREE)
+    (sentence,) = found.not_identifiable
+    assert "d mass/mass : d damping/damping : d stiffness/stiffness = 1 : 1 : 1" in sentence
+    assert sentence.endswith("what shows is damping mass^-1, stiffness mass^-1")
+    assert np.isnan(found.standard_errors).all()
+
+
 def test_a_sum_that_shows_is_told_as_one():
     class TwoDampers(Cart):
         second: jnp.ndarray = jj.parameter(0.13, unit="N s/m", non_negative=True)

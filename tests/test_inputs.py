@@ -306,6 +306,17 @@ def test_a_blow_within_thousands_of_samples_is_felt():
     assert int(motion.accepted) < 100  # the straight parts have no knots
 
 
+def test_lanes_feel_blows_of_their_own_forwards_and_backwards():
+    def end(at, t0, t1):
+        ts = jnp.stack([0.0 * at, at - 5e-4, at, at + 5e-4])
+        inputs = {"force": jj.Sampled(ts, jnp.array([0.0, 0.0, 2000.0, 0.0]))}
+        return jj.simulate(Struck(), {}, t0=t0, ts=[t1], inputs=inputs, work=False).q_end[0]
+
+    at = jnp.array([0.7, 3.0, 8.5])
+    assert_allclose(jax.vmap(lambda at: end(at, 0.0, 10.0))(at), 0.5 * (10 - at), rtol=1e-9)
+    assert_allclose(jax.vmap(lambda at: end(at, 10.0, 0.0))(at), 0.5 * at, rtol=1e-9)
+
+
 def test_lanes_of_a_rollout_feel_a_blow_that_they_share():
     lanes = jj.rollout(Struck(), parameters={"mass": np.array([1.0, 2.0, 4.0])}, ts=[10.0], inputs={"force": BLOW}, work=False, progress=False).lanes
     assert_allclose(lanes.u_end[:, 0], [1.0, 0.5, 0.25], rtol=1e-9)
