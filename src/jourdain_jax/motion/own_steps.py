@@ -52,7 +52,7 @@ class OwnSteps(Integrator):
             return "another backend was asked for"
         if not isinstance(self.solver, Method):
             return "the solver is implicit"
-        return native_motion.reason_against(setup.field, setup.scene, setup.inputs, bool(self.event_names))
+        return native_motion.reason_against(setup.field, setup.scene, setup.inputs, bool(self.event_names), self.order)
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
         if not setup.reason_against_machine_code:
@@ -81,12 +81,6 @@ def own_steps(solver, **static) -> OwnSteps | None:
         return None
     method = method.without_step() if isinstance(method, FixedStepMethod) else method
     return _once(method, **static)
-
-
-def reason_against_series(setup: Setup, order: int) -> str:
-    """Why machine code does not integrate by Taylor series of an order, in words; empty where it can."""
-    reason = setup.reason_against_machine_code
-    return reason or native_motion.reason_against_series(setup.field, setup.inputs, bool(setup.integrator.event_names), order)
 
 
 def _by_xla(mode: Mode, setup: Setup, begun: Begun) -> Solved:

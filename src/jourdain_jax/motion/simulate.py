@@ -24,7 +24,7 @@ from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
-from jourdain_jax.motion.own_steps import own_steps, reason_against_series
+from jourdain_jax.motion.own_steps import own_steps
 from jourdain_jax.motion.put_on_rows import Usual, usual_sizes
 from jourdain_jax.motion.retries import retried
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
@@ -154,11 +154,13 @@ def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, in
     setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, longest, integrator, usual, reference)
     if own is None:
         diffrax_steps.check(setup)
-    if options.backend == "native" and (reason := setup.reason_against_machine_code):
-        raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
-    if order is not None and (reason := reason_against_series(setup, order)):
-        raise ValueError(f"solver=jj.Taylor() cannot integrate `{type(scene).__name__}`: {reason}; omit `solver`, or use solver=diffrax.Dopri8()")
+    if (options.backend == "native" or order is not None) and (reason := setup.reason_against_machine_code):
+        asked, advice = ("backend='native'", "use backend='auto', which takes what serves") if order is None else _BY_SERIES
+        raise ValueError(f"{asked} cannot integrate `{type(scene).__name__}`: {reason}; {advice}")
     return setup
+
+
+_BY_SERIES = "solver=jj.Taylor()", "omit `solver`, or use solver=diffrax.Dopri8()"
 
 
 def _start(scene: Scene, given, t0, inputs: Inputs, native: bool, projects: bool) -> tuple[State, Usual | None]:

@@ -273,7 +273,7 @@ def _of_half(w: Writer, x: Value) -> tuple[Value, Value, Value]:
     a = w.magnitude(x)
     large = a > 0.5
     square = w.where(large, 0.5 - 0.5 * a, a * a)
-    root = w.intrinsic("sqrt", square)
+    root = w.root(square)
     s = w.where(large, root, a)
     over = w.where(large & (root > 0.0), product_less(w, root, root, square) / (root + root), 0.0)
     return large, s, w.fma(s * square, polynomial(w, ASIN, square), -over)

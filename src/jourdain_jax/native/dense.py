@@ -40,13 +40,13 @@ def write_rotated(w: Writer, rows: int, columns: int) -> None:
             with w.counted(0, rows) as i, w.counted(i + 1, rows) as j:
                 first, second = w.at(B, i * width, w.real), w.at(B, j * width, w.real)
                 a, b, p = (_product_of_rows(w, x, y, columns) for x, y in ((first, first), (second, second), (first, second)))
-                lengths = w.intrinsic("sqrt", a) * w.intrinsic("sqrt", b)
+                lengths = w.root(a) * w.root(b)
                 slanted = w.magnitude(p) > lengths * (columns * _EPS)
                 with w.when(w.any(slanted)):
                     w.store(w.literal(1, "i1"), turned)
                     zeta = (b - a) / (w.where(slanted, p, 1.0) * 2.0)
-                    t = w.intrinsic("copysign", w.number(1.0) / (w.magnitude(zeta) + w.intrinsic("sqrt", zeta * zeta + 1.0)), zeta)
-                    c = w.number(1.0) / w.intrinsic("sqrt", t * t + 1.0)
+                    t = w.intrinsic("copysign", w.number(1.0) / (w.magnitude(zeta) + w.root(zeta * zeta + 1.0)), zeta)
+                    c = w.number(1.0) / w.root(t * t + 1.0)
                     c, s = w.where(slanted, c, 1.0), w.where(slanted, c * t, 0.0)
                     with w.counted(0, width) as k:
                         x, y = w.load(w.real, first, k), w.load(w.real, second, k)
@@ -67,7 +67,7 @@ def write_inverted(w: Writer, rows: int, columns: int, cutoff: float) -> None:
         w.store(w.number(0.0), longest)
         with w.counted(0, rows) as i:
             row = w.at(B, i * width, w.real)
-            length = w.intrinsic("sqrt", _product_of_rows(w, row, row, columns))
+            length = w.root(_product_of_rows(w, row, row, columns))
             w.store(length, weights, i)
             w.store(w.larger(w.load(w.real, longest), length), longest)
         with w.counted(0, rows) as i:
@@ -107,7 +107,7 @@ def write_cholesky(w: Writer, n: int) -> None:
                 w.store(rest / w.load(w.real, other, j), row, j)
             pivot = w.load(w.real, row, i) - _product_of_rows(w, row, row, i)
             w.store(w.smaller(w.load(w.real, smallest), pivot), smallest)
-            w.store(w.intrinsic("sqrt", pivot), row, i)
+            w.store(w.root(pivot), row, i)
         is_finite = w.load(w.real, finite).equals(0.0)
         definite = w.load(w.real, smallest) > 16 * n * _EPS
         with w.counted(0, n) as i, w.counted(0, i + 1) as j:

@@ -145,12 +145,12 @@ def logarithm_of_more_than_one(w: Writer, x: Value) -> Value:
 
 def half_power(w: Writer, x: Value) -> Value:
     """x^(1/2): unlike the root, infinite for -inf and 0 for -0."""
-    return w.where(x.equals(-math.inf), math.inf, w.intrinsic("sqrt", x) + 0.0)
+    return w.where(x.equals(-math.inf), math.inf, w.root(x) + 0.0)
 
 
 def three_halves_power(w: Writer, x: Value) -> Value:
     """x^(3/2) = x sqrt(x), right to the last digit: forces of contacts, by Hertz."""
-    root = w.intrinsic("sqrt", x)
+    root = w.root(x)
     head = x * root
     # x (root - sqrt(x)) = x (root^2 - x)/(root + sqrt(x)) = root (root^2 - x)/2
     rest = product_less(w, x, root, head) - 0.5 * root * product_less(w, root, root, x)

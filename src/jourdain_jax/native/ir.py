@@ -264,6 +264,14 @@ class Writer:
         """|a|"""
         return self.intrinsic("fabs", a)
 
+    def root(self, a: Value) -> Value:
+        """The square root of a number."""
+        return self.intrinsic("sqrt", a)
+
+    def equal(self, a: Value, b) -> Value:
+        """Whether two values are equal."""
+        return a.equals(b)
+
     def smaller(self, a: Value, b) -> Value:
         """The smaller of two numbers, NaN if either is."""
         return self.intrinsic("minimum", a, b)

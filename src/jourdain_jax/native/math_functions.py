@@ -20,7 +20,7 @@ _BY_INSTRUCTIONS: dict[str, Callable[..., Value]] = {
     "mul": lambda w, a, b: a * b,
     "div": lambda w, a, b: a / b,
     "neg": lambda w, a: -a,
-    "sqrt": lambda w, a: w.intrinsic("sqrt", a),
+    "sqrt": lambda w, a: w.root(a),
     "abs": lambda w, a: w.magnitude(a),
     "max": lambda w, a, b: w.larger(a, b),
     "min": lambda w, a, b: w.smaller(a, b),

@@ -23,6 +23,9 @@ the event, only values before it are known: then cdot, which may be infinite the
 Source: T. R. Chandrupatla, Advances in Engineering Software 28 (1997) 145-149.
 """
 
+import math
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -98,27 +101,36 @@ class Trial(eqx.Module):
     near: Bool[Array, "*lanes"]
 
 
+class OnArrays:
+    """What the formulas of the search take of a `Writer` of machine code, for arrays of JAX."""
+
+    where, magnitude, larger, smaller, root, equal = map(staticmethod, (jnp.where, jnp.abs, jnp.maximum, jnp.minimum, jnp.sqrt, jnp.equal))
+
+
 def next_trial(known: Bracket, step: Float[Array, "*lanes"], last: Bool[Array, "*lanes"]) -> Trial:
     """The next time to try in a step of length `step`; with `last` the search ends, at a time where the value is a number."""
-    c_1, c_2, c_3 = (chosen(known.first, known.c[i]) for i in range(3))
-    t_1, t_2, t_3 = known.t
-    width, tiny = t_2 - t_1, 2 * jnp.finfo(t_1.dtype).eps * (jnp.abs(t_1) + jnp.abs(t_2))
+    return Trial(*trial(OnArrays, known.t, [chosen(known.first, c) for c in known.c], step, last, float(jnp.finfo(known.t.dtype).eps)))
+
+
+def trial(w, t: Sequence, c: Sequence, step, last, eps: float) -> tuple:
+    """The formulas of `next_trial`, of the times and values of a bracket; `w`: `OnArrays`, or a `Writer` of machine code."""
+    (t_1, t_2, t_3), (c_1, c_2, c_3) = t, c
+    width, tiny = t_2 - t_1, 2 * eps * (w.magnitude(t_1) + w.magnitude(t_2))
     xi, phi = (t_1 - t_2) / (t_3 - t_2), (c_1 - c_2) / (c_3 - c_2)
-    safe = (phi**2 < xi) & ((1 - phi) ** 2 < 1 - xi)
+    safe = (phi * phi < xi) & ((1.0 - phi) * (1.0 - phi) < 1.0 - xi)
     inverse = c_1 / (c_2 - c_1) * c_3 / (c_2 - c_3) - (t_3 - t_1) / width * c_1 / (c_3 - c_1) * c_2 / (c_2 - c_3)
-    share = jnp.where(jnp.isinf(t_3), c_1 / (c_1 - c_2), jnp.where(safe, inverse, 0.5))
-    share = jnp.where(jnp.isfinite(share), share, 0.5)
-    least = jnp.minimum(tiny / jnp.abs(width), 0.5)
+    share = w.where(w.equal(w.magnitude(t_3), math.inf), c_1 / (c_1 - c_2), w.where(safe, inverse, 0.5))
+    share = w.where(w.magnitude(share) < math.inf, share, 0.5)
+    least = w.smaller(tiny / w.magnitude(width), 0.5)
     # near in time by the slope, and small beside the value at the other end: neither says enough of a value that is flat, or that jumps; nor does the mean
     # slope over the whole step, before anything was tried
-    slope, tried = (c_1 - c_3) / (t_1 - t_3), jnp.isfinite(t_3)
-    slope = jnp.where(jnp.isfinite(slope), slope, (c_1 - c_2) / (t_1 - t_2))
-    small = jnp.sqrt(jnp.finfo(t_1.dtype).eps)
-    near = (c_1 == 0) | (tried & (jnp.abs(c_1) <= small * step * jnp.abs(slope)) & (jnp.abs(c_1) <= 1e-3 * jnp.abs(c_2)))
-    closed = (jnp.abs(width) <= 2 * tiny) | last
-    known_there = jnp.isfinite(c_1)
-    t = jnp.where(closed, t_2, t_1 + jnp.clip(share, least, 1 - least) * width)
-    return Trial(t, near | (closed & known_there))
+    slope, tried = (c_1 - c_3) / (t_1 - t_3), w.magnitude(t_3) < math.inf
+    slope = w.where(w.magnitude(slope) < math.inf, slope, (c_1 - c_2) / (t_1 - t_2))
+    small = (w.magnitude(c_1) <= math.sqrt(eps) * step * w.magnitude(slope)) & (w.magnitude(c_1) <= 1e-3 * w.magnitude(c_2))
+    near = w.equal(c_1, 0.0) | (tried & small)
+    closed = (w.magnitude(width) <= 2.0 * tiny) | last
+    clipped = w.smaller(w.larger(share, least), 1.0 - least)
+    return w.where(closed, t_2, t_1 + clipped * width), near | (closed & (w.magnitude(c_1) < math.inf))
 
 
 class Search(eqx.Module):
@@ -203,18 +215,25 @@ class Dip(eqx.Module):
 
 
 def dip(h: Float[Array, "*lanes"], c_0, c_dot_0, c_1, c_dot_1) -> Dip:
-    """The dips of the cubics through values (those at the start positive) and rates (events, *lanes) at the ends of a step `h`.
+    """The dips of the cubics through values (those at the start positive) and rates (events, *lanes) at the ends of a step `h`."""
+    share = lowest(OnArrays, jnp.ones_like(h), *jax.lax.stop_gradient((h, c_0, c_dot_0, c_1, c_dot_1)))
+    return Dip(share < 1, share)
+
+
+def lowest(w, share, h, c_0: Sequence, c_dot_0: Sequence, c_1: Sequence, c_dot_1: Sequence):
+    """After which part of a step, of which all is the `share` at first, the first dip is lowest; `w`: as of `trial`.
 
     p(s) = c_0 + m_0 s + A s^2 + B s^3,   lowest at s = -m_0/(A + sqrt(A^2 - 3 B m_0))
     """
-    c_0, m_0, c_1, m_1 = jax.lax.stop_gradient((c_0, h * c_dot_0, c_1, h * c_dot_1))
-    rise = c_1 - c_0
-    A, B = 3 * rise - 2 * m_0 - m_1, m_0 + m_1 - 2 * rise
-    s = -m_0 / (A + jnp.sqrt(jnp.maximum(A**2 - 3 * B * m_0, 0.0)))
-    lowest = c_0 + s * (m_0 + s * (A + s * B))
-    dips = (c_1 > 0) & (m_0 < 0) & (m_1 > 0) & (s < LATE) & (lowest < -1e-12 * (c_0 + c_1))
-    share = jnp.min(jnp.where(dips, s, 1.0), axis=0)
-    return Dip(share < 1, share)
+    for a, slope_a, b, slope_b in zip(c_0, c_dot_0, c_1, c_dot_1, strict=True):
+        m_0, m_1 = h * slope_a, h * slope_b
+        rise = b - a
+        A, B = 3.0 * rise - 2.0 * m_0 - m_1, m_0 + m_1 - 2.0 * rise
+        s = -m_0 / (A + w.root(w.larger(A * A - 3.0 * B * m_0, 0.0)))
+        value = a + s * (m_0 + s * (A + s * B))
+        dips = (b > 0.0) & (m_0 < 0.0) & (m_1 > 0.0) & (s < LATE) & (value < -1e-12 * (a + b))
+        share = w.smaller(share, w.where(dips, s, 1.0))
+    return share
 
 
 def chosen(index, values: Float[Array, "events *lanes"]) -> Float[Array, "*lanes"]:

@@ -5,7 +5,7 @@ not depend on the width.
 """
 
 from collections.abc import Callable, Sequence
-from functools import cache, lru_cache
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -62,11 +62,6 @@ def _results(*arguments, shapes: Callable, **_) -> list:
     return [arguments[-1].update(shape=(*arguments[-1].shape[:-1], *shape), weak_type=False) for shape in shapes(*arguments)]
 
 
-@lru_cache(maxsize=64)
-def _compiled(**how) -> Callable:
-    return jax.jit(lambda *arguments: _call_p.bind(*arguments, **how))
-
-
 def on_cpu(ctx: mlir.LoweringRuleContext, *arguments, handler: Callable, lanes: int, threads: int, **_):
     """The call in a program for the CPU."""
     _check_here(ctx)
@@ -97,7 +92,8 @@ def _check_here(ctx: mlir.LoweringRuleContext) -> None:
 # The call itself: machine code is made where a program is lowered that holds it, not for what is only traced.
 _call_p = Primitive("jourdain_machine_code")
 _call_p.multiple_results = True
-_call_p.def_impl(lambda *arguments, **how: _compiled(**how)(*arguments))
+_HOW = "handler", "kernel", "lanes", "threads", "shapes"
+_call_p.def_impl(jax.jit(lambda *arguments, **how: _call_p.bind(*arguments, **how), static_argnames=_HOW))
 _call_p.def_abstract_eval(_results)
 mlir.register_lowering(_call_p, _nowhere)
 mlir.register_lowering(_call_p, on_cpu, platform="cpu")

@@ -19,7 +19,7 @@ from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.native.flow_back import flow_back
 from jourdain_jax.motion.native.functions import Form, event_program
 from jourdain_jax.motion.native.functions_of_time import numbers_of, parts_from, with_functions
-from jourdain_jax.motion.native.kernel import MOST_KERNELS, Found, Start
+from jourdain_jax.motion.native.kernel import Found, Start
 from jourdain_jax.motion.native.layout import Layout
 from jourdain_jax.motion.native.pulled import check_derivatives
 from jourdain_jax.motion.native.times import moved
@@ -36,8 +36,8 @@ LARGEST_PROGRAM = 60_000
 MOST_PRODUCTS = 12_000  # of coefficients in a step by Taylor series, which is written out
 
 
-def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events: bool) -> str:
-    """Why machine code cannot integrate a scene, in words; empty where it can."""
+def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events: bool, order: int | None = None) -> str:
+    """Why machine code cannot integrate a scene, by Taylor series up to an `order` where one is given, in words; empty where it can."""
     if not isinstance(field, ByProgram):
         return "the scene has no scalar program"
     if reason := ffi.reason_against():
@@ -50,35 +50,30 @@ def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events
         return reason
     if has_events and not field.lowers_events:
         return "a stop event is no part of the scalar program"
-    return _reason_against_program(form_of(field, inputs, has_events))
+    return _reason_against_program(form_of(field, inputs, has_events), order)
 
 
-@lru_cache(maxsize=MOST_KERNELS)
-def _reason_against_program(form: Form) -> str:
+@lru_cache(maxsize=64)
+def _reason_against_program(form: Form, order: int | None) -> str:
     """Why machine code cannot evaluate the program of a form, in words; empty where it can."""
     program, graph = form.program, form.program.graph
     operations = graph.operations(form.nodes)
     if operations > LARGEST_PROGRAM:
         return f"the scalar program has {operations} operations, more than {LARGEST_PROGRAM}"
-    reason = unsupported(graph, form.nodes)
-    if not reason and form.has_events and form.sampled:
+    if reason := unsupported(graph, form.nodes):
+        return reason
+    if form.has_events and form.sampled:
         sampled = {program.variables[len(program.variables) - len(program.inputs) + i] for i in form.sampled}
         if sampled & set(graph.reachable(program.events)):
             return "a stop event depends on an input that changes with time"
-    if not reason and form.has_events:
+    if form.has_events:
         try:
             event_program(form)
         except Unsupported as error:
             return f"a stop event has no rate on the graph ({error})"
-    return reason
+    return "" if order is None else _reason_against_series(form, order)
 
 
-def reason_against_series(field: VectorField, inputs: Inputs, has_events: bool, order: int) -> str:
-    """Why machine code that integrates a scene cannot do so by Taylor series, in words; empty where it can."""
-    return _reason_against_series(form_of(field, inputs, has_events), order)
-
-
-@lru_cache(maxsize=MOST_KERNELS)
 def _reason_against_series(form: Form, order: int) -> str:
     if form.sampled:
         return "an input is given by samples"

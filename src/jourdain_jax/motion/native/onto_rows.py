@@ -127,7 +127,7 @@ def _write_metric(w: Writer, of: Rows) -> None:
 def _scale_of_speed(w: Writer, own: Value) -> Value:
     """As `equations/scaling.speed_scale`, of an entry on the diagonal of the mass matrix."""
     heavy = own > 0.0
-    return w.where(heavy, w.number(1.0) / w.intrinsic("sqrt", w.where(heavy, own, 1.0)), 1.0)
+    return w.where(heavy, w.number(1.0) / w.root(w.where(heavy, own, 1.0)), 1.0)
 
 
 def _write_factored(w: Writer, of: Rows) -> None:
@@ -149,7 +149,7 @@ def _write_factored(w: Writer, of: Rows) -> None:
             with w.counted(0, columns) as k:
                 slope = w.load(w.real, row, k)
                 w.store(w.fma(slope, slope, w.load(w.real, square)), square)
-            length = w.larger(w.intrinsic("sqrt", w.load(w.real, square)), w.load(w.real, state, i + first_typical))
+            length = w.larger(w.root(w.load(w.real, square)), w.load(w.real, state, i + first_typical))
             there = length > 0.0
             scale = w.where(there, w.number(1.0) / w.where(there, length, 1.0), 1.0)
             w.store(scale, d, i)

@@ -2,7 +2,7 @@
 
 import math
 
-from jourdain_jax.motion.integrators.event_search import DIFFERENTIABLE, FLAT, LATE, LEAVES, MOST_STEPS
+from jourdain_jax.motion.integrators.event_search import DIFFERENTIABLE, FLAT, LEAVES, MOST_STEPS, lowest, trial
 from jourdain_jax.motion.native.layout import Lanes
 from jourdain_jax.native.ir import Value, Writer
 
@@ -59,16 +59,8 @@ def chosen(w: Writer, index: Value, values: Values) -> Value:
 
 def dip(w: Writer, h: Value, c_0: Values, rate_0: Values, c_1: Values, rate_1: Values) -> tuple[Value, Value]:
     """Whether a value falls below zero between the ends of a step, and after which part of the step the first one is lowest."""
-    shares = w.number(1.0)
-    for a, slope_a, b, slope_b in zip(c_0, rate_0, c_1, rate_1, strict=True):
-        m_0, m_1 = h * slope_a, h * slope_b
-        rise = b - a
-        A, B = 3.0 * rise - 2.0 * m_0 - m_1, m_0 + m_1 - 2.0 * rise
-        s = -m_0 / (A + w.intrinsic("sqrt", w.larger(A * A - 3.0 * B * m_0, 0.0)))
-        lowest = a + s * (m_0 + s * (A + s * B))
-        dips = (b > 0.0) & (m_0 < 0.0) & (m_1 > 0.0) & (s < LATE) & (lowest < -1e-12 * (a + b))
-        shares = w.smaller(shares, w.where(dips, s, 1.0))
-    return shares < 1.0, shares
+    share = lowest(w, w.number(1.0), h, c_0, rate_0, c_1, rate_1)
+    return share < 1.0, share
 
 
 def advance(w: Writer, p: Lanes, begins: Value, trying: Value, locating: Value, start: tuple[Value, Values, Values], end: tuple[Value, Values]) -> Value:
@@ -93,7 +85,7 @@ def advance(w: Writer, p: Lanes, begins: Value, trying: Value, locating: Value, 
     is_before = no_event(w, known_c[0])
     before, after = _each(w, is_before, known_c[0], known_c[1]), _each(w, is_before, known_c[1], known_c[0])
     first = first_event(w, before, after)
-    tried, near = _next_trial(w, known_t, [chosen(w, first, x) for x in known_c], step, now_left <= DIFFERENTIABLE + 3.0)
+    tried, near = trial(w, known_t, [chosen(w, first, x) for x in known_c], step, now_left <= DIFFERENTIABLE + 3.0, EPS)
     trying = begins | trying
     now_left = w.where(trying & near, DIFFERENTIABLE + 1.0, now_left)
     to_trial = w.where(near, 0.0, tried - t_0)
@@ -122,24 +114,6 @@ def _same(w: Writer, a: Value, b: Value) -> Value:
 
 def _each(w: Writer, condition: Value, a: Values, b: Values) -> Values:
     return [w.where(condition, x, y) for x, y in zip(a, b, strict=True)]
-
-
-def _next_trial(w: Writer, t: Values, c: Values, step: Value, last: Value) -> tuple[Value, Value]:
-    (t_1, t_2, t_3), (c_1, c_2, c_3) = t, c
-    width, tiny = t_2 - t_1, 2 * EPS * (w.magnitude(t_1) + w.magnitude(t_2))
-    xi, phi = (t_1 - t_2) / (t_3 - t_2), (c_1 - c_2) / (c_3 - c_2)
-    safe = (phi * phi < xi) & ((1.0 - phi) * (1.0 - phi) < 1.0 - xi)
-    inverse = c_1 / (c_2 - c_1) * c_3 / (c_2 - c_3) - (t_3 - t_1) / width * c_1 / (c_3 - c_1) * c_2 / (c_2 - c_3)
-    share = w.where(w.magnitude(t_3).equals(math.inf), c_1 / (c_1 - c_2), w.where(safe, inverse, 0.5))
-    share = w.where(w.magnitude(share) < math.inf, share, 0.5)
-    least = w.smaller(tiny / w.magnitude(width), 0.5)
-    slope, tried = (c_1 - c_3) / (t_1 - t_3), w.magnitude(t_3) < math.inf
-    slope = w.where(w.magnitude(slope) < math.inf, slope, (c_1 - c_2) / (t_1 - t_2))
-    small = (w.magnitude(c_1) <= _SMALL * step * w.magnitude(slope)) & (w.magnitude(c_1) <= 1e-3 * w.magnitude(c_2))
-    near = c_1.equals(0.0) | (tried & small)
-    closed = (w.magnitude(width) <= 2.0 * tiny) | last
-    clipped = w.smaller(w.larger(share, least), 1.0 - least)
-    return w.where(closed, t_2, t_1 + clipped * width), near | (closed & (w.magnitude(c_1) < math.inf))
 
 
 def _newton_shift(w: Writer, t: Values, after: Value, step: Value, c: Value, rate: Value, searching: Value) -> Value:

@@ -245,7 +245,7 @@ def _norm(w: Writer, layout: Layout, p: Lanes, error: Value, y1: Value) -> Value
         return w.fma(relative, relative, total)
 
     total = over_rows(w, range(count), 0.0, added) / float(count)
-    return w.intrinsic("sqrt", w.where(w.is_nan(total), math.inf, total))
+    return w.root(w.where(w.is_nan(total), math.inf, total))
 
 
 def _count(w: Writer, happens: Value) -> Value:
