@@ -29,7 +29,6 @@ from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.tracebacks import users_level
 
-LANES = 2048  # with their tangents, at once
 SHIFT = "shift"  # of all values of a column of a table, or of all levels of a grid
 
 
@@ -72,7 +71,8 @@ def mean_gradients(task: Task, shared: Sequence[str]) -> MeanGradients:
     """The gradients of the means of all outputs of a task, also with respect to the parameters `shared` by all lanes."""
     _check_shared(task, shared)
     columns = (*task.design.names, *shared)
-    size = max(8, min(task.block, LANES // (1 + len(columns))))
+    # 2048 lanes with their tangents, at once
+    size = max(8, min(task.block, 2048 // (1 + len(columns))))
     common = {name: np.asarray(value, float) for name, value, _ in parameters_of(task.scene) if name in shared}
     of_block = _of_block(task, columns)
     values, weighted, ends = [], [], []

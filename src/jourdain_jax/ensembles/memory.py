@@ -21,7 +21,6 @@ COMPILED = 500e6  # bytes for compilers and what they compile; the disc takes 22
 BLOCKS = 4.0  # copies of a block's states that are there at once; seen: 3.7
 CHUNKS = 2.0  # the arrays of a chunk's blocks, and these put together
 _NOT_HERE = "`memory` is held on Linux with glibc only; leave it out here"
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 
 
 def bytes_of(memory: Any) -> int:
@@ -44,7 +43,8 @@ def resident() -> int:
 def give_back_at_once() -> None:
     """Have the allocator give large freed arrays back to the system; ValueError where that is not glibc's."""
     library: Any = ctypes.CDLL(None) if os.name == "posix" else None
-    if not hasattr(library, "mallopt") or not library.mallopt(_M_MMAP_THRESHOLD, 2**20) or not library.mallopt(_M_TRIM_THRESHOLD, 2**24):
+    # M_MMAP_THRESHOLD is -3, M_TRIM_THRESHOLD -1 in glibc's malloc.h
+    if not hasattr(library, "mallopt") or not library.mallopt(-3, 2**20) or not library.mallopt(-1, 2**24):
         raise ValueError(_NOT_HERE)
 
 

@@ -29,7 +29,6 @@ from jourdain_jax.motion.trajectories.versions import version_of
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.tracebacks import users_level
 
-MOST_CHUNKS, LARGEST_CHUNK = 1000, 2**20  # by default: number, and lanes of one
 PACKAGES = ("jourdain-jax", "jax", "jaxlib", "diffrax", "numpy", "scipy", "zarr", "llvmlite")
 
 
@@ -124,7 +123,7 @@ def _chunk(task: Task, chunk: int | None) -> int:
     """Lanes of a chunk: whole blocks, whole strides of saved lanes; by default about a thousandth of all."""
     unit = np.lcm(task.block, task.every)
     if chunk is None:
-        return int(unit * max(1, min(len(task.design), MOST_CHUNKS * LARGEST_CHUNK) // (MOST_CHUNKS * unit)))
+        return int(unit * max(1, min(len(task.design) // 1000, 2**20) // unit))
     if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or chunk < 1 or chunk % unit:
         raise ValueError(f"`chunk` is {chunk!r}, expected a multiple of {unit} lanes, such as {4 * unit}: so many are computed together in this study")
     return int(chunk)

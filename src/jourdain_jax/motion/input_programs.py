@@ -21,7 +21,6 @@ from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.program.calls import description
 from jourdain_jax.scene.names_read import is_function, now_read_by
 
-MOST_PROGRAMS = 64  # kept, so that equal ones are one object
 _TAKE_NUMBERS = ("add", "sub", "mul", "div", "lt", "le", "gt", "ge")  # finite derivatives with respect to a plain number, where it is not zero
 
 
@@ -118,7 +117,7 @@ class _Trace:
         self.found: tuple[FunctionOfTime | None, object] = (None, None)
 
 
-@lru_cache(maxsize=MOST_PROGRAMS)
+@lru_cache(maxsize=64)
 def _trace(function: Callable) -> _Trace:
     return _Trace()
 
@@ -145,7 +144,7 @@ def _known(function: Callable, program: TimeProgram) -> TimeProgram:
         return _one_of_equals(program)
 
 
-@lru_cache(maxsize=MOST_PROGRAMS)
+@lru_cache(maxsize=64)
 def _one_of_equals(program: TimeProgram) -> TimeProgram:
     return program
 

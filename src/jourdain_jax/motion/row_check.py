@@ -12,8 +12,6 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.equations.projection import linearised_rows
 from jourdain_jax.motion.setup import Setup
 
-VIOLATED = 1e-2  # of what stands in a row: far more than steps at loose tolerances leave
-
 
 def rows_violated(setup: Setup, t: Float[Array, "times"], q: Float[Array, "times coordinates"], u: Float[Array, "times speeds"]) -> Bool[Array, ""]:
     """Whether some row is violated at some of these states; those that were not reached are NaN, and do not count.
@@ -27,4 +25,5 @@ def rows_violated(setup: Setup, t: Float[Array, "times"], q: Float[Array, "times
         return jnp.abs(phi), jnp.abs(phi - A @ state[2]) + jnp.abs(A) @ jnp.abs(state[2])
 
     left, size = jax.lax.map(left_and_size, states)  # rows may be callbacks, which need not know batches
-    return jnp.any(left > VIOLATED * jnp.nanmax(size, axis=0))
+    # 1 % is far more than steps at loose tolerances leave
+    return jnp.any(left > 1e-2 * jnp.nanmax(size, axis=0))

@@ -20,27 +20,6 @@ from jourdain_jax.program.emit import COSINE, HALF_PI, SINE
 
 WHOLE = 1.5 * 2.0**52  # a number to which this is added is rounded to a whole one, whose last bits are the last of the sum
 LARGEST_ANGLE = 5e5  # rad; multiples of pi/2 below 2^20 times a part of 33 bits are exact
-TWO_OVER_PI = (  # its first 1,216 bits, 64 in each
-    0xA2F9836E4E441529,
-    0xFC2757D1F534DDC0,
-    0xDB6295993C439041,
-    0xFE5163ABDEBBC561,
-    0xB7246E3A424DD2E0,
-    0x06492EEA09D1921C,
-    0xFE1DEB1CB129A73E,
-    0xE88235F52EBB4484,
-    0xE99C7026B45F7E41,
-    0x3991D639835339F4,
-    0x9C845F8BBDF9283B,
-    0x1FF897FFDE05980F,
-    0xEF2F118B5A0A6D1F,
-    0x6D367ECF27CB09B7,
-    0x4F463F669E5FEA2D,
-    0x7527BAC7EBE5F17B,
-    0x3D0739F78A5292EA,
-    0x6BFB5FB11F8D5D08,
-    0x56033046FC7B6BAB,
-)
 _HALF_PI = (1.5707963267948966, 6.123233995736766e-17)
 _LESS_SINE = tuple(-c for c in SINE)
 _PI = (3.1415926535897896, 3.675178358715236e-15)  # the first has 50 bits: 1/4, 1/2 and 3/4 of it are exact
@@ -141,7 +120,14 @@ def _reduced_far(w: Writer, x: Value) -> tuple[Value, Value, Value]:
 
     x = m 2^e with a whole number m of 53 bits; of 2/pi those 192 bits count whose products with m are no multiples of whole turns, and not far below 2^-126.
     """
-    w.whole_numbers("two_over_pi", (0, *(word - 2**64 * (word >> 63) for word in TWO_OVER_PI)))
+    bits = (  # the first 1,216 of 2/pi, 64 in each
+        0xA2F9836E4E441529, 0xFC2757D1F534DDC0, 0xDB6295993C439041, 0xFE5163ABDEBBC561,
+        0xB7246E3A424DD2E0, 0x06492EEA09D1921C, 0xFE1DEB1CB129A73E, 0xE88235F52EBB4484,
+        0xE99C7026B45F7E41, 0x3991D639835339F4, 0x9C845F8BBDF9283B, 0x1FF897FFDE05980F,
+        0xEF2F118B5A0A6D1F, 0x6D367ECF27CB09B7, 0x4F463F669E5FEA2D, 0x7527BAC7EBE5F17B,
+        0x3D0739F78A5292EA, 0x6BFB5FB11F8D5D08, 0x56033046FC7B6BAB,
+    )
+    w.whole_numbers("two_over_pi", (0, *(word - 2**64 * (word >> 63) for word in bits)))
     w.once("far_angle", "void", dict.fromkeys(("x", "r", "over", "quadrant"), "ptr"), _write_far_angle)
     given, r, over, quadrant = w.room(w.real), w.room(w.real), w.room(w.real), w.room(w.whole)
     w.store(x, given)

@@ -29,10 +29,7 @@ _FRAME = "struct_size extension_start api ctx stage args rets attrs future"
 _BUFFER = "struct_size extension_start dtype data rank dims"
 _LISTS = "struct_size extension_start size types"
 # places, in words of 8 bytes
-_EXTENSION, ARGS, RETS = 1, 9, 14  # of a frame: its extension, its lists of pointers to arguments and results
-_TYPE, _DATA, _RANK, _DIMS = 2, 3, 4, 5  # of a buffer
-_KIND, _METADATA = 1, 3  # of an extension
-_MAJOR = 3  # of metadata, with the minor version after it
+ARGS, RETS = 9, 14  # of a frame: its lists of pointers to arguments and results
 
 _REGISTERED: set[str] = set()  # names of handlers
 _REGISTERING = threading.Lock()
@@ -130,18 +127,17 @@ def answer_metadata(w: Writer, frame: Value) -> None:
     """Where the frame asks for the version of the interface, says it and returns."""
     known = version()
     assert known is not None
-    extension = w.load("ptr", frame, _EXTENSION)
+    extension = w.load("ptr", frame, 1)
     asked, called = w.label(), w.label()
     is_asked = w.label()
     none = w.compared("eq", w.converted("ptrtoint", extension, "i64"), 0)
     w.go(called, none, is_asked)
     w.place(is_asked)
-    w.go(asked, w.load("i32", extension, 2 * _KIND).equals(1), called)
+    w.go(asked, w.load("i32", extension, 2).equals(1), called)  # the kind of an extension, in its second word
     w.place(asked)
-    metadata = w.load("ptr", extension, _METADATA)
-    w.store(w.literal(known[0], "i32"), metadata, 2 * _MAJOR)
-    w.store(w.literal(known[1], "i32"), metadata, 2 * _MAJOR + 1)
-    w.store(w.literal(0, "i32"), metadata, 2 * _MAJOR + 2)
+    metadata = w.load("ptr", extension, 3)
+    for place, number in enumerate((*known, 0), 6):  # major and minor version in the fourth word, then flags
+        w.store(w.literal(number, "i32"), metadata, place)
     w.give(Value(w, "ptr", "null"))
     w.place(called)
 
@@ -158,12 +154,13 @@ def _write_kernel(w: Writer, arguments: int, results: int, body: Callable[[list[
 
 def given(w: Writer, buffer: Value) -> Given:
     """What a handler is given of an array."""
-    return Given(w.load("ptr", buffer, _DATA), w.load("ptr", buffer, _DIMS), w.load("i64", buffer, _RANK))
+    # words of a buffer: 2 the type, 3 the data, 4 the rank, 5 the sizes
+    return Given(w.load("ptr", buffer, 3), w.load("ptr", buffer, 5), w.load("i64", buffer, 4))
 
 
 def _is_single(w: Writer, buffer: Value) -> Value:
     # 11: the type of arrays in single precision
-    return w.load("i32", buffer, 2 * _TYPE).equals(11)
+    return w.load("i32", buffer, 4).equals(11)
 
 
 def _write_doubles(w: Writer) -> None:

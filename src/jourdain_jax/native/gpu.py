@@ -23,10 +23,7 @@ _TARGET = "jourdain_jax_on_gpu"
 MOST_KERNELS = 4096  # of a process
 MOST_SCRATCH = 4 << 30  # bytes of what threads use beyond what they need, and no more than an eighth of the device
 _NUMBER, _FUNCTION, _WORDS = range(3)  # words of a kernel in the table; the number of words
-_API, _CONTEXT, _ARGUMENT_COUNT, _RESULT_COUNT, _ATTRIBUTES = 2, 3, 7, 12, 20  # words of a frame
 _BLOCKS, _KERNEL = range(2)  # attributes, in the order of their names
-_ERROR_CREATE, _STREAM_GET = 6, 10  # words of XLA's interface
-_INTERNAL, _EXHAUSTED, _OUT_OF_MEMORY = 13, 8, 2  # XLA's codes of errors, and one of the driver's
 
 _table = (ctypes.c_uint64 * (_WORDS * MOST_KERNELS))()
 _loading = threading.RLock()
@@ -47,11 +44,12 @@ def handler_text() -> str:
     _write_described(w)
     with w.function(ffi.HANDLER, "ptr", {"frame": "ptr"}, how="") as (frame,):
         ffi.answer_metadata(w, frame)
-        nothing, attributes = Value(w, "ptr", "null"), w.load("ptr", frame, _ATTRIBUTES)
+        # words of a frame: 2 the interface, 3 the context, 20 the attributes; sizes of lists stand two words before their pointers
+        nothing, attributes = Value(w, "ptr", "null"), w.load("ptr", frame, 20)
         blocks, number = (w.load("i64", w.load("ptr", w.load("ptr", attributes, k), 1)) for k in (_BLOCKS, _KERNEL))
         words, count = w.room("i64", ffi.WORDS * ffi.MOST_BUFFERS), w.room("i64")
         w.store(w.literal(0, "i64"), count)
-        for of, buffers in ((_ARGUMENT_COUNT, ffi.ARGS), (_RESULT_COUNT, ffi.RETS)):
+        for of, buffers in ((ffi.ARGS - 2, ffi.ARGS), (ffi.RETS - 2, ffi.RETS)):
             with w.counted(0, w.load("i64", frame, of)) as k:
                 place = w.load("i64", count)
                 w.call("described", "void", w.load("ptr", w.load("ptr", frame, buffers), k), w.at(words, place * ffi.WORDS, "i64"))
@@ -64,10 +62,10 @@ def handler_text() -> str:
             leave(w.load("i64", table, w.load("i64", entry)).equals(number))
             w.store(w.load("i64", entry) + _WORDS, entry)
         function = w.load("ptr", table, w.load("i64", entry) + _FUNCTION)
-        api, asked = w.load("ptr", frame, _API), w.room("i64", 4)
-        for word, value in enumerate((w.literal(32, "i64"), w.literal(0, "i64"), w.load("i64", frame, _CONTEXT), w.literal(0, "i64"))):
+        api, asked = w.load("ptr", frame, 2), w.room("i64", 4)
+        for word, value in enumerate((w.literal(32, "i64"), w.literal(0, "i64"), w.load("i64", frame, 3), w.literal(0, "i64"))):
             w.store(value, asked, word)
-        failed = w.through(w.load("ptr", api, _STREAM_GET), "ptr", asked)
+        failed = w.through(w.load("ptr", api, 10), "ptr", asked)  # `XLA_FFI_Stream_Get`
         with w.when(w.converted("ptrtoint", failed, "i64").differs(0)):
             w.give(failed)
             w.place(w.label())
@@ -81,10 +79,11 @@ def handler_text() -> str:
         with w.when(w.load("i32", code).differs(0)):
             message, error = w.room("ptr"), w.room("i64", 4)
             w.external("cuGetErrorString", "i32", w.load("i32", code), message)
-            kind = w.where(w.load("i32", code).equals(_OUT_OF_MEMORY), w.literal(_EXHAUSTED, "i64"), _INTERNAL)
+            # the driver is out of memory: XLA's resources are exhausted; otherwise its error is an internal one
+            kind = w.where(w.load("i32", code).equals(2), w.literal(8, "i64"), 13)
             for word, value in enumerate((w.literal(28, "i64"), w.literal(0, "i64"), w.load("i64", message), kind)):
                 w.store(value, error, word)
-            w.give(w.through(w.load("ptr", api, _ERROR_CREATE), "ptr", error))
+            w.give(w.through(w.load("ptr", api, 6), "ptr", error))  # `XLA_FFI_Error_Create`
             w.place(w.label())
         w.give(nothing)
     return w.text

@@ -13,7 +13,6 @@ from typing import NamedTuple
 from jourdain_jax.native import host
 
 TRIPLE = "nvptx64-nvidia-cuda"
-KNOWN = (75, 80, 86, 89, 90, 100, 120)  # compute capabilities that text is made for; newer GPUs take that of older ones
 WARP = 32
 _CALLED = (
     "cuCtxPopCurrent_v2",
@@ -29,8 +28,6 @@ _CALLED = (
     "cuLibraryLoadData",
     "cuMemsetD32Async",
 )
-_MULTIPROCESSORS, _MAJOR, _MINOR, _CACHE, _REGISTERS = 16, 75, 76, 81, 82  # attributes of a device; the cache is what of it can be shared memory
-_LOCAL_BYTES, _REGISTERS_EACH = 3, 4  # of a kernel
 
 
 class Loaded(NamedTuple):
@@ -115,8 +112,9 @@ def memory() -> int:
 @functools.cache
 def architecture() -> str:
     """What text is made for, such as `sm_90`."""
-    capability = 10 * _of_device(_MAJOR) + _of_device(_MINOR)
-    return f"sm_{max((known for known in KNOWN if known <= capability), default=KNOWN[0])}"
+    capability = 10 * _of_device(75) + _of_device(76)  # major and minor
+    # compute capabilities that text is made for; newer GPUs take that of older ones
+    return f"sm_{max((known for known in (80, 86, 89, 90, 100, 120) if known <= capability), default=75)}"
 
 
 def text_for(module: str, architecture: str) -> str:
@@ -151,7 +149,7 @@ def loaded(text: bytes, name: str) -> Loaded:
         library, kernel, found = ctypes.c_void_p(), ctypes.c_void_p(), []
         _checked(driver().cuLibraryLoadData(ctypes.byref(library), ctypes.c_char_p(text + b"\0"), None, None, 0, None, None, 0))
         _checked(driver().cuLibraryGetKernel(ctypes.byref(kernel), library, name.encode()))
-        for attribute in (_LOCAL_BYTES, _REGISTERS_EACH):
+        for attribute in (3, 4):  # bytes of local memory, registers
             value = ctypes.c_int()
             _checked(driver().cuKernelGetAttribute(ctypes.byref(value), attribute, kernel, 0))
             found.append(value.value)
@@ -160,7 +158,8 @@ def loaded(text: bytes, name: str) -> Loaded:
 
 def blocks(lanes: int, kernel: Loaded) -> int:
     """How many warps serve so many lanes: as many as registers allow, and whose local memory stays in the first cache, where that is not too few."""
-    by_registers = _of_device(_REGISTERS) // (WARP * max(8, kernel.registers + -kernel.registers % 8))
-    by_cache = _of_device(_CACHE) // max(1, WARP * kernel.local)
+    # attributes of a device: 82 its registers, 81 what of its cache can be shared memory, 16 its multiprocessors
+    by_registers = _of_device(82) // (WARP * max(8, kernel.registers + -kernel.registers % 8))
+    by_cache = _of_device(81) // max(1, WARP * kernel.local)
     # 4 of a multiprocessor: one for each of its parts
-    return min(-(lanes // -WARP), _of_device(_MULTIPROCESSORS) * min(by_registers, WARP, max(by_cache, 4)))
+    return min(-(lanes // -WARP), _of_device(16) * min(by_registers, WARP, max(by_cache, 4)))
