@@ -73,13 +73,11 @@ def lanes() -> int:
     return next((count for name, count in _LANES if features().get(name)), 2)
 
 
-@functools.cache
 def registers() -> int:
     """How many values may be kept in vector registers; four of these are left to the working of instructions."""
     return 28 if features().get("avx512f") or features().get("neon") else 12
 
 
-@functools.cache
 def threads() -> int:
     """How many threads share a batch: one for every core that this process may use, or as many as `JOURDAIN_JAX_THREADS` says."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

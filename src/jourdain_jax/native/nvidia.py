@@ -38,7 +38,6 @@ class Loaded(NamedTuple):
     registers: int
 
 
-@functools.cache
 def driver() -> ctypes.CDLL:
     """The library of the driver."""
     return ctypes.CDLL("libcuda.so.1")
@@ -64,7 +63,6 @@ def reason_against() -> str:
     return "" if count.value else "NVIDIA's driver knows of no GPU"
 
 
-@functools.cache
 def reason_against_text() -> str:
     """Why LLVM writes no text for NVIDIA's driver; empty where it does."""
     try:
@@ -99,7 +97,6 @@ def _of_device(attribute: int) -> int:
     return min(each)
 
 
-@functools.cache
 def memory() -> int:
     """Bytes of the smallest device."""
     found, each = ctypes.c_size_t(), []
@@ -109,7 +106,6 @@ def memory() -> int:
     return min(each)
 
 
-@functools.cache
 def architecture() -> str:
     """What text is made for, such as `sm_90`."""
     capability = 10 * _of_device(75) + _of_device(76)  # major and minor

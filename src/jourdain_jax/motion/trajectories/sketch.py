@@ -5,9 +5,6 @@ import numpy as np
 from jourdain_jax.calculus.figures import MODEL, figure
 from jourdain_jax.motion.trajectories.over_times import Record
 
-_MOST, _COLUMNS, _POINTS, _LANES = 12, 4, 120, 1000  # coordinates that are drawn, beside each other; points and lanes at most
-_LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)  # quantiles of lanes: the ends of two bands, the median between them
-
 
 def sketch(record: Record) -> str:
     """Draw each coordinate, with its name and its range; times that were not reached are left out."""
@@ -19,18 +16,19 @@ def sketch_of_lanes(record: Record) -> str:
 
     Return "" for lanes that were saved at times of their own.
     """
-    lanes = _spread(len(record.q), _LANES)
+    levels = 0.025, 0.25, 0.5, 0.75, 0.975  # the ends of two bands, the median between them
+    lanes = _spread(len(record.q), 1000)
     ts, q = np.asarray(record.ts[0]), np.asarray(record.q[lanes])
     if not np.all(np.asarray(record.ts) == ts):
         return ""
     reached = np.isfinite(q).all(axis=2).any(axis=0)
-    levels = np.full((len(_LEVELS), *q.shape[1:]), np.nan)
-    chosen = np.flatnonzero(reached)[_spread(int(reached.sum()), _POINTS)]
-    levels[:, chosen] = np.nanquantile(q[:, chosen], _LEVELS, axis=0)
-    return _drawn(record, ts, levels)
+    found = np.full((len(levels), *q.shape[1:]), np.nan)
+    chosen = np.flatnonzero(reached)[_spread(int(reached.sum()))]
+    found[:, chosen] = np.nanquantile(q[:, chosen], levels, axis=0)
+    return _drawn(record, ts, found)
 
 
-def _spread(count: int, most: int) -> np.ndarray:
+def _spread(count: int, most: int = 120) -> np.ndarray:
     """Return at most so many of the numbers 0 to count - 1, evenly chosen."""
     return np.unique(np.linspace(0, max(count - 1, 0), min(most, count)).astype(int))
 
@@ -40,9 +38,9 @@ def _drawn(record: Record, ts: np.ndarray, levels: np.ndarray) -> str:
     reached = np.flatnonzero(np.isfinite(levels).all(axis=(0, 2)))
     if reached.size < 2:
         return ""
-    chosen, names = reached[_spread(reached.size, _POINTS)], record.scene.coordinate_names.entries
-    half, shown = len(levels) // 2, min(len(names), _MOST)
-    rows, columns = -(-shown // _COLUMNS), min(shown, _COLUMNS)
+    chosen, names = reached[_spread(reached.size)], record.scene.coordinate_names.entries
+    half, shown = len(levels) // 2, min(len(names), 12)
+    rows, columns = -(-shown // 4), min(shown, 4)
 
     def draw(whole) -> None:
         for k, name in enumerate(names[:shown]):
