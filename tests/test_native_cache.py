@@ -199,7 +199,7 @@ def test_code_for_another_program_effort_machine_or_compiler_has_another_name(mo
 
     def name(text="a program", effort=2) -> str:
         with pytest.raises(Asked) as found:
-            ffi.registered.__wrapped__(text, effort)
+            ffi.registered(text, effort)
         return str(found.value)
 
     monkeypatch.setattr(disk, "kept", asked)

@@ -200,7 +200,6 @@ def _write_rounded(w: Writer) -> None:
         w.give()
 
 
-@functools.cache
 def registered(text: str, effort: int = 2) -> str:
     """The name under which JAX calls the handler of a module of LLVM IR; `effort`: as of `host.object_code`."""
     name = _name(text, effort)
@@ -213,7 +212,9 @@ def _name(text: str, effort: int) -> str:
 
 
 def register(name: str, text: str, platform: str, effort: int = 2) -> None:
-    """Registers the handler of a module of LLVM IR under a name."""
+    """Registers the handler of a module of LLVM IR under a name, once."""
+    if name in _REGISTERED:
+        return
     capsule = ctypes.pythonapi.PyCapsule_New
     capsule.restype, capsule.argtypes = ctypes.py_object, (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
     code = disk.kept(_name(text, effort), host.description(), lambda: host.object_code(text, effort))
