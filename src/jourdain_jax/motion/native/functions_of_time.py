@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +21,8 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import ARRAYS, Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 
+# Parts of a program that are nodes; `power` is another one.
+_NODES = ("qdot", "ydot", "pivots", "sizes", "directions", "guards", "events", "projected_q", "projected_u", "relations", "event_relations", "jumps")
 MOST_NUMBERS = 200  # in a function of time; of a long table each is a row of a lane, and `jj.Sampled` looks up in it
 
 
@@ -43,37 +46,24 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
                 new[node] = int(as_nodes(graph, interpret(graph, function.closed, [*arguments, Nodes(t)])[0]))
     except (Unsupported, ValueError) as error:
         return f"an input is a function of time without scalar form ({error})"
-    outputs = [*program.qdot, *program.ydot, program.power, *program.pivots, *program.directions, *program.guards, *program.events]
-    outputs += [*program.projected_q, *program.projected_u, *program.relations, *program.event_relations]
+    nodes = {name: getattr(program, name) for name in _NODES}
     of_functions = [new[n] for n in program.traced.inputs.tolist() if n in new]
     by_functions = switches(graph, of_functions)
     jumping = jumps(graph, by_functions, of_functions, _random(graph, [*by_functions, *of_functions]))
-    new = graph.copied(outputs, program.graph, new)
-
-    def on_it(nodes: Iterable[int]) -> tuple[int, ...]:
-        return tuple(new[n] for n in nodes)
-
+    new = graph.copied([program.power, *(n for part in nodes.values() for n in part)], program.graph, new)
+    on_it: dict[str, Any] = {name: tuple(new[n] for n in part) for name, part in nodes.items()}
+    on_it["relations"] = tuple(dict.fromkeys([*on_it["relations"], *by_functions]))
+    on_it["jumps"] += tuple(jumping)
     stays = [i for i, function in enumerate(functions) if function is None]
     u = [new.get(n, t) for n in program.traced.u.tolist()]  # dependent speeds are no variables
-    q, inputs = (np.array(on_it(nodes.tolist()), np.int64) for nodes in (program.traced.q, program.traced.inputs[stays]))
+    q, inputs = (np.array([new[n] for n in part.tolist()], np.int64) for part in (program.traced.q, program.traced.inputs[stays]))
     return replace(
         program,
         traced=Variables(graph, t, q, np.array(u, np.int64), inputs, []),
         inputs=tuple(program.inputs[i] for i in stays),
-        fixed=(*on_it(program.fixed), *known),
-        sizes=on_it(program.sizes),
-        qdot=on_it(program.qdot),
-        ydot=on_it(program.ydot),
+        fixed=(*(new[n] for n in program.fixed), *known),
         power=new[program.power],
-        pivots=on_it(program.pivots),
-        directions=on_it(program.directions),
-        guards=on_it(program.guards),
-        events=on_it(program.events),
-        relations=tuple(dict.fromkeys([*on_it(program.relations), *by_functions])),
-        event_relations=on_it(program.event_relations),
-        jumps=(*on_it(program.jumps), *jumping),
-        projected_q=on_it(program.projected_q),
-        projected_u=on_it(program.projected_u),
+        **on_it,
         z=(),  # what is seen of a motion is evaluated with the values of inputs
         energies=(),
         usual={},
