@@ -24,7 +24,6 @@ Source: T. R. Chandrupatla, Advances in Engineering Software 28 (1997) 145-149.
 """
 
 import math
-from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -112,7 +111,7 @@ def next_trial(known: Bracket, step: Float[Array, "*lanes"], last: Bool[Array, "
     return Trial(*trial(OnArrays, known.t, [chosen(known.first, c) for c in known.c], step, last, float(jnp.finfo(known.t.dtype).eps)))
 
 
-def trial(w, t: Sequence, c: Sequence, step, last, eps: float) -> tuple:
+def trial(w, t, c, step, last, eps: float) -> tuple:
     """The formulas of `next_trial`, of the times and values of a bracket; `w`: `OnArrays`, or a `Writer` of machine code."""
     (t_1, t_2, t_3), (c_1, c_2, c_3) = t, c
     width, tiny = t_2 - t_1, 2 * eps * (w.magnitude(t_1) + w.magnitude(t_2))
@@ -220,7 +219,7 @@ def dip(h: Float[Array, "*lanes"], c_0, c_dot_0, c_1, c_dot_1) -> Dip:
     return Dip(share < 1, share)
 
 
-def lowest(w, share, h, c_0: Sequence, c_dot_0: Sequence, c_1: Sequence, c_dot_1: Sequence):
+def lowest(w, share, h, c_0, c_dot_0, c_1, c_dot_1):
     """After which part of a step, of which all is the `share` at first, the first dip is lowest; `w`: as of `trial`.
 
     p(s) = c_0 + m_0 s + A s^2 + B s^3,   lowest at s = -m_0/(A + sqrt(A^2 - 3 B m_0))
