@@ -97,7 +97,7 @@ def test_processors_of_arm_have_vectors_and_fused_products_also_where_llvm_says_
     monkeypatch.setattr(host.llvm, "get_host_cpu_features", lambda: {})
     features = host.features.__wrapped__()
     monkeypatch.setattr(host, "features", lambda: features)
-    assert (host.lanes(), host.fuses(), host.registers.__wrapped__()) == (2, True, 28)
+    assert (host.lanes(), host.fuses(), host.registers()) == (2, True, 28)
 
 
 @needs_machine_code
@@ -117,7 +117,7 @@ def test_a_batch_is_shared_among_threads_also_where_registers_hold_two_numbers(m
 
 def test_threads_are_as_many_as_the_machine_has_cores_where_a_process_cannot_choose_them(monkeypatch):
     monkeypatch.setattr(host, "os", SimpleNamespace(environ={}, cpu_count=lambda: 10))
-    assert host.threads.__wrapped__() == 10
+    assert host.threads() == 10
 
 
 @needs_machine_code
@@ -245,7 +245,7 @@ def test_workers_share_threads_also_where_a_process_cannot_choose_its_cores(monk
 def test_a_number_of_threads_that_is_none_is_named(monkeypatch, text):
     monkeypatch.setenv("JOURDAIN_JAX_THREADS", text)
     with pytest.raises(ValueError, match=r"JOURDAIN_JAX_THREADS is `.*`, expected a whole number from 1 to 1024") as error:
-        host.threads.__wrapped__()
+        host.threads()
     assert len(str(error.value)) < 200
 
 
