@@ -30,11 +30,10 @@ LAYERS = ("equations", "dynamics", "motion", "analysis", "ensembles", "models", 
 
 # What takes longest for its number of tests, longest first: started last, one of these would keep one worker busy while the others have nothing to do.
 LONGEST = """
-diffrax load_jumps every_model sensors identify native_mutants mutants exported native plain_numbers float32 multiple_shooting native_starts
-native_functions feasible_starts linearize simulate lowering derivatives_of_failed long_chains native_derivatives native_second along_batches
-native_samples studies log_density what_probes_do_not_show row_functions piecewise_motion malformed_inputs rank_of_vanishing_rows stiff
-names_read verify power native_operations call_costs build inertia joint_prior inputs result_codes operations program readme
-events study_faults cluster notebooks
+malformed_inputs observed_events load_jumps ties storage_faults diffrax simulate noise_levels quality normal_forces events steady report reactions
+result_codes stricter_modes study_faults taylor rows_lost_at_rest identify native_second storage sensors other_systems native_cache native_programs
+traced_parameters sweep_verb two_wheel_axle native_times models_particles_and_discs every_model opaque_calls mutants feasible_starts reduced
+native_mutants crossings particles studies robot_trees names_read power build
 """
 
 

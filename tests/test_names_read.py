@@ -157,17 +157,6 @@ def test_methods_of_the_class_and_of_those_it_is_derived_from_count():
     assert stiffness(scene, "accelerations") == pytest.approx(6.0)
 
 
-def test_a_controller_whose_method_is_called_update_is_refused():
-    with pytest.raises(ValueError, match=r"`Spring\.loads` reads `controller`"):
-        cell("class Law:\n    def update(self, x): return x\ncontroller = Law()", "controller.update(1.0)")
-
-
-def test_a_table_of_pandas_is_refused():
-    pandas = pytest.importorskip("pandas")
-    with pytest.raises(ValueError, match=r"`Spring\.loads` reads `table`"):
-        exec(SPRING.format(read="table['k'][0]", before="pass"), {"jj": jj, "jnp": jnp, "table": pandas.DataFrame({"k": [1.0]})})
-
-
 def test_an_object_that_takes_the_place_of_a_number_is_refused_at_the_next_call():
     names = cell("k = 1.0", "k")
     scene = names["Spring"]()

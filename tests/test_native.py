@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import result_codes as results
 from numpy.testing import assert_allclose, assert_array_equal
+from test_stiff import Following
 
 import jourdain_jax as jj
 from jourdain_jax.motion.native import kernel as kernels
@@ -154,18 +155,7 @@ def test_a_scene_is_integrated_without_llvmlite(monkeypatch):
     assert_allclose(jj.simulate(scene, ts=[1.3, 1.4]).q[0], expected, rtol=1e-7)
 
 
-class Stiff(jj.Scene):
-    coordinates = jj.coordinates("x", "y")
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
-
-    def loads(self, motion):
-        q, u = motion.q, motion.u
-        return (jj.generalized_force(motion, x_rate=-1e6 * (q.x - jnp.sin(q.y)) - 1e6 * u.x_rate, y_rate=-1.0),)
-
-
 def test_a_stiff_motion_stays_with_the_backend_that_was_asked_for():
-    native, default = (jj.simulate(Stiff(), {"y": 1.0, "x": 0.8}, ts=[1.0], max_steps=1000, backend=backend, retry=True) for backend in ("native", "auto"))
+    native, default = (jj.simulate(Following(), {"y": 1.0, "x": 0.8}, ts=[1.0], max_steps=1000, backend=backend, retry=True) for backend in ("native", "auto"))
     assert (native.result, native.fallback) == (results.MAX_STEPS, results.AS_ASKED)
     assert (default.result, default.fallback) == (results.SUCCESS, results.IMPLICIT)

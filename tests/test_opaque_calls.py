@@ -215,12 +215,6 @@ class Mixed(OnCam):
         return {"bead": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, jnp.mean(jnp.full((40, 40), 0.3) @ jnp.sin(q.x + jnp.arange(40.0)))]))}
 
 
-def test_a_loop_in_a_pose_makes_the_whole_scene_dense():
-    with pytest.raises(jj.NotLowered, match="`OnCam` is not lowered: the operation `scan` has no scalar form"):
-        jj.lower(OnCam())
-    assert jj.simulate(OnCam(), {"x_rate": 1.0}, t1=0.5).reduction == "privileged"
-
-
 class Softly(OnCam):
     """A bead on a ramp that begins softly, by a function with a derivative of its own."""
 

@@ -63,14 +63,6 @@ def test_the_forces_of_a_blade_act_sideways_at_the_blade():
     assert jnp.allclose(torque, jnp.array([0.0, 0.0, -0.25 * (force @ sideways)]), atol=tolerance("round_off"))
 
 
-def test_an_unknown_body_is_answered_with_the_nearest_name():
-    scene = ChaplyginSleigh()
-    t, q, u = (jnp.asarray(x[0]) for x in jj.sample_states(scene, 1))
-    rows = row_reactions(scene, t, q, u, jj.accelerations(scene, t, q, u))
-    with pytest.raises(KeyError, match="did you mean `sleigh`"):
-        rows.forces_on("slegh")
-
-
 def test_multipliers_of_dependent_rows_are_marked_as_not_determined():
     scene = TwoWheelAxleRedundant()
     t, q, u = (jnp.asarray(x[0]) for x in jj.sample_states(scene, 1))

@@ -221,17 +221,6 @@ def test_a_linearization_prints_its_matrices_by_name_and_its_eigenvalues():
         assert part in str(disc)
 
 
-@pytest.mark.slow
-def test_linearizations_of_a_batch_print_their_shape_and_names():
-    small = jax.vmap(lambda s: jj.linearize(TiltingDisc(), jj.start(TiltingDisc(), spin_rate=s), ("lean",)))(jnp.array([-3.0, -4.0]))
-    assert str(small) == "Linearizations of shape (2,); named coordinates: lean"
-
-
-def test_a_batch_of_states_lists_its_names():
-    states = jax.vmap(lambda x: jj.start(SLEIGH, x=x))(jnp.arange(3.0))
-    assert str(states).startswith("States of shape (3,): x, y, heading")
-
-
 def test_printing_a_traced_result_says_its_shapes():
     texts = []
 

@@ -53,12 +53,6 @@ def test_a_direction_of_gravity_that_is_traced_hides_nothing_else():
         jax.jit(lambda e: jj.simulate(Ghost(direction=e), {}, t1=0.1).q_end)(jnp.array([0.0, -1.0, 0.0]))
 
 
-def test_an_invariant_of_several_components_is_refused_by_name():
-    motion = jj.simulate(described(invariants=lambda self, m: {"momentum": m["bead"].velocity}), {}, t1=0.1)
-    with pytest.raises(ValueError, match=r"invariant `momentum` of `Described` has shape .3,., expected one number; give every component a name"):
-        motion.invariants()
-
-
 def test_lists_and_integers_are_numbers():
     pulled = described(loads=lambda self, m: (jj.spring(m["bead"].point((0, 0, 0)), jj.fixed_point((0, 0, 1)), 2, 1),), prescribed=lambda self, t: {"y": 0})
     exact = jj.accelerations(pulled, 0.0, jnp.array([1.0, 0.0]), jnp.array([0.0, 0.0]), reduction="svd").udot
@@ -86,16 +80,6 @@ def test_inputs_are_given_by_name_or_as_a_vector():
         jj.accelerations(chain, 0.0, q, u, {"trun": 2.0})
     with pytest.raises(ValueError, match="input `turn` of `TrailerChain` is a function, expected real numbers; a function of time is for `simulate`"):
         jj.accelerations(chain, 0.0, q, u, {"turn": lambda t: t})
-
-
-def test_the_path_of_a_point_needs_three_components_and_a_body_that_exists():
-    motion = jj.simulate(Bead(), {}, t1=0.1, ts=[0.0, 0.1])
-    assert motion.point("bead", (1, 0, 0)).shape == (2, 3)
-    with pytest.raises(ValueError, match=r"point of body `bead` has shape \(2,\), expected \(3,\); give three components in its body frame, m"):
-        motion.point("bead", (1.0, 2.0))
-    with pytest.raises(KeyError) as caught:
-        motion.point("baed")
-    assert str(caught.value) == "no body `baed` in this scene; did you mean `bead`? Valid names: `bead`."
 
 
 def test_the_checks_leave_nothing_in_a_compiled_program():

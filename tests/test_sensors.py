@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import machine_code
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from small_scenes import Cart, OnLine
 
 import jourdain_jax as jj
@@ -276,13 +276,6 @@ def test_a_prior_counts_as_a_measurement():
     assert known.samples == free.samples
     assert not known.warnings
     assert jj.fit(Cart(), data, {"mass": jj.Normal(2.1, 0.01)}).warning.startswith("`mass` lies 9.9 standard deviations from its prior")
-
-
-def test_a_prior_alone_is_an_estimate_with_it():
-    data = run(7, sigma=0.01)
-    long, short = (jj.fit(Cart(), data, {"mass": given}) for given in (jj.Estimate(prior=jj.Normal(2.005, 0.003)), jj.Normal(2.005, 0.003)))
-    assert_array_equal(long.values, short.values)
-    assert_array_equal(long.standard_errors, short.standard_errors)
 
 
 def test_priors_of_starts_and_of_numbers_of_single_runs():

@@ -39,19 +39,6 @@ def test_it_passes_smoothly_where_the_wheel_rows_are_parallel(reduction):
         assert relative_error(motion[name], expected[key], size) <= tolerance("closed_form"), name
 
 
-@pytest.mark.parametrize("reduction", [pytest.param("qr", marks=pytest.mark.slow), "kkt"])
-def test_a_step_that_ends_where_the_rows_are_parallel_is_right_or_says_so(reduction):
-    times = np.linspace(0.0, oracle.RUN["t_end"], 9)  # steer is 90 degrees, to the last digits, at the fifth
-    motion = jj.simulate(BOARD, START, ts=jnp.asarray(times), rtol=1e-12, atol=1e-12, formulation=jj.Formulation(reduction=reduction))
-    heading = oracle.motion(times, **oracle.RUN)["th"]
-    if int(motion.result) != results.SUCCESS:
-        assert int(motion.result) == results.STEP_TOO_SMALL
-        # where round-off of the speeds, over the sine of the angle between rows, is more than what a projection may remove
-        assert abs(float(motion.t_end) - times[4]) <= 1e-7
-    valid = np.asarray(motion.valid)
-    assert relative_error(motion["heading"][valid], heading[valid]) <= tolerance("closed_form")
-
-
 def test_the_default_passes_wherever_a_step_ends_near_the_loss_of_rank():
     # a step that ends within round-off of parallel rows once met a jump of v/(1 - steer) in the accelerations and shrank to nothing
     times = np.linspace(0.0, oracle.RUN["t_end"], 9)

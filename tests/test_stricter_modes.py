@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from small_scenes import Bead
 
 import jourdain_jax as jj
 
@@ -126,13 +127,8 @@ def test_with_floats_checked():
         assert_allclose(jax.jit(_place)(1.0), _place(1.0), rtol=1e-12)
 
 
-class Slider(jj.Scene):
+class Slider(Bead):
     """A bead on a plane whose load has a mistake."""
-
-    coordinates = jj.coordinates("x y")
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
 
     def loads(self, motion):
         return (jj.point_force(motion["bead"].point(), self.pull(motion)),)

@@ -164,17 +164,6 @@ def test_a_study_is_opened_without_its_scene(whole):
         whole.lane(COUNT)
 
 
-def test_results_print_and_draw_themselves(whole, tmp_path):
-    assert f"{COUNT} of {COUNT} lanes" in str(whole)
-    whole.plot("final lean", "distance", path=tmp_path / "discs.png")
-    assert (tmp_path / "discs.png").stat().st_size > 5000
-    counts, edges = whole.histogram("distance", cells=20)
-    assert counts.sum() == COUNT - 1
-    assert len(counts) <= 20
-    assert len(edges) == len(counts) + 1
-    assert "radius" in str(discs())
-
-
 def test_a_study_shows_its_table_and_a_histogram_of_each_output_in_a_notebook(whole, drawn):
     shown = whole._repr_html_()
     assert shown.startswith(f"<pre>Study in {whole.store.path}: {COUNT} of {COUNT} lanes")

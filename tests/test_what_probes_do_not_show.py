@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from small_scenes import OnPlane
 
 import jourdain_jax as jj
 
@@ -18,21 +19,12 @@ def looked_up(x, table=None):
     return jnp.interp(x, KNOTS, jnp.sin(KNOTS) if table is None else table)
 
 
-class Plane(jj.Scene):
-    """A particle in a plane."""
-
-    coordinates = jj.coordinates("x y")
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
-
-
 def ends(scene, start, **options):
     """Of the lowered and of the dense motion."""
     return [jj.simulate(scene, start, t1=1.0, rtol=1e-9, atol=1e-9, backend=backend, **options).q_end for backend in ("auto", "dense")]
 
 
-class Fading(Plane):
+class Fading(OnPlane):
     """Two look-ups, one of whose operands leaves the other long after all probes."""
 
     def loads(self, motion):
@@ -45,7 +37,7 @@ def test_calls_whose_operands_differ_later_stay_two():
     assert len(jj.lower(Fading()).graph.calls(jj.lower(Fading()).ydot)) == 2
 
 
-class Filtered(Plane):
+class Filtered(OnPlane):
     """Two calls of one kind: what they are given as numbers is the same, the arrays that other calls hand them are not."""
 
     def loads(self, motion):
@@ -59,7 +51,7 @@ def test_calls_of_what_different_calls_made_stay_two():
     assert_allclose(*ends(Filtered(), {"x": 1.0, "y": -0.4, "x_rate": 0.3}), atol=1e-7)
 
 
-class Pushed(Plane):
+class Pushed(OnPlane):
     """Some force along x, often none near the probes."""
 
     push: Callable = eqx.field(static=True)
@@ -116,7 +108,7 @@ def test_states_are_put_back_onto_rows_as_they_are_for_other_parameters_and_else
     assert_allclose(lowered, dense, atol=1e-7)
 
 
-class Small(Plane):
+class Small(OnPlane):
     """Two tables of tiny numbers, one the other with its sign changed."""
 
     table: object = jj.parameter(1e-11 * np.array([5.0, 3.0, 2.0, 0.0, -2.0, -3.0, -5.0]))
@@ -131,15 +123,7 @@ def test_operands_are_compared_relative_to_their_size():
     assert_allclose(*ends(Small(), {"x": 1.0}), atol=1e-8)
 
 
-@jax.custom_jvp
-def half_as_steep(x):
-    return jnp.sin(x)
-
-
-half_as_steep.defjvp(lambda primals, tangents: (half_as_steep(*primals), 0.5 * tangents[0]))
-
-
-class Called(Plane):
+class Called(OnPlane):
     """A callback that takes one state at a time."""
 
     def loads(self, motion):
@@ -153,7 +137,7 @@ def test_a_callback_that_knows_no_batches_runs_alone_and_is_refused_by_name_in_b
         jj.rollout(Called(), {"x": jnp.array([1.0, 1.1])}, t1=0.1)
 
 
-class Sorted(Plane):
+class Sorted(OnPlane):
     """A part that is kept only because of what it follows."""
 
     table: object = jj.parameter(np.linspace(1.0, 2.0, 9))
@@ -169,7 +153,7 @@ def test_every_call_says_why_it_is_one():
     assert ";  has" not in jj.report(Sorted()).lowering
 
 
-class Oscillator(Plane):
+class Oscillator(OnPlane):
     """A spring."""
 
     stiffness: object = jj.parameter(1.0)
@@ -199,29 +183,29 @@ def test_tables_are_parameters_and_differ_between_lanes():
 # What begins after t = 1, or outside the domain. ----------------------------------------------------------------------
 
 
-class LateBelt(Plane):
+class LateBelt(OnPlane):
     """A belt that starts to move at t = 2."""
 
     def velocity_constraints(self, motion):
         return {"belt": motion.u.y_rate - motion.u.x_rate - jnp.where(motion.t > 2.0, (motion.t - 2.0) ** 3, 0.0)}
 
 
-class FarBelt(Plane):
+class FarBelt(OnPlane):
     """A belt that moves where x > 10."""
 
     def velocity_constraints(self, motion):
         return {"belt": motion.u.y_rate - motion.u.x_rate - jnp.maximum(motion.q.x - 10.0, 0.0) ** 2}
 
 
-class LateStiffness(Plane):
+class LateStiffness(OnPlane):
     """A spring that stiffens from t = 2 on."""
 
     def loads(self, motion):
         stiffness = 1.0 + 0.5 * jnp.where(motion.t > 2.0, (motion.t - 2.0) ** 2, 0.0)
-        return (jj.spring(motion["particle"].point(), jj.fixed_point(jnp.zeros(3)), stiffness, 0.5),)
+        return (jj.spring(motion["mass"].point(), jj.fixed_point(jnp.zeros(3)), stiffness, 0.5),)
 
 
-class LateMass(Plane):
+class LateMass(OnPlane):
     """Matter joins from t = 2 on."""
 
     def bodies(self, t, q):
@@ -259,7 +243,7 @@ def test_the_work_of_what_begins_late_or_far_off_is_counted(scene, start, end, f
     assert_allclose(motion.energies().balance, motion.energies().balance[0], atol=1e-4 * changed)
 
 
-class FastRow(Plane):
+class FastRow(OnPlane):
     """A row that is nonlinear in a speed beyond 3 m/s."""
 
     def velocity_constraints(self, motion):
@@ -276,7 +260,7 @@ def test_rows_that_are_nonlinear_at_speeds_beyond_the_probed_ones_hold():
         assert_allclose(motion.u_end, [4.0, 1.0], atol=1e-8)  # (1 + 4 (v-3)^2) vdot = 1 - (v-3), at rest where v = 4
 
 
-class Terrain(Plane):
+class Terrain(OnPlane):
     """Branches that neither time nor speeds decide: nothing begins that is not there."""
 
     def velocity_constraints(self, motion):
