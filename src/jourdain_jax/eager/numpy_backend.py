@@ -140,13 +140,19 @@ def _round(equation, x):
     return whole + np.copysign(np.abs(x - whole) >= 0.5, x)  # half away from zero
 
 
-def _dot_general(equation, a, b):
+def as_matrices(equation, a, b) -> tuple[np.ndarray, np.ndarray]:
+    """The operands of `dot_general` as matrices whose product is its result, but for the shape; axes of a batch first."""
     (over_a, over_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
     free_a = [i for i in range(a.ndim) if i not in (*over_a, *batch_a)]
     free_b = [i for i in range(b.ndim) if i not in (*over_b, *batch_b)]
     batch, contracted = [a.shape[i] for i in batch_a], int(np.prod([a.shape[i] for i in over_a]))
     left = np.transpose(a, (*batch_a, *free_a, *over_a)).reshape(*batch, int(np.prod([a.shape[i] for i in free_a])), contracted)
     right = np.transpose(b, (*batch_b, *over_b, *free_b)).reshape(*batch, contracted, int(np.prod([b.shape[i] for i in free_b])))
+    return left, right
+
+
+def _dot_general(equation, a, b):
+    left, right = as_matrices(equation, a, b)
     return _reshaped(equation, left @ right)
 
 

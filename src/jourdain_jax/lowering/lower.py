@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
-from typing import Any
 
 import jax
 import numpy as np
@@ -40,23 +39,7 @@ from jourdain_jax.scene.scene import Scene
 # 5.5 s); of 60,000 operations, those of the steps included, there is none.
 MOST_OPERATIONS, MOST_IN_MACHINE_CODE = 20_000, 50_000
 MOST_TERMS = 200  # of one normal form
-_NODES = (
-    "qdot",
-    "ydot",
-    "z",
-    "pivots",
-    "sizes",
-    "directions",
-    "guards",
-    "events",
-    "energies",
-    "relations",
-    "event_relations",
-    "jumps",
-    "projected_q",
-    "projected_u",
-    "fixed",
-)  # fields that are tuples of nodes
+
 
 
 def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLowered:
@@ -96,28 +79,10 @@ def _lowered(scene: Scene, every_speed: bool, massless: bool, kept: tuple) -> Lo
     begin = time.perf_counter()
     try:
         with np.errstate(all="ignore"):  # what is no number at a probe does not count there
-            found = _alone(_built(scene, structure_whatever_its_faults(scene), every_speed, massless))
+            found = _built(scene, structure_whatever_its_faults(scene), every_speed, massless)
     except NotLowered as reason:
         return NotLowered(str(reason))  # kept without its traceback
     return replace(found, seconds=time.perf_counter() - begin)
-
-
-def _alone(found: Lowered) -> Lowered:
-    """The program in a graph of its own, without what was tried for it."""
-    of = found.traced
-    variables = [of.t, *of.q.tolist(), *of.u.tolist(), *of.inputs.tolist(), *(n for x in of.parameters for n in x.ravel().tolist())]
-    outputs = [n for name in _NODES for n in getattr(found, name)]
-    graph, nodes = part_of(found.graph, [*variables, *outputs, found.power, *found.usual, *found.usual.values(), *found.states])
-    place = nodes.tolist()
-    moved: dict[str, Any] = {name: tuple(place[n] for n in getattr(found, name)) for name in _NODES}
-    return replace(
-        found,
-        traced=Variables(graph, place[of.t], nodes[of.q], nodes[of.u], nodes[of.inputs], [np.asarray(nodes[x]) for x in of.parameters]),
-        power=place[found.power],
-        usual={place[a]: place[b] for a, b in found.usual.items()},
-        states={place[n]: x for n, x in found.states.items()},
-        **moved,
-    )
 
 
 def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool) -> Lowered:
@@ -228,12 +193,17 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
     nodes["relations"], nodes["event_relations"] = watched = relations(graph, rates, nodes["events"], probes)
     nodes["jumps"] = jumps(graph, nodes["relations"], rates, probes)
     sizes = {graph.input(f"usual_pivot_{k}", False): n for k, n in enumerate(nodes["pivots"])}
-    stands_for = best.usual | sizes
+    nodes |= {"sizes": tuple(sizes), "fixed": graph.fixed([*outputs, *sizes, *(n for part in watched for n in part)])}
+    stands_for, own = best.usual | sizes, builder.traced
+    given = [own.t, *own.q.tolist(), *own.u.tolist(), *own.inputs.tolist(), *(n for x in own.parameters for n in x.ravel().tolist())]
+    # without what was tried for it
+    alone, places = part_of(graph, [*given, power, *stands_for, *stands_for.values(), *(n for part in nodes.values() for n in part)])
+    place = places.tolist()
     names = scene.coordinate_names.entries
     leaves = tuple(jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(scene)[0])
     units = {f".{name}": metadata["unit"] for name, _, metadata in parameters_of(scene)}
     return Lowered(
-        traced=builder.traced,
+        traced=Variables(alone, place[own.t], places[own.q], places[own.u], places[own.inputs], [np.asarray(places[x]) for x in own.parameters]),
         scene_name=type(scene).__name__,
         parameters=leaves,
         units=tuple(units.get(name, "") for name in leaves),
@@ -243,19 +213,17 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
         inputs=scene.inputs.entries,
         independent=tuple(builder.independent),
         dependent=tuple(builder.dependent),
-        sizes=tuple(sizes),
         divisors=len(of_rates),
-        power=power,
+        power=place[power],
         by_partition=builder.kept is not None and builder.kept.by_partition,
         left_out=structure.redundant_rows,
         held=tuple(names[i] for i in held),
         stages=tuple(stages),
         way=builder.kept.description if builder.kept else way.description,
         seconds=0.0,  # not known yet
-        fixed=graph.fixed([*outputs, *sizes, *(n for part in watched for n in part)]),
-        usual=stands_for,
-        states=_some_states(graph, probes, stands_for.values()),
-        **nodes,
+        usual={place[a]: place[b] for a, b in stands_for.items()},
+        states={place[n]: x for n, x in _some_states(graph, probes, stands_for.values()).items()},
+        **{name: tuple(place[n] for n in part) for name, part in nodes.items()},
     )
 
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jourdain_jax.eager.numpy_backend import as_matrices
 from jourdain_jax.program.graph import Graph, Unsupported
 
 _OPERATIONS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min", "reduce_and": "and", "reduce_or": "or"}
@@ -38,19 +39,13 @@ def _mean_of_those_equal(graph: Graph, entries: list[int], extreme: int) -> int:
     return graph.div(total, graph.total(graph.call("select", reaches, graph.zero, graph.one) for reaches in reached))
 
 
-def product(graph: Graph, x: np.ndarray, y: np.ndarray, dimension_numbers) -> np.ndarray:
+def product(graph: Graph, equation, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """What `dot_general` of JAX makes of two arrays of nodes."""
-    (over_x, over_y), (batch_x, batch_y) = dimension_numbers
-    free_x = [i for i in range(x.ndim) if i not in (*over_x, *batch_x)]
-    free_y = [i for i in range(y.ndim) if i not in (*over_y, *batch_y)]
-    batch = [x.shape[i] for i in batch_x]
-    sizes = [int(np.prod(s)) for s in (batch, [x.shape[i] for i in free_x], [y.shape[i] for i in free_y], [x.shape[i] for i in over_x])]
-    left = np.transpose(x, (*batch_x, *free_x, *over_x)).reshape(sizes[0], sizes[1], sizes[3])
-    right = np.transpose(y, (*batch_y, *free_y, *over_y)).reshape(sizes[0], sizes[2], sizes[3])
+    left, right = (m.reshape(int(np.prod(m.shape[:-2])), *m.shape[-2:]) for m in as_matrices(equation, x, y))
+    right = np.swapaxes(right, 1, 2)
     _check_size(graph, left, right)
     result = [[[graph.dot(row, column) for column in rights] for row in lefts] for lefts, rights in zip(left.tolist(), right.tolist(), strict=True)]
-    shape = batch + [x.shape[i] for i in free_x] + [y.shape[i] for i in free_y]
-    return np.array(result, dtype=np.int64).reshape(shape)
+    return np.array(result, dtype=np.int64).reshape(equation.outvars[0].aval.shape)
 
 
 def _check_size(graph: Graph, left: np.ndarray, right: np.ndarray) -> None:

@@ -25,11 +25,14 @@ def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) ->
     """Return values of the outputs as JAX scalars (or numbers), given those of inputs and of nodes computed before."""
     outputs, values = list(outputs), dict(known)
     needed = graph.needed(outputs, values)
-    if _depth(graph, needed) <= DEEP:
+    depth: dict[int, int] = {}  # the longest chain of operations that ends in a node
+    for node in needed:
+        depth[node] = 1 + max((depth.get(a, 0) for a in graph.args[node]), default=0)
+    if max(depth.values(), default=0) <= DEEP:
         _run_in_a_row(graph, needed, values)
         return [values[n] for n in outputs]
     values |= {n: graph.value[n] for n in needed if graph.is_const(n)}
-    order = _deepest_first(graph, outputs, values)
+    order = _deepest_first(graph, outputs, values, depth)
     parts = [order[k : k + PIECE] for k in range(0, len(order), PIECE)]
     last_use = {a: k for k, part in enumerate(parts) for n in part for a in graph.args[n]} | dict.fromkeys(outputs, len(parts))
     for k, part in enumerate(parts):
@@ -38,16 +41,12 @@ def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) ->
     return [values[n] for n in outputs]
 
 
-def _deepest_first(graph: Graph, outputs: Sequence[int], known: Iterable[int]) -> list[int]:
+def _deepest_first(graph: Graph, outputs: Sequence[int], known: Iterable[int], depth: Mapping[int, int]) -> list[int]:
     """Return the needed nodes, each soon after its arguments, of which the one that ends the longest chain of operations comes first.
 
     So chains are followed from their beginning, sums grow term by term, and little is carried from piece to piece.
     """
-    seen = set(known)
-    depth: dict[int, int] = {}
-    for node in graph.needed(outputs, seen):
-        depth[node] = 1 + max((depth.get(a, 0) for a in graph.args[node]), default=0)
-    order = []
+    seen, order = set(known), []
 
     def arguments(node):
         return iter(sorted(graph.args[node], key=lambda a: -depth.get(a, 0)))
@@ -80,14 +79,6 @@ def _run_in_a_row(graph: Graph, nodes: list[int], values: dict[int, jax.Array]) 
             values[node] = waves[args][op == "cos"]
         else:
             values[node] = FUNCTIONS[op](*given)
-
-
-def _depth(graph: Graph, nodes: list[int]) -> int:
-    """The longest chain of operations."""
-    depth: dict[int, int] = {}
-    for node in nodes:
-        depth[node] = 1 + max((depth.get(a, 0) for a in graph.args[node]), default=0)
-    return max(depth.values(), default=0)
 
 
 def _fused_by_shape(nodes: list[int], values: Mapping[int, jax.Array]) -> dict[int, jax.Array]:

@@ -86,7 +86,7 @@ def apply(graph: Graph, equation, inputs) -> list[Value]:
     if name in REDUCTIONS:
         return [Nodes(reduced(graph, as_nodes(graph, inputs[0]), equation.params["axes"], name))]
     if name == "dot_general":
-        return [Nodes(product(graph, as_nodes(graph, inputs[0]), as_nodes(graph, inputs[1]), equation.params["dimension_numbers"]))]
+        return [Nodes(product(graph, equation, *(as_nodes(graph, x) for x in inputs)))]
     if name in _ELEMENTWISE:
         arrays = np.broadcast_arrays(*(as_nodes(graph, x) for x in inputs)) if len(inputs) > 1 else [as_nodes(graph, inputs[0])]
         flat = [np.ravel(a).tolist() for a in arrays]
