@@ -233,16 +233,14 @@ class Lowered:
         return jnp.stack([jnp.broadcast_to(jnp.asarray(c, like.dtype), jnp.shape(like)) for c in out]) if nodes else jnp.zeros((0, *like.shape), like.dtype)
 
     def _known(self, fixed, t, q, y, inputs) -> dict[int, Float[Array, "*lanes"]]:
-        shapes = self._fixed_shapes
-        fixed = [jnp.moveaxis(x, 0, -1) if n in shapes and x.ndim > len(shapes[n]) else x for n, x in zip(self.fixed, fixed, strict=True)]  # lanes last
+        def lanes_last(n, x):
+            is_array = self.graph.op[n] in ARRAYS
+            return jnp.moveaxis(x, 0, -1) if is_array and x.ndim > len(self.graph.value[n][-2]) else x
+
+        fixed = map(lanes_last, self.fixed, fixed)
         return dict(zip(self.variables, (*fixed, t, *q, *y, *inputs), strict=True))
 
-    @functools.cached_property
-    def _fixed_shapes(self) -> dict[int, tuple[int, ...]]:
-        """The shapes of the arrays among what is fixed, without lanes."""
-        return {n: self.graph.value[n][-2] for n in self.fixed if self.graph.op[n] in ARRAYS}
-
-    @functools.cached_property
+    @property
     def calls(self) -> tuple[str, ...]:
         """Why each call of JAX in the rates and stop events is one: a part of a load or event that has no scalar form."""
         return tuple(self.graph.value[n].reason for n in self.graph.calls([*self.qdot, *self.ydot, *self.events]))

@@ -26,7 +26,9 @@ class Call:
     def __init__(self, closed, reasons: tuple[str, ...]):
         self.closed, self.reasons = closed, reasons
         self._described = description(closed)
-        self._hash = hash(self._described)
+        self._hash, self.name = hash(self._described), repr(self._described)  # the name tells it from calls of other functions
+        function = jaxpr_as_fun(closed)
+        self._together, self._alone = uncompiled(jax.vmap(function)), uncompiled(function)
 
     def __hash__(self):
         return self._hash
@@ -87,24 +89,12 @@ class Call:
             raise NotImplementedError(f"a callback in a load or stop event does not say how it takes a batch: {str(error).splitlines()[0]}") from None
         return tuple(jnp.asarray(x, jnp.result_type(*real)) if real and jnp.issubdtype(x.dtype, jnp.floating) else x for x in found)
 
-    @functools.cached_property
-    def name(self) -> str:
-        """What tells it from calls of other functions."""
-        return repr(self._described)
-
-    @functools.cached_property
-    def at_probes(self) -> Callable[..., list[np.ndarray]]:
+    def at_probes(self, *operands) -> list[np.ndarray]:
         """The results on NumPy, operands and results with a leading axis of probes."""
-        function = jaxpr_as_fun(self.closed)
-        together, alone = uncompiled(jax.vmap(function)), uncompiled(function)
-
-        def results(*operands):
-            try:
-                return together(*operands)
-            except NotImplementedError:  # a callback that takes one at a time
-                return [np.stack(x) for x in zip(*(alone(*one) for one in zip(*operands, strict=True)), strict=True)]
-
-        return results
+        try:
+            return self._together(*operands)
+        except NotImplementedError:  # a callback that takes one at a time
+            return [np.stack(x) for x in zip(*(self._alone(*one) for one in zip(*operands, strict=True)), strict=True)]
 
 
 def _array(shape_and_type, *entries):
@@ -172,17 +162,11 @@ def description(x, details: Callable = lambda equation: equation.params, of_othe
     def of_jaxpr(x) -> Hashable:
         number = {v: k for k, v in enumerate([*x.constvars, *x.invars])}
         atom = lambda v: of(np.asarray(v.val, v.aval.dtype)) if isinstance(v, Literal) else number[v]  # noqa: E731
-        lines: list = [tuple(_said(v.aval) for v in number)]
+        lines: list = [tuple(v.aval for v in number)]
         for equation in x.eqns:
             inputs = tuple(map(atom, equation.invars))
             number |= {v: len(number) + k for k, v in enumerate(equation.outvars)}
-            lines.append((equation.primitive, inputs, of(details(equation)), tuple(_said(v.aval) for v in equation.outvars)))
+            lines.append((equation.primitive, inputs, of(details(equation)), tuple(v.aval for v in equation.outvars)))
         return *lines, tuple(map(atom, x.outvars))
 
     return of(x)
-
-
-@functools.lru_cache(maxsize=1024)
-def _said(aval) -> str:
-    """Type and shape as text, which JAX makes anew each time."""
-    return str(aval)
