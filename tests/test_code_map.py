@@ -13,10 +13,10 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 455_255,
+    "code tokens of src": 454_856,
     "code tokens of docs": 11_441,
     "code tokens of notebooks": 7_444,
-    "caches": 69,
+    "caches": 64,
     "named numbers": 339,
     "tests for a tracer": 124,
     "functions with more than 8 parameters": 4,
@@ -24,8 +24,8 @@ CEILINGS = {
     "ways: state put back onto its constraints within a step": 1,
     "ways: rows and their slopes for a projection": 2,
     "ways: damped least squares": 3,
-    "code tokens of tests": 310_282,
-    "code tokens of bench": 121_000,
+    "code tokens of tests": 310_278,
+    "code tokens of bench": 120_973,
     "test files that reach private names": 37,
 }
 
