@@ -112,7 +112,7 @@ def test_whatever_the_numbers_of_a_body_are_its_parameters_are_possible(scene, b
     assert set(layout.following) == names
     for name in names:
         assert_allclose(getattr(layout.scene(scene, unknowns.guess), name), getattr(scene, name), rtol=1e-12)
-    positive = unknowns.ends[0] == 0
+    positive = unknowns.low == 0
     for x in GENERATOR.normal(size=(5, count)) * 2.0:
         shared = np.where(positive, np.exp(x), x)
         moved = layout.scene(scene, shared)

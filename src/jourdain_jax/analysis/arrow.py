@@ -164,10 +164,9 @@ class Arrow(ByMember):
         return np.where(held, moved, found)
 
 
-def with_prior(arrow: Arrow, residual: ByUnknown, mean: np.ndarray, sigma: np.ndarray, M: Float[np.ndarray, "shared shared"]) -> Arrow:
-    """Adds one `residual` (theta - mean) / sigma for each unknown that has a mean (not NaN); those of shared ones times M. The scores stay."""
-    slope = np.broadcast_to(np.where(np.isnan(mean), 0.0, 1 / sigma), residual.shape)
-    (r_s, r_l), (J_s, J_l) = arrow.split(residual), arrow.split(slope)
+def with_prior(arrow: Arrow, residual: ByUnknown, weight: np.ndarray, M: Float[np.ndarray, "shared shared"]) -> Arrow:
+    """Add one `residual` (theta - mean) * weight for each unknown, zero where nothing is known; those of shared ones times M. The scores stay."""
+    (r_s, r_l), (J_s, J_l) = arrow.split(residual), arrow.split(np.broadcast_to(weight, residual.shape))
     every, M = M, np.eye(J_s.shape[1])  # where there is one run, its own unknowns count as shared, after the others
     M[: len(every), : len(every)] = every
     tops, left = eliminated(arrow.local, J_l, residual=r_l)

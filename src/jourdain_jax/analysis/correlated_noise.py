@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from jourdain_jax.analysis.arrow import Arrow, PerMember, eliminated
 
-SHORTEST, LONGEST = 0.1, 10.0  # of tau: of the shortest interval (the noise is white), and of the longest span (hardly to be told from a bias)
+SHORTEST = 0.1  # tau over the shortest interval: the noise is white
 
 
 def chain(weight: Float[Array | np.ndarray, "times *channel"], ts: Float[Array | np.ndarray, "times"], xp=np) -> tuple[Array | np.ndarray, Array | np.ndarray]:
@@ -110,7 +110,8 @@ def correlation_limits(ts: Sequence[np.ndarray]) -> tuple[float, float]:
     intervals = [float(np.min(np.diff(t))) for t in ts if len(t) > 1]
     if not intervals:
         raise ValueError("a correlation time is None, but each run has one sample, and neighbours in a run tell it; give a number in s, or 0 for white noise")
-    return SHORTEST * min(intervals), LONGEST * max(float(t[-1] - t[0]) for t in ts)
+    # beyond ten spans hardly to be told from a bias
+    return SHORTEST * min(intervals), 10.0 * max(float(t[-1] - t[0]) for t in ts)
 
 
 def log_density(r, weight, ts, tau) -> Float[Array, ""]:

@@ -101,9 +101,6 @@ def unbounded(scale: Number | None = None) -> Range:
     return Range("unbounded", scale=None if scale is None else float(scale))
 
 
-_ROUND_OFF = 1e-9  # of correlations
-
-
 @dataclass(frozen=True, eq=False)
 class Correlated:
     """The prior of one of several numbers that were measured together (`joint_normal`): its mean, its standard deviation, and its place among them."""
@@ -139,11 +136,11 @@ def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]
     if np.any(variances <= 0):
         first = names[int(np.argmax(variances <= 0))]
         raise ValueError(f"the variance of `{first}` is {variances[names.index(first)]:g}, expected one above zero; a number that is known needs no estimate")
-    sigma = np.sqrt(variances)
+    sigma, round_off = np.sqrt(variances), 1e-9  # of correlations
     correlations = C / np.outer(sigma, sigma)
-    if np.max(np.abs(correlations - correlations.T)) > _ROUND_OFF:
+    if np.max(np.abs(correlations - correlations.T)) > round_off:
         raise ValueError("`covariance` of `joint_normal` is not symmetric; give cov(a, b) = cov(b, a)")
-    if (least := np.linalg.eigvalsh(correlations)[0]) < -n * _ROUND_OFF:
+    if (least := np.linalg.eigvalsh(correlations)[0]) < -n * round_off:
         raise ValueError(f"`covariance` of `joint_normal` is no covariance: its correlations have the eigenvalue {least:.3g}, expected none below zero")
     return {name: Correlated(means[k], float(sigma[k]), k, C) for k, name in enumerate(names)}
 

@@ -10,7 +10,7 @@ freedom       samples - rank + tr(C P)       what the samples determined is less
 What fitted motions pass on their way: stop events before samples (a disc that has fallen), or none where one was observed, and jumps of loads.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -21,21 +21,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jourdain_jax.analysis.information import CORRELATED, Information, derived, hidden_combinations, standard_errors, variances, weak_combinations
+from jourdain_jax.analysis.information import Information, derived, hidden_combinations, standard_errors, variances, weak_combinations
 from jourdain_jax.analysis.layout import Layout
-from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum
+from jourdain_jax.analysis.levenberg_marquardt import Minimum
 from jourdain_jax.analysis.likelihood import oddities
 from jourdain_jax.analysis.piecewise import Shot
-from jourdain_jax.analysis.problem import Loss, Problem
+from jourdain_jax.analysis.problem import Asked, Problem
 from jourdain_jax.analysis.quantities import LATEST, StopEvent
 from jourdain_jax.analysis.runs import run_of
-from jourdain_jax.analysis.shooting import MultipleShooting
-from jourdain_jax.analysis.spread import Around, AtBounds, moved_from_bounds, spread, too_narrow_near_bounds
+from jourdain_jax.analysis.spread import AtBounds, moved_from_bounds, spread, too_narrow_near_bounds
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.build.plausibility import impossible_bodies
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.inputs import as_inputs
-from jourdain_jax.motion.options import AllOptions
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.vector_fields.choice import vector_field
 from jourdain_jax.motion.watched import moving_jumps
@@ -45,12 +43,12 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 
-def events_met(problem: Problem, theta: Float[np.ndarray, "places"], options: AllOptions) -> tuple[str, ...]:
+def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> tuple[str, ...]:
     """One sentence for each run whose motion, with these unknowns, meets an event before a sample that counts, or not the one that was observed, or crosses
     a jump of its loads.
     """
     shared, local = problem.unknowns.split(theta)
-    found, layout = [], problem.unknowns.layout
+    found, layout, options = [], problem.unknowns.layout, problem.asked.options
     for index, run in enumerate(problem.runs):
         one = run_of(run).at(layout, shared, local[index])
         scene = layout.scene(problem.scene, shared)
@@ -103,26 +101,22 @@ class Statistics:
     samples: Int[np.ndarray, "*repeats"]  # with a finite sigma
     degrees_of_freedom: PerRepeat  # samples less the directions that they determined; priors take their share
     of_rise: PerUnknown  # by what 2 (F - F_min) is to be divided, for an interval that ends where it is `RISE_95`
-    from_prior: PerUnknown  # in standard deviations of the prior; NaN where there is none
+    from_prior: PerUnknown  # in standard deviations of the prior; zero where there is none
     oddities: tuple[str, ...]  # sentences about what is odd in the runs
     events_met: tuple[str, ...]  # sentences about events before the end of a run, or not met; none in a batch, and where runs were fitted in pieces
     too_narrow: tuple[str, ...]  # sentences about intervals that bounds make too narrow; none in a batch
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of unknowns that no bound kept from growing beyond all measure
-def statistics(problem: Problem, found: Minimum, limits: Limits, control: Control, errors: str, at_bounds: AtBounds, options: AllOptions | None) -> Statistics:
-    """Statistics of the minimum of each member; without the axis of members where the problem has none.
-
-    `options`: for the motions whose events are looked at; None: they are not.
-    """
+def statistics(problem: Problem, found: Minimum, at_bounds: AtBounds) -> Statistics:
+    """Statistics of the minimum of each member; without the axis of members where the problem has none."""
     unknowns, theta, single = problem.unknowns, found.theta, problem.single
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
     here = lambda x: one(x[:, places])  # noqa: E731
-    low, high = limits.low[places], limits.high[places]
-    bound = (theta <= limits.low) | (theta >= limits.high)
+    low, high, bound = unknowns.low[places], unknowns.high[places], unknowns.reached(theta)
     limit = here(at_bounds.limit)
-    about = spread(problem, found, bound, limits, control, errors)
+    about = spread(problem, found, bound)
     levels, known, reach = about.levels, about.known.only() if single else about.known, one(about.quantiles * about.known.standard_errors)
     residuals = tuple(problem.by_channel(run, levels.at, one) for run in range(len(problem.runs)))
     white = tuple(problem.by_channel(run, levels.at, one, white=True) for run in range(len(problem.runs)))
@@ -133,8 +127,8 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, control: Contro
     too_narrow = []
     if single and found.converged[0]:
         too_narrow = moved_from_bounds(at_bounds, theta[0], reach, places, unknowns.labels)
-        if errors == "sigmas":
-            too_narrow += too_narrow_near_bounds(Around(problem.linearised, found, limits, control), at_bounds, about.rise.errors[0], unknowns.labels)
+        if problem.asked.errors == "sigmas":
+            too_narrow += too_narrow_near_bounds(problem, found, at_bounds, about.rise.errors[0])
     values = here(theta)
     shared, local = unknowns.split(theta)
     scene = unknowns.layout.scene(problem.scene, one(shared))
@@ -159,9 +153,9 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, control: Contro
         samples=np.asarray(samples),
         degrees_of_freedom=np.asarray(samples - one(determined)),
         of_rise=one(np.where(bound[:, places], at_bounds.if_free.of_rise[:, places], about.rise.of_rise)),
-        from_prior=(values - unknowns.prior_mean[places]) / unknowns.prior_sigma[places],
+        from_prior=(values - unknowns.prior_mean[places]) * unknowns.prior_weight[places],
         oddities=oddities(problem.scene, problem.runs, not single),
-        events_met=() if options is None else events_met(problem, theta[0], options),
+        events_met=events_met(problem, theta[0]) if single and problem.asked.shooting is None else (),
         too_narrow=tuple(too_narrow),
     )
 
@@ -169,7 +163,7 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, control: Contro
 def _determined(known: Information, unknowns: Unknowns) -> Float[np.ndarray, "members"]:
     """How many unknowns the samples determined: rank - tr(C P)."""
     q, p = known.shared.shape[-1], len(unknowns.whitening)
-    M, weight = np.eye(q), np.where(np.isfinite(unknowns.prior_mean), 1 / unknowns.prior_sigma, 0.0)
+    M, weight = np.eye(q), unknowns.prior_weight
     M[:p, :p] = unknowns.whitening
     rows = M * weight[:q]
     of_shared = np.einsum("ij,bjk,ik->b", rows, known.shared, rows)
@@ -223,20 +217,6 @@ GONE = {
     "bootstrap": "`Fit.profiles` gives intervals where the scene is not linear; of repeats, draw them about `simulate` of `scene` and `starts`, and give them "
     "to `fit_batch`"
 }
-
-
-@dataclass(frozen=True, eq=False)
-class Asked:
-    """Arguments of a fit, without its data, stored with the result so that it can be resumed."""
-
-    scene: Scene  # with the first guesses
-    free: Mapping | tuple[str, ...]
-    options: AllOptions
-    loss: Loss
-    control: Control
-    errors: str  # whence standard errors come: "sigmas" or "runs"
-    guesses: int  # first guesses to try
-    shooting: MultipleShooting | None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -322,10 +302,10 @@ class Estimates(Printed):
 
     @property
     def correlated(self) -> tuple[str, ...]:
-        """Pairs of unknowns whose estimates correlate by `CORRELATED` or more in magnitude, strongest first, one sentence each."""
+        """Pairs of unknowns whose estimates correlate by 0.98 or more in magnitude, strongest first, one sentence each."""
         some = np.flatnonzero(np.isfinite(self.standard_errors))[:1000]  # unknowns
         found = np.triu(self.correlation[np.ix_(some, some)], 1)
-        pairs = sorted(zip(*np.nonzero(np.abs(found) >= CORRELATED), strict=True), key=lambda ij: -abs(found[ij]))
+        pairs = sorted(zip(*np.nonzero(np.abs(found) >= 0.98), strict=True), key=lambda ij: -abs(found[ij]))
         return tuple(
             f"`{self.labels[some[i]]}` and `{self.labels[some[j]]}` correlate at {np.sign(found[i, j]) * min(abs(found[i, j]), 0.9999):.4g}: "
             "the data tell a combination of them far better than either"

@@ -26,7 +26,7 @@ from jourdain_jax.analysis.experiment import Data, Experiment
 from jourdain_jax.analysis.likelihood import as_fit_options, as_runs, check_known, mapped
 from jourdain_jax.analysis.quantities import Channel, Instrument, StopEvent
 from jourdain_jax.analysis.runs import Run, equal_runs
-from jourdain_jax.analysis.sensors import Reading, ideal
+from jourdain_jax.analysis.sensors import Reading, gauss_legendre, ideal
 from jourdain_jax.analysis.tangent import dependent_coordinates, others, privileged_speeds
 from jourdain_jax.calculus.reals import checked_unless_traced, is_traced
 from jourdain_jax.equations.kinematics import motion_at
@@ -41,8 +41,7 @@ from jourdain_jax.scene.parameters import Scalar
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
-_NODES, _WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(5))
-_NODES = _NODES + 0.5
+_NODES, _WEIGHTS = gauss_legendre(5)
 
 
 @shown_from_users_lines

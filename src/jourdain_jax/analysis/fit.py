@@ -12,23 +12,23 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 
 from jourdain_jax.analysis.estimate import Estimate, Range
-from jourdain_jax.analysis.estimates import Asked, statistics
+from jourdain_jax.analysis.estimates import statistics
 from jourdain_jax.analysis.experiment import Data, Experiment
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.layout import PossibleInertia
-from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum
+from jourdain_jax.analysis.levenberg_marquardt import Control, Minimum
 from jourdain_jax.analysis.likelihood import as_fit_options, as_runs, in_all_or_none
 from jourdain_jax.analysis.piecewise import Piecewise, Shot, problem_of
-from jourdain_jax.analysis.problem import LEAST_SQUARES, Loss, Problem, Span
+from jourdain_jax.analysis.problem import LEAST_SQUARES, Asked, Loss, Problem, Span
 from jourdain_jax.analysis.shooting import MultipleShooting, check_shooting
 from jourdain_jax.analysis.shooting_steps import cutoff_of, shot
-from jourdain_jax.analysis.spread import Around, AtBounds, if_free, limits_at_bounds
-from jourdain_jax.analysis.unknowns import Unknowns, check_first_guess, check_starts, unknowns_of
+from jourdain_jax.analysis.spread import AtBounds, limits_at_bounds
+from jourdain_jax.analysis.unknowns import Unknowns, check_starts, unknowns_of
 from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.options import OptionFields, Options
@@ -37,46 +37,53 @@ from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
-_POOR = 10.0  # times the sum of squares that noise alone leaves, one for each sample
-_SPANS = (1 / 32, 1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 3 / 4)  # shares of the span that a fit grows over
-_PATIENCE = 3  # steps within which a fit of whole runs is to make F far smaller, or spans grow
-_STEPS = 8  # tried on each of them
-_FOLLOWED = 100.0  # times the squares that noise leaves, up to which a motion is followed, and a longer span can be next
+
+class FitFields(OptionFields, total=False):
+    """Arguments of `fit` and `fit_batch` by name."""
+
+    cutoff: float
+    tolerance: float
+    max_iterations: int
+    loss: Loss | None
+    errors: str
+    options: Options | None
 
 
-def minimum(problem: Problem, theta: np.ndarray, limits: Limits, control: Control, one_will_do: bool) -> Minimum:
+def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
     """The minimum from each `theta`; where none is found, or residuals are far beyond their sigmas, the lower one of it and that over growing spans.
 
     Over a short span a motion depends on its unknowns almost linearly, also an unstable one; each fit begins where that over the shorter span ended, and what
     a short span does not tell stays near the first guess. After a few steps, what is far off gives way to growing spans, and goes on only where these do not
-    lead to small residuals either. `one_will_do`: spans grow only where no theta led to a minimum with small residuals.
+    lead to small residuals either. Where each theta is a first guess of one problem, spans grow only where none led to a minimum with small residuals.
     """
-    samples = problem.samples
-    few = replace(control, most_steps=min(_STEPS, control.most_steps), patience=_PATIENCE, near=0.5 * _POOR * samples)
+    samples, control = problem.samples, problem.asked.control
+    large = 5.0 * samples  # F: ten times what noise alone leaves, one half for each sample
+    few = replace(control, most_steps=min(8, control.most_steps), patience=3, near=large)
     rest = replace(control, most_steps=control.most_steps - few.most_steps)
-    in_parts = samples > 0 and not (one_will_do and len(theta) > 1)
+    in_parts = samples > 0 and not (problem.single and len(theta) > 1)
 
     def of(members: np.ndarray, begin: np.ndarray, how: Control, span: Span | None = None) -> Minimum:
-        return problem.minimum(begin, members, limits, how, "whole runs", span)
+        return problem.minimum(begin, members, "whole runs", how, span)
 
     def far() -> np.ndarray:
-        return found.at.cost > 0.5 * _POOR * samples
+        return found.at.cost > large
 
     found = of(np.arange(len(theta)), theta, few if in_parts else control)
     unfinished = ~found.converged & ~found.stuck & in_parts & (rest.most_steps > 0)
     if (near := np.flatnonzero(unfinished & ~far())).size:
         found, unfinished[near] = found.continued(near, of(near, found.theta[near], rest)), False
     poor = np.flatnonzero(~found.converged | far())
-    if not poor.size or not samples or (one_will_do and np.argmin(found.at.cost) not in poor):
+    if not poor.size or not samples or (problem.single and np.argmin(found.at.cost) not in poor):
         return found
-    ended, spans, place = found.theta.copy(), np.array(_SPANS), np.zeros(len(poor), int)
+    spans = np.array([1 / 32, 1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 3 / 4])  # shares of each run
+    ended, place = found.theta.copy(), np.zeros(len(poor), int)
     way = replace(found.of(poor), theta=theta[poor])
     while (some := np.flatnonzero(place < len(spans))).size:
         grown = of(poor[some], way.theta[some], replace(few, tolerance=1.0, patience=None), Span(spans[place[some]], theta[poor[some]]))
         grown.trace[:] = [((f"the first {spans[k]:.3g} of each run", costs),) for k, ((_, costs),) in zip(place[some], grown.trace, strict=True)]
         way = way.continued(some, grown)
         place[some] += 1
-        followed = problem.is_followed(grown.at, spans, _FOLLOWED)
+        followed = problem.is_followed(grown.at, spans, 100.0)  # times the squares that noise leaves
         for k in range(1, len(spans)):
             place[some] += (place[some] == k) & followed[:, k]  # the next one is followed, and left out
     grown = of(poor, way.theta, control).after(way, np.arange(len(poor)))
@@ -87,36 +94,33 @@ def minimum(problem: Problem, theta: np.ndarray, limits: Limits, control: Contro
     return found
 
 
-def with_memory(problem: Problem, found: Minimum, limits: Limits, control: Control) -> Minimum:
+def with_memory(problem: Problem, found: Minimum) -> Minimum:
     """The minimum with the correlation times of the noise estimated: these and the unknowns take turns, from what was found as if the noise were white."""
     if not problem.with_memory:
         return found
     going = np.flatnonzero(np.isfinite(found.at.cost))
-    some = replace(control, most_steps=min(12, control.most_steps))
+    some = replace(problem.asked.control, most_steps=min(12, problem.asked.control.most_steps))
     for _ in range(20):
         if not going.size:
             break
         changed = problem.restrict(found.theta[going], going)
-        again = problem.minimum(found.theta[going], going, limits, some, "whole runs, after a turn of correlation times")
+        again = problem.minimum(found.theta[going], going, "whole runs, after a turn of correlation times", some)
         found = found.continued(going, again)
         going = going[(changed > 1e-3) | ~again.converged]
     found.converged[going] = False
     return found
 
 
-def off_bounds(
-    problem: Problem, found: Minimum, limits: Limits, control: Control, pieces: Piecewise | None, errors: str = "sigmas"
-) -> tuple[Minimum, AtBounds]:
-    """The minimum, gone on from where unknowns at a bound let it be lower away from it; and what is known of those that stay. `errors`: as of `fit`."""
+def off_bounds(problem: Problem, found: Minimum, pieces: Piecewise | None) -> tuple[Minimum, AtBounds]:
+    """The minimum, gone on from where unknowns at a bound let it be lower away from it; and what is known of those that stay."""
     for _ in range(20):
         with nullcontext() if pieces is None else pieces.unmoved():
-            around = Around(problem.linearised, found, limits, control)
-            told = limits_at_bounds(around, if_free(problem, found, around.at_bound, limits, control, errors))
+            told = limits_at_bounds(problem, found)
         if not told.lower:
             break
         members = np.array(list(told.lower))
-        again = problem.minimum(np.stack([theta for _, theta in told.lower.values()]), members, limits, control, "whole runs, off a bound")
-        found = with_memory(problem, found.lowered(members, again.after(found, members)), limits, control)
+        again = problem.minimum(np.stack([theta for _, theta in told.lower.values()]), members, "whole runs, off a bound")
+        found = with_memory(problem, found.lowered(members, again.after(found, members)))
     return found, told
 
 
@@ -126,15 +130,9 @@ def fit(
     data: Data,
     free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
     *,
-    cutoff: float = 1e-6,
-    tolerance: float = 1e-4,
-    max_iterations: int = 50,
-    loss: Loss | None = None,
-    errors: str = "sigmas",
     guesses: int = 1,
     shooting: MultipleShooting | None = None,
-    options: Options | None = None,
-    **by_name: Unpack[OptionFields],
+    **by_name: Unpack[FitFields],
 ) -> Fit:
     """Estimate the `free` parameters of a scene, unknown initial values of its runs and numbers of their sensors, from measurements.
 
@@ -146,19 +144,21 @@ def fit(
       `free={"radius": None, "inertia": lambda scene: 0.5 * scene.mass * scene.radius**2}`. The measured sigmas of a bicycle are such priors:
       `free=measured_bicycle("Browser").prior`; of parameters that were measured together, `joint_normal(means, covariance)`. The name of a body, with
       `possible_inertia()`, frees its moments of inertia. What `unknown_start`, sensors and actuators of the runs name is free as well.
-    - `cutoff`: singular values of the scaled Jacobian below this fraction of the largest count as zero (`Information`). Keep it
-      well above the relative accuracy of the simulation.
-    - `tolerance`: the fit has converged when a step changes no residual by more than about this many sigmas, and no unknown by
-      more than about this fraction. `max_iterations`: steps tried at most, over each span.
-    - `loss`: `huber()` or `student_t()` where some samples are far out (default: least squares).
-    - `errors`: whence standard errors and intervals come. "sigmas": from the sigmas, which holds for noise that is white. "runs": from how much runs differ
-      (the sandwich of clusters, which needs five runs or more), which holds whatever the noise within a run, also where the scene is not quite right; but for
-      what is a run's own, which takes noise within it as white.
     - `guesses`: how many first guesses are tried side by side: that of the scene and the runs, and others on a Latin hypercube over the bounds of all
       unknowns, or within a factor of five of a `positive()` one. The lowest minimum counts; `Fit.agreeing` says how many led to it.
     - `shooting`: `MultipleShooting(duration=...)` or `MultipleShooting(pieces=...)` for unstable and chaotic motions: the runs are fitted in pieces with
       starts of their own, and continuity between them is an equation. What is minimised stays the same.
-    - `options`: a `jj.Options`; `by_name`: its fields, such as `rtol`, `solver`, `max_step`, `max_steps`. Stop events cut no run: what is given counts,
+
+    By name (`by_name`):
+    - `cutoff` (1e-6): singular values of the scaled Jacobian below this fraction of the largest count as zero (`Information`). Keep it
+      well above the relative accuracy of the simulation.
+    - `tolerance` (1e-4): the fit has converged when a step changes no residual by more than about this many sigmas, and no unknown by
+      more than about this fraction. `max_iterations` (50): steps tried at most, over each span.
+    - `loss`: `huber()` or `student_t()` where some samples are far out (default: least squares).
+    - `errors`: whence standard errors and intervals come. "sigmas" (default): from the sigmas, which holds for white noise. "runs": from how much runs differ
+      (the sandwich of clusters, which needs five runs or more), which holds whatever the noise within a run, also where the scene is not quite right; but for
+      what is a run's own, which takes noise within it as white.
+    - `options`: a `jj.Options`; or its fields, such as `rtol`, `solver`, `max_step`, `max_steps`. Stop events cut no run: what is given counts,
       and `Fit.warnings` names those that the fitted motion meets before a sample. Give samples up to where the real motion met one; were runs cut where the
       fitted one does, estimates whose motion ends early would have fewer residuals.
 
@@ -186,69 +186,68 @@ def fit(
     """
     if isinstance(guesses, bool) or not isinstance(guesses, int | np.integer) or guesses < 1:
         raise ValueError(f"`guesses` is {guesses!r}, expected a whole number of at least 1: how many first guesses to begin from")
-    settled = as_fit_options(scene, options, by_name, "fit")
-    least = _checked_choices(loss, errors, shooting)
-    return _fit(Asked(as_scene(scene), _named(free), settled, least, Control(tolerance, max_iterations, cutoff), errors, int(guesses), shooting), data)
+    check_shooting(shooting)
+    return _fit(replace(_asked(scene, free, by_name, "fit"), guesses=int(guesses), shooting=shooting), data)
 
 
 def fit_batch(
     scene: Scene | BuiltFor,
     data: Data,
     free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
-    *,
-    cutoff: float = 1e-6,
-    tolerance: float = 1e-4,
-    max_iterations: int = 50,
-    loss: Loss | None = None,
-    errors: str = "sigmas",
-    options: Options | None = None,
-    **by_name: Unpack[OptionFields],
+    **by_name: Unpack[FitFields],
 ) -> Fit:
     """`fit` for many repeats of the same experiment, as one batch.
 
-    Every array in the `values` of `data` has a leading axis `repeats`; all else is shared. `free`, `cutoff`, `tolerance`,
-    `max_iterations`, `loss`, `errors`, `options` and `by_name` as in `fit`. **Returns** a `Fit` whose arrays have the leading axis; a repeat that fails has
+    Every array in the `values` of `data` has a leading axis `repeats`; all else is shared. `free` and `by_name` as in `fit`.
+
+    **Returns** a `Fit` whose arrays have the leading axis; a repeat that fails has
     `converged` False and harms no other, as does one with fewer samples than unknowns. **Raises** as `fit`.
     """
-    settled = as_fit_options(scene, options, by_name, "fit_batch")
-    least = _checked_choices(loss, errors, None)
-    return _fit(Asked(as_scene(scene), _named(free), settled, least, Control(tolerance, max_iterations, cutoff), errors, 1, None), data, repeats=True)
+    return _fit(_asked(scene, free, by_name, "fit_batch"), data, repeats=True)
+
+
+def _asked(scene: Scene | BuiltFor, free: Mapping | Iterable[str], by_name: FitFields, function: str) -> Asked:
+    """Return what was asked, checked; from one first guess of whole runs."""
+    rest: dict[str, Any] = dict(by_name)
+    cutoff, tolerance, most_steps = (rest.pop(name, value) for name, value in (("cutoff", 1e-6), ("tolerance", 1e-4), ("max_iterations", 50)))
+    loss, errors, options = rest.pop("loss", None), rest.pop("errors", "sigmas"), rest.pop("options", None)
+    settled = as_fit_options(scene, options, rest, function)
+    if loss is not None and not isinstance(loss, Loss):
+        raise ValueError(f"`loss` is {loss!r}, expected `huber()`, `student_t()`, or None for least squares")
+    if errors not in ("sigmas", "runs"):
+        raise ValueError(f'`errors` is {errors!r}, expected "sigmas" or "runs"')
+    named = free if isinstance(free, Mapping) else tuple(as_names(free))
+    return Asked(as_scene(scene), named, settled, loss or LEAST_SQUARES, Control(tolerance, most_steps, cutoff), errors, 1, None)
 
 
 def _fit(asked: Asked, data: Data, repeats: bool = False) -> Fit:
-    scene, control, data = asked.scene, asked.control, tuple(data) if isinstance(data, Iterator) else data
-    if is_traced((scene, data, control.tolerance, control.cutoff, asked.options)):
+    scene, data = asked.scene, tuple(data) if isinstance(data, Iterator) else data
+    if is_traced((scene, data, asked.control.tolerance, asked.control.cutoff, asked.options)):
         raise DifferentiationModeError(
             "`fit` was called inside jit, vmap or a derivative, but its steps are chosen outside of compiled code. Call it with known numbers; "
             "for many repeats use `fit_batch`, for derivatives of the fit's objective `log_likelihood`."
         )
-    _check_control(control)
+    _check_control(asked.control)
     runs = as_runs(scene, data, repeats=repeats)
     _check_noise(runs, asked)
     unknowns = unknowns_of(scene, runs, asked.free)
-    check_starts(scene, runs, unknowns)
     members = _repeats(runs) if repeats else None
     enough = _check_enough(runs, unknowns, repeats)
-    problem, pieces = problem_of(scene, runs, unknowns, asked.options, members, asked.loss, asked.shooting)
+    problem, pieces = problem_of(asked, runs, unknowns, members)
     theta = unknowns.first_guesses(asked.guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
-    limits = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
-    if pieces is None:
-        found = minimum(problem, theta, limits, control, one_will_do=members is None)
-    else:
-        found = shot(problem, pieces, theta, limits, control)
-    if not all(np.isfinite(trace[0][1][0]) for trace in found.trace):
-        check_first_guess(scene, runs, unknowns)
+    found = minimum(problem, theta) if pieces is None else shot(problem, pieces, theta)
+    if problem.failed or not found.steps.all():  # no step shows whether starts go along with the unknowns
+        check_starts(scene, runs, unknowns)
     same = np.zeros(members, int) if members else np.asarray(found.agreeing(0.05))
     if pieces is not None:
         pieces.keep(int(np.argmin(found.at.cost)))
-        control = replace(control, cutoff=cutoff_of(pieces, control, np.arange(len(pieces.at.theta))))
-        asked = replace(asked, control=control)
-    found = with_memory(problem, found if members else found.lowest(), limits, control)
-    found, at_bounds = off_bounds(problem, found, limits, control, pieces, asked.errors)
+        problem.asked = replace(asked, control=replace(asked.control, cutoff=cutoff_of(pieces, asked.control, np.arange(len(pieces.at.theta)))))
+    found = with_memory(problem, found if members else found.lowest())
+    found, at_bounds = off_bounds(problem, found, pieces)
     found.converged &= enough
     if pieces is not None:
         found.converged &= pieces.closed(np.arange(len(found.converged)))
-    return _result(problem, found, limits, at_bounds, asked, same, None if pieces is None else pieces.told())
+    return _result(problem, found, at_bounds, same, None if pieces is None else pieces.told())
 
 
 def _check_control(control: Control) -> None:
@@ -258,19 +257,6 @@ def _check_control(control: Control) -> None:
         raise ValueError(f"`tolerance` is {control.tolerance!r}, expected a number above zero: the step in sigmas that ends the fit")
     if isinstance(control.most_steps, bool) or not isinstance(control.most_steps, int | np.integer) or control.most_steps < 0:
         raise ValueError(f"`max_iterations` is {control.most_steps!r}, expected a whole number of steps")
-
-
-def _named(free: Mapping | Iterable[str]) -> Mapping | tuple[str, ...]:
-    return free if isinstance(free, Mapping) else tuple(as_names(free))
-
-
-def _checked_choices(loss, errors, shooting) -> Loss:
-    if loss is not None and not isinstance(loss, Loss):
-        raise ValueError(f"`loss` is {loss!r}, expected `huber()`, `student_t()`, or None for least squares")
-    if errors not in ("sigmas", "runs"):
-        raise ValueError(f'`errors` is {errors!r}, expected "sigmas" or "runs"')
-    check_shooting(shooting)
-    return LEAST_SQUARES if loss is None else loss
 
 
 def _check_noise(runs: Sequence[Experiment], asked: Asked) -> None:
@@ -296,7 +282,7 @@ def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool)
     """Which repeats have as many measured values as unknowns; ValueError where none has."""
     known = [np.isfinite(values) & np.isfinite(run.sigma_of(name, repeats)) for run in runs for name, values in run.values.items()]
     counts = [one.reshape(*one.shape[: int(repeats)], -1).sum(axis=-1) for one in known]
-    each, sigmas = sum(counts) + len(unknowns.with_prior), len({name for run in runs for name in run.unknown_sigma})
+    each, sigmas = sum(counts) + np.count_nonzero(unknowns.prior_weight), len({name for run in runs for name in run.unknown_sigma})
     samples = int(np.max(each))
     if samples < len(unknowns.labels) + sigmas:
         and_sigmas = f" and {sigmas} sigmas" if sigmas else ""
@@ -307,8 +293,8 @@ def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool)
     return np.asarray(each >= len(unknowns.labels) + sigmas)
 
 
-def _result(problem: Problem, found: Minimum, limits: Limits, at_bounds: AtBounds, asked: Asked, agreeing: np.ndarray, how: Shot | None) -> Fit:
-    unknowns, single, control = problem.unknowns, problem.single, asked.control
+def _result(problem: Problem, found: Minimum, at_bounds: AtBounds, agreeing: np.ndarray, how: Shot | None) -> Fit:
+    unknowns, single, asked = problem.unknowns, problem.single, problem.asked
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
     places = unknowns.estimated
     told = Fit(
@@ -322,13 +308,13 @@ def _result(problem: Problem, found: Minimum, limits: Limits, at_bounds: AtBound
         guesses=asked.guesses,
         labels=unknowns.labels,
         units=unknowns.units,
-        cutoff=control.cutoff,
+        cutoff=asked.control.cutoff,
         errors=asked.errors,
         shooting=how,
         trace=found.trace[0] if single else (),
         asked=asked,
         layout=unknowns.layout,
-        work_out=partial(statistics, problem, found, limits, control, asked.errors, at_bounds, asked.options if single and how is None else None),
+        work_out=partial(statistics, problem, found, at_bounds),
     )
     if problem.with_memory:  # its motions are needed, in the context that is here
         told.statistics  # noqa: B018

@@ -20,7 +20,6 @@ from jourdain_jax.analysis.table import table
 from jourdain_jax.calculus.figures import DATA, MODEL, QUIET, figure
 
 _WIDTH, _HEIGHT = 460, 200  # pixels
-_NARROWEST, _WIDEST = 1e-4, 100.0  # per cent
 
 
 def data_and_prediction(caption: str, label: str, one: Prediction, component: int) -> str:
@@ -54,7 +53,7 @@ def autocorrelation(name: str, found: np.ndarray, limit: float) -> str:
 
 def interval_widths(fit: Estimates) -> str:
     """Draw half the width of the 95 % interval of each unknown, in per cent of the estimate, on an axis of powers of ten."""
-    names = fit.labels[:40]  # unknowns in one figure
+    names, narrowest, widest = fit.labels[:40], 1e-4, 100.0  # unknowns in one figure; per cent
     values, low, high = (np.asarray(x[: len(names)], float) for x in (fit.values, fit.low, fit.high))
     half = np.maximum(high - values, values - low)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -65,11 +64,11 @@ def interval_widths(fit: Estimates) -> str:
 
     def draw(whole) -> None:
         axes = whole.add_subplot(xlabel="half of the 95 % interval, in % of the estimate", xscale="log")
-        shown = np.where(told, np.clip(share, _NARROWEST, _WIDEST), _NARROWEST)
+        shown = np.where(told, np.clip(share, narrowest, widest), narrowest)
         bars = axes.barh(range(len(names)), shown, color=[MODEL if s < 100 else DATA for s in share])
         axes.bar_label(bars, words[: len(names)], padding=3, fontsize=8)
         axes.set_yticks(range(len(names)), [name if len(name) <= 30 else name[:29] + "…" for name in names])
-        axes.set_xlim(max(_NARROWEST, 0.5 * shown.min()), 40 * _WIDEST)
+        axes.set_xlim(max(narrowest, 0.5 * shown.min()), 40 * widest)
         axes.invert_yaxis()
 
     notes = ["red: the interval is wider than the estimate"] if np.any(share >= 100) else []
@@ -133,7 +132,6 @@ def way_to_the_minimum(trace: tuple[tuple[str, tuple[float, ...]], ...]) -> str:
     return figure(draw, 2 * _WIDTH if sum(len(costs) for _, costs in trace) > 60 else _WIDTH, _HEIGHT)
 
 
-_MOST_PANELS = 40  # components of channels of runs that are drawn, of the runs fitted and of those held out
 _PAGE = """<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
 body{{font:15px/1.45 sans-serif;max-width:980px;margin:2em auto;padding:0 1em;color:#222}}pre{{font-size:13px;white-space:pre-wrap}}
 figure{{display:inline-block;margin:.4em .6em .4em 0;vertical-align:top}}figcaption{{font-size:13px;max-width:460px}}h2{{margin-top:1.6em}}
@@ -223,8 +221,9 @@ def _predicted(title: str, about: str, runs: Sequence[dict[str, Prediction]], un
             for k in range(count):
                 component = f"{name}[{k}]" if count > 1 else name
                 panels.append((f"{what} {run}: {component}", f"{component} in {units.get(name, 'SI units')}", one, k))
-    lines += [f"{len(panels) - _MOST_PANELS} more are not drawn."] if len(panels) > _MOST_PANELS else []
-    return Section(title, about, lines, [data_and_prediction(*panel) for panel in panels[:_MOST_PANELS]])
+    drawn, more = panels[:40], panels[40:]
+    lines += [f"{len(more)} more are not drawn."] if more else []
+    return Section(title, about, lines, [data_and_prediction(*panel) for panel in drawn])
 
 
 def _whiteness(fit: Estimates, fitted: Sequence[dict[str, Prediction]]) -> Section:

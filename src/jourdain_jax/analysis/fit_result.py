@@ -6,7 +6,7 @@ Why estimates of a fit, or their intervals, should not be relied on, in words.
 """
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -20,8 +20,6 @@ from jourdain_jax.analysis.spread import FAR_BEYOND
 from jourdain_jax.analysis.table import table
 from jourdain_jax.scene.names import as_names
 
-_SURE = 5.0  # standard deviations: a mean square that is further from 1 is no chance
-
 
 def warnings_of(fit: Estimates) -> tuple[str, ...]:
     """Warnings of a fit of one experiment, the most serious reason first, one sentence each."""
@@ -29,10 +27,11 @@ def warnings_of(fit: Estimates) -> tuple[str, ...]:
         if any(np.any(np.abs(r) > 1e150) for run in fit.residuals for r in run.values()):  # sigmas: the square is no number any more
             return ("residuals overflow at the first guess: use NaN for missing values, and check `sigma`",)
         return ("the motion fails at the first guess, so that there is nothing to fit; look at it with `simulate`", *fit.events_met)
-    return tuple(sentence for reason in REASONS for sentence in reason(fit))
+    return (*_of_the_minimum(fit), *fit.impossible, *fit.events_met, *fit.oddities, *fit.too_narrow, *_of_the_data(fit), *_of_residuals(fit))
 
 
-def _no_minimum(fit: Estimates) -> Iterator[str]:
+def _of_the_minimum(fit: Estimates) -> Iterator[str]:
+    """Warn of a minimum that is none, or that bounds or missing degrees of freedom decide."""
     if fit.stuck:
         yield "no step leads to a better fit, and yet this is no minimum: nearby the motion fails, or it is rougher than its tolerance; start elsewhere"
     elif fit.shooting is not None and fit.shooting.continuity > 1:
@@ -40,15 +39,9 @@ def _no_minimum(fit: Estimates) -> Iterator[str]:
         yield f"pieces of runs do not join: states jump by up to {jump:.2g} tolerances of the simulation; take shorter pieces, or start nearer"
     elif not fit.converged:
         yield "no minimum was found; raise `max_iterations`, or start nearer to it"
-
-
-def _decided_by_bounds(fit: Estimates) -> Iterator[str]:
     if names := [f"`{name}`" for name, far in zip(fit.labels, fit.beyond, strict=True) if far > FAR_BEYOND]:
         verb = "lies at a bound, which decides its value" if len(names) == 1 else "lie at bounds, which decide their values"
         yield f"{', '.join(names)} {verb}; all standard errors lose their meaning: widen the bounds"
-
-
-def _untold_sigmas(fit: Estimates) -> Iterator[str]:
     for name in fit.untold:
         yield (
             f"channel `{name}` has no degrees of freedom left to estimate its sigma; pass `sigma`: estimates are drawn to meet its samples exactly, and "
@@ -56,7 +49,8 @@ def _untold_sigmas(fit: Estimates) -> Iterator[str]:
         )
 
 
-def _counted_twice(fit: Estimates) -> Iterator[str]:
+def _of_the_data(fit: Estimates) -> Iterator[str]:
+    """Warn of channels that are counted twice, of a minimum that one first guess found alone, and of priors that the data contradict."""
     first: dict[bytes, str] = {}
     for run, of_run in enumerate(fit.residuals):
         for name, r in of_run.items():
@@ -65,37 +59,33 @@ def _counted_twice(fit: Estimates) -> Iterator[str]:
             there = first.setdefault(counted.tobytes(), here)
             if here != there and len(np.unique(counted)) > 3:  # different residuals that two channels may share by chance
                 yield f"{there} and {here} hold the same numbers: counted as two measurements, they make intervals too narrow; leave one out"
-
-
-def _only_one_guess(fit: Estimates) -> Iterator[str]:
     if fit.guesses > 1 and fit.converged and fit.agreeing == 1:
         yield f"only one of {fit.guesses} first guesses led to this minimum, so there may be a lower one; try more `guesses`, or narrower bounds"
-
-
-def _far_from_priors(fit: Estimates) -> Iterator[str]:
     for name, far in zip(fit.labels, fit.from_prior, strict=True):
         if abs(far) > 4.0:  # standard deviations: an estimate that lies further from its prior is no chance
             yield f"`{name}` lies {abs(far):.2g} standard deviations from its prior: the prior, the data or the scene is not right"
 
 
-def _large_residuals(fit: Estimates) -> Iterator[str]:
-    if large := [size for size in _sizes_of_residuals(fit) if size.least > _by_chance(size.narrow, _SURE)]:
+def _of_residuals(fit: Estimates) -> Iterator[str]:
+    """Warn of residuals that are larger or smaller than sigmas allow, or not white."""
+    sizes, sure = _sizes_of_residuals(fit), 5.0  # standard deviations: a mean square that is further from 1 is no chance
+    coloured = {name: rho for name, (rho, limit) in fit.autocorrelation.items() if abs(rho) > limit}
+    if large := [size for size in sizes if size.least > _by_chance(size.narrow, sure)]:
         why = "a local minimum (start nearer), a scene that is not right, or sigmas that are too small"
         yield f"the residuals{large[0].named} are larger than the sigmas allow: {why}"
 
+    def larger(channels: list[str]) -> float:
+        """Residuals with a correlation rho of neighbours tell (1 + rho)/(1 - rho) times less."""
+        return max((1 + rho) / max(1 - rho, 1e-9) for rho in (0.0, *(coloured.get(name, 0.0) for name in channels)))
 
-def _small_residuals(fit: Estimates) -> Iterator[str]:
-    if small := _too_small(fit):
+    if small := [size for size in sizes if size.most * larger(size.channels) < _by_chance(size.wide, -sure)]:
         times = f" by a factor of about {1 / np.sqrt(small[0].most):.2g}" if small[0].most > 0 else ""
         yield (
             f"the residuals{small[0].named} are smaller than the sigmas foretell{times}: sigmas are too large, so that intervals are too wide, or samples were "
             "smoothed or have no noise; a sigma of `None` is estimated"
         )
-
-
-def _coloured_residuals(fit: Estimates) -> Iterator[str]:
-    wide = {name for size in _too_small(fit) for name in size.channels}
-    named = ", ".join(f"`{name}` ({rho:.2f})" for name, rho in _coloured(fit).items() if name not in wide)
+    wide = {name for size in small for name in size.channels}
+    named = ", ".join(f"`{name}` ({rho:.2f})" for name, rho in coloured.items() if name not in wide)
     own = [name for name in fit.labels if name.startswith("run ")]
     start = f"residuals of {named} are not white (in brackets: correlation of neighbouring ones), which makes intervals"
     if named and fit.errors == "sigmas":
@@ -107,23 +97,6 @@ def _coloured_residuals(fit: Estimates) -> Iterator[str]:
         yield f"{start} of what is a run's own too narrow (`{own[0]}`): how runs differ says nothing of it"
 
 
-REASONS: tuple[Callable[[Estimates], Iterator[str] | tuple[str, ...]], ...] = (  # the most serious first
-    _no_minimum,
-    _decided_by_bounds,
-    _untold_sigmas,
-    lambda fit: fit.impossible,
-    lambda fit: fit.events_met,
-    lambda fit: fit.oddities,
-    lambda fit: fit.too_narrow,
-    _counted_twice,
-    _only_one_guess,
-    _far_from_priors,
-    _large_residuals,
-    _small_residuals,
-    _coloured_residuals,
-)
-
-
 class _Size(NamedTuple):
     """The mean square of the residuals of some channels, in sigmas."""
 
@@ -133,21 +106,6 @@ class _Size(NamedTuple):
     narrow: float  # standard deviation of that, of normal residuals
     most: float  # where they determined all of them
     wide: float
-
-
-def _coloured(fit: Estimates) -> dict[str, float]:
-    """Return correlations of neighbouring residuals, for channels whose residuals are not white."""
-    return {name: rho for name, (rho, limit) in fit.autocorrelation.items() if abs(rho) > limit}
-
-
-def _too_small(fit: Estimates) -> list[_Size]:
-    """Return which values are too small to be chance; residuals with a correlation rho of neighbours tell (1 + rho)/(1 - rho) times less."""
-    coloured = _coloured(fit)
-
-    def larger(channels: list[str]) -> float:
-        return max((1 + rho) / max(1 - rho, 1e-9) for rho in (0.0, *(coloured.get(name, 0.0) for name in channels)))
-
-    return [size for size in _sizes_of_residuals(fit) if size.most * larger(size.channels) < _by_chance(size.wide, -_SURE)]
 
 
 def _by_chance(spread: float, deviations: float) -> float:
@@ -178,12 +136,10 @@ def _mean_square(squares: np.ndarray, determined: float, robust: bool) -> tuple[
     return float(np.sum(squares)) / degrees, (2 / degrees) ** 0.5  # chi-square has mean n and variance 2 n
 
 
-MOST_NAMED = 8  # combinations of unknowns that are told poorly, pairs that correlate
-
-
 @np.errstate(over="ignore", invalid="ignore")
 def text(fit: Estimates) -> str:
     """The text of a fit of one experiment: estimates with their intervals, warnings, what the data do not tell, residuals by channel."""
+    most = 8  # combinations of unknowns that are told poorly, pairs that correlate, pieces of runs
     lines = [
         f"Fit of {type(fit.scene).__name__}: {'converged' if fit.converged else 'NOT CONVERGED'} in {int(fit.steps)} steps; "
         f"{int(fit.samples)} samples, {len(fit.labels)} unknowns, reduced chi-square {float(fit.reduced_chi_square):.4g}"
@@ -192,7 +148,7 @@ def text(fit: Estimates) -> str:
     if fit.grown:
         lines.append("found over growing spans: the first guess led elsewhere")
     if fit.shooting is not None:
-        pieces = " + ".join(map(str, fit.shooting.pieces[:MOST_NAMED])) + (" + ..." if len(fit.shooting.pieces) > MOST_NAMED else "")
+        pieces = " + ".join(map(str, fit.shooting.pieces[:most])) + (" + ..." if len(fit.shooting.pieces) > most else "")
         lines.append(f"found by multiple shooting in {pieces} pieces, which join to {float(fit.shooting.continuity):.1g} of the simulation's tolerance")
     if fit.guesses > 1:
         lines.append(fit.agreement)
@@ -208,8 +164,8 @@ def text(fit: Estimates) -> str:
         lines.append(f"singular values below {fit.cutoff:g} of the largest count as zero:")
         lines += [f"  {sentence}" for sentence in fit.not_identifiable]
     for sentences, what in ((fit.weak, "combinations"), (fit.correlated, "pairs")):
-        lines += [f"  {sentence}" for sentence in sentences[:MOST_NAMED]]
-        lines += [f"  and {len(sentences) - MOST_NAMED} more {what}"] if len(sentences) > MOST_NAMED else []
+        lines += [f"  {sentence}" for sentence in sentences[:most]]
+        lines += [f"  and {len(sentences) - most} more {what}"] if len(sentences) > most else []
     rows = [("run", "channel", "samples", "mean", "rms", "largest residual (in sigmas)")]
     for s in fit.residual_summary():
         rows.append((str(s.run), s.channel, str(s.samples), f"{s.mean:.2g}", f"{s.rms:.3g}", f"{s.largest:.3g}"))

@@ -36,12 +36,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.analysis.arrow import Arrow
 from jourdain_jax.analysis.layout import Layout
+from jourdain_jax.analysis.sensors import gauss_legendre
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.scene.scene import Scene
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
+_NODES, _WEIGHTS = gauss_legendre(40)
 _ARRAYS = ("singular_values", "least_part", "rank", "identifiable", "standard_errors", "shared", "own", "follow")
-_WHOLE = 0.01  # how far from a multiple of one half an exponent may be, to be taken as that, and two changes from being equal
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,7 @@ def students_t_95(degrees):
     n = np.clip(np.asarray(degrees, float), 1.0, 1e7)  # degrees of freedom, beyond which Student's t is normal
     c, a = np.vectorize(lambda x: np.exp(math.lgamma((x + 1) / 2) - math.lgamma(x / 2)) / np.sqrt(np.pi))(n), np.zeros(n.shape)
     for _ in range(12):  # Newton's method, from below: what is integrated falls
-        area = a / 2 * (np.cos(a[..., None] * (_NODES + 1) / 2) ** (n[..., None] - 1) @ _WEIGHTS)
+        area = a * (np.cos(a[..., None] * _NODES) ** (n[..., None] - 1) @ _WEIGHTS)
         a = a + (0.475 / c - area) / np.cos(a) ** (n - 1)
     return np.asarray(np.sqrt(n) * np.tan(a))
 
@@ -197,7 +197,7 @@ def hidden_combinations(directions, least_part, size, values, labels: tuple[str,
 
 def _in_words(row: np.ndarray, relative: np.ndarray, power: np.ndarray, values: np.ndarray, labels: tuple[str, ...]) -> str:
     """`power`: where a power of the unknown may stay as it is along this direction and along all others."""
-    involved = np.flatnonzero(row)
+    involved, close = np.flatnonzero(row), 0.01  # how far an exponent may be from a multiple of one half, and two changes from being equal
     if len(involved) == 1:
         return f"`{labels[involved[0]]}` does not show in any channel"
     names = " and ".join(f"`{labels[i]}`" for i in involved)
@@ -205,11 +205,11 @@ def _in_words(row: np.ndarray, relative: np.ndarray, power: np.ndarray, values: 
     text = f"{names} do not show separately: no channel changes along {changes} = {' : '.join(f'{row[i]:.3g}' for i in involved)}"
     own, others = involved[0], involved[1:]
     exponents = -row[others] / row[own]
-    if power[involved].all() and np.all(np.abs(exponents - np.round(2 * exponents) / 2) < _WHOLE):
-        of_own = ["" if abs(e - 1) < _WHOLE else f"^{e:.3g}" for e in exponents]
+    if power[involved].all() and np.all(np.abs(exponents - np.round(2 * exponents) / 2) < close):
+        of_own = ["" if abs(e - 1) < close else f"^{e:.3g}" for e in exponents]
         return f"{text}; what shows is {', '.join(f'{labels[i]} {labels[own]}{e}' for i, e in zip(others, of_own, strict=True))}"
     moved = np.where(relative, row * values, row)[involved]
-    if len(involved) == 2 and abs(abs(moved[0]) - abs(moved[1])) < _WHOLE * abs(moved[0]):
+    if len(involved) == 2 and abs(abs(moved[0]) - abs(moved[1])) < close * abs(moved[0]):
         return f"{text}; what shows is their {'difference' if moved[0] * moved[1] > 0 else 'sum'}"
     return text
 
@@ -273,14 +273,10 @@ def standard_errors(
 
 
 
-WEAK = 0.1  # relative standard error from which a direction is named
-CORRELATED = 0.98  # from which a pair is
-
-
 def weak_combinations(
     covariance: Float[np.ndarray, "unknowns unknowns"], values: Float[np.ndarray, "unknowns"], sizes: Float[np.ndarray, "unknowns"], labels: tuple[str, ...]
 ) -> tuple[str, ...]:
-    """The directions with a relative standard error of `WEAK` or more, weakest first, one sentence each.
+    """The directions with a relative standard error of 0.1 or more, weakest first, one sentence each.
 
     They are those of the unknowns that runs share, where there are any.
     """
@@ -295,7 +291,7 @@ def weak_combinations(
     found = []
     for k in range(some.size)[::-1]:
         spread = float(np.sqrt(max(squares[k], 0.0)))
-        if spread < WEAK:
+        if spread < 0.1:
             break
         change = spread * directions[:, k] * scale / np.where(is_relative, np.abs(values[some]), 1.0)  # d theta / |theta|, or d theta
         # of the largest entry of a direction: what is less is left out

@@ -86,9 +86,7 @@ class RowsOverStates:
         return LinearRows(A, flat[:rows].T - np.einsum("pij,pj->pi", A, u), N, flat[count : count + len(self.traced.q)].T)
 
 
-INTEGRABLE = 1e-9  # size of dw on the velocities that w admits, relative to the derivatives of w
 STEP = {"float64": 0.02, "float32": 0.1}  # of the differences, along unit directions
-BATCH = 256  # points evaluated together
 
 
 @dataclass(frozen=True)
@@ -122,7 +120,7 @@ def row_integrability(scene: Scene) -> RowIntegrability:
         return RowIntegrability((), (), {})
     t, q, u = (np.asarray(x, float) for x in sample_states(scene, 6))
     forms, derivatives, frames, nonlinear = _forms_at(RowsOverStates(scene), np.concatenate([t[:, None], q], axis=1), u)
-    limit = INTEGRABLE if jnp.result_type(float) == jnp.float64 else 1e-4
+    limit = 1e-9 if jnp.result_type(float) == jnp.float64 else 1e-4
     violations = {}
     for s, name in enumerate(names):
         at_states = zip(forms[:, s], derivatives[:, s], frames, strict=True)
@@ -237,11 +235,10 @@ def _brackets(fields: "_Fields", x: np.ndarray, parts: np.ndarray) -> tuple[np.n
 
     `x` has shape (brackets, coordinates), `parts` (brackets, fields in each, generators): the coefficients of X, Y, ...
     """
-    if len(x) > BATCH:
-        pieces = [_brackets(fields, x[i : i + BATCH], parts[i : i + BATCH]) for i in range(0, len(x), BATCH)]
-        values, sizes = zip(*pieces, strict=True)
-        return np.concatenate(values), np.concatenate(sizes)
-    return _brackets_of(fields, x, *fields(x), parts)
+    together = 256  # points
+    pieces = [(x[i : i + together], parts[i : i + together]) for i in range(0, len(x), together)]
+    values, sizes = zip(*(_brackets_of(fields, some, *fields(some), of) for some, of in pieces), strict=True)
+    return np.concatenate(values), np.concatenate(sizes)
 
 
 def _brackets_of(fields: "_Fields", x: np.ndarray, here: np.ndarray, along: Callable, parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -38,7 +38,6 @@ from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
 _DIAGONAL, _PRODUCTS = ((0, 0), (1, 1), (2, 2)), ((0, 1), (1, 2), (0, 2))
-_ROUND_OFF = 1e-9
 _OTHERWISE = "give its parameters ranges or ties of their own, or make its inertia of `jj.log_cholesky` numbers in the scene"
 
 
@@ -164,17 +163,17 @@ def _found(scene: Scene, name: str) -> tuple[list[Entry], list[Entry | None]]:
     elsewhere = {of: x * (1 + 0.1 * generator.uniform(size=x.shape)) + 0.01 * generator.uniform(size=x.shape) for of, x in values.items()}
     slopes_of = _slopes(name)
     (I, slopes), (I_there, slopes_there) = slopes_of(scene, values), slopes_of(scene, elsewhere)
-    size = np.max(np.abs(I))
+    size, round_off = np.max(np.abs(I)), 1e-9
 
     def entry(i: int, j: int) -> Entry | None:
         where = [(of, index) for of in names for index in np.ndindex(values[of].shape) if slopes[of][(i, j, *index)] or slopes_there[of][(i, j, *index)]]
         if not where:
-            if i != j and abs(I[i, j]) <= _ROUND_OFF * size:
+            if i != j and abs(I[i, j]) <= round_off * size:
                 return None
             raise ValueError(_refusal(scene, name, f"entry {i + 1}{j + 1} of its inertia, {I[i, j]:.4g} kg m^2, is no parameter"))
         of, index = where[0]
         factor = float(slopes[of][(i, j, *index)])
-        straight = all(abs(M[i, j] - factor * x[of][index]) <= _ROUND_OFF * abs(M[i, j]) for M, x in ((I, values), (I_there, elsewhere)))
+        straight = all(abs(M[i, j] - factor * x[of][index]) <= round_off * abs(M[i, j]) for M, x in ((I, values), (I_there, elsewhere)))
         if len(where) > 1 or not straight:
             parts = ", ".join(f"`{of}`" for of in dict.fromkeys(of for of, _ in where))
             raise ValueError(_refusal(scene, name, f"entry {i + 1}{j + 1} of its inertia is made of {parts}, expected one parameter times a constant"))
@@ -288,18 +287,14 @@ class Layout:
     def scene(self, scene: Scene, shared: Float[Array | np.ndarray, "*members shared"]) -> Scene:
         """The scene with these shared unknowns."""
         leaves, treedef = jax.tree.flatten(scene)
-        return jax.tree.unflatten(treedef, [x if x is own else jnp.asarray(x) for x, own in zip(self.leaves(leaves, treedef, shared), leaves, strict=True)])
-
-    def leaves(self, leaves: list, treedef, shared: Float[Array | np.ndarray, "*members shared"]) -> list:
-        """The leaves of a scene, with these shared unknowns in their places."""
-        found = list(leaves)
+        found, names = list(leaves), jax.tree.unflatten(treedef, range(treedef.num_leaves))  # which leaf each parameter is
         for place in self.shared:
             if place.kind == "scene":
-                found[_leaf(treedef, place.name)] = place.of(shared)
+                found[getattr(names, place.name)] = place.of(shared)
         of_bodies = {place.name: place.of(shared) for place in self.shared if place.kind == "inertia"}
         for body in self.bodies:
             for entry, value in zip(body.entries, body.values(*map(of_bodies.get, body.labels)), strict=True):
-                leaf = _leaf(treedef, entry.name)
+                leaf = getattr(names, entry.name)
                 own = jnp.broadcast_to(found[leaf], value.shape + jnp.shape(leaves[leaf]))
                 found[leaf] = own.at[(..., *entry.index)].set(value)
         for tie in self.ties:
@@ -307,8 +302,8 @@ class Layout:
             function, axes = tie.value, [0 if np.ndim(x) > np.ndim(own) else None for x, own in zip(found, leaves, strict=True)]
             for _ in shared.shape[:-1]:
                 function = jax.vmap(function, in_axes=(axes,))
-            found[_leaf(treedef, tie.name)] = function(found)
-        return found
+            found[getattr(names, tie.name)] = function(found)
+        return jax.tree.unflatten(treedef, [x if x is own else jnp.asarray(x) for x, own in zip(found, leaves, strict=True)])
 
     def start(self, start: dict, local: Float[Array | np.ndarray, "*members local"]) -> dict:
         """The start of a run with these unknowns of its own."""
@@ -322,8 +317,3 @@ class Layout:
     def known(self, shared, local) -> dict[str, Array | np.ndarray]:
         """Numbers of sensors and actuators by name, of one run."""
         return {place.name: place.of(vector) for places, vector in ((self.shared, shared), (self.local, local)) for place in places if place.of_sensor}
-
-
-def _leaf(treedef, name: str) -> int:
-    """Which leaf of a scene the parameter of this name is."""
-    return getattr(jax.tree.unflatten(treedef, range(treedef.num_leaves)), name)

@@ -21,8 +21,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jourdain_jax.analysis.arrow import Arrow, ByMember, ByUnknown, Flags, PerMember
+from jourdain_jax.analysis.unknowns import Unknowns
 
-LEAST, MOST = 1e-9, 1e9  # damping lambda: at least, and where no step is found
+LEAST = 1e-9  # damping lambda
 
 
 @dataclass
@@ -35,20 +36,6 @@ class Linearised(ByMember):
     sigma: Float[np.ndarray, "members channels"]  # of channels whose noise is estimated
     triangles: Float[np.ndarray, "members runs kinds width width"]  # of [J r]: of channels whose sigma is known, then of each other
     squares: Float[np.ndarray, "members kinds"]  # sums of squared residuals of these
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What steps may do; all of shape (unknowns,)."""
-
-    low: Float[np.ndarray, "unknowns"]
-    high: Float[np.ndarray, "unknowns"]
-    fixed: Bool[np.ndarray, "unknowns"]
-    size: Callable  # theta -> magnitude of each unknown
-
-    def reached(self, theta: ByUnknown) -> Bool[np.ndarray, "members unknowns"]:
-        """Which unknowns lie at a bound."""
-        return ((theta <= self.low) | (theta >= self.high)) & ~self.fixed
 
 
 @dataclass(frozen=True)
@@ -144,7 +131,7 @@ class Way:
         return Minimum(self.theta, self.at, self.converged, self.stuck, self.steps, np.zeros(len(self.theta), bool), trace)
 
 
-def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: ByUnknown, limits: Limits, control: Control, what: str = "") -> Minimum:
+def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: ByUnknown, unknowns: Unknowns, control: Control, what: str = "") -> Minimum:
     """Minimise from `theta`. `evaluate(theta, members)`: value and slopes of the members with these numbers; `what`: says in the trace what is minimised."""
     way = Way.begun(theta, evaluate(theta, np.arange(len(theta))))
     full = np.ones(len(theta))
@@ -153,13 +140,13 @@ def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: By
         here, arrow, x = way.here()
         if not here.size:
             break
-        size = limits.size(x)
+        size = unknowns.sizes(x)
         scaling = column_scaling(arrow, size)
-        d = damped_step(arrow, x, scaling, damping[here], limits, control.cutoff)
+        d = damped_step(arrow, x, scaling, damping[here], unknowns, control.cutoff)
         change = arrow.change(d)
         done = is_small(change, size, d, control)
         if (done & (damping[here] > LEAST)).any():
-            undamped = damped_step(arrow, x, scaling, np.full(here.size, LEAST), limits, control.cutoff)
+            undamped = damped_step(arrow, x, scaling, np.full(here.size, LEAST), unknowns, control.cutoff)
             done &= is_small(arrow.change(undamped), size, undamped, control)
         slope = -np.einsum("bi,bi->b", arrow.gradient, d)
         here, x, d, change, slope = way.arrived(here, done), x[~done], d[~done], change[~done], slope[~done]
@@ -175,7 +162,7 @@ def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: By
         fall[here] = np.where(better, np.minimum(1.5 * fall[here], 10.0), 2.0)
         growth[here] = np.where(better, 4.0, 2 * growth[here])
         way.go(here, x + d, trial, better)
-        way.give_up(damping > MOST)
+        way.give_up(damping > 1e9)
         if control.patience is not None:
             late = [b for b in here.tolist() if len(way.costs[b]) > control.patience]
             way.going[[b for b in late if way.costs[b][-1] > max(control.near, 0.25 * way.costs[b][-1 - control.patience])]] = False
@@ -194,14 +181,6 @@ def fallen(before: Float[np.ndarray, "some"], trial: Linearised, d: ByUnknown, s
     return np.where(unsure, by_slopes, found)
 
 
-def minimum_beside(evaluate: Callable, theta: Float[np.ndarray, "1 unknowns"], place: int, value: float, limits: Limits, control: Control) -> Minimum:
-    """The minimum over all unknowns but one, which is held at this value; to one per cent of a standard error."""
-    begin, fixed = np.clip(theta, limits.low, limits.high), limits.fixed.copy()
-    begin[0, place], fixed[place] = value, True
-    # standard errors: tolerance where the value of F matters, not the place
-    return minimise(evaluate, begin, replace(limits, fixed=fixed), replace(control, tolerance=max(control.tolerance, 1e-2)))
-
-
 def column_scaling(arrow: Arrow, size: ByUnknown) -> ByUnknown:
     """D: lengths of the columns of J, and something positive for those that count as zero: times the sizes of their unknowns, by the longest."""
     norms = arrow.column_norms
@@ -213,21 +192,21 @@ def column_scaling(arrow: Arrow, size: ByUnknown) -> ByUnknown:
     return np.where(D > 0, D, 1.0)
 
 
-def damped_step(arrow: Arrow, theta, D, damping, limits: Limits, cutoff: float) -> np.ndarray:
+def damped_step(arrow: Arrow, theta, D, damping, unknowns: Unknowns, cutoff: float) -> np.ndarray:
     """The damped step within the bounds."""
     # an unknown whose bound is above zero shrinks to a tenth at most in one step: with far smaller masses and lengths, motions take long
-    g, low = arrow.gradient, np.where(limits.low > 0, np.maximum(limits.low, 0.1 * theta), limits.low)
-    held = limits.fixed | ((theta <= limits.low) & (g >= 0)) | ((theta >= limits.high) & (g <= 0))
+    g, low = arrow.gradient, np.where(unknowns.low > 0, np.maximum(unknowns.low, 0.1 * theta), unknowns.low)
+    held = unknowns.fixed | ((theta <= unknowns.low) & (g >= 0)) | ((theta >= unknowns.high) & (g <= 0))
     moved = np.zeros(theta.shape)
     for _ in range(8):
         d = arrow.step(damping, D, held, moved, cutoff)
         ended = theta + d
-        within = np.minimum(np.maximum(ended, low), limits.high)
+        within = np.minimum(np.maximum(ended, low), unknowns.high)
         over = (within != ended) & ~held
         if not over.any():
             return d
         held, moved = held | over, np.where(over, within - theta, moved)
-    return np.clip(theta + d, low, limits.high) - theta
+    return np.clip(theta + d, low, unknowns.high) - theta
 
 
 def is_small(change, size, d, control: Control) -> Flags:

@@ -46,9 +46,6 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines, users_level
 
-_BEYOND = 1.5  # intervals between samples, that an end may be away from that of a run
-_TURN = 2 * np.pi
-
 
 def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> tuple[str, ...]:
     """One sentence for each, of runs that were `checked`; traced numbers are not looked at. `repeats`: values have a leading axis, and the first one counts."""
@@ -70,9 +67,9 @@ def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: fl
 
     The last interval may be a jump, such as those of commands that are held; then the one before it counts.
     """
-    intervals = np.diff(ts)
-    spans = [f"its first value until {ts[0]:.6g} s"] if ts[0] - begin > _BEYOND * intervals[0] else []
-    spans += [f"its last value from {ts[-1]:.6g} to {end:.6g} s"] if end - ts[-1] > _BEYOND * max(intervals[-2:]) else []
+    intervals, beyond = np.diff(ts), 1.5  # intervals, that an end may be away from that of a run
+    spans = [f"its first value until {ts[0]:.6g} s"] if ts[0] - begin > beyond * intervals[0] else []
+    spans += [f"its last value from {ts[-1]:.6g} to {end:.6g} s"] if end - ts[-1] > beyond * max(intervals[-2:]) else []
     if spans:
         yield (
             f"{what} is not sampled over all of the run and keeps {' and '.join(spans)}; if it did so, repeat that value in its samples, otherwise give more "
@@ -91,13 +88,13 @@ def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: fl
 
 def _of_angle(what: str, values: Float[np.ndarray, "times"], ts: Float[np.ndarray, "times"]) -> Iterator[str]:
     """Where values lie in [-pi, pi] or [0, 2 pi], and neighbours are nearly one turn apart, but near each other without it."""
-    known = np.isfinite(values)
+    known, turn = np.isfinite(values), 2 * np.pi
     x, t = values[known], ts[known]
-    if x.size < 2 or not any(low <= x.min() and x.max() <= low + _TURN for low in (-np.pi, 0.0)):
+    if x.size < 2 or not any(low <= x.min() and x.max() <= low + turn for low in (-np.pi, 0.0)):
         return
     steps = np.diff(x)
-    (jumps,) = np.nonzero(np.abs(steps) > 0.75 * _TURN)
-    if jumps.size and np.max(np.abs(steps - _TURN * np.round(steps / _TURN))) < 0.25 * _TURN:
+    (jumps,) = np.nonzero(np.abs(steps) > 0.75 * turn)
+    if jumps.size and np.max(np.abs(steps - turn * np.round(steps / turn))) < 0.25 * turn:
         yield (
             f"{what} jumps by {steps[jumps[0]]:.3g} at {t[jumps[0] + 1]:.6g} s and stays within one turn: an angle that was wrapped, where coordinates go on; "
             "give `np.unwrap` of it"
@@ -302,12 +299,11 @@ def planned_information(
             raise ValueError(f"the noise of channel `{name}` has a correlation time, of which a plan knows nothing; leave it out")
     numbers = [eqx.tree_at(lambda r: r.start, run, {n: np.zeros(x.shape) if is_traced(x) else x for n, x in run.start.items()}) for run in runs]
     unknowns = unknowns_of(with_reference_parameters(scene), numbers, free)
-    places, count = unknowns.estimated, unknowns.layout.sizes[0]
+    places = unknowns.estimated
     ready = tuple(run_of(run, array_module((run.values, run.sigma))) for run in runs)
     theta = _values(scene, runs, unknowns)
     F, J = _sensitivities(scene, ready, theta, settled, unknowns.layout, tuple(places.tolist()), Reference(scene))
-    prior = np.diag(1 / np.where(np.isfinite(unknowns.prior_mean[places]), unknowns.prior_sigma[places], np.inf))
-    prior[:count] = unknowns.whitening @ prior[:count]  # all that are shared are estimated
+    prior = unknowns.prior_rows
     return PlannedInformation(F + prior.T @ prior, theta[places], J, unknowns.labels, unknowns.units)
 
 

@@ -37,7 +37,6 @@ from jourdain_jax.scene.parameters import Scalar
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
-_INSIDE = 0.02  # of the width of a range: the least distance from its ends of the centre of a whitened density
 Point = Float[Array, "unknowns"]
 
 
@@ -53,9 +52,9 @@ class LogDensity(eqx.Module):
     fixed: Float[np.ndarray, "places"]  # the first guess, and what is known, of all places of a layout
     transforms: Transforms
     guess: Float[np.ndarray, "unknowns"]  # in their units
-    prior_mean: Float[np.ndarray, "unknowns"]
-    prior_sigma: Float[np.ndarray, "unknowns"]  # infinite where nothing is known beforehand
-    whitening: Float[np.ndarray, "shared shared"]  # of priors of the first unknowns, which all runs share: see `joint_prior`
+    prior_mean: Float[np.ndarray, "places"]
+    prior_rows: Float[np.ndarray, "places places"]  # of priors: see `Unknowns`
+    prior_height: float  # logarithm of what all priors are at most
     centre: Float[np.ndarray, "unknowns"]
     factor: Float[np.ndarray, "unknowns unknowns"]  # lower triangular
     labels: tuple[str, ...] = eqx.field(static=True)
@@ -75,14 +74,10 @@ class LogDensity(eqx.Module):
         x = self._spread(z)
         inner = self.transforms.constrain(x)
         theta = self._told(inner)
-        known = jnp.where(jnp.isfinite(self.prior_sigma), (theta - self.prior_mean) / self.prior_sigma, 0.0)
-        shared = len(self.whitening)
-        known = jnp.concatenate([self.whitening @ known[:shared], known[shared:]])
-        logs = self.transforms.log_slopes(x)
-        logs = logs - 0.5 * known**2 - jnp.where(jnp.isfinite(self.prior_sigma), jnp.log(self.prior_sigma * jnp.sqrt(2 * jnp.pi)), 0.0)
-        # of a sigma: flat in its logarithm, which is x
         count, end = len(self.places), len(self.places) + len(self.sigmas)
-        logs = jnp.sum(logs[:count]) + jnp.sum(logs[end:]) + jnp.sum(jnp.log(jnp.diagonal(self.factor))) + jnp.linalg.slogdet(self.whitening)[1]
+        slopes, known = self.transforms.log_slopes(x), self.prior_rows @ (theta[:count] - self.prior_mean)
+        # of a sigma: flat in its logarithm, which is x
+        logs = jnp.sum(slopes[:count]) + jnp.sum(slopes[end:]) + jnp.sum(jnp.log(jnp.diagonal(self.factor))) + self.prior_height - 0.5 * known @ known
         shared, local = self._split(theta)
         scene, sigma = self.layout.scene(self.scene, shared), dict(zip(self.sigmas, theta[count:end], strict=True))
         tau = dict(zip(self.with_memory, theta[end:], strict=True))
@@ -146,7 +141,7 @@ class LogDensity(eqx.Module):
         theta = np.array(self._inner(jnp.asarray(np.concatenate([fit.values, noise]))))
         last = slice(len(theta) - len(self.with_memory), None)
         low, high = self.transforms.low[last], self.transforms.high[last]
-        theta[last] = np.clip(theta[last], low + _INSIDE * (high - low), high - _INSIDE * (high - low))  # a correlation time may be at an end
+        theta[last] = np.clip(theta[last], 0.98 * low + 0.02 * high, 0.02 * low + 0.98 * high)  # a correlation time may be at an end
         x = self.transforms.unconstrain(jnp.asarray(theta))
         slopes = np.exp(-np.asarray(self.transforms.log_slopes(x)))
         covariance = np.zeros((len(theta), len(theta)))
@@ -231,8 +226,7 @@ def log_density(
         guesses = [_rms(scene, [group for _, group in grouped if name in group.weights], name, settled) for name in sigmas]
     guesses += (intervals / np.log(2)).tolist()  # neighbouring samples correlate by a half
     places = unknowns.estimated
-    known, size = np.isfinite(unknowns.prior_mean[places]), len(places) + len(guesses)
-    with_noise = lambda x, of_noise: np.concatenate([x, np.full(len(guesses), of_noise)])  # noqa: E731
+    size, weights = len(places) + len(guesses), unknowns.prior_weight[unknowns.prior_weight > 0]
     return LogDensity(
         scene=scene,
         groups=tuple(group for _, group in grouped),
@@ -240,9 +234,9 @@ def log_density(
         fixed=unknowns.guess,
         transforms=Transforms([*(unknowns.ranges[place] for place in places), *(positive() for _ in sigmas), *angles]),
         guess=np.concatenate([unknowns.guess[places], guesses]),
-        prior_mean=with_noise(np.where(known, unknowns.prior_mean[places], 0.0), 0.0),
-        prior_sigma=with_noise(np.where(known, unknowns.prior_sigma[places], np.inf), np.inf),
-        whitening=unknowns.whitening,
+        prior_mean=unknowns.prior_mean[places],
+        prior_rows=unknowns.prior_rows,
+        prior_height=float(np.sum(np.log(weights / np.sqrt(2 * np.pi))) + np.linalg.slogdet(unknowns.whitening)[1]),
         centre=np.zeros(size),
         factor=np.eye(size),
         labels=(*unknowns.labels, *(f"{name}.sigma" for name in sigmas), *(f"{name}.correlation_time" for name in with_memory)),

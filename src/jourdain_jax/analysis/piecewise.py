@@ -20,12 +20,10 @@ from jourdain_jax.analysis.estimate import unbounded
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.layout import Place
 from jourdain_jax.analysis.levenberg_marquardt import Linearised
-from jourdain_jax.analysis.problem import Loss, Problem, closed
+from jourdain_jax.analysis.problem import Asked, Problem, closed
 from jourdain_jax.analysis.runs import Lanes, Some
-from jourdain_jax.analysis.shooting import NODE, MultipleShooting, ends_of_pieces, in_pieces, numbers_of_filters, owned
+from jourdain_jax.analysis.shooting import NODE, ends_of_pieces, in_pieces, numbers_of_filters, owned
 from jourdain_jax.analysis.unknowns import Unknowns
-from jourdain_jax.motion.options import AllOptions
-from jourdain_jax.scene.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +51,11 @@ class _Standing(ByMember):
 class Piecewise(Lanes):
     """Whole runs that are worked out in pieces, and the problem with nodes as unknowns."""
 
-    def __init__(self, scene: Scene, runs: tuple[Experiment, ...], unknowns: Unknowns, options: AllOptions, shooting: MultipleShooting):
-        layout = unknowns.layout
+    def __init__(self, asked: Asked, runs: tuple[Experiment, ...], unknowns: Unknowns):
+        scene, layout, options, shooting = asked.scene, unknowns.layout, asked.options, asked.shooting
+        assert shooting is not None
         super().__init__(scene, runs, layout, options)
-        self.scene, self.runs, self.unknowns = scene, runs, unknowns
+        self.asked, self.runs, self.unknowns = asked, runs, unknowns
         of_runs = [len(scene.coordinate_names) + len(scene.speed_names) + numbers_of_filters(run) for run in runs]
         self.states = max(of_runs)  # of a node; zero where a run has fewer low-passes than another
         self.ends_of = [ends_of_pieces(run, shooting, index) for index, run in enumerate(runs)]
@@ -79,14 +78,14 @@ class Piecewise(Lanes):
 
     # With nodes as unknowns. ----------------------------------------------------------------------------------------
 
-    def problem(self, loss: Loss) -> Problem:
+    def problem(self) -> Problem:
         """The problem of pieces whose starts have nothing to do with each other."""
         whole, free = self.unknowns, unbounded(1.0)
         ranges = self._each(np.array(whole.ranges, object), free, free, np.array([unbounded(float(size)) for size in self.node_sizes], object))
-        means, sigmas = (self._each(x, np.nan, np.nan, np.nan, carried=False) for x in (whole.prior_mean, whole.prior_sigma))
+        means, weights = (self._each(x, 0.0, 0.0, 0.0, carried=False) for x in (whole.prior_mean, whole.prior_weight))
         fixed, guess = self._each(whole.fixed, True, True, False), self.spread(whole.guess)
-        unknowns = Unknowns(self.layout, len(self.parts), guess, fixed, tuple(ranges), (), (), means, sigmas, whole.whitening)
-        return Problem(self.scene, self.parts, unknowns, self.lanes, loss)
+        unknowns = Unknowns(self.layout, len(self.parts), guess, fixed, tuple(ranges), (), (), means, weights, whole.whitening)
+        return Problem(self.asked, self.parts, unknowns, self.lanes)
 
     def spread(self, theta: Float[np.ndarray, "*members places"]) -> Float[np.ndarray, "*members all_places"]:
         """Unknowns of whole runs as those of all pieces, with nodes at zero."""
@@ -292,9 +291,7 @@ class Piecewise(Lanes):
         return np.concatenate(of_piece), np.concatenate(of_run)
 
 
-def problem_of(
-    scene: Scene, runs: tuple[Experiment, ...], unknowns: Unknowns, options: AllOptions, members: int | None, loss: Loss, shooting: MultipleShooting | None
-) -> tuple[Problem, Piecewise | None]:
-    """Return the problem of these runs; where `shooting` says so, what works them out in pieces, too."""
-    pieces = None if shooting is None else Piecewise(scene, runs, unknowns, options, shooting)
-    return Problem(scene, runs, unknowns, pieces or Lanes(scene, runs, unknowns.layout, options, members), loss), pieces
+def problem_of(asked: Asked, runs: tuple[Experiment, ...], unknowns: Unknowns, members: int | None = None) -> tuple[Problem, Piecewise | None]:
+    """Return the problem of these runs; where multiple shooting is asked for, what works them out in pieces, too."""
+    pieces = None if asked.shooting is None else Piecewise(asked, runs, unknowns)
+    return Problem(asked, runs, unknowns, pieces or Lanes(asked.scene, runs, unknowns.layout, asked.options, members)), pieces

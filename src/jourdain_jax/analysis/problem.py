@@ -16,8 +16,8 @@ Source: P. J. Huber and E. M. Ronchetti, Robust Statistics, 2nd ed. (2009), sect
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -25,10 +25,12 @@ from jaxtyping import Bool, Float
 from jourdain_jax.analysis.arrow import Arrow, ByMember, PerMember, arrow, triangle, with_prior
 from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits, half_log_determinant, lowest
 from jourdain_jax.analysis.experiment import Experiment
-from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Linearised, Minimum, minimise
+from jourdain_jax.analysis.levenberg_marquardt import Control, Linearised, Minimum, minimise
 from jourdain_jax.analysis.runs import Lanes, Some, Taus
+from jourdain_jax.analysis.shooting import MultipleShooting
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.calculus.reals import Number, checked_real
+from jourdain_jax.motion.options import AllOptions
 from jourdain_jax.scene.scene import Scene
 
 
@@ -105,6 +107,20 @@ def _positive(x: Number, name: str, function: str) -> float:
     return float(x)
 
 
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """Arguments of a fit, without its data, stored with the result so that it can be resumed."""
+
+    scene: Scene  # with the first guesses
+    free: Mapping | tuple[str, ...]
+    options: AllOptions
+    loss: Loss
+    control: Control
+    errors: str  # whence standard errors come: "sigmas" or "runs"
+    guesses: int  # first guesses to try
+    shooting: MultipleShooting | None
+
+
 @dataclass(frozen=True)
 class Span(ByMember):
     """The first part of all runs. The first guess is a weak prior, known to its own size: what so few samples do not tell stays there."""
@@ -114,23 +130,21 @@ class Span(ByMember):
 
 
 class Problem:
-    """Residuals with their derivatives, of any members at any numbers."""
+    """What a fit was asked of its runs: residuals with their derivatives, of any members at any numbers."""
 
-    def __init__(self, scene: Scene, runs: tuple[Experiment, ...], unknowns: Unknowns, lanes: Lanes, loss: Loss):
-        self.scene, self.runs, self.unknowns, self.lanes, self.loss, self.single = scene, runs, unknowns, lanes, loss, lanes.single
+    def __init__(self, asked: Asked, runs: tuple[Experiment, ...], unknowns: Unknowns, lanes: Lanes):
+        self.asked, self.runs, self.unknowns, self.lanes = asked, runs, unknowns, lanes
+        self.scene, self.loss, self.single = asked.scene, asked.loss, lanes.single
         self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))  # channels whose sigma is
         largest = [max(float(np.nanmax(np.abs(run.values[name]))) for run in runs if name in run.values) for name in self.estimated]
         self.least_sigma = 1e-10 * np.array([x or 1.0 for x in largest])  # sigma of each of these: of one that is met exactly
         self.with_memory = tuple(sorted({name for run in runs for name in run.unknown_correlation}))  # channels whose correlation time is estimated
         self.tau = np.zeros((lanes.count, len(self.with_memory)))  # s, of these: at first as if their noise were white
+        self.failed = False  # whether a motion has
 
     def taus(self, members: np.ndarray) -> dict[str, np.ndarray]:
         """Correlation times of some members, by channel, s."""
-        return dict(zip(self.with_memory, self.tau[self._own(members)].T, strict=True)) if self.with_memory else {}
-
-    def _own(self, members: np.ndarray) -> np.ndarray:
-        """Where numbers of these members are in what is kept by member: in the first place, if the runs have no repeats."""
-        return 0 * members if self.single else members
+        return dict(zip(self.with_memory, self.tau[members % self.lanes.count].T, strict=True)) if self.with_memory else {}
 
     def linearised(self, theta: np.ndarray, members: np.ndarray, span: Span | None = None) -> Linearised:
         """Return what is minimised, with its arrow, of some members, over all of the runs or a span of them."""
@@ -139,9 +153,19 @@ class Problem:
     def evaluated(self, theta: np.ndarray, members: np.ndarray) -> Iterator[Some]:
         return self.lanes.evaluate(*self.unknowns.split(theta), members)
 
-    def minimum(self, theta: np.ndarray, members: np.ndarray, limits: Limits, control: Control, what: str, span: Span | None = None) -> Minimum:
-        """Return the minimum of some members, from theta."""
-        return minimise(lambda x, here: self.linearised(x, members[here], span and span.of(here)), theta, limits, control, what)
+    def minimum(self, theta: np.ndarray, members: np.ndarray, what: str = "", control: Control | None = None, span: Span | None = None) -> Minimum:
+        """Return the minimum of some members, from theta. `control`: other than that of the fit."""
+        evaluate = lambda x, here: self.linearised(x, members[here], span and span.of(here))  # noqa: E731
+        return minimise(evaluate, theta, self.unknowns, control or self.asked.control, what)
+
+    def beside(self, theta: Float[np.ndarray, "1 places"], member: int, place: int, value: float) -> Minimum:
+        """Return the minimum over all unknowns but one, which is held at this value; to one per cent of a standard error."""
+        unknowns, control, fixed = self.unknowns, self.asked.control, self.unknowns.fixed.copy()
+        begin = np.clip(theta, unknowns.low, unknowns.high)
+        begin[0, place], fixed[place] = value, True
+        # standard errors: tolerance where the value of F matters, not the place
+        roughly = replace(control, tolerance=max(control.tolerance, 1e-2))
+        return minimise(lambda x, _: self.linearised(x, np.array([member])), begin, replace(unknowns, fixed=fixed), roughly)
 
     def assembled(self, theta: np.ndarray, members: np.ndarray, evaluated: Iterable[Some], taus: Taus, span: Span | None = None) -> Linearised:
         """What is minimised, from what was evaluated; `taus`: correlation times by channel."""
@@ -172,7 +196,7 @@ class Problem:
             cost = costs.sum(axis=1)
             if not math.isfinite(triangles.sum() + cost.sum()):
                 failed = ~np.isfinite(triangles.sum(axis=(1, 2, 3, 4)) + cost)
-                triangles[failed], cost[failed] = 0.0, np.inf
+                triangles[failed], cost[failed], self.failed = 0.0, np.inf, True
         if kinds > 1:
             samples = self.lanes.counted(self.estimated, members)
             sigma = np.sqrt(np.maximum(squares[:, 1:] / np.maximum(samples, 1), self.least_sigma**2))
@@ -188,14 +212,14 @@ class Problem:
         if kinds > 1 or np.any(sigma != 1):
             together = np.linalg.qr((triangles / sigma[:, None, :, None, None]).reshape(count, runs, -1, m + p + 1), mode="r")
         whole = arrow(together, m if runs > 1 else 0)
-        if span is None and not self.unknowns.with_prior.size:
-            return whole, 0.0
-        mean, spread = (np.broadcast_to(x, theta.shape) for x in (self.unknowns.prior_mean, self.unknowns.prior_sigma))
+        unknowns, mean, weight = self.unknowns, self.unknowns.prior_mean, self.unknowns.prior_weight
         if span is not None:
-            none = ~np.isfinite(mean) & ~self.unknowns.fixed
-            mean, spread = np.where(none, span.begun, mean), np.where(none, self.unknowns.sizes(span.begun), spread)
-        r, M = np.where(np.isfinite(mean), (theta - mean) / spread, 0.0), self.unknowns.whitening
-        return with_prior(whole, r, mean, spread, M), 0.5 * (np.sum((r[:, :p] @ M.T) ** 2, axis=1) + np.sum(r[:, p:] ** 2, axis=1))
+            none = (weight == 0) & ~unknowns.fixed
+            mean, weight = np.where(none, span.begun, mean), np.where(none, 1 / unknowns.sizes(span.begun), weight)
+        elif not weight.any():
+            return whole, 0.0
+        r, M = (theta - mean) * weight, unknowns.whitening
+        return with_prior(whole, r, weight, M), 0.5 * (np.sum((r[:, :p] @ M.T) ** 2, axis=1) + np.sum(r[:, p:] ** 2, axis=1))
 
     def is_followed(self, at: Linearised, shares: Float[np.ndarray, "shares"], most: float) -> Bool[np.ndarray, "members shares"]:
         """Over which shares of the span the squares of residuals are on average at most so many times those of noise."""
@@ -223,7 +247,7 @@ class Problem:
             found, interval = np.exp(lowest(tried, *edges)), low / SHORTEST
             changed = np.maximum(changed, np.abs(np.exp(-interval / found) - np.exp(-interval / taus[name])))
             taus[name] = found
-        self.tau[self._own(members)] = np.stack(list(taus.values()), axis=1)
+        self.tau[members % self.lanes.count] = np.stack(list(taus.values()), axis=1)
         return changed
 
     def _limits(self, name: str) -> tuple[float, float]:

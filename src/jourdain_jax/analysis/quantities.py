@@ -42,8 +42,6 @@ from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.names_read import is_function, now_read_by
 from jourdain_jax.scene.scene import Scene
 
-MOST = 256  # functions whose trace is kept
-
 
 class Channel(eqx.Module):
     """A function of a motion as it was when it was given."""
@@ -71,7 +69,7 @@ def channel(function: Callable, scene: Scene) -> Channel:
     return found
 
 
-@lru_cache(maxsize=MOST)
+@lru_cache(maxsize=256)
 def _kept(function: Callable) -> dict:
     return {}
 

@@ -25,45 +25,31 @@ one before it ended. Correlation times are held. Source: D. J. Venzon and S. H. 
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.analysis.estimates import Asked, Estimates
+from jourdain_jax.analysis.estimates import Estimates
 from jourdain_jax.analysis.experiment import Data, Experiment
 from jourdain_jax.analysis.information import Information, information, variances
-from jourdain_jax.analysis.levenberg_marquardt import Limits, Linearised, minimise, minimum_beside
 from jourdain_jax.analysis.likelihood import as_runs
 from jourdain_jax.analysis.piecewise import Piecewise, problem_of
-from jourdain_jax.analysis.problem import Problem
+from jourdain_jax.analysis.problem import Asked, Problem
 from jourdain_jax.analysis.spread import RISE_95
 from jourdain_jax.analysis.unknowns import unknowns_of
 from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.printing import Printed
 
 
-@dataclass
 class TakenUp:
-    """A fit taken up again, for the runs it was fitted to or for others."""
+    """A fit taken up again at theta, (1, places), for the runs it was fitted to or for others."""
 
-    asked: Asked
-    problem: Problem
-    theta: Float[np.ndarray, "1 places"]
-    limits: Limits
-    pieces: Piecewise | None
-
-    @cached_property
-    def at(self) -> Linearised:
-        """What is minimised, at theta."""
-        return self.evaluate(self.theta, np.array([0]))
-
-    def evaluate(self, theta: np.ndarray, members: np.ndarray) -> Linearised:
-        """What is minimised, at any numbers."""
-        return self.problem.linearised(theta, members)
+    def __init__(self, problem: Problem, theta: np.ndarray):
+        self.problem, self.theta = problem, theta
+        self.at = problem.linearised(theta, np.array([0]))
 
     def residuals(self, run: int) -> dict[str, np.ndarray]:
         """Residuals of a run by channel, in units of sigma, at theta; NaN where a sample is missing."""
@@ -73,19 +59,20 @@ class TakenUp:
         """What the data tell at theta, from the sigmas alone: no factor for the loss, for sigmas that are estimated, or from how runs differ."""
         unknowns, theta = self.problem.unknowns, self.theta
         size, fails = unknowns.sizes(theta), ~np.isfinite(self.at.cost)
-        return information(self.at.arrow, size, unknowns.estimated, self.limits.reached(theta), fails, self.asked.control.cutoff).only()
+        return information(self.at.arrow, size, unknowns.estimated, unknowns.reached(theta), fails, self.problem.asked.control.cutoff).only()
 
 
 def taken_up(fit: Estimates, data: Data) -> TakenUp:
     """A `Fit` of one experiment where it ended, with residuals and derivatives computed anew. ValueError where `data` are not what it was fitted to."""
-    again = for_runs(fit, data, fitted=True)
-    unknowns = again.problem.unknowns
+    problem, pieces = for_runs(fit, data, fit.asked)
+    unknowns, theta = problem.unknowns, problem.unknowns.guess[None].copy()
     if unknowns.labels != fit.labels:
         raise ValueError(f"`data` have the unknowns {', '.join(unknowns.labels)}, expected those of the fit: {', '.join(fit.labels)}")
-    again.theta[0, unknowns.estimated] = fit.values
-    if again.pieces is not None and fit.shooting is not None:
-        again.pieces.put_nodes(again.theta, fit.shooting)
-    sigma = dict(zip(again.problem.estimated, again.at.sigma[0].tolist(), strict=True))  # as F has it; that of a fit allows for its unknowns
+    theta[0, unknowns.estimated] = fit.values
+    if pieces is not None and fit.shooting is not None:
+        pieces.put_nodes(theta, fit.shooting)
+    again = TakenUp(problem, theta)
+    sigma = dict(zip(problem.estimated, again.at.sigma[0].tolist(), strict=True))  # as F has it; that of a fit allows for its unknowns
 
     def here(run: int, name: str) -> np.ndarray:
         return np.nan_to_num(again.residuals(run).get(name, np.nan)) * (sigma.get(name, 1.0) / fit.sigma.get(name, 1.0))
@@ -96,18 +83,14 @@ def taken_up(fit: Estimates, data: Data) -> TakenUp:
     return again
 
 
-def for_runs(fit: Estimates, runs: Data, fitted: bool = False) -> TakenUp:
-    """The problem of a `Fit` for these runs, at the first guesses; ValueError where they do not fit the scene.
-
-    `fitted`: they are those of the fit, in pieces where it was found so.
-    """
-    asked = fit.asked
+def for_runs(fit: Estimates, runs: Data, asked: Asked) -> tuple[Problem, Piecewise | None]:
+    """The problem of a `Fit` for these runs, and what works them out in pieces; ValueError where they do not fit the scene."""
     checked = as_runs(asked.scene, runs)
     unknowns = unknowns_of(asked.scene, checked, asked.free)
-    problem, pieces = problem_of(asked.scene, checked, unknowns, asked.options, None, asked.loss, asked.shooting if fitted else None)
+    problem, pieces = problem_of(asked, checked, unknowns)
     if problem.with_memory:
         problem.tau = np.array([[float(fit.correlation_time[name]) for name in problem.with_memory]])
-    return TakenUp(asked, problem, unknowns.guess[None].copy(), Limits(*unknowns.ends, unknowns.fixed.copy(), unknowns.sizes), pieces)
+    return problem, pieces
 
 
 class Prediction(Printed, eqx.Module):
@@ -148,19 +131,20 @@ def of_fitted(fit: Estimates, runs: Sequence[Experiment]) -> tuple[dict[str, Pre
 def of_held_out(fit: Estimates, runs: Data) -> tuple[dict[str, Prediction], ...]:
     """Predictions of other runs; ValueError where they do not fit the scene, or share unknowns that the fit did not estimate."""
     runs = (runs,) if isinstance(runs, Experiment) else tuple(runs)
-    other = for_runs(fit, runs)
-    unknowns, shared = other.problem.unknowns, other.problem.unknowns.layout.sizes[0]
+    problem, _ = for_runs(fit, runs, replace(fit.asked, shooting=None))
+    unknowns, theta, shared = problem.unknowns, problem.unknowns.guess[None].copy(), problem.unknowns.layout.sizes[0]
     labels = unknowns.labels[:shared]
     for place, label in enumerate(labels):
         if label not in fit.labels:
             raise ValueError(f"the runs held out share `{label}`, which was not estimated; {nearest(label, fit.labels)}")
-        other.theta[0, place] = fit[label].value
-    other.limits.fixed[:shared] = True
-    if not np.all(other.limits.fixed):
-        other.theta = minimise(other.evaluate, other.theta, other.limits, fit.asked.control).theta
+        theta[0, place] = fit[label].value
+    unknowns.fixed[:shared] = True
+    if not np.all(unknowns.fixed):
+        theta = problem.minimum(theta, np.array([0])).theta
+    other = TakenUp(problem, theta)
     if not np.isfinite(other.at.cost[0]):
         raise ValueError("a motion of the runs held out fails at the estimates; look at it with `simulate`")
-    own = dict(zip(other.problem.estimated, other.at.sigma[0].tolist(), strict=True))
+    own = dict(zip(problem.estimated, other.at.sigma[0].tolist(), strict=True))
     found = []
     for run, data in enumerate(runs):
         # residuals are in units of sigmas, of which those that are not known were estimated from these very runs
@@ -240,9 +224,6 @@ def informed(fitted: TakenUp, most: int) -> Informed:
     return Informed(labels, tuple(found), tuple(np.asarray(run.ts) for run in problem.runs))
 
 
-_STEP = 0.6  # of sqrt(rise), from point to point
-
-
 class Profile(Printed, eqx.Module):
     """The rise of the sum of squares along one unknown, and the 95 % interval that follows from it."""
 
@@ -293,14 +274,16 @@ class _Side(NamedTuple):
 def _side(fitted: TakenUp, place: int, error: float, inflation: float, way: float) -> _Side:
     """The profile to one side: `way` is 1 or -1."""
     theta, origin, note = fitted.theta, float(fitted.theta[0, place]), ""
-    size, bound = float(fitted.problem.unknowns.sizes(theta)[0, place]), float((fitted.limits.low if way < 0 else fitted.limits.high)[place])
-    first = step = _STEP * error if np.isfinite(error) and error > 0 else 0.1 * size
+    unknowns = fitted.problem.unknowns
+    size, bound = float(unknowns.sizes(theta)[0, place]), float((unknowns.low if way < 0 else unknowns.high)[place])
+    stride = 0.6  # of sqrt(rise), from point to point
+    first = step = stride * error if np.isfinite(error) and error > 0 else 0.1 * size
     points: list[tuple[float, float]] = []
 
     def solved(theta: np.ndarray, at: float) -> tuple[float, np.ndarray]:
         """The rise so far from the estimate, and all others there; infinite where the motion fails."""
         nonlocal note
-        found = minimum_beside(fitted.evaluate, theta, place, origin + way * at, fitted.limits, fitted.asked.control)
+        found = fitted.problem.beside(theta, 0, place, origin + way * at)
         if np.isfinite(found.at.cost[0]) and not found.converged[0]:
             note = f"no minimum over the others was found near {origin + way * at:.4g}, so that the interval may be too narrow"
         rise = 2 * float(found.at.cost[0] - fitted.at.cost[0]) / inflation
@@ -347,6 +330,6 @@ def _side(fitted: TakenUp, place: int, error: float, inflation: float, way: floa
             note = "" if "fails" in note else note
             return _Side(origin + way * crossing(theta, (far, rise), (at, found)), points, True, note)
         speed = (np.sqrt(max(found, 0.0)) - np.sqrt(max(rise, 0.0))) / (at - far)
-        step = (at - far) * float(np.clip(_STEP / max(speed * (at - far), 1e-9), 0.5, 4.0))
+        step = (at - far) * float(np.clip(stride / max(speed * (at - far), 1e-9), 0.5, 4.0))
         slope, theta, far, rise = (there - theta) / (at - far), there, at, found
     return _Side(bound if np.isfinite(bound) else way * np.inf, points, False, note)

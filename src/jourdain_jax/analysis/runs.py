@@ -209,14 +209,14 @@ class Lanes:
         for k, name in enumerate(names):
             for weights in (group.weights[name] for group in self.groups if name in group.weights):
                 found[:, k] += np.count_nonzero(weights, axis=(0, *range(2, weights.ndim)))
-        return found[0 * members if self.single else members]
+        return found[members % self.count]
 
 
 class Group:
     """Runs of equal structure, padded to one length. A lane is a run, by its number in the problem, and a member; runs without repeats have one for all."""
 
     def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, options: AllOptions, members: int | None):
-        self.runs, self._single, self._lengths = np.array(indices), members is None, [run.ts.shape[0] for run in runs]
+        self.runs, self._count, self._lengths = np.array(indices), members or 1, [run.ts.shape[0] for run in runs]
         times, knots = max(self._lengths), most_knots(runs)
         equal = runs if runs[0].grid is None or len(runs) == 1 else on_equal_grids(runs)
         filled = [filled_up(run, times, knots, 0 if members is None else 1) for run in equal]
@@ -232,7 +232,7 @@ class Group:
         self._chains = Chains.of(self.weights, self._ts, taus, self.channels) if taus else None
         # numbers of a run in one row, since each array that is handed over costs as much as some of the steps of a motion
         self._common = _row((scene, options), 1)[0]
-        self._rows = np.stack([_row(run, members or 1, members is not None) for run in filled])
+        self._rows = np.stack([_row(run, self._count, members is not None) for run in filled])
         if members is not None:
             first = first._replace(**{name: {n: x[0] for n, x in getattr(first, name).items()} for name in _BY_MEMBER})
         leaves, treedef = jax.tree.flatten(((scene, options), first))
@@ -243,10 +243,6 @@ class Group:
         # bytes of saved states with their tangents in one loop: far below what XLA compiles into one function (see `jourdain_jax`)
         self._width = int(min(64, max(1, 2**18 // states)))
 
-    def _own(self, members: np.ndarray) -> np.ndarray:
-        """Where the numbers of these members are."""
-        return 0 * members if self._single else members
-
     def places(self, runs: np.ndarray) -> np.ndarray:
         """Return the places of these runs in the group."""
         return np.searchsorted(self.runs, runs)
@@ -256,7 +252,7 @@ class Group:
         first, *chunks = self._chunks(len(members))
 
         def lanes(kept: int, b: np.ndarray, j: np.ndarray) -> Some:
-            rows = self._rows[j, self._own(members[b])]
+            rows = self._rows[j, members[b] % self._count]
             found = self._run(self._common, np.concatenate([rows, local[b, self.runs[j]], shared[b]], axis=1))
             return b[:kept], self.runs[j[:kept]], np.asarray(found)[:kept]
 
@@ -285,14 +281,14 @@ class Group:
         """Rows of lanes, whitened; `taus`: correlation times (lanes,) that are estimated, s."""
         if self._chains is None:
             return rows
-        before, rho = self._chains.at(self.places(runs), self._own(members), taus)
+        before, rho = self._chains.at(self.places(runs), members % self._count, taus)
         return whitened(rows, np.take_along_axis(rows, before[..., None], axis=1), rho[..., None])
 
     def log_widths(self, runs: np.ndarray, members: np.ndarray, taus: Taus) -> Float[np.ndarray, "lanes"]:
         """`sum log sqrt(1 - rho^2)` of lanes."""
         if self._chains is None:
             return np.zeros(len(runs))
-        _, rho = self._chains.at(self.places(runs), self._own(members), taus)
+        _, rho = self._chains.at(self.places(runs), members % self._count, taus)
         return 0.5 * np.sum(np.log1p(-(rho**2)), axis=1)
 
     def within(self, runs: np.ndarray, share: Float[np.ndarray, "lanes"]) -> Bool[np.ndarray, "lanes samples"]:
@@ -310,7 +306,7 @@ class Group:
             shape = (*flat.shape[:-1], *weight.shape[1:])
             part = flat[..., where].reshape(shape) if flat.shape[-1] else np.full(shape, np.nan)
             kept = (..., slice(self._lengths[place]), *(slice(None),) * (weight.ndim - 2))
-            found[name] = np.where((weight[0] if self._single else weight) > 0, part, np.nan)[kept]
+            found[name] = np.where((weight if flat.ndim > 1 else weight[0]) > 0, part, np.nan)[kept]
         return found
 
 

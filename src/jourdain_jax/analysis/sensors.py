@@ -69,10 +69,16 @@ def grid(t0, ts: Times, count: int, node=None) -> Float[Array | np.ndarray, "gri
 POINTS = 6  # of the grid, that a polynomial goes through
 _MIDDLE = (POINTS - 1) / 2
 _COEFFICIENTS = np.linalg.inv(np.vander(np.arange(POINTS) - _MIDDLE, increasing=True))  # of powers of the distance from the middle, from values
-_SMALL = 0.2  # of rho
 _LEAST = 1e-3  # of rho, in exp(-s / rho)
-_NODES, _WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(10))
-_NODES = _NODES + 0.5
+
+
+def gauss_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes and weights of the quadrature from 0 to 1."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return (nodes + 1) / 2, weights / 2
+
+
+_NODES, _WEIGHTS = gauss_legendre(10)
 
 
 def read(
@@ -122,7 +128,8 @@ def _value(polynomial: Float[Array, "*batch powers channel"], at) -> Float[Array
 
 def _relaxed(y: Float[Array, "channel"], polynomial: Float[Array, "powers channel"], begin, since, rho) -> Float[Array, "channel"]:
     """What the filter gives `since` intervals after the place `begin`, where it gave `y`."""
-    quick, slow = jnp.where(rho < _SMALL, rho, 0.5 * _SMALL), jnp.where(rho < _SMALL, 1.0, rho)
+    small = rho < 0.2
+    quick, slow = jnp.where(small, rho, 0.1), jnp.where(small, 1.0, rho)
     # P = p - rho p' + rho^2 p'' - ...
     particular, derivative = polynomial, polynomial
     for order in range(1, POINTS):
@@ -134,7 +141,7 @@ def _relaxed(y: Float[Array, "channel"], polynomial: Float[Array, "powers channe
     weights = since / slow * jnp.asarray(_WEIGHTS, polynomial.dtype) * jnp.exp(-since * (1 - _NODES.astype(polynomial.dtype)) / slow)
     inside = jax.vmap(lambda node: _value(polynomial, begin + since * node))(jnp.asarray(_NODES, polynomial.dtype))
     by_quadrature = y * jnp.exp(-since / slow) + weights @ inside
-    return jnp.where(rho < _SMALL, by_formula, by_quadrature)
+    return jnp.where(small, by_formula, by_quadrature)
 
 
 def held(ts: Float[Array, "knots"], values: Float[Array, "knots"]) -> tuple[Float[Array, "more_knots"], Float[Array, "more_knots"]]:

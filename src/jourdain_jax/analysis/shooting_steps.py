@@ -23,10 +23,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jourdain_jax.analysis.experiment import Experiment
-from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Linearised, Minimum, Way, column_scaling, damped_step, minimise
+from jourdain_jax.analysis.levenberg_marquardt import Control, Linearised, Minimum, Way, column_scaling, damped_step, minimise
 from jourdain_jax.analysis.piecewise import Piecewise
 from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.analysis.sensors import ideal
+from jourdain_jax.analysis.unknowns import check_starts
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.projection import closure_residual
@@ -110,20 +111,19 @@ def _parabola(ts: Float[np.ndarray, "times"], x: Float[np.ndarray, "times"], t: 
     return float(value), float(slope)
 
 
-def shot(problem: Problem, lanes: Piecewise, theta: Float[np.ndarray, "members places"], limits: Limits, control: Control) -> Minimum:
+def shot(problem: Problem, lanes: Piecewise, theta: Float[np.ndarray, "members places"]) -> Minimum:
     """The minimum from each `theta`; `problem`: that of whole runs, with these lanes."""
-    pieces, begin = _begun(problem, lanes, theta)
-    unknowns = pieces.unknowns
-    wide = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
+    check_starts(problem.scene, problem.runs, problem.unknowns)
+    (pieces, begin), control = _begun(problem, lanes, theta), problem.asked.control
     roughly, every = replace(control, tolerance=1.0, most_steps=min(15, control.most_steps)), np.arange(len(theta))
 
     def with_gaps(begin: np.ndarray, width: float) -> Minimum:
         what = f"pieces with gaps of {width:g}"  # in sizes of the states
-        return minimise(lambda x, members: lanes.joined(pieces, x, members, width), begin, wide, roughly, what)
+        return minimise(lambda x, members: lanes.joined(pieces, x, members, width), begin, pieces.unknowns, roughly, what)
 
     found = with_gaps(begin, 0.1)
     found = with_gaps(found.theta, 0.01).after(found, every)
-    return _closed(problem, lanes, lanes.put(found.theta), limits, control).after(found, every)
+    return _closed(problem, lanes, lanes.put(found.theta)).after(found, every)
 
 
 def _begun(problem: Problem, lanes: Piecewise, theta: np.ndarray) -> tuple[Problem, np.ndarray]:
@@ -156,7 +156,7 @@ def _begun(problem: Problem, lanes: Piecewise, theta: np.ndarray) -> tuple[Probl
     sizes = np.maximum(sizes, 0.01 * np.max(np.abs(nodes), axis=(0, 1)))
     least = np.where(of_y, sizes, np.where(of_q, np.max(sizes[of_q], initial=0.0), np.max(sizes[~of_q & ~of_y], initial=0.0)))
     lanes.node_sizes = np.where(least > 0, np.maximum(sizes, 1e-4 * least), 1.0)
-    return lanes.problem(problem.loss), guess
+    return lanes.problem(), guess
 
 
 def _start(problem: Problem, data: Experiment, theta: np.ndarray, run: int) -> tuple[np.ndarray, np.ndarray]:
@@ -170,7 +170,7 @@ def _start(problem: Problem, data: Experiment, theta: np.ndarray, run: int) -> t
 def _put_starts(problem: Problem, lanes: Piecewise, local: np.ndarray, nodes: np.ndarray) -> None:
     """Unknown start values of runs as they were measured, where that is within their bounds and nothing is known of them beforehand."""
     unknowns, scene = problem.unknowns, problem.scene
-    (low, high), p, m = unknowns.ends, lanes.shared, lanes.own
+    low, high, p, m = unknowns.low, unknowns.high, lanes.shared, lanes.own
     for run, first in enumerate(np.flatnonzero(~lanes.follows).tolist()):
         q, u, _ = np.split(nodes[:, first], np.cumsum([len(scene.coordinate_names), len(scene.speed_names)]), axis=-1)
         for place in unknowns.layout.local:
@@ -180,12 +180,13 @@ def _put_starts(problem: Problem, lanes: Piecewise, local: np.ndarray, nodes: np
             at = p + run * m + where
             names, x = (scene.coordinate_names, q) if place.name in scene.coordinate_names else (scene.speed_names, u)
             value = names.view(x)[place.name].reshape(len(x), -1)
-            free = ~unknowns.fixed[at] & ~np.isfinite(unknowns.prior_mean[at]) & (value > low[at]) & (value < high[at])
+            free = ~unknowns.fixed[at] & (unknowns.prior_weight[at] == 0) & (value > low[at]) & (value < high[at])
             local[:, first, where] = np.where(free, value, local[:, first, where])
 
 
-def _closed(problem: Problem, lanes: Piecewise, theta: np.ndarray, limits: Limits, control: Control) -> Minimum:
+def _closed(problem: Problem, lanes: Piecewise, theta: np.ndarray) -> Minimum:
     """The minimum with all gaps closed, by sequential quadratic programming from where the pieces are."""
+    unknowns, control = problem.unknowns, problem.asked.control
 
     def evaluate(theta: np.ndarray, members: np.ndarray, share: np.ndarray) -> Linearised:
         return problem.assembled(theta, members, lanes.moved(theta, members, share), problem.taus(members))
@@ -197,8 +198,8 @@ def _closed(problem: Problem, lanes: Piecewise, theta: np.ndarray, limits: Limit
         here, arrow, x = way.here()
         if not here.size:
             break
-        size, undamped = limits.size(x), np.full(here.size, 1e-24)  # only keeps what is held from being singular
-        d = damped_step(arrow, x, column_scaling(arrow, size), undamped, limits, cutoff_of(lanes, control, here))
+        size, undamped = unknowns.sizes(x), np.full(here.size, 1e-24)  # only keeps what is held from being singular
+        d = damped_step(arrow, x, column_scaling(arrow, size), undamped, unknowns, cutoff_of(lanes, control, here))
         length = lanes.change(problem, way.at.sigma[here], d, here)
         done = lanes.closed(here) & (length <= control.tolerance) & (np.abs(d) <= control.tolerance * size).all(axis=1)
         here, d, x, length = way.arrived(here, done), d[~done], x[~done], length[~done]

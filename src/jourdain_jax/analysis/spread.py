@@ -40,12 +40,11 @@ from jaxtyping import Bool, Float
 
 from jourdain_jax.analysis.arrow import Arrow, ByUnknown
 from jourdain_jax.analysis.information import Information, information, students_t_95, variances
-from jourdain_jax.analysis.levenberg_marquardt import LEAST, Control, Limits, Linearised, Minimum, minimum_beside
+from jourdain_jax.analysis.levenberg_marquardt import LEAST, Linearised, Minimum
 from jourdain_jax.analysis.problem import LEAST_SQUARES, Problem
 
 RISE_95 = 3.841458820694124  # of 2 F
 FAR_BEYOND = 3.0  # standard errors: an estimate that is held at its bound by more is no chance
-CLOSE = 0.02  # of p at the limit: its error there, and by how much F is to be lower elsewhere to count as lower
 ADVICE = "`Fit.profiles` gives intervals that hold"
 
 
@@ -70,42 +69,27 @@ class AtBounds:
     at_limit: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)  # by member and unknown at a bound: all unknowns with that one at its limit
 
 
-@dataclass(frozen=True)
-class Around:
-    """A minimum, and how much worse the best fit is where one unknown is elsewhere."""
-
-    evaluate: Callable  # as `minimise` asks for
-    found: Minimum
-    limits: Limits
-    control: Control
-
-    @property
-    def at_bound(self) -> Bool[np.ndarray, "members unknowns"]:
-        """Which unknowns lie at a bound."""
-        return self.limits.reached(self.found.theta)
-
-    def rise(self, b: int, place: int, step: float) -> tuple[float, Minimum]:
-        """How much F of member `b` rises when one unknown is moved by a step and held there (infinite where the motion fails), and the minimum there."""
-        theta = self.found.theta[b : b + 1]
-        at = minimum_beside(lambda x, _: self.evaluate(x, np.array([b])), theta, place, theta[0, place] + step, self.limits, self.control)
-        return float(at.at.cost[0] - self.found.at.cost[b]), at
+def _rise(problem: Problem, found: Minimum, b: int, place: int, step: float) -> tuple[float, Minimum]:
+    """How much F of member `b` rises when one unknown is moved by a step and held there (infinite where the motion fails), and the minimum there."""
+    at = problem.beside(found.theta[b : b + 1], b, place, found.theta[b, place] + step)
+    return float(at.at.cost[0] - found.at.cost[b]), at
 
 
-def limits_at_bounds(around: Around, if_free: Rise) -> AtBounds:
+def limits_at_bounds(problem: Problem, found: Minimum) -> AtBounds:
     """Each unknown at a bound is moved away from it, all others following."""
-    theta = around.found.theta
-    told = AtBounds(np.full(theta.shape, np.nan), np.full(theta.shape, np.nan), if_free)
-    for b, place in np.argwhere(around.at_bound & around.found.converged[:, None]).tolist():
-        _look_inward(around, told, b, place)
+    theta, bound = found.theta, problem.unknowns.reached(found.theta)
+    told = AtBounds(np.full(theta.shape, np.nan), np.full(theta.shape, np.nan), if_free(problem, found, bound))
+    for b, place in np.argwhere(bound & found.converged[:, None]).tolist():
+        _look_inward(problem, found, told, b, place)
     return told
 
 
-def _look_inward(around: Around, told: AtBounds, b: int, place: int) -> None:
-    """Tells what one unknown at its bound shows when it is moved away from it."""
-    bound, limits = around.found.theta[b, place], around.limits
+def _look_inward(problem: Problem, found: Minimum, told: AtBounds, b: int, place: int) -> None:
+    """Tell what one unknown at its bound shows when it is moved away from it."""
+    bound, limits = found.theta[b, place], problem.unknowns
     inward = 1.0 if bound <= limits.low[place] else -1.0
     error, f, w, n = (x[b, place] for x in vars(told.if_free).values())
-    slope, end = abs(float(around.found.at.arrow.gradient[b, place])), RISE_95 / 2 * f
+    slope, end = abs(float(found.at.arrow.gradient[b, place])), RISE_95 / 2 * f
     if np.isfinite(error):
         left = w**2 - (slope * error) ** 2 / n
         told.beyond[b, place] = np.inf if left <= 0 else slope * error / np.sqrt(left)
@@ -113,8 +97,8 @@ def _look_inward(around: Around, told: AtBounds, b: int, place: int) -> None:
         told.limit[b, place] = bound + inward * _root(slope, 1 / error**2, end)
         return
     room = float(limits.high[place] - limits.low[place])
-    first = min(_root(slope, 1 / error**2, end) if np.isfinite(error) else float(limits.size(around.found.theta[b : b + 1])[0, place]), room)
-    delta, at = _limit(partial(around.rise, b, place), inward, first, room, end)
+    first = min(_root(slope, 1 / error**2, end) if np.isfinite(error) else float(limits.sizes(found.theta[b])[place]), room)
+    delta, at = _limit(partial(_rise, problem, found, b, place), inward, first, room, end)
     if at is not None and np.isfinite(delta):
         told.at_limit[b, place] = at.theta[0]
     elif at is not None and (b not in told.lower or at.at.cost[0] < told.lower[b][0]):
@@ -133,15 +117,16 @@ def moved_from_bounds(told: AtBounds, theta: np.ndarray, reach: np.ndarray, plac
     return sentences
 
 
-def too_narrow_near_bounds(around: Around, told: AtBounds, errors: Float[np.ndarray, "unknowns"], labels: tuple[str, ...]) -> list[str]:
+def too_narrow_near_bounds(problem: Problem, found: Minimum, told: AtBounds, errors: Float[np.ndarray, "unknowns"]) -> list[str]:
     """Says which intervals of the first member are too narrow, since the squares rise less than `errors` foretell, those of all unknowns that are not fixed.
 
     Looked at are bounds that an interval reaches, and where an unknown at its bound may leave it, the ends of the intervals of what runs share.
     """
-    limits, theta, places = around.limits, around.found.theta[0], np.flatnonzero(~around.limits.fixed)
+    limits, theta, rise = problem.unknowns, found.theta[0], partial(_rise, problem, found, 0)
+    places, labels = limits.estimated, limits.labels
 
     def named(some: Iterable[int], steps: Callable[[int], list[float]]) -> list[str]:
-        return [f"`{labels[k]}`" for k in some if any(2 * around.rise(0, int(places[k]), step)[0] < 0.5 * (step / errors[k]) ** 2 for step in steps(k))]
+        return [f"`{labels[k]}`" for k in some if any(2 * rise(int(places[k]), step)[0] < 0.5 * (step / errors[k]) ** 2 for step in steps(k))]
 
     def to_bounds(k: int) -> list[float]:
         steps = [float((end - theta)[places[k]]) for end in (limits.low, limits.high)]
@@ -171,12 +156,13 @@ def _limit(profile: Callable[[float], tuple[float, Minimum]], inward: float, del
 
     Infinite with a minimum: that one is lower than at the bound.
     """
+    close = 0.02  # of p at the limit: its error there, and by how much F is to be lower elsewhere to count as lower
     inner, outer = (0.0, 0.0), (np.inf, np.inf)  # delta and rise on either side
     for _ in range(16):
         rise, at = profile(inward * delta)
-        if rise < -CLOSE * end:
+        if rise < -close * end:
             return np.inf, at
-        if abs(rise / end - 1) < CLOSE:
+        if abs(rise / end - 1) < close:
             return delta, at
         if rise < end:
             inner = delta, max(rise, 0.0)
@@ -190,17 +176,13 @@ def _limit(profile: Callable[[float], tuple[float, Minimum]], inward: float, del
         elif np.isfinite(outer[0]):  # the motion fails there
             delta = (inner[0] + outer[0]) / 2
         else:
-            delta = min(delta * min(np.sqrt(end / inner[1]) * (1 + CLOSE) if inner[1] else 4.0, 4.0), room)
+            delta = min(delta * min(np.sqrt(end / inner[1]) * (1 + close) if inner[1] else 4.0, 4.0), room)
     return (delta, at) if np.isfinite(outer[0]) else (np.inf, None)
 
 
 def _root(slope: float, curvature: float, end: float) -> float:
     """delta > 0 with slope delta + curvature delta^2 / 2 = end."""
     return float(2 * end / (slope + np.sqrt(slope**2 + 2 * curvature * end)))
-
-
-LEFT = 0.5  # degrees of freedom: with fewer, a channel does not tell its sigma
-_STEP = 0.03  # of sigma^2, for the second derivative of C
 
 
 @dataclass(frozen=True)
@@ -227,10 +209,11 @@ def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: C
     residuals = [r[np.isfinite(r)] for r in np.concatenate([r.reshape(len(theta), -1) for of in by_run for r in of.values()], axis=1)]
     samples = np.concatenate([[[r.size] for r in residuals], problem.lanes.counted(problem.estimated, members)], axis=1)
     (determined, widths), unsure = np.zeros((2, len(theta), count)), problem.loss != LEAST_SQUARES
+    fewest = 0.5  # degrees of freedom: with fewer, a channel does not tell its sigma
     for _ in range(50):
         left, before = samples - determined, widths.copy()
-        untold[:, 1:] |= left[:, 1:] < LEFT
-        widths[:, 1:] = np.maximum(np.sqrt(at.squares[:, 1:] / np.maximum(left[:, 1:], LEFT)), problem.least_sigma)
+        untold[:, 1:] |= left[:, 1:] < fewest
+        widths[:, 1:] = np.maximum(np.sqrt(at.squares[:, 1:] / np.maximum(left[:, 1:], fewest)), problem.least_sigma)
         widths[:, 0] = [np.sqrt(of_loss(r, p)) if r.size else 1.0 for r, p in zip(residuals, determined[:, 0].tolist(), strict=True)] if unsure else 1.0
         widths[untold] = np.inf
         if np.allclose(widths, before, rtol=1e-8, atol=0):
@@ -241,13 +224,13 @@ def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: C
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = added[..., places] / variances(known.shared, known.own, known.follow)[:, None, places]
     counts = np.s_[:, 0 if unsure else 1 :]
-    doubt = 2 * np.sum(np.nan_to_num(shares[counts]) ** 2 / np.maximum(left[counts], LEFT)[..., None], axis=1)
+    doubt = 2 * np.sum(np.nan_to_num(shares[counts]) ** 2 / np.maximum(left[counts], fewest)[..., None], axis=1)
     at = replace(at, arrow=arrow, sigma=np.where(untold[:, 1:], at.sigma, widths[:, 1:]))
-    more = 0 * doubt
+    more, change = 0 * doubt, 0.03  # of sigma^2, for the second derivative of C
     for k in range(1, count):
-        other = [widths * np.sqrt(1 + step * (np.arange(count) == k)) for step in (-_STEP, _STEP)]
+        other = [widths * np.sqrt(1 + step * (np.arange(count) == k)) for step in (-change, change)]
         ends = [(told_by(problem.joined(theta, at.triangles, some)[0]).standard_errors / known.standard_errors) ** 2 for some in other]
-        more -= 2 / np.maximum(left[:, k : k + 1], 1.0) * (sum(ends) - 2) / _STEP**2
+        more -= 2 / np.maximum(left[:, k : k + 1], 1.0) * (sum(ends) - 2) / change**2
     return NoiseLevels(at, known, doubt, np.maximum(np.nan_to_num(more), 0.0), untold[:, 1:])
 
 
@@ -273,22 +256,22 @@ class Spread:
     rise: Rise
 
 
-def spread(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members places"], limits: Limits, control: Control, errors: str) -> Spread:
-    """The spread of estimates; those at a `bound` are held there. `errors`: as of `fit`."""
-    unknowns, theta, scores = problem.unknowns, found.theta, found.at.arrow.scores
+def spread(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members places"]) -> Spread:
+    """The spread of estimates; those at a `bound` are held there."""
+    unknowns, theta, scores, cutoff = problem.unknowns, found.theta, found.at.arrow.scores, problem.asked.control.cutoff
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
-    told_by = partial(information, size=size, estimated=places, bound=bound, fails=fails, cutoff=control.cutoff)
+    told_by = partial(information, size=size, estimated=places, bound=bound, fails=fails, cutoff=cutoff)
 
     def elsewhere(arrow: Arrow) -> tuple[np.ndarray, np.ndarray]:
         norms = np.where(arrow.column_norms > 0, arrow.column_norms, 1.0)
-        moved = arrow.step(np.full(len(theta), LEAST), norms, limits.fixed | bound, np.zeros_like(theta), control.cutoff)
+        moved = arrow.step(np.full(len(theta), LEAST), norms, unknowns.fixed | bound, np.zeros_like(theta), cutoff)
         return told_by(arrow).standard_errors, moved[:, places]
 
     levels = noise_levels(problem, theta, found.at, told_by, problem.loss.inflation)
     known, plain, of_sigmas = levels.known, told_by(found.at.arrow).standard_errors, levels.doubt
     more, of_memory = problem.doubt(theta, elsewhere)
     quantiles = _normal_or_t(of_memory, of_sigmas) * np.sqrt(1 + more + levels.more)
-    if errors == "runs":
+    if problem.asked.errors == "runs":
         of_runs = levels if problem.estimated else noise_levels(problem, theta, found.at, told_by, lambda r, _: problem.loss.bend(r))
         known = replace(of_runs.known, own=known.own).between_runs(levels.at.arrow.scores if problem.estimated else scores)
         quantiles, of_sigmas = students_t_95(len(problem.runs) - 1), np.zeros(1)
@@ -297,12 +280,12 @@ def spread(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members pl
     return Spread(levels, known, quantiles, Rise(plain, _of_rise(wider, quantiles, degrees), wider, degrees))
 
 
-def if_free(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members places"], limits: Limits, control: Control, errors: str) -> Rise:
+def if_free(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members places"]) -> Rise:
     """What is known of each unknown at a `bound`, as if it were free; NaN of others."""
     told = np.full((4, *bound.shape), np.nan)
     for place in np.flatnonzero(bound.any(axis=0)).tolist():
         others = np.where(np.arange(bound.shape[1]) == place, False, bound)
-        here, k = spread(problem, found, others, limits, control, errors), np.searchsorted(problem.unknowns.estimated, place)
+        here, k = spread(problem, found, others), np.searchsorted(problem.unknowns.estimated, place)
         told[..., place] = [x[:, k] for x in vars(here.rise).values()]
     return Rise(*told)
 

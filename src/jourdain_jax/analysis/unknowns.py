@@ -6,11 +6,9 @@ Whether the runs of a fit start on the constraints, at the first guess and where
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
@@ -24,9 +22,12 @@ from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Unknowns:
-    """All unknowns, with their first guesses and ranges; vectors theta have a number for every place of every run."""
+    """All unknowns, with their first guesses and ranges; vectors theta have a number for every place of every run.
+
+    Priors are residuals M W (theta - mean), W: one over each standard deviation.
+    """
 
     layout: Layout
     runs: int
@@ -35,29 +36,29 @@ class Unknowns:
     ranges: tuple[Range, ...]
     labels: tuple[str, ...]  # of those that are not fixed
     units: tuple[str, ...]
-    prior_mean: Float[np.ndarray, "places"]  # NaN where nothing is known beforehand
-    prior_sigma: Float[np.ndarray, "places"]
-    whitening: Float[np.ndarray, "shared shared"]  # of priors of shared ones: see `joint_prior`
+    prior_mean: Float[np.ndarray, "places"]  # zero where nothing is known beforehand
+    prior_weight: Float[np.ndarray, "places"]  # W; zero where nothing is
+    whitening: Float[np.ndarray, "shared shared"]  # M, of priors of shared ones: see `estimate.whitening`
+    estimated: np.ndarray = field(init=False)  # places of those that are not fixed
+    low: Float[np.ndarray, "places"] = field(init=False)
+    high: Float[np.ndarray, "places"] = field(init=False)
+    least: Float[np.ndarray, "places"] = field(init=False)  # the magnitude of each where it is near zero
+
+    def __post_init__(self):
+        self.estimated = np.flatnonzero(~self.fixed)
+        self.low, self.high = np.array([(r.low, r.high) for r in self.ranges]).T
+        self.least = np.array([r.least_size(x) for r, x in zip(self.ranges, self.guess.tolist(), strict=True)])
 
     @property
-    def with_prior(self) -> np.ndarray:
-        """Places of those of which something is known beforehand."""
-        return np.flatnonzero(np.isfinite(self.prior_mean))
+    def prior_rows(self) -> Float[np.ndarray, "unknowns unknowns"]:
+        """M W of the unknowns that are estimated; all that are shared are."""
+        rows, shared = np.diag(self.prior_weight[self.estimated]), len(self.whitening)
+        rows[:shared] = self.whitening @ rows[:shared]
+        return rows
 
-    @property
-    def estimated(self) -> np.ndarray:
-        """Places of those that are not fixed."""
-        return np.flatnonzero(~self.fixed)
-
-    @property
-    def ends(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of every place."""
-        return np.array([r.low for r in self.ranges]), np.array([r.high for r in self.ranges])
-
-    @cached_property
-    def least(self) -> np.ndarray:
-        """The magnitude of each where it is near zero."""
-        return np.array([r.least_size(x) for r, x in zip(self.ranges, self.guess.tolist(), strict=True)])
+    def reached(self, theta: Float[np.ndarray, "members places"]) -> Bool[np.ndarray, "members places"]:
+        """Which unknowns lie at a bound."""
+        return ((theta <= self.low) | (theta >= self.high)) & ~self.fixed
 
     def sizes(self, theta: Float[np.ndarray, "*members places"]) -> Float[np.ndarray, "*members places"]:
         """The magnitude against which changes of each are measured: its own; near zero a typical one."""
@@ -154,8 +155,8 @@ def unknowns_of(
         ranges=tuple(entry.range for entry in entries for _ in range(entry.guess.size)),
         labels=tuple(label for entry in free_ones for label in entry.labels),
         units=tuple(entry.unit for entry in free_ones for _ in range(entry.guess.size)),
-        prior_mean=each([np.nan if entry.prior is None else float(entry.prior.mean) for entry in entries]),
-        prior_sigma=each([np.nan if entry.prior is None else float(entry.prior.sigma) for entry in entries]),
+        prior_mean=each([0.0 if entry.prior is None else float(entry.prior.mean) for entry in entries]),
+        prior_weight=each([0.0 if entry.prior is None else 1 / float(entry.prior.sigma) for entry in entries]),
         whitening=whitening([entry.prior for entry in entries for _ in range(entry.guess.size)][: layout.sizes[0]]),
     )
 
@@ -242,49 +243,15 @@ def _entry(label: str, unit: str, given, default: Range, value: np.ndarray) -> _
     return _Entry(label, unit, guess, found, prior=prior)
 
 
-MOST = 4096  # kinds of starts that were found right, and are not looked at again
-
-_right: dict[tuple, None] = {}
-
-
 def check_starts(scene: Scene, runs: Sequence[Experiment], unknowns: Unknowns) -> None:
-    """ValueError unless the start of each run meets the constraints at the first guess, and still does when the unknowns change.
-
-    Where it did at other numbers of the unknowns, this is no matter of the numbers, and it is not looked at again: a look at new parameters takes longer than
-    a fit. Where the motion fails at the first guess, ask `check_first_guess`.
-    """
-    guess = unknowns.guess
-    leaves, treedef = jax.tree.flatten(scene)
+    """ValueError unless the start of each run meets the constraints at the first guess, and still does when the unknowns change."""
+    guess, layout = unknowns.guess, unknowns.layout
+    change = 1e-3 * unknowns.sizes(guess) * np.where(unknowns.fixed, 0.0, np.sin(1.0 + np.arange(guess.size)))  # by unequal amounts
+    changes = "no longer meets the constraints when the unknowns change: the values in `start` depend on each other"
     for index, run in enumerate(runs):
-        if (key := _key(leaves, treedef, run, unknowns, index)) in _right:
-            continue
-        elsewhere = guess + 1e-3 * unknowns.sizes(guess) * np.where(unknowns.fixed, 0.0, np.sin(1.0 + np.arange(guess.size)))  # by unequal amounts
-        _check(scene, run, unknowns, guess, index, "is not admissible")
-        _check(scene, run, unknowns, elsewhere, index, "no longer meets the constraints when the unknowns change: the values in `start` depend on each other")
-        _right[key] = None
-        while len(_right) > MOST:
-            del _right[next(iter(_right))]
-
-
-def check_first_guess(scene: Scene, runs: Sequence[Experiment], unknowns: Unknowns) -> None:
-    """ValueError unless the start of each run meets the constraints at the first guess."""
-    for index, run in enumerate(runs):
-        _check(scene, run, unknowns, unknowns.guess, index, "is not admissible")
-
-
-def _key(leaves: list, treedef, run: Experiment, unknowns: Unknowns, index: int) -> tuple:
-    """What a start consists of, and its numbers but for those of unknowns. `leaves`, `treedef`: of the scene."""
-    layout = unknowns.layout
-    others, of_run = jax.tree.flatten((run.t0, run.inputs))
-    shared, local = unknowns.split(np.where(unknowns.fixed, unknowns.guess, 0.0))
-    start = layout.start(run.start, local[index])
-    numbers = *others, *layout.leaves(leaves, treedef, shared), *start.values()
-    return layout, treedef, of_run, *start, *(x if callable(x) else np.asarray(x).tobytes() for x in numbers)
-
-
-def _check(scene: Scene, run: Experiment, unknowns: Unknowns, theta: np.ndarray, index: int, why: str) -> None:
-    shared, local = unknowns.split(theta)
-    try:
-        consistent_start(unknowns.layout.scene(scene, shared), t0=run.t0, inputs=run.inputs, **unknowns.layout.start(run.start, local[index]))
-    except ValueError as error:
-        raise ValueError(f"the start of run {index} {why}. {error}") from None
+        for theta, why in ((guess, "is not admissible"), (guess + change, changes)):
+            shared, local = unknowns.split(theta)
+            try:
+                consistent_start(layout.scene(scene, shared), t0=run.t0, inputs=run.inputs, **layout.start(run.start, local[index]))
+            except ValueError as error:
+                raise ValueError(f"the start of run {index} {why}. {error}") from None

@@ -18,7 +18,6 @@ from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.names import UnknownNameError, nearest
 
 ENERGIES = ("energy", "kinetic energy", "potential energy")
-_DARK, _PALE = 0.4, 0.2  # opacity of the narrowest band, and of the others
 
 
 def check_format(path: str | os.PathLike) -> None:
@@ -137,14 +136,14 @@ def _kinds(motions: Sequence) -> dict[str, tuple[str, ...]]:
 
 
 def _draw(axis, motion, y: np.ndarray, second: float, bands: Sequence[float], colour: str, label: str) -> None:
-    """A line; of a rollout the bands, widest first, and the median, `y` as `_values` gives them."""
+    """A line; of a rollout the bands, widest and palest first, and the median, `y` as `_values` gives them."""
     if not isinstance(motion, Rollout):
         axis.plot(np.asarray(motion.ts) / second, y, color=colour, lw=1.5, label=label)
         return
     ts, named = np.asarray(motion.lanes.ts[0]) / second, f"{label}, " if label else ""
     for k, part in reversed(list(enumerate(bands))):
         low, high = y[2 * k], y[2 * k + 1]
-        axis.fill_between(ts, low, high, color=colour, alpha=_PALE if k else _DARK, lw=0, label=f"{named}{100 * part:.3g} % of lanes")
+        axis.fill_between(ts, low, high, color=colour, alpha=0.2 if k else 0.4, lw=0, label=f"{named}{100 * part:.3g} % of lanes")
     axis.plot(ts, y[-1], color=colour, lw=1.5, label=f"{named}median")
 
 
