@@ -119,57 +119,44 @@ def row_integrability(scene: Scene) -> RowIntegrability:
     if not names:
         return RowIntegrability((), (), {})
     t, q, u = (np.asarray(x, float) for x in sample_states(scene, 6))
-    forms, derivatives, frames, nonlinear = _forms_at(RowsOverStates(scene), np.concatenate([t[:, None], q], axis=1), u)
+    rows, x = RowsOverStates(scene), np.concatenate([t[:, None], q], axis=1)
+    (here, along), (other, _) = rows(x, u), rows(x, -0.7 * u[:, ::-1])
+    curved = np.max(np.abs(here.A - other.A), axis=2, initial=0.0) > 1.5e-8 * (1 + np.max(np.abs(here.A), axis=2, initial=0.0))
+    a, F = _in_speeds(here, 1.0)
+    changes = [_in_speeds(along(np.tile(e, (len(x), 1))), 0.0) for e in np.eye(x.shape[1])]
+    da, dF = (np.stack(parts, axis=-1) for parts in zip(*changes, strict=True))
     limit = 1e-9 if jnp.result_type(float) == jnp.float64 else 1e-4
     violations = {}
     for s, name in enumerate(names):
-        at_states = zip(forms[:, s], derivatives[:, s], frames, strict=True)
-        worst = max(_frobenius_violation(w, dw, frame) for w, dw, frame in at_states)
-        violations[name] = float("inf") if nonlinear[:, s].any() else worst
+        worst = max(_frobenius_violation(*one) for one in zip(a[:, s], da[:, s], F, dF, strict=True))
+        violations[name] = float("inf") if curved[:, s].any() else worst
     integrable = tuple(name for name in names if violations[name] <= limit)
     return RowIntegrability(integrable, tuple(name for name in names if name not in integrable), violations)
 
 
-def _frobenius_violation(w: np.ndarray, derivative: np.ndarray, frame: np.ndarray) -> float:
-    """Largest entry of dw on the kinematically possible velocities that w admits."""
-    basis, _ = np.linalg.qr(frame)
-    on_basis = w @ basis
-    size = np.linalg.norm(on_basis)
+def _in_speeds(here: LinearRows, time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rows a over (1, u), and the frame F of the possible velocities of (t, q), which is F (1, u)."""
+    F = np.zeros((len(here.N), 1 + here.N.shape[1], 1 + here.N.shape[2]))
+    F[:, 0, 0], F[:, 1:, 0], F[:, 1:, 1:] = time, here.nu, here.N
+    return np.concatenate([here.d[..., None], here.A], axis=-1), F
+
+
+def _frobenius_violation(a: np.ndarray, da: np.ndarray, F: np.ndarray, dF: np.ndarray) -> float:
+    """Largest value of dw on unit velocities that w admits, w F = a, over the size of w; the last axis of `da` and `dF` are directions in (t, q).
+
+    dw(X, Y) = X a(y) - Y a(x) - w(DF[X] y - DF[Y] x)      of fields X = F x, Y = F y, x and y being constant
+    """
+    U, S, Vt = np.linalg.svd(F, full_matrices=False)
+    kept = 1e-12 * S[0] < S
+    basis, coefficients = U[:, kept], Vt[kept].T / S[kept]  # orthonormal = F coefficients
+    w = a @ coefficients
+    size = np.linalg.norm(w)
     if size == 0:
         return 0.0
-    admitted = basis @ np.linalg.svd(on_basis[None])[2][1:].T
-    two_form = admitted.T @ (derivative.T - derivative) @ admitted
-    return float(np.max(np.abs(two_form), initial=0.0) / (size + np.max(np.abs(derivative))))
-
-
-def _forms_at(rows: RowsOverStates, x: np.ndarray, u: np.ndarray):
-    """Forms over (t, q), derivatives (component, direction), a frame of the possible velocities, and which rows are nonlinear."""
-    here, along = rows(x, u)
-    other, _ = rows(x, -0.7 * u[:, ::-1])
-    inverse = np.linalg.pinv(here.N, rcond=1e-12)
-    alpha = here.A @ inverse
-    forms = np.concatenate([(here.d - _times(alpha, here.nu))[:, :, None], alpha], axis=2)
-    derivatives = np.empty((*forms.shape, x.shape[1]))
-    for k, e in enumerate(np.eye(x.shape[1])):
-        change = along(np.tile(e, (len(x), 1)))
-        dalpha = change.A @ inverse + here.A @ _derivative_of_inverse(here.N, inverse, change.N)
-        derivatives[:, :, 0, k] = change.d - _times(dalpha, here.nu) - _times(alpha, change.nu)
-        derivatives[:, :, 1:, k] = dalpha
-    frame = np.zeros((len(x), x.shape[1], 1 + u.shape[1]))
-    frame[:, 0, 0], frame[:, 1:, 0], frame[:, 1:, 1:] = 1.0, here.nu, here.N
-    curved = np.max(np.abs(here.A - other.A), axis=2, initial=0.0) > np.sqrt(np.finfo(float).eps) * (1 + np.max(np.abs(here.A), axis=2, initial=0.0))
-    return forms, derivatives, frame, curved
-
-
-def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    return np.einsum("pij,pj->pi", matrices, vectors)
-
-
-def _derivative_of_inverse(N: np.ndarray, inverse: np.ndarray, dN: np.ndarray) -> np.ndarray:
-    """The derivative of the pseudo-inverse: `-N+ dN N+ + N+ N+' dN' (1 - N N+) + (1 - N+ N) dN' N+' N+` (Golub and Pereyra)."""
-    down, across = np.swapaxes(dN, 1, 2), np.swapaxes(inverse, 1, 2)
-    off_range, of_null_space = np.eye(N.shape[1]) - N @ inverse, np.eye(N.shape[2]) - inverse @ N
-    return -inverse @ dN @ inverse + inverse @ across @ down @ off_range + of_null_space @ down @ across @ inverse
+    slopes = coefficients.T @ (da - np.tensordot(basis @ w, dF, 1))
+    admitted = np.linalg.svd(w[None])[2][1:].T
+    along = admitted.T @ slopes @ basis @ admitted
+    return float(np.max(np.abs(along - along.T), initial=0.0) / (size + np.max(np.abs(slopes))))
 
 
 def growth_vector(scene: Scene, *, depth: int = 4) -> Growth:
@@ -273,41 +260,31 @@ class _Fields:
 
     def __init__(self, scene: Scene, with_time: bool, u):
         self.scene, self.with_time, self.u, self.rows = scene, with_time, np.asarray(u, float), RowsOverStates(scene)
-        independent = structure_of(scene).independent
-        self.independent = list(independent)
-        self.dependent = [i for i in range(len(scene.speed_names)) if i not in independent]
+        # places in (1, u)
+        self.free = [0, *(1 + i for i in structure_of(scene).independent)]
+        self.dependent = [k for k in range(1 + len(scene.speed_names)) if k not in self.free]
 
     def __call__(self, x: np.ndarray) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
         """Values at many points, and derivatives as a function of one direction for each."""
-        padded = lambda a: a if self.with_time else np.pad(a, ((0, 0), (1, 0)))  # noqa: E731
+        first = 1 - self.with_time
+        padded = lambda a: np.pad(a, ((0, 0), (first, 0)))  # noqa: E731
         here, change_along = self.rows(padded(x), np.tile(self.u, (len(x), 1)))
+        a, F = _in_speeds(here, 1.0)
         length = np.linalg.norm(here.A, axis=2, keepdims=True)
         scale = 1 / np.where(length > 0, length, 1.0)
-        A, d = scale * here.A, scale[..., 0] * here.d
-        # A (C, c) = (0, -d);  A dC = -dA C,  A dc = -dA c - dd, in the dependent speeds only
-        C = np.zeros((len(x), A.shape[2], 1 + len(self.independent)))
-        C[:, self.independent, np.arange(1, 1 + len(self.independent))] = 1.0
-        C[:, self.dependent] = self._solved(A, -A @ C, d)
+        # X = F C,  a C = 0,  a dC = -da C, in the dependent speeds only
+        C = np.zeros((len(x), a.shape[2], len(self.free)))
+        C[:, self.free, np.arange(len(self.free))] = 1.0
+        C[:, self.dependent] = self._solved(scale * a, scale * a @ C)
 
         def along(direction: np.ndarray) -> np.ndarray:
-            change = change_along(padded(direction))
-            dA, dd, dC = scale * change.A, scale[..., 0] * change.d, np.zeros_like(C)
-            dC[:, self.dependent] = self._solved(A, -dA @ C, dd)
-            return self._columns(change.N @ C + here.N @ dC, change.nu, 0.0)
+            (da, dF), dC = _in_speeds(change_along(padded(direction)), 0.0), np.zeros_like(C)
+            dC[:, self.dependent] = self._solved(scale * a, scale * da @ C)
+            return (dF @ C + F @ dC)[:, first:, first:]
 
-        return self._columns(here.N @ C, here.nu, 1.0), along
+        return (F @ C)[:, first:, first:], along
 
-    def _columns(self, X: np.ndarray, nu: np.ndarray, time: float) -> np.ndarray:
-        """Columns over (t, q) with `(time, X_0)` first where time counts, over q where not."""
-        if not self.with_time:
-            return X[:, :, 1:]
-        X[:, :, 0] += nu
-        X = np.pad(X, ((0, 0), (1, 0), (0, 0)))
-        X[:, 0, 0] = time
-        return X
-
-    def _solved(self, A, right, drift) -> np.ndarray:
-        """`A_z^-1 (right - (drift, 0, ...))`."""
-        right[:, :, 0] -= drift
-        A_z = A[:, :, self.dependent]
-        return np.linalg.solve(A_z, right) if A_z.shape[1] == A_z.shape[2] else np.linalg.pinv(A_z, rcond=1e-12) @ right
+    def _solved(self, a: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """`-a_z^-1 right`, a_z: of the dependent speeds."""
+        a_z = a[:, :, self.dependent]
+        return -np.linalg.solve(a_z, right) if a_z.shape[1] == a_z.shape[2] else -np.linalg.pinv(a_z, rcond=1e-12) @ right
