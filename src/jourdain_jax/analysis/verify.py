@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.statements import Check, Verification, by_reduction, check, gradient_checks, statement_checks
+from jourdain_jax.analysis.statements import Verification, by_reduction, check, gradient_checks, statement_checks
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import plain_row_lengths, structure_of, usual_rows
 from jourdain_jax.calculus.null_space import null_space_svd
@@ -77,7 +77,7 @@ def verify(scene: Scene | BuiltFor, state: State | dict | None = None, inputs: N
     applicable = [name for name, ok in found["applicable"].items() if ok]
     Z = jnp.asarray(found["directions"])
     checks = statement_checks(scene, t, q, u, inputs, Z, seed)
-    checks += [_reductions(found, applicable), _forms(found), _virtual_power(found, applicable, names_of_rows(scene)), _newton(scene, found), _energy(found)]
+    checks += [check(name, values, found["M"].dtype) for name, values in _comparisons(scene, found, applicable).items()]
     checks += gradient_checks(scene, t, q, u, inputs, Z, tuple(applicable), seed)
     return Verification(type(scene).__name__, tuple(checks), tuple(name for name in found["applicable"] if name not in applicable))
 
@@ -140,41 +140,39 @@ def _energy_of(scene, t, q, u, inputs):
     return sum(energies_at(scene, motion_at(scene, t, q, u, inputs)))
 
 
-def _reductions(found: dict, applicable: list[str]) -> Check:
+def _comparisons(scene: Scene, found: dict, applicable: list[str]) -> dict[str, dict[str, float]]:
+    """Return relative differences by check and suspect."""
+    size, names = _size(found, found["reference"]), names_of_rows(scene)
+    virtual = {f"reduction `{name}`": found["force"][name] for name in applicable}
+    virtual |= {f"row `{name}`": force for name, force in zip(names, found["rows"], strict=True)}
+    newton = {"rows: their reactions do not add up to the constraint force": found["rows"]}
+    if not _acts_on_speeds(scene):
+        newton["bodies: m a - F does not add up to the constraint force"] = found["newton"]
+    of_h, of_newton = 1 + np.max(np.abs(found["h"])), _size(found, found["newton"])
+    energy = np.abs(found["energy_rate"] - found["power"]) / (np.finfo(found["M"].dtype).tiny + found["power_scale"])
+    return {
+        "reductions": _reductions(found, applicable),
+        "forms": {f"form `{name}`": np.max([_largest(M - found["M"]), _largest(h - found["h"]) / of_h]) for name, (M, h) in found["forms"].items()},
+        "virtual power": {suspect: _largest(found["Z"].T @ force) / size for suspect, force in virtual.items()},
+        "Newton": {suspect: _largest(forces.sum(0) - found["reference"]) / of_newton for suspect, forces in newton.items()},
+        "energy": {"a load whose potential does not give its force, or a row whose power is not counted": energy},
+    }
+
+
+def _largest(x: np.ndarray) -> float:
+    return float(np.max(np.abs(x), initial=0.0))
+
+
+def _reductions(found: dict, applicable: list[str]) -> dict[str, float]:
     if not applicable:
-        return check("reductions", {"the mass matrix and the rows: no reduction applies": np.inf}, found["M"].dtype)
-    differences: dict[str, float] = {}
+        return {"the mass matrix and the rows: no reduction applies": np.inf}
+    differences = dict.fromkeys(applicable, 0.0)
     for quantity in ("udot", "force"):
         # against the median of all: one wrong way does not make the others look wrong
         middle = np.median(np.stack([found[quantity][name] for name in applicable]), axis=0)
         size = _size(found, middle)
-        for name in applicable:
-            suspect = f"reduction `{name}`"
-            differences[suspect] = np.max([differences.get(suspect, 0.0), np.max(np.abs(found[quantity][name] - middle)) / size])
-    return check("reductions", differences, middle.dtype)
-
-
-def _forms(found: dict) -> Check:
-    size = 1 + np.max(np.abs(found["h"]))
-    values = {f"form `{name}`": np.max([np.max(np.abs(M - found["M"])), np.max(np.abs(h - found["h"])) / size]) for name, (M, h) in found["forms"].items()}
-    return check("forms", values, found["M"].dtype)
-
-
-def _virtual_power(found: dict, applicable: list[str], names: tuple[str, ...]) -> Check:
-    size = _size(found, found["reference"])
-    values = {f"reduction `{name}`": np.max(np.abs(found["Z"].T @ found["force"][name]), initial=0.0) / size for name in applicable}
-    values |= {f"row `{name}`": np.max(np.abs(found["Z"].T @ force), initial=0.0) / size for name, force in zip(names, found["rows"], strict=True)}
-    return check("virtual power", values, found["M"].dtype)
-
-
-def _newton(scene: Scene, found: dict) -> Check:
-    size = _size(found, found["newton"])
-    direct_loads = np.max(np.abs(found["newton"].sum(0) - found["reference"])) / size
-    rows = np.max(np.abs(found["rows"].sum(0) - found["reference"]), initial=0.0) / size
-    values = {"rows: their reactions do not add up to the constraint force": rows}
-    if not _acts_on_speeds(scene):
-        values["bodies: m a - F does not add up to the constraint force"] = direct_loads
-    return check("Newton", values, found["M"].dtype)
+        differences = {name: np.max([known, _largest(found[quantity][name] - middle) / size]) for name, known in differences.items()}
+    return {f"reduction `{name}`": value for name, value in differences.items()}
 
 
 def _acts_on_speeds(scene: Scene) -> bool:
@@ -187,9 +185,3 @@ def _acts_on_speeds(scene: Scene) -> bool:
 
     shapes_along_motion(look, scene)
     return any(flags)
-
-
-def _energy(found: dict) -> Check:
-    value = np.abs(found["energy_rate"] - found["power"]) / (np.finfo(found["M"].dtype).tiny + found["power_scale"])
-    culprit = "a load whose potential does not give its force, or a row whose power is not counted"
-    return check("energy", {culprit: value}, found["M"].dtype)
