@@ -5,15 +5,15 @@ precision. The tolerance that gives an error of 1e-8 or 1e-12 is read off the cu
 motions are timed at it, the methods in turn. Alone means one motion after another inside one compiled program, which knows nothing of the other motions.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 
 import diffrax
 import jax
-import jax.numpy as jnp
 import numpy as np
 from baselines import heyoka_disc, heyoka_lowered
-from baselines.timing import least_processor_time
+from figures import Figures, figure, least_processor_time
+from minimal_states import final_states
 
 import jourdain_jax as jj
 from jourdain_jax.motion.integrators.taylor import order_for
@@ -25,22 +25,6 @@ JUDGED = 64  # lanes whose final states are compared with the reference
 REPEATED = 64  # motions alone in one call
 REQUIRED = {"tilting-disc": 1.2, "chaplygin-sleigh": 1.2, "rattleback": 0.5, "whipple-bicycle": 0.5}
 REQUIRED_ALONE = 1.5
-
-
-def ours(scene: jj.Scene, end: float, options: dict, alone: bool) -> Callable:
-    """A compiled function of a tolerance and starts that returns final states of the program."""
-    integrated = jnp.array(jj.lower(scene).independent)
-
-    @jax.jit
-    def run(tolerance, starts):
-        more = {"ts": jnp.array([end]), "rtol": tolerance, "atol": tolerance, "backend": "native", **options}
-        if alone:
-            found = jax.lax.map(lambda start: jj.simulate(scene, start, **more), starts)
-        else:
-            found = jj.rollout(scene, starts, **more).lanes
-        return jnp.concatenate([found.q_end, found.u_end[:, integrated]], axis=1)
-
-    return lambda tolerance, starts: jax.block_until_ready(run(tolerance, starts))
 
 
 def tolerance_at(wanted: float, run: Callable, starts, expected: np.ndarray) -> float:
@@ -57,8 +41,8 @@ def tolerance_at(wanted: float, run: Callable, starts, expected: np.ndarray) -> 
     raise ValueError(f"no tolerance down to {TOLERANCES[-1]:.0e} gives a final error of {wanted:.0e}")
 
 
-def compared(name: str, starts: jj.State, end: float, options: dict, quick: bool) -> Iterator[tuple[str, float, float | None]]:
-    """(figure, value, required) of one model."""
+def compared(name: str, starts: jj.State, end: float, options: dict, quick: bool) -> Figures:
+    """Figures of one model."""
     scene = jj.models.MODELS[name]()
     system, plain = heyoka_lowered.equations(scene), heyoka_lowered.states(scene, starts.q, starts.u)
     expected = heyoka_lowered.extended(system, end, plain[:JUDGED])
@@ -69,14 +53,14 @@ def compared(name: str, starts: jj.State, end: float, options: dict, quick: bool
     for wanted in ERRORS:
         at = {}
         for how, equations in systems.items():
-            run = partial(_by_heyoka, equations, end)
+            run = lambda tolerance, y, equations=equations: heyoka_lowered.final_states(equations, end, tolerance, 4, compact=True)(y)  # noqa: E731
             at[how] = tolerance_at(wanted, run, plain[:JUDGED], expected)
         for alone, count, widths in ((False, len(plain), (4, 8)), (True, REPEATED, (1,))):
             who = f"{'alone' if alone else f'batch of {count}'}, error {wanted:.0e}"
             judged, first = (jax.tree.map(lambda x, count=count: x[:count], starts) for count in (JUDGED, count))
             runs = {}
             for solver in _our_solvers(scene, wanted, options):
-                run = ours(scene, end, {"solver": solver, **options}, alone)
+                run = final_states(scene, end, alone, backend="native", solver=solver, **options)
                 runs[f"ours, {type(solver).__name__}"] = partial(run, tolerance_at(wanted, run, judged, expected), first)
             own = list(runs)
             for how, compact, width in ((how, compact, width) for how in systems for compact in (False, True) for width in widths):
@@ -84,11 +68,11 @@ def compared(name: str, starts: jj.State, end: float, options: dict, quick: bool
                 runs[way] = partial(heyoka_lowered.final_states(systems[how], end, at[how], width, compact), plain[:count])
             seconds = least_processor_time(runs, 3 if quick else 7)
             for way, value in seconds.items():
-                yield f"{who}, {way}, us per trajectory", 1e6 * value / count, None
+                yield figure(f"{who}, {way}, us per trajectory", name, 1e6 * value / count)
             best, theirs = (min(value for way, value in seconds.items() if (way in own) is is_ours) for is_ours in (True, False))
-            yield f"{who}, ours at its best / heyoka at its best", best / theirs, REQUIRED_ALONE if alone else REQUIRED[name]
+            yield figure(f"{who}, ours at its best / heyoka at its best", name, best / theirs, REQUIRED_ALONE if alone else REQUIRED[name])
             if len(own) > 1:
-                yield f"{who}, Taylor / Dopri8", seconds[own[1]] / seconds[own[0]], None
+                yield figure(f"{who}, Taylor / Dopri8", name, seconds[own[1]] / seconds[own[0]])
 
 
 def _our_solvers(scene: jj.Scene, wanted: float, options: dict) -> list:
@@ -99,7 +83,3 @@ def _our_solvers(scene: jj.Scene, wanted: float, options: dict) -> list:
     except ValueError:
         return [diffrax.Dopri8()]
     return [diffrax.Dopri8(), series]
-
-
-def _by_heyoka(system: list, end: float, tolerance: float, starts: np.ndarray) -> np.ndarray:
-    return heyoka_lowered.final_states(system, end, tolerance, 4, compact=True)(starts)

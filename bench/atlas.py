@@ -1,9 +1,9 @@
 """The atlas of where methods fail: hard cases E1 to E36, every method, float64 and float32.
 
-    python bench/atlas.py [--quick] [--json FILE] [--out DIR] [--case NAME ...] [--method NAME ...] [--cache DIR]
+    python bench/atlas.py [--quick] [--json FILE] [--out DIR] [--case NAME ...] [--method NAME ...]
     python bench/atlas.py --redraw FILE --out DIR
 
-Writes a list of {"case", "method", "dtype", "outcome", "error", "tolerance", "mechanism"}, tables (CSV and Markdown) and a picture (PNG and SVG).
+Writes a list of {"case", "method", "dtype", "outcome", "error", "tolerance", "mechanism"}, tables and a picture (PNG and SVG).
 The engine as it comes is the method `default`. Each floating-point type runs in a process of its own: JAX chooses it once.
 """
 
@@ -13,13 +13,10 @@ import os
 import subprocess
 import sys
 import tempfile
-from importlib.metadata import version
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
-# Hundreds of small programs: compiling them is most of the time. The first flag belongs to jaxlib 0.10.
-FLAGS = "--xla_backend_optimization_level=0" + (" --xla_cpu_use_fusion_emitters=false" if version("jaxlib").startswith("0.10.") else "")
-os.environ.setdefault("XLA_FLAGS", FLAGS)
+from floats import HERE, TYPES, environment
+
 sys.path[:0] = [str(HERE), str(HERE.parent / "tests")]  # `tests/oracles` holds the closed forms
 
 
@@ -53,10 +50,9 @@ def in_process(dtype: str, arguments) -> list[dict]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cells.json"
         command = [sys.executable, __file__, "--only-dtype", dtype, "--json", str(path), *(["--quick"] if arguments.quick else [])]
-        command += ["--cache", str(arguments.cache)] if arguments.cache else []
         for option in ("case", "method"):
             command += [f"--{option}", *getattr(arguments, option)] if getattr(arguments, option) else []
-        subprocess.run(command, env=os.environ | {"JAX_ENABLE_X64": "1" if dtype == "float64" else "0"}, check=True)
+        subprocess.run(command, env=os.environ | environment(dtype), check=True)
         return json.loads(path.read_text())
 
 
@@ -66,22 +62,16 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for the list of cells")
     parser.add_argument("--out", type=Path, help="folder for the picture and the tables")
     parser.add_argument("--case", nargs="*", help="only these cases")
-    parser.add_argument("--cache", type=Path, help="folder for compiled programs, which makes a second run much shorter")
     parser.add_argument("--method", nargs="*", help="only these methods")
     parser.add_argument("--redraw", type=Path, metavar="FILE", help="measure nothing: picture and tables of what is in this file")
-    parser.add_argument("--only-dtype", choices=("float64", "float32"), help=argparse.SUPPRESS)
+    parser.add_argument("--only-dtype", choices=TYPES, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    if arguments.cache:
-        import jax
-
-        jax.config.update("jax_compilation_cache_dir", str(arguments.cache))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     if arguments.redraw:
         found = json.loads(arguments.redraw.read_text())
     elif arguments.only_dtype:
         found = measure(arguments)
     else:
-        found = [cell for dtype in ("float64", "float32") for cell in in_process(dtype, arguments)]
+        found = [cell for dtype in TYPES for cell in in_process(dtype, arguments)]
     if arguments.json:
         arguments.json.write_text(json.dumps(found, indent=1) + "\n")
     if arguments.only_dtype:

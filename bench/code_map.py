@@ -17,20 +17,18 @@ Measured, in a fresh process for each model, with every call of a Python functio
 `--private`: which private modules every test file reaches.
 """
 
-import argparse
 import ast
 import inspect
 import io
-import json
-import os
 import re
-import subprocess
 import sys
 import threading
 import tokenize
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
+
+from figures import Figures, figure, fresh, main
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "jourdain_jax"
@@ -221,54 +219,23 @@ def observed_calls(model: str) -> dict[str, dict[str, int]]:
     return {"build": built, "first": first, "gradient": observed(slope)[1], "warm": observed(moved)[1]}
 
 
-def in_fresh_process(model: str) -> dict[str, dict[str, int]]:
-    """Return `observed_calls` of a model, in a process of its own."""
-    paths = [str(SOURCE.parent), *filter(None, [os.environ.get("PYTHONPATH")])]  # this source, whatever is installed
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
-    done = subprocess.run([sys.executable, __file__, "--observe", model], env=environment, capture_output=True, text=True)
-    if done.returncode != 0:
-        raise RuntimeError(f"`{model}` failed: {done.stderr.strip().splitlines()[-1] if done.stderr.strip() else done.returncode}")
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-def figure(name: str, model: str, value: float, required: float | None = None) -> dict:
-    """Return one entry of the JSON; `required`: the largest value that is allowed."""
-    return {"figure": name, "model": model, "value": value, "required": required, "met": required is None or value <= required}
-
-
-def figures(models: tuple[str, ...]) -> Iterator[dict]:
-    """Yield all figures."""
+def source(quick: bool) -> Figures:
+    """Yield what is read from the source."""
     yield from (figure(name, "all", value) for name, value in figures_of_source().items())
-    for model in models:
-        found = in_fresh_process(model)
+
+
+def calls(quick: bool) -> Figures:
+    """Yield how much of the package runs, for every model."""
+    for model in MODELS[: 1 if quick else None]:
+        found = fresh("import code_map, json, sys; print(json.dumps(code_map.observed_calls(sys.argv[1])))", model)
         for name, files in found.items():
             yield figure(f"files run, {name}", model, len(files), MOST_FILES if name == "warm" else None)
             yield figure(f"calls of own functions, {name}", model, sum(files.values()))
         yield figure("files run, build, first and gradient", model, len(set().union(*found.values())))
 
 
-def main() -> int:
-    """Measure, print, write; exit code 1 where a model failed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help=f"only {MODELS[0]}")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to this file")
-    parser.add_argument("--private", action="store_true", help="list the private modules that test files reach")
-    parser.add_argument("--observe", metavar="MODEL", help="print what one model runs, as JSON, in this process")
-    options = parser.parse_args()
-    if options.observe:
-        print(json.dumps(observed_calls(options.observe)))
-        return 0
-    if options.private:
-        print(*(f"{name}: {' '.join(modules)}" for name, modules in reaching().items()), sep="\n")
-        return 0
-    found = []
-    for entry in figures(MODELS[:1] if options.quick else MODELS):
-        found.append(entry)
-        print(f"{entry['value']:>8}  {entry['figure']}: {entry['model']}{'' if entry['met'] else ' MISS'}", flush=True)
-    if options.json:
-        options.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    if "--private" in sys.argv:
+        print(*(f"{name}: {' '.join(modules)}" for name, modules in reaching().items()), sep="\n")
+    else:
+        main(__doc__, (source, calls))

@@ -10,18 +10,15 @@ Writes a list of {"figure", "model", "value", "required", "met"}, and the pictur
 that is given). `--quick`: a hundredth of the samples. Needs the extras `ensembles`, `native` and `plot`.
 """
 
-import argparse
-import json
-import shutil
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
+from figures import HERE, Figures, figure, main
 
 import jourdain_jax as jj
 from jourdain_jax.bicycle import eigenvalues, linear_matrices, measured_bicycle, stability_speeds
@@ -34,24 +31,14 @@ BICYCLE = "Browser"
 BLUE, ORANGE = "#1f5fa8", "#b3470f"
 
 
-def figure(name: str, value: float, required: float | None = None) -> dict:
-    """One entry of the JSON."""
-    print(f"  {name}: {value:.4g}", flush=True)
-    return {"figure": name, "model": BICYCLE, "value": value, "required": required, "met": required is None or bool(value <= required)}
-
-
-def in_parts(function, columns: dict, size: int = 4096) -> np.ndarray:
+def in_parts(function, columns: dict) -> np.ndarray:
     """`function` of one sample, over all samples, some at a time."""
-    run, count = jax.jit(jax.vmap(function)), len(next(iter(columns.values())))
-    parts = []
-    for first in range(0, count, size):
-        part = {name: np.pad(x[first : first + size], (0, max(0, first + size - count)), mode="edge") for name, x in columns.items()}
-        parts.append(np.asarray(run(part))[: count - first])
-    return np.concatenate(parts)
+    return np.asarray(jax.jit(lambda columns: jax.lax.map(function, columns, batch_size=4096))(columns))
 
 
-def stability(samples: int, out: Path) -> Iterator[dict]:
+def stability(quick: bool, out: Path) -> Figures:
     """Self-stability of a measured bicycle, and what its uncertainty comes from."""
+    samples = 1_000 if quick else 100_000
     bicycle = measured_bicycle(BICYCLE)
     fixed = {name: value for name, value in bicycle.values.items() if name not in bicycle.prior}
     began = time.perf_counter()
@@ -62,13 +49,13 @@ def stability(samples: int, out: Path) -> Iterator[dict]:
     indices = jj.sobol_indices(weave, design.names)
     speeds = np.nanmean(weave) + np.linspace(-8.0, 8.0, 101) * np.nanstd(weave)  # m/s
     stable = in_parts(lambda p: jnp.all(jnp.real(eigenvalues(*linear_matrices(fixed | p), speeds)) < 0, axis=1), drawn).mean(axis=0)
-    yield figure("seconds for eigenvalues at 101 speeds and weave speeds of as many samples", time.perf_counter() - began)
-    yield figure("largest share of samples that is stable at one speed", float(stable.max()))
-    yield figure("deviation of the weave speed, m/s", float(np.nanstd(weave)))
+    yield figure("seconds for eigenvalues at 101 speeds and weave speeds of as many samples", BICYCLE, time.perf_counter() - began)
+    yield figure("largest share of samples that is stable at one speed", BICYCLE, float(stable.max()))
+    yield figure("deviation of the weave speed, m/s", BICYCLE, float(np.nanstd(weave)))
     order = np.argsort(-indices.total)[:10]
     for k in order[:3]:
-        yield figure(f"total Sobol' index of the weave speed, {indices.names[k]}", float(indices.total[k]))
-    yield figure("largest half-width of these indices, at 95 %", float(indices.total_half_width[order[:3]].max()))
+        yield figure(f"total Sobol' index of the weave speed, {indices.names[k]}", BICYCLE, float(indices.total[k]))
+    yield figure("largest half-width of these indices, at 95 %", BICYCLE, float(indices.total_half_width[order[:3]].max()))
 
     shape, axes = plt.subplots(1, 2, figsize=(11, 4), layout="constrained", width_ratios=(1, 1.25))
     axes[0].fill_between(speeds, stable, color=BLUE, alpha=0.25)
@@ -77,7 +64,7 @@ def stability(samples: int, out: Path) -> Iterator[dict]:
     axes[0].set_title(f"{BICYCLE} bicycle, {samples:,} samples", fontsize=10)
     place = np.arange(len(order))[::-1]
     axes[1].barh(place, indices.total[order], xerr=indices.total_half_width[order], color=ORANGE, capsize=2, height=0.7)
-    axes[1].set_yticks(place, [f"{PARAMETERS[indices.names[k]][0]} ({indices.names[k]})" for k in order], fontsize=8)
+    axes[1].set_yticks(place, [f"{PARAMETERS[indices.names[k]]['about']} ({indices.names[k]})" for k in order], fontsize=8)
     axes[1].set(xlabel="total Sobol' index of the weave speed")
     axes[1].set_title("what deserves a better measurement", fontsize=10)
     for axis in axes:
@@ -86,8 +73,9 @@ def stability(samples: int, out: Path) -> Iterator[dict]:
     plt.close(shape)
 
 
-def rides(samples: int, out: Path) -> Iterator[dict]:
+def rides(quick: bool, out: Path) -> Figures:
     """Where a bicycle falls, over the speed and the lean at the start."""
+    samples = 10_000 if quick else 1_000_000
     bicycle = measured_bicycle(BICYCLE)
     radius = bicycle.values["rR"]
     start = {
@@ -98,15 +86,15 @@ def rides(samples: int, out: Path) -> Iterator[dict]:
     }
     study = jj.Study(bicycle.scene, start=start, sampler="sobol", samples=samples, seed=7)
     outputs = {"fell": jj.Happened("fallen"), "fall time": jj.EventTime("fallen")}
-    folder = Path(tempfile.mkdtemp())
-    began = time.perf_counter()
-    result = study.run(folder / "rides.zarr", t1=5.0, rtol=1e-6, atol=1e-6, outputs=outputs)
-    seconds = time.perf_counter() - began
-    yield figure("rides per second of wall time, storage and compilation included", samples / seconds)
-    yield figure("rides that failed, of all", result.failed.size / samples)
-    yield figure("rides that ended in a fall, of all", float(result.mean("fell")))
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        result = study.run(f"{folder}/rides.zarr", t1=5.0, rtol=1e-6, atol=1e-6, outputs=outputs)
+        seconds = time.perf_counter() - began
+        arrays = result.to_xarray().load()
+    yield figure("rides per second of wall time, storage and compilation included", BICYCLE, samples / seconds)
+    yield figure("rides that failed, of all", BICYCLE, result.failed.size / samples)
+    yield figure("rides that ended in a fall, of all", BICYCLE, float(result.mean("fell")))
 
-    arrays = result.to_xarray().load()
     speed, lean, fell = arrays["rear_spin_rate_at_start"].values * radius, arrays["lean_at_start"].values, arrays["fell"].values
     edges, known = (np.linspace(1.0, 10.0, 181), np.linspace(-0.6, 0.6, 121)), np.isfinite(fell)
     counts, *_ = np.histogram2d(speed[known], lean[known], edges)
@@ -119,24 +107,7 @@ def rides(samples: int, out: Path) -> Iterator[dict]:
     axis.set_title(f"{BICYCLE} bicycle without a hand on it, {samples:,} rides", fontsize=10)
     shape.savefig(out / "bicycle_rides.png", dpi=110)
     plt.close(shape)
-    shutil.rmtree(folder)
-
-
-def main() -> None:
-    """All figures."""
-    parts = {"stability": (stability, 100_000), "rides": (rides, 1_000_000)}
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="a hundredth of the samples; pictures go to a temporary folder unless --out is given")
-    parser.add_argument("--json", help="write the figures to this file")
-    parser.add_argument("--only", nargs="+", choices=parts, default=list(parts), help="these figures")
-    parser.add_argument("--out", help="folder of the pictures")
-    options = parser.parse_args()
-    home = Path(tempfile.mkdtemp()) if options.quick else Path(__file__).parent.parent / "docs"
-    out = Path(options.out) if options.out else home
-    figures = [entry for name in options.only for entry in parts[name][0](parts[name][1] // (100 if options.quick else 1), out)]
-    if options.json:
-        Path(options.json).write_text(json.dumps(figures, indent=1))
 
 
 if __name__ == "__main__":
-    main()
+    main(__doc__, (stability, rides), out=HERE.parent / "docs")

@@ -1,6 +1,6 @@
 """Studies of many motions: how many per second, what storage and interruption cost, memory, and whether bits depend on how a study is run.
 
-    python bench/ensembles.py [--quick] [--json FILE] [--only NAME ...] [--folder FOLDER]
+    python bench/ensembles.py [--quick] [--json FILE] [--only NAME ...]
 
 The motions: two seconds of a rolling disc with random lean, yaw, lean and spin rates, some of which fall, at a tolerance of 1e-6; end values, result codes and
 steps are stored. Every measurement runs in a fresh process, and a program is compiled before the clock starts.
@@ -17,7 +17,6 @@ steps are stored. Every measurement runs in a fresh process, and a program is co
 The JSON is a list of {"figure", "model", "value", "required", "met"}. `--quick`: a tenth of the lanes.
 """
 
-import argparse
 import heapq
 import json
 import os
@@ -28,12 +27,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import dask
 import numpy as np
 from distributed import Client, LocalCluster
+from figures import HERE, Figures, figure, main
 
 import jourdain_jax as jj
 from jourdain_jax.ensembles.store import Store
@@ -55,9 +55,6 @@ def run(lanes: int, path, **options) -> jj.StudyResult:
     return discs(lanes).run(path, t1=SPAN, rtol=TOLERANCE, atol=TOLERANCE, outputs=OUTPUTS, progress=False, **options)
 
 
-# In a process of its own. ----------------------------------------------------------------------------------------
-
-
 def timed(lanes: int, folder: Path, **options) -> dict:
     """Seconds of a run after one that compiled its program: by the clock, of the processor, of the processor within writing."""
     if options.get("processes", 1) == 1:
@@ -71,8 +68,8 @@ def timed(lanes: int, folder: Path, **options) -> dict:
 
     Store.write = watched
     clock, processor = time.perf_counter(), time.process_time()
-    result = run(lanes, folder / "timed", **options)
-    found = {"wall": time.perf_counter() - clock, "processor": time.process_time() - processor, "writing": within[0], "counts": result.counts}
+    run(lanes, folder / "timed", **options)
+    found = {"wall": time.perf_counter() - clock, "processor": time.process_time() - processor, "writing": within[0]}
     return found | {"peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
 
 
@@ -89,39 +86,41 @@ def logged(lanes: int, folder: Path, log: Path) -> jj.StudyResult:
     return run(lanes, folder / "timed")
 
 
+CALL = """
+import ensembles, json, pathlib, sys
+told = json.loads(sys.argv[2])
+print(json.dumps(getattr(ensembles, sys.argv[1])(folder=pathlib.Path(told.pop("folder")), **told), default=str))
+"""
+
+
+def call(name: str, lanes: int, folder: Path, **options) -> list[str]:
+    """The command that calls a function of this file in a process of its own."""
+    return [sys.executable, "-c", CALL, name, json.dumps({"lanes": lanes, "folder": str(folder), **options})]
+
+
 def in_fresh_process(lanes: int, folder: Path, on_one_core: bool = False, **options) -> dict:
     """`timed` in a process of its own, on all cores or on one."""
     environment = os.environ | ({"JOURDAIN_JAX_THREADS": "1"} if on_one_core else {})
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    command = [sys.executable, __file__, "--timed", json.dumps({"lanes": lanes, "folder": str(folder), **options})]
     cores = os.sched_getaffinity(0)
-    pinned = {min(cores)} if on_one_core else cores
-    begin = lambda: os.sched_setaffinity(0, pinned)  # noqa: E731
-    return json.loads(subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True, preexec_fn=begin).stdout.splitlines()[-1])
+    begin = lambda: os.sched_setaffinity(0, {min(cores)} if on_one_core else cores)  # noqa: E731
+    command = call("timed", lanes, folder, **options)
+    done = subprocess.run(command, cwd=HERE, env=environment, check=True, stdout=subprocess.PIPE, text=True, preexec_fn=begin)
+    return json.loads(done.stdout.splitlines()[-1])
 
 
-# Figures. --------------------------------------------------------------------------------------------------------
-
-
-def figure(name: str, value: float, required: float | None = None, *, at_least: bool = False, model: str = MODEL) -> dict:
-    """One entry of the JSON."""
-    met = required is None or bool(value >= required if at_least else value <= required)
-    return {"figure": name, "model": model, "value": value, "required": required, "met": met}
-
-
-def rate(lanes: int, folder: Path) -> Iterator[dict]:
+def rate(lanes: int, folder: Path) -> Figures:
     """Rate and storage."""
     found = min((in_fresh_process(lanes, folder / "rate") for _ in range(3)), key=lambda found: found["wall"])
     cores = len(os.sched_getaffinity(0))
-    yield figure(f"discs per second of wall time, {cores} cores, storage included", lanes / found["wall"], 25_000, at_least=True)
-    yield figure("discs per second of processor time, storage included", lanes / found["processor"])
-    yield figure("share of processor time spent on storage", found["writing"] / found["processor"], 0.05)
+    yield figure(f"discs per second of wall time, {cores} cores, storage included", MODEL, lanes / found["wall"], least=25_000)
+    yield figure("discs per second of processor time, storage included", MODEL, lanes / found["processor"])
+    yield figure("share of processor time spent on storage", MODEL, found["writing"] / found["processor"], 0.05)
 
 
-def busy(lanes: int, folder: Path) -> Iterator[dict]:
+def busy(lanes: int, folder: Path) -> Figures:
     """Busy share, from the steps of every lane."""
-    shutil.rmtree(folder / "busy", ignore_errors=True)
     result = run(min(lanes, 20_000), folder / "busy")
     arrays = result.to_xarray()
     steps, block = (arrays["steps"] + arrays["rejected_steps"]).values, result.store.study["block"]
@@ -132,39 +131,37 @@ def busy(lanes: int, folder: Path) -> Iterator[dict]:
             heapq.heapreplace(ends, ends[0] + count)
         there += WIDTH * max(ends)
         plain += len(steps[first : first + block]) * steps[first : first + block].max()
-    yield figure("busy share of lanes, by their steps, ended lanes replaced", steps.sum() / there, 0.9, at_least=True)
-    yield figure("busy share of lanes, by their steps, all waiting for the last", steps.sum() / plain)
+    yield figure("busy share of lanes, by their steps, ended lanes replaced", MODEL, steps.sum() / there, least=0.9)
+    yield figure("busy share of lanes, by their steps, all waiting for the last", MODEL, steps.sum() / plain)
 
 
-def memory(lanes: int, folder: Path) -> Iterator[dict]:
+def memory(lanes: int, folder: Path) -> Figures:
     """Resident memory."""
     few, many = (in_fresh_process(count, folder / "memory")["peak"] for count in (lanes, 10 * lanes))
-    yield figure(f"growth of resident memory from {lanes} to {10 * lanes} lanes, MB", many - few, 300)
+    yield figure(f"growth of resident memory from {lanes} to {10 * lanes} lanes, MB", MODEL, many - few, 300)
     bound = 1000  # MB
     kept = {"save": "trajectories", "ts": np.linspace(0.0, SPAN, 201).tolist(), "memory": f"{bound}MB"}
     peak = in_fresh_process(lanes, folder / "memory", **kept)["peak"] * 2**20 / 1e6
-    yield figure("largest resident memory, MB, of a study that keeps trajectories under memory='1000MB'", peak, bound)
+    yield figure("largest resident memory, MB, of a study that keeps trajectories under memory='1000MB'", MODEL, peak, bound)
 
 
-def processes(lanes: int, folder: Path) -> Iterator[dict]:
+def processes(lanes: int, folder: Path) -> Figures:
     """Two processes, each on a core, over one on one core: minutes, since the start and compilation of the two, some eight seconds, are included."""
     one = in_fresh_process(200 * lanes, folder / "processes", on_one_core=True)["wall"]
     two = in_fresh_process(200 * lanes, folder / "processes", processes=2)["wall"]
     print(f"  one process {one:.1f} s, two {two:.1f} s", flush=True)
-    yield figure("wall time by one process on one core over that by two processes on two", one / two, 1.8, at_least=True)
+    yield figure("wall time by one process on one core over that by two processes on two", MODEL, one / two, least=1.8)
     dask.config.set({"distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": 1}})  # as docs/ensembles.md advises: no early return of memory
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster, Client(cluster) as client:
-        shutil.rmtree(folder / "dask", ignore_errors=True)
         began = time.perf_counter()
         run(200 * lanes, folder / "dask", client=client)
         by_cluster = time.perf_counter() - began
     print(f"  two workers of Dask {by_cluster:.1f} s", flush=True)
-    yield figure("wall time by one process on one core over that by two workers of Dask", one / by_cluster, 1.7, at_least=True)
+    yield figure("wall time by one process on one core over that by two workers of Dask", MODEL, one / by_cluster, least=1.7)
 
 
-def bits(lanes: int, folder: Path) -> Iterator[dict]:
+def bits(lanes: int, folder: Path) -> Figures:
     """Arrays that differ."""
-    shutil.rmtree(folder / "bits", ignore_errors=True)
     lanes = min(lanes, 20_000)
     plain = run(lanes, folder / "bits" / "plain")
     ways = {"chunks of 8192": {"chunk": 8192}, "one chunk": {"chunk": 2048 * -(-lanes // 2048)}, "two processes": {"processes": 2}}
@@ -173,37 +170,32 @@ def bits(lanes: int, folder: Path) -> Iterator[dict]:
     others["the second half first"] = run(lanes, folder / "bits" / "in two parts")
     for way, other in others.items():
         one, two = plain.to_xarray().load(), other.to_xarray().load()
-        differing = [name for name in one.variables if not np.array_equal(one[name].values, two[name].values, equal_nan=True)]
-        for name in ("mean", "covariance", "counts", "extremes"):
-            if not np.array_equal(getattr(plain.statistics, name), getattr(other.statistics, name), equal_nan=True):
-                differing.append(name)
-        yield figure(f"arrays that differ: {way}", len(differing), 0)
+        pairs = [(one[name].values, two[name].values) for name in one.variables]
+        pairs += [(getattr(plain.statistics, name), getattr(other.statistics, name)) for name in ("mean", "covariance", "counts", "extremes")]
+        yield figure(f"arrays that differ: {way}", MODEL, sum(not np.array_equal(*pair, equal_nan=True) for pair in pairs), 0)
 
 
-def kills(lanes: int, folder: Path) -> Iterator[dict]:
+def kills(lanes: int, folder: Path) -> Figures:
     """Twenty kills."""
     generator, path = np.random.default_rng(0), folder / "kills"
-    shutil.rmtree(path, ignore_errors=True)
     lanes *= 100
     log = folder / "blocks"
     log.write_bytes(b"")
     for _ in range(20):
-        options = json.dumps({"lanes": lanes, "folder": str(path), "log": str(log)})
-        process = subprocess.Popen([sys.executable, __file__, "--timed", options])
-        place = path / "timed" / "run" / "chunks"
-        before = len(list(place.glob("[0-9]*"))) if place.exists() else 0
-        while process.poll() is None and (len(list(place.glob("[0-9]*"))) if place.exists() else 0) <= before:
+        process = subprocess.Popen(call("logged", lanes, path, log=str(log)), cwd=HERE)
+        before = len(list(path.glob("timed/run/chunks/[0-9]*")))
+        while process.poll() is None and len(list(path.glob("timed/run/chunks/[0-9]*"))) <= before:
             time.sleep(1e-3)
         time.sleep(generator.uniform(0.0, 2.0))
         process.send_signal(signal.SIGKILL)
         process.wait()
     result = logged(lanes, path, log)
     again = len(log.read_bytes()) * result.store.study["block"] / lanes - 1.0
-    yield figure("lanes computed again after 20 kills, of all", again, 0.02 if lanes >= 10_000_000 else None)
-    yield figure("lanes missing or repeated after 20 kills", len(result) - sum(result.counts.values()), 0)
+    yield figure("lanes computed again after 20 kills, of all", MODEL, again, 0.02 if lanes >= 10_000_000 else None)
+    yield figure("lanes missing or repeated after 20 kills", MODEL, len(result) - sum(result.counts.values()), 0)
 
 
-def indices(lanes: int, folder: Path) -> Iterator[dict]:
+def indices(lanes: int, folder: Path) -> Figures:
     """Ishigami's function; its indices in closed form."""
     a, b = 7.0, 0.1
     design = jj.Design(dict.fromkeys(("x1", "x2", "x3"), jj.Uniform(-np.pi, np.pi)), sampler="saltelli", samples=5 * 2**14, seed=1)
@@ -212,37 +204,16 @@ def indices(lanes: int, folder: Path) -> Iterator[dict]:
     one, two, three = 0.5 * (1 + b * np.pi**4 / 5) ** 2, a**2 / 8, b**2 * np.pi**8 * (1 / 18 - 1 / 50)
     first, total = np.array([one, two, 0.0]) / (one + two + three), np.array([one + three, two, three]) / (one + two + three)
     errors = [abs(found.first - first) / found.first_half_width, abs(found.total - total) / found.total_half_width]
-    yield figure("largest error of a Sobol' index over its stated limit", float(np.max(errors)), 1.0, model="Ishigami's function")
+    yield figure("largest error of a Sobol' index over its stated limit", "Ishigami's function", float(np.max(errors)), 1.0)
 
 
-MEASURED = {measure.__name__: measure for measure in (rate, busy, memory, processes, bits, kills, indices)}
+def _in_folder(measure) -> Callable[[bool], Figures]:
+    def part(quick: bool) -> Figures:
+        with tempfile.TemporaryDirectory() as folder:
+            yield from measure(10_000 if quick else 100_000, Path(folder))
 
-
-def main() -> int:
-    """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a tenth of the lanes")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to this file")
-    parser.add_argument("--only", nargs="+", choices=MEASURED, default=list(MEASURED), help="these alone")
-    parser.add_argument("--folder", type=Path, help="where studies are written (default: a temporary one)")
-    parser.add_argument("--timed", help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.timed:
-        asked = json.loads(options.timed)
-        folder, lanes, log = Path(asked.pop("folder")), asked.pop("lanes"), asked.pop("log", None)
-        print(json.dumps(logged(lanes, folder, Path(log)).counts if log else timed(lanes, folder, **asked)))
-        return 0
-    figures = []
-    with tempfile.TemporaryDirectory() as temporary:
-        for name in options.only:
-            for found in MEASURED[name](10_000 if options.quick else 100_000, options.folder or Path(temporary)):
-                figures.append(found)
-                needed = "" if found["required"] is None else f"  (required {found['required']:g}: {'met' if found['met'] else 'MISSED'})"
-                print(f"{found['figure']}: {found['value']:.6g}{needed}", flush=True)
-    if options.json:
-        options.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
-    return 0
+    return part
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main(__doc__, {measure.__name__: _in_folder(measure) for measure in (rate, busy, memory, processes, bits, kills, indices)})

@@ -1,8 +1,7 @@
 """A search for motions that are wrong and do not say so: generated scenes and uses against references that share nothing with the engine.
 
-    python bench/hunt.py [--quick] [--json FILE] [--cases N] [--seed S] [--jobs N] [--markdown]
+    python bench/hunt.py [--quick] [--json FILE] [--cases N] [--seed S] [--jobs N]
     python bench/hunt.py --only NAME [--seed N]             # one family; with a seed, that case alone
-    python bench/hunt.py --list
 
 Every case is drawn by a seed. Outcomes: right; flagged by its result code; flagged by `motion.warnings`; refused with an error of the engine's own; wrong
 in silence; crashed with a raw error. Wrong and crashed ones are printed with what repeats them alone. The JSON is a list of {"figure", "model", "value",
@@ -11,35 +10,21 @@ in silence; crashed with a raw error. Wrong and crashed ones are printed with wh
 
 import argparse
 import json
-import os
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
-# Hundreds of small programs: compiling them is most of the time. The first flag belongs to jaxlib 0.10.
-FLAGS = "--xla_backend_optimization_level=0" + (" --xla_cpu_use_fusion_emitters=false" if version("jaxlib").startswith("0.10.") else "")
+from floats import TYPES, prepare
+
 CASES, QUICK = 2500, 300  # in all
 
 
-def prepare(dtype: str) -> None:
-    """The floats of this process, before JAX is imported."""
-    os.environ.setdefault("XLA_FLAGS", FLAGS)
-    os.environ["JAX_ENABLE_X64"] = "1" if dtype == "float64" else "0"
-    sys.path[:0] = [str(HERE), str(HERE.parent / "tests")]
-
-
-def run_family(name: str, dtype: str, seeds: list[int], cache: str | None = None) -> list[dict]:
+def run_family(name: str, dtype: str, seeds: list[int]) -> list[dict]:
     """Records of one family's cases, in this process."""
     prepare(dtype)
     import jax
-
-    if cache:
-        jax.config.update("jax_compilation_cache_dir", cache)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     from hunting.families import family
 
     found = [record.as_dict() for record in family(name).run(seeds)]
@@ -66,22 +51,14 @@ def planned(arguments) -> list[tuple[str, str, list[int]]]:
     return sorted(work, key=lambda w: -len(w[2]))
 
 
-def run_all(work, jobs: int, cache: str | None, report) -> list[dict]:
+def run_all(work, jobs: int, report) -> list[dict]:
     """Records of all; each kind of floats has processes of its own. `report(records so far, new ones)` after every family."""
     from hunting.record import CRASHED
 
     found: list[dict] = []
-    for dtype in ("float64", "float32"):
-        own = [w for w in work if w[1] == dtype]
-        if not own:
-            continue
-        if jobs == 1 and len({w[1] for w in work}) == 1 and dtype == "float64":
-            for w in own:
-                found += _said(w, run_family(*w, cache))
-                report(found, found[-len(w[2]) :])
-            continue
+    for dtype in TYPES:
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-            waiting = {pool.submit(run_family, *w, cache): w for w in own}
+            waiting = {pool.submit(run_family, *w): w for w in work if w[1] == dtype}
             for done in as_completed(waiting):
                 name, _, seeds = waiting[done]
                 try:
@@ -110,20 +87,13 @@ def main() -> int:
     parser.add_argument("--cases", type=int, help=f"about how many cases all families together have (default: {CASES})")
     parser.add_argument("--seed", type=int, help="first seed (default 0); with --only and without --cases, the only one")
     parser.add_argument("--only", nargs="*", metavar="NAME", help="only these families")
-    parser.add_argument("--dtype", choices=("float64", "float32"), default="float64", help="of a case that is run alone")
+    parser.add_argument("--dtype", choices=TYPES, default="float64", help="of a case that is run alone")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
-    parser.add_argument("--cache", help="folder for compiled programs, which makes a second run shorter")
-    parser.add_argument("--markdown", action="store_true", help="print the table as Markdown")
-    parser.add_argument("--list", action="store_true", help="print the families and end")
     arguments = parser.parse_args()
     begin = time.perf_counter()
     work = planned(arguments)
-    from hunting.families import FAMILIES
-    from hunting.table import as_markdown, as_text, figures, losses
+    from hunting.table import as_markdown, figures, losses
 
-    if arguments.list:
-        print("\n".join(f"{f.name:26s} {f.cases:4d}  {f.what}" for f in FAMILIES))
-        return 0
     print(f"seeds from {arguments.seed or 0}; {sum(len(w[2]) for w in work)} cases", file=sys.stderr)
 
     def report(records: list[dict], new: list[dict]) -> None:
@@ -131,11 +101,11 @@ def main() -> int:
         if arguments.records:
             arguments.records.write_text(json.dumps(records, indent=1) + "\n")
 
-    records = run_all(work, arguments.jobs, arguments.cache, report)
+    records = run_all(work, arguments.jobs, report)
     wall = time.perf_counter() - begin
     if arguments.json:
-        arguments.json.write_text(json.dumps(figures(records, wall), indent=1) + "\n")
-    print("\n".join((as_markdown if arguments.markdown else as_text)(records)))
+        arguments.json.write_text(json.dumps(list(figures(records, wall)), indent=1) + "\n")
+    print("\n".join(as_markdown(records)))
     print(f"{len(records)} cases in {wall:.0f} s")
     return int(any(r["outcome"] in ("wrong", "crashed") for r in records))
 

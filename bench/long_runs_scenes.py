@@ -9,21 +9,26 @@ import jax.numpy as jnp
 import jourdain_jax as jj
 
 
-class ContactOscillator(jj.Scene):
+class Point(jj.Scene):
+    """A unit particle in space."""
+
+    coordinates = jj.coordinates("x y z")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0, q.array)}
+
+
+class ContactOscillator(Point):
     """A unit particle with the row `xdot + y zdot = 0` and V = (x^2 + y^2 + z^2 + strength x^2 z^2)/2.
 
     y feels neither the row nor the coupling: it swings by itself, and (y^2 + ydot^2)/2 is an integral for every strength.
     """
 
-    strength: jnp.ndarray = jj.parameter(0.3, about="eps, of the coupling of x and z")
+    strength: object = jj.parameter(0.3, about="eps, of the coupling of x and z")
 
-    coordinates = jj.coordinates("x y z")
     privileged = ("y_rate", "z_rate")
     example = {"x": 1.0, "y": 1.0, "z": 0.0, "y_rate": 0.3, "z_rate": 0.5}
     example_span = 10.0
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(1.0, q.array)}
 
     def potential(self, pose):
         q = pose.q
@@ -65,23 +70,19 @@ class ChaoticOscillator(jj.Scene):
         return {"contact": u[0] + q[1:4] @ u[4:]}
 
 
-class Transmission(jj.Scene):
+class Transmission(Point):
     """A pendulum y that drives a continuously variable transmission `xdot + f(y) zdot = 0` between two oscillators x, z.
 
     V = (x^2 + z^2)/2 + 1 - cos y - asymmetry sin(2y)/2, f = y + bend y^2. The energies of the pendulum and of the oscillators are both integrals.
     With asymmetry or bend no reflection of y helps an integrator that is only symmetric in time.
     """
 
-    asymmetry: jnp.ndarray = jj.parameter(0.2)
-    bend: jnp.ndarray = jj.parameter(0.3)
+    asymmetry: object = jj.parameter(0.2)
+    bend: object = jj.parameter(0.3)
 
-    coordinates = jj.coordinates("x y z")
     privileged = ("y_rate", "z_rate")
     example = {"x": 1.0, "y": 1.2, "z": 0.0, "z_rate": 0.5}
     example_span = 10.0
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(1.0, q.array)}
 
     def potential(self, pose):
         q = pose.q

@@ -2,39 +2,46 @@
 
     taskset -c 0 python bench/lowering.py [--quick] [--json FILE] [--only NAME ...]
 
-Writes a list of {"figure", "model", "value", "required", "aim", "met"} (met: the required figure). float64, warm unless said; ratios come from
+Writes a list of {"figure", "model", "value", "required", "met"}. float64, warm unless said; ratios come from
 one run, times are the fastest of some repeats. Baselines, frozen: `bench/baselines` (by hand, dense autodiff, flat arrays).
 """
 
-import argparse
-import json
 import os
-import platform
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
 
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
 os.environ["JOURDAIN_JAX_CACHE"] = "0"  # all is found and compiled here, and what is found beyond the budget of operations is kept for nobody
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from baselines import dense, disc_run
 from baselines.hand_derived import HAND_DERIVED, operations
-from baselines.timing import fastest, least_processor_time, seconds_per_evaluation
+from figures import Figures, compiled, fastest, figure, least_processor_time, main
+from minimal_states import final_states, starts_at
 
 import jourdain_jax as jj
 from jourdain_jax.models import PendulumChain, TrailerChain
 
-Figure = dict
 BY_HAND_LANES, DENSE_LANES = 4096, 1024
+COMPILED = {"forward": 6, "reverse": 10}  # s
 
 
-def figure(name: str, model: str, value: float | None, required: float, aim: float, at_least: bool = False) -> Figure:
-    """One entry of the result; `value` None where it could not be measured."""
-    met = value is not None and (value >= required if at_least else value <= required)
-    return {"figure": name, "model": model, "value": value, "required": required, "aim": aim, "met": bool(met)}
+def seconds_per_evaluation(rates: Callable, state, lanes: int, evaluations: int = 20, repeats: int = 60) -> float:
+    """Time per evaluation of `rates(state)` of a whole batch and per lane, inside a compiled loop, as a solver calls it: fastest of some repeats, s.
+
+    The loop takes explicit Euler steps, so short that the states stay where they start; one multiplication and addition per state are part of the time.
+    """
+
+    @jax.jit
+    def loop(state):
+        return jax.lax.fori_loop(0, evaluations, lambda _, y: jax.tree.map(lambda y, rate: y + 1e-6 * rate, y, rates(y)), state)
+
+    return fastest(lambda: jax.block_until_ready(loop(state)), repeats) / (lanes * evaluations)
 
 
 def states(name: str, lanes: int):
@@ -45,12 +52,12 @@ def states(name: str, lanes: int):
     return scene, program, (tuple(map(jnp.asarray, q.T)), tuple(jnp.asarray(u[:, k]) for k in program.independent))
 
 
-def operation_ratios(quick: bool) -> Iterator[Figure]:
+def operation_ratios(quick: bool) -> Figures:
     """Operations of the lowered right-hand side, relative to the one by hand."""
     for name in HAND_DERIVED:
         value = jj.lower(jj.models.MODELS[name]()).operations / operations(name)
-        yield figure("operations, lowered / by hand", name, value, 1.5, 1.1)
-    yield figure("operations", "whipple-bicycle", jj.lower(jj.models.MODELS["whipple-bicycle"]()).operations, 2500, 1200)
+        yield figure("operations, lowered / by hand", name, value, 1.5)
+    yield figure("operations", "whipple-bicycle", jj.lower(jj.models.MODELS["whipple-bicycle"]()).operations, 2500)
 
 
 def evaluation_time(name: str, lanes: int) -> float:
@@ -58,70 +65,46 @@ def evaluation_time(name: str, lanes: int) -> float:
     scene, program, state = states(name, lanes)
     fixed, inputs = program.fixed_values(scene), jnp.zeros(len(scene.inputs))
     one = lambda q, y: program.rates(fixed, 0.0, q, y, inputs)[:2]  # noqa: E731
-    return seconds_per_evaluation(lambda state: jax.vmap(one)(*state), state, len(state[0][0]), repeats=60)
+    return seconds_per_evaluation(lambda state: jax.vmap(one)(*state), state, len(state[0][0]))
 
 
-def evaluation_ratios(quick: bool) -> Iterator[Figure]:
+def evaluation_ratios(quick: bool) -> Figures:
     """Time per evaluation in a batch, relative to hand-written equations in the same layout, and to dense ones."""
     for name in ("tilting-disc",) if quick else HAND_DERIVED:
         known, (scene, _, state) = HAND_DERIVED[name], states(name, BY_HAND_LANES)
         parameters = {key: getattr(scene, key) for key in known.parameters}
-        by_hand = seconds_per_evaluation(lambda y, known=known, p=parameters: known.rates(p, 0.0, *y), state, len(state[0][0]), repeats=60)
-        yield figure("time per evaluation in a batch of 4096, lowered / by hand", name, evaluation_time(name, BY_HAND_LANES) / by_hand, 1.5, 1.1)
+        by_hand = seconds_per_evaluation(lambda y, known=known, p=parameters: known.rates(p, 0.0, *y), state, len(state[0][0]))
+        yield figure("time per evaluation in a batch of 4096, lowered / by hand", name, evaluation_time(name, BY_HAND_LANES) / by_hand, 1.5)
     scene = jj.models.MODELS["whipple-bicycle"]()
     _, q, u = jj.sample_states(scene, DENSE_LANES)
     rates = jax.vmap(lambda y: dense.bicycle_rates(dense.BICYCLE_PARAMETERS, 0.0, y))
     by_dense = seconds_per_evaluation(rates, jnp.concatenate([q, u], axis=1), len(q), evaluations=10, repeats=20)
     ratio = by_dense / evaluation_time("whipple-bicycle", DENSE_LANES)
-    yield figure("time per evaluation in a batch of 1024, dense / lowered", "whipple-bicycle", ratio, 15, 40, at_least=True)
+    yield figure("time per evaluation in a batch of 1024, dense / lowered", "whipple-bicycle", ratio, least=15)
 
 
-def our_starts(y) -> jj.State:
-    """States of discs, for minimal ones (lanes, 8): the contact point's speeds follow from the rows."""
-    start = jax.tree.map(lambda x: jnp.broadcast_to(0.0 * x, (len(y), *jnp.shape(x))), jj.start(jj.models.MODELS["tilting-disc"]()))
-    q, u = y[:, :5], jnp.concatenate([jnp.zeros((len(y), 2)), y[:, 5:]], axis=1)
-    return jj.State(start.t, q, u, start.moved_q, start.moved_u, start.residual, start.names, start.guess)
+RUN = {"solver": diffrax.Dopri8(), "events": False, "formulation": jj.Formulation(stabilisation=None)}
 
 
-RUN = {"ts": jnp.array([disc_run.END]), "solver": diffrax.Dopri8(), "events": False, "formulation": jj.Formulation(stabilisation=None)}
-
-
-def our_disc(alone: bool = False) -> Callable:
-    """A compiled function `(tolerance, starts)` of initial minimal states to final ones, by `rollout` or `simulate`."""
-    scene = jj.models.MODELS["tilting-disc"]()
-
-    @jax.jit
-    def compiled(tolerance, y):
-        starts, options = our_starts(y), RUN | {"rtol": tolerance, "atol": tolerance}
-        if alone:
-            motion = jj.simulate(scene, jax.tree.map(lambda x: x[0], starts), **options)
-            return jnp.concatenate([motion.q_end, motion.u_end[2:]])[None]
-        lanes = jj.rollout(scene, starts, **options).lanes
-        return jnp.concatenate([lanes.q_end, lanes.u_end[:, 2:]], axis=1)
-
-    return lambda tolerance, starts: np.asarray(compiled(tolerance, starts))
-
-
-def disc_seconds(run: Callable, starts, expected, first: float, repeats: int) -> float:
+def disc_seconds(run: Callable, starts, expected, repeats: int) -> float:
     """Seconds per trajectory at the loosest tolerance with a final error of 1e-8."""
-    tolerance, _ = disc_run.loosest(lambda tolerance: run(tolerance, starts), expected, first)
-    return fastest(lambda: run(tolerance, starts), repeats) / len(starts)
+    tolerance = disc_run.loosest(lambda tolerance: run(tolerance, starts), expected, 1e-9)
+    return fastest(lambda: run(tolerance, starts), repeats) / len(expected)
 
 
-def disc_motions(quick: bool) -> Iterator[Figure]:
+def disc_motions(quick: bool) -> Figures:
     """10 s of the tilting disc, 1024 lanes, at a final error of 1e-8."""
-    starts = disc_run.starts(128 if quick else disc_run.LANES)
+    scene, starts, one = jj.models.TiltingDisc(), disc_run.starts(128 if quick else disc_run.LANES), disc_run.START[None]
     expected = disc_run.reference(starts)
-    ours = disc_seconds(our_disc(), starts, expected, 1e-9, 5)
-    print(f"  ours: {1e3 * ours:.3f} ms per trajectory in a batch of {len(starts)}", flush=True)
+    ours = disc_seconds(final_states(scene, disc_run.END, **RUN), starts_at(scene, starts), expected, 5)
+    yield figure("10 s of the disc at error 1e-8 in a batch, ms per trajectory", "tilting-disc", 1e3 * ours)
     if not quick:
-        plain = disc_seconds(disc_run.final_states("dense", "Dopri8"), starts, expected, 1e-9, 2)
-        yield figure("10 s of the disc at error 1e-8, dense / ours", "tilting-disc", plain / ours, 15, 50, at_least=True)
-    flat = disc_seconds(disc_run.final_states("flat", "Dopri8"), starts, expected, 1e-9, 3)
-    yield figure("10 s of the disc at error 1e-8, by hand in a flat array / ours", "tilting-disc", flat / ours, 3, 10, at_least=True)
-    one = disc_run.START[None]
-    alone = disc_seconds(our_disc(alone=True), one, disc_run.reference(one), 1e-9, 20)
-    print(f"  ours: {1e3 * alone:.3f} ms alone", flush=True)
+        plain = disc_seconds(disc_run.final_states("dense"), starts, expected, 2)
+        yield figure("10 s of the disc at error 1e-8, dense / ours", "tilting-disc", plain / ours, least=15)
+    flat = disc_seconds(disc_run.final_states("flat"), starts, expected, 3)
+    yield figure("10 s of the disc at error 1e-8, by hand in a flat array / ours", "tilting-disc", flat / ours, least=3)
+    alone = disc_seconds(final_states(scene, disc_run.END, True, **RUN), starts_at(scene, one), disc_run.reference(one), 20)
+    yield figure("10 s of the disc at error 1e-8 alone, ms", "tilting-disc", 1e3 * alone)
 
 
 # span in s, names of parameters, and which coordinates and speeds of the start vary: eight numbers in all
@@ -144,7 +127,7 @@ def final_losses(name: str) -> tuple[Callable, np.ndarray]:
         starts = jax.tree.map(lambda y: jnp.broadcast_to(y, (len(x), *jnp.shape(y))), start)
         first, middle = len(parameters), len(parameters) + len(of_q)
         q, u = starts.q.at[:, jnp.array(of_q)].set(x[:, first:middle]), starts.u.at[:, jnp.array(of_u)].set(x[:, middle:])
-        starts = jj.State(starts.t, q, u, starts.moved_q, starts.moved_u, starts.residual, starts.names, starts.guess)
+        starts = eqx.tree_at(lambda state: (state.q, state.u), starts, (q, u))
         if len(x) == 1:
             own = scene.replace(**{p: x[0, k] for k, p in enumerate(parameters)})
             return jnp.sum(jj.simulate(own, jax.tree.map(lambda x: x[0], starts), **options).q_end ** 2)[None]
@@ -154,133 +137,113 @@ def final_losses(name: str) -> tuple[Callable, np.ndarray]:
     return losses, values
 
 
-def gradients(quick: bool) -> Iterator[Figure]:
+def by_forward_mode(losses: Callable, x):
+    """The gradient of the loss of every lane by its eight numbers."""
+    along = jnp.eye(8)[:, None, :] + jnp.zeros_like(x)
+    return jax.vmap(lambda v: jax.jvp(losses, (x,), (v,))[1])(along).T
+
+
+def assert_close(found, expected, off: float = 1e-5) -> None:
+    """Numbers are equal up to the tolerance of the motions."""
+    np.testing.assert_allclose(found, expected, rtol=off, atol=off * np.max(np.abs(expected)))
+
+
+def gradients(quick: bool) -> Figures:
     """Gradient of a final-state loss by 8 numbers, best mode, relative to one forward solve at the same tolerance; what each mode takes to compile."""
     for name in ("tilting-disc",) if quick else BY_EIGHT:
         losses, values = final_losses(name)
-
-        def by_forward_mode(x, losses=losses):
-            along = jnp.eye(8)[:, None, :] + jnp.zeros_like(x)
-            return jax.vmap(lambda v: jax.jvp(losses, (x,), (v,))[1])(along).T
-
-        ways = {
-            "solve": losses,
-            "forward": by_forward_mode,
-            "reverse": jax.grad(lambda x, losses=losses: jnp.sum(losses(x))),
-        }
+        ways = {"solve": losses, "forward": partial(by_forward_mode, losses), "reverse": jax.grad(lambda x, losses=losses: jnp.sum(losses(x)))}
         for where, lanes in (("alone", 1), ("batched", 1024))[: 1 if quick else 2]:
             x = jnp.asarray(values * (1 + 0.01 * np.random.default_rng(0).normal(size=(lanes, 8))))
-            runs, found = {}, {}
+            runs = {}
             for way, f in ways.items():
-                begin = time.process_time()
-                runs[way] = jax.jit(f).lower(x).compile()
-                seconds = time.process_time() - begin
-                found[way] = np.asarray(runs[way](x))
+                runs[way], seconds = compiled(f, x)
                 if way != "solve" and where == "alone":
-                    yield figure(
-                        f"trace and compile the gradient with respect to 8 numbers, {way}, s", name, seconds, *((6, 3) if way == "forward" else (10, 5))
-                    )
-            timed = least_processor_time({way: lambda run=run, x=x: jax.block_until_ready(run(x)) for way, run in runs.items()}, 7)
-            scale = np.max(np.abs(found["reverse"]))
-            np.testing.assert_allclose(found["forward"], found["reverse"], rtol=1e-5, atol=1e-5 * scale)
-            print(f"  {name}, {where}: " + ", ".join(f"{way} {1e3 * t / lanes:.3f} ms" for way, t in timed.items()), flush=True)
+                    yield figure(f"trace and compile the gradient with respect to 8 numbers, {way}, s", name, seconds, COMPILED[way])
+            assert_close(runs["forward"](), runs["reverse"]())
+            timed = least_processor_time(runs, 7)
+            for way, seconds in timed.items():
+                yield figure(f"gradient with respect to 8 numbers, {where}, {way}, ms", name, 1e3 * seconds / lanes)
             best = min(timed["forward"], timed["reverse"])
-            yield figure(f"gradient with respect to 8 numbers / one solve, {where}", name, best / timed["solve"], AT_MOST[name], 3)
+            yield figure(f"gradient with respect to 8 numbers / one solve, {where}", name, best / timed["solve"], AT_MOST[name])
 
 
-def second_derivatives(quick: bool) -> Iterator[Figure]:
+def second_derivatives(quick: bool) -> Figures:
     """Second derivatives of a final-state loss by 8 numbers in two ways, relative to one solve at the same tolerance; what each takes to compile."""
     for name in ("tilting-disc",) if quick else BY_EIGHT:
         losses, values = final_losses(name)
         x = jnp.asarray(values)
-
-        def loss(x, losses=losses):
-            return losses(x[None])[0]
-
-        def with_vector(x, v, loss=loss):
-            return jax.jvp(jax.grad(loss), (x,), (v,))[1]
-
+        loss = lambda x, losses=losses: losses(x[None])[0]  # noqa: E731
         slope, step = jax.jit(jax.jacfwd(loss)), 1e-4 * np.diag(np.maximum(np.abs(values), 0.1))
         differences = np.stack([(slope(x + h) - slope(x - h)) / (2 * np.sum(h)) for h in step])
-        runs, seconds = {}, {}
-        ways = {"solve": (loss, x), "jacfwd of jacfwd": (jax.jacfwd(jax.jacfwd(loss)), x), "hessian": (jax.hessian(loss), x)}
-        for way, (f, *arguments) in (ways | {"hessian times a vector": (with_vector, x, x)}).items():
-            begin = time.process_time()
-            run = jax.jit(f).lower(*arguments).compile()
-            seconds[way] = time.process_time() - begin
-            runs[way] = lambda run=run, arguments=arguments: jax.block_until_ready(run(*arguments))
-        scale = np.max(np.abs(differences))
-        for way, expected in (("jacfwd of jacfwd", differences), ("hessian", differences), ("hessian times a vector", differences @ x)):
-            np.testing.assert_allclose(runs[way](), expected, rtol=1e-4, atol=1e-4 * scale)
+        ways = {
+            "jacfwd of jacfwd": (jax.jacfwd(jax.jacfwd(loss)), differences),
+            "hessian": (jax.hessian(loss), differences),
+            "hessian times a vector": (lambda x, loss=loss: jax.jvp(jax.grad(loss), (x,), (x,))[1], differences @ x),
+        }
+        runs, seconds = {"solve": compiled(loss, x)[0]}, {}
+        for way, (f, expected) in ways.items():
+            runs[way], seconds[way] = compiled(f, x)
+            np.testing.assert_allclose(runs[way](), expected, rtol=1e-4, atol=1e-4 * np.max(np.abs(differences)))
         timed = least_processor_time(runs, 7)
-        for way in ("jacfwd of jacfwd", "hessian", "hessian times a vector"):
-            print(f"  {name}: {way} with respect to 8 numbers compiled in {seconds[way]:.1f} s, {1e3 * timed[way]:.3f} ms", flush=True)
-            yield figure(f"trace and compile second derivatives with respect to 8 numbers, {way}, s", name, seconds[way], 20, 10)
-            yield figure(f"second derivatives with respect to 8 numbers, {way} / one solve", name, timed[way] / timed["solve"], 64, 32)
+        for way in ways:
+            what = f"second derivatives with respect to 8 numbers, {way}"
+            yield figure(f"trace and compile {what}, s", name, seconds[way], 20)
+            yield figure(f"{what}, ms", name, 1e3 * timed[way])
+            yield figure(f"{what} / one solve", name, timed[way] / timed["solve"], 64)
+
+
+def both_modes(what: str, name: str, loss: Callable, x, forward: float) -> Figures:
+    """What the derivative of a loss takes to compile by each mode (`forward`: at most, s, by that), and once it is compiled."""
+    jax.block_until_ready(loss(x))  # what is found of the scene is not counted
+    found = {}
+    for way, derivative in (("forward", jax.jacfwd), ("reverse", jax.grad)):
+        run, seconds = compiled(derivative(loss), x)
+        found[way] = np.concatenate([np.ravel(x) for x in jax.tree.leaves(run())])
+        yield figure(f"trace and compile a derivative {what}, {way} mode, s", name, seconds, forward if way == "forward" else COMPILED[way])
+        yield figure(f"a derivative {what}, {way} mode, ms", name, 1e3 * least_processor_time({way: run}, 7)[way])
+    assert_close(found["forward"], found["reverse"])
 
 
 NAMED = {
-    "tilting-disc": ({"lean": 0.3, "spin_rate": -3.0}, ("radius", "mass", "gravity"), "lean"),
-    "whipple-bicycle": ({"lean": 0.05, "rear_spin_rate": 15.0, "lean_rate": 0.2}, ("IBxx", "mB", "c"), "lean"),
+    "tilting-disc": ({"lean": 0.3, "spin_rate": -3.0}, ("radius", "mass", "gravity")),
+    "whipple-bicycle": ({"lean": 0.05, "rear_spin_rate": 15.0, "lean_rate": 0.2}, ("IBxx", "mB", "c")),
 }
 
 
-def named_starts(quick: bool) -> Iterator[Figure]:
+def named_starts(quick: bool) -> Figures:
     """Derivative of 2 s of a motion by three parameters, its start being named values, which depend on them where they are put onto the rows."""
-    for name, (given, free, seen) in list(NAMED.items())[: 1 if quick else 2]:
+    for name, (given, free) in list(NAMED.items())[: 1 if quick else 2]:
         scene, ts = jj.models.MODELS[name](), jnp.linspace(0.0, 2.0, 41)
 
-        def loss(x, scene=scene, given=given, free=free, seen=seen, ts=ts):
-            return jnp.sum(jj.simulate(scene.replace(**dict(zip(free, x, strict=True))), given, ts=ts)[seen])
+        def loss(x, scene=scene, given=given, free=free, ts=ts):
+            return jnp.sum(jj.simulate(scene.replace(**dict(zip(free, x, strict=True))), given, ts=ts)["lean"])
 
-        x = jnp.stack([getattr(scene, one) for one in free])
-        jax.block_until_ready(jj.simulate(scene, given, ts=ts).q)  # what is found of the scene is not counted
-        found = {}
-        for way, derivative in (("forward", jax.jacfwd), ("reverse", jax.grad)):
-            begin = time.process_time()
-            run = jax.jit(derivative(loss)).lower(x).compile()
-            seconds = time.process_time() - begin
-            found[way] = np.asarray(run(x))
-            warm = least_processor_time({way: lambda run=run, x=x: jax.block_until_ready(run(x))}, 7)[way]
-            print(f"  {name}, {way} mode from named values: compiled in {seconds:.1f} s, {1e3 * warm:.3f} ms", flush=True)
-            yield figure(f"trace and compile a derivative from named values, {way} mode, s", name, seconds, *((6, 3) if way == "forward" else (10, 5)))
-        np.testing.assert_allclose(found["forward"], found["reverse"], rtol=1e-5, atol=1e-5 * np.max(np.abs(found["reverse"])))
+        yield from both_modes("from named values", name, loss, jnp.stack([getattr(scene, one) for one in free]), COMPILED["forward"])
 
 
-def all_parameters(quick: bool) -> Iterator[Figure]:
+def all_parameters(quick: bool) -> Figures:
     """Derivative of all speeds at the saved times of 1 s with respect to every parameter of a scene: what each mode takes to compile."""
-    chain, ts = jj.models.TrailerChain(trailers=16), jnp.linspace(0.0, 1.0, 101)
-    scenes = {"trailer-chain, n = 16": chain} | ({} if quick else {"whipple-bicycle": jj.models.WhippleBicycle()})
-    for name, scene in scenes.items():
+    ts, scenes = jnp.linspace(0.0, 1.0, 101), {"trailer-chain, n = 16": TrailerChain(trailers=16), "whipple-bicycle": jj.models.WhippleBicycle()}
+    for name, scene in list(scenes.items())[: 1 if quick else 2]:
         start = jj.start(scene, **scene.example)
 
         def loss(scene, start=start):
             return jnp.sum(jj.simulate(scene, start, ts=ts, work=False).u ** 2)
 
-        jax.block_until_ready(loss(scene))  # what is found of the scene is not counted
-        found = {}
-        for way, derivative in (("forward", jax.jacfwd), ("reverse", jax.grad)):
-            begin = time.process_time()
-            run = jax.jit(derivative(loss)).lower(scene).compile()
-            seconds = time.process_time() - begin
-            found[way] = np.concatenate([np.ravel(x) for x in jax.tree.leaves(run(scene))])
-            warm = least_processor_time({way: lambda run=run, scene=scene: jax.block_until_ready(run(scene))}, 7)[way]
-            print(f"  {name}, {way} mode by all {found[way].size} parameters: compiled in {seconds:.1f} s, {1e3 * warm:.3f} ms", flush=True)
-            yield figure(f"trace and compile a derivative by all parameters, {way} mode, s", name, seconds, *((8, 4) if way == "forward" else (10, 5)))
-        np.testing.assert_allclose(found["forward"], found["reverse"], rtol=1e-5, atol=1e-5 * np.max(np.abs(found["reverse"])))
+        yield from both_modes("by all parameters", name, loss, scene, 8)
 
 
 LONGEST = 200  # trailers of the chain that is to be built in a minute
 
 
-def growth(quick: bool) -> Iterator[Figure]:
+def growth(quick: bool) -> Figures:
     """Time per step over n of motions of chains of trailers and of pendulums, and their compile time."""
     few, many = (2, 4) if quick else (8, 64)
     for name, make in (("trailer-chain", lambda n: TrailerChain(trailers=n)), ("pendulum-chain", lambda n: PendulumChain(links=n))):
-        laps, compile_time = {}, None
+        laps, built = {}, {}
         for n in (few, many):
-            scene = make(n)
-            begin = time.perf_counter()
+            scene, begin = make(n), time.perf_counter()
             try:
                 program = jj.lower(scene)
             except jj.NotLowered as reason:
@@ -289,54 +252,18 @@ def growth(quick: bool) -> Iterator[Figure]:
             start = jj.start(scene, **scene.example)
             run = jax.jit(lambda start, scene=scene: jj.simulate(scene, start, ts=jnp.array([1.0]), events=False))
             motion = run(start).raise_if_failed()
-            compile_time = time.perf_counter() - begin
-            seconds = least_processor_time({"run": lambda run=run, start=start: jax.block_until_ready(run(start).q_end)}, 7)["run"]
+            built[n] = time.perf_counter() - begin
+            seconds = least_processor_time({"run": lambda run=run, start=start: run(start)}, 7)["run"]
             laps[n] = seconds / int(motion.accepted + motion.rejected) / n
-            told = f"{1e6 * laps[n]:.2f} us per step and link ({motion.reduction}), built and compiled in {compile_time:.1f} s"
-            print(f"  {name}, n = {n}: {program.operations} operations, {told}")
-        complete = len(laps) == 2
-        yield figure(f"time per step / n, n = {many} against n = {few}", name, laps[many] / laps[few] if complete else None, 3, 1.5)
-        yield figure(f"build and compile time at n = {many}, s", name, compile_time if complete else None, 60, 15)
+            yield figure(f"operations, n = {n}", name, program.operations)
+            yield figure(f"us per step and link, n = {n}, {motion.reduction}", name, 1e6 * laps[n])
+        yield figure(f"time per step / n, n = {many} against n = {few}", name, laps[many] / laps[few] if many in laps else None, 3)
+        yield figure(f"build and compile time at n = {many}, s", name, built.get(many), 60)
     if not quick:
         begin = time.perf_counter()
         jj.simulate(TrailerChain(trailers=LONGEST), t1=1.0).raise_if_failed()
-        yield figure(f"n = {LONGEST}, built and its first motion, s", "trailer-chain", time.perf_counter() - begin, 60, 24)
-
-
-FIGURES = {
-    f.__name__: f
-    for f in (
-        operation_ratios,
-        evaluation_ratios,
-        disc_motions,
-        gradients,
-        second_derivatives,
-        all_parameters,
-        named_starts,
-        growth,
-    )
-}
-
-
-def main() -> None:
-    """Measure, print, and write JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a reduced set, in less than a minute")
-    parser.add_argument("--json", help="file to write")
-    parser.add_argument("--only", nargs="*", choices=FIGURES, default=list(FIGURES))
-    options = parser.parse_args()
-    print(f"jax {jax.__version__}, Python {platform.python_version()}, {platform.processor() or platform.machine()}, one core", flush=True)
-    found = []
-    for name in options.only:
-        for entry in FIGURES[name](options.quick):
-            found.append(entry)
-            value = "not measured" if entry["value"] is None else f"{entry['value']:.3g}"
-            said = f"{value:>12} (required {entry['required']}, aim {entry['aim']})  {entry['figure']}: {entry['model']}"
-            print("met " if entry["met"] else "MISS", said, flush=True)
-    if options.json:
-        with open(options.json, "w") as file:
-            json.dump(found, file, indent=1)
+        yield figure(f"n = {LONGEST}, built and its first motion, s", "trailer-chain", time.perf_counter() - begin, 60)
 
 
 if __name__ == "__main__":
-    main()
+    main(__doc__, (operation_ratios, evaluation_ratios, disc_motions, gradients, second_derivatives, all_parameters, named_starts, growth))

@@ -5,13 +5,10 @@
 Writes a list of {"figure", "model", "value", "required", "met"}. `--quick`: three bicycles, 200 samples each instead of 2,000.
 """
 
-import argparse
-import json
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
+from figures import Figures, figure, main
 
 from jourdain_jax.bicycle import (
     benchmark_from_measurements,
@@ -28,13 +25,6 @@ from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
 ABOUT_CENTRES = ("xB", "zB", "xH", "zH", "IByy", "IHyy")  # published as means over pairs of lines
 ROUNDED = ("Balanceassistv1",)  # its file gives two or three digits
 SPLIT = ("Rigid",)  # moments of its fork follow from two mass centres
-
-
-def figure(name: str, model: str, value: float, required: float | None = None) -> dict:
-    """One entry of the result."""
-    met = required is None or value <= required
-    print(f"  {name}, {model}: {value:.4g}" + ("" if required is None else f" (required: <= {required:g})"), flush=True)
-    return {"figure": name, "model": model, "value": value, "required": required, "met": bool(met)}
 
 
 def against_published(name: str) -> list[dict]:
@@ -70,30 +60,20 @@ def width(bicycle, count: int) -> float:
     return float(limits.high - limits.low)
 
 
-def main() -> None:
-    """Run, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    names = ["Browser", "Crescendo", "Stratos"] if options.quick else list(shipped_measurements())
-    figures, ratios = [], []
+def bicycles(quick: bool) -> Figures:
+    """Values and sigmas of every bicycle, and its limits on the weave speed."""
+    names, ratios = ("Browser", "Crescendo", "Stratos") if quick else shipped_measurements(), []
     for name in names:
-        print(name)
         if name in shipped_bicycles():
-            figures += against_published(name)
+            yield from against_published(name)
         bicycle = benchmark_from_measurements(name)
-        together, alone = (width(one, 200 if options.quick else 2000) for one in (bicycle, bicycle.with_independent_errors))
+        together, alone = (width(one, 200 if quick else 2000) for one in (bicycle, bicycle.with_independent_errors))
         ratios.append(together / alone)
-        figures += [
-            figure("95 % limits on the weave speed, width with covariance, m/s", name, together),
-            figure("and with independent sigmas, m/s", name, alone),
-            figure("one over the other", name, ratios[-1]),
-        ]
-    figures.append(figure("widths with covariance over those with independent sigmas, median", f"{len(names)} bicycles", float(np.median(ratios))))
-    if options.json:
-        options.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+        yield figure("95 % limits on the weave speed, width with covariance, m/s", name, together)
+        yield figure("and with independent sigmas, m/s", name, alone)
+        yield figure("one over the other", name, ratios[-1])
+    yield figure("widths with covariance over those with independent sigmas, median", f"{len(names)} bicycles", float(np.median(ratios)))
 
 
 if __name__ == "__main__":
-    main()
+    main(__doc__, (bicycles,))

@@ -1,34 +1,31 @@
 """What the README's test command costs: wall and processor time, peak of the sum of resident memory of its processes, slowest files and tests.
 
-python bench/suite.py [--quick] [--json FILE] [--only FILE ...]        --quick: three files alone
+    python bench/suite.py [--quick] [--json FILE]        --quick: three files alone
+
+What is required, of the whole suite alone, is for two idle cores.
 """
 
-import argparse
-import json
 import re
 import subprocess
 import sys
 import time
 from collections import Counter
 from contextlib import suppress
-from pathlib import Path
 from threading import Thread
 
 import psutil
+from figures import HERE, Figures, figure, main
 
 COMMAND = [sys.executable, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile"]
-REQUIRED = {"wall_s": 360.0, "peak_GiB": 5e9 / 2**30}  # on two idle cores
 QUICK = ("tests/test_simulate.py", "tests/test_deep_programs.py", "tests/test_labelled.py")
-EVERY = 0.5  # s between looks at the processes
 _TEST = re.compile(r"^\s*([\d.]+)s (call|setup|teardown)\s+(\S+)", re.MULTILINE)
 
 
-def measured(files: tuple[str, ...] = ()) -> dict:
-    """Run the command on these files (default: all); return its times in s, its peak in GiB, and the slowest files and tests."""
-    root = Path(__file__).resolve().parents[1]
-    command = [*COMMAND, "--durations=0", "--durations-min=0.05", *files]
+def suite(quick: bool) -> Figures:
+    """Run the command; yield its times in s, its peak in GiB, and the slowest files and tests."""
+    command = [*COMMAND, "--durations=0", "--durations-min=0.05", *(QUICK if quick else ())]
     begin, peak, processor = time.perf_counter(), 0, Counter()
-    run = subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    run = subprocess.Popen(command, cwd=HERE.parent, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     tree = psutil.Process(run.pid)
     with run.stdout as stream:
         lines: list[str] = []
@@ -36,21 +33,20 @@ def measured(files: tuple[str, ...] = ()) -> dict:
         reader.start()
         while run.poll() is None:
             peak = max(peak, _resident(tree, processor))
-            time.sleep(EVERY)
+            time.sleep(0.5)  # between looks at the processes
         reader.join()
     tests, by_file, text = Counter(), Counter(), "".join(lines)
     for seconds, _, name in _TEST.findall(text):
         tests[name] += float(seconds)
         by_file[name.partition("::")[0]] += float(seconds)
-    return {
-        "wall_s": time.perf_counter() - begin,
-        "processor_s": sum(processor.values()),
-        "peak_GiB": peak / 2**30,
-        "passed": run.returncode == 0,
-        "ended": text.strip().rpartition("\n")[2],
-        "slowest files": dict(by_file.most_common(15)),
-        "slowest tests": dict(tests.most_common(25)),
-    }
+    name, seconds, size = ("part of the suite", None, None) if quick else ("suite", 360.0, 5e9 / 2**30)
+    yield figure("wall_s", name, time.perf_counter() - begin, seconds)
+    yield figure("peak_GiB", name, peak / 2**30, size)
+    yield figure("processor_s", name, sum(processor.values()))
+    yield from (figure("seconds of a file", name, seconds) for name, seconds in by_file.most_common(15))
+    yield from (figure("seconds of a test", name, seconds) for name, seconds in tests.most_common(25))
+    if run.returncode:
+        raise RuntimeError(text.strip().rpartition("\n")[2])
 
 
 def _resident(tree: psutil.Process, processor: Counter) -> int:
@@ -65,36 +61,5 @@ def _resident(tree: psutil.Process, processor: Counter) -> int:
     return total
 
 
-def figures(found: dict, whole: bool) -> list[dict]:
-    """Return rows of figures as the other scripts write them; only the `whole` suite has required ones."""
-    rows = [
-        (name, "suite" if whole else "part of the suite", found[name], REQUIRED.get(name) if whole else None) for name in ("wall_s", "peak_GiB", "processor_s")
-    ]
-    rows += [("seconds of a file", name, seconds, None) for name, seconds in found["slowest files"].items()]
-    rows += [("seconds of a test", name, seconds, None) for name, seconds in found["slowest tests"].items()]
-    return [{"figure": figure, "model": model, "value": value, "required": most, "met": most is None or value <= most} for figure, model, value, most in rows]
-
-
-def main() -> None:
-    """Measure and print."""
-    arguments = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    arguments.add_argument("--quick", action="store_true", help="three files alone")
-    arguments.add_argument("--only", nargs="+", default=[], metavar="FILE", help="files of tests")
-    arguments.add_argument("--json", type=Path, help="where to write all figures")
-    given = arguments.parse_args()
-    found = measured(tuple(given.only) or (QUICK if given.quick else ()))
-    for name in ("slowest files", "slowest tests"):
-        print(name)
-        print(*(f"  {seconds:7.1f} s  {what}" for what, seconds in found[name].items()), sep="\n")
-    print(found["ended"])
-    rows = figures(found, whole=not (given.only or given.quick))
-    for row in rows[:3]:
-        least = "" if row["required"] is None else f" (required on two idle cores: <= {row['required']:.2f})"
-        print(f"{row['figure']}: {row['value']:.2f}{least}")
-    if given.json:
-        given.json.write_text(json.dumps(rows, indent=1) + "\n")
-    sys.exit(not found["passed"])
-
-
 if __name__ == "__main__":
-    main()
+    main(__doc__, (suite,))

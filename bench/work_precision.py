@@ -1,4 +1,4 @@
-"""Work-precision charts: error against time for eight problems, this engine's methods and its peers, each at its best settings.
+"""Work-precision charts: error against time for four problems, this engine's methods and its peers, each at its best settings.
 
     taskset -c 0 python bench/work_precision.py [--quick] [--json FILE] [--out DIR] [--problem NAME ...] [--part NAME ...]
     python bench/work_precision.py --redraw FILE --out DIR
@@ -29,20 +29,19 @@ def say(text: str) -> None:
     print(f"[{time.perf_counter() - BEGIN:6.0f} s] {text}", flush=True)
 
 
-def curves(names, quick: bool, methods=None) -> Iterator[dict]:
+def curves(names, quick: bool) -> Iterator[dict]:
     """References and single trajectories."""
     from work_precision_cases import measure, ours, peer_c, peer_diffrax, peer_exudyn, peer_heyoka, peer_mujoco, peer_sympy
     from work_precision_cases.problems import PROBLEMS
 
     for name in names:
         problem = PROBLEMS[name]
-        reference = problem.judge.reference
+        reference = problem.truth
         say(f"{name}: {reference.how}; {reference.uncertainty:.1e} from {reference.against}")
         yield {"reference": name, "how": reference.how, "against": reference.against, "uncertainty": reference.uncertainty}
-        peers = [*peer_sympy.curves(problem, quick), *peer_c.curves(problem), *peer_heyoka.curves(problem), *peer_diffrax.curves(problem, quick)]
+        peers = [*peer_sympy.curves(problem, quick), *peer_c.curves(problem), *peer_heyoka.curves(problem), *peer_diffrax.curves(problem)]
         for curve in [*ours.curves(problem, quick), *peers, *peer_exudyn.curves(problem, quick), *peer_mujoco.curves(problem, quick)]:
-            if not methods or curve.method in methods:
-                yield from measure.points(problem, curve, say)[0]
+            yield from measure.points(problem, curve, say)[0]
 
 
 def measured(arguments) -> Iterator[dict]:
@@ -52,7 +51,7 @@ def measured(arguments) -> Iterator[dict]:
 
     names, quick = arguments.problem or (QUICK if arguments.quick else tuple(PROBLEMS)), arguments.quick
     if "curves" in arguments.part:
-        yield from curves(names, quick, arguments.method)
+        yield from curves(names, quick)
     for name in names:
         if "batches" in arguments.part and name in batches.PROBLEMS:
             say(f"batches: {name}")
@@ -64,9 +63,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="disc and sleigh, fewer methods: under two minutes")
     parser.add_argument("--json", type=Path, metavar="FILE", help="file for the list of records")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for pictures and the table")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for pictures")
     parser.add_argument("--problem", nargs="*", metavar="NAME", help="only these problems")
-    parser.add_argument("--method", nargs="*", metavar="NAME", help="only these single-trajectory methods, by their names in the records")
     parser.add_argument("--part", nargs="*", choices=PARTS, default=list(PARTS), help="only these parts")
     parser.add_argument("--redraw", type=Path, metavar="FILE", help="measure nothing: draw what is in this file")
     arguments = parser.parse_args()
@@ -81,11 +79,9 @@ def main() -> None:
                 arguments.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     if arguments.out:
         from work_precision_cases.draw import draw
-        from work_precision_cases.tables import write_table
 
         arguments.out.mkdir(parents=True, exist_ok=True)
         draw(found, arguments.out)
-        write_table(found, arguments.out)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ CEILINGS = {
     "ways: rows and their slopes for a projection": 2,
     "ways: damped least squares": 3,
     "code tokens of tests": 310_278,
-    "code tokens of bench": 120_973,
+    "code tokens of bench": 100_000,
     "test files that reach private names": 37,
 }
 

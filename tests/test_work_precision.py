@@ -1,15 +1,15 @@
 """The work-precision charts: what a record holds, how an error is judged, and what is said of peers that are not installed."""
 
 import json
-from types import SimpleNamespace
 
+import disc_body
 import numpy as np
 import pytest
 from oracles import chaplygin_sleigh
 from tolerances import tolerance
 
 pytest.importorskip("work_precision_cases", reason="the scripts of `bench/` are not here")
-from work_precision_cases import curve, disc_body, measure, peer_exudyn, peer_heyoka, peer_mujoco, peer_sympy, record
+from work_precision_cases import curve, measure, peer_exudyn, peer_heyoka, peer_mujoco, peer_sympy, record
 from work_precision_cases.problems import PROBLEMS
 
 SLEIGH, DISC = PROBLEMS["chaplygin-sleigh"], PROBLEMS["tilting-disc"]
@@ -32,18 +32,13 @@ def _constant(y):
 
 def test_the_error_of_the_sleigh_is_its_distance_from_the_closed_form():
     q, u = _exact_sleigh()
-    exact = SLEIGH.judge.full(q, u)
-    assert exact.error <= tolerance("closed_form")
-    assert exact.energy_drift <= tolerance("closed_form")
-    assert exact.slip <= tolerance("closed_form")
-    moved = SLEIGH.judge.full(q + np.array([0.0, 0.0, 3e-4]), u)
-    assert abs(moved.error - 3e-4) <= tolerance("closed_form")
-    assert moved.slip > 1e-6  # the blade points elsewhere, the velocity does not
-    assert np.isnan(SLEIGH.judge.full(q * np.nan, u).error)
+    assert SLEIGH.error(q, u) <= tolerance("closed_form")
+    assert abs(SLEIGH.error(q + np.array([0.0, 0.0, 3e-4]), u) - 3e-4) <= tolerance("closed_form")
+    assert np.isnan(SLEIGH.error(q * np.nan, u))
 
 
 def test_the_reference_says_how_far_a_second_computation_is():
-    reference = SLEIGH.judge.reference
+    reference = SLEIGH.truth
     assert 0 < reference.uncertainty <= 1e-12
     assert reference.how
     assert reference.against
@@ -51,7 +46,7 @@ def test_the_reference_says_how_far_a_second_computation_is():
 
 def test_a_curve_gives_records_of_one_format():
     q, u = _exact_sleigh()
-    found, ready = measure.points(SLEIGH, curve.Curve("exact", record.PEER, (1e-3,), "step (s)", _constant(np.concatenate([q, u[:2]]))), lambda text: None)
+    found, ready = measure.points(SLEIGH, curve.Curve("exact", (1e-3,), _constant(np.concatenate([q, u[:2]]))), lambda text: None)
     (entry,) = found
     assert tuple(entry) == record.KEYS
     assert entry == json.loads(json.dumps(entry))
@@ -63,10 +58,10 @@ def test_a_curve_gives_records_of_one_format():
 
 def test_a_run_that_is_not_finite_or_says_that_it_failed_has_no_error():
     y = np.full(5, np.nan)
-    (entry,), _ = measure.points(SLEIGH, curve.Curve("lost", record.PEER, (1.0,), "step (s)", _constant(y)), lambda text: None)
+    (entry,), _ = measure.points(SLEIGH, curve.Curve("lost", (1.0,), _constant(y)), lambda text: None)
     assert entry["error"] is None
     failed = lambda problem: curve.Prepared(lambda setting: None, lambda raw: curve.Solved(failed="out of steps"))  # noqa: E731
-    (entry,), _ = measure.points(SLEIGH, curve.Curve("failed", record.PEER, (1.0,), "step (s)", failed), lambda text: None)
+    (entry,), _ = measure.points(SLEIGH, curve.Curve("failed", (1.0,), failed), lambda text: None)
     assert entry["error"] is None
     assert entry["note"] == "out of steps"
 
@@ -98,16 +93,10 @@ def test_peers_that_are_not_installed_are_skipped_with_a_message(monkeypatch, mo
 
 def test_a_free_body_is_read_as_the_disc_that_it_is():
     # as contact engines hold it: centre, rotation, velocities in space; back to the contact point, yaw, lean and spin
-    q, u = disc_body.state(_AtStart, disc_body.start(DISC))
+    radius = float(DISC.scene.radius)
+    q, u = disc_body.state(radius, disc_body.start(radius, DISC.minimal_start), {"yaw": 0.0, "spin": 0.0})
     assert np.max(np.abs(q - np.asarray(DISC.state.q))) <= tolerance("round_off")
     assert np.max(np.abs(u - np.asarray(DISC.state.u))) <= tolerance("round_off")
-
-
-class _AtStart:
-    """The disc, with its start in place of the reference, from which whole turns are taken."""
-
-    scene = DISC.scene
-    judge = SimpleNamespace(reference=SimpleNamespace(values={"yaw": 0.0, "spin": 0.0}))
 
 
 def test_sympys_equations_of_the_sleigh_compiled_from_c_are_chaplygins():
@@ -120,7 +109,7 @@ def test_sympys_equations_of_the_sleigh_compiled_from_c_are_chaplygins():
         library = peer_sympy.compiled(peer_sympy.c_source(equations))
     except curve.NotApplicable as reason:
         pytest.skip(str(reason))
-    rates, _ = peer_sympy.callback(library, 5)
+    rates = peer_sympy.callback(library, 5)
     y = equations.from_minimal(minimal)
     scene, (_, _, heading, v, w), a = SLEIGH.scene, y, float(SLEIGH.scene.offset)
     # v' = a w^2, w' = -(a/k^2) v w

@@ -2,20 +2,9 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import jax
 import jax.numpy as jnp
-
-from atlas_cases.methods import Method
-from atlas_cases.outcomes import Outcome
-
-
-class Probe(Protocol):
-    """What a case asks of a method."""
-
-    def cell(self, method: Method, tolerance: float) -> Outcome:
-        """What became of `method`."""
 
 
 @dataclass(frozen=True)
@@ -24,13 +13,23 @@ class Case:
 
     name: str
     title: str
-    probe: Callable[[], Probe]  # sets it up; called once per process
+    probe: Callable[[], object]  # sets it up, once per process; `cell(method, tolerance)` of what it returns is an `Outcome`
     tolerance: float  # float64
     tolerance32: float  # float32
     reason: str  # of both tolerances
     must_be_right: bool = False  # the default path, in float64
     flag_is_right: bool = False  # nothing but a flag is a right answer here
     quick: bool = False
+
+
+def required(*case, **more) -> Case:
+    """A case that the default path must get right in float64."""
+    return Case(*case, must_be_right=True, **more)
+
+
+def unanswered(name: str, title: str, probe: Callable[[], object], reason: str) -> Case:
+    """A case that has no right number: nothing but a flag is right."""
+    return Case(name, title, probe, 0.0, 0.0, reason, flag_is_right=True)
 
 
 def single() -> bool:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from disc_body import Body, start
 
 try:
     import mujoco
@@ -60,16 +61,29 @@ def free_body(mass: float, inertia, q, u) -> Elsewhere:
     return Elsewhere(text, 1e-3, (q, u))
 
 
-def rolling(mass: float, inertia, shape: str, q, u, step: float = 1e-4) -> Elsewhere:
+def rolling(mass: float, inertia, shape: str, q, u, *, step: float = 1e-4, constant: float = 5, integrator="implicitfast", impratio=100, noslip=0) -> Elsewhere:
     """A body that rolls on a plane; friction coefficient 1, time constant of the contact five steps, as short as it may be."""
-    head = _HEAD.format(step=step, integrator="implicitfast", gravity=-9.81, more='cone="elliptic" impratio="100" tolerance="1e-12" iterations="100"')
+    more = f'cone="elliptic" impratio="{impratio}" tolerance="1e-12" iterations="100" noslip_iterations="{noslip}" noslip_tolerance="1e-14"'
+    head = _HEAD.format(step=step, integrator=integrator, gravity=-9.81, more=more)
     body = _FREE.format(ground=_GROUND, mass=mass, inertia=_numbers(inertia), shape=shape)
-    return Elsewhere(head + _ROLLING.format(reference=5 * step) + body, step, (q, u))
+    return Elsewhere(head + _ROLLING.format(reference=constant * step) + body, step, (q, u))
 
 
-def disc_shape(radius: float) -> str:
-    """A thin cylinder about body y."""
-    return f'<geom type="cylinder" size="{radius} 1e-4" euler="90 0 0"/>'
+def rolling_disc(mass: float, radius: float, minimal, **settings) -> Elsewhere:
+    """A thin cylinder about body y, from a start as in `disc_body`."""
+    body, quaternion = start(radius, minimal), np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, body.rotation.ravel())
+    shape = f'<geom type="cylinder" size="{radius} 1e-4" euler="90 0 0"/>'
+    q, u = np.concatenate([body.centre, quaternion]), np.concatenate([body.velocity, body.rotation.T @ body.angular_velocity])
+    return rolling(mass, mass * radius**2 * np.array([0.25, 0.5, 0.25]), shape, q, u, **settings)
+
+
+def body_of(position, velocity) -> Body:
+    """The body of a free joint."""
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, np.asarray(position[3:], float))
+    rotation = rotation.reshape(3, 3)
+    return Body(np.asarray(position[:3]), rotation, np.asarray(velocity[:3]), rotation @ np.asarray(velocity[3:]))
 
 
 def ball_shape(radius: float, middle) -> str:

@@ -31,10 +31,7 @@ class DerivativeOfMotion:
     scale: float | None = None
     rtol: float = 1e-10
     atol: float = 1e-10
-    rtol32: float = 1e-5
-    atol32: float = 1e-6
     steps: int = 400
-    options: dict = field(default_factory=dict)
     skip: dict = field(default_factory=dict)
     naive_value: Callable | None = None  # (q_end, u_end) -> value; None: naive methods are not asked
 
@@ -46,12 +43,12 @@ class DerivativeOfMotion:
         x = jnp.asarray(self.x, jnp.result_type(float))
         if method.naive is not None:
             return self._by_naive(method, x, tolerance)
-        options = {**self.options, **method.options(self.begin(x)[0])}
+        options = method.options(self.begin(x)[0])
         if method.reduction:  # each by itself: reverse mode through the choice of one out of several has met NaN of the others
             options |= {"max_steps": FEWER_STEPS, "formulation": jj.Formulation("full", jj.reductions(self.begin(x)[0])[method.reduction])}
         if method.name == "Kvaerno5":
             options |= {"max_steps": IMPLICIT_STEPS}
-        options |= {"rtol": by_type(self.rtol, self.rtol32), "atol": by_type(self.atol, self.atol32), "ts": self.ts, "retry": True}
+        options |= {"rtol": by_type(self.rtol, 1e-5), "atol": by_type(self.atol, 1e-6), "ts": self.ts, "retry": True}
 
         def value(x):
             scene, start = self.begin(x)

@@ -27,12 +27,11 @@ class Instant:
     udot: np.ndarray  # known
     scale: float | None = None
     force: np.ndarray | None = None  # known constraint force on the speeds
-    skip: dict = field(default_factory=dict)
 
     def cell(self, method: Method, tolerance: float) -> Outcome:
         """Outcome of one method."""
-        if method.group in ONLY_OF_MOTIONS or method.batch or method.naive in naive.SPEEDS_IN_BASIS or method.name in self.skip:
-            return not_applicable(self.skip.get(method.name, ONLY_MOTION))
+        if method.group in ONLY_OF_MOTIONS or method.batch or method.naive in naive.SPEEDS_IN_BASIS:
+            return not_applicable(ONLY_MOTION)
         q, u = jnp.asarray(self.q, jnp.result_type(float)), jnp.asarray(self.u, jnp.result_type(float))
         if method.naive is not None:
             udot = naive.accelerations(method.naive, self.scene, naive.fixed_point(self.scene, q, u), 0.0, q, u)
@@ -68,7 +67,6 @@ class DerivativeOfAccelerations:
     x: float
     weights: np.ndarray
     known: float
-    scale: float | None = None
     traced: dict = field(default_factory=dict)  # one program serves all reductions
 
     def cell(self, method: Method, tolerance: float) -> Outcome:
@@ -92,4 +90,4 @@ class DerivativeOfAccelerations:
             slope = float(self.traced[key](jnp.asarray(self.x, jnp.result_type(float)), reduction(scene, method.reduction)))
         except NotImplementedError as refusal:
             return judged(np.nan, tolerance, f"NotImplementedError: {str(refusal).splitlines()[0][:90]}")
-        return judged(worst(slope, self.known, self.scale), tolerance)
+        return judged(worst(slope, self.known), tolerance)

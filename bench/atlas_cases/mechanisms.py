@@ -5,6 +5,12 @@ from atlas_cases.methods import Method
 from atlas_cases.outcomes import FLAGGED, NOT_APPLICABLE, RIGHT, Outcome
 
 USUAL = {
+    **dict.fromkeys(("privileged", "gibbs-appell"), "the privileged speeds stop determining the others: division by their pivot"),
+    **dict.fromkeys(
+        ("qr", "svd", "kkt", "udwadia-kalaba"),
+        "all speeds are integrated: errors off the rows and round-off are amplified by the motion before the projection takes them back",
+    ),
+    **dict.fromkeys(("default", "rollout"), "the tolerance is met per step, and errors are amplified by the motion"),
     "fixed partition": "division by the determinant of a partition that was chosen once, at the start",
     "Schur, Cholesky": "A M^-1 A' is singular or nearly so: its Cholesky factor fails or loses twice the digits",
     "KKT, LU": "the saddle-point matrix is singular where rows are dependent",
@@ -17,12 +23,6 @@ USUAL = {
     "no projection": "rows hold for accelerations only: round-off and truncation of velocities and positions are never taken back",
     "Baumgarte 5/s": "violations decay at a rate that has nothing to do with the motion, and their forces do work",
     "Baumgarte 1e4/s": "a pole at -1e4/s that the motion does not have: the step is bound to it",
-    "privileged": "the privileged speeds stop determining the others: division by their pivot",
-    "gibbs-appell": "the privileged speeds stop determining the others: division by their pivot",
-    "qr": "all speeds are integrated: errors off the rows and round-off are amplified by the motion before the projection takes them back",
-    "svd": "all speeds are integrated: errors off the rows and round-off are amplified by the motion before the projection takes them back",
-    "kkt": "all speeds are integrated: errors off the rows and round-off are amplified by the motion before the projection takes them back",
-    "udwadia-kalaba": "all speeds are integrated: errors off the rows and round-off are amplified by the motion before the projection takes them back",
     "Tsit5": "order 5: the tolerance is met per step, and errors add up over the run; explicit: a stiff force bounds its steps",
     "Dopri8": "the tolerance is met per step, and errors add up over the run or are amplified by the motion; explicit: a stiff force bounds its steps",
     "Kvaerno5": "order 5, by iterations that stop at the tolerance: errors of the order of it add up; where these iterations fail, steps shrink",
@@ -32,8 +32,6 @@ USUAL = {
     "discrete gradient": "order 2: the energy is kept to round-off, every other integral and the path itself only to the size of the step squared",
     "forward mode": "the derivative is exact for steps that are off by the tolerance: a motion that amplifies errors spoils it, too",
     "MuJoCo": "constraints and contacts are springs with regularised friction: rods stretch, discs sink in and creep; steps have one length",
-    "default": "the tolerance is met per step, and errors are amplified by the motion",
-    "rollout": "the tolerance is met per step, and errors are amplified by the motion",
 }
 
 

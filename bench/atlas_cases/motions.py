@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -35,13 +36,10 @@ class Motion:
     rtol: float = 1e-12
     atol: float = 1e-12
     rtol32: float = 1e-5
-    atol32: float = 1e-6
     steps: int = 400  # of the naive methods, between two times
     most_steps: int = 20_000  # of reductions on the full state (float32: 5,000, constraints too), a hundred times as slow per step as the default
     independent: tuple[str, ...] | None = None  # speeds that the fixed partition keeps; None: the best at the start
     options: dict = field(default_factory=dict)  # of `simulate`, part of the set-up
-    flags: Callable | None = None  # trajectory -> further flag in words
-    ends_at_event: bool = False  # whether an event is a right end
     skip: dict = field(default_factory=dict)  # method or group -> why it is not asked
     asked: tuple[str, ...] = ()  # costly methods, `SELDOM`, that are asked here
     step: float | None = None  # s, of integrators that take steps of one length; None: they are not asked
@@ -72,7 +70,12 @@ class Motion:
     @property
     def tolerances(self) -> dict:
         """rtol and atol of this process's floats."""
-        return {"rtol": by_type(self.rtol, self.rtol32), "atol": by_type(self.atol, self.atol32)}
+        return {"rtol": by_type(self.rtol, self.rtol32), "atol": by_type(self.atol, 1e-6)}
+
+    @property
+    def state(self) -> jj.State:
+        """The start."""
+        return self.start if isinstance(self.start, jj.State) else jj.start(self.scene, **self.start)
 
     def _simulate(self, method: Method):
         with warnings.catch_warnings():
@@ -84,9 +87,7 @@ class Motion:
 
     def _rollout(self):
         """Two equal lanes of a batch; the second one."""
-        state = self.start if isinstance(self.start, jj.State) else jj.start(self.scene, **self.start)
-        leaves = {name: jnp.stack([getattr(state, name)] * 2) for name in ("t", "q", "u", "moved_q", "moved_u", "residual")}
-        lanes = jj.State(**leaves, names=state.names)
+        lanes = jax.tree.map(lambda x: jnp.stack([x, x]), self.state)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return jj.rollout(self.scene, lanes, ts=self.ts, retry=True, **self.tolerances, **self.options).lane(1)
@@ -96,14 +97,13 @@ class Motion:
         code = int(motion.result)
         if code == results.MAX_STEPS:
             return judged(np.nan, tolerance, f"{motion.message} (t = {float(motion.t_end):.3g} s)", stalled=True)
-        if code not in (results.SUCCESS, results.EVENT) or (code == results.EVENT and not self.ends_at_event):
+        if code != results.SUCCESS:
             return judged(np.nan, tolerance, f"{motion.message} (t = {float(motion.t_end):.3g} s)")
         error = self.error(np.asarray(motion.q, float), np.asarray(motion.u, float))
         found = judged(error, tolerance)
         if found.outcome == "right":
             return found
-        flag = warned(motion) or (self.flags(motion) if self.flags else "")
-        return judged(error, tolerance, flag) if flag else found
+        return judged(error, tolerance, "; ".join(motion.warnings))
 
     def _elsewhere(self, tolerance: float) -> Outcome:
         why = "its model of the case would be another one" if self.by_mujoco is None else elsewhere.MISSING if elsewhere.mujoco is None else ""
@@ -113,11 +113,8 @@ class Motion:
             return judged(self.error(*self.by_mujoco().run(self.ts, float(self.options.get("t0", 0.0)))), tolerance)
 
     def _by_naive(self, method: Method, tolerance: float) -> Outcome:
-        if self.naive_start is None:
-            state = self.start if isinstance(self.start, jj.State) else jj.start(self.scene, **self.start)
-            q, u = state.q, state.u
-        else:
-            q, u = (jnp.asarray(x) for x in self.naive_start)
+        state = self.state
+        q, u = (state.q, state.u) if self.naive_start is None else map(jnp.asarray, self.naive_start)
         rows = jj.constraint_rows(self.scene, 0.0, q, u)
         if method.naive in naive.REDUCED_STATE and (not jj.structure_of(self.scene).affine or rows.A.shape[0] == 0):
             return not_applicable("no rows that are linear in the speeds")
@@ -127,11 +124,6 @@ class Motion:
         if not (np.all(np.isfinite(qs)) and np.all(np.isfinite(us))):
             return Outcome(NAN)
         return judged(self.error(qs, us), tolerance)
-
-
-def warned(motion: jj.Trajectory) -> str:
-    """What a motion that claims success says against itself."""
-    return "; ".join(motion.warnings)
 
 
 def against(scene: jj.Scene, expected: dict, scales: dict | None = None) -> Callable[[np.ndarray, np.ndarray], float]:
@@ -144,6 +136,12 @@ def against(scene: jj.Scene, expected: dict, scales: dict | None = None) -> Call
         return max_error(worst(column, expected[name], (scales or {}).get(name)) for name, column in pairs)
 
     return error
+
+
+def followed(scene: jj.Scene, start, ts, known: dict, names: str, scales: dict | None = None, **more) -> Motion:
+    """A motion whose coordinates an oracle knows; `names`: of ours, "ours=theirs" where the oracle calls it otherwise."""
+    pairs = [name.split("=") for name in names.split()]
+    return Motion(scene, start, ts, against(scene, {pair[0]: known[pair[-1]] for pair in pairs}, scales), **more)
 
 
 def drift(*integrals: Callable[[np.ndarray, np.ndarray], np.ndarray], size: float | None = None) -> Callable[[np.ndarray, np.ndarray], float]:

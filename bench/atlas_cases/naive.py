@@ -5,6 +5,7 @@ classical method with fixed steps. They report nothing: what comes out is right,
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -48,35 +49,35 @@ def _pivots(A, count: int) -> tuple[int, ...]:
     return tuple(chosen)
 
 
-def _fixed_partition(M, f, A, b, static: Static):
-    n, dependent = M.shape[0], list(static.dependent)
+def _partition(A, b, static: Static):
+    """C and c of `u = C y + c`, so that `A u + b = 0`, by the partition settled at the start."""
+    n, dependent = A.shape[1], list(static.dependent)
     independent = [i for i in range(n) if i not in dependent]
     A, b = A[np.array(static.rows, int)], b[np.array(static.rows, int)]
-    B = jnp.linalg.solve(A[:, np.array(dependent, int)], jnp.concatenate([-A[:, np.array(independent, int)], b[:, None]], axis=1))
+    B = jnp.linalg.solve(A[:, np.array(dependent, int)], jnp.concatenate([-A[:, np.array(independent, int)], -b[:, None]], axis=1))
     order = np.argsort([*independent, *dependent])
     C = jnp.concatenate([jnp.eye(len(independent)), B[:, :-1]])[order]
-    c = jnp.concatenate([jnp.zeros(len(independent)), B[:, -1]])[order]
+    return C, jnp.concatenate([jnp.zeros(len(independent)), B[:, -1]])[order]
+
+
+def _fixed_partition(M, f, A, b, static: Static):
+    C, c = _partition(A, -b, static)
     return C @ jnp.linalg.solve(C.T @ M @ C, C.T @ (f - M @ c)) + c
 
 
-def _schur(M, f, A, b, static):
-    a, W = jnp.linalg.solve(M, f), jnp.linalg.solve(M, A.T)
-    return a + W @ jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(A @ W), b - A @ a)
+def _by_schur(solve):
+    """Multipliers first, by a solution of `A M^-1 A' lambda = b - A M^-1 f`."""
+
+    def udot(M, f, A, b, static):
+        a, W = jnp.linalg.solve(M, f), jnp.linalg.solve(M, A.T)
+        return a + W @ solve(A @ W, b - A @ a)
+
+    return udot
 
 
 def _kkt(M, f, A, b, static):
     m = A.shape[0]
     return jnp.linalg.solve(jnp.block([[M, -A.T], [A, jnp.zeros((m, m))]]), jnp.concatenate([f, b]))[: M.shape[0]]
-
-
-def _pinv(M, f, A, b, static):
-    a, W = jnp.linalg.solve(M, f), jnp.linalg.solve(M, A.T)
-    return a + W @ (jnp.linalg.pinv(A @ W, rtol=1e-10) @ (b - A @ a))
-
-
-def _ridge(M, f, A, b, static):
-    a, W = jnp.linalg.solve(M, f), jnp.linalg.solve(M, A.T)
-    return a + W @ jnp.linalg.solve(A @ W + 1e-6 * jnp.eye(A.shape[0]), b - A @ a)
 
 
 def svd_basis(A, rank: int):
@@ -89,19 +90,29 @@ def qr_basis(A, rank: int):
     return jnp.linalg.qr(A.T, mode="complete")[0][:, rank:]
 
 
-def _on_basis(Z, M, f, A, b):
-    particular = jnp.linalg.pinv(A) @ b
-    return particular + Z @ jnp.linalg.solve(Z.T @ M @ Z, Z.T @ (f - M @ particular))
+def _on_basis(basis):
+    """Accelerations along a null space, beside the smallest ones that meet the rows."""
+
+    def udot(M, f, A, b, static):
+        Z, particular = basis(A, static.rank), jnp.linalg.pinv(A) @ b
+        return particular + Z @ jnp.linalg.solve(Z.T @ M @ Z, Z.T @ (f - M @ particular))
+
+    return udot
 
 
 ACCELERATIONS = {
     "fixed partition": _fixed_partition,
-    "Schur, Cholesky": _schur,
+    "Schur, Cholesky": _by_schur(lambda S, r: jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(S), r)),
     "KKT, LU": _kkt,
-    "pinv, 1e-10": _pinv,
-    "ridge 1e-6": _ridge,
-    "raw SVD basis": lambda M, f, A, b, static: _on_basis(svd_basis(A, static.rank), M, f, A, b),
-    "raw QR basis": lambda M, f, A, b, static: _on_basis(qr_basis(A, static.rank), M, f, A, b),
+    "pinv, 1e-10": _by_schur(lambda S, r: jnp.linalg.pinv(S, rtol=1e-10) @ r),
+    "ridge 1e-6": _by_schur(lambda S, r: jnp.linalg.solve(S + 1e-6 * jnp.eye(len(r)), r)),
+    "raw SVD basis": _on_basis(svd_basis),
+    "raw QR basis": _on_basis(qr_basis),
+}
+REDUCED_STATE = {
+    "fixed partition": _partition,
+    "speeds in SVD basis": lambda A, b, static: (svd_basis(A, static.rank), -jnp.linalg.pinv(A) @ b),
+    "speeds in QR basis": lambda A, b, static: (qr_basis(A, static.rank), -jnp.linalg.pinv(A) @ b),
 }
 SPEEDS_IN_BASIS = ("speeds in SVD basis", "speeds in QR basis")
 
@@ -122,10 +133,8 @@ def motion(name: str, scene, static: Static, q, u, ts: np.ndarray, steps: int, *
 
     `alone`: a program of its own, for derivatives: where methods share one, a method without a derivative would take it from all.
     """
-    if name in REDUCED_STATE:
-        return _in_basis(name, scene, static, q, u, ts, steps)
-    names = (name,) if alone else tuple(ACCELERATIONS)
-    return _all_in_one(scene, static, names, jnp.asarray(names.index(name)), q, u, jnp.asarray(ts), steps)
+    program, names = (_in_basis, tuple(REDUCED_STATE)) if name in REDUCED_STATE else (_all_in_one, (name,) if alone else tuple(ACCELERATIONS))
+    return program(scene, jnp.asarray(names.index(name)), q, u, jnp.asarray(ts), static, steps, names)
 
 
 _STAGES = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))  # how far each stage reaches along the slope before it, and its weight
@@ -159,83 +168,50 @@ def _runge_kutta(rates, y, ts, steps: int):
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), y, ys)
 
 
-def _all_in_one(scene, static, names, index, q, u, ts, steps):
-    key = (jax.tree.structure(scene), static, steps, len(ts), q.dtype, names)
-    if key not in _compiled:
+@partial(jax.jit, static_argnames=("static", "steps", "names"))
+def _all_in_one(scene, index, q, u, ts, static: Static, steps: int, names: tuple[str, ...]):
+    def rates(t, y):
+        q, u = y
+        equations, rows = equations_and_rows(scene, t, q, u)
+        problem = (equations.M, equations.Q - equations.h, rows.A, -rows.drift)
+        if rows.A.shape[0] == 0:
+            return jj.coordinate_rates(scene, t, q, u), jnp.linalg.solve(problem[0], problem[1])
+        branches = [lambda p, name=name: ACCELERATIONS[name](*p, static) for name in names]
+        return jj.coordinate_rates(scene, t, q, u), jax.lax.switch(index, branches, problem)
 
-        def run(scene, index, q, u, ts):
-            def rates(t, y):
-                q, u = y
-                equations, rows = equations_and_rows(scene, t, q, u)
-                problem = (equations.M, equations.Q - equations.h, rows.A, -rows.drift)
-                if rows.A.shape[0] == 0:
-                    return jj.coordinate_rates(scene, t, q, u), jnp.linalg.solve(problem[0], problem[1])
-                branches = [lambda p, name=name: ACCELERATIONS[name](*p, static) for name in names]
-                return jj.coordinate_rates(scene, t, q, u), jax.lax.switch(index, branches, problem)
-
-            return _runge_kutta(rates, (q, u), ts, steps)
-
-        _compiled[key] = jax.jit(run)
-    return _compiled[key](scene, index, q, u, ts)
+    return _runge_kutta(rates, (q, u), ts, steps)
 
 
-_compiled: dict = {}
-
-
-def _in_basis(name, scene, static, q, u, ts, steps):
+@partial(jax.jit, static_argnames=("static", "steps", "names"))
+def _in_basis(scene, index, q, u, ts, static: Static, steps: int, names: tuple[str, ...]):
     """A state of as many speeds s as there are freedoms: `u = Z s`, `sdot = Z+ (udot - Zdot s)`, Zdot by a difference.
 
     Z is whatever basis the library returns, or C of the fixed partition, for which Z+ just picks the independent speeds.
     """
-    small, names = float(np.sqrt(jnp.finfo(q.dtype).eps)), tuple(REDUCED_STATE)
-    key = (jax.tree.structure(scene), static, steps, len(ts), q.dtype, "reduced state")
-    if key not in _compiled:
+    small, none = float(np.sqrt(jnp.finfo(q.dtype).eps)), jnp.zeros(u.shape)
+    independent = np.array([i for i in range(u.shape[0]) if i not in static.dependent], int)
 
-        def run(scene, index, q, u, ts):
-            def rows_at(t, q, u):
-                rows = jj.constraint_rows(scene, t, q, u)
-                # beyond that LAPACK's singular values of float32 may never converge: a motion that far off is lost
-                A = jnp.where(jnp.max(jnp.abs(rows.A), initial=0.0) < 1e-3 * float(np.sqrt(jnp.finfo(q.dtype).max)), rows.A, jnp.nan)
-                return A, rows.phi - A @ u
+    def rows_at(t, q):
+        rows = jj.constraint_rows(scene, t, q, none)
+        # beyond that LAPACK's singular values of float32 may never converge: a motion that far off is lost
+        A = jnp.where(jnp.max(jnp.abs(rows.A), initial=0.0) < 1e-3 * float(np.sqrt(jnp.finfo(q.dtype).max)), rows.A, jnp.nan)
+        return A, rows.phi - A @ none
 
-            @eqx.filter_jit  # one copy of it
-            def basis(t, q):
-                """Z and c of `u = Z s + c`."""
-                return jax.lax.switch(index, [lambda A, b, f=f: f(A, b, static) for f in REDUCED_STATE.values()], *rows_at(t, q, jnp.zeros(u.shape)))
+    @eqx.filter_jit  # one copy of it
+    def basis(t, q):
+        """Z and c of `u = Z s + c`."""
+        return jax.lax.switch(index, [lambda A, b, name=name: REDUCED_STATE[name](A, b, static) for name in names], *rows_at(t, q))
 
-            def rates(t, y):
-                q, s = y
-                Z, c = basis(t, q)
-                u = Z @ s + c
-                qdot = jj.coordinate_rates(scene, t, q, u)
-                udot = accelerations("pinv, 1e-10", scene, static, t, q, u)
-                Z1, c1 = basis(t + small, q + small * qdot)
-                jump = ((Z1 - Z) @ s + c1 - c) / small
-                by_basis = Z.T @ (udot - jump)  # Z'Z = 1 for orthonormal bases
-                independent = np.array([i for i in range(u.shape[0]) if i not in static.dependent], int)
-                return qdot, jnp.where(index == names.index("fixed partition"), udot[independent], by_basis)
+    def rates(t, y):
+        q, s = y
+        Z, c = basis(t, q)
+        u = Z @ s + c
+        qdot = jj.coordinate_rates(scene, t, q, u)
+        udot = accelerations("pinv, 1e-10", scene, static, t, q, u)
+        Z1, c1 = basis(t + small, q + small * qdot)
+        by_basis = Z.T @ (udot - ((Z1 - Z) @ s + c1 - c) / small)  # Z'Z = 1 for orthonormal bases
+        return qdot, jnp.where(index == names.index("fixed partition"), udot[independent], by_basis)
 
-            Z, c = basis(ts[0], q)
-            qs, ss = _runge_kutta(rates, (q, jnp.linalg.pinv(Z) @ (u - c)), ts, steps)
-            return qs, jax.vmap(lambda t, q, s: basis(t, q)[0] @ s + basis(t, q)[1])(ts, qs, ss)
-
-        _compiled[key] = jax.jit(run)
-    return _compiled[key](scene, jnp.asarray(names.index(name)), q, u, jnp.asarray(ts))
-
-
-def _partition(A, b, static: Static):
-    """C and c of `u = C y + c` by the partition settled at the start."""
-    n, dependent = A.shape[1], list(static.dependent)
-    independent = [i for i in range(n) if i not in dependent]
-    A, b = A[np.array(static.rows, int)], b[np.array(static.rows, int)]
-    B = jnp.linalg.solve(A[:, np.array(dependent, int)], jnp.concatenate([-A[:, np.array(independent, int)], -b[:, None]], axis=1))
-    order = np.argsort([*independent, *dependent])
-    C = jnp.concatenate([jnp.eye(len(independent)), B[:, :-1]])[order]
-    return C, jnp.concatenate([jnp.zeros(len(independent)), B[:, -1]])[order]
-
-
-REDUCED_STATE = {
-    "fixed partition": _partition,
-    "speeds in SVD basis": lambda A, b, static: (svd_basis(A, static.rank), -jnp.linalg.pinv(A) @ b),
-    "speeds in QR basis": lambda A, b, static: (qr_basis(A, static.rank), -jnp.linalg.pinv(A) @ b),
-}
+    Z, c = basis(ts[0], q)
+    qs, ss = _runge_kutta(rates, (q, jnp.linalg.pinv(Z) @ (u - c)), ts, steps)
+    return qs, jax.vmap(lambda t, q, s: basis(t, q)[0] @ s + basis(t, q)[1])(ts, qs, ss)

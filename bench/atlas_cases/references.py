@@ -31,24 +31,26 @@ def linkage_angle(ts) -> np.ndarray:
     return integrate(lambda _, y: [y[1], LONG(35) / 30 * LONG(9.81) * np.sin(y[0])], [0.0, 1.0], ts)[:, 0]
 
 
+def octahedron_rods(points, edges) -> tuple[np.ndarray, np.ndarray]:
+    """Rods (6, 3) of half a line-symmetric octahedron, and their rows (6, 9) on its three vertices; `edges`: (i, j, whether the rod ends at the image of j)."""
+    turned, rods, rows = np.diag(np.array([-1, -1, 1], points.dtype)), [], np.zeros((len(edges), 9), points.dtype)
+    for k, (i, j, image) in enumerate(edges):
+        S = turned if image else np.eye(3, dtype=points.dtype)
+        rods.append(points[i] - S @ points[j])
+        rows[k, 3 * i : 3 * i + 3] += rods[k]
+        rows[k, 3 * j : 3 * j + 3] -= S.T @ rods[k]
+    return np.array(rods), rows
+
+
 def bricard_accelerations(points, velocities, masses, edges) -> np.ndarray:
     """Accelerations (3, 3) of the three vertices of a line-symmetric octahedron under gravity, images turned by half a turn about z.
 
-    Six rods `|P - Q| = l` of full rank, `(P - Q).(P'' - Q'') = -|P' - Q'|^2`; vertices count twice, once for their image. `edges`: (i, j, image):
-    whether the rod ends at the image of j.
+    Six rods `|P - Q| = l` of full rank, `(P - Q).(P'' - Q'') = -|P' - Q'|^2`; vertices count twice, once for their image.
     """
-    points, velocities = np.asarray(points, LONG), np.asarray(velocities, LONG)
-    turned = np.diag(np.array([-1, -1, 1], LONG))
-    rows, known = np.zeros((len(edges), 9), LONG), np.zeros(len(edges), LONG)
-    for k, (i, j, image) in enumerate(edges):
-        S = turned if image else np.eye(3, dtype=LONG)
-        rod, rate = points[i] - S @ points[j], velocities[i] - S @ velocities[j]
-        rows[k, 3 * i : 3 * i + 3] += rod
-        rows[k, 3 * j : 3 * j + 3] -= S.T @ rod
-        known[k] = -(rate @ rate)
+    rows, rates = octahedron_rods(np.asarray(points, LONG), edges)[1], octahedron_rods(np.asarray(velocities, LONG), edges)[0]
     force = np.tile(np.array([0, 0, -1], LONG) * LONG("9.81"), 3)  # per mass
     W = rows.T / np.repeat(np.asarray(masses, LONG), 3)[:, None]
-    return (force + W @ solve(rows @ W, known - rows @ force)).reshape(3, 3)
+    return (force + W @ solve(rows @ W, -np.sum(rates**2, axis=1) - rows @ force)).reshape(3, 3)
 
 
 def ball_on_switched_turntable(ts, x0, v0) -> np.ndarray:

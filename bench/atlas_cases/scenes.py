@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from long_runs_scenes import Point
 
 import jourdain_jax as jj
 
@@ -12,12 +12,12 @@ _TURN = (-3.2, 3.2)
 class HeavyAxle(jj.Scene):
     """Two disc wheels on an axle with mass, on an incline (B1): four rows, of which the two lateral ones are the same."""
 
-    radius: Float[Array, ""] = jj.parameter(0.3, unit="m", positive=True)
-    half_track: Float[Array, ""] = jj.parameter(0.4, unit="m", positive=True)
-    wheel_mass: Float[Array, ""] = jj.parameter(1.2, unit="kg", positive=True)
-    axle_mass: Float[Array, ""] = jj.parameter(0.5, unit="kg", positive=True)
-    slope: Float[Array, ""] = jj.parameter(0.2, unit="rad")
-    gravity: Float[Array, ""] = jj.parameter(9.81, unit="m/s^2")
+    radius: object = jj.parameter(0.3, positive=True)
+    half_track: object = jj.parameter(0.4, positive=True)
+    wheel_mass: object = jj.parameter(1.2, positive=True)
+    axle_mass: object = jj.parameter(0.5, positive=True)
+    slope: object = jj.parameter(0.2)
+    gravity: object = jj.parameter(9.81)
     coordinates = jj.coordinates("x y th p1 p2")
     domain = {"th": _TURN, "p1": _TURN, "p2": _TURN}
 
@@ -50,8 +50,8 @@ class HeavyAxle(jj.Scene):
 class Edges(jj.Scene):
     """The skate with three copies of its row (one of them seven times as long), or with a second edge turned by `angle` against the first."""
 
-    angle: Float[Array, ""] = jj.parameter(0.0, unit="rad")
-    slope: Float[Array, ""] = jj.parameter(0.3, unit="rad")
+    angle: object = jj.parameter(0.0)
+    slope: object = jj.parameter(0.3)
     copies: bool = eqx.field(static=True, default=True)
     coordinates = jj.coordinates("x y heading")
     domain = {"heading": _TURN}
@@ -70,13 +70,8 @@ class Edges(jj.Scene):
         return rows | {"second": jj.knife_edge(skate, skate.position, skate.orientation @ jnp.stack([-jnp.sin(self.angle), jnp.cos(self.angle), 0.0]))}
 
 
-class OrthonormalRows(jj.Scene):
+class OrthonormalRows(Point):
     """A particle in space whose velocity has two orthonormal rows, turned with its coordinate x: equal singular values everywhere."""
-
-    coordinates = jj.coordinates("x y z")
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(1.0, q.array)}
 
     def loads(self, motion):
         return (jj.gravity(motion, 9.81),)
@@ -87,27 +82,18 @@ class OrthonormalRows(jj.Scene):
         return {"first": velocity @ frame[:, 1], "second": velocity @ frame[:, 2]}
 
 
-class LeadingRow(jj.Scene):
+class LeadingRow(Point):
     """Rosenberg's particle in another order, `xdot = z ydot`: at z = 0 the row lies along the first coordinate."""
-
-    coordinates = jj.coordinates("x y z")
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(1.0, q.array)}
 
     def velocity_constraints(self, motion):
         return {"sheet": motion.u.x_rate - motion.q.z * motion.u.y_rate}
 
 
-class AppellHamel(jj.Scene):
+class AppellHamel(Point):
     """Appell and Hamel's example, a row quadratic in the speeds: `xdot^2 + ydot^2 = k^2 zdot^2`. It vanishes, with its slope, at rest."""
 
-    k: Float[Array, ""] = jj.parameter(0.8)
-    coordinates = jj.coordinates("x y z")
+    k: object = jj.parameter(0.8)
     domain = {"x_rate": (0.2, 1.0), "y_rate": (0.2, 1.0), "z_rate": (-2.0, -0.2)}
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(1.0, q.array)}
 
     def loads(self, motion):
         return (jj.gravity(motion, 9.81),)
@@ -124,7 +110,7 @@ class FourBars(jj.Scene):
     """
 
     windows: int = eqx.field(static=True, default=2)
-    gravity: Float[Array, ""] = jj.parameter(9.81, unit="m/s^2")
+    gravity: object = jj.parameter(9.81)
 
     @property
     def coordinates(self):
@@ -156,58 +142,32 @@ class FourBars(jj.Scene):
 
 
 class Bricard(jj.Scene):
-    """Bricard's line-symmetric octahedron: six particles, twelve rods of rank eleven, and yet it bends. Axis of symmetry: z.
+    """Bricard's line-symmetric octahedron: six particles, twelve rods of rank eleven, and yet it bends. Axis of symmetry: z."""
 
-    With `whole=False` the same by symmetry: three particles of double mass whose images are turned by half a turn, six rods of full rank.
-    """
-
-    lengths: Float[Array, "6"] = jj.parameter((1.0,) * 6, unit="m", positive=True)
-    whole: bool = eqx.field(static=True, default=True)
+    lengths: object = jj.parameter((1.0,) * 6, positive=True)
     domain_near: tuple[float, ...] = eqx.field(static=True, default=())
-
-    @property
-    def coordinates(self):
-        """Cartesian coordinates of A, B, C and, of the whole, their images."""
-        return jj.coordinates(*(f"{name}{axis}" for name in _VERTICES[: 6 if self.whole else 3] for axis in "xyz"))
+    coordinates = jj.coordinates(*(f"{name}{axis}" for name in ("a", "b", "c", "ai", "bi", "ci") for axis in "xyz"))  # "ai": the image of "a"
 
     @property
     def domain(self):
         """Near a given shape."""
-        near = dict(zip(self.coordinates.names.entries, self.domain_near, strict=False)) if self.domain_near else {}
-        return {name: (value - 0.05, value + 0.05) for name, value in near.items()}
+        near = zip(self.coordinates.names.entries, self.domain_near, strict=False)
+        return {name: (value - 0.05, value + 0.05) for name, value in near}
 
-    def _points(self, q):
-        points = {name: jnp.stack([q[f"{name}{axis}"] for axis in "xyz"]) for name in _VERTICES[: 6 if self.whole else 3]}
-        if not self.whole:
-            points |= {name + "i": points[name] * jnp.array([-1.0, -1.0, 1.0]) for name in "abc"}
-        return points
+    def points(self, q):
+        """Places of the vertices, images after their originals."""
+        return dict(zip(("a", "b", "c", "ai", "bi", "ci"), q.array.reshape(6, 3), strict=True))
 
     def bodies(self, t, q):
-        points = self._points(q)
-        return {name: jj.Particle(mass * (1.0 if self.whole else 2.0), points[name]) for name, mass in _MASSES.items() if name in q_names(self)}
+        return {name: jj.Particle(mass, at) for (name, at), mass in zip(self.points(q).items(), (1.0, 1.5, 0.7) * 2, strict=True)}
 
     def loads(self, motion):
         return (jj.gravity(motion, 9.81),)
 
     def geometric_constraints(self, pose):
-        points = self._points(pose.q)
-        rows = {}
-        for k, (first, second) in enumerate(_EDGES):
-            rows[f"{first}{second}"] = jj.rod(points[first], points[second], self.lengths[k])
-            if self.whole:
-                rows[f"{first}{second} image"] = jj.rod(points[_image(first)], points[_image(second)], self.lengths[k])
+        points, rows = self.points(pose.q), {}
+        images = {name: name[0] if name.endswith("i") else f"{name}i" for name in points}
+        for (first, second), length in zip((("a", "b"), ("b", "c"), ("a", "c"), ("a", "bi"), ("b", "ci"), ("a", "ci")), self.lengths, strict=True):
+            rows[f"{first}{second}"] = jj.rod(points[first], points[second], length)
+            rows[f"{first}{second} image"] = jj.rod(points[images[first]], points[images[second]], length)
         return rows
-
-
-_VERTICES = ("a", "b", "c", "ai", "bi", "ci")
-_MASSES = {"a": 1.0, "b": 1.5, "c": 0.7, "ai": 1.0, "bi": 1.5, "ci": 0.7}
-_EDGES = (("a", "b"), ("b", "c"), ("a", "c"), ("a", "bi"), ("b", "ci"), ("a", "ci"))
-
-
-def _image(name: str) -> str:
-    return name[0] if name.endswith("i") else name + "i"
-
-
-def q_names(scene: Bricard) -> tuple[str, ...]:
-    """Vertices that have coordinates of their own."""
-    return _VERTICES[: 6 if scene.whole else 3]

@@ -3,7 +3,8 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from long_runs_scenes import Point
+from small_scenes import OnLine
 
 import jourdain_jax as jj
 
@@ -15,12 +16,24 @@ def _turning() -> dict:
     return {f"attitude_omega_{axis}": _OMEGA for axis in "xyz"}
 
 
-class CeltInQuaternion(jj.Scene):
+class InSpace(jj.Scene):
+    """A body whose attitude is a quaternion, under gravity."""
+
+    coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
+
+    def place(self, q):
+        """Position and orientation."""
+        return jnp.stack([q.x, q.y, q.z]), jj.quaternion_to_matrix(q.attitude)
+
+    def loads(self, motion):
+        return (jj.gravity(motion, 9.81),)
+
+
+class CeltInQuaternion(InSpace):
     """The rattleback (B15) with a quaternion and a height row: no attitude is singular. z up; body axis 3 down at identity of the table's angles."""
 
-    gravity: Float[Array, ""] = jj.parameter(9.81, unit="m/s^2")
+    gravity: object = jj.parameter(9.81)
     scale: float = eqx.field(static=True, default=1.0)  # units of length per metre
-    coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
 
     @property
     def domain(self):
@@ -30,7 +43,7 @@ class CeltInQuaternion(jj.Scene):
     def bodies(self, t, q):
         k = self.scale**2
         inertia = k * jnp.array([[2e-4, -0.2e-4, 0.0], [-0.2e-4, 16e-4, 0.0], [0.0, 0.0, 17e-4]])
-        return {"stone": jj.RigidBody(1.0, inertia, jnp.stack([q.x, q.y, q.z]), jj.quaternion_to_matrix(q.attitude))}
+        return {"stone": jj.RigidBody(1.0, inertia, *self.place(q))}
 
     def loads(self, motion):
         return (jj.gravity(motion, self.gravity * self.scale),)
@@ -49,21 +62,17 @@ class CeltInQuaternion(jj.Scene):
         return {"no slip": stone.velocity_at(stone.place(self._arm(-stone.orientation[2])))[:2]}
 
 
-class EccentricBall(jj.Scene):
+class EccentricBall(InSpace):
     """A ball of radius 1 m that rolls on a plane, its mass centre off its middle along the body axis z, about which its inertia is symmetric."""
 
-    offset: Float[Array, ""] = jj.parameter(0.3, unit="m")
-    axial: Float[Array, ""] = jj.parameter(0.5, unit="kg m^2", positive=True)
-    transverse: Float[Array, ""] = jj.parameter(0.4, unit="kg m^2", positive=True)
-    coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
+    offset: object = jj.parameter(0.3)
+    axial: object = jj.parameter(0.5, positive=True)
+    transverse: object = jj.parameter(0.4, positive=True)
     domain = {"z": (0.7, 1.3), **_turning()}
 
     def bodies(self, t, q):
         inertia = jnp.stack([self.transverse, self.transverse, self.axial])
-        return {"ball": jj.RigidBody(1.0, inertia, jnp.stack([q.x, q.y, q.z]), jj.quaternion_to_matrix(q.attitude))}
-
-    def loads(self, motion):
-        return (jj.gravity(motion, 9.81),)
+        return {"ball": jj.RigidBody(1.0, inertia, *self.place(q))}
 
     def _contact(self, body):
         middle = body.position - self.offset * body.orientation[:, 2]
@@ -77,15 +86,14 @@ class EccentricBall(jj.Scene):
         return {"no slip": ball.velocity_at(self._contact(ball))[:2]}
 
 
-class DragDisc(jj.Scene):
+class DragDisc(InSpace):
     """Euler's disc (B7): a rolling disc in quaternions that loses the power `drag psidot^2`; theta^2 then falls linearly, to zero in finite time."""
 
-    drag: Float[Array, ""] = jj.parameter(1.7e-4, unit="N m s", non_negative=True)
-    coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
+    drag: object = jj.parameter(1.7e-4, non_negative=True)
     domain = {"z": (0.05, 0.3), **_turning()}
 
     def bodies(self, t, q):
-        centre, turned = jnp.stack([q.x, q.y, q.z]), jj.quaternion_to_matrix(q.attitude)
+        centre, turned = self.place(q)
         return {"disc": jj.RigidBody.thin_disc(1.0, 0.3, axis="y", position=centre, orientation=turned)}
 
     def loads(self, motion):
@@ -94,7 +102,7 @@ class DragDisc(jj.Scene):
         up = jnp.array([0.0, 0.0, 1.0]) - axle[2] * axle  # of length sin(theta), along the line from the contact to the centre
         squared = up @ up
         # psidot = w . up / sin^2, and M . w = -drag psidot^2
-        return (jj.gravity(motion, 9.81), jj.torque(motion, "disc", -self.drag * (disc.angular_velocity @ up) / squared**2 * up))
+        return (*super().loads(motion), jj.torque(motion, "disc", -self.drag * (disc.angular_velocity @ up) / squared**2 * up))
 
     def contacts(self, pose):
         return {"rim": jj.disc_contact(pose["disc"], 0.3, height="row")}
@@ -110,7 +118,7 @@ class ContactOscillator(jj.Scene):
     With `pairs` = 3 the chaotic one: `xdot + sum y_i zdot_i = 0` and a coupling of x^2 with all z_i^2.
     """
 
-    strength: Float[Array, ""] = jj.parameter(0.3)
+    strength: object = jj.parameter(0.3)
     pairs: int = eqx.field(static=True, default=1)
 
     @property
@@ -138,17 +146,13 @@ class ContactOscillator(jj.Scene):
         return {"contact": u.x_rate + sum(q[f"y{i}"] * u[f"z{i}_rate"] for i in range(self.pairs))}
 
 
-class PendulumDrivenGear(jj.Scene):
+class PendulumDrivenGear(Point):
     """A continuously variable transmission: a driver y, on its own, sets the ratio between two oscillators, `xdot + f(y) zdot = 0`.
 
     f(y) = 1 + sin(y), which is neither even nor odd; V = 1 - cos(y) + y/5 + (x^2 + z^2)/2; masses 1 kg.
     """
 
-    coordinates = jj.coordinates("x y z")
     privileged = ("y_rate", "z_rate")
-
-    def bodies(self, t, q):
-        return {"point": jj.Particle(1.0, q.array)}
 
     def potential(self, pose):
         q = pose.q
@@ -158,14 +162,10 @@ class PendulumDrivenGear(jj.Scene):
         return {"gear": motion.u.x_rate + (1 + jnp.sin(motion.q.y)) * motion.u.z_rate}
 
 
-class SteepEdge(jj.Scene):
+class SteepEdge(OnLine):
     """A particle of 1 kg on a line, over an edge of its potential, 2 J high and 1e-6 m wide, at x = 1 m."""
 
-    width: Float[Array, ""] = jj.parameter(1e-6, unit="m", positive=True)
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"ball": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+    width: object = jj.parameter(1e-6, positive=True)
 
     def potential(self, pose):
         return 2.0 * jax.nn.sigmoid((pose.q.x - 1.0) / self.width)
@@ -177,7 +177,7 @@ class SoftWheel(jj.Scene):
     What penalty methods do. Its limit is rolling.
     """
 
-    stiffness: Float[Array, ""] = jj.parameter(1e5, unit="N/m", positive=True)
+    stiffness: object = jj.parameter(1e5, positive=True)
     coordinates = jj.coordinates("x y z heading roll")
     domain = {"z": (0.9, 1.1), "heading": (-3.2, 3.2), "roll": (-3.2, 3.2)}
 

@@ -1,6 +1,5 @@
 """The tables behind the picture (CSV and Markdown), and the figures of the default path."""
 
-import csv
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,19 +7,11 @@ from pathlib import Path
 from atlas_cases.cases import CASES
 from atlas_cases.outcomes import FLAGGED, NAN, NOT_APPLICABLE, OUTCOMES, RIGHT, STALLED, WRONG
 
-KEYS = ("case", "method", "dtype", "outcome", "error", "tolerance", "mechanism")
 BEGIN, END = "<!-- from here on written by bench/atlas.py -->", "<!-- up to here -->"
 
 
 def write_tables(cells: list[dict], out: Path) -> None:
-    """Write `atlas.csv`, one line per cell, and `atlas.md`, the summary.
-
-    Of an `atlas.md` that is there, only what stands between `BEGIN` and `END` is replaced.
-    """
-    with (out / "atlas.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, KEYS)
-        writer.writeheader()
-        writer.writerows(cells)
+    """Write `atlas.md`, the summary. Of one that is there, only what stands between `BEGIN` and `END` is replaced."""
     path = out / "atlas.md"
     before, _, rest = (path.read_text(encoding="utf-8") if path.exists() else "").partition(BEGIN)
     after = rest.partition(END)[2] or "\n"

@@ -4,12 +4,6 @@ Each function is `(parameters, t, q, v, xp=jnp) -> (qdot, vdot)`: scalars by nam
 coordinate in the tuple `q` and per privileged speed in `v`; all rates of the minimal state come back as two tuples. `xp` has `sin`, `cos` and
 `zeros_like`. Expressions of parameters alone stand first; `operations(name)` counts the rest, each common subexpression once.
 
-The engine's privileged speeds are an expert's choice for four of the models. For two they are not:
-
-    skate               none serves at every heading: all three stay (9 operations). `skate_in_x_rate` (8) is singular at right angles;
-                        `skate_in_forward_speed` (5), a quasi-velocity, is not
-    chaplygin-sleigh    x_rate, y_rate: needs an offset; with forward speed and turn rate `sleigh_in_blade_speeds` (12) does not
-
 Sources: the docstrings of the models; Wang and Pao (2003), sections V and VI; Neimark and Fufaev (1972), ch. III.
 """
 
@@ -34,30 +28,13 @@ def two_wheel_axle(parameters, t, q, v, xp=jnp):
     return qdot, (push * c, xp.zeros_like(phi_rate))
 
 
-def skate_in_x_rate(parameters, t, q, v, xp=jnp):
-    """The skate in x_rate, singular at right angles: `ydot = xdot tan`, `x'' = G cos^2 - headingdot ydot`, G = g sin(slope)."""
-    G = parameters["gravity"] * xp.sin(parameters["slope"])
-    x_rate, w = v
-    s, c = xp.sin(q[2]), xp.cos(q[2])
-    y_rate = x_rate * (s / c)
-    return (x_rate, y_rate, w), (G * c * c - w * y_rate, xp.zeros_like(w))
-
-
-def skate_in_all_speeds(parameters, t, q, v, xp=jnp):
+def skate(parameters, t, q, v, xp=jnp):
     """The skate in all three speeds, regular at every heading: acceleration G cos(heading) along the blade, w v across it."""
     G = parameters["gravity"] * xp.sin(parameters["slope"])
     x_rate, y_rate, w = v
     s, c = xp.sin(q[2]), xp.cos(q[2])
     along = G * c
     return (x_rate, y_rate, w), (along * c - w * y_rate, along * s + w * x_rate, xp.zeros_like(w))
-
-
-def skate_in_forward_speed(parameters, t, q, v, xp=jnp):
-    """The skate in forward speed and turn rate: `v' = G cos(heading)`."""
-    G = parameters["gravity"] * xp.sin(parameters["slope"])
-    forward, w = v
-    s, c = xp.sin(q[2]), xp.cos(q[2])
-    return (forward * c, forward * s, w), (G * c, xp.zeros_like(w))
 
 
 def chaplygin_sleigh(parameters, t, q, v, xp=jnp):
@@ -74,16 +51,6 @@ def chaplygin_sleigh(parameters, t, q, v, xp=jnp):
     b = c * y_rate - s * x_rate
     kw = k_over_a * b
     return (x_rate, y_rate, per_a * b), (kw * (c * b - y_rate), kw * (x_rate + s * b))
-
-
-def sleigh_in_blade_speeds(parameters, t, q, v, xp=jnp):
-    """The sleigh in forward speed v and turn rate w: `v' = a w^2`, `w' = -(m a/(I + m a^2)) v w`."""
-    m, a = parameters["mass"], parameters["offset"]
-    turning_back = -m / (parameters["inertia"] + m * a * a)
-    forward, w = v
-    s, c = xp.sin(q[2]), xp.cos(q[2])
-    b = a * w
-    return (forward * c - b * s, forward * s + b * c, w), (b * w, turning_back * (b * forward))
 
 
 def vertical_disc(parameters, t, q, v, xp=jnp):
@@ -153,29 +120,19 @@ def _entry(rates: Callable, parameters: str, coordinates: str, speeds: str) -> H
     return HandDerived(rates, tuple(parameters.split()), tuple(coordinates.split()), tuple(speeds.split()))
 
 
-_SKATE = "slope gravity", "x y heading"
-_SLEIGH = "mass inertia offset", "x y heading"
-_BALL = "radius inertia_ratio turn_rate tilt gravity", "x y attitude_w attitude_x attitude_y attitude_z"
-
 HAND_DERIVED = {
     "two-wheel-axle-coordinates": _entry(two_wheel_axle, "radius length mass rim_mass slope gravity", "x1 y1 psi1 x2 y2 psi2 phi", "psi1_rate phi_rate"),
-    "skate": _entry(skate_in_all_speeds, *_SKATE, "x_rate y_rate heading_rate"),
-    "chaplygin-sleigh": _entry(chaplygin_sleigh, *_SLEIGH, "x_rate y_rate"),
+    "skate": _entry(skate, "slope gravity", "x y heading", "x_rate y_rate heading_rate"),
+    "chaplygin-sleigh": _entry(chaplygin_sleigh, "mass inertia offset", "x y heading", "x_rate y_rate"),
     "vertical-disc": _entry(vertical_disc, "radius", "x y heading roll", "heading_rate roll_rate"),
     "tilting-disc": _entry(tilting_disc, "radius gravity", "x y yaw lean spin", "yaw_rate lean_rate spin_rate"),
-    "ball-on-turntable": _entry(ball_on_turntable, *_BALL, "x_rate y_rate spin"),
-}
-
-# The same models in speeds that an expert would rather take.
-ALTERNATIVES = {
-    "skate, x_rate": _entry(skate_in_x_rate, *_SKATE, "x_rate heading_rate"),
-    "skate, forward speed": _entry(skate_in_forward_speed, *_SKATE, "forward heading_rate"),
-    "chaplygin-sleigh, blade speeds": _entry(sleigh_in_blade_speeds, *_SLEIGH, "forward heading_rate"),
+    "ball-on-turntable": _entry(
+        ball_on_turntable, "radius inertia_ratio turn_rate tilt gravity", "x y attitude_w attitude_x attitude_y attitude_z", "x_rate y_rate spin"
+    ),
 }
 
 
 def operations(name: str) -> int:
     """Number of operations of the equations called `name`, after common subexpressions, without those of parameters alone."""
-    known = (HAND_DERIVED | ALTERNATIVES)[name]
-    parameters = dict.fromkeys(known.parameters, 1.0)
-    return count_operations(known.rates, parameters, len(known.coordinates), len(known.speeds)).total()
+    known = HAND_DERIVED[name]
+    return count_operations(known.rates, known.parameters, len(known.coordinates), len(known.speeds)).total()

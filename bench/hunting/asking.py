@@ -19,50 +19,40 @@ class Failed:
     said: str
 
 
+def tolerance(ask: Ask) -> float:
+    """That which is asked for in this process's floats."""
+    return ask.rtol if jax.config.jax_enable_x64 else max(ask.rtol, 1e-5)
+
+
 def ask_for(family: Family, ask: Ask, numbers: list[dict], ts: np.ndarray) -> list:
     """A `Trajectory` (as numbers) or `Failed` for every case."""
-    single = not jax.config.jax_enable_x64
-    rtol = max(ask.rtol, family.rtol32) if single else ask.rtol
-    options = {"rtol": rtol, "atol": rtol, "retry": True} | {"events": True} | ask.options
+    rtol = tolerance(ask)
+
+    def options(numbers: dict) -> dict:
+        size = {name: numbers[name] for name in ("atol", "t0") if name in numbers}
+        return {"t0": 0.0, "rtol": rtol, "atol": rtol, "retry": True, "events": True} | ask.options | family.given_inputs(numbers) | size
 
     def motion(numbers: dict, ts):
-        given = {} if family.inputs is None else {"inputs": family.inputs(numbers)}
-        size = {} if "atol" not in numbers else {"atol": numbers["atol"]}
-        scene = family.scene().replace(**family.parameters(numbers))
-        return jj.simulate(scene, family.start(numbers), t0=numbers.get("t0", 0.0), ts=ts, **options | given | size)
+        return jj.simulate(family.scene().replace(**family.parameters(numbers)), family.begin(numbers), ts=ts, **options(numbers))
 
-    def lanes(numbers: dict, first: dict, ts):
-        given = {} if family.inputs is None else {"inputs": family.inputs(first)}
-        size = {} if "atol" not in first else {"atol": first["atol"]}
-        parameters = {name: value for name, value in family.parameters(numbers).items() if np.ndim(value)}
-        fixed = {name: value for name, value in family.parameters(first).items() if name not in parameters}
-        scene = family.scene().replace(**fixed)
-        return jj.rollout(scene, family.start(numbers), parameters=parameters or None, t0=first.get("t0", 0.0), ts=ts, **options | given | size).lanes
+    def lanes(many: dict):
+        return jj.rollout(family.scene(), family.begin(many), parameters=family.parameters(many) or None, ts=ts[0], **options(numbers[0])).lanes
 
-    if ask.way == "simulate":
-        return [_caught(lambda one=one, row=row: motion(one, row)) for one, row in zip(numbers, ts, strict=True)]
-    if ask.way == "jit":
-        compiled = jax.jit(motion)
-        return [
-            _caught(lambda one=one, row=row: compiled({k: jnp.asarray(v) for k, v in one.items()}, jnp.asarray(row)))
-            for one, row in zip(numbers, ts, strict=True)
-        ]
     many = {name: jnp.asarray(value) for name, value in together(numbers).items()}
-    if ask.way == "vmap":
-        found = _caught(lambda: jax.jit(jax.vmap(motion))(many, jnp.asarray(ts)))
-    elif ask.way == "rollout":
-        found = _caught(lambda: lanes(many, numbers[0], ts[0]))
-    elif ask.way == "jit rollout":
-        found = _caught(lambda: jax.jit(lambda many: lanes(many, numbers[0], ts[0]))(many))
-    else:
-        raise ValueError(f"unknown way `{ask.way}`")
+    one_by_one = {"simulate": motion, "jit": jax.jit(motion)}
+    if ask.way in one_by_one:
+        given = numbers if ask.way == "simulate" else [{k: jnp.asarray(v) for k, v in one.items()} for one in numbers]
+        rows = ts if ask.way == "simulate" else jnp.asarray(ts)
+        return [_caught(one_by_one[ask.way], *case) for case in zip(given, rows, strict=True)]
+    batched = {"vmap": lambda many: jax.jit(jax.vmap(motion))(many, jnp.asarray(ts)), "rollout": lanes, "jit rollout": jax.jit(lanes)}
+    found = _caught(batched[ask.way], many)
     if isinstance(found, Failed):
         return [found] * len(numbers)
     return [jax.tree.map(lambda x, i=i: x[i], found) for i in range(len(numbers))]
 
 
-def _caught(motion) -> object:
+def _caught(call, *arguments) -> object:
     try:
-        return jax.tree.map(np.asarray, motion())
+        return jax.tree.map(np.asarray, call(*arguments))
     except Exception as error:
         return Failed(*refusal(error))

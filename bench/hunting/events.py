@@ -2,26 +2,19 @@
 
 import jax.numpy as jnp
 import numpy as np
+from small_scenes import OnLine, OnPlane, Upright
 
 import jourdain_jax as jj
-from hunting.family import Ask, Family, Truth
+from hunting.family import Ask, Family, G, drawn, either, one_of, power, stopped
+from hunting.pendulums import Weighted
+from hunting.reference import integrate
 
-G = 9.81
 
-
-class Room(jj.Scene):
+class Room(Weighted, Upright):
     """A particle that flies in a room of which floor, ceiling and walls stop it."""
 
-    coordinates = jj.coordinates("x z")
-    g: object = jj.parameter(G, unit="m/s^2")
-    width: object = jj.parameter(2.0, unit="m")
-    height: object = jj.parameter(3.0, unit="m")
-
-    def bodies(self, t, q):
-        return {"ball": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, q.z]))}
-
-    def loads(self, motion):
-        return (jj.gravity(motion, self.g),)
+    width: object = jj.parameter(2.0)
+    height: object = jj.parameter(3.0)
 
     def events(self, motion):
         q = motion.q
@@ -29,131 +22,88 @@ class Room(jj.Scene):
 
 
 def _earliest(candidates: dict[str, np.ndarray], span) -> tuple[np.ndarray, list[str]]:
-    """Times and names of the first of the events; the span and "" where none comes."""
-    names, times = list(candidates), np.stack(list(candidates.values()))
-    first = np.argmin(times, axis=0)
-    found = times[first, np.arange(len(span))]
-    return np.minimum(found, span), [names[k] if t < s else "" for k, t, s in zip(first, found, span, strict=True)]
+    """Time (cases, 1) and name of the first of the events; the span and "" where none comes."""
+    names, times = list(candidates), np.concatenate(list(candidates.values()), axis=1)
+    first = np.min(times, axis=1, keepdims=True)
+    found = [names[k] if t < s else "" for k, (t,), (s,) in zip(np.argmin(times, axis=1), first, span, strict=True)]
+    return np.minimum(first, span), found
 
 
 def _first_root(a, b, c):
     """Smallest positive root of a t^2 + b t + c; infinite where there is none."""
     with np.errstate(all="ignore"):
         root = np.sqrt(b * b - 4 * a * c)
-        pair = np.stack([(-b - root) / (2 * a), (-b + root) / (2 * a)]) if np.all(a != 0) else np.stack([-c / b, -c / b])
+        pair = np.stack([(-b - root) / (2 * a), (-b + root) / (2 * a)]) if a else np.stack([-c / b, -c / b])
     return np.min(np.where(np.isfinite(pair) & (pair > 1e-9), pair, np.inf), axis=0)
 
 
-def _stopped(values_at, t_end, event, ts) -> Truth:
-    """Values at the saved times up to the end, NaN after it."""
-    reached = ts <= t_end[:, None] * (1 + 1e-12)
-    return Truth(np.where(reached[..., None], values_at(ts), np.nan), t_end, values_at(t_end[:, None])[:, 0], event)
-
-
 def _room_truth(n, ts):
-    half = np.full_like(n["z"], G / 2)
-    t_end, event = _earliest(
-        {
-            "floor": _first_root(-half, n["vz"], n["z"]),
-            "ceiling": _first_root(half, -n["vz"], n["height"] - n["z"]),
-            "back wall": _first_root(0 * half, n["vx"], 1.0 + 0 * half),
-            "wall": _first_root(0 * half, -n["vx"], n["width"]),
-        },
-        ts[:, -1],
-    )
-
-    def values_at(t):
-        x, z = n["vx"][:, None] * t, n["z"][:, None] + n["vz"][:, None] * t - G / 2 * t**2
-        return np.stack([x, z, n["vx"][:, None] + 0 * t, n["vz"][:, None] - G * t], axis=-1)
-
-    return _stopped(values_at, t_end, event, ts)
-
-
-def _room_drawn(r):
-    return {
-        "z": r.uniform(0.5, 2.5),
-        "vx": r.choice([-1.0, 1.0]) * r.uniform(0.5, 8.0),
-        "vz": r.uniform(-4.0, 4.0),
-        "width": r.uniform(0.5, 3.0),
-        "height": 3.0,
-        "span": 3.0,
+    events = {
+        "floor": _first_root(-G / 2, n.z_rate, n.z),
+        "ceiling": _first_root(G / 2, -n.z_rate, n.height - n.z),
+        "back wall": _first_root(0, n.x_rate, 1.0),
+        "wall": _first_root(0, -n.x_rate, n.width),
     }
+    return stopped(lambda t: (n.x_rate * t, n.z + n.z_rate * t - G / 2 * t**2, n.x_rate, n.z_rate - G * t), *_earliest(events, ts[:, -1:]), ts)
 
 
 def _grazing_drawn(r):
     """Its path passes the ceiling by a little, for a short time; nothing else is near."""
     vz, over = r.uniform(3.0, 7.0), 10 ** r.uniform(-3.5, -0.5)
-    return {"z": 1.0, "vx": r.uniform(0.1, 0.3), "vz": vz, "width": 3.0, "height": 1.0 + vz**2 / (2 * G) - over, "span": 1.1 * vz / G + vz / G}
+    return {"z": 1.0, "x_rate": r.uniform(0.1, 0.3), "z_rate": vz, "width": 3.0, "height": 1.0 + vz**2 / (2 * G) - over, "span": 2.1 * vz / G}
 
 
-class Spring(jj.Scene):
-    """An undamped oscillator with a stop whose value is no number beyond its boundary."""
+class Spring(OnLine):
+    """An undamped oscillator that meets a stop."""
 
-    coordinates = jj.coordinates("x")
-    k: object = jj.parameter(4.0, unit="N/m", positive=True)
-    stop: object = jj.parameter(1.0, unit="m", positive=True)
-
-    def bodies(self, t, q):
-        return {"ball": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+    k: object = jj.parameter(4.0, positive=True)
+    stop: object = jj.parameter(1.0, positive=True)
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=-self.k * motion.q.x),)
 
+    def left(self, x):
+        """The value of the event, which falls through zero."""
+        return self.stop - x
+
     def events(self, motion):
-        return {"stop": self.stop - motion.q.x}
+        return {"stop": self.left(motion.q.x)}
 
 
 class ArcsineStop(Spring):
     """The angle of a crank that a ratio gives, which has none beyond a right angle."""
 
-    def events(self, motion):
-        return {"stop": 1.0 - jnp.arcsin(jnp.maximum(motion.q.x / self.stop, -0.9)) / (jnp.pi / 2)}
+    def left(self, x):
+        return 1.0 - jnp.arcsin(jnp.maximum(x / self.stop, -0.9)) / (jnp.pi / 2)
 
 
 class RootStop(Spring):
     """A distance as a root."""
 
-    def events(self, motion):
-        return {"stop": jnp.sqrt(self.stop - motion.q.x)}
+    def left(self, x):
+        return jnp.sqrt(self.stop - x)
 
 
 class LogarithmStop(Spring):
     """Falls through zero a little before it ceases to be a number."""
 
-    def events(self, motion):
-        return {"stop": jnp.log((self.stop + 1e-6 - motion.q.x) / 1e-6)}
+    def left(self, x):
+        return jnp.log((self.stop + 1e-6 - x) / 1e-6)
 
 
 def _stop_truth(n, ts):
-    w, x0, v0 = np.sqrt(n["k"]), n["x"], n["v"]
-    size, phase = np.hypot(x0, v0 / w), np.arctan2(v0 / w, x0)  # x = size cos(w t - phase)
+    w = np.sqrt(n.k)
+    size, phase = np.hypot(n.x, n.x_rate / w), np.arctan2(n.x_rate / w, n.x)  # x = size cos(w t - phase)
     with np.errstate(invalid="ignore"):
-        hit = (phase - np.arccos(n["stop"] / size)) % (2 * np.pi) / w
-    t_end, event = _earliest({"stop": np.where(np.isfinite(hit), hit, np.inf)}, ts[:, -1])
-
-    def values_at(t):
-        turn = w[:, None] * t - phase[:, None]
-        return np.stack([size[:, None] * np.cos(turn), -(size * w)[:, None] * np.sin(turn)], axis=-1)
-
-    return _stopped(values_at, t_end, event, ts)
+        hit = (phase - np.arccos(n.stop / size)) % (2 * np.pi) / w
+    events = {"stop": np.where(np.isfinite(hit), hit, np.inf)}
+    return stopped(lambda t: (size * np.cos(w * t - phase), -size * w * np.sin(w * t - phase)), *_earliest(events, ts[:, -1:]), ts)
 
 
-def _stop(name, what, scene, slack=1.0, **more):
-    drawn = lambda r: {"k": r.uniform(1, 30), "stop": r.uniform(0.6, 1.2), "x": r.uniform(-0.5, 0.4), "v": r.choice([-1, 1]) * r.uniform(4.0, 8.0), "span": 4.0}  # noqa: E731
-    return Family(
-        name=name, what=what, scene=scene, draw=drawn, truth=_stop_truth, start=lambda n: {"x": n["x"], "x_rate": n["v"]},
-        names=("x", "x_rate"), parameters=lambda n: {"k": n["k"], "stop": n["stop"]}, asks=ASKS, cases=42, slack=slack, **more,
-    )  # fmt: skip
+class StiffDrop(OnPlane):
+    """x is drawn to sin(y) by a stiff spring and damper while y falls evenly onto the floor."""
 
-
-class StiffDrop(jj.Scene):
-    """x is drawn to sin(y) by a stiff spring and damper while y falls evenly onto the floor; where `late`, by a stiffness of its own."""
-
-    coordinates = jj.coordinates("x y")
-    k: object = jj.parameter(1e6, unit="N/m", positive=True)
-
-    def bodies(self, t, q):
-        return {"block": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+    k: object = jj.parameter(1e6, positive=True)
 
     def loads(self, motion):
         q, u = motion.q, motion.u
@@ -168,54 +118,40 @@ def _stiff_truth(n, ts):
 
     On the slow manifold p = x' obeys p = s - x - p'/k, s = sin y: two Picard steps leave O(k^-3).
     """
-    from hunting.reference import integrate
 
-    fall = lambda t: (n["y"] - t**2 / 2, -t)  # noqa: E731
-
-    def rates(t, y):
-        h, v = fall(t)
+    def rates(t, x):
+        h, v = n.y - t**2 / 2, -t
         s, ds, dds = np.sin(h), np.cos(h) * v, -np.sin(h) * v**2 - np.cos(h)
-        x, e = y[:, 0], 1 / n["k"]
         p0 = s - x
-        p1 = s - x - e * (ds - p0)  # p' of the order before
-        dp1 = ds - p1 - e * (dds - (ds - p0))
-        return (s - x - e * dp1)[:, None]
+        dp1 = ds - (p0 - (ds - p0) / n.k) - (dds - (ds - p0)) / n.k  # p' of the order before
+        return (s - x - dp1 / n.k,)
 
-    t_end = np.minimum(np.sqrt(2 * n["y"]), ts[:, -1])
-    event = ["floor" if t < s else "" for t, s in zip(t_end, ts[:, -1], strict=True)]
-    every = np.sort(np.concatenate([np.minimum(ts, t_end[:, None]), t_end[:, None]], axis=1), axis=1)
-    x = integrate(rates, n["x"][:, None], every, width=0.1)[..., 0]
-    clipped = np.minimum(ts, t_end[:, None])
-    index = np.argmax(every[:, None, :] == clipped[..., None], axis=2)
-    at = np.take_along_axis(x, index, axis=1)
-    h, v = n["y"][:, None] - clipped**2 / 2, -clipped
-    values = np.where((ts <= t_end[:, None])[..., None], np.stack([at, h, v], axis=-1), np.nan)
-    end = np.stack([x[:, -1], n["y"] - t_end**2 / 2, -t_end], axis=-1)
-    return Truth(values, t_end, end, event)
+    t_end, event = _earliest({"floor": np.sqrt(2 * n.y)}, ts[:, -1:])
+    every = np.sort(np.concatenate([np.minimum(ts, t_end), t_end], axis=1), axis=1)
+    x = integrate(rates, (n.x,), every, width=0.1)[0]
+    at = lambda t: np.take_along_axis(x, np.argmax(every[:, None, :] == np.minimum(t, t_end)[..., None], axis=2), axis=1)  # noqa: E731
+    return stopped(lambda t: (at(t), n.y - t**2 / 2, -t), t_end, event, ts)
 
 
 ASKS = (Ask("simulate"), Ask("jit", 9), Ask("rollout", 9, 1e-6), Ask("vmap", 33), Ask("simulate", 33, 1e-6), Ask("rollout", 1), Ask("jit rollout", 2, 1e-6))
-IMPLICIT = (
-    Ask("simulate", 1, 1e-6),
-    Ask("simulate", 9, 1e-6, {"solver": jj.RadauIIA()}),
-    Ask("rollout", 1, 1e-6),
-    Ask("jit", 9, 1e-6, {"solver": jj.RadauIIA()}),
-)
-ROOM = {
-    "scene": Room, "truth": _room_truth, "names": ("x", "z", "x_rate", "z_rate"), "asks": ASKS,
-    "start": lambda n: {"x": 0.0 * n["z"], "z": n["z"], "x_rate": n["vx"], "z_rate": n["vz"]},
-    "parameters": lambda n: {"width": n["width"], "height": n["height"]},
+RADAU = {"solver": jj.RadauIIA()}
+IMPLICIT = (Ask("simulate", 1, 1e-6), Ask("simulate", 9, 1e-6, RADAU), Ask("rollout", 1, 1e-6), Ask("jit", 9, 1e-6, RADAU))
+ROOM = {"scene": Room, "truth": _room_truth, "names": "x z x_rate z_rate", "asks": ASKS}
+ROOM_DRAWN = drawn(z=(0.5, 2.5), x_rate=either(0.5, 8.0), z_rate=(-4.0, 4.0), width=(0.5, 3.0), height=3.0, span=3.0)
+STOP = {
+    "truth": _stop_truth, "names": "x x_rate", "asks": ASKS, "cases": 42,
+    "draw": drawn(k=(1, 30), stop=(0.6, 1.2), x=(-0.5, 0.4), x_rate=either(4.0, 8.0), span=4.0),
 }  # fmt: skip
+NO_NUMBER = STOP | {"slack": 30.0, "single": False}
 FAMILIES = (
-    Family(name="room", what="several events of a flying particle, the earliest ends it", draw=_room_drawn, **ROOM, cases=140),
+    Family(name="room", what="several events of a flying particle, the earliest ends it", draw=ROOM_DRAWN, **ROOM, cases=140),
     Family(name="grazing", what="a ceiling that is passed by a little for a short time", draw=_grazing_drawn, **ROOM),
-    _stop("stop", "an oscillator that meets a stop", Spring),
-    _stop("stop-arcsine", "an event value that is no number beyond its boundary, 1 - arcsin(x)/(pi/2)", ArcsineStop, slack=30.0, single=False),
-    _stop("stop-root", "the same, sqrt(1 - x)", RootStop, slack=30.0, single=False),
-    _stop("stop-logarithm", "the same, log(1 - x)", LogarithmStop, slack=30.0, single=False),
+    Family(name="stop", what="an oscillator that meets a stop", scene=Spring, **STOP),
+    Family(name="stop-arcsine", what="an event value that is no number beyond its boundary, 1 - arcsin(x)/(pi/2)", scene=ArcsineStop, **NO_NUMBER),
+    Family(name="stop-root", what="the same, sqrt(1 - x)", scene=RootStop, **NO_NUMBER),
+    Family(name="stop-logarithm", what="the same, log(1 - x)", scene=LogarithmStop, **NO_NUMBER),
     Family(
-        name="stiff-drop", what="a stiff motion that ends at an event", scene=StiffDrop, truth=_stiff_truth, names=("x", "y", "y_rate"),
-        draw=lambda r: {"k": 10 ** r.uniform(4.5, 7.0), "x": 0.0, "y": r.uniform(4.0, 9.0), "span": r.choice([2.0, 5.0])},
-        start=lambda n: {"x": n["x"], "y": n["y"]}, parameters=lambda n: {"k": n["k"]}, asks=IMPLICIT, cases=48, fixed=("span", "x", "k"), single=False,
+        name="stiff-drop", what="a stiff motion that ends at an event", scene=StiffDrop, truth=_stiff_truth, names="x y y_rate",
+        draw=drawn(k=power(4.5, 7.0), x=0.0, y=(4.0, 9.0), span=one_of(2.0, 5.0)), asks=IMPLICIT, cases=48, fixed=("span", "x", "k"), single=False,
     ),
 )  # fmt: skip

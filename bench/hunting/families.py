@@ -12,7 +12,7 @@ FAMILIES = (
     *uses.FAMILIES,
     *short_features.FAMILIES,
     *refusals.FAMILIES,
-    *gradients.families(),
+    *gradients.FAMILIES,
 )
 
 

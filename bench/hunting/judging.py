@@ -5,12 +5,13 @@ A value may be off by `2 (steps + 10) rtol (size + growth)`: so much may add up 
 """
 
 import time
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hunting.asking import Failed, ask_for
+from hunting.asking import Failed, ask_for, tolerance
 from hunting.family import Ask, Family, Truth, together
 from hunting.record import BY_CODE, BY_WARNING, RIGHT, UNDECIDED, WRONG, Record
 
@@ -34,7 +35,7 @@ def search(family: Family, seeds: list[int]) -> list[Record]:
         motions = ask_for(family, ask, numbers, ts)
         seconds = (time.process_time() - begin) / len(own)
         for i, seed in enumerate(own):
-            outcome, error, said = _judged(family, ask, motions[i], i, numbers, truth, growth, single)
+            outcome, error, said = _judged(family, ask, motions[i], i, numbers, truth, growth)
             told = f"{ask}; ts to {float(ts[i, -1])!r}; " + ", ".join(f"{name}={value!r}" for name, value in numbers[i].items())
             found.append(Record(family.name, seed, dtype, told, outcome, error, said, seconds))
     return sorted(found, key=lambda record: record.seed)
@@ -50,7 +51,7 @@ def _truth(family: Family, numbers: list[dict], ts) -> tuple[Truth, np.ndarray]:
             off = NUDGE * np.where(draw.uniform(size=count) < 0.5, -1.0, 1.0)
             absolute = off if family.size is None else 0.0
             every[name].append(value if name in family.fixed else value * (1 + off) + absolute)
-    truth = family.truth({name: np.concatenate(values) for name, values in every.items()}, np.tile(ts, (1 + NUDGES, 1)))
+    truth = family.right({name: np.concatenate(values) for name, values in every.items()}, np.tile(ts, (1 + NUDGES, 1)))
     whole = _whole(truth, np.tile(ts, (1 + NUDGES, 1))).reshape(1 + NUDGES, count, ts.shape[1] + 1, -1)
     growth = np.nan_to_num(np.max(np.abs(whole[1:] - whole[0]), axis=0) / NUDGE)
     return truth, growth
@@ -63,22 +64,23 @@ def _whole(truth: Truth, ts) -> np.ndarray:
     return np.concatenate([values, times[..., None]], axis=2)
 
 
-def _columns(scene, names) -> tuple[list[tuple[str, int]], tuple]:
-    known = (scene.coordinate_names.entries, scene.speed_names.entries)
-    return [("q", known[0].index(name)) if name in known[0] else ("u", known[1].index(name)) for name in names]
+def places_of(family: Family) -> list[tuple[str, int]]:
+    """Where each compared name stands: among the coordinates `q` or the speeds `u`."""
+    q, u = (names.entries for names in (family.scene().coordinate_names, family.scene().speed_names))
+    return [("q", q.index(name)) if name in q else ("u", u.index(name)) for name in family.names.split()]
 
 
-def _judged(family: Family, ask: Ask, motion, i: int, numbers, truth: Truth, growth, single: bool):
+def _judged(family: Family, ask: Ask, motion, i: int, numbers, truth: Truth, growth):
     """Outcome, error relative to its bound, and words."""
     if isinstance(motion, Failed):
         return motion.outcome, None, motion.said
     code = int(motion.result)  # a flag is a flag, whether or not there is a reference
     if code not in (SUCCESS, EVENT):
         return BY_CODE, None, f"code {code} at t = {float(motion.t_end):.4g} s"
-    columns = _columns(family.scene(), family.names)
-    values = np.stack([getattr(motion, kind)[:, k] for kind, k in columns], axis=-1)
-    end = np.stack([getattr(motion, f"{kind}_end")[k] for kind, k in columns])
-    rtol = max(ask.rtol, family.rtol32) if single else ask.rtol
+    places = places_of(family)
+    values = np.stack([getattr(motion, kind)[:, k] for kind, k in places], axis=-1)
+    end = np.stack([getattr(motion, f"{kind}_end")[k] for kind, k in places])
+    rtol = tolerance(ask)
     count = min(int(motion.accepted), 1000) + 10
     expected, size = truth.values[i], _size(family, numbers, truth, i)
     wide = lambda grown: np.minimum(family.slack * 2 * count * rtol * (size + grown), MOST * size)  # noqa: E731
@@ -91,7 +93,7 @@ def _judged(family: Family, ask: Ask, motion, i: int, numbers, truth: Truth, gro
     both = reached & np.isfinite(values)
     off = np.where(both, np.abs(values - np.where(reached, expected, 0.0)) / allowed, 0.0)
     error = max(float(np.max(off, initial=0.0)), float(np.max(np.abs(end - truth.last[i]) / allowed)) if np.all(np.isfinite(end)) else np.inf)
-    worst = f"`{family.names[int(np.argmax(np.max(off, axis=0)))]}` is off by {float(np.max(off * allowed, initial=0.0)):.2e}"
+    worst = f"`{family.names.split()[int(np.argmax(np.max(off, axis=0)))]}` is off by {float(np.max(off * allowed, initial=0.0)):.2e}"
     worst += f", the end {np.array2string(end, precision=6)} for {np.array2string(truth.last[i], precision=6)}"
     if truth.event is not None:
         named = motion.event_names[int(motion.event)] if code == EVENT else ""
@@ -110,7 +112,7 @@ def _judged(family: Family, ask: Ask, motion, i: int, numbers, truth: Truth, gro
 
 def _size(family: Family, numbers, truth: Truth, i: int) -> np.ndarray:
     """What counts as the size of each name: the largest value, or what the family says; at least `size` or 1."""
-    least = np.ones(len(family.names)) if family.size is None else family.size(together(numbers))[i]
+    least = 1.0 if family.size is None else np.array(family.size(SimpleNamespace(**numbers[i])))
     return np.maximum(np.nanmax(np.abs(truth.values[i]), axis=0, initial=0.0, where=np.isfinite(truth.values[i])), least)
 
 

@@ -33,6 +33,11 @@ class Record:
         return asdict(self) | {"error": error}
 
 
+def outcome_of(code: int, error: float, said: str) -> str:
+    """What became of a motion: by its result code, its error over what is allowed, and what is said against it."""
+    return BY_CODE if code not in (0, 1) else RIGHT if error <= 1 else BY_WARNING if said else WRONG
+
+
 def refusal(error: Exception) -> tuple[str, str]:
     """Outcome and words of an error: the engine's own kinds are refusals, others crashes."""
     import jourdain_jax as jj

@@ -14,17 +14,18 @@ SHORTEST = 1e-7  # of a span: a motion that needs shorter steps is given up
 MOST = 20_000  # steps
 
 
-def integrate(rates: Callable, y0: np.ndarray, ts: np.ndarray, *, t0=0.0, width: float = 0.05) -> np.ndarray:
-    """States (cases, times, n) of y' = rates(t, y) from y0 (cases, n) at times ts (cases, times); first step `width` s.
+def integrate(rates: Callable, start: tuple, ts: np.ndarray, *, t0=0.0, width: float = 0.05) -> np.ndarray:
+    """States (n, cases, times) of y' = rates(t, *y) from n numbers at times ts (cases, times); first step `width` s.
 
-    `rates(t, y)`: t (cases,), y (cases, n); y0 may be complex, for derivatives by a complex step. A case that is given up is NaN from then on.
+    Every number, and the time, is a column of cases, (cases, 1). A start may be complex, for derivatives by a complex step. A case that is given up is NaN
+    from then on.
     """
-    y = np.array(y0)
-    t = np.broadcast_to(np.asarray(t0, float), ts.shape[:1]).astype(float)
-    whole, found, left = ts[:, -1] - t, [], MOST
+    y, t = (np.stack([np.broadcast_to(x, (len(ts), 1)) for x in some]) for some in (start, [t0]))
+    t = t[0].astype(float)
+    whole, found, left = ts[:, -1:] - t, [], MOST
     part = min(1.0, width / max(float(np.max(np.abs(whole))), 1e-300))  # length of a step, as a part of the whole span
     with np.errstate(all="ignore"):
-        for stop in ts.T:
+        for stop in ts.T[:, :, None]:
             done, span = 0.0, stop - t
             share = float(np.max(np.abs(span) / np.maximum(np.abs(whole), 1e-300)))
             while done < 1.0 and share > 0:
@@ -35,27 +36,27 @@ def integrate(rates: Callable, y0: np.ndarray, ts: np.ndarray, *, t0=0.0, width:
                 if worst > 1.0 and step * share > SHORTEST and left > 0:
                     part = step * share * max(0.2, 0.9 * worst**-0.125)
                     continue
-                y = np.where((off > 1.0)[:, None], np.nan, new)
+                y = np.where(off > 1.0, np.nan, new)
                 done = 1.0 if 1.0 - done - step < 1e-14 else done + step
                 part = max(part, step * share * min(5.0, 0.9 * max(worst, 1e-9) ** -0.125)) if worst <= 1.0 else 1e-3
             t = stop
             found.append(y)
-    return np.stack(found, axis=1)
+    return np.concatenate(found, axis=-1)
 
 
 def _step(rates: Callable, t, y, h):
-    """The next state, and its error (cases,) relative to what is let pass; zero where a case was given up."""
+    """The next state, and its error (cases, 1) relative to what is let pass; zero where a case was given up."""
     stages: list[np.ndarray] = []
-    h = h[:, None]
+    at = lambda t, y: np.stack([np.broadcast_to(x, t.shape) for x in rates(t, *y)])  # noqa: E731
     for i in range(table.N_STAGES):
         slope = sum((A[i, j] * stages[j] for j in range(i) if A[i, j]), np.zeros_like(y))
-        stages.append(rates(t + C[i] * h[:, 0], y + h * slope))
+        stages.append(at(t + C[i] * h, y + h * slope))
     new = y + h * sum(b * k for b, k in zip(B, stages, strict=True) if b)
-    stages.append(rates(t + h[:, 0], new))
+    stages.append(at(t + h, new))
     fifth, third = (np.abs(h * sum(e * k for e, k in zip(row, stages, strict=True) if e)) for row in (table.E5, table.E3))
     scale = CLOSE * (1 + np.maximum(np.abs(y), np.abs(new)))
-    off = np.max(fifth**2 / np.sqrt(fifth**2 + 0.01 * third**2 + 1e-300) / scale, axis=1)
-    given_up = ~np.all(np.isfinite(y), axis=1)
+    off = np.max(fifth**2 / np.sqrt(fifth**2 + 0.01 * third**2 + 1e-300) / scale, axis=0)
+    given_up = ~np.all(np.isfinite(y), axis=0)
     return new, np.where(given_up, 0.0, np.nan_to_num(off, nan=1e30, posinf=1e30))
 
 

@@ -4,35 +4,34 @@ A case counts as right only where the truth exists and is met; otherwise the eng
 """
 
 import json
-import os
 import re
-import subprocess
-import sys
 import tempfile
 import warnings
 from functools import cache
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from figures import fresh
+from small_scenes import OnPlane
 
 import jourdain_jax as jj
-from hunting.uses import Single, warnings_of
+from hunting.family import G
+from hunting.pendulums import SphericalPendulum
+from hunting.uses import Single, in_way, warnings_of
 
 WAYS = ("simulate", "jit", "rollout", "jit rollout")
-G = 9.81
 
 
 def _asked(scene, parameters: dict[str, float], start: dict, way: str, **options):
     """The motion of a scene whose `parameters` are numbers, in one of the ways; of two lanes the second is the one that is meant."""
-    if way == "simulate":
-        return jj.simulate(scene.replace(**parameters), start, **options)
-    if way == "jit":
-        return jax.jit(lambda p: jj.simulate(scene.replace(**p), start, **options))({k: jnp.asarray(v) for k, v in parameters.items()})
-    lanes = {name: jnp.array([getattr(scene, name), value]) for name, value in parameters.items()}
-    call = lambda p: jj.rollout(scene, start, parameters=p, **options).lanes  # noqa: E731
-    return jax.tree.map(lambda x: x[1], jax.jit(call)(lanes) if way == "jit rollout" else call(lanes))
+    one = lambda p: jj.simulate(scene.replace(**p), start, **options)  # noqa: E731
+
+    def lanes(p):
+        both = {name: jnp.stack([jnp.asarray(getattr(scene, name)), jnp.asarray(value)]) for name, value in p.items()}
+        return jj.rollout(scene, start, parameters=both, **options).lanes
+
+    return in_way(way, one, lanes, parameters)
 
 
 # Impossible bodies. ------------------------------------------------------------------------------------------------
@@ -137,16 +136,12 @@ def _impossible(seed: int):
 # Rows that vanish with the speeds. ---------------------------------------------------------------------------------
 
 
-class Lawful(jj.Scene):
+class Lawful(OnPlane):
     """A particle in a plane whose speed is c(t) = 1 - t/stop; at rest its row has no slope, and nothing says where it goes."""
 
-    coordinates = jj.coordinates("x y")
-    stop: object = jj.parameter(1.0, unit="s")
-    pull: object = jj.parameter(1.0, unit="m/s^2")
+    stop: object = jj.parameter(1.0)
+    pull: object = jj.parameter(1.0)
     power: object = jj.parameter(1.0)  # unit of the row
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
 
     def velocity_constraints(self, motion):
         u = motion.u
@@ -175,7 +170,7 @@ class CrankAndSlider(jj.Scene):
     """A crank and a slider in its line, joined by a rod; in its domain the slider is to the right of the crank, or below it."""
 
     coordinates = jj.coordinates("crank slide")
-    long: object = jj.parameter(1.5, unit="m")
+    length: object = jj.parameter(1.5)
     domain = {"crank": (-1.2, 1.2), "slide": (0.7, 2.6)}
 
     def bodies(self, t, q):
@@ -183,30 +178,19 @@ class CrankAndSlider(jj.Scene):
         return {"pin": jj.Particle(1.0, pin), "slider": jj.Particle(1.0, jnp.stack([q.slide, 0.0 * q.slide, 0.0 * q.slide]))}
 
     def geometric_constraints(self, pose):
-        return {"rod": jj.rod(pose["pin"].position, pose["slider"].position, self.long)}
+        return {"rod": jj.rod(pose["pin"].position, pose["slider"].position, self.length)}
 
 
-class Hanging(jj.Scene):
+class Hanging(SphericalPendulum):
     """A pendulum in x, y, z that hangs."""
 
-    coordinates = jj.coordinates("x y z")
-    long: object = jj.parameter(1.0, unit="m")
     domain = {"x": (-0.7, 0.7), "y": (-0.7, 0.7), "z": (-1.3, -0.3)}
-
-    def bodies(self, t, q):
-        return {"bob": jj.Particle(1.0, jnp.stack([q.x, q.y, q.z]))}
-
-    def geometric_constraints(self, pose):
-        return {"rod": jj.rod(jnp.zeros(3), pose["bob"].position, self.long)}
-
-    def loads(self, motion):
-        return (jj.gravity(motion, G),)
 
 
 def _outside(seed: int):
     """What `start` finds lies in the domain (a tenth of its width beyond is let pass), or it is refused."""
     r = np.random.default_rng([seed, 91])
-    scene = (CrankAndSlider, Hanging)[seed % 2](long=r.uniform(1.25, 1.6) if seed % 2 == 0 else r.uniform(0.8, 1.2))
+    scene = (CrankAndSlider, Hanging)[seed % 2](length=r.uniform(1.25, 1.6) if seed % 2 == 0 else r.uniform(0.8, 1.2))
     named = {"crank": r.uniform(-1.0, 1.0)} if seed % 2 == 0 else {"x": r.uniform(-0.5, 0.5), "y": r.uniform(-0.5, 0.5)}
     state = jj.start(scene, named)
     q = dict(zip(scene.coordinate_names.entries, np.asarray(state.q), strict=True))
@@ -301,18 +285,18 @@ def _study_file(seed: int):
 # Machine code on disk. ---------------------------------------------------------------------------------------------
 
 TWO_MOTIONS = """
-import warnings; warnings.simplefilter("ignore")
+import json, warnings; warnings.simplefilter("ignore")
 import jourdain_jax as jj
-for scene in (jj.models.VerticalDisc(), jj.models.ChaplyginSleigh()):
-    print(jj.simulate(scene, jj.start(scene, heading_rate=0.7), t1=1.0).q_end.tolist())
+scenes = jj.models.VerticalDisc(), jj.models.ChaplyginSleigh()
+print(json.dumps([jj.simulate(scene, jj.start(scene, heading_rate=0.7), t1=1.0).q_end.tolist() for scene in scenes]))
 """
 
 
-def _run_twice(folder: Path) -> str:
-    done = subprocess.run(
-        [sys.executable, "-c", TWO_MOTIONS], env=os.environ | {"JOURDAIN_JAX_CACHE": str(folder)}, capture_output=True, text=True, timeout=300, check=False
-    )
-    return done.stdout if done.returncode == 0 else f"exit status {done.returncode}: {done.stderr.strip().splitlines()[-1:]}"
+def _run_twice(folder: Path):
+    try:
+        return fresh(TWO_MOTIONS, JOURDAIN_JAX_CACHE=str(folder))
+    except RuntimeError as error:
+        return str(error)
 
 
 def _cache_file(seed: int):

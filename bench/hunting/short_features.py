@@ -6,24 +6,19 @@ Motions are free between the features, where nothing bounds a step but the rules
 import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
+from small_scenes import OnLine, OnPlane
 
 import jourdain_jax as jj
-from hunting.events import _stopped
-from hunting.family import Ask, Family, Truth
-
-G = 9.81
+from hunting.family import Ask, Family, G, drawn, stopped
+from hunting.pendulums import Weighted
 
 
-class Strip(jj.Scene):
+class Strip(OnLine):
     """A mass that slides freely along x, and is braked by `force` N on a strip from `at` to `at + width` m."""
 
-    coordinates = jj.coordinates("x")
-    force: object = jj.parameter(1.0, unit="N")
-    at: object = jj.parameter(1.0, unit="m")
-    width: object = jj.parameter(0.1, unit="m")
-
-    def bodies(self, t, q):
-        return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+    force: object = jj.parameter(1.0)
+    at: object = jj.parameter(1.0)
+    width: object = jj.parameter(0.1)
 
     def loads(self, motion):
         x = motion.q.x
@@ -54,29 +49,24 @@ class Bump(Strip):
 
 def _strip_truth(n, ts):
     """Speed v before the strip, (v^2 - 2 F w)^(1/2) behind it."""
-    v, f, a, w = (n[name][:, None] for name in ("v", "force", "at", "width"))
-    behind = np.sqrt(v * v - 2 * f * w)
-    enters = a / v
-    leaves = enters + (v - behind) / f
-    inside = ts - enters
+    v, f, a, w = n.x_rate, n.force, n.at, n.width
+    behind, enters = np.sqrt(v * v - 2 * f * w), a / v
+    leaves, inside = enters + (v - behind) / f, ts - enters
     x = np.where(ts < enters, v * ts, np.where(ts < leaves, a + v * inside - f / 2 * inside**2, a + w + behind * (ts - leaves)))
-    speed = np.where(ts < enters, v, np.where(ts < leaves, v - f * inside, behind))
-    return Truth(np.stack([x, speed], axis=-1))
+    return x, np.where(ts < enters, v, np.where(ts < leaves, v - f * inside, behind))
 
 
 def _pulse_truth(n, ts):
-    v, f, a, w = (n[name][:, None] for name in ("v", "force", "at", "width"))
-    during = np.clip(ts - a, 0.0, w)
-    after = np.maximum(ts - a - w, 0.0)
-    return Truth(np.stack([v * ts + f * (during**2 / 2 + during * after), v + f * during], axis=-1))
+    during, after = np.clip(ts - n.at, 0.0, n.width), np.maximum(ts - n.at - n.width, 0.0)
+    return n.x_rate * ts + n.force * (during**2 / 2 + during * after), n.x_rate + n.force * during
 
 
 def _bump_truth(n, ts):
     """xdot^2 (1 + z'^2) + 2 g z = v^2; the time over the bump by quadrature, of order 10 in 400 pieces."""
-    found = np.empty((*ts.shape, 2))
+    found = np.empty((2, *ts.shape))
     nodes, weights = np.polynomial.legendre.leggauss(5)
     for i, times in enumerate(ts):
-        v, h, a, w = (float(n[name][i]) for name in ("v", "force", "at", "width"))
+        v, h, a, w = (float(x[i, 0]) for x in (n.x_rate, n.force, n.at, n.width))
 
         def speed(x, v=v, h=h, a=a, w=w):
             phase = 2 * np.pi * (x - a) / w
@@ -90,23 +80,23 @@ def _bump_truth(n, ts):
         x = np.where(times < at[0], v * times, a + w + v * (times - at[-1]))
         over = (times >= at[0]) & (times <= at[-1])
         x[over] = CubicHermiteSpline(at, grid, speed(grid))(times[over])
-        found[i] = np.stack([x, np.where(over, speed(x), v)], axis=-1)
-    return Truth(found)
+        found[:, i] = x, np.where(over, speed(x), v)
+    return tuple(found)
 
 
 def _strip_drawn(r):
     v, width = r.uniform(1.0, 4.0), 10 ** r.uniform(-2.2, -0.7)
-    return {"v": v, "width": width, "force": r.uniform(0.1, 0.4) * v * v / (2 * width), "at": r.uniform(0.5, 2.0), "span": 3.0}
+    return {"x_rate": v, "width": width, "force": r.uniform(0.1, 0.4) * v * v / (2 * width), "at": r.uniform(0.5, 2.0), "span": 3.0}
 
 
 def _pulse_drawn(r):
     width = 3.0 * 10 ** r.uniform(-2.2, -0.9)
-    return {"v": r.uniform(-2.0, 2.0), "width": width, "force": r.uniform(-2.0, 2.0) / width, "at": r.uniform(0.3, 2.5), "span": 3.0}
+    return {"x_rate": r.uniform(-2.0, 2.0), "width": width, "force": r.uniform(-2.0, 2.0) / width, "at": r.uniform(0.3, 2.5), "span": 3.0}
 
 
 def _bump_drawn(r):
     v, width = r.uniform(2.0, 4.0), 10 ** r.uniform(-1.5, -0.5)
-    return {"v": v, "width": width, "force": r.uniform(0.2, 0.5) * min(width, v * v / (2 * G)), "at": r.uniform(0.5, 3.0), "span": 3.0}
+    return {"x_rate": v, "width": width, "force": r.uniform(0.2, 0.5) * min(width, v * v / (2 * G)), "at": r.uniform(0.5, 3.0), "span": 3.0}
 
 
 # Events with a short negative part. ------------------------------------------------------------------------------
@@ -131,12 +121,12 @@ class Gate(Window):
 
 
 def _window_truth(n, ts):
-    t_end = (n["at"] - n["width"]) / n["v"]
-    return _stopped(lambda t: np.stack([n["v"][:, None] * t, n["v"][:, None] + 0 * t], axis=-1), t_end, ["near"] * len(t_end), ts)
+    t_end = (n.at - n.width) / n.x_rate
+    return stopped(lambda t: (n.x_rate * t, n.x_rate), t_end, ["near"] * len(t_end), ts)
 
 
 def _window_drawn(r):
-    return {"v": r.uniform(0.7, 4.0), "at": r.uniform(0.5, 2.0), "width": 10 ** r.uniform(-4.0, -1.0), "span": 3.0}
+    return {"x_rate": r.uniform(0.7, 4.0), "at": r.uniform(0.5, 2.0), "width": 10 ** r.uniform(-4.0, -1.0), "span": 3.0}
 
 
 # Speeds and constraints that lose their slope. -------------------------------------------------------------------
@@ -165,45 +155,35 @@ class SwingSpeed(TurnedSpeed):
         return jnp.stack([u.w / jnp.cos(q.q)])
 
 
-def _turned(name, scene, weight, centre):
+def _turned(name, scene, weight, weight_of_start, first):
     """q = q0 + r t; it passes the place where the rate of the coordinate is infinite."""
-
-    def truth(n, ts):
-        q = n["q"][:, None] + n["rate"][:, None] * ts
-        return Truth(np.stack([q, weight(q) * n["rate"][:, None]], axis=-1))
-
     return Family(
-        name=name, what="a quasi-velocity whose coordinate rate is infinite at one place", scene=scene, truth=truth, names=("q", "w"),
-        draw=lambda r: {"q": centre(r), "rate": -r.uniform(0.5, 2.0), "span": r.uniform(0.3, 3.0)},
-        start=lambda n: {"q": n["q"], "w": (jnp.sin if scene is TurnedSpeed else jnp.cos)(n["q"]) * n["rate"]}, cases=40,
+        name=name, what="a quasi-velocity whose coordinate rate is infinite at one place", scene=scene, names="q w", cases=40,
+        truth=lambda n, ts: (n.q + n.rate * ts, weight(n.q + n.rate * ts) * n.rate), start=lambda n: {"w": weight_of_start(n.q) * n.rate},
+        draw=drawn(q=first, rate=lambda r: -r.uniform(0.5, 2.0), span=(0.3, 3.0)),
     )  # fmt: skip
 
 
-class EvenPace(jj.Scene):
+class EvenPace(Weighted):
     """Appell and Hamel's constraint zdot^2 = k^2 (xdot^2 + ydot^2): without slope where the speeds vanish, at the top of the throw."""
 
     coordinates = jj.coordinates("x y z")
     slope: object = jj.parameter(1.0)
 
     def bodies(self, t, q):
-        return {"mass": jj.Particle(1.0, jnp.stack([q.x, q.y, q.z]))}
+        return {"mass": jj.Particle(1.0, q.array)}
 
     def velocity_constraints(self, motion):
         u = motion.u
         return {"pace": u.z_rate**2 - self.slope**2 * (u.x_rate**2 + u.y_rate**2)}
 
-    def loads(self, motion):
-        return (jj.gravity(motion, G),)
-
 
 def _pace_truth(n, ts):
     """Along its straight line the mass is slowed by g k^2/(1 + k^2) in z; at the top the constraint no longer determines the motion, which has no truth."""
-    k, v, turn = (n[name][:, None] for name in ("slope", "v", "turn"))
+    k, c, s = n.slope, np.cos(n.turn), np.sin(n.turn)
     pull = G * k * k / (1 + k * k)
-    z, up = k * v * ts - pull / 2 * ts**2, k * v - pull * ts
-    ahead, pace = z / k, up / k
-    values = np.stack([np.cos(turn) * ahead, np.sin(turn) * ahead, z, np.cos(turn) * pace, np.sin(turn) * pace, up], axis=-1)
-    return Truth(values)
+    z, up = k * n.v * ts - pull / 2 * ts**2, k * n.v - pull * ts
+    return c * z / k, s * z / k, z, c * up / k, s * up / k, up
 
 
 def _pace_drawn(r):
@@ -212,14 +192,10 @@ def _pace_drawn(r):
     return {"slope": k, "v": v, "turn": r.uniform(0.0, 6.0), "span": float(r.choice([0.7, r.uniform(1.2, 2.0)])) * top}
 
 
-class SetPace(jj.Scene):
+class SetPace(OnPlane):
     """A mass whose speed is prescribed by xdot^2 + ydot^2 = (pace cos t)^2: without slope where the pace passes zero."""
 
-    coordinates = jj.coordinates("x y")
-    pace: object = jj.parameter(1.0, unit="m/s")
-
-    def bodies(self, t, q):
-        return {"mass": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+    pace: object = jj.parameter(1.0)
 
     def velocity_constraints(self, motion):
         return {"pace": motion.u.x_rate**2 + motion.u.y_rate**2 - (self.pace * jnp.cos(motion.t)) ** 2}
@@ -227,39 +203,28 @@ class SetPace(jj.Scene):
 
 def _set_pace_truth(n, ts):
     """Straight ahead, and, without a force, straight back: pace sin t."""
-    along = np.stack([np.cos(n["turn"]), np.sin(n["turn"])], axis=-1)[:, None]
-    ahead, pace = (n["v"][:, None] * f(ts) for f in (np.sin, np.cos))
-    return Truth(np.concatenate([along * ahead[..., None], along * pace[..., None]], axis=-1))
-
-
-def _family(name, what, scene, drawn, truth, names=("x", "x_rate"), **more):
-    own = ("force", "at", "width")
-    return Family(
-        name=name, what=what, scene=scene, draw=drawn, truth=truth, names=names, start=lambda n: {"x": 0.0 * n["v"], "x_rate": n["v"]},
-        parameters=lambda n: {key: n[key] for key in own if key in n}, **more,
-    )  # fmt: skip
+    c, s = n.pace * np.cos(n.turn), n.pace * np.sin(n.turn)
+    return c * np.sin(ts), s * np.sin(ts), c * np.cos(ts), s * np.cos(ts)
 
 
 ASKS = (Ask("simulate"), Ask("jit", 33), Ask("rollout", 9, 1e-6), Ask("vmap", 3), Ask("simulate", 9, 1e-6))
+LINE, ROWS = {"names": "x x_rate", "cases": 63}, {"cases": 42, "single": False, "asks": ASKS}
 FAMILIES = (
-    _family("strip", "a free mass that a strip of 0.6 to 20 cm brakes", Strip, _strip_drawn, _strip_truth, cases=63),
-    _family("pulse", "a force for 0.6 to 12 % of the span", Pulse, _pulse_drawn, _pulse_truth, cases=63),
-    _family("bump", "a flat road with a bump of 3 to 30 cm", Bump, _bump_drawn, _bump_truth, cases=42, single=False),
-    _family("window", "an event within 0.1 to 100 mm of a place, by `abs`", Window, _window_drawn, _window_truth, cases=63),
-    _family("gate", "the same by `where`", Gate, _window_drawn, _window_truth, cases=42),
-    _turned("turned-speed", TurnedSpeed, np.sin, lambda r: r.uniform(0.4, 1.5)),
-    _turned("swing-speed", SwingSpeed, np.cos, lambda r: r.uniform(-1.0, 1.0)),
+    Family("strip", "a free mass that a strip of 0.6 to 20 cm brakes", Strip, _strip_drawn, _strip_truth, **LINE),
+    Family("pulse", "a force for 0.6 to 12 % of the span", Pulse, _pulse_drawn, _pulse_truth, **LINE),
+    Family("bump", "a flat road with a bump of 3 to 30 cm", Bump, _bump_drawn, _bump_truth, **LINE | {"cases": 42, "single": False}),
+    Family("window", "an event within 0.1 to 100 mm of a place, by `abs`", Window, _window_drawn, _window_truth, **LINE),
+    Family("gate", "the same by `where`", Gate, _window_drawn, _window_truth, **LINE | {"cases": 42}),
+    _turned("turned-speed", TurnedSpeed, np.sin, jnp.sin, (0.4, 1.5)),
+    _turned("swing-speed", SwingSpeed, np.cos, jnp.cos, (-1.0, 1.0)),
     Family(
         name="even-pace", what="Appell and Hamel's constraint up to the top of the throw, and beyond", scene=EvenPace, draw=_pace_drawn, truth=_pace_truth,
-        names=("x", "y", "z", "x_rate", "y_rate", "z_rate"), parameters=lambda n: {"slope": n["slope"]}, cases=42, single=False,
-        start=lambda n: {"x": 0.0 * n["v"], "y": 0.0 * n["v"], "z": 0.0 * n["v"]} | {
-            "x_rate": n["v"] * jnp.cos(n["turn"]), "y_rate": n["v"] * jnp.sin(n["turn"]), "z_rate": n["slope"] * n["v"]},
-        asks=ASKS,
+        names="x y z x_rate y_rate z_rate", **ROWS,
+        start=lambda n: {"x_rate": n.v * jnp.cos(n.turn), "y_rate": n.v * jnp.sin(n.turn), "z_rate": n.slope * n.v},
     ),
     Family(
-        name="set-pace", what="a prescribed magnitude of the velocity that passes zero", scene=SetPace, truth=_set_pace_truth,
-        names=("x", "y", "x_rate", "y_rate"), parameters=lambda n: {"pace": n["v"]}, cases=42, single=False, asks=ASKS,
-        draw=lambda r: {"v": r.uniform(0.5, 3.0), "turn": r.uniform(0.0, 6.0), "span": r.uniform(1.0, 4.5)},
-        start=lambda n: {"x": 0.0 * n["v"], "y": 0.0 * n["v"], "x_rate": n["v"] * jnp.cos(n["turn"]), "y_rate": n["v"] * jnp.sin(n["turn"])},
+        name="set-pace", what="a prescribed magnitude of the velocity that passes zero", scene=SetPace, truth=_set_pace_truth, names="x y x_rate y_rate",
+        draw=drawn(pace=(0.5, 3.0), turn=(0.0, 6.0), span=(1.0, 4.5)), **ROWS,
+        start=lambda n: {"x_rate": n.pace * jnp.cos(n.turn), "y_rate": n.pace * jnp.sin(n.turn)},
     ),
 )  # fmt: skip

@@ -3,6 +3,8 @@
 from collections import Counter
 from collections.abc import Iterator
 
+from figures import figure
+
 from hunting.record import BY_CODE, BY_WARNING, CRASHED, LOST, OUTCOMES, REFUSED, RIGHT, WRONG
 
 BEGIN, END = "<!-- from here on written by bench/hunt.py -->", "<!-- up to here by bench/hunt.py -->"
@@ -21,13 +23,6 @@ def _row(name: str, own: list[dict]) -> tuple:
 
 
 HEAD = ("family", "cases", *OUTCOMES, "seconds")
-
-
-def as_text(records: list[dict]) -> Iterator[str]:
-    """Columns of even width."""
-    short = ("family", "cases", "right", "code", "warn", "refused", "WRONG", "crashed", "no ref", "s")
-    for row in (short, *rows(records)):
-        yield f"{row[0]:26s}" + "".join(f"{entry!s:>9s}" for entry in row[1:])
 
 
 def as_markdown(records: list[dict]) -> Iterator[str]:
@@ -49,14 +44,11 @@ def losses(records: list[dict]) -> Iterator[str]:
             yield f"{r['outcome'].upper()}: {again}\n    {r['said']}\n    {r['asked']}"
 
 
-def figures(records: list[dict], wall: float) -> list[dict]:
+def figures(records: list[dict], wall: float) -> Iterator[dict]:
     """Figures as in the other scripts."""
-    found = []
     for row in rows(records):
         counts = dict(zip(OUTCOMES, row[2:-1], strict=True))
-        lost = counts[WRONG] + counts[CRASHED]
-        found.append({"figure": "wrong in silence or crashed", "model": row[0], "value": lost, "required": 0, "met": lost == 0})
-        flagged = counts[BY_CODE] + counts[BY_WARNING] + counts[REFUSED]
-        found.append({"figure": "right", "model": row[0], "value": counts[RIGHT], "required": None, "met": None})
-        found.append({"figure": "flagged", "model": row[0], "value": flagged, "required": None, "met": None})
-    return [*found, {"figure": "wall time, s", "model": "all", "value": round(wall), "required": None, "met": None}]
+        yield figure("wrong in silence or crashed", row[0], counts[WRONG] + counts[CRASHED], 0)
+        yield figure("right", row[0], counts[RIGHT])
+        yield figure("flagged", row[0], counts[BY_CODE] + counts[BY_WARNING] + counts[REFUSED])
+    yield figure("wall time, s", "all", round(wall))

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from small_scenes import OnLine, OnPlane
 
 import jourdain_jax as jj
-from hunting.family import Ask, Family, Truth
+from hunting.family import Ask, Family, G, drawn
 from hunting.oscillators import Oscillator
-from hunting.pendulums import G
-from hunting.record import BY_CODE, BY_WARNING, RIGHT, WRONG, Record, refusal
+from hunting.record import BY_CODE, Record, outcome_of, refusal
 from hunting.reference import integrate
 
 
@@ -34,13 +34,19 @@ class Single:
             begin = time.process_time()
             try:
                 asked, error, code, said = self.ask(seed)
-                outcome = BY_CODE if code not in (0, 1) else RIGHT if error <= 1 else BY_WARNING if said else WRONG
+                outcome = outcome_of(code, error, said)
                 said = f"code {code}" if outcome == BY_CODE else said
             except Exception as problem:
                 asked, error = "", None
                 outcome, said = refusal(problem)
             found.append(Record(self.name, seed, "float64", asked, outcome, error, said, time.process_time() - begin))
         return found
+
+
+def in_way(way: str, one: Callable, lanes: Callable, given):
+    """The motion by `one` or, of lanes, the last; inside `jit` where the way says so, with what is given traced."""
+    call = (lambda given: jax.tree.map(lambda x: x[-1], lanes(given))) if "rollout" in way else one
+    return jax.jit(call)(jax.tree.map(jnp.asarray, given)) if "jit" in way else call(given)
 
 
 # Times. ------------------------------------------------------------------------------------------------------------
@@ -55,14 +61,9 @@ def _times(seed: int):
     scene, options = Oscillator(), {"t0": t0, "rtol": 1e-8, "atol": 1e-8} | ({} if t1 is None else {"t1": t1})
     start = {"x": r.uniform(0.5, 1.0), "x_rate": 0.0}
     asked = f"{way}, t0={t0}, t1={t1}, ts={ts}, x={start['x']!r}"
-    if way == "simulate":
-        motion = jj.simulate(scene, start, ts=ts, **options)
-    elif way == "jit":
-        motion = jax.jit(lambda ts: jj.simulate(scene, start, ts=ts, **options))(jnp.array(ts))
-    else:
-        many = {name: np.full(2, value) for name, value in start.items()}
-        call = lambda ts: jj.rollout(scene, many, ts=ts, **options).lanes  # noqa: E731
-        motion = jax.tree.map(lambda x: x[0], jax.jit(call)(jnp.array(ts)) if way == "jit rollout" else call(np.array(ts)))
+    many = {name: np.full(2, value) for name, value in start.items()}
+    one = lambda ts: jj.simulate(scene, start, ts=ts, **options)  # noqa: E731
+    motion = in_way(way, one, lambda ts: jj.rollout(scene, many, ts=ts, **options).lanes, np.array(ts))
     x = np.asarray(motion.q[:, 0])
     error = np.nanmax(np.abs(x - start["x"] * np.cos(2 * (np.array(ts) - t0))), initial=0.0)
     return asked, np.inf if np.any(np.isnan(x)) else error / 1e-6, int(motion.result), ""
@@ -109,9 +110,8 @@ def _changed(seed: int):
     exec(NOTEBOOK.format(read=read), cell)
 
     def run():
-        if way == "rollout":
-            return jax.tree.map(lambda x: x[0], jj.rollout(cell["Spring"](), {"x": np.ones(2), "x_rate": np.zeros(2)}, ts=[1.0]).lanes)
-        return jj.simulate(cell["Spring"](), {"x": 1.0, "x_rate": 0.0}, ts=[1.0])
+        one = lambda ts: jj.simulate(cell["Spring"](), {"x": 1.0, "x_rate": 0.0}, ts=ts)  # noqa: E731
+        return in_way(way, one, lambda ts: jj.rollout(cell["Spring"](), {"x": np.ones(2), "x_rate": np.zeros(2)}, ts=ts).lanes, [1.0])
 
     motion = run()
     if not later:
@@ -129,19 +129,19 @@ def warnings_of(motion) -> str:
 # Rows that set in later. -------------------------------------------------------------------------------------------
 
 
-class LateRow(jj.Scene):
+class LateRow(OnPlane):
     """Until `late` s the second row says no more than the first; then it holds the speed along y, against a force that sets in with it."""
 
-    coordinates = jj.coordinates("x y")
-    late: object = jj.parameter(1.0, unit="s")
-    speed: object = jj.parameter(0.3, unit="m/s")
+    late: object = jj.parameter(1.0)
+    speed: object = jj.parameter(0.3)
 
-    def bodies(self, t, q):
-        return {"block": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+    def passed(self, motion):
+        """How far the row has set in."""
+        return jnp.maximum(motion.t - self.late, 0.0)
 
     def velocity_constraints(self, motion):
-        u, more = motion.u, jnp.maximum(motion.t - self.late, 0.0)
-        return {"first": u.x_rate - 1.0, "second": u.x_rate - 1.0 + more * (u.y_rate - self.speed)}
+        u = motion.u
+        return {"first": u.x_rate - 1.0, "second": u.x_rate - 1.0 + self.passed(motion) * (u.y_rate - self.speed)}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, y_rate=4.0 * jnp.maximum(motion.t - self.late, 0.0)),)
@@ -150,34 +150,22 @@ class LateRow(jj.Scene):
 class ElsewhereRow(LateRow):
     """A row that sets in beyond a place instead of a time."""
 
-    def velocity_constraints(self, motion):
-        u, more = motion.u, jnp.maximum(motion.q.x - self.late, 0.0)
-        return {"first": u.x_rate - 1.0, "second": u.x_rate - 1.0 + more * (u.y_rate - self.speed)}
+    def passed(self, motion):
+        return jnp.maximum(motion.q.x - self.late, 0.0)
 
 
-def _late(name, what, scene):
-    def truth(n, ts):
-        one = np.ones_like(ts)
-        return Truth(np.stack([ts, n["speed"][:, None] * ts, one, n["speed"][:, None] * one], axis=-1))
-
-    return Family(
-        name=name, what=what, scene=scene, truth=truth, names=("x", "y", "x_rate", "y_rate"), cases=28, slack=100.0, single=False,
-        draw=lambda r: {"late": r.uniform(5.0, 8.0), "speed": r.uniform(-0.5, 0.5), "span": 10.0},
-        start=lambda n: {"x": 0.0 * n["speed"], "y": 0.0 * n["speed"], "x_rate": 1.0 + 0.0 * n["speed"], "y_rate": n["speed"]},
-        parameters=lambda n: {"late": n["late"], "speed": n["speed"]}, asks=(Ask("simulate"), Ask("jit", 33), Ask("rollout", 9, 1e-6), Ask("jit rollout")),
-    )  # fmt: skip
+LATE = {
+    "truth": lambda n, ts: (ts, n.speed * ts, 1.0, n.speed), "names": "x y x_rate y_rate", "cases": 28, "slack": 100.0, "single": False,
+    "draw": drawn(late=(5.0, 8.0), speed=(-0.5, 0.5), span=10.0), "start": lambda n: {"x_rate": 1.0, "y_rate": n.speed},
+    "asks": (Ask("simulate"), Ask("jit", 33), Ask("rollout", 9, 1e-6), Ask("jit rollout")),
+}  # fmt: skip
 
 
 # Tiny and huge coefficients. ---------------------------------------------------------------------------------------
 
 
-class TinyForce(jj.Scene):
+class TinyForce(OnLine):
     """A force with a tiny coefficient that grows by e in a tenth of a metre."""
-
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"block": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=-1e-24 * jnp.exp(motion.q.x / 0.1)),)
@@ -200,28 +188,21 @@ class BesideHugeForce(jj.Scene):
 
 
 def _pushed(push):
-    def truth(n, ts):
-        rates = lambda _, y: np.stack([y[:, 1], push(y[:, 0])], axis=1)  # noqa: E731
-        return Truth(integrate(rates, np.stack([n["x"], n["v"]], axis=1), ts))
-
-    return truth
+    return lambda n, ts: integrate(lambda _, x, v: (v, push(x)), (n.x, n.x_rate), ts)
 
 
-FEW = (Ask("simulate"), Ask("jit", 33), Ask("rollout", 9, 1e-6), Ask("vmap"))
+ALONE = {"names": "x x_rate", "cases": 20, "single": False, "asks": (Ask("simulate"), Ask("jit", 33), Ask("rollout", 9, 1e-6), Ask("vmap"))}
 FAMILIES = (
     Single("times", "times before the start, against the span or beyond it", _times, 32),
     Single("changed", "what methods read besides their arguments: numbers and functions that change between calls, and objects with state", _changed, 36),
-    _late("late-row", "a row that sets in after some seconds", LateRow),
-    _late("row-elsewhere", "a row that sets in beyond a place", ElsewhereRow),
+    Family(name="late-row", what="a row that sets in after some seconds", scene=LateRow, **LATE),
+    Family(name="row-elsewhere", what="a row that sets in beyond a place", scene=ElsewhereRow, **LATE),
     Family(
-        name="tiny-force", what="a force of 1e-24 exp(x/0.1)", scene=TinyForce, truth=_pushed(lambda x: -1e-24 * np.exp(x / 0.1)), names=("x", "x_rate"),
-        draw=lambda r: {"x": r.uniform(5.0, 5.6), "v": r.uniform(-0.3, 0.3), "span": 1.0}, start=lambda n: {"x": n["x"], "x_rate": n["v"]},
-        fixed=("span",), cases=20, single=False, asks=FEW,
+        name="tiny-force", what="a force of 1e-24 exp(x/0.1)", scene=TinyForce, truth=_pushed(lambda x: -1e-24 * np.exp(x / 0.1)), fixed=("span",),
+        draw=drawn(x=(5.0, 5.6), x_rate=(-0.3, 0.3), span=1.0), **ALONE,
     ),
     Family(
-        name="beside-huge-force", what="a pendulum beside a block that 1e16 N push", scene=BesideHugeForce,
-        truth=_pushed(lambda x: -G * np.sin(x)), names=("x", "x_rate"),
-        draw=lambda r: {"x": r.uniform(-2.0, 2.0), "v": r.uniform(-3, 3), "span": r.uniform(0.5, 2)}, start=lambda n: {"x": n["x"], "x_rate": n["v"]},
-        cases=20, single=False, asks=FEW,
+        name="beside-huge-force", what="a pendulum beside a block that 1e16 N push", scene=BesideHugeForce, truth=_pushed(lambda x: -G * np.sin(x)),
+        draw=drawn(x=(-2.0, 2.0), x_rate=(-3, 3), span=(0.5, 2)), **ALONE,
     ),
 )  # fmt: skip

@@ -1,15 +1,16 @@
 """Batches of 1, 100 and 10,000 trajectories with starts that differ by 5 %: time per trajectory against the largest error over the first 100 lanes."""
 
 from collections.abc import Callable, Iterator
+from functools import cache
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 from baselines import heyoka_disc, heyoka_lowered
+from minimal_states import final_states, starts_at
 
 import jourdain_jax as jj
-from jourdain_jax.equations.minimal import minimal_kinematics
 from jourdain_jax.motion.integrators.taylor import order_for
 from work_precision_cases import peer_c, peer_diffrax, peer_heyoka
 from work_precision_cases import record as records
@@ -34,42 +35,22 @@ def starts(problem: Problem, lanes: int) -> np.ndarray:
 
 def by_rollout(problem: Problem, solver=None) -> Callable:
     """`rollout` under `jit`, by Dopri8 unless said; the consistent starts are given."""
-    scene, independent, n = problem.scene, problem.independent, len(problem.scene.coordinate_names.entries)
-    known, rows = problem.state, jj.structure_of(scene).kept_rows
-
-    @jax.jit
-    def states(y):
-        u = jax.vmap(lambda y: minimal_kinematics(scene, independent, rows, jnp.zeros(()), y[:n], y[n:]).u)(y)
-        same = jax.tree.map(lambda x: jnp.broadcast_to(0.0 * x, (len(y), *jnp.shape(x))), known)
-        return jj.State(same.t, y[:, :n], u, same.moved_q, same.moved_u, same.residual, known.names, same.guess)
-
-    @jax.jit
-    def compiled(tolerance, state):
-        options = {"ts": jnp.array([problem.end]), "rtol": tolerance, "atol": tolerance, "events": False, "max_steps": MAX_STEPS}
-        lanes = jj.rollout(scene, state, solver=solver or diffrax.Dopri8(), **options).lanes
-        return jnp.concatenate([lanes.q_end, lanes.u_end[:, jnp.array(independent)]], axis=1)
+    run = final_states(problem.scene, problem.end, solver=solver or diffrax.Dopri8(), events=False, max_steps=MAX_STEPS)
 
     def prepared(y):
-        state = jax.block_until_ready(states(jnp.asarray(y)))
-        return lambda tolerance: np.asarray(compiled(jnp.asarray(tolerance), state))
+        starts = starts_at(problem.scene, y)
+        return lambda tolerance: np.asarray(run(jnp.asarray(tolerance), starts))
 
     return prepared
 
 
 def by_series(problem: Problem) -> Callable:
     """As `by_rollout`, by Taylor series of the order for each tolerance."""
-    made: dict = {}
+    made = cache(lambda tolerance: by_rollout(problem, jj.Taylor(order_for(tolerance))))
 
     def prepared(y):
-        def run(tolerance):
-            if tolerance not in made:
-                made[tolerance] = by_rollout(problem, jj.Taylor(order_for(tolerance)))
-            key = tolerance, len(y)
-            if key not in made:
-                made[key] = made[tolerance](y)
-            return made[key](tolerance)
-
-        return run
+        ready = cache(lambda tolerance: made(tolerance)(y))
+        return lambda tolerance: ready(tolerance)(tolerance)
 
     return prepared
 
@@ -96,52 +77,36 @@ def by_c(problem: Problem) -> Callable:
     return lambda y: lambda tolerance: (many if len(y) >= SIMD else alone)(tolerance, y)[0]
 
 
-def by_dense_vmap(problem: Problem) -> Callable:
-    """diffrax under `vmap` on dense matrices; the disc."""
-    from baselines import disc_run
-
-    run = disc_run.final_states("dense", "Dopri8")
-    return lambda y: lambda tolerance: run(tolerance, y)
-
-
 def by_heyoka(system: Callable[[Problem], list]) -> Callable[[Problem], Callable]:
     """heyoka, eight trajectories in the lanes of SIMD registers, one at a time alone."""
 
     def of(problem: Problem) -> Callable:
-        made: dict = {}
+        made = cache(lambda tolerance, width: heyoka_lowered.final_states(system(problem), problem.end, tolerance, width))
 
         def prepared(y):
             width = SIMD if len(y) >= SIMD else 1
-            padded = np.concatenate([y, y[: -len(y) % width]]) if len(y) % width else y
-
-            def run(tolerance):
-                if (tolerance, width) not in made:
-                    made[tolerance, width] = heyoka_lowered.final_states(system(problem), problem.end, tolerance, width)
-                return made[tolerance, width](padded)[: len(y)]
-
-            return run
+            padded = np.concatenate([y, y[: -len(y) % width]])
+            return lambda tolerance: made(tolerance, width)(padded)[: len(y)]
 
         return prepared
 
     return of
 
 
-def methods(problem: Problem, quick: bool) -> list[tuple[str, str, Callable, tuple[str, ...]]]:
-    """Name, kind, preparation, packages."""
+def methods(problem: Problem) -> list[tuple[str, Callable, tuple[str, ...]]]:
+    """Name, preparation, packages."""
     jax_packages = ("jax", "jaxlib", "diffrax")
     found = [
-        ("rollout, Dopri8", records.OURS, by_rollout, jax_packages),
-        ("rollout, Taylor", records.OURS, by_series, jax_packages),
-        ("JAX by hand, diffrax Dopri8", records.PEER, by_vmap, jax_packages),
-        ("JAX by hand in blocks of eight, diffrax Dopri8", records.PEER, in_blocks, jax_packages),
-        ("C by hand, Dopri8", records.PEER, by_c, ("sympy",)),
+        ("rollout, Dopri8", by_rollout, jax_packages),
+        ("rollout, Taylor", by_series, jax_packages),
+        ("JAX by hand, diffrax Dopri8", by_vmap, jax_packages),
+        ("JAX by hand in blocks of eight, diffrax Dopri8", in_blocks, jax_packages),
+        ("C by hand, Dopri8", by_c, ("sympy",)),
     ]
-    if problem.name == "tilting-disc" and not quick:
-        found.append(("dense autodiff, diffrax Dopri8", records.PEER, by_dense_vmap, jax_packages))
     if heyoka_lowered.heyoka is not None:
         if problem.name == "tilting-disc":
-            found.append(("heyoka, equations by hand", records.PEER, by_heyoka(lambda problem: heyoka_disc.system()), ("heyoka",)))
-        found.append(("heyoka, the engine's equations", records.PEER, by_heyoka(peer_heyoka.system), ("heyoka",)))
+            found.append(("heyoka, equations by hand", by_heyoka(lambda problem: heyoka_disc.system()), ("heyoka",)))
+        found.append(("heyoka, the engine's equations", by_heyoka(peer_heyoka.system), ("heyoka",)))
     return found
 
 
@@ -149,7 +114,8 @@ def measured(problem: Problem, quick: bool, say: Callable[[str], None]) -> Itera
     """Records of a problem."""
     sizes = SIZES[:2] if quick else SIZES
     expected = by_vmap(problem)(starts(problem, JUDGED))(1e-14)
-    for method, kind, make, packages in methods(problem, quick):
+    for method, make, packages in methods(problem):
+        kind = records.OURS if method.startswith("rollout") else records.PEER
         try:
             prepare, each = make(problem), 0.0
         except (NotApplicable, ImportError) as reason:

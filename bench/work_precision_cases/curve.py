@@ -17,7 +17,6 @@ class Solved:
     y: np.ndarray | None = None
     q: np.ndarray | None = None
     u: np.ndarray | None = None
-    rhs_evaluations: float | None = None
     steps: float | None = None
     failed: str = ""  # why, where the end was not reached
 
@@ -39,10 +38,9 @@ class Curve:
     """A method on a problem. `prepare` may raise `NotApplicable` or `ImportError`, whose text is printed and recorded."""
 
     method: str
-    kind: str  # "ours" or "peer"
     settings: tuple[float, ...]
-    setting_unit: str  # "tolerance" or "step (s)"
     prepare: Callable[[Problem], Prepared]
     packages: tuple[str, ...] = ("jax", "jaxlib", "diffrax")
+    kind: str = "peer"  # or "ours"
+    setting_unit: str = "tolerance"  # or "step (s)"
     note: str = ""
-    group: str = ""  # of ours: "solver", "reduction" or "state"

@@ -1,4 +1,4 @@
-"""Three scenes in SymPy's `KanesMethod`, in speeds that leave no row over, as an expert of it would choose them.
+"""Two scenes in SymPy's `KanesMethod`, in speeds that leave no row over, as an expert of it would choose them.
 
 The equations come as `M(q) udot = f(q, u)` with `qdot(q, u)`. Source of the method: T. R. Kane and D. A. Levinson, Dynamics (1985).
 """
@@ -97,29 +97,4 @@ def chaplygin_sleigh(scene) -> KaneEquations:
     return KaneEquations([x, y, turn], [v, w], qdot, kane.mass_matrix, kane.forcing, numbers, from_minimal, to_minimal)
 
 
-def two_wheel_axle(scene) -> KaneEquations:
-    """Speeds: the first wheel's roll rate and the turn rate."""
-    x1, y1, psi1, x2, y2, psi2, phi, roll, turn = me.dynamicsymbols("x1 y1 psi1 x2 y2 psi2 phi roll turn")
-    M, rim, a, l, g, slope = sp.symbols("M rim a l g slope", positive=True)
-    space = me.ReferenceFrame("S")
-    axle = space.orientnew("A", "Axis", [phi, space.z])
-    axle.set_ang_vel(space, turn * space.z)
-    second_roll = roll - l / a * turn
-    bodies, loads = [], []
-    for name, rate, angle in (("1", roll, psi1), ("2", second_roll, psi2)):
-        wheel = axle.orientnew(f"W{name}", "Axis", [angle, axle.y])
-        wheel.set_ang_vel(space, rate * axle.y + turn * axle.z)
-        hub = me.Point(f"C{name}")
-        hub.set_vel(space, a * rate * axle.x)
-        bodies.append(me.RigidBody(f"wheel{name}", hub, wheel, M, (me.inertia(axle, rim * a**2 / 2, rim * a**2, rim * a**2 / 2), hub)))
-        loads.append((hub, M * g * (sp.sin(slope) * space.x - sp.cos(slope) * space.z)))
-    kinematic = [phi.diff() - turn, psi1.diff() - roll, psi2.diff() - second_roll]
-    kane, _ = _formed(space, [phi, psi1, psi2], [roll, turn], kinematic, bodies, loads)
-    c, s = sp.cos(phi), sp.sin(phi)
-    qdot = [a * roll * c, a * roll * s, roll, a * second_roll * c, a * second_roll * s, second_roll, turn]
-    names = {M: "mass", rim: "rim_mass", a: "radius", l: "length", g: "gravity", slope: "slope"}
-    numbers = {symbol: float(getattr(scene, name)) for symbol, name in names.items()}
-    return KaneEquations([x1, y1, psi1, x2, y2, psi2, phi], [roll, turn], qdot, kane.mass_matrix, kane.forcing, numbers, np.array, np.array)
-
-
-SCENES = {"tilting-disc": tilting_disc, "chaplygin-sleigh": chaplygin_sleigh, "two-wheel-axle": two_wheel_axle}
+SCENES = {"tilting-disc": tilting_disc, "chaplygin-sleigh": chaplygin_sleigh}

@@ -1,11 +1,13 @@
-"""Running a curve: error, energy drift, slip and warm time at every setting."""
+"""Running a curve: error and warm time at every setting."""
 
 import time
 from collections.abc import Callable
 
+import jax.numpy as jnp
+
 from work_precision_cases import record as records
 from work_precision_cases.curve import Curve, NotApplicable, Prepared, Solved
-from work_precision_cases.problem import Judged, Problem
+from work_precision_cases.problem import Problem
 
 SECONDS_PER_POINT = 0.25
 MOST_REPEATS, LONGEST = 25, 8.0  # s: after a run as long as that, smaller settings are left out
@@ -21,11 +23,11 @@ def fastest(run: Callable[[], object], seconds: float = SECONDS_PER_POINT) -> fl
     return min(laps)
 
 
-def judged(problem: Problem, solved: Solved) -> Judged | None:
+def error_of(problem: Problem, solved: Solved) -> float | None:
     """None where the run failed."""
     if solved.failed:
         return None
-    return problem.judge.minimal(solved.y) if solved.y is not None else problem.judge.full(solved.q, solved.u)
+    return problem.error(*(problem.completed(jnp.asarray(solved.y)) if solved.y is not None else (solved.q, solved.u)))
 
 
 def points(problem: Problem, curve: Curve, say: Callable[[str], None]) -> tuple[list[dict], Prepared | None]:
@@ -45,7 +47,6 @@ def points(problem: Problem, curve: Curve, say: Callable[[str], None]) -> tuple[
             return found, None
         first = time.perf_counter() - begin
         solved = ready.read(raw)
-        verdict = judged(problem, solved)
         seconds = fastest(lambda setting=setting: ready.run(setting))
         entry = records.record(
             problem=problem.name,
@@ -54,12 +55,9 @@ def points(problem: Problem, curve: Curve, say: Callable[[str], None]) -> tuple[
             setting=setting,
             setting_unit=curve.setting_unit,
             batch=1,
-            error=None if verdict is None else verdict.error,
             seconds=seconds,
-            rhs_evaluations=solved.rhs_evaluations,
             steps=solved.steps,
-            energy_drift=None if verdict is None else verdict.energy_drift,
-            slip=None if verdict is None else verdict.slip,
+            error=error_of(problem, solved),
             note=solved.failed or curve.note,
             versions=records.versions(*curve.packages),
         )
@@ -72,10 +70,5 @@ def points(problem: Problem, curve: Curve, say: Callable[[str], None]) -> tuple[
 
 def line(entry: dict) -> str:
     """The figures of a record, for reading."""
-
-    def shown(key, form):
-        return "-".rjust(9) if entry[key] is None else format(entry[key], form).rjust(9)
-
-    return f"error {shown('error', '.1e')}  {1e3 * entry['seconds']:10.4f} ms  rhs {shown('rhs_evaluations', '.0f')}" + (
-        f"  energy {shown('energy_drift', '.0e')}  slip {shown('slip', '.0e')}" + (f"  {entry['note']}" if entry["error"] is None else "")
-    )
+    error = f"{entry['note']:>9}" if entry["error"] is None else f"{entry['error']:9.1e}"
+    return f"error {error}  {1e3 * entry['seconds']:10.4f} ms"

@@ -104,7 +104,7 @@ long solve(double tolerance, double end, long lanes, const double *start, double
 
 def _rates(problem: Problem, side_by_side: int) -> tuple[int, str]:
     """How many states there are, and `rates(y, f)` of all lanes: each common subexpression once, parameters as numbers."""
-    sp, known = kane.sp, HAND_DERIVED[BY_HAND[problem.name]]
+    sp, known = kane.sp, HAND_DERIVED[problem.name]
     if sp is None:
         raise ImportError(MISSING)
     y = sp.symbols(f"y:{len(known.coordinates) + len(known.speeds)}")
@@ -133,19 +133,24 @@ def source(problem: Problem, side_by_side: int) -> str:
     return f"#include <math.h>\nenum {{ N = {size}, W = {side_by_side}, S = {stages} }};\n{tables}{MACROS}{rates}{LOOP}"
 
 
-def compiled(problem: Problem, side_by_side: int) -> Callable[[float, np.ndarray], tuple[np.ndarray, int]]:
-    """A function of a tolerance and starts, (lanes, states), that returns the states at the end, and how many steps were tried."""
+def library_of(source: str, flags: tuple[str, ...]) -> ctypes.CDLL:
+    """C, compiled and loaded; NotApplicable without a compiler that takes it."""
     compiler = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
     if compiler is None:
         raise NotApplicable("there is no C compiler (cc, gcc, clang)")
-    text, folder = source(problem, side_by_side), Path(tempfile.mkdtemp())
-    (folder / "motion.c").write_text(text)
+    with tempfile.TemporaryDirectory() as folder:
+        text, library = Path(folder) / "source.c", Path(folder) / "library.so"
+        text.write_text(source)
+        done = subprocess.run([compiler, *flags, "-o", str(library), str(text), "-lm"], capture_output=True, text=True)
+        if done.returncode != 0:
+            raise NotApplicable(f"{compiler} does not compile it: {done.stderr.strip().splitlines()[-1]}")
+        return ctypes.CDLL(str(library))
+
+
+def compiled(problem: Problem, side_by_side: int) -> Callable[[float, np.ndarray], tuple[np.ndarray, int]]:
+    """A function of a tolerance and starts, (lanes, states), that returns the states at the end, and how many steps were tried."""
     flags = (*FLAGS, WIDE) if platform.machine() in ("x86_64", "AMD64") else FLAGS
-    done = subprocess.run([compiler, *flags, "-o", str(folder / "motion.so"), str(folder / "motion.c"), "-lm"], capture_output=True, text=True)
-    if done.returncode != 0:
-        raise NotApplicable(f"{compiler} does not compile it: {done.stderr.strip().splitlines()[-1]}")
-    solve = ctypes.CDLL(str(folder / "motion.so")).solve
-    shutil.rmtree(folder)  # loaded already
+    solve = library_of(source(problem, side_by_side), flags).solve
     solve.argtypes, solve.restype = [ctypes.c_double, ctypes.c_double, ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p], ctypes.c_long
 
     def run(tolerance: float, starts: np.ndarray) -> tuple[np.ndarray, int]:
@@ -160,12 +165,9 @@ def compiled(problem: Problem, side_by_side: int) -> Callable[[float, np.ndarray
 def _alone(problem: Problem) -> Prepared:
     run, start = compiled(problem, 1), problem.minimal_start[None]
 
-    def read(raw) -> Solved:
-        return Solved(y=raw[0][0], steps=float(raw[1]), rhs_evaluations=float(raw[1] * DOPRI8.needed))
-
-    return Prepared(lambda tolerance: run(tolerance, start), read)
+    return Prepared(lambda tolerance: run(tolerance, start), lambda raw: Solved(y=raw[0][0], steps=float(raw[1])))
 
 
 def curves(problem: Problem) -> list[Curve]:
     """Those of the problem."""
-    return [Curve("C by hand, Dopri8", "peer", TOLERANCES, "tolerance", _alone, ("sympy",))] if problem.name in BY_HAND else []
+    return [Curve("C by hand, Dopri8", TOLERANCES, _alone, ("sympy",))] if problem.name in BY_HAND else []

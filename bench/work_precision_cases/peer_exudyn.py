@@ -6,22 +6,16 @@ The version without range checks is asked for. Source: J. Gerstmayr, Multibody S
 import sys
 import warnings
 
+import disc_body
 import numpy as np
 
-from work_precision_cases import disc_body
 from work_precision_cases.curve import Curve, Prepared, Solved
 from work_precision_cases.problem import Problem
 
 sys.exudynFast = True  # read when it is imported
 try:
     import exudyn
-    from exudyn.itemInterface import (
-        MarkerBodyRigid,
-        NodeGenericData,
-        ObjectConnectorRollingDiscPenalty,
-        ObjectGround,
-        ObjectJointRollingDisc,
-    )
+    from exudyn import itemInterface as items
     from exudyn.rigidBodyUtilities import RigidBodyInertia
 except ImportError:
     exudyn = None
@@ -36,9 +30,9 @@ PENALTY = {"contactStiffness": 5e5, "contactDamping": 50.0, "dryFriction": [1e3,
 def _system(problem: Problem, penalty: bool):
     container = exudyn.SystemContainer()
     system = container.AddSystem()
-    scene, at_start = problem.scene, disc_body.start(problem)
+    scene, at_start = problem.scene, disc_body.start(float(problem.scene.radius), problem.minimal_start)
     m, a = float(scene.mass), float(scene.radius)
-    on_ground = system.AddMarker(MarkerBodyRigid(bodyNumber=system.AddObject(ObjectGround()), localPosition=[0, 0, 0]))
+    on_ground = system.AddMarker(items.MarkerBodyRigid(bodyNumber=system.AddObject(items.ObjectGround()), localPosition=[0, 0, 0]))
     body = system.CreateRigidBody(
         inertia=RigidBodyInertia(mass=m, inertiaTensor=m * a**2 * np.diag([0.25, 0.5, 0.25]), com=[0, 0, 0]),
         referencePosition=at_start.centre.tolist(),
@@ -47,26 +41,23 @@ def _system(problem: Problem, penalty: bool):
         initialAngularVelocity=at_start.angular_velocity.tolist(),
         gravity=[0, 0, -float(scene.gravity)],
     )
-    on_disc = system.AddMarker(MarkerBodyRigid(bodyNumber=body, localPosition=[0, 0, 0]))
+    on_disc = system.AddMarker(items.MarkerBodyRigid(bodyNumber=body, localPosition=[0, 0, 0]))
     rolling = {"markerNumbers": [on_ground, on_disc], "discRadius": a, "discAxis": [0, 1, 0]}
     if penalty:
-        node = system.AddNode(NodeGenericData(initialCoordinates=[0, 0, 0], numberOfDataCoordinates=3))
-        system.AddObject(ObjectConnectorRollingDiscPenalty(**rolling, nodeNumber=node, useLinearProportionalZone=True, **PENALTY))
+        node = system.AddNode(items.NodeGenericData(initialCoordinates=[0, 0, 0], numberOfDataCoordinates=3))
+        system.AddObject(items.ObjectConnectorRollingDiscPenalty(**rolling, nodeNumber=node, useLinearProportionalZone=True, **PENALTY))
     else:
-        system.AddObject(ObjectJointRollingDisc(**rolling))
+        system.AddObject(items.ObjectJointRollingDisc(**rolling))
     system.Assemble()
     return container, system, body
 
 
 def _settings(problem: Problem, step: float):
     settings = exudyn.SimulationSettings()
-    settings.timeIntegration.numberOfSteps = round(problem.end / step)
-    settings.timeIntegration.endTime = problem.end
-    settings.timeIntegration.verboseMode = 0
-    settings.timeIntegration.newton.useModifiedNewton = True
-    settings.timeIntegration.newton.relativeTolerance = 1e-10
-    settings.timeIntegration.newton.absoluteTolerance = 1e-12
-    settings.timeIntegration.generalizedAlpha.spectralRadius = 0.9
+    time, newton = settings.timeIntegration, settings.timeIntegration.newton
+    time.numberOfSteps, time.endTime, time.verboseMode = round(problem.end / step), problem.end, 0
+    newton.useModifiedNewton, newton.relativeTolerance, newton.absoluteTolerance = True, 1e-10, 1e-12
+    time.generalizedAlpha.spectralRadius = 0.9
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the name changed between versions; the old one serves in both
         settings.solutionSettings.writeSolutionToFile = False
@@ -78,7 +69,7 @@ def _by_exudyn(solver: str, penalty: bool = False):
     def prepare(problem: Problem) -> Prepared:
         if exudyn is None:
             raise ImportError(MISSING)
-        container, system, body = _system(problem, penalty)
+        container, system, number = _system(problem, penalty)
         kind = getattr(exudyn.DynamicSolverType, solver)
         kinds = exudyn.OutputVariableType
 
@@ -95,10 +86,11 @@ def _by_exudyn(solver: str, penalty: bool = False):
             if failed:
                 return Solved(failed=failed)
             position, rotation, velocity, omega = (
-                np.array(system.GetObjectOutputBody(body, kind, [0, 0, 0]))
+                np.array(system.GetObjectOutputBody(number, kind, [0, 0, 0]))
                 for kind in (kinds.Position, kinds.RotationMatrix, kinds.Velocity, kinds.AngularVelocity)
             )
-            q, u = disc_body.state(problem, disc_body.Body(position, rotation.reshape(3, 3), velocity, omega))
+            body = disc_body.Body(position, rotation.reshape(3, 3), velocity, omega)
+            q, u = disc_body.state(float(problem.scene.radius), body, problem.truth.values)
             return Solved(q=q, u=u, steps=float(round(problem.end / step)), failed="" if np.all(np.isfinite(q)) else "not finite")
 
         prepared = Prepared(run, read)
@@ -112,17 +104,10 @@ def curves(problem: Problem, quick: bool) -> list[Curve]:
     """Of the disc only; `quick`: one integrator."""
     if problem.name != "tilting-disc":
         return []
-    found = [
-        Curve("Exudyn, joint, trapezoidal index 2", "peer", STEPS, "step (s)", _by_exudyn("TrapezoidalIndex2"), ("exudyn",), "ObjectJointRollingDisc"),
-        Curve("Exudyn, joint, generalized-alpha", "peer", STEPS, "step (s)", _by_exudyn("GeneralizedAlpha"), ("exudyn",), "ObjectJointRollingDisc"),
-        Curve(
-            "Exudyn, penalty, generalized-alpha",
-            "peer",
-            PENALTY_STEPS,
-            "step (s)",
-            _by_exudyn("GeneralizedAlpha", penalty=True),
-            ("exudyn",),
-            "ObjectConnectorRollingDiscPenalty",
-        ),
-    ]
+    ways = {
+        "joint, trapezoidal index 2": (STEPS, "TrapezoidalIndex2", False),
+        "joint, generalized-alpha": (STEPS, "GeneralizedAlpha", False),
+        "penalty, generalized-alpha": (PENALTY_STEPS, "GeneralizedAlpha", True),
+    }
+    found = [Curve(f"Exudyn, {name}", steps, _by_exudyn(*way), ("exudyn",), setting_unit="step (s)") for name, (steps, *way) in ways.items()]
     return found[1:2] if quick else found

@@ -11,7 +11,6 @@ from baselines import heyoka_disc, heyoka_lowered
 from baselines.heyoka_lowered import MISSING, heyoka
 
 import jourdain_jax as jj
-from jourdain_jax.equations.minimal import minimal_kinematics
 from work_precision_cases.curve import Curve, Prepared, Solved
 from work_precision_cases.problem import Problem
 
@@ -21,21 +20,11 @@ LARGE, HUGE = 100, 1000  # operations: from LARGE on fewer tolerances, from HUGE
 
 
 @functools.cache
-def applies(problem: Problem) -> bool:
-    """Whether the scene has a scalar program to take the equations from."""
-    try:
-        return jj.lower(problem.scene) is not None
-    except jj.NotLowered:
-        return False
-
-
-@functools.cache
-def states(problem: Problem) -> tuple[tuple[str, ...], np.ndarray, list[int]]:
-    """Names and start of the program's state (all speeds, where rows are kept by multipliers), and where in it the minimal state is."""
-    program = jj.lower(problem.scene)
-    names = (*program.coordinates, *(program.speeds[i] for i in program.independent))
-    start = np.concatenate([problem.state.q, np.asarray(problem.state.u)[list(program.independent)]])
-    return names, start, [names.index(name) for name in problem.minimal_names]
+def states(problem: Problem) -> tuple[np.ndarray, list[int]]:
+    """Start of the program's state (all speeds, where rows are kept by multipliers), and where in it the minimal state is."""
+    names = heyoka_lowered.names(problem.scene)
+    start = heyoka_lowered.states(problem.scene, problem.state.q[None], problem.state.u[None])[0]
+    return start, [names.index(name) for name in problem.minimal_names]
 
 
 def system(problem: Problem) -> list:
@@ -43,23 +32,12 @@ def system(problem: Problem) -> list:
     return heyoka_lowered.equations(problem.scene)
 
 
-def operations(problem: Problem) -> int:
-    """Of the engine's program."""
-    return jj.lower(problem.scene).operations
-
-
 def extended(problem: Problem) -> dict[str, float]:
     """Coordinates and speeds at the end, integrated in long double with a tolerance of 1e-18; the speeds that are not integrated follow from the rows."""
-    names, start, _ = states(problem)
-    start = start.astype(np.longdouble)
-    solver = heyoka.taylor_adaptive(system(problem), start, tol=np.longdouble("1e-18"), fp_type=np.longdouble, compact_mode=True)
-    solver.propagate_until(np.longdouble(problem.end))
-    found = dict(zip(names, solver.state.astype(float), strict=True))
-    scene, independent = problem.scene, jj.lower(problem.scene).independent
-    q, v = (jnp.array([found[name] for name in which]) for which in (names[: len(names) - len(independent)], names[len(names) - len(independent) :]))
-    if len(independent) < len(scene.speed_names):
-        v = minimal_kinematics(scene, tuple(independent), jj.structure_of(scene).kept_rows, jnp.asarray(problem.end), q, v).u
-    return dict(zip(scene.speed_names.entries, np.asarray(v), strict=True)) | found
+    start, minimal = states(problem)
+    q, u = problem.completed(jnp.asarray(heyoka_lowered.extended(system(problem), problem.end, start[None])[0, minimal]))
+    names = (*problem.scene.coordinate_names.entries, *problem.scene.speed_names.entries)
+    return dict(zip(names, (*np.asarray(q), *np.asarray(u)), strict=True))
 
 
 def _prepared(problem: Problem, equations: list, start: np.ndarray, minimal: list[int], compact: bool) -> Prepared:
@@ -79,14 +57,12 @@ def _prepared(problem: Problem, equations: list, start: np.ndarray, minimal: lis
 
 def on_engines_equations(problem: Problem) -> Prepared:
     """One integrator per tolerance."""
-    _, start, minimal = states(problem)
-    return _prepared(problem, system(problem), start, minimal, compact=operations(problem) >= HUGE)
+    return _prepared(problem, system(problem), *states(problem), compact=jj.lower(problem.scene).operations >= HUGE)
 
 
 def on_disc_by_hand(problem: Problem) -> Prepared:
     """The disc's equations as an expert writes them."""
-    start = problem.minimal_start
-    return _prepared(problem, heyoka_disc.system(), start, list(range(len(start))), compact=False)
+    return _prepared(problem, heyoka_disc.system(), problem.minimal_start, slice(None), compact=False)
 
 
 def _missing(problem: Problem) -> Prepared:
@@ -96,11 +72,9 @@ def _missing(problem: Problem) -> Prepared:
 def curves(problem: Problem) -> list[Curve]:
     """Those of the problem."""
     if heyoka is None:
-        return [Curve("heyoka", "peer", TOLERANCES, "tolerance", _missing)]
+        return [Curve("heyoka", TOLERANCES, _missing)]
     found = []
     if problem.name == "tilting-disc":
-        found.append(Curve("heyoka, equations by hand", "peer", TOLERANCES, "tolerance", on_disc_by_hand, ("heyoka",)))
-    if applies(problem):
-        tolerances = TOLERANCES if operations(problem) < LARGE else FEWER
-        found.append(Curve("heyoka, the engine's equations", "peer", tolerances, "tolerance", on_engines_equations, ("heyoka",)))
-    return found
+        found.append(Curve("heyoka, equations by hand", TOLERANCES, on_disc_by_hand, ("heyoka",)))
+    tolerances = TOLERANCES if jj.lower(problem.scene).operations < LARGE else FEWER
+    return [*found, Curve("heyoka, the engine's equations", tolerances, on_engines_equations, ("heyoka",))]

@@ -6,9 +6,12 @@ contact down to five steps, `impratio` 100, the noslip pass, both kinds of integ
 
 import functools
 
+import disc_body
+import jax
+import jax.numpy as jnp
 import numpy as np
+from atlas_cases import elsewhere
 
-from work_precision_cases import disc_body
 from work_precision_cases.curve import Curve, Prepared, Solved
 from work_precision_cases.problem import Problem
 
@@ -23,65 +26,34 @@ except ImportError:
 
 MISSING = "{} cannot be imported, so it is not measured; `pip install {}`"
 STEPS = (1e-3, 3.125e-4, 1e-4, 5e-5, 2e-5)  # s
-STEPS_MJX = (1e-3, 3.125e-4, 1e-4)
-HALF_THICKNESS = 1e-4  # m
-_MODEL = """
-<mujoco>
-  <option timestep="{step}" integrator="{integrator}" cone="elliptic" impratio="{impratio}" noslip_iterations="{noslip}" noslip_tolerance="1e-14"
-          solver="Newton" tolerance="1e-12" iterations="100" gravity="0 0 {gravity}"/>
-  <default><geom condim="3" friction="1 0 0" solref="{reference}" solimp="0.999 0.9999 1e-4"/></default>
-  <worldbody>
-    <geom type="plane" size="0 0 1"/>
-    <body><freejoint/>
-      <inertial pos="0 0 0" mass="{mass}" diaginertia="{diametral} {axial} {diametral}"/>
-      <geom type="cylinder" size="{radius} {half}" euler="90 0 0"/>
-    </body>
-  </worldbody>
-</mujoco>
-"""
 
 
-def _model(problem: Problem, step: float, integrator: str, impratio: float, noslip: int, steps_per_constant: float):
+def _model(problem: Problem, step: float, **settings):
+    """The model, and its state at the start."""
     scene = problem.scene
-    m, a = float(scene.mass), float(scene.radius)
-    text = _MODEL.format(
-        step=step, integrator=integrator, impratio=impratio, noslip=noslip, gravity=-float(scene.gravity), reference=f"{steps_per_constant * step} 1",
-        mass=m, diametral=m * a**2 / 4, axial=m * a**2 / 2, radius=a, half=HALF_THICKNESS,
-    )  # fmt: skip
-    return mujoco.MjModel.from_xml_string(text)
-
-
-def _start(problem: Problem):
-    body = disc_body.start(problem)
-    quaternion = np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, body.rotation.ravel())
-    return np.concatenate([body.centre, quaternion]), np.concatenate([body.velocity, body.rotation.T @ body.angular_velocity])
+    made = elsewhere.rolling_disc(float(scene.mass), float(scene.radius), problem.minimal_start, step=step, **settings)
+    return mujoco.MjModel.from_xml_string(made.model), made.start
 
 
 def _solved(problem: Problem, position, velocity, steps: int) -> Solved:
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, np.asarray(position[3:], float))
-    rotation = rotation.reshape(3, 3)
-    body = disc_body.Body(np.asarray(position[:3]), rotation, np.asarray(velocity[:3]), rotation @ np.asarray(velocity[3:]))
-    q, u = disc_body.state(problem, body)
+    q, u = disc_body.state(float(problem.scene.radius), elsewhere.body_of(position, velocity), problem.truth.values)
     return Solved(q=q, u=u, steps=float(steps), failed="" if np.all(np.isfinite(q)) else "not finite")
 
 
-def _by_mujoco(integrator: str, **settings):
+def _by_mujoco(**settings):
     def prepare(problem: Problem) -> Prepared:
         if mujoco is None:
             raise ImportError(MISSING.format("mujoco", "mujoco"))
-        position, velocity = _start(problem)
 
         @functools.cache
         def made(step):
-            model = _model(problem, step, integrator, **settings)
-            return model, mujoco.MjData(model)
+            model, start = _model(problem, step, **settings)
+            return model, mujoco.MjData(model), start
 
         def run(step: float):
-            model, data = made(step)
+            model, data, start = made(step)
             mujoco.mj_resetData(model, data)
-            data.qpos[:], data.qvel[:] = position, velocity
+            data.qpos[:], data.qvel[:] = start
             steps = round(problem.end / step)
             mujoco.mj_step(model, data, nstep=steps)
             return data.qpos.copy(), data.qvel.copy(), steps
@@ -94,17 +66,12 @@ def _by_mujoco(integrator: str, **settings):
 def _by_mjx(problem: Problem) -> Prepared:
     if mujoco is None or mjx is None:
         raise ImportError(MISSING.format("mujoco.mjx", "mujoco-mjx"))
-    import jax
-    import jax.numpy as jnp
-
-    position, velocity = _start(problem)
 
     @functools.cache
     def made(step):
-        # MJX has no noslip pass
-        model = mjx.put_model(_model(problem, step, "Euler", impratio=100, noslip=0, steps_per_constant=5))
-        data = mjx.make_data(model).replace(qpos=jnp.asarray(position), qvel=jnp.asarray(velocity))
-        steps = round(problem.end / step)
+        model, start = _model(problem, step, integrator="Euler")  # MJX has no noslip pass
+        model, (position, velocity) = mjx.put_model(model), map(jnp.asarray, start)
+        data, steps = mjx.make_data(model).replace(qpos=position, qvel=velocity), round(problem.end / step)
 
         @jax.jit
         def run(data):
@@ -125,16 +92,12 @@ def curves(problem: Problem, quick: bool) -> list[Curve]:
     if problem.name != "tilting-disc":
         return []
     ways = {
-        "MuJoCo, implicitfast": {"integrator": "implicitfast", "impratio": 100, "noslip": 0, "steps_per_constant": 5},
-        "MuJoCo, implicitfast, noslip": {"integrator": "implicitfast", "impratio": 1, "noslip": 20, "steps_per_constant": 5},
-        "MuJoCo, implicitfast, softer contact": {"integrator": "implicitfast", "impratio": 100, "noslip": 0, "steps_per_constant": 20},
-        "MuJoCo, RK4": {"integrator": "RK4", "impratio": 100, "noslip": 0, "steps_per_constant": 5},
+        "MuJoCo, implicitfast": {},
+        "MuJoCo, implicitfast, noslip": {"impratio": 1, "noslip": 20},
+        "MuJoCo, implicitfast, softer contact": {"constant": 20},
+        "MuJoCo, RK4": {"integrator": "RK4"},
     }
-    if quick:
-        ways = {"MuJoCo, implicitfast": ways["MuJoCo, implicitfast"]}
-    steps = (STEPS[2], STEPS[-1]) if quick else STEPS
-    found = [Curve(name, "peer", steps, "step (s)", _by_mujoco(**way), ("mujoco",), "elliptic cone, thin cylinder in contact") for name, way in ways.items()]
-    if quick:
-        return found
-    found.append(Curve("MJX, Euler", "peer", STEPS_MJX, "step (s)", _by_mjx, ("mujoco", "mujoco-mjx", "jax"), "elliptic cone, thin cylinder in contact"))
-    return found
+    steps, how = (STEPS[2], STEPS[-1]) if quick else STEPS, {"setting_unit": "step (s)", "note": "elliptic cone, thin cylinder in contact"}
+    found = [Curve(name, steps, _by_mujoco(**way), ("mujoco",), **how) for name, way in ways.items()]
+    mjx_curve = Curve("MJX, Euler", STEPS[:3], _by_mjx, ("mujoco", "mujoco-mjx", "jax"), **how)
+    return found[:1] if quick else [*found, mjx_curve]

@@ -1,8 +1,8 @@
-"""A problem: a scene, a start, an end, what is compared there and with what; and the judge of a final state."""
+"""A problem: a scene, a start, an end, what is compared there and with what."""
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -33,10 +33,6 @@ class Problem:
     end: float  # s
     reference: Callable[["Problem"], Reference]
     compared: tuple[str, ...]  # names of coordinates and speeds
-    conserves_energy: bool = True
-    steps: tuple[float, ...] = field(default=(0.1, 0.03, 0.01, 0.003, 0.001))  # s, of methods with a constant step
-    large: bool = False  # implicit solvers, whose inner solves take minutes to compile, and most reductions are left out
-    structure_preserving: bool = False  # whether the costly solvers of that kind are run
 
     @functools.cached_property
     def scene(self) -> jj.Scene:
@@ -65,55 +61,21 @@ class Problem:
         return np.concatenate([self.state.q, np.asarray(self.state.u)[list(self.independent)]])
 
     @functools.cached_property
-    def judge(self) -> "Judge":
-        """The judge of final states, with the reference computed."""
-        return Judge(self)
+    def truth(self) -> Reference:
+        """The reference, computed when first wanted."""
+        return self.reference(self)
 
-
-@dataclass(frozen=True)
-class Judged:
-    """What a final state is worth; see `record.record`."""
-
-    error: float
-    energy_drift: float | None
-    slip: float
-
-
-class Judge:
-    """Error, energy drift and slip of final states of a problem."""
-
-    def __init__(self, problem: Problem):
-        self.problem = problem
-        self.reference = problem.reference(problem)
-        scene = problem.scene
-        self._names = (*scene.coordinate_names.entries, *scene.speed_names.entries)
-        self._complete = jax.jit(lambda y: self._all_speeds(y))
-        self._energy_and_slip = jax.jit(self._measured)
-        self._energy_at_start = float(self._energy_and_slip(problem.state.t, problem.state.q, problem.state.u)[0])
-
-    def _all_speeds(self, y):
-        q = y[: len(self.problem.scene.coordinate_names.entries)]
-        scene, end = self.problem.scene, jnp.asarray(self.problem.end)
-        return q, minimal_kinematics(scene, self.problem.independent, jj.structure_of(scene).kept_rows, end, q, y[len(q) :]).u
-
-    def _measured(self, t, q, u):
-        scene = self.problem.scene
-        rows = jj.velocity_residual(scene, t, q, u)
-        return jj.kinetic_energy(scene, t, q, u) + jj.potential_energy(scene, jj.motion_at(scene, t, q, u)), jnp.max(jnp.abs(rows), initial=0.0)
+    @functools.cached_property
+    def completed(self) -> Callable:
+        """A function of coordinates and privileged speeds at the end that returns coordinates and all speeds."""
+        scene, n, end = self.scene, len(self.scene.coordinate_names.entries), jnp.asarray(self.end)
+        rows = jj.structure_of(scene).kept_rows
+        return jax.jit(lambda y: (y[:n], minimal_kinematics(scene, self.independent, rows, end, y[:n], y[n:]).u))
 
     def error(self, q, u) -> float:
-        """The largest absolute difference from the reference over the quantities compared, SI units."""
-        return largest_error(dict(zip(self._names, (*np.asarray(q), *np.asarray(u)), strict=True)), self.reference.values, self.problem.compared)
-
-    def full(self, q, u) -> Judged:
-        """Of coordinates and all speeds."""
-        energy, slip = map(float, self._energy_and_slip(self.problem.end, jnp.asarray(q), jnp.asarray(u)))
-        drift = abs(energy - self._energy_at_start) / abs(self._energy_at_start) if self.problem.conserves_energy else None
-        return Judged(self.error(q, u), drift, slip)
-
-    def minimal(self, y) -> Judged:
-        """Of coordinates and privileged speeds: the others follow from the rows."""
-        return self.full(*self._complete(jnp.asarray(y)))
+        """The largest absolute difference of a final state from the reference over the quantities compared, SI units."""
+        names = (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries)
+        return largest_error(dict(zip(names, (*np.asarray(q), *np.asarray(u)), strict=True)), self.truth.values, self.compared)
 
 
 def largest_error(found: dict, expected: dict[str, float], names: tuple[str, ...]) -> float:

@@ -4,8 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from work_precision_cases.problem import Problem
-
 TURN = 2 * np.pi
 
 
@@ -31,19 +29,19 @@ class Body:
     angular_velocity: np.ndarray
 
 
-def start(problem: Problem) -> Body:
-    """The start of the problem: rolling without slip, the lowest point of the rim at height zero."""
-    x, y, yaw, lean, spin, yaw_rate, lean_rate, spin_rate = problem.minimal_start
+def start(radius: float, minimal) -> Body:
+    """A disc that rolls without slip, the lowest point of the rim at height zero; `minimal`: contact point, yaw, lean, spin, and the rates of these three."""
+    x, y, yaw, lean, spin, yaw_rate, lean_rate, spin_rate = minimal
     frame = rot_z(yaw) @ rot_x(lean)
-    up = float(problem.scene.radius) * frame[:, 2]
+    up = radius * frame[:, 2]
     omega = np.array([0.0, 0.0, yaw_rate]) + lean_rate * frame[:, 0] + spin_rate * frame[:, 1]
     assert spin == 0.0, "the body's axes are those of the leant frame at the start"
     return Body(np.array([x, y, 0.0]) + up, frame, np.cross(omega, up), omega)
 
 
-def state(problem: Problem, body: Body) -> tuple[np.ndarray, np.ndarray]:
-    """q and u of the scene. Yaw and spin are known up to whole turns, which are taken from the reference."""
-    axle, radius = body.rotation[:, 1], float(problem.scene.radius)
+def state(radius: float, body: Body, near: dict) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates and speeds of the tilting disc; yaw and spin are known up to whole turns, and taken next to those in `near`."""
+    axle = body.rotation[:, 1]
     lean, yaw = np.arcsin(np.clip(axle[2], -1.0, 1.0)), np.arctan2(-axle[0], axle[1])
     frame = rot_z(yaw) @ rot_x(lean)
     turned = frame.T @ body.rotation
@@ -53,6 +51,5 @@ def state(problem: Problem, body: Body) -> tuple[np.ndarray, np.ndarray]:
     lean_rate, spin_rate = along[0], along[1] - yaw_rate * np.sin(lean)
     up_rate = np.cross(np.array([0.0, 0.0, yaw_rate]) + lean_rate * frame[:, 0], radius * frame[:, 2])
     contact, contact_rate = body.centre - radius * frame[:, 2], body.velocity - up_rate
-    true = problem.judge.reference.values
-    yaw, spin = (angle + TURN * np.round((true[name] - angle) / TURN) for name, angle in (("yaw", yaw), ("spin", spin)))
+    yaw, spin = (angle + TURN * np.round((near[name] - angle) / TURN) for name, angle in (("yaw", yaw), ("spin", spin)))
     return np.array([*contact[:2], yaw, lean, spin]), np.array([*contact_rate[:2], yaw_rate, lean_rate, spin_rate])
