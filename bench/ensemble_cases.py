@@ -91,9 +91,9 @@ def rides(quick: bool, out: Path) -> Figures:
         result = study.run(f"{folder}/rides.zarr", t1=5.0, rtol=1e-6, atol=1e-6, outputs=outputs)
         seconds = time.perf_counter() - began
         arrays = result.to_xarray().load()
-    yield figure("rides per second of wall time, storage and compilation included", BICYCLE, samples / seconds)
-    yield figure("rides that failed, of all", BICYCLE, result.failed.size / samples)
-    yield figure("rides that ended in a fall, of all", BICYCLE, float(result.mean("fell")))
+        yield figure("rides per second of wall time, storage and compilation included", BICYCLE, samples / seconds)
+        yield figure("rides that failed, of all", BICYCLE, result.failed.size / samples)
+        yield figure("rides that ended in a fall, of all", BICYCLE, float(result.mean("fell")))
 
     speed, lean, fell = arrays["rear_spin_rate_at_start"].values * radius, arrays["lean_at_start"].values, arrays["fell"].values
     edges, known = (np.linspace(1.0, 10.0, 181), np.linspace(-0.6, 0.6, 121)), np.isfinite(fell)
