@@ -1,8 +1,11 @@
 """A row that vanishes at a configuration is lost there, in whatever unit it is written; and the conditioning says so beforehand."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from atlas_cases.references import linkage_angle
+from atlas_cases.scenes import FourBars
 from linkages import Parallelogram, SliderCrank, Windows, bennett, bricard
 from numpy.testing import assert_allclose
 
@@ -151,3 +154,32 @@ def test_sampled_states_are_on_the_rows_and_in_the_domain(name):
     low, high = bounds(scene)
     assert max(np.max(np.abs(jj.position_residual(scene, *state))) for state in zip(t, q, strict=True)) < 1e-11
     assert np.all((q >= low - 0.1 * (high - low)) & (q <= high + 0.1 * (high - low)))
+
+
+def _swinging(backend: str):
+    """Two windows of rods with all speeds in the state, which pass two positions where one freedom becomes three."""
+    return jj.build(FourBars(), jj.Formulation(state="full"), backend=backend)
+
+
+def _start(rate) -> dict:
+    upright = {f"x{i}": float(i) for i in range(3)} | {f"z{i}": 1.0 for i in range(3)}
+    return {name: jnp.broadcast_to(value, jnp.shape(rate)) for name, value in upright.items()} | {f"x{i}_rate": rate for i in range(3)}
+
+
+@pytest.mark.parametrize(("backend", "tolerance"), [("auto", 1e-8), ("auto", 1e-12), ("xla", 1e-12)])
+def test_losses_of_rank_are_passed_at_every_tolerance(backend, tolerance):
+    """Saved times lie at all distances from them; `3 a'' = 3.5 g sin a` for the angle of the cranks from upright."""
+    ts, rates = np.linspace(0.0, 2.0, 101), jnp.append(jnp.linspace(0.6, 1.9, 15), 1.0)
+    found = jj.rollout(_swinging(backend), _start(rates), ts=ts, rtol=tolerance, atol=tolerance)
+    assert np.all(found.result == 0)
+    assert_allclose(found["x0"][-1], np.sin(linkage_angle(ts)), atol=1e-10 + 3 * tolerance)
+
+
+def test_derivatives_past_losses_of_rank_agree_in_both_modes():
+    def end(rate):
+        return jj.simulate(_swinging("auto"), _start(rate), ts=jnp.array([0.0, 2.0]), rtol=1e-12, atol=1e-12).q_end[0]
+
+    h, forward = 1e-3, jax.jacfwd(end)(1.0)
+    by_values = (8 * (end(1 + h) - end(1 - h)) - end(1 + 2 * h) + end(1 - 2 * h)) / (12 * h)
+    assert_allclose(forward, by_values, rtol=1e-8)
+    assert_allclose(jax.grad(end)(1.0), forward, rtol=1e-10)

@@ -58,6 +58,7 @@ class Equations:
     energies: list[int] = field(default_factory=list)  # kinetic and potential
     usual: dict[int, int] = field(default_factory=dict)  # inputs that stand for what a node usually is, with that node
     directions: list[int] = field(default_factory=list)  # of rows nonlinear in the speeds, an entry for each speed: must not turn round
+    squares: list[int] = field(default_factory=list)  # of rows kept by multipliers (`Accelerations`)
 
 
 class AppellOnGraph:
@@ -99,7 +100,7 @@ class AppellOnGraph:
             true_power = self._power(_Kinematics(self, forms, {}, explicit=False), ydot)
             power = power if equal(self.identity_probes([power]), self.identity_probes([true_power])).all() else true_power
         pivots = list(dict.fromkeys([*kinematics.pivots, *pivots, *sines]))
-        return Equations(qdot, ydot, z, pivots, sorted(guards), power, events, [T, V], found.usual, directions)
+        return Equations(qdot, ydot, z, pivots, sorted(guards), power, events, [T, V], found.usual, directions, found.squares)
 
     def _at_reference(self, held: tuple[int, ...]) -> dict[int, int]:
         return {int(self.traced.q[i]): self.graph.const(self.reference[i]) for i in held}

@@ -41,7 +41,6 @@ MOST_OPERATIONS, MOST_IN_MACHINE_CODE = 20_000, 50_000
 MOST_TERMS = 200  # of one normal form
 
 
-
 def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLowered:
     """The lowered equations of the scene's class, or the reason why there are none. Built once per class, shapes and privileged speeds.
 
@@ -182,7 +181,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
             best, fewest, way = candidate, count, strategy
     stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors taken out", fewest))
     put_q, put_u = builder.projection(MOST_TERMS if fewest < small else 0, held)
-    groups = {name: getattr(best, name) for name in ("qdot", "ydot", "z", "pivots", "directions", "guards", "power", "events", "energies")}
+    groups = {name: getattr(best, name) for name in ("qdot", "ydot", "z", "pivots", "directions", "squares", "guards", "power", "events", "energies")}
     of_rates = [] if scene.speeds is None else _divisors(graph, builder.traced.at.qdot.tolist())
     groups |= {"power": [best.power], "projected_q": put_q, "projected_u": put_u, "pivots": [*of_rates, *best.pivots]}
     outputs = graph.with_quotients(_with_equal_calls_once(builder.identity_probes, [n for group in groups.values() for n in group]))

@@ -54,6 +54,7 @@ class Lowered:
     divisors: int  # how many those are
     sizes: tuple[int, ...]  # inputs for what the magnitudes of the pivots usually are
     directions: tuple[int, ...]  # of rows nonlinear in the speeds, an entry for each speed: must not turn round
+    squares: tuple[int, ...]  # of rows kept by multipliers by turns: what is left of one beside those before it, and its size; the ratio is a squared sine
     guards: tuple[int, ...]  # must stay positive
     power: int  # `rate_of_work` (d(T + V)/dt at constant inputs, or that part of it that is integrated)
     events: tuple[int, ...]  # values of the stop events, sorted by name; none where they have no scalar form
@@ -144,12 +145,16 @@ class Lowered:
         """
         return self.rates_and_pivots(fixed, t, q, y, inputs, with_power)[:3]
 
-    def rates_and_pivots(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple[tuple, tuple, Array | None, tuple, tuple]:
-        """As `rates`; the pivots relative to their usual sizes, which must keep their signs; and directions. These are numbers to differentiation.
+    def rates_and_pivots(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple:
+        """Return `rates`; the pivots relative to their usual sizes, which must keep their signs; directions; and the smallest sine between a row that is
+        kept by multipliers and those before it, None where there are none. The last three are numbers to differentiation.
 
         `fixed`, `t` (s), `q`, `y`, `inputs`, `with_power`: as in `rates`.
         """
         found = list(self._program_of_rates(with_power)(*self._known(fixed, t, q, y, inputs).values()))
+        found, squares = found[: len(found) - len(self.squares)], found[len(found) - len(self.squares) :]
+        ratios = [left / size for left, size in zip(squares[::2], squares[1::2], strict=True)]
+        sine = jnp.sqrt(jnp.maximum(functools.reduce(jnp.minimum, ratios), 0.0)) if ratios else None
         count = len(found) - len(self.directions)
         directions = tuple(found[count:])
         found, count = found[:count], count - len(self.pivots)
@@ -159,13 +164,13 @@ class Lowered:
             found[0] = jnp.where(guard > 0, found[0], jnp.nan)
         at = len(self.qdot)
         power = found[count - 1] if with_power else None
-        return tuple(found[:at]), tuple(found[at : at + len(self.ydot)]), power, pivots, directions
+        return tuple(found[:at]), tuple(found[at : at + len(self.ydot)]), power, pivots, directions, sine
 
     @functools.cached_property
     def _program_of_rates(self) -> Callable[[bool], Callable[..., tuple]]:
         def made(with_power: bool):
             outputs = [*self.qdot, *self.ydot, *([self.power] if with_power else []), *self.guards]
-            return differentiable(self.graph, outputs, self.variables, like=len(self.fixed) + 1, monitored=(*self.pivots, *self.directions))
+            return differentiable(self.graph, outputs, self.variables, like=len(self.fixed) + 1, monitored=(*self.pivots, *self.directions, *self.squares))
 
         return functools.cache(made)
 

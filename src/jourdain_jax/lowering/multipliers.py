@@ -36,6 +36,7 @@ class Accelerations(NamedTuple):
     margins: list[int]  # must stay positive: what is left of each entry, above its least
     usual: dict[int, int]  # inputs for the usual value of an entry, with the node of that entry
     directions: Columns = []  # that rows must not leave by more than a right angle within a step
+    squares: list[int] = []  # of rows by turns: what is left of an entry, and its size; the ratio is a squared sine
 
 
 def accelerations_by_multipliers(
@@ -55,16 +56,17 @@ def accelerations_by_multipliers(
     udot = [graph.add(w, graph.total(graph.mul(x[k], m) for x, m in zip(impulses, multipliers, strict=True))) for k, w in enumerate(free)]
     left = [(r, pivot) for r, pivot in enumerate(solved.pivots) if graph.varies[pivot]]
     sines = [graph.call("sqrt", graph.call("max", graph.zero, graph.div(pivot, S[r][r]))) for r, pivot in left]
-    # sine, or length of a row beside its usual one: below it rows count as dependent, and the program does not serve
-    least = max(1e-4 if affine else 0.0, undecided(jnp.result_type(float))) ** 2
+    # sine, or length of a row beside its usual one: below it round-off decides how a motion goes on, and the program does not serve
+    least = undecided(jnp.result_type(float)) ** 2
     usual = {graph.input(f"usual_{r}", False): S[r][r] for r, _ in left}
-    margins = []
+    margins, squares = [], []
     for (r, pivot), (size, entry) in zip(left, usual.items(), strict=True):
         values = np.abs(probes([entry])[0])
         probes.inputs[f"usual_{r}"] = np.full(probes.count, np.median(values[np.isfinite(values)]) if np.isfinite(values).any() else np.nan)
-        margins.append(graph.sub(pivot, graph.mul(graph.const(least), graph.call("max", entry, size))))
+        squares += [pivot, graph.call("max", entry, size)]
+        margins.append(graph.sub(pivot, graph.mul(graph.const(least), squares[-1])))
     if affine:
-        return Accelerations(udot, sines, margins, usual)
+        return Accelerations(udot, sines, margins, usual, squares=squares)
     signs = [[margin, *[graph.zero] * (len(f) - 1)] for margin in margins]
     return Accelerations(udot, sines, [], usual, [*signs, *([column[r] for column in solved.forward[1:]] for r, _ in left)])
 

@@ -111,6 +111,7 @@ def _loop(mode: Mode, setup: Setup, y0, args, ts, knots) -> Solved:
         max_steps=setup.most_steps(knots),
         knots=knots,
         rates_and_pivots=integrands.rates_and_pivots if field.has_pivots else None,
+        near_rank_loss=field.near_rank_loss,
         relations=relations,
         relation_count=relation_count,
         span=jnp.abs(goals[-1]),

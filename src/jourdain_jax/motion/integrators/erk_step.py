@@ -11,6 +11,11 @@ Implicit methods (`implicit_steps.py`) give a state, and an error or none. A ste
 cannot try one again: what would refuse it ends the motion with a code of its own. Trials of the search for an event are steps of the method too; its last
 shifts, which are tiny, are steps of Tsit5, whose derivatives are those of the motion.
 
+Where rows are about to lose rank, sigma being the sine between a row and those before it, round-off eps of a row is a velocity eps/sigma^2 across it, which
+fills the error of short steps. In a step that starts at sigma < 0.1 the stages are put back onto the rows; of the error counts what lies along the rows,
+beyond n^2, and how far the projection moves the state, beyond n, with n = 16 eps/sigma^2, at most eps^0.4, for the smallest sigma of the stages: n across the
+rows moves a state by n^2 along them. So what is passed depends on the position, and on no tolerance.
+
 In single precision the state is summed with compensation (Kahan): what rounding leaves off an increment is added to the next one. Otherwise a state whose
 increments are smaller than its last digit stands still while time passes, and no error estimate sees it.
 """
@@ -35,7 +40,8 @@ from jourdain_jax.motion.integrators.tableaus import TSIT5, Method
 from jourdain_jax.motion.trajectories import results
 
 RUNNING, LOCATING = -1, -2
-NOISE = 0.6  # exponent of round-off: rows shrink to about its power 0.4 before a step passes
+NOISE = 0.6  # exponent of round-off: its power 0.6 counts as noise anywhere, and no more than its power 0.4
+NEAR_SINE, AMPLIFIED = 0.1, 16.0  # below it rows are about to lose rank; the number of round-offs over its square that count as noise
 SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
 
 
@@ -104,12 +110,13 @@ def _tried(problem: Problem, method: Method | ImplicitMethod, p: Progress, goal,
     t1 = jnp.where(lands, target, p.t + h)
     h = t1 - p.t  # as rounded: the state and the time advance together
     if isinstance(method, Method):
-        y1, slopes, _, pivots = stages(problem, method, p.t, p.y, h, monitored=True)
+        y1, slopes, _, pivots, rank = stages(problem, method, p.t, p.y, h, monitored=True)
         increments = jax.tree.map(lambda k: as_in(h, k) * weighted(method.b, k), slopes)
         error = jax.tree.map(lambda k: as_in(h, k) * weighted(method.b_error, k), slopes)
         ends, solved = [jax.tree.map(lambda k, i=i: k[i], slopes) for i in (0, method.at_the_end)], True
     else:
         (increments, error, solved), ends, pivots = _by_equations(problem, method, p, h)
+        rank = None
         y1 = jax.tree.map(jnp.add, p.y, increments)
     rest = p.rest
     if rest is not None:
@@ -121,7 +128,7 @@ def _tried(problem: Problem, method: Method | ImplicitMethod, p: Progress, goal,
         if error is None:
             fault = jnp.where(solved & (_relative(free, p.y, y1) > results.MOST_PROJECTED), results.OFF_CONSTRAINTS, fault)
         else:
-            error = jax.tree.map(lambda e, moved: jnp.maximum(jnp.abs(e), moved), error, removed(y1, free, p.t.ndim))
+            error = _beside_rows(problem, rank, t1, y1, free, error)
     size_of_error = jnp.zeros_like(p.t)
     if error is not None:
         scale = jax.tree.map(lambda a, b: problem.atol + problem.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)), p.y, y1)
@@ -179,8 +186,8 @@ def _by_equations(problem: Problem, method: ImplicitMethod, p: Progress, h) -> t
         return found, [], None
     end = p.t + h, jax.tree.map(jnp.add, p.y, found.change)
     states = jax.tree.map(lambda a, b: jnp.stack([a, (a + b) / 2, b]), (p.t, p.y), end)
-    seen_at = problem.rates_and_pivots if monitored else lambda *given: (problem.rates(*given), None, None)
-    slopes, seen, directions = jax.lax.map(lambda at: tuple(seen_at(*at, inside.args)), states)
+    seen_at = problem.rates_and_pivots if monitored else lambda *given: (problem.rates(*given), None, None, None)
+    slopes, seen, directions, _ = jax.lax.map(lambda at: tuple(seen_at(*at, inside.args)), states)
     ends = [jax.tree.map(lambda k, y, i=i: as_in(k[i], y), slopes, p.y) for i in (0, 2)]
     return found, ends, _pivots(seen, directions) if monitored else None
 
@@ -202,14 +209,42 @@ def _compensated(y: PyTree, rest: PyTree, increments: PyTree) -> tuple[PyTree, P
     return y_1, jax.lax.stop_gradient(jax.tree.map(lambda k, new, old: k - (new - old), whole, y_1, y))
 
 
-def removed(projected: PyTree, free: PyTree, lane_axes: int) -> PyTree:
-    """How far a projection moved a state, beyond what is noise near a loss of rank: round-off e at a row of size sigma is a velocity e/sigma."""
+class Rank(NamedTuple):
+    """How near to a loss of rank the rows are in a step."""
 
-    def moved(a, b):
-        size = jnp.max(jnp.abs(a), axis=tuple(range(a.ndim - lane_axes)), initial=0.0)
-        return jax.lax.stop_gradient(jnp.maximum(jnp.abs(a - b) - jnp.finfo(a.dtype).eps ** NOISE * size, 0.0))
+    near: Bool[Array, "*lanes"]  # at its start
+    sine: Float[Array, "*lanes"]  # the smallest between a row and those before it, of all stages
 
-    return jax.tree.map(moved, projected, free)
+
+def onto_rows(problem: Problem, near: Bool[Array, "*lanes"], t, y: PyTree) -> PyTree:
+    """Return the state of a stage, put back onto the rows in lanes that are `near` a loss of rank."""
+
+    def put():
+        return jax.tree.map(lambda new, old: jnp.where(near, new, old), problem.project(t, y, problem.args), y)
+
+    return jax.lax.cond(eqxi.unvmap_any(near), put, lambda: y)
+
+
+def _beside_rows(problem: Problem, rank: Rank | None, t, projected: PyTree, free: PyTree, error: PyTree) -> PyTree:
+    """Return the error of a step beside rows: no smaller than how far the projection moved the state beyond noise."""
+    lane_axes = jnp.ndim(t)
+    projected, free, error, args = jax.lax.stop_gradient((projected, free, error, problem.args))
+    amplified = 0.0
+    if rank is not None:
+        amplified = jnp.where(rank.near, AMPLIFIED / rank.sine**2, 0.0)
+
+        def along_rows():
+            along = jax.jvp(lambda y: problem.project(t, y, args), (projected,), (error,))[1]
+            return jax.tree.map(lambda new, old: jnp.where(rank.near, new, old), along, error)
+
+        error = jax.lax.cond(eqxi.unvmap_any(rank.near), along_rows, lambda: error)
+
+    def size(y, y_free, e):
+        eps, largest = jnp.finfo(y.dtype).eps, jnp.max(jnp.abs(y), axis=tuple(range(y.ndim - lane_axes)), initial=0.0)
+        noise = jnp.minimum(amplified * eps, eps ** (1 - NOISE))
+        return jnp.maximum(jnp.abs(e) - noise**2 * largest, jnp.maximum(jnp.abs(y - y_free) - jnp.maximum(eps**NOISE, noise) * largest, 0.0))
+
+    return jax.tree.map(size, projected, free, error)
 
 
 class Pivots(eqx.Module):
@@ -226,6 +261,7 @@ class Stages(NamedTuple):
     slopes: PyTree
     states: PyTree
     pivots: Pivots | None
+    rank: Rank | None
 
 
 def stages(problem: Problem, method: Method, t, y: PyTree, h, monitored: bool = False) -> Stages:
@@ -233,22 +269,30 @@ def stages(problem: Problem, method: Method, t, y: PyTree, h, monitored: bool = 
     leaves, treedef = jax.tree.flatten(y)
     problem = problem.in_step(t, h)
     monitored = monitored and problem.rates_and_pivots is not None
+    watch = problem.rates_and_pivots if monitored or problem.near_rank_loss else lambda *given: (problem.rates(*given), None, None, None)
 
     def stage(carried, row):
         # k_i = f(y_i), then the next y_i: what is carried from stage to stage is computed once, whatever uses it
-        at, slopes = carried
+        at, slopes, rank = carried
         c, i, next_A = row
-        there = t + c * h, treedef.unflatten(at), problem.args
-        found, *watched = problem.rates_and_pivots(*there) if monitored else (problem.rates(*there),)
+        time, there = t + c * h, treedef.unflatten(at)
+        if rank is not None:
+            there = onto_rows(problem, rank.near, time, there)
+        found, *watched, sine = watch(time, there, problem.args)
+        if rank is not None:
+            sine = jax.lax.stop_gradient(sine)
+            rank = Rank(jnp.where(i == 0, sine < NEAR_SINE, rank.near), jnp.fmin(rank.sine, sine))
         found = jax.tree.leaves(found)
         slopes = [jax.lax.dynamic_update_index_in_dim(k, as_in(f, k), i, 0) for k, f in zip(slopes, found, strict=True)]
-        return ([y + as_in(h, y) * weighted(next_A, k) for y, k in zip(leaves, slopes, strict=True)], slopes), (at, watched)
+        watched = watched if monitored else None
+        return ([y + as_in(h, y) * weighted(next_A, k) for y, k in zip(leaves, slopes, strict=True)], slopes, rank), (at, watched)
 
     count = method.needed
     rows = (jnp.asarray(method.c[:count]), jnp.arange(count), jnp.asarray([*method.A[1:count], method.b]))
     slopes = [jnp.zeros((len(method.c), *y.shape), y.dtype) for y in leaves]
-    (y_1, slopes), (at, watched) = jax.lax.scan(stage, (leaves, slopes), rows)
-    return Stages(treedef.unflatten(y_1), treedef.unflatten(slopes), treedef.unflatten(at), _pivots(*watched) if monitored else None)
+    rank = Rank(jnp.zeros(jnp.shape(t), bool), jnp.full(jnp.shape(t), jnp.inf, leaves[0].dtype)) if problem.near_rank_loss else None
+    (y_1, slopes, rank), (at, watched) = jax.lax.scan(stage, (leaves, slopes, rank), rows)
+    return Stages(treedef.unflatten(y_1), treedef.unflatten(slopes), treedef.unflatten(at), _pivots(*watched) if monitored else None, rank)
 
 
 def _pivots(seen: Float[Array, "stages pivots *lanes"], directions: Float[Array, "stages rows speeds *lanes"]) -> Pivots:

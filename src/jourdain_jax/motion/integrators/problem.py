@@ -22,11 +22,12 @@ class Problem(eqx.Module):
     longest: Float[Array, "*lanes"]
     max_steps: int = eqx.field(static=True)
     knots: Float[Array, "knots *lanes"] | None = None  # times at which a step must end, in the order of the motion; the last are infinite, with its sign
-    # as `rates`; pivots (pivots, *lanes) that must keep their signs, and directions (rows, speeds, *lanes) that must not turn round; None: there are none
+    # as `rates`; pivots (pivots, *lanes) that must keep their signs, directions (rows, speeds, *lanes) that must not turn round, a sine; None: there are none
     rates_and_pivots: Callable | None = None
     relations: Callable | None = None  # (args, t, y) -> numbers whose signs are watched, (numbers, *lanes): first so many relations, then stop events
     relation_count: int = eqx.field(static=True, default=0)
     span: Float[Array, "*lanes"] | None = None  # of the motion, s
+    near_rank_loss: bool = eqx.field(static=True, default=False)  # `rates_and_pivots` has a sine: of rows that may lose rank
     within: Callable | None = None  # (t, args) -> args for the stages of a step with the middle t; None: the same in all steps
 
     def in_step(self, t, h) -> "Problem":

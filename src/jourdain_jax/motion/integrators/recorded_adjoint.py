@@ -91,7 +91,8 @@ def motion(forward: Callable, problem: Problem, method: Method | ImplicitMethod,
     like = (t0, y0, problem.args)
     rates, project, events = (f if f is None else eqx.filter_closure_convert(f, *like) for f in (problem.rates, problem.project, problem.events))
     control = problem.norm, *jax.lax.stop_gradient((problem.rtol, problem.atol, problem.shortest, problem.longest)), problem.max_steps
-    control += (problem.rates_and_pivots, problem.relations, problem.relation_count, jax.lax.stop_gradient(problem.span), problem.within)
+    control += (problem.rates_and_pivots, problem.relations, problem.relation_count, jax.lax.stop_gradient(problem.span))
+    control += (problem.near_rank_loss, problem.within)
     return _motion(((rates, project, problem.args), events, problem.knots, y0, t0, goals), (control, jax.lax.stop_gradient(jnp.asarray(dt0))), forward, method)
 
 

@@ -12,9 +12,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
-from jourdain_jax.motion.integrators.erk_step import stages, weighted
+from jourdain_jax.motion.integrators.erk_step import onto_rows, stages, weighted
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
 from jourdain_jax.motion.integrators.problem import Problem, as_in
 from jourdain_jax.motion.integrators.tableaus import Method
@@ -35,7 +35,7 @@ def step_vjp(problem_of: Callable[[PyTree], Problem], shared: PyTree, method: Me
         return _by_jax(problem_of, shared, method, t_0, t_1, y, g)
     problem, h = problem_of(shared), t_1 - t_0
     method = replace(method, b_error=np.zeros_like(method.b_error))  # no error is asked: a stage that only it needs is left out
-    y_1, slopes, at, _ = stages(problem, method, t_0, y, h)
+    y_1, slopes, at, _, rank = stages(problem, method, t_0, y, h)
     by_t_1 = jnp.zeros_like(t_1)
     by_shared = jax.tree.map(jnp.zeros_like, shared)
     if problem.project is not None:
@@ -45,7 +45,8 @@ def step_vjp(problem_of: Callable[[PyTree], Problem], shared: PyTree, method: Me
         G, by_shared, by_t, by_h = carry
         c, b, column, Y, k, i = row
         v = jax.tree.map(lambda g, G: as_in(b, g) * g + weighted(column, G), g, G)
-        _, pull = jax.vjp(lambda t, y, shared: _rates(problem_of(shared).in_step(t_0, h), t, y), t_0 + c * h, Y, shared)
+        near = None if rank is None else rank.near & (i > 0)
+        _, pull = jax.vjp(lambda t, y, shared: _rates(problem_of(shared).in_step(t_0, h), near, t, y), t_0 + c * h, Y, shared)
         tau, G_i, more = pull(jax.tree.map(lambda v: as_in(h, v) * v, v))
         G = jax.tree.map(lambda G, new: jax.lax.dynamic_update_index_in_dim(G, new, i, 0), G, G_i)
         by_h = by_h + product(v, k, t_0.ndim) + c * tau
@@ -78,5 +79,6 @@ def product(g: PyTree, f: PyTree, lane_axes: int) -> Float[Array, "*lanes"]:
     return sum(jnp.sum(a * b, axis=tuple(range(a.ndim - lane_axes))) for a, b in zip(jax.tree.leaves(g), jax.tree.leaves(f), strict=True))
 
 
-def _rates(problem: Problem, t, y: PyTree) -> PyTree:
+def _rates(problem: Problem, near: Bool[Array, "*lanes"] | None, t, y: PyTree) -> PyTree:
+    y = y if near is None else onto_rows(problem, near, t, y)
     return jax.tree.map(lambda f, y: as_in(f, y), problem.rates(t, y, problem.args), y)

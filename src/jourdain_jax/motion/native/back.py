@@ -24,7 +24,7 @@ from jourdain_jax.motion.native.layout import Lanes
 from jourdain_jax.motion.native.loop import COUNT, FIRST_OF_SAMPLES, TIMES, write_functions, write_job
 from jourdain_jax.motion.native.pulled import write_pulled
 from jourdain_jax.motion.native.record import GOALS, STARTS, TO_ENDS, TO_STATES, Slot, prepare, write_record
-from jourdain_jax.motion.native.step import IDLE, each_row, weighted
+from jourdain_jax.motion.native.step import IDLE, each_row, near_rank_loss, put_near_rows, squares_of, weighted
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native.ffi import write_handler
 from jourdain_jax.native.ir import Value, Writer
@@ -140,13 +140,25 @@ def _write_step_back(w: Writer, form: Form, method: Method, asked: int) -> None:
             return h * total
 
         used: list[int] = []
+        near = None
+        if form.squares:
+            pivots = w.room(w.real, len(form.monitored))
+            w.call("rates", "void", state, t, here, v, pivots)
+            near = near_rank_loss(squares_of(w, form, pivots))
         for stage in reversed(range(method.needed)):
             later = [j for j in used if method.A[j][stage] != 0]
             if method.b[stage] == 0 and not later:
                 continue
+            of_stage, time = w.at(G, stage * count, w.real), w.fma(h, float(method.c[stage]), t)
             each_row(w, rows, at, partial(state_at, stage))
             each_row(w, rows, v, partial(cotangent, stage, later))
-            w.call("pull_rates", "void", state, w.fma(h, float(method.c[stage]), t), at, v, w.at(G, stage * count, w.real), added)
+            if near is not None and stage:
+                put_near_rows(w, layout, state, near, time, at)
+            w.call("pull_rates", "void", state, time, at, v, of_stage, added)
+            if near is not None and stage:
+                with w.when(w.any(near)):
+                    each_row(w, rows, at, partial(state_at, stage))
+                    _project_back_where(w, form, near, (state, time, at), of_stage, added, asked)
             used.append(stage)
 
         def total(i: int | Value) -> Value:
@@ -158,6 +170,16 @@ def _write_step_back(w: Writer, form: Form, method: Method, asked: int) -> None:
         each_row(w, rows, g, total)
         each_row(w, range(asked), by_known, lambda i: w.load(w.real, by_known, i) + w.where(took, w.load(w.real, added, i), 0.0))
         w.give()
+
+
+def _project_back_where(w: Writer, form: Form, near: Value, at: tuple[Value, Value, Value], g: Value, added: Value, asked: int) -> None:
+    """Cotangents `g` of a stage's state, put back onto the rows in lanes that are `near` a loss of rank; `at`: lanes, time, and the state before."""
+    rows, pulled, more = range(form.layout.integrated), w.room(w.real, form.layout.integrated), w.room(w.real, max(asked, 1))
+    each_row(w, rows, pulled, lambda i: w.load(w.real, g, i))
+    each_row(w, range(asked), more, lambda i: w.load(w.real, added, i))
+    _project_back(w, form, *at, pulled, more)
+    each_row(w, rows, g, lambda i: w.where(near, w.load(w.real, pulled, i), w.load(w.real, g, i)))
+    each_row(w, range(asked), added, lambda i: w.where(near, w.load(w.real, more, i), w.load(w.real, added, i)))
 
 
 def _project_back(w: Writer, form: Form, state: Value, t1: Value, free: Value, g: Value, added: Value) -> None:

@@ -8,7 +8,7 @@ and, of derivatives of higher order, the tangents of these along the next direct
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from jourdain_jax.lowering.jacobian import on_its_own
@@ -71,8 +71,13 @@ class Form:
 
     @property
     def monitored(self) -> list[int]:
-        """What is watched at all stages of a step: pivots first, then directions of rows."""
-        return [*self.program.pivots[: self.pivots], *self.program.directions]
+        """What is watched at all stages of a step: pivots first, then directions of rows, then how far rows are from losing rank."""
+        return [*self.program.pivots[: self.pivots], *self.program.directions, *self.squares]
+
+    @property
+    def squares(self) -> tuple[int, ...]:
+        """What is left of rows beside those before them, and their sizes, by turns."""
+        return self.program.squares if self.projects else ()
 
     @property
     def directions(self) -> list[range]:
@@ -91,7 +96,7 @@ class Form:
         program = self.program
         projected = [*program.projected_q, *program.projected_u] if self.projects else []
         events = program.events if self.has_events else ()
-        return [*self.rates, *program.guards, *program.pivots, *program.directions, *projected, *events, *self.watched]
+        return [*self.rates, *program.guards, *program.pivots, *program.directions, *self.squares, *projected, *events, *self.watched]
 
 
 class Outputs(NamedTuple):
@@ -196,6 +201,20 @@ def write_projection(w: Writer, form: Form) -> None:
     with w.function("project", "void", {"state": "ptr", "tau": w.real, "y": "ptr"}) as (state, tau, y):
         for q_moves in form.moves:
             w.call("projected_once", "void", state, tau, y, w.literal(q_moves, "i1"))
+        w.give()
+    if form.squares:
+        _write_along(w, form)
+
+
+def _write_along(w: Writer, form: Form) -> None:
+    """`along(state, tau, y)`: after a state `y` on the rows stands its error, which becomes the part of it along the rows: what a projection leaves."""
+    program, layout, moved = form.program, form.layout, replace(form, moving=((),), time_moves=False)
+    with w.function("along", "void", {"state": "ptr", "tau": w.real, "y": "ptr"}, attributes="noinline") as (state, tau, y):
+        for nodes, first in ((program.projected_q, 0), (program.projected_u, layout.coordinates)):
+            known = known_values(w, form, state, tau, y)
+            _, (tangent,) = _found(w, form, outputs_of(moved, nodes, len(nodes)), known, state, tau, y)
+            for i, x in enumerate(tangent):
+                w.store(x, y, layout.y + first + i)
         w.give()
 
 

@@ -22,7 +22,10 @@ from jourdain_jax.program.graph import ARRAYS, Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 
 # Parts of a program that are nodes; `power` is another one.
-_NODES = ("qdot", "ydot", "pivots", "sizes", "directions", "guards", "events", "projected_q", "projected_u", "relations", "event_relations", "jumps")
+_NODES = (
+    *("qdot", "ydot", "pivots", "sizes", "directions", "squares", "guards", "events"),
+    *("projected_q", "projected_u", "relations", "event_relations", "jumps"),
+)
 MOST_NUMBERS = 200  # in a function of time; of a long table each is a row of a lane, and `jj.Sampled` looks up in it
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
-from jourdain_jax.motion.integrators.erk_step import LARGEST_FACTOR, LEAST_FACTOR, LOCATING, NOISE, RUNNING, SAFETY, Method
+from jourdain_jax.motion.integrators.erk_step import AMPLIFIED, LARGEST_FACTOR, LEAST_FACTOR, LOCATING, NEAR_SINE, NOISE, RUNNING, SAFETY, Method
 from jourdain_jax.motion.integrators.event_search import DIFFERENTIABLE
 from jourdain_jax.motion.native import crossings, search
 from jourdain_jax.motion.native.functions import Form
@@ -59,14 +59,14 @@ def _tried_by_stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value) 
     step = w.where(locating, p["search_shift"], direction * size) if form.has_events else direction * size
     t1 = w.where(lands, goal, t + step)
     step = t1 - t
-    smallest, changed_sign = _stages(w, form, method, p, k, t, step)
+    smallest, changed_sign, rank = _stages(w, form, method, p, k, t, step)
     y1, error = w.room(w.real, layout.integrated), w.room(w.real, layout.y)
     each_row(w, range(layout.integrated), y1, lambda i: w.fma(step, weighted(w, method.b, k, layout, i), w.load(w.real, y, i)))
     each_row(w, range(layout.y), error, lambda i: step * weighted(w, method.b_error, k, layout, i))
     if form.projects:
-        _project(w, layout, p, t1, y1, error)
+        _project(w, layout, p, t1, y1, error, rank)
     size_of_error = _norm(w, layout, p, error, y1)
-    if form.monitored:
+    if form.pivots or form.directions:
         size_of_error = w.where(changed_sign & ~locating, math.inf, size_of_error)
     accept = locating | (size_of_error <= 1.0)
     factor = SAFETY * power(w, w.where(size_of_error > 0.0, size_of_error, 1e-30), -1 / method.order)
@@ -179,12 +179,20 @@ def over_rows(w: Writer, rows: range, start: float, added: Callable[[Value, int 
     return w.load(w.real, total)
 
 
-def _stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value, t: Value, step: Value) -> tuple[Value, Value]:
-    """The smallest magnitude of a pivot, and whether any changed its sign; puts the slopes of all stages into `k`."""
+class Rank(NamedTuple):
+    """How near to a loss of rank the rows are in a step."""
+
+    near: Value  # at its start
+    square: Value  # the smallest squared sine between a row and those before it, of all stages
+
+
+def _stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value, t: Value, step: Value) -> tuple[Value, Value, Rank | None]:
+    """The smallest magnitude of a pivot, whether any changed its sign, and how near rows are to losing rank; puts the slopes of all stages into `k`."""
     layout, count = form.layout, form.pivots
     every, turned = layout.integrated, w.literal(0, w.truth)
     first: list[Value] = []
     at, pivots = w.room(w.real, every), w.room(w.real, max(len(form.monitored), 1))
+    rank, square = None, w.room(w.real)
     low, high = [w.number(math.inf)] * count, [w.number(-math.inf)] * count
 
     def next_state(i: int, row: int | Value) -> Value:
@@ -192,9 +200,19 @@ def _stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value, t: Value,
         return w.fma(step, weighted(w, method.A[i], k, layout, row), start) if i else start
 
     for i in range(method.needed):
+        time = w.fma(step, float(method.c[i]), t)
         each_row(w, range(every), at, partial(next_state, i))
-        w.call("rates", "void", p.pointer, w.fma(step, float(method.c[i]), t), at, w.at(k, i * every, w.real), pivots)
-        now = [w.load(w.real, pivots, j) for j in range(len(form.monitored))]
+        if rank is not None:
+            put_near_rows(w, layout, p.pointer, rank.near, time, at)
+        w.call("rates", "void", p.pointer, time, at, w.at(k, i * every, w.real), pivots)
+        now = [w.load(w.real, pivots, j) for j in range(len(form.monitored) - len(form.squares))]
+        if form.squares:
+            by_rows = squares_of(w, form, pivots)
+            if rank is None:
+                rank = Rank(near_rank_loss(by_rows), square)
+                w.store(w.number(math.inf), square)
+            with w.when(w.any(rank.near)):
+                w.store(reduce(w.smaller, [left / size for left, size in by_rows], w.load(w.real, square)), square)
         first = first or now
         turned = turned | _turns_round(w, form, first, now)
         low, high = [w.smaller(a, b) for a, b in zip(low, now, strict=False)], [w.larger(a, b) for a, b in zip(high, now, strict=False)]
@@ -202,7 +220,27 @@ def _stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value, t: Value,
     for a, b in zip(low, high, strict=True):
         smallest = w.smaller(smallest, w.smaller(w.magnitude(a), w.magnitude(b)))
         changed = changed | ((a < 0.0) & (b > 0.0))
-    return smallest, changed
+    return smallest, changed, rank if rank is None else rank._replace(square=w.load(w.real, square))
+
+
+def squares_of(w: Writer, form: Form, monitored: Value) -> list[tuple[Value, Value]]:
+    """What is left of each row beside those before it, and its size, squared."""
+    found = [w.load(w.real, monitored, j) for j in range(len(form.monitored) - len(form.squares), len(form.monitored))]
+    return list(zip(found[::2], found[1::2], strict=True))
+
+
+def near_rank_loss(squares: list[tuple[Value, Value]]) -> Value:
+    """Whether some row is nearly one of those before it."""
+    return any_of([left < NEAR_SINE**2 * size for left, size in squares])
+
+
+def put_near_rows(w: Writer, layout: Layout, state: Value, near: Value, t: Value, y: Value) -> None:
+    """Puts the state `y` of a stage back onto the rows in lanes that are `near` a loss of rank."""
+    with w.when(w.any(near)):
+        put = w.room(w.real, layout.integrated)
+        each_row(w, range(layout.integrated), put, lambda i: w.load(w.real, y, i))
+        w.call("project", "void", state, t, put)
+        each_row(w, range(layout.integrated), y, lambda i: w.where(near, w.load(w.real, put, i), w.load(w.real, y, i)))
 
 
 def _turns_round(w: Writer, form: Form, first: list[Value], now: list[Value]) -> Value:
@@ -220,17 +258,28 @@ def weighted(w: Writer, weights: np.ndarray, k: Value, layout: Layout, row: int 
     return total
 
 
-def _project(w: Writer, layout: Layout, p: Lanes, t1: Value, y1: Value, error: Value) -> None:
+def _project(w: Writer, layout: Layout, p: Lanes, t1: Value, y1: Value, error: Value, rank: Rank | None = None) -> None:
     """Puts `y1` back onto the rows; the error is no smaller than how far that moved it, beyond noise."""
     free = w.room(w.real, layout.y)
     each_row(w, range(layout.y), free, lambda i: w.load(w.real, y1, i))
     w.call("project", "void", p.pointer, t1, y1)
+    amplified = None if rank is None else w.where(rank.near, w.smaller(AMPLIFIED * search.EPS / rank.square, search.EPS ** (1 - NOISE)), 0.0)
+    if rank is not None:
+        with w.when(w.any(rank.near)):
+            both = w.room(w.real, 2 * layout.y)
+            each_row(w, range(layout.y), both, lambda i: w.load(w.real, y1, i))
+            each_row(w, range(layout.y), w.at(both, layout.y, w.real), lambda i: w.load(w.real, error, i))
+            w.call("along", "void", p.pointer, t1, both)
+            each_row(w, range(layout.y), error, lambda i: w.where(rank.near, w.load(w.real, both, i + layout.y), w.load(w.real, error, i)))
     for part in layout.parts:
-        noise = search.EPS**NOISE * over_rows(w, part, 0.0, lambda largest, i: w.larger(largest, w.magnitude(w.load(w.real, y1, i))))
+        largest = over_rows(w, part, 0.0, lambda largest, i: w.larger(largest, w.magnitude(w.load(w.real, y1, i))))
+        noise = (search.EPS**NOISE if amplified is None else w.larger(amplified, search.EPS**NOISE)) * largest
+        by_rows = None if amplified is None else amplified * amplified * largest
 
-        def larger_error(i: int | Value, noise: Value = noise) -> Value:
+        def larger_error(i: int | Value, noise: Value = noise, by_rows: Value | None = by_rows) -> Value:
             moved = w.magnitude(w.load(w.real, y1, i) - w.load(w.real, free, i)) - noise
-            return w.larger(w.magnitude(w.load(w.real, error, i)), w.larger(moved, 0.0))
+            along = w.magnitude(w.load(w.real, error, i))
+            return w.larger(along if by_rows is None else along - by_rows, w.larger(moved, 0.0))
 
         each_row(w, part, error, larger_error)
 

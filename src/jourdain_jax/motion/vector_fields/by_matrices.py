@@ -110,6 +110,11 @@ class FullByMatrices(ByMatrices):
         """Whether round-off might decide on which branch a motion goes on."""
         return self.undecided is not None or bool(self.nonlinear_rows) or len(self.usual.own_speeds) > 0
 
+    @property
+    def near_rank_loss(self) -> bool:
+        """Whether branches may cross on the rows that a step is put back onto."""
+        return self.projects and self.undecided is not None
+
     def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "speeds"]:
         return y.v
 
@@ -123,7 +128,8 @@ class FullByMatrices(ByMatrices):
         motion, found, directions = self.solved(scene, t, y.q, y.v, inputs)
         rates = Integrated(motion.qdot.array, found.udot, self.power(scene, motion, found))
         branch = jnp.zeros(0) if self.undecided is None else jnp.where(found.pivot > self.undecided, 1.0, -1.0)[None]
-        return self.watched(scene, t, y, rates, branch.astype(y.q.dtype), directions)
+        watched = self.watched(scene, t, y, rates, branch.astype(y.q.dtype), directions)
+        return watched._replace(sine=found.pivot) if self.near_rank_loss else watched
 
 
 def _left_by_elimination(A: Float[Array, "rows speeds"]) -> Float[Array, "rows speeds"]:

@@ -33,12 +33,22 @@ class ByProgram(VectorField):
     @property
     def has_pivots(self) -> bool:
         """Whether an elimination, or the rates of the coordinates, divide by numbers that must not vanish."""
-        return self.pivots > 0 or bool(self.program.directions)
+        return self.pivots > 0 or bool(self.program.directions) or self.near_rank_loss
 
     @property
     def pivots(self) -> int:
         """Return how many are monitored: all, or with multipliers only those of the coordinate rates."""
         return self.program.divisors if self.independent is None and not self.program.by_partition else len(self.program.pivots)
+
+    @property
+    def needs_pivot(self) -> bool:
+        """Whether a small pivot ends a motion: with multipliers a state is all there."""
+        return self.independent is not None or self.program.by_partition
+
+    @property
+    def near_rank_loss(self) -> bool:
+        """Whether rows are kept by multipliers, and put back onto."""
+        return self.projects and bool(self.program.squares)
 
     def fixed(self, scene: Scene) -> tuple:
         """What depends on parameters alone."""
@@ -63,11 +73,11 @@ class ByProgram(VectorField):
 
     def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Watched:
         """Return `rates`, the pivots of the elimination relative to their usual sizes, and the eliminated rows."""
-        qdot, vdot, power, pivots, directions = self.program.rates_and_pivots(fixed, t, tuple(y.q), tuple(y.v), inputs, self.with_work)
+        qdot, vdot, power, pivots, directions, sine = self.program.rates_and_pivots(fixed, t, tuple(y.q), tuple(y.v), inputs, self.with_work)
         pivots = pivots[: self.pivots]
         monitored = jnp.stack(pivots) if pivots else jnp.zeros((0, *y.q.shape[1:]))
         rows = jnp.reshape(jnp.stack(directions), (-1, *y.v.shape)) if directions else jnp.zeros((0, *y.v.shape))
-        return Watched(Integrated(jnp.stack(qdot), jnp.stack(vdot) if vdot else y.v, power), monitored, rows)
+        return Watched(Integrated(jnp.stack(qdot), jnp.stack(vdot) if vdot else y.v, power), monitored, rows, sine)
 
     def project(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
         """The state put back onto the rows."""

@@ -33,11 +33,12 @@ class Integrated(eqx.Module):
 
 
 class Watched(NamedTuple):
-    """Rates, pivots that must keep their signs, and directions of rows nonlinear in the speeds, which must not turn round."""
+    """Rates; pivots that must keep their signs; directions of rows nonlinear in the speeds, which must not turn round; a sine, small near a loss of rank."""
 
     rates: Integrated
     pivots: Float[Array, "pivots *lanes"]
     directions: Float[Array, "rows speeds *lanes"]
+    sine: Float[Array, "*lanes"] | None = None  # the smallest between a row and those before it; None: rows that are solved for speeds, or none
 
 
 class VectorField(eqx.Module):
@@ -90,6 +91,11 @@ class VectorField(eqx.Module):
     @abc.abstractmethod
     def has_pivots(self) -> bool:
         """Whether steps in which some pivot changes its sign are tried again: in them the state, or a row that it is kept on, is lost."""
+
+    @property
+    def near_rank_loss(self) -> bool:
+        """Whether `rates_and_pivots` says how far the rows, onto which steps are put back, are from losing rank."""
+        return False
 
     def fixed(self, scene: Scene) -> tuple:
         """What the rates need of the scene: computed once per motion."""
