@@ -204,7 +204,7 @@ def test_a_bicycle_with_tyres_is_the_whipple_bicycle_whose_wheels_widen():
     [
         (
             lambda scene, pose: jj.Plane(normal=jnp.stack([0.0 * scene.size, 0.0 * scene.size, 2.4 * scene.size])),
-            "contact `touch` of `Rolls` has a normal whose length differs from 1 by 0.2",
+            "the normal of contact `touch` of `Rolls` has a length that differs from 1 by 0.2",
         ),
         (
             lambda scene, pose: jj.Sphere(0.09 * scene.size, side="inside"),
@@ -245,7 +245,7 @@ class OnACusp(BallInBowl):
     ("scene", "sentence"),
     [
         (TooLarge(), "contact `bowl` of `TooLarge` finds no point where body and ground touch at any probed state; a ball must be smaller"),
-        (OnACusp(), "contact `bowl` of `OnACusp` (finds no point|has a normal whose length differs from 1)"),
+        (OnACusp(), "contact `bowl` of `OnACusp` (finds no point|has a length that differs from 1)"),
     ],
 )
 def test_a_contact_that_touches_nowhere_is_named(scene, sentence):

@@ -222,7 +222,7 @@ BAD = {
     "massless": (f'<mujoco><worldbody><body name="b">{HINGE}</body></worldbody></mujoco>', r"link `b`, which `j` moves, has no mass"),
     "mesh-of-unknown-mass": (_body(f'{HINGE}<geom type="mesh" mesh="m"/>'), r"the mass of a geom of body `b`, of the type `mesh`, is not read"),
     "no-inertia": (_body(f'{HINGE}<inertial pos="0 0 0" mass="1"/>'), r"`inertial` of body `b` has neither `diaginertia` nor `fullinertia`"),
-    "negative-mass": (_body(f'{HINGE}<inertial pos="0 0 0" mass="-1" diaginertia="1 1 1"/>'), r"mass in `inertial` of body `b` is -1"),
+    "negative-mass": (_body(f'{HINGE}<inertial pos="0 0 0" mass="-1" diaginertia="1 1 1"/>'), r"mass of `inertial` of body `b` is -1"),
     "no-size": (_body(f'{HINGE}<geom name="g" type="box" size="1 1"/>'), r"size of geom `g` of body `b` is `1 1`, expected 3 lengths"),
     "no-class": (_body('<joint name="j" class="heavy"/>'), r"joint `j` is of the class `heavy`, which no `default` states"),
     "default-without-class": (_body(HINGE, compiler="<default><default/></default>"), r"a `default` inside the class `main` has no `class`"),

@@ -215,7 +215,7 @@ WRONG = {
     "height": (0.2, "a body off its ground: contact `rim`"),
     "radius": (0.12, "a body off its ground: contact `rim`"),
     "tyre": (-0.01, "a negative tyre: contact `rim`"),
-    "down": ((0.0, 0.0, -2.0), "a direction of gravity that is no unit vector: load 1"),
+    "down": ((0.0, 0.0, -2.0), "no unit vector: the direction of gravity in load 1"),
 }
 
 

@@ -230,10 +230,14 @@ NO_NUMBERS = ["1_0", "\u0661", "\uff11", "0x1", "nan", "inf", "1e999", "1,5", ""
 
 @pytest.mark.parametrize("number", NO_NUMBERS)
 def test_what_is_no_number_is_refused_with_its_place(number):
-    for old, what in (('mass value="2"', "mass of link `first`"), ('damping="0.7"', "damping of joint `turn`"), ('lower="-1"', "limit of joint `turn`")):
+    for old, what in (
+        ('mass value="2"', "value of `mass` of `inertial` of link `first`"),
+        ('damping="0.7"', "damping of `dynamics` of joint `turn`"),
+        ('lower="-1"', "lower of `limit` of joint `turn`"),
+    ):
         with pytest.raises(ValueError, match=rf"the URDF text: {what} is `.*`, expected"):
             jj.from_urdf(URDF.replace(old, re.sub('".*"', f'"{number}"', old)))
-    for old, what in (('mass="2"', "mass in `inertial` of body `a`"), ('gear="2"', "gear of motor `push`"), ('density="500"', "density of")):
+    for old, what in (('mass="2"', "mass of `inertial` of body `a`"), ('gear="2"', "gear of motor `push`"), ('density="500"', "density of")):
         with pytest.raises(ValueError, match=rf"the MJCF text: {what}.* is `.*`, expected"):
             jj.from_mjcf(MJCF.replace(old, re.sub('".*"', f'"{number}"', old)))
 

@@ -62,8 +62,7 @@ class RowsOverStates:
 
         `x`, `u` and what that function takes have a leading axis of points.
         """
-        named = named_values(self.scene, x[:, 0], x[:, 1:], u, np.zeros((len(x), len(self.scene.inputs))))
-        probes = Probes(self.traced.graph, {name: np.asarray(value, float) for name, value in named.items()})
+        probes = Probes(self.traced.graph, named_values(self.scene, x[:, 0], x[:, 1:], u, np.zeros((len(x), len(self.scene.inputs)))))
         found = probes([*self.values, *(node for _, _, node in self.changes)])
         value, change = found[: len(self.values)], found[len(self.values) :]
         place, variable = (np.array([c[k] for c in self.changes], int) for k in (0, 1))

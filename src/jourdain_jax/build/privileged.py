@@ -12,8 +12,6 @@ from jourdain_jax.calculus.reals import described
 from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.scene import Scene
 
-_EXHAUSTIVE = 3000
-
 
 def privileged_by_user(scene: Scene, freedoms: int) -> tuple[int, ...] | None:
     """Numbers of the speeds that the scene names; None where it names none. ValueError for unknown names, and for others than `freedoms` speeds."""
@@ -52,8 +50,8 @@ def best_privileged(scaled: np.ndarray, count: int, rank: int) -> tuple[int, ...
     """The independent speeds whose complement has the largest worst pivot over all probes (the largest typical one among equals)."""
     if rank == 0:
         return tuple(range(count))
-    subsets = list(itertools.islice(itertools.combinations(range(count), rank), _EXHAUSTIVE + 1))
-    if len(subsets) > _EXHAUSTIVE:
+    subsets = list(itertools.islice(itertools.combinations(range(count), rank), 3001))
+    if len(subsets) > 3000:
         subsets = list({_greedy(A, rank) for A in scaled})
 
     def merit(dependent, probes):

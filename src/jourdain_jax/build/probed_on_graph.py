@@ -14,11 +14,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PyTree
+from jaxtyping import Float
 
 from jourdain_jax.build.assembling import Assembled, assemble, speed_scales, typical_lengths, without_rows
 from jourdain_jax.build.domain import coordinate_bounds
-from jourdain_jax.build.plausibility import PoseNumbers
+from jourdain_jax.build.plausibility import Numbers
 from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
 from jourdain_jax.calculus.gauss_newton import nearest_root, shortest
 from jourdain_jax.calculus.reals import Entries
@@ -45,17 +45,13 @@ class Probed(eqx.Module):
     position_error: Float[Entries, "*states"]  # of these rows, as the next two from `Assembled`
     error: Float[Entries, "*states"]  # of the coordinates
     outside: Float[Entries, "*states"]  # of the domain
+    G: Float[Entries, "*states closures coordinates"]
     A: Float[Entries, "*states rows speeds"]
     A_other: Float[Entries, "*states rows speeds"]  # at other speeds
     A_beyond: Float[Entries, "*states rows speeds"]  # at the coordinates as they were before they were put on the geometric rows
     M: Float[Entries, "*states speeds speeds"]
-    phi_at_rest: Float[Entries, "*states rows"]  # at u = 0
-    motion_at_rest: PyTree  # velocities and coordinate rates at u = 0
-    timed: dict[str, PyTree]  # rates in time by `TIMED`, while coordinates, speeds and inputs are held (for loads and potentials: the motion)
-    inertia_rates: PyTree  # along the motion
-    potential_rates: Float[Entries, "*states loads"]  # of each load's potential, along a generic change of the inputs
-    row_rates_of_inputs: Float[Entries, "*states rows"]  # along the same change
-    numbers: PoseNumbers
+    vanishing: dict[str, Float[Entries, "*states entries"]]  # as in `LookedAt`
+    numbers: Numbers
     unproved: frozenset[str] = eqx.field(static=True, default=frozenset())  # what may be other than zero where no probe lies
     in_calls: frozenset[str] = eqx.field(static=True, default=frozenset())  # what calls of JAX compute of poses and rows
 
@@ -74,12 +70,10 @@ class LookedAt:
     velocities: list[dict[int, int]]  # d (v, omega)/du
     closures: list[int]  # geometric rows and unit norms
     of_closures: list[dict[int, int]]  # their derivatives with respect to q
-    phi_at_rest: np.ndarray
-    motion_at_rest: np.ndarray
-    timed: dict[str, list[int]]
-    inertia_rates: list[int]
-    potential_rates: list[int]
-    row_rates: list[int]
+    # what may be zero everywhere: "rows at rest" and "motion at rest" (velocities and rates of coordinates), at u = 0; rates in time by `TIMED`, while
+    # coordinates, speeds and inputs are held (for loads and potentials: the motion); rates of the "inertia" along the motion, and along a generic change of
+    # the inputs those of "rows of inputs", and of each load's potential, "potential 0", ...
+    vanishing: dict[str, list[int]]
     in_calls: frozenset[str]  # what passes calls of JAX
     nonanalytic: frozenset[str]  # what passes an operation that is not analytic
 
@@ -96,18 +90,16 @@ def looked_at(scene: Scene) -> LookedAt:
     g, at, u = traced.graph, traced.at, traced.u.tolist()
     flat = [*at.phi.tolist(), *at.v.ravel().tolist(), *at.omega.ravel().tolist()]
     by_speed, rows = jacobian(g, flat, u), len(at.phi)
-    at_rest = np.split(np.array(g.substituted([*flat, *at.qdot.tolist()], dict.fromkeys(u, g.zero)), np.int64), [rows])
-    weights = [*at.mass.tolist(), *at.inertia.ravel().tolist()]
-    poses = [*at.position.ravel().tolist(), *at.orientation.ravel().tolist()]
-    by_time = {"rows": [*at.phi.tolist(), *at.closure.tolist()], "poses": poses, "inertias": weights, "coordinate rates": at.qdot.tolist()}
-    timed = {name: derivatives(g, nodes, {traced.t: g.one}) for name, nodes in by_time.items()} | traced.particulars.explicit
+    at_rest = g.substituted([*flat, *at.qdot.tolist()], dict.fromkeys(u, g.zero))
+    weights = _flat([at.mass, at.inertia])
+    by_time = {"rows": [at.phi, at.closure], "poses": [at.position, at.orientation], "inertias": weights, "coordinate rates": at.qdot}
     along_motion = {traced.t: g.one} | dict(zip(traced.q.tolist(), at.qdot.tolist(), strict=True))
     changed = {n: g.mul(n, n) for n in traced.inputs.tolist()}
-    inertia_rates, potential_rates = derivatives(g, weights, along_motion), derivatives(g, traced.particulars.potentials.tolist(), changed)
-    row_rates = derivatives(g, at.phi.tolist(), changed)
-    vanishing = {"rows at rest": at_rest[0], "motion at rest": at_rest[1], "inertia": inertia_rates, "rows of inputs": row_rates}
-    vanishing |= {f"potential {k}": [rate] for k, rate in enumerate(potential_rates)} | timed
-    vanishing["rank"] = [*at_rest[0].tolist(), *(node for row in by_speed[:rows] for node in row.values())]
+    potentials = derivatives(g, traced.particulars.potentials.tolist(), changed)
+    vanishing = {name: derivatives(g, _flat(nodes), {traced.t: g.one}) for name, nodes in by_time.items()}
+    vanishing |= {name: _flat(nodes) for name, nodes in traced.particulars.explicit.items()}
+    vanishing |= {"rows at rest": at_rest[:rows], "motion at rest": at_rest[rows:], "inertia": derivatives(g, weights, along_motion)}
+    vanishing |= {"rows of inputs": derivatives(g, at.phi.tolist(), changed)} | {f"potential {k}": [rate] for k, rate in enumerate(potentials)}
     closures = traced.closures
     return LookedAt(
         traced=traced,
@@ -115,12 +107,7 @@ def looked_at(scene: Scene) -> LookedAt:
         velocities=by_speed[rows:],
         closures=closures,
         of_closures=jacobian(g, closures, traced.q.tolist()),
-        phi_at_rest=at_rest[0],
-        motion_at_rest=at_rest[1],
-        timed=timed,
-        inertia_rates=inertia_rates,
-        potential_rates=potential_rates,
-        row_rates=row_rates,
+        vanishing=vanishing,
         in_calls=_passing(CALLS, traced, vanishing, by_speed[:rows]),
         nonanalytic=_passing(NONANALYTIC, traced, vanishing, by_speed[:rows]),
     )
@@ -132,21 +119,23 @@ def coordinates_on_rows(scene: Scene) -> np.ndarray:
     return np.isin(nodes.traced.q, [n for row in nodes.of_closures for n in row])
 
 
-def _passing(kinds, traced: TracedScene, vanishing: dict, rows: list[dict[int, int]]) -> frozenset[str]:
-    """What passes an operation of these kinds; "nonlinear" where the rows do so with the speeds."""
+def _passing(kinds, traced: TracedScene, vanishing: dict[str, list[int]], rows: list[dict[int, int]]) -> frozenset[str]:
+    """What passes an operation of these kinds; "rank" where rows do so, "nonlinear" where they do so with the speeds."""
     g, u = traced.graph, traced.u.tolist()
     entries = [node for row in rows for node in row.values()]
-    bent = any(a and b for a, b in zip(depend_on(g, entries, u), passes(g, entries, kinds), strict=True))
-    nonlinear = {"nonlinear"} if bent or decided_by(g, traced.at.phi.tolist(), u, kinds) else set()
-    return frozenset(name for name, nodes in vanishing.items() if any(passes(g, _flat(nodes), kinds))) | nonlinear
+    passing = passes(g, entries, kinds)
+    bent = any(a and b for a, b in zip(depend_on(g, entries, u), passing, strict=True))
+    found = {name for name, nodes in vanishing.items() if any(passes(g, nodes, kinds))}
+    found |= {"rank"} if any(passing) or "rows at rest" in found else set()
+    return frozenset(found | ({"nonlinear"} if bent or decided_by(g, traced.at.phi.tolist(), u, kinds) else set()))
 
 
-def probed_on_graph(scene: Scene, t, q, u, u_other, generic, far: int = 0) -> Probed:
+def probed_on_graph(scene: Scene, t, q, u, u_other, generic, **limits: int) -> Probed:
     """The scene at states (t, q, u), put on the geometric rows; and its rows at `u_other`. `generic`: which states are random ones.
 
-    The last `far` states are meant to be far from the domain. `Unsupported` where a call has no derivative in JAX.
+    `limits`: of `assemble`. `Unsupported` where a call has no derivative in JAX.
     """
-    return _AtStates(looked_at(scene), scene, t, q, u, generic_inputs(scene), generic, far).probed(u_other)
+    return _AtStates(looked_at(scene), scene, t, q, u, generic_inputs(scene), generic, **limits).probed(u_other)
 
 
 def sampled_on_graph(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled]:
@@ -163,7 +152,7 @@ def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
     at = _AtStates(looked_at(scene), scene, t, q, u, generic_inputs(scene), np.ones(len(t), bool))
     graph, traced = at.graph, at.traced
     generic = generic_states(traced, at.values)
-    columns_of_rows = [[row.get(n, graph.zero) for row in at.nodes.rows] for n in traced.u.tolist()] + [at.nodes.phi_at_rest.tolist()]
+    columns_of_rows = [[row.get(n, graph.zero) for row in at.nodes.rows] for n in traced.u.tolist()] + [at.nodes.vanishing["rows at rest"]]
     found = generic([n for column in columns_of_rows for n in column])
     shape = len(columns_of_rows), len(traced.at.phi), -1
     A, E = (np.moveaxis(np.reshape(x, shape), (2, 1), (0, 1)) for x in (np.asarray(found), found.error))
@@ -181,18 +170,17 @@ def generic_states(traced: TracedScene, near: Probes) -> IdentityProbes:
 class _AtStates:
     """Values on the graph at the probed states."""
 
-    def __init__(self, nodes: LookedAt, scene: Scene, t, q, u, inputs, generic, far: int = 0):
+    def __init__(self, nodes: LookedAt, scene: Scene, t, q, u, inputs, generic, **limits: int):
         self.nodes, self.traced, self.graph, self.scene = nodes, nodes.traced, nodes.graph, scene
         self.inputs = np.tile(inputs, (len(t), 1))
-        self.t, self.u, self.generic, self.far = t, u, generic, far
+        self.t, self.u, self.generic, self.limits = t, u, generic, limits
         self.q_beyond, self.found = np.array(q, float), self._assembled(q)
         self.q = self.found.q
         self.values = self._probes(self.q, u)
 
     def _probes(self, q, u, which=slice(None)) -> Probes:
         """The graph at coordinates and speeds of the states numbered `which`."""
-        named = named_values(self.scene, self.t[which], q, u, self.inputs[which])
-        return Probes(self.graph, {name: np.asarray(value, float) for name, value in named.items()})
+        return Probes(self.graph, named_values(self.scene, self.t[which], q, u, self.inputs[which]))
 
     def probed(self, u_other) -> Probed:
         """All that is looked at."""
@@ -202,16 +190,12 @@ class _AtStates:
             error=self.found.error,
             position_error=self.found.position_error,
             outside=self.found.outside,
+            G=self.real(self._matrices(self.values, nodes.of_closures, self.traced.q.tolist())),
             A=self.real(self._row_matrices(self.values)),
             A_beyond=self.real(self._row_matrices(self._probes(self.q_beyond, self.u))),
             A_other=self.real(self._row_matrices(self._probes(self.q, u_other))),
             M=self.real(self._mass_matrix()),
-            phi_at_rest=self.real(self._at(nodes.phi_at_rest)),
-            motion_at_rest=self.real(self._at(nodes.motion_at_rest)),
-            timed=jax.tree.map(self._at, nodes.timed, is_leaf=lambda x: isinstance(x, list)),
-            inertia_rates=self._at(nodes.inertia_rates),
-            potential_rates=self._at(nodes.potential_rates),
-            row_rates_of_inputs=self._at(nodes.row_rates),
+            vanishing={name: self._at(nodes) for name, nodes in nodes.vanishing.items()},
             numbers=jax.tree.map(lambda of: self.real(self._at(of)), self.traced.particulars.numbers),
             unproved=nodes.nonanalytic | (nodes.in_calls - _MOTION),
             in_calls=nodes.in_calls & _MOTION,
@@ -282,7 +266,7 @@ class _AtStates:
             probes = self._probes(q, self.u[which], which)
             return _values(probes, rows), _values(probes, slopes)
 
-        return assemble(look, pattern, q, *coordinate_bounds(self.scene), self.generic, self.far)
+        return assemble(look, pattern, q, *coordinate_bounds(self.scene), self.generic, **self.limits)
 
 
 def _flat(nodes) -> list[int]:

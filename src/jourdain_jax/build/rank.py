@@ -14,8 +14,6 @@ from jourdain_jax.build.assembling import speed_scales
 from jourdain_jax.build.probed_on_graph import Probed
 from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 
-LARGE_COEFFICIENT, TAIL = 20.0, 3.0  # of the rows that stay, in a row that is left out: at any probe; with both signs, beside the median
-
 
 class Scaled(eqx.Module):
     """What decides ranks and pivots, at every probed state."""
@@ -107,6 +105,6 @@ def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarr
 
 def _are_bounded(c: np.ndarray) -> bool:
     """Whether coefficients at many states are: none is large, nor far beyond its usual size with both signs, as tangents are."""
-    usual = TAIL * np.median(np.abs(c), axis=0) + np.sqrt(np.finfo(c.dtype).eps)
+    usual = 3.0 * np.median(np.abs(c), axis=0) + np.sqrt(np.finfo(c.dtype).eps)
     poles = (np.max(c, axis=0, initial=0.0) > usual) & (np.min(c, axis=0, initial=0.0) < -usual)
-    return bool(np.all(np.abs(c) < LARGE_COEFFICIENT) and not np.any(poles & (np.max(np.abs(c), axis=0, initial=0.0) > 2)))
+    return bool(np.all(np.abs(c) < 20.0) and not np.any(poles & (np.max(np.abs(c), axis=0, initial=0.0) > 2)))

@@ -95,13 +95,14 @@ def with_reference_parameters(scene: Scene) -> Scene:
     Generic, because a default of zero (a tilt, a rate) must not pass for a term that is absent, nor two equal defaults for one length.
     """
     leaves, treedef = jax.tree.flatten(scene)
-    if not any(is_traced_type(type(x)) for x in leaves):
+    unknown = [is_traced_type(type(x)) for x in leaves]
+    if not any(unknown):
         return scene
     near = [default for _, default in defaults(scene)]
     known = _STAND_IN.get()
     if known is not None and jax.tree.structure(known) == treedef:
         near = [y if not is_traced_type(type(y)) and np.shape(y) == np.shape(x) else d for x, y, d in zip(leaves, jax.tree.leaves(known), near, strict=True)]
-    numbers = [_generic(x, y, place) if is_traced_type(type(x)) else x for place, (x, y) in enumerate(zip(leaves, near, strict=True))]
+    numbers = [_generic(x, y, place) if unknown[place] else x for place, (x, y) in enumerate(zip(leaves, near, strict=True))]
     return jax.tree.unflatten(treedef, numbers)
 
 

@@ -6,16 +6,18 @@ Unit norms of quaternions count as geometric rows.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.build.plausibility import any_wrong
+from jourdain_jax.build.plausibility import CHECKS, any_wrong
 from jourdain_jax.build.probed_on_graph import LookedAt, looked_at
 from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.build.trace import TracedScene
 from jourdain_jax.program.analyticity import depend_on
+from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 from jourdain_jax.program.part import part_of
@@ -53,35 +55,24 @@ def row_program(scene: Scene) -> RowProgram | None:
         return None
     graph, traced = nodes.graph, nodes.traced
     q, u = traced.q.tolist(), traced.u.tolist()
-    g, phi = [int(n) for n in nodes.closures], traced.at.phi.tolist()
-    G, A = _entries(nodes.of_closures, q), _entries(nodes.rows, u)
-    M = _mass_matrix(nodes, u)
-    needed = [right, *g, *G.values(), *phi, *A.values(), *({} if M is None else M).values()]
+    parts: dict[str, Any] = {
+        "t": traced.t,
+        "q": q,
+        "u": u,
+        "inputs": traced.inputs.tolist(),
+        "g": nodes.closures,
+        "G": _entries(nodes.of_closures, q),
+        "phi": traced.at.phi.tolist(),
+        "A": _entries(nodes.rows, u),
+        "M": _mass_matrix(nodes, u),
+        "right": right,
+    }
+    needed = jax.tree.leaves(parts)
     if graph.calls(needed):
         return None
-    inputs = [traced.t, *q, *u, *traced.inputs.tolist()]
-    own, place = part_of(graph, [*needed, *inputs])
-
-    def places(entries: dict) -> dict:
-        return {key: int(place[n]) for key, n in entries.items()}
-
-    def every(nodes) -> tuple[int, ...]:
-        return tuple(int(place[n]) for n in np.ravel(np.asarray(nodes, int)))
-
-    return RowProgram(
-        graph=own,
-        parameters=tuple(map(every, traced.parameters)),
-        t=int(place[traced.t]),
-        q=every(traced.q),
-        u=every(traced.u),
-        inputs=every(traced.inputs),
-        g=every(g),
-        G=places(G),
-        phi=every(phi),
-        A=places(A),
-        M=None if M is None else places(M),
-        right=int(place[right]),
-    )
+    own, place = part_of(graph, needed)
+    listed: dict[str, Any] = {name: tuple(x) if isinstance(x, list) else x for name, x in jax.tree.map(lambda n: int(place[n]), parts).items()}
+    return RowProgram(own, tuple(tuple(place[x.ravel()].tolist()) for x in traced.parameters), **listed)
 
 
 def _right(scene: Scene, traced: TracedScene) -> int:
@@ -95,7 +86,8 @@ def _right(scene: Scene, traced: TracedScene) -> int:
     def decided(of: np.ndarray) -> bool:
         return any(depend_on(g, of.ravel().tolist(), of_parameters)) and not any(depend_on(g, of.ravel().tolist(), known))
 
-    kept = {name: [x for x in map(np.asarray, of.values()) if decided(x)] for name, of in vars(traced.particulars.numbers.stated).items()}
+    judged = dict.fromkeys(check.of for check in CHECKS if check.label)
+    kept = {kind: [x for x in map(np.asarray, traced.particulars.numbers[kind].values()) if decided(x)] for kind in judged}
     stacked = {name: np.stack(of) for name, of in kept.items() if of}
     nodes = [*traced.parameters, *stacked.values()]
     treedef, count = jax.tree.structure(scene), len(traced.parameters)
@@ -115,27 +107,14 @@ def _entries(rows: list[dict[int, int]], variables: list[int]) -> dict[tuple[int
 
 
 def _mass_matrix(nodes: LookedAt, u: list[int]) -> dict[tuple[int, int], int] | None:
-    """`M = sum m beta' beta + gamma' I gamma`, the lower triangle."""
+    """`M = d^2 T/du^2`, the lower triangle."""
     # products of entries of velocities: beyond, the mass matrix is not written out
     if sum(len(row) ** 2 for row in nodes.velocities) > 20_000:
         return None
-    graph, at = nodes.graph, nodes.traced.at
-    bodies, place = len(at.mass), {n: k for k, n in enumerate(u)}
-    found: dict[tuple[int, int], int] = {}
-
-    def add(row: dict[int, int], other: dict[int, int], weight: int) -> None:
-        for n, x in row.items():
-            for m, y in other.items():
-                if place[m] <= place[n]:
-                    key = place[n], place[m]  # x y first: so x y m - y x m is one node less itself, which is zero
-                    found[key] = graph.add(found.get(key, graph.zero), graph.mul(weight, graph.mul(x, y)))
-
-    for b in range(bodies):
-        beta, gamma = nodes.velocities[3 * b : 3 * b + 3], nodes.velocities[3 * (bodies + b) : 3 * (bodies + b) + 3]
-        for i in range(3):
-            add(beta[i], beta[i], int(at.mass[b]))
-            for k in range(3):
-                if at.inertia[b, i, k] != graph.zero:
-                    add(gamma[i], gamma[k], int(at.inertia[b, i, k]))
+    graph, (kinetic, _) = nodes.graph, nodes.traced.at.energies.tolist()
+    momenta = jacobian(graph, [kinetic], u)[0]
+    slopes = jacobian(graph, list(momenta.values()), u)
+    place = {n: k for k, n in enumerate(u)}
+    found = {(place[n], place[m]): node for n, row in zip(momenta, slopes, strict=True) for m, node in row.items() if place[m] <= place[n]}
     at_rest = graph.substituted(list(found.values()), dict.fromkeys(u, graph.zero))
     return {key: int(node) for key, node in zip(found, at_rest, strict=True) if node != graph.zero}

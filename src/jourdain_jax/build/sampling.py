@@ -3,16 +3,16 @@ at random states are singular.
 """
 
 import itertools
+from collections.abc import Iterator
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.assembling import Assembled
 from jourdain_jax.build.domain import coordinate_bounds, speed_bounds
 from jourdain_jax.build.probed_on_graph import Probed, sampled_on_graph
-from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.calculus.reals import array_module
 from jourdain_jax.scene.arguments import as_scene, of_known_numbers
 from jourdain_jax.scene.scene import Scene, vectors_named
 
@@ -22,16 +22,6 @@ NEARLY_INSIDE = 0.05  # of the width of the domain
 
 class NoStateFoundError(ValueError):
     """No state of a scene's domain was found that is on its geometric rows and at which its rows are numbers."""
-
-
-def states_near_example(scene: Scene, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """States near the scene's example, not yet on the rows, for a domain in which none was found; None where it states none."""
-    if not scene.example:
-        return None
-    t, q, u = random_states(scene, count, generator)
-    low, high = coordinate_bounds(scene)
-    near = 10.0 ** -(1.0 + np.arange(count) % 6)  # of the domain: rows may be met, or be numbers, in a small part of it only
-    return t, vectors_named(scene, scene.example)[0] + near[:, None] * (q - (low + high) / 2), u
 
 
 @of_known_numbers
@@ -47,21 +37,15 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
     if not isinstance(seed, int | np.integer) or seed < 0:
         raise ValueError(f"`seed` is {seed!r}, expected a whole number that is not negative")
     drawn = -(-count // 32) * 32  # always a multiple of this, so that one program serves all small samples
-    t, q, u = random_states(scene, drawn, np.random.default_rng(seed))
-    q, u, found = sampled_on_graph(scene, t, q, u)
-    near = None if (found.on_rows & _are_numbers(u)).any() else states_near_example(scene, drawn, np.random.default_rng(seed))
-    if near is not None:
-        t, q, u = near
-        q, u, found = sampled_on_graph(scene, t, q, u)
-    good = np.flatnonzero(usable_states(scene, found, np.ones(drawn, bool)) & _are_numbers(u))[:count]
+    for t, *begin in drawn_states(scene, drawn, np.random.default_rng(seed)):
+        q, u, found = sampled_on_graph(scene, t, *begin)
+        numbers = np.all(np.isfinite(u), axis=1)  # put on rows that are none, speeds are none
+        if (found.on_rows & numbers).any():
+            break
+    good = np.flatnonzero(usable_states(scene, found, np.ones(drawn, bool)) & numbers)[:count]
     if not good.size:
         raise no_numbers(scene, drawn)
     return t[good], q[good], u[good]
-
-
-def _are_numbers(u: np.ndarray) -> np.ndarray:
-    """Whether the speeds of each state are numbers, (states,); put on rows that are none, they are none."""
-    return np.all(np.isfinite(u), axis=1)
 
 
 def no_numbers(scene: Scene, count: int) -> NoStateFoundError:
@@ -87,10 +71,20 @@ def random_states(scene: Scene, count: int, generator: np.random.Generator) -> t
     return generator.uniform(0, 1, count), q, generator.uniform(u_low, u_high, (count, len(u_low)))
 
 
+def drawn_states(scene: Scene, count: int, generator: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """States from the domain, not yet on the rows; then, where these do not serve, states near the scene's example, if it states one."""
+    yield random_states(scene, count, generator)
+    if scene.example:
+        t, q, u = random_states(scene, count, generator)
+        low, high = coordinate_bounds(scene)
+        near = 10.0 ** -(1.0 + np.arange(count) % 6)  # of the domain: rows may be met, or be numbers, in a small part of it only
+        yield t, vectors_named(scene, scene.example)[0] + near[:, None] * (q - (low + high) / 2), u
+
+
 def guesses_of(scene: Scene, states: np.ndarray, q, free) -> Float[Array | np.ndarray, "guesses coordinates"]:
     """Configurations near q, those of the `states` on the rows (first those whose coordinates that are not `free` are nearest), and elsewhere in the domain."""
-    on = jnp if is_traced(q) else np
-    q = jax.lax.stop_gradient(q) if is_traced(q) else np.asarray(q)
+    on = array_module(q)
+    q = np.asarray(q) if on is np else jax.lax.stop_gradient(q)
     low, high = coordinate_bounds(scene)
     on_rows = on.asarray(states, q.dtype)
     apart = on.where(free, 0.0, (on_rows - q) / np.where(high > low, high - low, 1.0))
@@ -139,10 +133,9 @@ def symmetric_configurations(scene: Scene) -> np.ndarray:
         chosen = [(), *((turn,) for turn in turns), *pairs]
     else:
         chosen = [(), *((turns[k],) for k in np.linspace(0, len(turns) - 1, most - 1).astype(int))]
-    configurations = []
-    for turned in chosen[:most]:
-        q = np.where([i in attitude for i in range(len(low))], reference, np.clip(reference, low, high))
+    still = np.where([i in attitude for i in range(len(low))], reference, np.clip(reference, low, high))
+    configurations = np.tile(still, (len(chosen[:most]), 1))
+    for q, turned in zip(configurations, chosen, strict=False):
         for i, angle in turned:
             q[i] = angle
-        configurations.append(q)
-    return np.array(configurations).reshape(-1, len(low))
+    return configurations

@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.build.assembling import speed_scales, typical_row_lengths
-from jourdain_jax.build.plausibility import implausible, odd_gravity, odd_grounds
+from jourdain_jax.build.plausibility import sentences
 from jourdain_jax.build.privileged import best_privileged, pivots_at, privileged_by_user, worst_pivot
 from jourdain_jax.build.probed_on_graph import TIMED, Probed, follow_from_others, probed_on_graph
 from jourdain_jax.build.rank import Scaled, contradictions, ranks_of, redundant_rows, scaled_states
 from jourdain_jax.build.reference_parameters import once_per_values
-from jourdain_jax.build.sampling import no_numbers, random_states, states_near_example, symmetric_configurations, usable_states
+from jourdain_jax.build.sampling import drawn_states, no_numbers, symmetric_configurations, usable_states
 from jourdain_jax.build.smoothness import kinks
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
@@ -28,9 +28,6 @@ from jourdain_jax.scene.scene import Scene
 
 RANDOM_PROBES = 24
 WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all probes, for the minimal state to be the default
-LONG = 24  # dependent speeds: of a chain of n rows that each hold two neighbours that value falls as 1/n, although no pivot does
-TRACED = 1e-3  # of the typical lengths of rows, where parameters are traced
-FAR, FAR_PROBES = 100.0, 16  # where calls hide what they do: further states, at times (s), coordinates and speeds up to this
 
 
 @dataclass(frozen=True)
@@ -63,6 +60,8 @@ class Structure:
     times: np.ndarray = field(compare=False, repr=False)  # of the probed states on the geometric rows
     coordinates: np.ndarray = field(compare=False, repr=False)  # of the same; random ones first
     random: int  # how many of them are random ones
+    closure_slopes: np.ndarray = field(compare=False, repr=False)  # derivatives of geometric rows and unit norms, at the first of them
+    row_slopes: np.ndarray = field(compare=False, repr=False)  # derivatives of the rows in the speeds, at the same
 
     @property
     def decisions(self) -> tuple:
@@ -109,12 +108,13 @@ class Structure:
     @property
     def well_conditioned(self) -> bool:
         """Whether the privileged velocities serve everywhere in the domain."""
-        return not self.may_set_in and self.worst_pivot >= WELL_CONDITIONED * min(1.0, LONG / max(self.rank, 1))
+        # of a chain of n rows that each hold two neighbours that value falls as 1/n, although no pivot does
+        return not self.may_set_in and self.worst_pivot >= WELL_CONDITIONED * min(1.0, 24 / max(self.rank, 1))
 
 
-def _moves(rates) -> bool:
+def _moves(rates: np.ndarray) -> bool:
     """Whether any rate is a number other than zero."""
-    return any(bool(np.any(np.isfinite(x) & (x != 0))) for x in jax.tree.leaves(rates))
+    return bool(np.any(np.isfinite(rates) & (rates != 0)))
 
 
 def _exceeds(difference: np.ndarray, tolerance: float, size: np.ndarray) -> bool:
@@ -128,37 +128,32 @@ def _sizes(found: Probed) -> np.ndarray:
     return np.max(np.abs(found.A), axis=2, initial=0.0)
 
 
-def _look(scene: Scene, *states_and_generic) -> Probed:
+def _look(scene: Scene, t, q, u, u_other, generic) -> Probed:
     try:
-        found = probed_on_graph(scene, *states_and_generic)
-        return _looked_at_from_afar(scene, *states_and_generic) if found.in_calls else found
+        found = probed_on_graph(scene, t, q, u, u_other, generic)
+        if not found.in_calls:
+            return found
+        # no graph says what calls do where the probes do not show it: a few states are looked at that are far off, as they are
+        generator, count = np.random.default_rng(1), 16
+        far = 100.0 * generator.uniform(size=count), q[:count] * 100.0 ** generator.uniform(size=(count, 1))
+        for first, _ in scene.coordinates.quaternions:
+            far[1][:, first : first + 4] = q[:count, first : first + 4]
+        u, u_other = 100.0 * generator.uniform(-1, 1, (2, count, u.shape[1]))
+        beyond = probed_on_graph(scene, *far, u, u_other, np.ones(count, bool), tries=0)
+        return replace(found, unproved=(found.unproved - found.in_calls) | (found.in_calls & _seen(beyond, u)))
     except Unsupported as reason:
         raise ValueError(
             f"the motion of `{type(scene).__name__}` needs {reason}, which JAX does not have in forward mode; give that part a rule with `jax.custom_jvp`"
         ) from None
 
 
-def _looked_at_from_afar(scene: Scene, t, q, u, u_other, generic) -> Probed:
-    """What was looked at, at a few states far off as well: no graph says what calls do where the probes do not show it."""
-    generator = np.random.default_rng(1)
-    far_q = q[:FAR_PROBES] * FAR ** generator.uniform(size=(FAR_PROBES, 1))
-    for first, _ in scene.coordinates.quaternions:
-        far_q[:, first : first + 4] = q[:FAR_PROBES, first : first + 4]
-    far = FAR * generator.uniform(size=FAR_PROBES), far_q, *(FAR * generator.uniform(-1, 1, (2, *u[:FAR_PROBES].shape)))
-    t, q, u, u_other = (np.concatenate(pair) for pair in zip((t, q, u, u_other), far, strict=True))
-    found = probed_on_graph(scene, t, q, u, u_other, np.append(generic, np.zeros(FAR_PROBES, bool)), far=FAR_PROBES)
-    near, beyond = (jax.tree.map(lambda x, part=part: x[part], found) for part in (np.s_[:-FAR_PROBES], np.s_[-FAR_PROBES:]))
-    return replace(near, unproved=(near.unproved - found.in_calls) | (found.in_calls & _seen(beyond, u[-FAR_PROBES:])))
-
-
 def _seen(found: Probed, u: np.ndarray) -> frozenset[str]:
     """What is other than zero at states far off; rows, where it is more than round-off."""
     some = np.sqrt(np.finfo(found.A.dtype).eps)
-    vanishing = {"motion at rest": found.motion_at_rest, "inertia": found.inertia_rates, "rows of inputs": found.row_rates_of_inputs, **found.timed}
-    vanishing |= {f"potential {k}": rate for k, rate in enumerate(found.potential_rates.T)}
-    rows = {"rows at rest"} if _exceeds(found.phi_at_rest, some, _speeds(found, u)) else set()
+    seen = {name for name, rates in found.vanishing.items() if _moves(rates)} - {"rows at rest"}
+    rows = {"rows at rest"} if _exceeds(found.vanishing["rows at rest"], some, _speeds(found, u)) else set()
     rows |= {"nonlinear"} if _exceeds(found.A - found.A_other, some, _sizes(found)[..., None]) else set()
-    return frozenset({name for name, rates in vanishing.items() if _moves(rates)} | rows)
+    return frozenset(seen | rows)
 
 
 def _speeds(found: Probed, u: np.ndarray) -> np.ndarray:
@@ -185,9 +180,14 @@ def structure_whatever_its_faults(scene: Scene) -> Structure:
     return _structure(as_scene(scene))
 
 
+def trust(scene: Scene) -> float:
+    """How far typical lengths count: a thousandth where parameters are traced, for the numbers that stand in may be of another order."""
+    return 1e-3 if is_traced(scene) else 1.0
+
+
 def plain_row_lengths(scene: Scene) -> Float[np.ndarray, "rows"]:
-    """Typical lengths of the rows of `A` in the units of the speeds; of a scene whose parameters are traced, as in `usual_rows`."""
-    return structure_whatever_its_faults(scene).plain_row_lengths * (TRACED if is_traced(scene) else 1.0)
+    """Typical lengths of the rows of `A` in the units of the speeds."""
+    return structure_whatever_its_faults(scene).plain_row_lengths * trust(scene)
 
 
 def rows_are_affine(scene: Scene) -> bool:
@@ -202,12 +202,9 @@ def closure_lengths(scene: Scene) -> Float[np.ndarray, "closures"]:
 
 
 def usual_rows(scene: Scene) -> UsualRows:
-    """Typical lengths of the rows in scaled speeds, and their rank at generic states.
-
-    Of a scene whose parameters are traced, numbers stand in that may be of another order: only what is shorter than a thousandth of those lengths counts less.
-    """
+    """Typical lengths of the rows in scaled speeds, and their rank at generic states."""
     known = structure_whatever_its_faults(scene)
-    return UsualRows(known.row_lengths * (TRACED if is_traced(scene) else 1.0), np.asarray(known.rank, np.int32))
+    return UsualRows(known.row_lengths * trust(scene), np.asarray(known.rank, np.int32))
 
 
 @once_per_values
@@ -219,17 +216,13 @@ def _structure(scene: Scene) -> Structure:
 def _probed_structure(scene: Scene) -> Structure:
     names = names_of_rows(scene)
     count = len(scene.speed_names)
-    generator = np.random.default_rng(0)
-    drawn = random_states(scene, RANDOM_PROBES, generator)
-    t, u, generic, found = _at_probes(scene, *drawn)
-    finite = np.isfinite(found.error) & np.all(np.isfinite(found.A), axis=(1, 2))
-    near = None if finite[generic].any() else states_near_example(scene, RANDOM_PROBES, generator)
-    if near is not None:
-        drawn = near
-        t, u, generic, found = _at_probes(scene, *near)
+    for drawn in drawn_states(scene, RANDOM_PROBES, np.random.default_rng(0)):
+        t, u, generic, found = _at_probes(scene, *drawn)
+        if (np.isfinite(found.error) & np.all(np.isfinite(found.A), axis=(1, 2)))[generic].any():
+            break
     on_rows = usable_states(scene, found, generic)
     numbers = jax.tree.map(lambda x: x[on_rows], found.numbers)
-    rough, grounds, faults = kinks(scene, found.q[on_rows & generic], u), odd_grounds(scene, numbers), implausible(scene, numbers)
+    rough, grounds, faults = kinks(scene, found.q[on_rows & generic], u), sentences(scene, numbers, "grounds"), sentences(scene, numbers, "faults")
     A = found.A * speed_scales(found.M)[:, None]
     usable = np.all(np.isfinite(A), axis=(1, 2)) & on_rows
     if not faults and not usable.any():
@@ -253,15 +246,16 @@ def _probed_structure(scene: Scene) -> Structure:
     dependent = [i for i in range(count) if i not in independent]
     pivots = pivots_at(candidates, dependent, rank)
     full_everywhere, eps, unproved = all(r == rank for r in ranks), float(np.finfo(found.A.dtype).eps), found.unproved
+    acts, at_rest = lambda name: name in unproved or _moves(found.vanishing[name]), found.vanishing["rows at rest"]
     affine = "nonlinear" not in unproved and not _exceeds(found.A - found.A_other, np.sqrt(eps), _sizes(found)[..., None])
     # near round-off: work that turns out as zero does less harm than work left out
-    homogeneous = "rows at rest" not in unproved and not _exceeds(found.phi_at_rest, 32 * eps, _speeds(found, u))
-    rows_of_inputs = "rows of inputs" in unproved or _moves(found.row_rates_of_inputs)
-    asks_for_motion = _exceeds(found.phi_at_rest, np.sqrt(eps), _speeds(found, u))  # smaller numbers may be errors of tables and of iterations
+    homogeneous = "rows at rest" not in unproved and not _exceeds(at_rest, 32 * eps, _speeds(found, u))
+    rows_of_inputs = acts("rows of inputs")
+    asks_for_motion = _exceeds(at_rest, np.sqrt(eps), _speeds(found, u))  # smaller numbers may be errors of tables and of iterations
     if affine and asks_for_motion and not (faults or rows_of_inputs) and rank < len(names):
-        at_rest = (found.phi_at_rest / np.where(scaled.lengths > 0, scaled.lengths, 1))[generic]
-        faults = contradictions(type(scene).__name__, names, scaled.A[generic], at_rest, [r for r, is_random in zip(ranks, generic, strict=True) if is_random])
-    faults = faults or odd_gravity(scene, found.numbers)  # last: numbers that stand in for a traced direction are no unit vector, which must hide nothing else
+        asked = (at_rest / np.where(scaled.lengths > 0, scaled.lengths, 1))[generic]
+        faults = contradictions(type(scene).__name__, names, scaled.A[generic], asked, [r for r, is_random in zip(ranks, generic, strict=True) if is_random])
+    faults = faults or sentences(scene, found.numbers, "gravity")  # last: what stands in for a traced direction must hide nothing else
     redundant = redundant_rows(scaled, found.error, ranks, generic, names, lambda: _far_rows(scene, typical, *drawn))
     return Structure(
         row_names=names,
@@ -277,11 +271,11 @@ def _probed_structure(scene: Scene) -> Structure:
         typical_pivot=float(np.median(pivots)) if pivots.size else 1.0,
         affine=affine,
         homogeneous=homogeneous,
-        timed=tuple(name for name in TIMED if name in unproved or _moves(found.timed[name])),
-        driven="motion at rest" in unproved or _moves(found.motion_at_rest),
+        timed=tuple(filter(acts, TIMED)),
+        driven=acts("motion at rest"),
         massless=_is_singular(scaled.M[generic]),
-        varying_inertia="inertia" in unproved or _moves(found.inertia_rates),
-        potentials_of_inputs=tuple(k for k, rate in enumerate(found.potential_rates.T) if f"potential {k}" in unproved or _moves(rate)),
+        varying_inertia=acts("inertia"),
+        potentials_of_inputs=tuple(sorted(int(name.split()[1]) for name in found.vanishing if name.startswith("potential ") and acts(name))),
         rows_of_inputs=rows_of_inputs,
         chosen_by_user=by_user,
         kinks=rough,
@@ -292,6 +286,8 @@ def _probed_structure(scene: Scene) -> Structure:
         times=t,
         coordinates=found.q,
         random=int(np.sum(generic)),
+        closure_slopes=found.G[generic][:4],
+        row_slopes=found.A[generic][:4],
     )
 
 

@@ -20,9 +20,10 @@ import numpy as np
 from jaxtyping import Array, Float, Num, PyTree
 
 from jourdain_jax.build.explicit_power import explicit_power
-from jourdain_jax.build.plausibility import PoseNumbers, numbers_of
+from jourdain_jax.build.plausibility import Numbers, numbers_of
 from jourdain_jax.calculus.reals import Entries, is_traced
 from jourdain_jax.equations.kinematics import inertias_of, motion_at, velocities_of
+from jourdain_jax.equations.listed import names_of_bodies, names_of_position_rows
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
 from jourdain_jax.equations.virtual_power import energies_at, impressed, potential_energy, resultants
 from jourdain_jax.program.graph import MOST_MULTIPLICATIONS, Graph, Unsupported
@@ -58,7 +59,7 @@ class VelocityQuantities(eqx.Module):
 class Particulars(eqx.Module):
     """What only probing looks at; arrays of numbers, or of nodes."""
 
-    numbers: PoseNumbers
+    numbers: Numbers
     potentials: Num[Entries, "loads"]  # of the loads; zero where a load has none
     explicit: dict[str, PyTree]  # rates in time of loads and potentials while the motion is held
 
@@ -203,8 +204,20 @@ def _inputs(graph: Graph, name: str, shape, varies: bool) -> np.ndarray:
 
 def named_values(scene: Scene, t, q, u, inputs) -> dict[str, np.ndarray]:
     """Values of the inputs of the scene's graph by name; states may have a leading axis."""
-    named = {f"p{k}_{i}": np.asarray(value) for k, leaf in enumerate(jax.tree.leaves(scene)) for i, value in enumerate(np.ravel(leaf))}
-    named["t_0"] = np.asarray(t)
+    named = {f"p{k}_{i}": value for k, leaf in enumerate(jax.tree.leaves(scene)) for i, value in enumerate(np.ravel(leaf))}
+    named["t_0"] = t
     for prefix, values in zip("qui", (q, u, inputs), strict=True):
         named |= {f"{prefix}_{i}": column for i, column in enumerate(np.moveaxis(np.asarray(values), -1, 0))}
-    return named
+    return {name: np.asarray(value, np.float64) for name, value in named.items()}  # whatever precision motions have
+
+
+def owned(scene: Scene, **fields: np.ndarray) -> dict[int, str]:
+    """Return node -> what it belongs to, in words, for nodes of some fields of `VelocityQuantities`; the first that has it counts."""
+    of_bodies = dict.fromkeys(("position", "orientation", "v", "omega"), "pose of") | {"mass": "mass of", "inertia": "inertia of"}
+    of_bodies |= {"force": "force on", "torque": "torque on"}
+    named = {field: [f"the {what} body `{name}`" for name in names_of_bodies(scene)] for field, what in of_bodies.items()}
+    named["direct"] = [f"the force along `{name}`" for name in scene.speed_names.entries]
+    named["qdot"] = [f"the rate of coordinate `{name}`" for name in scene.coordinate_names.entries]
+    named["closure"] = named["phi"] = [f"row `{name}`" for name in names_of_position_rows(scene)]
+    pairs = [pair for field, nodes in fields.items() for pair in zip(named[field], nodes, strict=False)]
+    return {node: owner for owner, nodes in reversed(pairs) for node in np.ravel(nodes).tolist()}

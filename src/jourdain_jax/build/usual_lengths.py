@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.probed_on_graph import generic_inputs
 from jourdain_jax.build.reference_parameters import with_reference_parameters
-from jourdain_jax.build.structure import TRACED, closure_lengths, structure_whatever_its_faults, usual_rows
+from jourdain_jax.build.structure import closure_lengths, structure_whatever_its_faults, trust, usual_rows
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.equations.kinematics import rates_by_own_speeds
 from jourdain_jax.equations.listed import names_of_position_rows
@@ -62,4 +62,4 @@ def _of_own_speeds(scene: Scene) -> Float[Array, "own_speeds"]:
     known, reference = structure_whatever_its_faults(scene), with_reference_parameters(scene)
     t, q = jnp.asarray(known.times), jnp.asarray(known.coordinates)
     lengths = jnp.nanmedian(jax.vmap(lambda t, q: jnp.linalg.norm(rates_by_own_speeds(reference, t, q), axis=1))(t, q), axis=0)
-    return jnp.where(lengths > 0, lengths, jnp.inf) / (TRACED if is_traced(scene) else 1.0)
+    return jnp.where(lengths > 0, lengths, jnp.inf) / trust(scene)

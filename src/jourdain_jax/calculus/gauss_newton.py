@@ -13,10 +13,12 @@ import numpy as np
 Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
-def nearest_root(look: Look, solve: Callable, x: np.ndarray, *, most: int = 25, longest: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
+def nearest_root(
+    look: Look, solve: Callable, x: np.ndarray, *, most: int = 25, longest: np.ndarray | float = np.inf, within: tuple = (-np.inf, np.inf)
+) -> tuple[np.ndarray, np.ndarray]:
     """Return x with g(x) = 0 near the given x, shape (states, unknowns), and the last corrections relative to 1 + |x|, infinite where they are no numbers.
 
-    `solve`: from G and g to the shortest d with G d = g. No step is longer than `longest` in an entry.
+    `solve`: from G and g to the shortest d with G d = g. No step is longer than `longest` in an entry, and none leads out of the bounds `within`.
     """
     x, last, moving = np.array(x, float), np.full(len(x), np.inf), np.arange(len(x))
     for _ in range(most):
@@ -26,7 +28,8 @@ def nearest_root(look: Look, solve: Callable, x: np.ndarray, *, most: int = 25, 
         moves = np.isfinite(size)
         last[moving[~moves]] = np.inf
         step, size, moving = step[moves], size[moves], moving[moves]
-        x[moving] -= step / np.maximum(1.0, size / longest)[:, None]
+        shorter = np.maximum(1.0, np.max(np.abs(step) / longest, axis=1, keepdims=True, initial=0.0))
+        x[moving] = np.clip(x[moving] - step / shorter, *within)
         last[moving] = size / (1 + np.max(np.abs(x[moving]), axis=1, initial=0.0))
         moving = moving[last[moving] > 4 * np.finfo(float).eps]
         if not moving.size:

@@ -75,6 +75,14 @@ def checked_real(value, what: str, shape: tuple[int, ...] | None = None, *, advi
     return as_real(array)
 
 
+def checked_positive(value, what: str, shape: tuple[int, ...] | None = (), *, advice: str = "give it in m") -> Array:
+    """As `checked_real`, with numbers above zero. ValueError where they are known not to be."""
+    found = checked_real(value, what, shape, advice=advice)
+    if not is_traced(found) and not np.all(np.asarray(found) > 0):
+        raise ValueError(f"{what} is {np.asarray(found).tolist()}, expected more than zero; {advice}")
+    return found
+
+
 def checked_known(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str = "check how it is put together") -> np.ndarray:
     """`value`, which is not traced, as a NumPy array of the default float, also inside `jit`. Arguments and errors: as of `checked_real`."""
     if type(value) is float and not shape:

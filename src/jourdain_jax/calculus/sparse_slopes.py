@@ -1,6 +1,6 @@
 """Derivatives of rows at many states by their entries; where many rows hold few coordinates each, as in a long chain, linear systems are sparse.
 
-    (G G' + damping) y = f,   x = G' y
+    G G' y = f,   x = G' y
 
 Dense matrices take a time that grows with the cube of the rows, sparse ones of a chain one that grows with the rows.
 """
@@ -55,15 +55,15 @@ class Pattern:
         d = 1 / np.where(lengths > 0, lengths, 1.0)
         scaled, right_scaled = d[:, self.rows] * values, d * right
         with np.errstate(invalid="ignore", over="ignore"):
-            found = self.transposed_times(scaled, self.solved(scaled, np.zeros(len(values)), right_scaled))
+            found = self.transposed_times(scaled, self.solved(scaled, right_scaled))
             left = _summed(self.rows, self.shape[0], scaled * found[:, self.columns]) - right_scaled
             others = ~(np.max(np.abs(left), axis=1) <= 1e-8 * np.max(np.abs(right_scaled), axis=1))
         if others.any():
             found[others] = shortest(self.dense(values[others]), right[others], typical)
         return found
 
-    def solved(self, values: np.ndarray, damping: np.ndarray, f: np.ndarray) -> np.ndarray:
-        """`(G G' + damping)^-1 f` at every state, all of them as one sparse system; NaN where it is singular, or no number."""
+    def solved(self, values: np.ndarray, f: np.ndarray) -> np.ndarray:
+        """`(G G')^-1 f` at every state, all of them as one sparse system; NaN where it is singular, or no number."""
         from scipy import sparse
         from scipy.sparse.linalg import splu
 
@@ -72,7 +72,7 @@ class Pattern:
         places = (states * rows + self.rows).ravel(), (states * columns + self.columns).ravel()
         G = sparse.csr_array((values[known].ravel(), places), shape=(states.size * rows, states.size * columns))
         with contextlib.suppress(RuntimeError):  # a pivot of zero
-            factors = splu((G @ G.T + sparse.diags_array(np.repeat(damping[known], rows))).tocsc())
+            factors = splu((G @ G.T).tocsc())
             found[known] = factors.solve(f[known].ravel()).reshape(-1, rows)
         return found
 

@@ -16,7 +16,7 @@ from types import CodeType, FunctionType, MethodType, ModuleType
 import jax
 import numpy as np
 
-from jourdain_jax.scene.names_read import spaces
+from jourdain_jax.scene.names_read import names_in, spaces
 from jourdain_jax.scene.scene import Scene
 
 
@@ -106,7 +106,7 @@ def _function(f: FunctionType, of) -> object:
     installed, name = is_installed(f.__globals__.get("__name__")), (f.__module__, f.__qualname__, f.__code__.co_qualname)
     if installed and is_installed(f.__module__) and "<locals>" not in f.__qualname__:
         return "function", name
-    attributes = _names_in(f.__code__)
+    attributes = sorted(names_in(f.__code__))
 
     def read(y: object, *outer: ModuleType) -> object:
         """What the code reads of what it names: of a module of the user, the attributes that the code names, too."""
@@ -118,10 +118,6 @@ def _function(f: FunctionType, of) -> object:
     if installed:
         return "function", name, around
     return "function", of(f.__code__), of(f.__defaults__), of(f.__kwdefaults__), around, named
-
-
-def _names_in(code: CodeType) -> tuple[str, ...]:
-    return tuple(sorted(set(code.co_names).union(*(_names_in(inner) for inner in code.co_consts if isinstance(inner, CodeType)))))
 
 
 def is_installed(name: str | None) -> bool:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from functools import reduce
-from operator import add, mul
 from types import ModuleType
 from typing import Any
 
@@ -13,13 +12,14 @@ import numpy as np
 from jourdain_jax.calculus.on_first_use import needed
 
 _FUNCTIONS = {
-    **{name: name for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sign", "floor", "sinc")},
+    **{name: name for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sign", "floor")},
     **{f"a{name}": f"arc{name}" for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
-    **{"Abs": "abs", "atan2": "arctan2", "ceiling": "ceil"},
+    **{"Abs": "abs", "atan2": "arctan2", "ceiling": "ceil", "Heaviside": "heaviside", "Not": "logical_not"},
+    **{"Equality": "equal", "Unequality": "not_equal", "StrictLessThan": "less", "LessThan": "less_equal"},
+    **{"StrictGreaterThan": "greater", "GreaterThan": "greater_equal"},
 }
-_RELATIONS = {"Equality": "equal", "Unequality": "not_equal", "StrictLessThan": "less", "LessThan": "less_equal"}
-_RELATIONS |= {"StrictGreaterThan": "greater", "GreaterThan": "greater_equal", "And": "logical_and", "Or": "logical_or", "Not": "logical_not"}
-_KNOWN = {*_FUNCTIONS, *_RELATIONS, "Add", "Mul", "Pow", "Min", "Max", "Heaviside", "Piecewise", "ExprCondPair", "erf", "BooleanTrue", "BooleanFalse"}
+_OF_MANY = {"Add": "add", "Mul": "multiply", "Min": "minimum", "Max": "maximum", "And": "logical_and", "Or": "logical_or"}
+_KNOWN = {*_FUNCTIONS, *_OF_MANY, "Pow", "Piecewise", "ExprCondPair", "sinc", "erf", "BooleanTrue", "BooleanFalse"}
 
 
 def sympy_package() -> Any:
@@ -88,26 +88,17 @@ def _value(expression, known: dict, on: ModuleType):
     if name == "Pow":
         return _power(expression, known, on)
     values = [_value(argument, known, on) for argument in expression.args]
-    if name in ("Add", "Mul"):
-        return reduce(add if name == "Add" else mul, values)
-    if name in ("Min", "Max"):
-        return reduce(on.minimum if name == "Min" else on.maximum, values)
+    if name in _OF_MANY:
+        return reduce(getattr(on, _OF_MANY[name]), values)
     if name == "ExprCondPair":
         return tuple(values)
     if name == "Piecewise":
-        otherwise = on.nan
-        for value, condition in reversed(values):
-            otherwise = on.where(condition, value, otherwise)
-        return otherwise
-    if name == "Heaviside":
-        return on.heaviside(*values)
+        return reduce(lambda otherwise, pair: on.where(pair[1], pair[0], otherwise), reversed(values), on.nan)
     if name == "sinc":
         return on.sinc(values[0] / on.pi)  # SymPy's is sin(x)/x
     if name == "erf":
         return jax.scipy.special.erf(values[0])
-    if name in ("And", "Or"):
-        return reduce(getattr(on, _RELATIONS[name]), values)
-    return getattr(on, _FUNCTIONS.get(name) or _RELATIONS[name])(*values)
+    return getattr(on, _FUNCTIONS[name])(*values)
 
 
 def _power(expression, known: dict, on: ModuleType):

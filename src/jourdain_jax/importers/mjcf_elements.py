@@ -3,7 +3,7 @@
 Source: the XML reference of MuJoCo's documentation, version 3.
 """
 
-from jourdain_jax.importers.xml_file import Element, Holds, XmlFile
+from jourdain_jax.importers.xml_file import Element, Holds, Part, XmlFile
 
 _PLACE = "pos quat axisangle xyaxes zaxis euler"
 _CONTACT = "contype conaffinity condim group priority friction solmix solref solimp margin gap user fitscale fluidcoef"
@@ -119,16 +119,16 @@ class Defaults:
                 raise self._file.fault(f"two `default` are of the class `{inner}`; give each a class of its own")
             self._read(element, inner, known)
 
-    def of(self, element: Element, childclass: str | None, what: str) -> dict[str, str]:
-        """The attributes of an element, completed by its class, or else by that of the bodies around it; checked."""
+    def of(self, element: Element, childclass: str | None, what: str) -> Part:
+        """The element with its attributes completed by its class, or else by that of the bodies around it; checked."""
         name = element.get("class") or childclass or "main"
         if name not in self._classes:
             raise self._file.fault(f"{what} is of the class `{name}`, which no `default` states")
         found = self._classes[name].get(element.tag, {}) | dict(element.attrib)
         self._file.check_attributes(element.tag, found, what)
-        return found
+        return Part(self._file, what, element, found)
 
 
-def attributes_of(file: XmlFile, tag: str) -> dict[str, str]:
-    """The attributes of all sections of a kind, the last counts."""
-    return {name: value for section in file.root.findall(tag) for name, value in section.attrib.items()}
+def all_of(file: XmlFile, path: str) -> Part:
+    """All sections at a path as one: of an attribute that several state the last counts."""
+    return Part(file, f"`{path.rpartition('/')[2]}`", None, {name: value for section in file.root.findall(path) for name, value in section.attrib.items()})

@@ -14,7 +14,7 @@ from jourdain_jax.importers.scene_class import scene_class
 from jourdain_jax.importers.tree import Follower, Joint, Link, Look, Mass, Tree
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.coordinates import Quaternion, coordinates, inputs, quaternion
-from jourdain_jax.scene.loads import Load, generalized_force
+from jourdain_jax.scene.loads import Load, generalized_force, gravity
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
@@ -47,7 +47,8 @@ class TreeScene(Scene):
 
     def loads(self, motion):
         """Gravity, and the springs, dampers and motors of the joints."""
-        found = list(self._weights(motion))
+        size = float(np.linalg.norm(self._tree.gravity))
+        found = [gravity(motion, self.gravity, self._tree.gravity / size)] if size else []
         for link in self._tree.links:
             for joint in link.joints:
                 found += self._of_joint(motion, joint)
@@ -106,14 +107,6 @@ class TreeScene(Scene):
     def _centre(self, link: Link):
         """Mass centre in the frame of the link, m."""
         return getattr(self, f"{self._names[link.name]}_mass_centre", np.zeros(3))
-
-    def _weights(self, motion):
-        size = float(np.linalg.norm(self._tree.gravity))
-        if size == 0:
-            return
-        g = self.gravity * (self._tree.gravity / size)
-        forces = {name: body.mass * g for name, body in motion.bodies.items()}
-        yield Load(forces=forces, potential=-sum(body.mass * (g @ body.position) for body in motion.bodies.values()))
 
     def _of_joint(self, motion, joint: Joint):
         name = self._names[joint.name]

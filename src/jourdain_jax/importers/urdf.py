@@ -12,12 +12,13 @@ import numpy as np
 from jourdain_jax.importers.placing import by_roll_pitch_yaw
 from jourdain_jax.importers.tree import Follower, Joint, Link, Look, Mass, Matrix, Motor, Tree, Vector
 from jourdain_jax.importers.tree_scene import tree_scene
-from jourdain_jax.importers.xml_file import Element, Holds, XmlFile
+from jourdain_jax.importers.xml_file import Holds, Part, XmlFile
 from jourdain_jax.scene.names import as_labels, nearest
 from jourdain_jax.scene.scene import Scene
 
 _KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free", "planar": "planar", "fixed": ""}
 _BASES = ("fixed", "planar", "free")
+_SHAPES = {"box": ("box", ()), "sphere": ("ball", ("radius",))} | {kind: (kind, ("radius", "length")) for kind in ("cylinder", "capsule")}
 # What elements may hold; all else is refused by name. Elements that are read are idle, or listed, where they move nothing.
 _TABLE = {
     "robot": Holds("name", many="link joint material", idle="version", listed="transmission gazebo sensor ros2_control mujoco"),
@@ -82,11 +83,7 @@ def from_urdf(
     file = XmlFile(path, _TABLE, "URDF", ignore)
     if base not in _BASES:
         raise ValueError(f"`base` is {base!r}, expected one of {', '.join(map(repr, _BASES))}")
-    links = file.named(file.root.findall("link"), "link")
-    joints = list(file.named(file.root.findall("joint"), "joint").values())
-    if not links:
-        raise file.fault("it has no links")
-    tree = _Reader(file, links, packages or {}).tree(joints, base, as_labels(motors), as_labels(free))
+    tree = _Reader(file, packages or {}).tree(base, as_labels(motors), as_labels(free))
     file.warn()
     return tree_scene(tree, file.source, file.ignore)
 
@@ -94,28 +91,28 @@ def from_urdf(
 class _Reader:
     """Reads the elements of one file."""
 
-    def __init__(self, file: XmlFile, links: dict[str, Element], packages: Mapping[str, str]):
-        self.file, self.links, self.packages = file, links, packages
-        self.colours = {m.get("name"): m for m in file.root.findall("material")}
+    def __init__(self, file: XmlFile, packages: Mapping[str, str]):
+        self.file, self.packages = file, packages
+        self.links, self.joints = file.named("link"), file.named("joint")
+        self.colours = {m.get("name"): Part(file, "a material", m) for m in file.root.findall("material")}
+        if not self.links:
+            raise file.fault("it has no links")
 
-    def tree(self, joints: list[Element], base: str, motors: tuple[str, ...], free: tuple[str, ...]) -> Tree:
+    def tree(self, base: str, motors: tuple[str, ...], free: tuple[str, ...]) -> Tree:
         """The whole mechanism."""
-        holder: dict[str, Element] = {}  # child -> its joint
-        for joint in joints:
-            name = self.file.name(joint, "joint")
-            child = self._end(joint, "child", name)
-            self._end(joint, "parent", name)
-            if child in holder:
-                raise self.file.fault(f"link `{child}` is the child of joints `{holder[child].get('name')}` and `{name}`; a link has one parent")
-            holder[child] = joint
-        roots = [name for name in self.links if name not in holder]
+        above: dict[str, tuple[str, str]] = {}  # link -> its joint and its parent
+        for name, joint in self.joints.items():
+            child, parent = (self._end(joint, which) for which in ("child", "parent"))
+            if child in above:
+                raise self.file.fault(f"link `{child}` is the child of joints `{above[child][0]}` and `{name}`; a link has one parent")
+            above[child] = name, parent
+        roots = [name for name in self.links if name not in above]
         if len(roots) != 1:
             found = f"links {', '.join(f'`{name}`' for name in roots)} have none" if roots else "there is a loop"
             raise self.file.fault(f"expected one link without a parent, the root; {found}")
-        links = [self._root(roots[0], base)]
+        links = [Link(roots[0], None, np.zeros(3), np.eye(3), () if base == "fixed" else (Joint("", base),), *self._content(self.links[roots[0]]))]
         for link in links:  # it grows
-            held = [name for name, joint in holder.items() if self._end(joint, "parent", "") == link.name]
-            links += [self._link(name, holder[name]) for name in held]
+            links += [self._link(name, joint, parent) for name, (joint, parent) in above.items() if parent == link.name]
         if len(links) < len(self.links):
             lost = next(name for name in self.links if name not in {link.name for link in links})
             raise self.file.fault(f"link `{lost}` hangs in a loop of joints; a URDF is a tree, close loops by `geometric_constraints` in a subclass")
@@ -123,140 +120,99 @@ class _Reader:
         for name in motors:
             if name not in names:
                 raise ValueError(f"`motors` names `{name}`, which is no joint of one coordinate; {nearest(name, names)}")
-        followers = tuple(self._follower(joint, names) for joint in joints if joint.find("mimic") is not None and joint.get("type") != "fixed")
+        mimics = {name: joint.child("mimic") for name, joint in self.joints.items() if joint.given.get("type") != "fixed" and joint.children("mimic")}
+        followers = tuple(self._follower(name, mimic, names) for name, mimic in mimics.items())
         pushed = tuple(Motor(f"{name}_motor", name) for name in motors)
         return Tree(self.file.root.get("name") or "Robot", tuple(links), np.array([0.0, 0.0, -9.81]), pushed, followers, free=free)
 
-    def _end(self, joint: Element, which: str, name: str) -> str:
-        found = joint.find(which)
-        link = None if found is None else found.get("link")
+    def _end(self, joint: Part, which: str) -> str:
+        link = joint.child(which).given.get("link")
         if link is None:
-            raise self.file.fault(f"joint `{name}` has no `{which}`; name a link")
+            raise self.file.fault(f"{joint.what} has no `{which}`; name a link")
         if link not in self.links:
-            raise self.file.fault(f"joint `{name}` has the {which} `{link}`, which is no link; {nearest(link, self.links)}")
+            raise self.file.fault(f"{joint.what} has the {which} `{link}`, which is no link; {nearest(link, self.links)}")
         return link
 
-    def _root(self, name: str, base: str) -> Link:
-        joints = () if base == "fixed" else (Joint("", base),)
-        return Link(name, None, np.zeros(3), np.eye(3), joints, *self._content(name))
-
-    def _link(self, name: str, joint: Element) -> Link:
-        label = joint.get("name") or ""
-        kind = joint.get("type")
+    def _link(self, name: str, label: str, parent: str) -> Link:
+        joint = self.joints[label]
+        kind = joint.given.get("type")
         if kind not in _KINDS:
-            raise self.file.fault(f"joint `{label}` is of the type `{kind}`; {nearest(str(kind), _KINDS)}")
-        position, turn = self._origin(joint, f"joint `{label}`")
-        moved = (self._joint(joint, label, _KINDS[kind], kind),) if _KINDS[kind] else ()
-        parent = self._end(joint, "parent", label)
-        return Link(name, parent, position, turn, moved, *self._content(name))
+            raise self.file.fault(f"{joint.what} is of the type `{kind}`; {nearest(str(kind), _KINDS)}")
+        moved = (self._joint(joint, label, kind),) if _KINDS[kind] else ()
+        return Link(name, parent, *_origin(joint), moved, *self._content(self.links[name]))
 
-    def _joint(self, joint: Element, name: str, kind: str, given: str) -> Joint:
-        stated = joint.find("axis")
-        axis = self.file.numbers(None if stated is None else stated.get("xyz"), 3, f"axis of joint `{name}`", [1.0, 0.0, 0.0])
-        if not np.any(axis):
-            raise self.file.fault(f"axis of joint `{name}` is zero, expected a direction")
-        dynamics = joint.find("dynamics")
-        damping = 0.0 if dynamics is None else self.file.number(dynamics.get("damping"), f"damping of joint `{name}`", 0.0)
-        if dynamics is not None and self.file.number(dynamics.get("friction"), f"friction of joint `{name}`", 0.0):
-            self.file.refuse("friction", f"the friction of joint `{name}`", "state a smooth torque in `loads` of a subclass")
-        limit = joint.find("limit") if given in ("revolute", "prismatic") else None
-        low, high = (0.0 if limit is None else self.file.number(limit.get(which), f"limit of joint `{name}`", 0.0) for which in ("lower", "upper"))
+    def _joint(self, joint: Part, name: str, kind: str) -> Joint:
+        dynamics, limit = joint.child("dynamics"), joint.child("limit")
+        damping = dynamics.number("damping", 0.0)
+        if dynamics.number("friction", 0.0):
+            self.file.refuse("friction", f"the friction of {joint.what}", "state a smooth torque in `loads` of a subclass")
         if damping < 0:
-            raise self.file.fault(f"damping of joint `{name}` is {damping:g}, expected a number >= 0")
-        return Joint(name, kind, axis / np.linalg.norm(axis), damping=damping, limits=(low, high) if low < high else None)
+            raise dynamics.fault("damping", f"{damping:g}, expected a number >= 0")
+        low, high = (limit.number(which, 0.0) for which in ("lower", "upper"))
+        limits = (low, high) if low < high and kind in ("revolute", "prismatic") else None
+        return Joint(name, _KINDS[kind], joint.child("axis").direction("xyz", [1.0, 0.0, 0.0]), damping=damping, limits=limits)
 
-    def _follower(self, joint: Element, names: list[str]) -> Follower:
-        mimic, name = joint.find("mimic"), joint.get("name") or ""
-        assert mimic is not None
-        leader = mimic.get("joint") or ""
+    def _follower(self, name: str, mimic: Part, names: list[str]) -> Follower:
+        leader = mimic.given.get("joint") or ""
         for end in (name, leader):
             if end not in names:
-                raise self.file.fault(f"`mimic` of joint `{name}`: `{end}` is no joint of one coordinate; {nearest(end, names)}")
+                raise self.file.fault(f"{mimic.what}: `{end}` is no joint of one coordinate; {nearest(end, names)}")
         if leader == name:
             raise self.file.fault(f"joint `{name}` mimics itself; expected another joint")
-        factor = self.file.number(mimic.get("multiplier"), f"multiplier of joint `{name}`", 1.0)
-        return Follower(name, leader, (self.file.number(mimic.get("offset"), f"offset of joint `{name}`", 0.0), factor))
+        return Follower(name, leader, (mimic.number("offset", 0.0), mimic.number("multiplier", 1.0)))
 
-    def _origin(self, element: Element, what: str) -> tuple[Vector, Matrix]:
-        origin = element.find("origin")
-        xyz, rpy = (None, None) if origin is None else (origin.get("xyz"), origin.get("rpy"))
-        zero = np.zeros(3)
-        return self.file.numbers(xyz, 3, f"xyz of {what}", zero), by_roll_pitch_yaw(self.file.numbers(rpy, 3, f"rpy of {what}", zero))
-
-    def _content(self, name: str) -> tuple[Mass | None, tuple[Look, ...]]:
+    def _content(self, link: Part) -> tuple[Mass | None, tuple[Look, ...]]:
         """Mass and shapes of a link."""
-        link = self.links[name]
-        looks = [self._look(visual, f"visual of link `{name}`") for visual in link.findall("visual")]
-        return self._mass(link, name), tuple(look for look in looks if look is not None)
+        looks = [self._look(Part(self.file, f"visual of {link.what}", visual)) for visual in link.children("visual")]
+        return self._mass(link), tuple(look for look in looks if look is not None)
 
-    def _mass(self, link: Element, name: str) -> Mass | None:
-        inertial = link.find("inertial")
-        if inertial is None:
+    def _mass(self, link: Part) -> Mass | None:
+        if not link.children("inertial"):
             return None
-        mass, inertia = inertial.find("mass"), inertial.find("inertia")
-        if mass is None or inertia is None:
-            raise self.file.fault(f"link `{name}` has an `inertial` without `{'mass' if mass is None else 'inertia'}`; give both")
-        m = self.file.number(mass.get("value"), f"mass of link `{name}`")
-        centre, turn = self._origin(inertial, f"`inertial` of link `{name}`")
-        xx, xy, xz, yy, yz, zz = (self.file.number(inertia.get(f"i{axes}"), f"i{axes} of link `{name}`") for axes in ("xx", "xy", "xz", "yy", "yz", "zz"))
-        matrix = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
-        if m == 0 and not np.any(matrix):
-            return None
-        if not m > 0:
-            raise self.file.fault(f"mass of link `{name}` is {m:g}, expected a number above zero")
-        return Mass(m, centre, matrix)
+        inertial = link.child("inertial")
+        for kind in ("mass", "inertia"):
+            if not inertial.children(kind):
+                raise self.file.fault(f"{link.what} has an `inertial` without `{kind}`; give both")
+        centre, turn = _origin(inertial)
+        xx, xy, xz, yy, yz, zz = (inertial.child("inertia").number(f"i{axes}") for axes in ("xx", "xy", "xz", "yy", "yz", "zz"))
+        return link.mass(inertial.child("mass").number("value"), centre, turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T)
 
-    def _look(self, visual: Element, what: str) -> Look | None:
-        geometry = visual.find("geometry")
-        if geometry is None or len(geometry) != 1:
-            raise self.file.fault(f"{what} has {'no shape' if not geometry else 'several shapes'} in its `geometry`, expected one")
-        (shape,) = geometry
-        position, turn = self._origin(visual, what)
-        colour, opacity = self._colour(visual)
+    def _look(self, visual: Part) -> Look | None:
+        geometry, material = visual.child("geometry"), visual.child("material")
+        shapes = [] if geometry.element is None else list(geometry.element)
+        if len(shapes) != 1:
+            raise self.file.fault(f"{visual.what} has {'several shapes' if shapes else 'no shape'} in its `geometry`, expected one")
+        if not material.children("color"):
+            material = self.colours.get(material.given.get("name"), material)
+        colour, opacity = material.child("color").colour()
+        kind, shape = shapes[0].tag, Part(self.file, geometry.what, shapes[0])
         if opacity == 0:
             return None
-        if shape.tag == "box":
-            return Look("box", tuple(self.file.numbers(shape.get("size"), 3, f"size of {what}")), position, turn, colour, opacity)
-        if shape.tag == "sphere":
-            return Look("ball", (self.file.number(shape.get("radius"), f"radius of {what}"),), position, turn, colour, opacity)
-        if shape.tag in ("cylinder", "capsule"):
-            size = tuple(self.file.number(shape.get(word), f"{word} of {what}") for word in ("radius", "length"))
-            return Look(shape.tag, size, position, turn, colour, opacity)
-        path = self._mesh_path(shape.get("filename"))
-        if path is None:
-            if shape.tag == "mesh":
-                self.file.leave_out(f"mesh {shape.get('filename')}")
+        path = None
+        if kind in _SHAPES:
+            look, words = _SHAPES[kind]
+            size = tuple(shape.numbers("size", 3)) if look == "box" else tuple(shape.number(word) for word in words)
+        elif (path := self._mesh_path(shape.given.get("filename"))) is not None:
+            look, size = "mesh", tuple(shape.numbers("scale", 3, [1.0] * 3))
+        else:
+            if kind == "mesh":
+                self.file.leave_out(f"mesh {shape.given.get('filename')}")
             return None
-        return Look("mesh", tuple(self.file.numbers(shape.get("scale"), 3, f"scale of {what}", [1.0] * 3)), position, turn, colour, opacity, str(path))
+        return Look(look, size, *_origin(visual), colour, opacity, path)
 
-    def _mesh_path(self, name: str | None) -> Path | None:
+    def _mesh_path(self, name: str | None) -> str | None:
         """The file of a mesh, if it is there."""
         if not name:
             return None
+        here = self.file.folder
+        folders, rest = [here], name.removeprefix("file://")
         if name.startswith("package://"):
             package, _, rest = name.removeprefix("package://").partition("/")
-            folders = (
-                [Path(self.packages[package])] if package in self.packages else [above / package for above in (self.file.folder, *self.file.folder.parents)]
-            )
-            folders += [above for above in self.file.folder.parents if above.name == package]
-        else:
-            folders, rest = [self.file.folder], name.removeprefix("file://")
-        return next((folder / rest for folder in folders if os.path.isfile(folder / rest)), None)
-
-    def _colour(self, visual: Element) -> tuple[str | None, float]:
-        material = visual.find("material")
-        if material is None:
-            return None, 1.0
-        colour = material.find("color")
-        if colour is None:
-            known = self.colours.get(material.get("name"))
-            colour = None if known is None else known.find("color")
-        if colour is None:
-            return None, 1.0
-        return colour_of(self.file.numbers(colour.get("rgba"), 4, "rgba of a material"))
+            folders = [Path(self.packages[package])] if package in self.packages else [above / package for above in (here, *here.parents)]
+            folders += [above for above in here.parents if above.name == package]
+        return next((str(folder / rest) for folder in folders if os.path.isfile(folder / rest)), None)
 
 
-def colour_of(rgba) -> tuple[str, float]:
-    """Colour and opacity as `jj.Visual` takes them."""
-    levels = [round(255 * min(max(x, 0.0), 1.0)) for x in rgba[:3]]
-    return "#{:02x}{:02x}{:02x}".format(*levels), min(max(float(rgba[3]), 0.0), 1.0)
+def _origin(part: Part) -> tuple[Vector, Matrix]:
+    origin = part.child("origin")
+    return origin.numbers("xyz", 3, np.zeros(3)), by_roll_pitch_yaw(origin.numbers("rpy", 3, np.zeros(3)))

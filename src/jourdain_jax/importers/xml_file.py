@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from jourdain_jax.calculus.reading import check_depth, number, parsed, read_bytes, shortened
 from jourdain_jax.calculus.reals import described
+from jourdain_jax.importers.tree import Mass, Matrix, Vector
 from jourdain_jax.scene.names import as_labels, nearest
 from jourdain_jax.scene.tracebacks import users_level
 
@@ -129,35 +130,79 @@ class XmlFile:
         """The error of this file."""
         return ValueError(f"{self.source}: {what}")
 
-    def name(self, element: Element, what: str) -> str:
-        """The name of an element that must have one."""
-        name = element.get("name")
-        if not name:
-            raise self.fault(f"a {what} has no `name`; give it one")
-        return name
+    def named(self, kind: str) -> "dict[str, Part]":
+        """The elements of a kind in the root, by their names; ValueError where one has none, or two have the same."""
+        found: dict[str, Part] = {}
+        for element in self.root.findall(kind):
+            name = element.get("name")
+            if not name:
+                raise self.fault(f"a {kind} has no `name`; give it one")
+            if name in found:
+                raise self.fault(f"two {kind}s are called `{name}`; give each a name of its own")
+            found[name] = Part(self, f"{kind} `{name}`", element)
+        return found
 
-    def numbers(self, text: str | None, count: int | None, what: str, default=None) -> Float[np.ndarray, "_"]:
+
+class Part:
+    """An element while it is read: its attributes and children, and what it is called in messages; None stands for an element that is not there."""
+
+    def __init__(self, file: XmlFile, what: str, element: Element | None, attributes: Mapping[str, str] | None = None):
+        """`attributes`: where they are not those of the element alone."""
+        self.file, self.what, self.element = file, what, element
+        self.given: Mapping[str, str] = attributes or ({} if element is None else element.attrib)
+
+    def __contains__(self, word: str) -> bool:
+        return word in self.given
+
+    def children(self, *kinds: str) -> list[Element]:
+        """The elements of some kinds in it."""
+        return [] if self.element is None else [child for child in self.element if child.tag in kinds]
+
+    def child(self, kind: str) -> "Part":
+        """The element of a kind in it."""
+        return Part(self.file, f"`{kind}` of {self.what}", next(iter(self.children(kind)), None))
+
+    def numbers(self, word: str, count: int | None, default=None) -> Float[np.ndarray, "_"]:
         """The numbers in an attribute, as many as `count` (None: any). `default` where there is no attribute; ValueError without one."""
+        text, what = self.given.get(word), f"{word} of {self.what}"
         if text is None:
             if default is None:
-                raise self.fault(f"{what} is missing")
+                raise self.file.fault(f"{what} is missing")
             return np.asarray(default, float)
-        found = np.array([number(word, f"{self.source}: {what}") for word in re.findall(r"[^ \t\r\n]+", text)], float)
+        found = np.array([number(x, f"{self.file.source}: {what}") for x in re.findall(r"[^ \t\r\n]+", text)], float)
         if len(found) != (count or max(1, len(found))):
-            raise self.fault(f"{what} is `{shortened(text)}`, expected {count or 'finite'} number{'' if count == 1 else 's'}")
+            raise self.file.fault(f"{what} is `{shortened(text)}`, expected {count or 'finite'} number{'' if count == 1 else 's'}")
         return found
 
-    def number(self, text: str | None, what: str, default: float | None = None) -> float:
+    def number(self, word: str, default: float | None = None) -> float:
         """The one number in an attribute."""
-        return float(self.numbers(text, 1, what, None if default is None else [default])[0])
+        return float(self.numbers(word, 1, None if default is None else [default])[0])
 
-    def named(self, elements: Iterable[Element], what: str) -> dict[str, Element]:
-        """Elements by their names; ValueError where two have one name."""
-        found: dict[str, Element] = {}
-        for element in elements:
-            if found.setdefault(self.name(element, what), element) is not element:
-                raise self.fault(f"two {what}s are called `{element.get('name')}`; give each a name of its own")
-        return found
+    def direction(self, word: str, default) -> Float[np.ndarray, "3"]:
+        """The unit vector along three numbers. ValueError where these are zero."""
+        along = self.numbers(word, 3, default)
+        if not np.any(along):
+            raise self.fault(word, "zero, expected a direction")
+        return along / np.linalg.norm(along)
+
+    def fault(self, word: str, what: str) -> ValueError:
+        """The error of an attribute that is not as it should be."""
+        return self.file.fault(f"{word} of {self.what} is {what}")
+
+    def mass(self, mass: float, centre: Vector, inertia: Matrix) -> Mass | None:
+        """What an element weighs; None where it states zeros. ValueError for other masses that are not positive."""
+        if mass == 0 and not np.any(inertia):
+            return None
+        if not mass > 0:
+            raise self.fault("mass", f"{mass:g}, expected a number above zero")
+        return Mass(mass, centre, inertia)
+
+    def colour(self) -> tuple[str | None, float]:
+        """Colour and opacity as `jj.Visual` takes them; those of a body where none is stated."""
+        if "rgba" not in self:
+            return None, 1.0
+        *levels, opacity = np.clip(self.numbers("rgba", 4), 0.0, 1.0)
+        return "#{:02x}{:02x}{:02x}".format(*(round(255 * x) for x in levels)), float(opacity)
 
 
 def _is_off(value: str, off: str) -> bool:

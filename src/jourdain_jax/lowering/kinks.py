@@ -8,8 +8,7 @@ import numpy as np
 from jourdain_jax.build.probed_on_graph import looked_at
 from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.build.structure import structure_whatever_its_faults
-from jourdain_jax.build.trace import TracedScene, named_values
-from jourdain_jax.equations.listed import names_of_bodies
+from jourdain_jax.build.trace import TracedScene, named_values, owned
 from jourdain_jax.lowering.relations import AGREE, branches, jumps, switches
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.evaluate import Probes
@@ -47,7 +46,7 @@ def bent_load(scene: Scene, t, q, u, inputs) -> str:
     # 1e-6 off a state, relative to entries larger than one
     step = np.diag(1e-6 * np.maximum(1.0, np.abs(at)))
     q, u, inputs = np.split(np.concatenate([at + step, at - step]), np.cumsum([np.size(q), np.size(u)]), axis=1)
-    beside = Probes(graph, {name: np.asarray(x, float) for name, x in named_values(scene, t, q, u, inputs).items()})
+    beside = Probes(graph, named_values(scene, t, q, u, inputs))
     size, bent = np.nanmax(np.abs(_probes(scene, traced)(loads)), axis=1), np.zeros(len(loads), bool)
     for number, nodes in numbers.items():
         if not beside.sign(number):
@@ -60,16 +59,9 @@ def _probes(scene: Scene, traced: TracedScene) -> Probes:
     """Return the states at which the structure of the scene was found, with random speeds and inputs."""
     known, generator = structure_whatever_its_faults(scene), np.random.default_rng(7)
     u, inputs = (generator.normal(size=(len(known.times), len(names))) for names in (scene.speed_names.entries, scene.inputs))
-    values = named_values(scene, known.times, known.coordinates, u, inputs)
-    return Probes(traced.graph, {name: np.asarray(x, float) for name, x in values.items()})
+    return Probes(traced.graph, named_values(scene, known.times, known.coordinates, u, inputs))
 
 
 def _loads(scene: Scene, traced: TracedScene) -> dict[int, str]:
     """Return the nodes of loads and masses, with the name of each."""
-    bodies, at = names_of_bodies(scene), traced.at
-    named = {f"the {what} body `{name}`": x for what, of in _OF_BODIES.items() for name, x in zip(bodies, getattr(at, of), strict=True)}
-    named |= {f"the force along `{name}`": x for name, x in zip(scene.speed_names.entries, at.direct, strict=True)}
-    return {n: name for name, nodes in reversed(named.items()) for n in np.ravel(nodes).tolist()}
-
-
-_OF_BODIES = {"force on": "force", "torque on": "torque", "mass of": "mass", "inertia of": "inertia"}
+    return owned(scene, **{name: getattr(traced.at, name) for name in ("force", "torque", "mass", "inertia", "direct")})

@@ -135,7 +135,7 @@ def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
     def probes(share) -> Probes:
         columns = [np.reshape(x + np.reshape(share, (-1, *[1] * x.ndim)) * dx, (len(t), -1)).T for x, dx in zip(given, away, strict=True)]
         parameters = {f"p{k}_{i}": column for k, of_leaf in enumerate(columns) for i, column in enumerate(of_leaf)}
-        return Probes(traced.graph, {name: np.asarray(value, np.float64) for name, value in (values | parameters).items()})  # whatever precision motions have
+        return Probes(traced.graph, values | {name: np.asarray(value, np.float64) for name, value in parameters.items()})
 
     share, possible, least = np.zeros(len(t)), False, _least_moments(traced, probes(np.zeros(len(t)))) / 2
     # shares of the usual differences from the values of parameters: the first with which these can be

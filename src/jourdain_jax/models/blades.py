@@ -138,7 +138,6 @@ class Snakeboard(Scene):
     domain = {"heading": (-3.2, 3.2), "rotor": (-3.2, 3.2), "steer": (-1.2, 1.2)}
     conventions = "z up; heading from x towards y; all angles positive counterclockwise seen from above."
     example = {"steer": 0.3, "steer_rate": 0.5, "x_rate": 1.0, "rotor_rate": 0.4}
-    example_span = 5.0
 
     def bodies(self, t, q):
         board = rot_z(q.heading)
@@ -207,7 +206,6 @@ class TrailerChain(Scene):
     inputs = inputs("drive turn")
     privileged = ("forward0", "turn0")
     conventions = "z up; headings from x towards y; x, y of the axle; hitch of a trailer on the axle of the body ahead."
-    example_span = 5.0
 
     def __check_init__(self):
         if not isinstance(self.trailers, int) or self.trailers < 0:

@@ -93,8 +93,7 @@ class TiltingDisc(Scene):
         return {"fallen": 1.5 - jnp.abs(motion.q.lean)}
 
 
-_LEAN, _YAW_RATE, _LEAN_RATE, _SPIN_RATE = 0.3, 0.5, 0.2, -3.0  # the example of `TiltingDisc`
-_FLAT = 45.0  # units of round-off of the squared angle to the ground (1e-7 rad in double precision): nearer the contact point is undefined
+_TILTED = TiltingDisc.example
 
 
 class TiltingDiscQuaternion(Scene):
@@ -115,12 +114,12 @@ class TiltingDiscQuaternion(Scene):
     domain = {"z": (0.05, 0.5), **{f"attitude_omega_{axis}": (-3.0, 3.0) for axis in "xyz"}}
     conventions = "z up; x, y, z of the centre; upright and heading along x at identity attitude; axle along body y."
     example = {
-        "y": -0.5 * math.sin(_LEAN),
-        "attitude_w": math.cos(_LEAN / 2),
-        "attitude_x": math.sin(_LEAN / 2),
-        "attitude_omega_x": _LEAN_RATE,
-        "attitude_omega_y": _SPIN_RATE + _YAW_RATE * math.sin(_LEAN),
-        "attitude_omega_z": _YAW_RATE * math.cos(_LEAN),
+        "y": -0.5 * math.sin(_TILTED["lean"]),
+        "attitude_w": math.cos(_TILTED["lean"] / 2),
+        "attitude_x": math.sin(_TILTED["lean"] / 2),
+        "attitude_omega_x": _TILTED["lean_rate"],
+        "attitude_omega_y": _TILTED["spin_rate"] + _TILTED["yaw_rate"] * math.sin(_TILTED["lean"]),
+        "attitude_omega_z": _TILTED["yaw_rate"] * math.cos(_TILTED["lean"]),
     }
     example_span = 10.0
 
@@ -136,4 +135,5 @@ class TiltingDiscQuaternion(Scene):
 
     def events(self, motion):
         axle = motion["disc"].orientation[:, 1]
-        return {"flat": axle[0] ** 2 + axle[1] ** 2 - _FLAT * jnp.finfo(axle.dtype).eps}
+        # 45 units of round-off of the squared angle to the ground (1e-7 rad in double precision): nearer the contact point is undefined
+        return {"flat": axle[0] ** 2 + axle[1] ** 2 - 45.0 * jnp.finfo(axle.dtype).eps}

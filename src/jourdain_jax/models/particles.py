@@ -41,7 +41,6 @@ class RosenbergParticle(_OnSheets):
 
     conventions = "Right-handed inertial frame without gravity; y counts in metres in the row zdot = y xdot."
     example = {"y": -1.0, "x_rate": 1.1 / 2**0.5, "y_rate": 0.8}
-    example_span = 5.0
 
     def velocity_constraints(self, motion):
         return {"sheet": motion.u.z_rate - motion.q.y * motion.u.x_rate}

@@ -23,8 +23,6 @@ class _DoublePendulum(Scene):
     length2: Scalar = parameter(0.8, unit="m", positive=True)
     gravity: Scalar = parameter(9.81, unit="m/s^2")
 
-    example_span = 5.0
-
     def loads(self, motion):
         return (gravity(motion, self.gravity),)
 
@@ -110,7 +108,6 @@ class SpringAndRod(Scene):
     coordinates = coordinates("x1 z1 x2 z2")
     domain = {"x2": (-1.5, 1.5), "z2": (-1.5, 1.5)}
     conventions = "x horizontal, z up; the spring's fixed end is the origin."
-    example_span = 5.0
 
     @property
     def example(self):

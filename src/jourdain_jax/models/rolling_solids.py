@@ -84,9 +84,6 @@ class BallOnTurntable(Scene):
         return jnp.concatenate([table.tangents, table.normal[None]])
 
 
-_HALF_TURN = (1.0, -1.0, -1.0)  # from axes with n3 down to the engine's, z up
-
-
 class Rattleback(Scene):
     """The rattleback (celt): an ellipsoid rolling without slip on a level plane, its inertia axes turned against its own axes.
 
@@ -134,7 +131,8 @@ class Rattleback(Scene):
 
     def bodies(self, t, q):
         level = jnp.stack([q.x, q.y])
-        turned = jnp.diag(jnp.array(_HALF_TURN)) @ rot_z(q.gamma) @ rot_x(q.alpha) @ rot_y(q.beta)
+        # half a turn: from axes with n3 down to the engine's, z up
+        turned = jnp.diag(jnp.array([1.0, -1.0, -1.0])) @ rot_z(q.gamma) @ rot_x(q.alpha) @ rot_y(q.beta)
         down = -turned[2]  # mu
         height = self.contact_arm(down) @ down
         return {"stone": RigidBody(self.mass, self._inertia(), jnp.append(level, height), turned)}

@@ -80,7 +80,6 @@ class WhippleBicycle(Scene):
         "yaw, lean, pitch. Positive: yaw left, lean right, pitch nose down, steer right, spins rolling forward."
     )
     example = {"rear_spin_rate": 15.0, "lean_rate": 0.2, "steer_rate": 0.0}
-    example_span = 5.0
 
     @classmethod
     def from_values(cls, values: Mapping[str, float | Array]) -> "WhippleBicycle":

@@ -8,7 +8,7 @@ Geometric rows are functions of a `Pose` and vanish; the engine differentiates t
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Number, Vector, checked_real, described, is_traced
+from jourdain_jax.calculus.reals import Number, Vector, checked_positive, checked_real, described
 from jourdain_jax.calculus.rotations import vee
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose
 
@@ -33,9 +33,7 @@ def rod(a: Vector, b: Vector, length: Number) -> Float[Array, ""]:
     To first order the excess length; its multiplier is the thrust (positive, N) in the rod. Smooth also where the points meet. Eq. (5).
     """
     apart = _point(b, "second point of a rod") - _point(a, "first point of a rod")
-    length = checked_real(length, "length of a rod", (), advice="give a positive number, m")
-    if not is_traced(length) and not length > 0:
-        raise ValueError(f"length of a rod is {length}, expected a positive number, m; to keep two points together use `jj.pin`")
+    length = checked_positive(length, "length of a rod", advice="give it in m; to keep two points together use `jj.pin`")
     return (apart @ apart - length**2) / (2 * length)
 
 

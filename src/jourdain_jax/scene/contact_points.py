@@ -17,8 +17,6 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.newton import newton_root
 from jourdain_jax.scene.grounds import Cylinder, Ground, Plane, Sphere, normal_at
 
-_TOWARDS_THE_SURFACE = 3  # steps along the gradient before Newton's method for the contact itself
-
 
 class Ball(eqx.Module):
     """A ball."""
@@ -123,7 +121,7 @@ def _by_newton(shape: Shape, ground: Ground) -> Touch:
 def _guess(shape: Shape, ground: Ground) -> Float[Array, "4"]:
     """The point of the body towards the ground, and the point of the surface near it: x and the gap."""
     x = point = shape.lowest(normal_at(ground, shape.centre))
-    for _ in range(_TOWARDS_THE_SURFACE):
+    for _ in range(3):  # steps along the gradient before Newton's method for the contact itself
         value, slope = jax.value_and_grad(ground.value)(x)
         x = x - value * slope / (slope @ slope)
     return jax.lax.stop_gradient(jnp.append(x, normal_at(ground, x) @ (point - x)))

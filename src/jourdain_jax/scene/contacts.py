@@ -5,17 +5,16 @@ is zero). With `height="coordinates"` the coordinates keep the contact point on 
 found from Newton's equations (row S1) instead of from a multiplier. Nothing hinders spin about the normal.
 """
 
-from collections.abc import Iterable
-from typing import get_args
+from collections.abc import Callable, Iterable
+from typing import TypedDict, Unpack, get_args
 
 import equinox as eqx
-import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import checked_real, described, is_traced
+from jourdain_jax.calculus.reals import Vector, checked_positive, checked_real, described
 from jourdain_jax.scene.bodies import RigidBody, _axis_index
 from jourdain_jax.scene.contact_points import Ball, Ellipsoid, Shape, Wheel, touch
-from jourdain_jax.scene.grounds import Cylinder, Ground, Plane, Sphere, positive_length
+from jourdain_jax.scene.grounds import Ground, Plane
 from jourdain_jax.scene.motion_state import BodyPose
 
 _HEIGHTS = ("coordinates", "row")
@@ -71,115 +70,93 @@ class Contact(eqx.Module):
         return self.plane.height_of(self.point) if self.distance is None else self.distance
 
 
-def ball_contact(
-    body: BodyPose, radius, *, centre=None, ground: Ground | None = None, height: str = "coordinates", carried: tuple[str, ...] | None = None
-) -> Contact:
+class Rolling(TypedDict, total=False):
+    """What all rolling bodies may state."""
+
+    centre: Vector | None  # m, body frame, of what rolls
+    ground: Ground | None
+    height: str
+    carried: tuple[str, ...] | None
+
+
+def ball_contact(body: BodyPose, radius, **options: Unpack[Rolling]) -> Contact:
     """Rolling of a ball on a ground, without slip; the contact point is `c - a n`.
 
-    - `body`: `pose["name"]`; `radius` a in m. `centre` c (3,) of the ball in m, body frame (default: the mass centre).
+    - `body`: `pose["name"]`; `radius` a in m. The `options`, here and of the other contacts, are
+    - `centre`: c (3,) of what rolls in m, body frame (default: the mass centre).
     - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest).
     - `height`: "coordinates" where they keep the body on the ground by themselves, "row" for a geometric row.
     - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all), for the normal force where
       `height="coordinates"`.
 
-    Two velocity rows (m/s), along the ground's tangents. ValueError for an unknown height, or a ball that does not fit into the cylinder or sphere.
+    Two velocity rows (m/s), along the ground's tangents. ValueError for an unknown height or a length that is not positive; for a ball that does
+    not fit into the cylinder or sphere, where its scene is built.
     """
-    ground = _checked(body, ground, height)
-    radius = positive_length(radius, f"radius of the contact of `{body.name}`")
-    _room(body, ground, radius, "radius")
-    return _rolling(body, Ball(_centre(body, centre), radius), ground, height, carried)
+    return rolling(body, lambda centre: Ball(centre, _radius(body, radius)), **options)
 
 
-def ellipsoid_contact(
-    body: BodyPose, semi_axes, *, centre=None, ground: Ground | None = None, height: str = "coordinates", carried: tuple[str, ...] | None = None
-) -> Contact:
+def ellipsoid_contact(body: BodyPose, semi_axes, **options: Unpack[Rolling]) -> Contact:
     """Rolling of an ellipsoid on a ground, without slip; the contact point is `c - R S n'/sqrt(n'.S n')`, `n' = R' n`, `S = diag(a^2, b^2, c^2)`.
 
-    - `body`: `pose["name"]`; `semi_axes` (a, b, c) in m, along the axes of its body frame. `centre` (3,) of the ellipsoid in m, body frame (default: the
-      mass centre).
-    - `ground`, `height`, `carried`: as in `ball_contact`.
+    - `body`: `pose["name"]`; `semi_axes` (a, b, c) in m, along the axes of its body frame. `options`: as in `ball_contact`.
 
     Two velocity rows (m/s), along the ground's tangents; ValueError for an unknown height. On all but planes the point is found by Newton's method.
     """
-    ground = _checked(body, ground, height)
-    semi_axes = checked_real(semi_axes, f"semi-axes of the contact of `{body.name}`", (3,), advice="give three lengths, m")
-    if not is_traced(semi_axes) and not np.all(np.asarray(semi_axes) > 0):
-        raise ValueError(f"semi-axes of the contact of `{body.name}` are {np.asarray(semi_axes).tolist()} m, expected positive numbers; give three lengths")
-    return _rolling(body, Ellipsoid(_centre(body, centre), body.orientation, semi_axes), ground, height, carried)
+
+    def ellipsoid(centre) -> Ellipsoid:
+        lengths = checked_positive(semi_axes, f"semi-axes of the contact of `{body.name}`", (3,), advice="give three lengths, m")
+        return Ellipsoid(centre, body.orientation, lengths)
+
+    return rolling(body, ellipsoid, **options)
 
 
-def disc_contact(
-    body: BodyPose, radius, *, axis: str = "y", centre=None, ground: Ground | None = None, height: str = "coordinates", carried: tuple[str, ...] | None = None
-) -> Contact:
+def disc_contact(body: BodyPose, radius, *, axis: str = "y", **options: Unpack[Rolling]) -> Contact:
     """Rolling of the edge of a thin disc on a ground, without slip.
 
     The contact is the lowest point of the circle, `c - a (n - (n.k) k)/|n - (n.k) k|` with the ground's normal n and disc axis k. Undefined for
     a disc lying flat.
 
-    - `body`: `pose["name"]`; `radius` a in m; `axis`: the body axis k, "x", "y" or "z". `centre` c (3,) in m, body frame (default: the mass centre).
-    - `ground`, `height`, `carried`: as in `ball_contact`.
+    - `body`: `pose["name"]`; `radius` a in m; `axis`: the body axis k, "x", "y" or "z". `options`: as in `ball_contact`.
 
     Two velocity rows (m/s), along the ground's tangents; ValueError for an unknown axis or height. On a plane and a sphere the point is in closed form.
     """
-    return _wheel(body, radius, None, axis, centre, _checked(body, ground, height), height, carried)
+    return rolling(body, lambda centre: Wheel(centre, body.orientation[:, _axis_index(axis)], _radius(body, radius), None), **options)
 
 
-def wheel_contact(
-    body: BodyPose,
-    radius,
-    tyre,
-    *,
-    axis: str = "y",
-    centre=None,
-    ground: Ground | None = None,
-    height: str = "coordinates",
-    carried: tuple[str, ...] | None = None,
-) -> Contact:
+def wheel_contact(body: BodyPose, radius, tyre, *, axis: str = "y", **options: Unpack[Rolling]) -> Contact:
     """Rolling of a wheel with a tyre of circular section (a torus) on a ground, without slip.
 
     The contact is the wheel's outermost point along `-n`: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n`, with the ground's normal n, the axle k. R is
     the wheel's outer radius, R - r that of the circle within the tyre; a tyre of r = 0 makes a `disc_contact`. Undefined for a wheel lying flat.
 
-    - `body`: `pose["name"]`; `radius` R and `tyre` r in m, `0 <= r < R`; `axis`: the body axis k, "x", "y" or "z". `centre` c (3,) in m, body frame
-      (default: the mass centre).
-    - `ground`, `height`, `carried`: as in `ball_contact`.
+    - `body`: `pose["name"]`; `radius` R and `tyre` r in m, `0 <= r < R`; `axis`: the body axis k, "x", "y" or "z". `options`: as in
+      `ball_contact`.
 
     Two velocity rows (m/s), along the ground's tangents; ValueError for an unknown axis or height. On a plane and a sphere the point is in closed form.
     """
     tyre = checked_real(tyre, "tyre of a wheel's contact", ())
-    return _wheel(body, radius, tyre, axis, centre, _checked(body, ground, height), height, carried)
+    return rolling(body, lambda centre: Wheel(centre, body.orientation[:, _axis_index(axis)], _radius(body, radius), tyre), **options)
 
 
-def _wheel(body, radius, tyre, axis, centre, ground, height, carried) -> Contact:
-    radius = positive_length(radius, f"radius of the contact of `{body.name}`")
-    if tyre is not None and not is_traced(radius, tyre) and not 0 <= float(tyre) < float(radius):
-        advice = "give the radius of its section, smaller than that of the wheel"
-        raise ValueError(f"tyre of the contact of `{body.name}` is {float(tyre):.4g} m at a wheel of {float(radius):.4g} m, expected 0 <= r < R; {advice}")
-    if tyre is not None:
-        _room(body, ground, tyre, "tyre")
-    return _rolling(body, Wheel(_centre(body, centre), body.orientation[:, _axis_index(axis)], radius, tyre), ground, height, carried)
+def _radius(body: BodyPose, radius) -> Float[Array, ""]:
+    return checked_positive(radius, f"radius of the contact of `{body.name}`")
 
 
-def _rolling(body: BodyPose, shape: Shape, ground: Ground, height: str, carried) -> Contact:
-    found = touch(shape, ground)
-    return Contact(body, found.point, found.plane, height, carried, found.gap, shape=shape, ground=ground)
-
-
-def _centre(body: BodyPose, centre) -> Float[Array, "3"]:
-    """The centre of what rolls (m, inertial frame)."""
-    if centre is None:
-        return body.position
-    return body.place(checked_real(centre, f"centre of the contact of `{body.name}`", (3,), advice="give three components in its body frame, m"))
-
-
-def _checked(body, ground, height: str) -> Ground:
-    """The ground of the contact of a body that can roll; a ValueError otherwise."""
+def rolling(
+    body: BodyPose, shape: Callable[[Array], Shape], *, centre=None, ground: Ground | None = None, height: str = "coordinates", carried=None
+) -> Contact:
+    """The contact of what rolls, whose shape is a function of its centre (m, inertial frame); the other arguments: as in `ball_contact`."""
     _checked_height(height)
     if not isinstance(body, BodyPose):
         raise ValueError(f'the body of a contact is {described(body)}, expected the pose of a body; write pose["name"]')
     if not isinstance(body.body, RigidBody):
         raise ValueError(f"body `{body.name}` of a contact is a particle, which cannot roll; make it a `jj.RigidBody`")
-    return Plane() if ground is None else _checked_ground(ground, body.name)
+    ground, at = Plane() if ground is None else _checked_ground(ground, body.name), body.position
+    if centre is not None:
+        at = body.place(checked_real(centre, f"centre of the contact of `{body.name}`", (3,), advice="give three components in its body frame, m"))
+    rolls = shape(at)
+    found = touch(rolls, ground)
+    return Contact(body, found.point, found.plane, height, carried, found.gap, shape=rolls, ground=ground)
 
 
 def _checked_ground(given, body: str) -> Ground:
@@ -187,16 +164,6 @@ def _checked_ground(given, body: str) -> Ground:
         known = "`jj.Plane(...)`, `jj.Cylinder`, `jj.Sphere`, `jj.Surface` or `jj.HeightMap`"
         raise ValueError(f"`ground` of the contact of `{body}` is {described(given)}, expected a {known}, or None for z = 0 at rest")
     return given
-
-
-def _room(body: BodyPose, ground: Ground, radius, what: str) -> None:
-    """A ValueError where it is known that a hollow is too narrow; otherwise the contact is NaN there, which is said when a scene is probed."""
-    if not isinstance(ground, Cylinder | Sphere) or ground.side == "outside" or is_traced(radius, ground.radius):
-        return
-    if not float(radius) < float(ground.radius):
-        kind, size = type(ground).__name__.lower(), float(ground.radius)
-        advice = "take a smaller one, or roll on the outside"
-        raise ValueError(f"{what} of the contact of `{body.name}` is {float(radius):.4g} m inside a {kind} of {size:.4g} m, expected a smaller one; {advice}")
 
 
 def _checked_height(height: str) -> str:

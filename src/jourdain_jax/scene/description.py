@@ -7,7 +7,6 @@ import difflib
 import inspect
 from dataclasses import fields
 from functools import lru_cache
-from types import CodeType
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ import numpy as np
 from jourdain_jax.calculus.reals import described, has_unit, is_traced
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import as_names, nearest
+from jourdain_jax.scene.names_read import functions_in, names_in
 
 METHODS = (
     "bodies",
@@ -40,7 +40,6 @@ _MEANT = {  # what other programs and textbooks call them
     "holonomic_constraints": "geometric_constraints",
     "position_constraints": "geometric_constraints",
 }
-_ALIKE = 0.85  # of two names: `load` and `loads` are, `contact_arm` and `contacts` are not
 
 
 def check_description(scene, base: Any) -> None:
@@ -88,7 +87,7 @@ def checked_arguments(kind: type, given: dict) -> None:
 def _misspelt(kind: type, base: type) -> str:
     """What is wrong with the names of a class's methods, attributes and fields, in words; empty where nothing is."""
     own, owners = {field.name for field in fields(kind)}, [owner for owner in kind.__mro__ if owner not in base.__mro__]
-    read = {name for owner in owners for member in vars(owner).values() for name in _read_in(member)}
+    read = {name for owner in owners for member in vars(owner).values() for f in functions_in(member) for name in names_in(f.__code__)}
     for owner in owners:
         annotated = inspect.get_annotations(owner)
         for name, member in vars(owner).items():
@@ -102,7 +101,8 @@ def _misspelt(kind: type, base: type) -> str:
                 continue
             callable_ = callable(member) or isinstance(member, property)
             near = [_MEANT[name]] if callable_ and name in _MEANT else []
-            near = near or difflib.get_close_matches(name, (*METHODS, *ATTRIBUTES) if callable_ else ATTRIBUTES, n=1, cutoff=_ALIKE)
+            # `load` and `loads` are as near as that, `contact_arm` and `contacts` are not
+            near = near or difflib.get_close_matches(name, (*METHODS, *ATTRIBUTES) if callable_ else ATTRIBUTES, n=1, cutoff=0.85)
             if near and not any(name in vars(one) and near[0] in vars(one) for one in kind.__mro__):  # beside the real one it is a helper
                 what = "a method" if callable_ else "an attribute"
                 return (
@@ -110,13 +110,6 @@ def _misspelt(kind: type, base: type) -> str:
                     f"Rename it, or begin its name with an underscore (`_{name}`) if it is your own"
                 )
     return ""
-
-
-def _read_in(member) -> set[str]:
-    """Names that a method or property reads, functions within it included."""
-    function: Any = member.fget if isinstance(member, property) else member
-    code = function if isinstance(function, CodeType) else getattr(inspect.unwrap(function), "__code__", None)
-    return set() if code is None else {*code.co_names, *(name for inner in code.co_consts if isinstance(inner, CodeType) for name in _read_in(inner))}
 
 
 def _check_counts(scene) -> None:

@@ -7,22 +7,51 @@ A moving ground states its motion twice: its shape as a function of time, and `v
 moves within the ground itself (a belt, a turntable). Along the normal both must agree, which is checked when a scene is probed.
 """
 
+from abc import abstractmethod
 from collections.abc import Callable
+from typing import TypedDict, Unpack
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Vector, as_real, checked_real, described, is_traced
+from jourdain_jax.calculus.reals import Vector, as_real, checked_positive, checked_real, described, is_traced
 from jourdain_jax.calculus.rotations import rot_y
 
-_SIDES = ("inside", "outside")
-_UNIT = 1e-4  # a typed unit vector may have a few digits; a mistake is larger
+
+class RigidMotion(TypedDict, total=False):
+    """How a ground lies and moves; all zero where nothing is said."""
+
+    origin: Vector  # m
+    velocity: Vector  # m/s, of the material point at the origin
+    angular_velocity: Vector  # rad/s
 
 
-class Plane(eqx.Module):
+class _Ground(eqx.Module):
+    """Where a ground lies, and how it moves."""
+
+    origin: Float[Array, "3"]  # m
+    velocity: Float[Array, "3"]  # m/s, of the point at the origin
+    angular_velocity: Float[Array, "3"]  # rad/s
+
+    def velocity_at(self, position: Vector) -> Float[Array, "3"]:
+        """Velocity (m/s, inertial frame) of the ground's material point at `position` (m, inertial frame)."""
+        return self.velocity + jnp.cross(self.angular_velocity, as_real(position) - self.origin)
+
+    def _moves(self, what: str, origin=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)) -> None:
+        """Take the motion, checked."""
+        self.origin = checked_real(origin, f"origin of {what}", (3,))
+        self.velocity = checked_real(velocity, f"velocity of {what}", (3,))
+        self.angular_velocity = checked_real(angular_velocity, f"angular velocity of {what}", (3,))
+
+    def _tangent(self, origin, normal, tangents) -> "Plane":
+        """A plane of known axes that moves with the ground."""
+        parts = lambda p: (p.origin, p.normal, p.tangents, p.velocity, p.angular_velocity)  # noqa: E731
+        return eqx.tree_at(parts, Plane(), (origin, normal, tangents, self.velocity_at(origin), self.angular_velocity))
+
+
+class Plane(_Ground):
     """A plane through `origin` (m), at rest or in rigid motion: velocity of its point at p is `velocity + angular_velocity x (p - origin)`.
 
     `Plane(origin, tilt, velocity, angular_velocity)`: the plane z = 0, turned by `tilt`: an angle (rad) about the y axis, so that positive tilt
@@ -34,14 +63,11 @@ class Plane(eqx.Module):
 
     A moving plane states its motion twice: `origin` and `tilt` or `normal` as functions of time, and `velocity` and `angular_velocity`, their rates and
     what moves within the plane itself (a belt, a turntable). Along the normal both must agree, which is checked when a scene is probed.
-    ValueError: a normal that is no unit vector, an `along` that is normal to the plane, or both `tilt` and `normal`.
+    ValueError: an `along` that is normal to the plane, or both `tilt` and `normal`; a normal that is no unit vector, where its scene is built.
     """
 
-    origin: Float[Array, "3"]  # m
     normal: Float[Array, "3"]  # unit vector, out of the ground
     tangents: Float[Array, "2 3"]  # unit vectors along the no-slip rows
-    velocity: Float[Array, "3"]  # m/s, of the point at the origin
-    angular_velocity: Float[Array, "3"]  # rad/s
 
     def __init__(self, origin=(0.0, 0.0, 0.0), tilt=None, velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0), *, normal=None, along=None):
         """The plane z = 0, turned by `tilt` (rad, about y; or a rotation matrix); or the one with this `normal`, and its first tangent `along`."""
@@ -51,19 +77,15 @@ class Plane(eqx.Module):
             axes = _turned(0.0 if tilt is None else tilt)
             self.normal, tangents = axes[:, 2], axes[:, :2].T
         else:
-            self.normal = unit_vector(normal, "normal of a plane")
+            self.normal = checked_real(normal, "normal of a plane", (3,), advice="give a unit vector")
             tangents = tangents_of(self.normal)
         self.tangents = tangents if along is None else _tangents_along(self.normal, along)
-        self.origin, self.velocity, self.angular_velocity = _rigid_motion("a plane", origin, velocity, angular_velocity)
+        self._moves("a plane", origin, velocity, angular_velocity)
 
     @property
     def axes(self) -> Float[Array, "3 3"]:
         """Rotation matrix whose columns are the two tangents and the normal: from components in the plane to those in the inertial frame."""
         return jnp.concatenate([self.tangents, self.normal[None]]).T
-
-    def velocity_at(self, position: Vector) -> Float[Array, "3"]:
-        """Velocity (m/s, inertial frame) of the plane's material point at `position` (m, inertial frame)."""
-        return self.velocity + jnp.cross(self.angular_velocity, as_real(position) - self.origin)
 
     def height_of(self, position: Vector) -> Float[Array, ""]:
         """Signed distance (m) of the point at `position` (m, inertial frame) from the plane, positive along the normal."""
@@ -79,80 +101,85 @@ class Plane(eqx.Module):
         return self
 
 
-class Cylinder(eqx.Module):
+class _Round(_Ground):
+    """A ground at one distance from an axis or a centre."""
+
+    radius: Float[Array, ""]  # m
+    side: str = eqx.field(static=True)  # "inside" or "outside"
+
+    @abstractmethod
+    def arm_to(self, point: Vector) -> Float[Array, "3"]:
+        """The vector from the nearest point of the axis, or the centre, to the `point` (m, inertial frame)."""
+
+    @abstractmethod
+    def _tangents(self, normal: Float[Array, "3"]) -> Float[Array, "2 3"]:
+        """Unit vectors along the no-slip rows."""
+
+    def _is(self, what: str, radius, side: str, motion: RigidMotion) -> None:
+        """Take radius, side and motion, checked."""
+        if side not in ("inside", "outside"):
+            raise ValueError(f"side `{side}` is unknown; expected `inside` or `outside`, where the bodies are")
+        self.radius, self.side = checked_positive(radius, f"radius of {what}"), side
+        self._moves(what, **motion)
+
+    def value(self, point: Vector) -> Float[Array, ""]:
+        """f (m) at a `point` (m, inertial frame): half of the difference of squared distance and squared radius, over the radius."""
+        arm = self.arm_to(point)
+        outward = (arm @ arm - self.radius**2) / (2 * self.radius)
+        return -outward if self.side == "inside" else outward
+
+    def plane_at(self, point: Vector) -> Plane:
+        """The tangent plane where the ground is nearest to the `point` (m, inertial frame)."""
+        arm = self.arm_to(point)
+        out = arm / jnp.sqrt(arm @ arm)
+        normal = -out if self.side == "inside" else out
+        return self._tangent(as_real(point) - arm + self.radius * out, normal, self._tangents(normal))
+
+
+class Cylinder(_Round):
     """A circular cylinder of the given `radius` (m) about the line through `origin` (m) along the unit vector `axis`.
 
     `side`: "inside" or "outside", where the bodies are. `velocity` (m/s) of its material point at the origin, `angular_velocity` (rad/s): a drum that
     turns has `angular_velocity = rate * axis`. All vectors in the inertial frame. The no-slip rows are along the axis and around it.
-    ValueError: an axis that is no unit vector, a radius that is not positive, an unknown side.
+    ValueError: a radius that is not positive, an unknown side; an axis that is no unit vector, where its scene is built.
     """
 
-    radius: Float[Array, ""]  # m
-    origin: Float[Array, "3"]  # m
     axis: Float[Array, "3"]  # unit vector
-    side: str = eqx.field(static=True)  # "inside" or "outside"
-    velocity: Float[Array, "3"]  # m/s, of the point at the origin
-    angular_velocity: Float[Array, "3"]  # rad/s
 
-    def __init__(self, radius, axis, *, side: str, origin=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)):
-        """A cylinder of `radius` (m) about the line through `origin` along the unit vector `axis`, touched from its `side`."""
-        self.radius, self.side = positive_length(radius, "radius of a cylinder"), _checked_side(side)
-        self.axis = unit_vector(axis, "axis of a cylinder")
-        self.origin, self.velocity, self.angular_velocity = _rigid_motion("a cylinder", origin, velocity, angular_velocity)
+    def __init__(self, radius, axis, *, side: str, **motion: Unpack[RigidMotion]):
+        """A cylinder of `radius` (m) about the line through `origin` along the unit vector `axis`, touched from its `side`; `motion`: of the ground."""
+        self._is("a cylinder", radius, side, motion)
+        self.axis = checked_real(axis, "axis of a cylinder", (3,), advice="give a unit vector")
 
     def arm_to(self, point: Vector) -> Float[Array, "3"]:
         """The vector from the nearest point of the axis to the `point` (m, inertial frame)."""
         arm = as_real(point) - self.origin
         return arm - (arm @ self.axis) * self.axis
 
-    def value(self, point: Vector) -> Float[Array, ""]:
-        """f (m) at a `point` (m, inertial frame): half of the difference of squared distance and squared radius, over the radius."""
-        return _round_value(self, self.arm_to(point))
-
-    def plane_at(self, point: Vector) -> Plane:
-        """The tangent plane where the cylinder is nearest to the `point` (m, inertial frame)."""
-        arm = self.arm_to(point)
-        out = arm / jnp.sqrt(arm @ arm)
-        normal = -out if self.side == "inside" else out
-        around = jnp.cross(normal, self.axis)
-        return _tangent_plane(self, as_real(point) - arm + self.radius * out, normal, jnp.stack([self.axis, around]))
+    def _tangents(self, normal: Float[Array, "3"]) -> Float[Array, "2 3"]:
+        return jnp.stack([self.axis, jnp.cross(normal, self.axis)])
 
 
-class Sphere(eqx.Module):
+class Sphere(_Round):
     """A sphere of the given `radius` (m) about `origin` (m), touched from `side`: "inside" (a bowl) or "outside".
 
     `velocity` (m/s) of its material point at the origin, `angular_velocity` (rad/s). All vectors in the inertial frame.
     ValueError: a radius that is not positive, an unknown side.
     """
 
-    radius: Float[Array, ""]  # m
-    origin: Float[Array, "3"]  # m
-    side: str = eqx.field(static=True)  # "inside" or "outside"
-    velocity: Float[Array, "3"]  # m/s, of the point at the origin
-    angular_velocity: Float[Array, "3"]  # rad/s
-
-    def __init__(self, radius, *, side: str, origin=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)):
-        """A sphere of `radius` (m) about `origin` (m), touched from its `side`."""
-        self.radius, self.side = positive_length(radius, "radius of a sphere"), _checked_side(side)
-        self.origin, self.velocity, self.angular_velocity = _rigid_motion("a sphere", origin, velocity, angular_velocity)
+    def __init__(self, radius, *, side: str, **motion: Unpack[RigidMotion]):
+        """A sphere of `radius` (m) about `origin` (m), touched from its `side`; `motion`: of the ground."""
+        self._is("a sphere", radius, side, motion)
 
     def arm_to(self, point: Vector) -> Float[Array, "3"]:
         """The vector from the sphere's centre to the `point` (m, inertial frame)."""
         return as_real(point) - self.origin
 
-    def value(self, point: Vector) -> Float[Array, ""]:
-        """f (m) at a `point` (m, inertial frame): half of the difference of squared distance and squared radius, over the radius."""
-        return _round_value(self, self.arm_to(point))
-
-    def plane_at(self, point: Vector) -> Plane:
-        """The tangent plane where the sphere is nearest to the `point` (m, inertial frame)."""
-        arm = self.arm_to(point)
-        out = arm / jnp.sqrt(arm @ arm)
-        normal = -out if self.side == "inside" else out
-        return _tangent_plane(self, self.origin + self.radius * out, normal, tangents_of(normal))
+    def _tangents(self, normal: Float[Array, "3"]) -> Float[Array, "2 3"]:
+        return tangents_of(normal)
 
 
-class Surface(eqx.Module):
+class Surface(_Ground):
     """The smooth surface `f(x, y, z) = 0`; f is positive on the side of the bodies.
 
     `f`: a function of three numbers (m, inertial frame) to one, twice differentiable by JAX, with a gradient that does not vanish where it is touched;
@@ -161,14 +188,11 @@ class Surface(eqx.Module):
     """
 
     f: Callable = eqx.field(static=True)  # (x, y, z) -> number, positive on the side of the bodies
-    origin: Float[Array, "3"]  # m
-    velocity: Float[Array, "3"]  # m/s, of the point at the origin
-    angular_velocity: Float[Array, "3"]  # rad/s
 
-    def __init__(self, f, *, origin=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)):
-        """The surface on which `f(x, y, z)` is zero."""
+    def __init__(self, f, **motion: Unpack[RigidMotion]):
+        """The surface on which `f(x, y, z)` is zero; `motion`: of the ground."""
         self.f = _function(f, "a surface", "lambda x, y, z: z - 0.1 * x**2")
-        self.origin, self.velocity, self.angular_velocity = _rigid_motion("a surface", origin, velocity, angular_velocity)
+        self._moves("a surface", **motion)
 
     def value(self, point: Vector) -> Float[Array, ""]:
         """f at a `point` (m, inertial frame)."""
@@ -179,10 +203,10 @@ class Surface(eqx.Module):
         """The tangent plane at a `point` (m, inertial frame) of the surface."""
         point = as_real(point)
         normal = normal_at(self, point)
-        return _tangent_plane(self, point, normal, tangents_of(normal))
+        return self._tangent(point, normal, tangents_of(normal))
 
 
-class HeightMap(eqx.Module):
+class HeightMap(_Ground):
     """The surface `z = h(x, y)`, with the bodies above it.
 
     `h`: a function of two numbers (m, inertial frame) to one (m), twice differentiable by JAX. `velocity` (m/s) of its material point at `origin` (m)
@@ -191,14 +215,11 @@ class HeightMap(eqx.Module):
     """
 
     h: Callable = eqx.field(static=True)  # (x, y) -> height, m
-    origin: Float[Array, "3"]  # m
-    velocity: Float[Array, "3"]  # m/s, of the point at the origin
-    angular_velocity: Float[Array, "3"]  # rad/s
 
-    def __init__(self, h, *, origin=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)):
-        """The surface of height `h(x, y)`."""
+    def __init__(self, h, **motion: Unpack[RigidMotion]):
+        """The surface of height `h(x, y)`; `motion`: of the ground."""
         self.h = _function(h, "a height map", "lambda x, y: 0.1 * x**2")
-        self.origin, self.velocity, self.angular_velocity = _rigid_motion("a height map", origin, velocity, angular_velocity)
+        self._moves("a height map", **motion)
 
     def height_at(self, x, y) -> Float[Array, ""]:
         """h (m) at `x`, `y` (m)."""
@@ -217,7 +238,7 @@ class HeightMap(eqx.Module):
         _, along_y = jax.jvp(self.height_at, (x, y), (o, i))
         first, normal = jnp.stack([i, o, along_x]), jnp.stack([-along_x, -along_y, i])
         first, normal = first / jnp.sqrt(1 + along_x * along_x), normal / jnp.sqrt(1 + along_x * along_x + along_y * along_y)
-        return _tangent_plane(self, jnp.stack([x, y, height]), normal, jnp.stack([first, jnp.cross(normal, first)]))
+        return self._tangent(jnp.stack([x, y, height]), normal, jnp.stack([first, jnp.cross(normal, first)]))
 
     def point_at(self, x, y) -> Float[Array, "3"]:
         """The point (m, inertial frame) of the surface at `x`, `y` (m)."""
@@ -245,29 +266,6 @@ def tangents_of(n: Float[Array, "3"]) -> Float[Array, "2 3"]:
     return jnp.stack([jnp.stack([1 + s * x * x * a, s * x * y * a, -s * x]), jnp.stack([x * y * a, s + y * y * a, -y])])
 
 
-def unit_vector(value, what: str) -> Float[Array, "3"]:
-    """A unit vector; a ValueError where it is known to have another length. Traced ones are looked at when a scene is probed."""
-    vector = checked_real(value, what, (3,), advice="give a unit vector")
-    length = 1.0 if is_traced(value) else float(np.linalg.norm(np.asarray(value, float)))  # `vector` is traced wherever the scene is
-    if not abs(length - 1) <= _UNIT:
-        raise ValueError(f"{what} has length {length:.4g}, expected a unit vector; divide it by its length")
-    return vector
-
-
-def positive_length(value, what: str) -> Float[Array, ""]:
-    """A length (m); a ValueError where it is known not to be positive."""
-    length = checked_real(value, what, ())
-    if not is_traced(length) and not float(length) > 0:
-        raise ValueError(f"{what} is {float(length):.4g} m, expected a positive number; give it in m")
-    return length
-
-
-def _rigid_motion(what: str, origin, velocity, angular_velocity) -> list[Float[Array, "3"]]:
-    """`origin` (m), `velocity` (m/s) and `angular_velocity` (rad/s) of a ground, checked."""
-    given = {"origin": origin, "velocity": velocity, "angular velocity": angular_velocity}
-    return [checked_real(value, f"{name} of {what}", (3,)) for name, value in given.items()]
-
-
 def _turned(tilt) -> Float[Array, "3 3"]:
     """Columns: x, y and z, turned about y."""
     advice = "give one angle in rad, or a rotation matrix, such as jj.rot_x(0.1)"
@@ -278,28 +276,10 @@ def _turned(tilt) -> Float[Array, "3 3"]:
 def _tangents_along(n, along) -> Float[Array, "2 3"]:
     along = checked_real(along, "`along` of a plane", (3,), advice="give a vector that is not normal to the plane")
     first = along - (n @ along) * n
-    if not is_traced(first, along) and not float(first @ first) > _UNIT**2 * float(along @ along):
+    if not is_traced(first, along) and not float(first @ first) > 1e-8 * float(along @ along):
         raise ValueError("`along` of a plane is normal to it, expected a direction within it; give another vector")
     first = first / jnp.sqrt(first @ first)
     return jnp.stack([first, jnp.cross(n, first)])
-
-
-def _tangent_plane(ground: Ground, origin, normal, tangents) -> Plane:
-    """A plane of known axes that moves with the ground."""
-    velocity = ground.velocity + jnp.cross(ground.angular_velocity, origin - ground.origin)
-    parts = lambda p: (p.origin, p.normal, p.tangents, p.velocity, p.angular_velocity)  # noqa: E731
-    return eqx.tree_at(parts, Plane(), (origin, normal, tangents, velocity, ground.angular_velocity))
-
-
-def _round_value(ground: Cylinder | Sphere, arm) -> Float[Array, ""]:
-    outward = (arm @ arm - ground.radius**2) / (2 * ground.radius)
-    return -outward if ground.side == "inside" else outward
-
-
-def _checked_side(side: str) -> str:
-    if side not in _SIDES:
-        raise ValueError(f"side `{side}` is unknown; expected `inside` or `outside`, where the bodies are")
-    return side
 
 
 def _function(f, what: str, example: str) -> Callable:

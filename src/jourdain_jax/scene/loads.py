@@ -10,7 +10,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import checked_real, described
-from jourdain_jax.scene.grounds import unit_vector
 from jourdain_jax.scene.motion_state import Motion, Point
 from jourdain_jax.scene.names import nearest
 
@@ -55,10 +54,10 @@ def _real_parts(kind: str, parts: dict | None) -> dict[str, Array]:
 def gravity(motion: Motion, strength, direction=(0.0, 0.0, -1.0)) -> Load:
     """Uniform gravity `m g e` on every body of a `motion`, with its potential `- sum m g e . r`.
 
-    `strength`: g in m/s^2; `direction`: e, a unit vector of the inertial frame. ValueError for a direction of another length.
+    `strength`: g in m/s^2; `direction`: e, a unit vector of the inertial frame. ValueError for a direction of another length, where its scene is built.
     """
     motion = _motion(motion, "gravity")
-    e = unit_vector(direction, "direction of gravity")
+    e = checked_real(direction, "direction of gravity", (3,), advice="give a unit vector")
     g = checked_real(strength, "strength of gravity", ()) * e
     forces = {name: body.mass * g for name, body in motion.bodies.items()}
     potential = -sum(body.mass * (g @ body.position) for body in motion.bodies.values())

@@ -196,16 +196,16 @@ class _Cells(Mapping):
 
 def spaces(f: FunctionType) -> tuple[tuple[Mapping, tuple[str, ...]], ...]:
     """Where the names that a function loads itself are looked up: its globals, and the variables of the functions around it."""
-    written = {"__class__"} | _names(f.__code__, ("STORE_GLOBAL", "STORE_DEREF"))  # a counter of calls, say
-    own, around = _names(f.__code__, ("LOAD_GLOBAL", "LOAD_NAME")) - written, set(f.__code__.co_freevars) - written
+    written = {"__class__"} | names_in(f.__code__, ("STORE_GLOBAL", "STORE_DEREF"))  # a counter of calls, say
+    own, around = names_in(f.__code__, ("LOAD_GLOBAL", "LOAD_NAME")) - written, set(f.__code__.co_freevars) - written
     return (f.__globals__, tuple(sorted(own))), (_Cells(f), tuple(sorted(around)))
 
 
 @functools.lru_cache(maxsize=4096)
-def _names(code: CodeType, operations: tuple[str, ...]) -> frozenset[str]:
-    """Names on which code works by some operations of Python's machine, functions inside it included."""
-    own = frozenset(i.argval for i in dis.get_instructions(code) if i.opname in operations)
-    return own.union(*(_names(inner, operations) for inner in code.co_consts if isinstance(inner, CodeType)))
+def names_in(code: CodeType, operations: tuple[str, ...] | None = None) -> frozenset[str]:
+    """Names on which code works, of attributes too, or those by some operations of Python's machine alone; functions inside it included."""
+    own = frozenset(code.co_names if operations is None else (i.argval for i in dis.get_instructions(code) if i.opname in operations))
+    return own.union(*(names_in(inner, operations) for inner in code.co_consts if isinstance(inner, CodeType)))
 
 
 def _member_key(member) -> Hashable:

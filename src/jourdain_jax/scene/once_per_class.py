@@ -10,11 +10,10 @@ import numpy as np
 from jourdain_jax.scene.parameters import stacked_parameters
 from jourdain_jax.scene.scene import Scene
 
-MOST_CASES = 1024  # that are kept of one function
 _UNKNOWN = object()
 
 
-def once_per_class(describe: Callable, most: int = MOST_CASES) -> Callable:
+def once_per_class(describe: Callable, most: int = 1024) -> Callable:
     """A function of a scene (and of what else tells its cases apart) that depends on its class and the shapes of its parameters only: worked out once.
 
     `most`: cases that are kept.

@@ -25,8 +25,6 @@ from jourdain_jax.scene.parameters import check_parameters, parameters_of
 from jourdain_jax.scene.printing import scene_html, scene_text
 from jourdain_jax.scene.visuals import Visual
 
-_TYPED = 1e-4  # of the square of a quaternion whose parts were typed with a few digits
-
 
 class Scene(eqx.Module):
     """Base class of all scenes. Subclass it, state `coordinates` and `bodies`, and what else the scene needs.
@@ -204,7 +202,7 @@ def _completed(parts: tuple[str, ...], q: list, first: int, given: list[str]) ->
         return []
     q[first : first + 4] = [value if name in named else 0.0 for name, value in zip(parts, q[first : first + 4], strict=True)]
     square = sum(value * value for value in q[first : first + 4])
-    if not is_traced(square) and abs(float(square) - 1) > _TYPED:
+    if not is_traced(square) and abs(float(square) - 1) > 1e-4:  # parts may be typed with a few digits
         group, told = parts[0].removesuffix("_w"), ", ".join(f"`{name}`" for name in named)
         raise ValueError(
             f"of the quaternion `{group}` only {told} is given, the squares of which sum up to {float(square):.4g}: many attitudes have that; give all four "

@@ -17,10 +17,12 @@ from jourdain_jax.scene.names import Named, nearest
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 
+_VANISH = "return numbers that vanish where the constraint is met"
+
 
 def bodies_of(scene: Scene, t, q: Named) -> dict[str, Body]:
     """The bodies of a scene by name."""
-    bodies = _dictionary(scene, "bodies", scene.bodies(t, q), '{"disc": jj.RigidBody(...)}')
+    bodies = _dictionary(scene, "bodies", (t, q), '{"disc": jj.RigidBody(...)}')
     if not bodies:
         raise ValueError(f'`bodies` of `{_name(scene)}` returned no body; return at least one by name, such as {{"disc": jj.RigidBody(...)}}')
     for name, body in bodies.items():
@@ -76,27 +78,23 @@ def gauge_of(scene: Scene, pose: Pose) -> Float[Array, ""] | None:
 
 def prescribed_of(scene: Scene, t) -> dict[str, Float[Array, ""]]:
     """Prescribed coordinates and their values."""
-    given = _dictionary(scene, "prescribed", scene.prescribed(t), '{"x": 0.1 * jnp.sin(t)}')
-    return _checked(scene, "prescribed value of", given, (), "prescribe every coordinate by its own name")
+    advice = "prescribe every coordinate by its own name"
+    return _numbers(scene, "prescribed", t, '{"x": 0.1 * jnp.sin(t)}', "prescribed value of", advice)
 
 
 def geometric_constraints_of(scene: Scene, pose: Pose) -> dict[str, Array]:
     """Values of the scene's own geometric rows."""
-    return _rows(scene, "geometric_constraints", scene.geometric_constraints(pose))
+    return _numbers(scene, "geometric_constraints", pose, '{"edge": value}', "row", _VANISH, None)
 
 
 def velocity_constraints_of(scene: Scene, motion: Motion) -> dict[str, Array]:
     """Values of the scene's own velocity rows."""
-    return _rows(scene, "velocity_constraints", scene.velocity_constraints(motion))
-
-
-def _rows(scene: Scene, method: str, given) -> dict[str, Array]:
-    return _checked(scene, "row", _dictionary(scene, method, given, '{"edge": value}'), None, "return numbers that vanish where the constraint is met")
+    return _numbers(scene, "velocity_constraints", motion, '{"edge": value}', "row", _VANISH, None)
 
 
 def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
     """Rolling contacts by name."""
-    contacts = _dictionary(scene, "contacts", scene.contacts(pose), '{"rim": jj.disc_contact(pose["disc"], radius)}')
+    contacts = _dictionary(scene, "contacts", (pose,), '{"rim": jj.disc_contact(pose["disc"], radius)}')
     for name, contact in contacts.items():
         if not isinstance(contact, Contact):
             raise ValueError(f"contact `{name}` of `{_name(scene)}` is {described(contact)}, expected a `jj.disc_contact(...)` or another contact")
@@ -105,20 +103,19 @@ def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
 
 def events_of(scene: Scene, motion: Motion) -> dict[str, Float[Array, ""]]:
     """Values of the stop events by name."""
-    events = _dictionary(scene, "events", scene.events(motion), '{"fallen": 1.4 - motion.q.lean}')
     advice = "return a number, positive while the motion may go on, such as `1.4 - motion.q.lean`; give every condition a name of its own"
-    return _checked(scene, "event", events, (), advice)
+    return _numbers(scene, "events", motion, '{"fallen": 1.4 - motion.q.lean}', "event", advice)
 
 
 def invariants_of(scene: Scene, motion: Motion) -> dict[str, Float[Array, ""]]:
     """Values of the conserved quantities by name."""
-    given = _dictionary(scene, "invariants", scene.invariants(motion), '{"momentum x": body.mass * body.velocity[0]}')
-    return _checked(scene, "invariant", given, (), "give every component a name of its own")
+    advice = "give every component a name of its own"
+    return _numbers(scene, "invariants", motion, '{"momentum x": body.mass * body.velocity[0]}', "invariant", advice)
 
 
 def visuals_of(scene: Scene, pose: Pose) -> dict[str, tuple[Visual, ...]]:
     """What the scene itself says of the look of its bodies, `""` for what stands in the inertial frame."""
-    given = _dictionary(scene, "visuals", scene.visuals(pose), '{"ball": jj.Visual.ball(0.1)}')
+    given = _dictionary(scene, "visuals", (pose,), '{"ball": jj.Visual.ball(0.1)}')
     found = {}
     for name, looks in given.items():
         if name and name not in pose:
@@ -130,8 +127,9 @@ def visuals_of(scene: Scene, pose: Pose) -> dict[str, tuple[Visual, ...]]:
     return found
 
 
-def _dictionary(scene: Scene, method: str, given, example: str) -> dict:
-    """What a method returned, which must be a dictionary by name."""
+def _dictionary(scene: Scene, method: str, at: tuple, example: str) -> dict:
+    """What a method returns, which must be a dictionary by name."""
+    given = getattr(scene, method)(*at)
     if not isinstance(given, dict):
         raise ValueError(f"`{method}` of `{_name(scene)}` returned {described(given)}, expected a dictionary by name; write return {example}")
     for name in given:
@@ -140,7 +138,9 @@ def _dictionary(scene: Scene, method: str, given, example: str) -> dict:
     return given
 
 
-def _checked(scene: Scene, what: str, given: dict, shape: tuple[int, ...] | None, advice: str) -> dict[str, Array]:
+def _numbers(scene: Scene, method: str, at, example: str, what: str, advice: str, shape: tuple[int, ...] | None = ()) -> dict[str, Array]:
+    """What a method returns at a time, pose or motion: numbers by name, or arrays of another `shape`."""
+    given = _dictionary(scene, method, (at,), example)
     return {name: checked_real(value, f"{what} `{name}` of `{_name(scene)}`", shape, advice=advice) for name, value in given.items()}
 
 

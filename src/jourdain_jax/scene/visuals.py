@@ -5,6 +5,7 @@ A scene states them in `visuals(self, pose)`; bodies that it leaves out are draw
 """
 
 import os
+from typing import TypedDict, Unpack
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.on_first_use import needed
-from jourdain_jax.calculus.reals import checked_real, described, is_traced
+from jourdain_jax.calculus.reals import Vector, checked_positive, checked_real, described, is_traced
 from jourdain_jax.scene.bodies import _axis_index, _stack
 from jourdain_jax.scene.grounds import tangents_of
 
@@ -22,6 +23,15 @@ class Faces:
 
     def __init__(self, corners: np.ndarray, polygons: tuple[tuple[int, ...], ...]):
         self.corners, self.polygons = corners, polygons
+
+
+class Look(TypedDict, total=False):
+    """Where a shape is, and how it is painted; see `Visual`."""
+
+    at: Vector  # m
+    turn: Float[Array, "3 3"]
+    colour: str | None
+    opacity: float
 
 
 class Visual(eqx.Module):
@@ -53,40 +63,38 @@ class Visual(eqx.Module):
     opacity: float = eqx.field(static=True, default=1.0)
 
     @staticmethod
-    def ball(radius, *, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":
-        """A ball of the given `radius` (m), its octants painted in turn, so that one sees it roll; `at`, `turn`, `colour`, `opacity` as for all shapes."""
-        return _placed("ellipsoid", _lengths(radius, "radius of a ball", ()) * jnp.ones(3), at, turn, colour, opacity)
+    def ball(radius, **look: Unpack[Look]) -> "Visual":
+        """A ball of the given `radius` (m), its octants painted in turn, so that one sees it roll; `look` as for all shapes."""
+        return shape("ellipsoid", _lengths(radius, "radius of a ball", ()) * jnp.ones(3), **look)
 
     @staticmethod
-    def ellipsoid(semi_axes, *, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":
-        """An ellipsoid with three `semi_axes` (m) along its axes; `at`, `turn`, `colour`, `opacity` as for all shapes."""
-        return _placed("ellipsoid", _lengths(semi_axes, "semi-axes of an ellipsoid", (3,)), at, turn, colour, opacity)
+    def ellipsoid(semi_axes, **look: Unpack[Look]) -> "Visual":
+        """An ellipsoid with three `semi_axes` (m) along its axes; `look` as for all shapes."""
+        return shape("ellipsoid", _lengths(semi_axes, "semi-axes of an ellipsoid", (3,)), **look)
 
     @staticmethod
-    def wheel(radius, width=None, *, axis="y", at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":
+    def wheel(radius, width=None, *, axis="y", **look: Unpack[Look]) -> "Visual":
         """A wheel or disc of `radius` and `width` (m, default: a sixth of the radius) about `axis` ("x", "y" or "z"), its quarters painted in turn.
 
-        `at`, `turn`, `colour`, `opacity` as for all shapes.
+        `look` as for all shapes.
         """
         radius = _lengths(radius, "radius of a wheel", ())
-        return _about(axis, "wheel", [radius, radius / 6 if width is None else _lengths(width, "width of a wheel", ())], at, turn, colour, opacity)
+        return _about(axis, "wheel", [radius, radius / 6 if width is None else _lengths(width, "width of a wheel", ())], **look)
 
     @staticmethod
-    def box(sides, *, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":
-        """A box with three `sides` (m) along its axes; `at`, `turn`, `colour`, `opacity` as for all shapes."""
-        return _placed("box", _lengths(sides, "sides of a box", (3,)), at, turn, colour, opacity)
+    def box(sides, **look: Unpack[Look]) -> "Visual":
+        """A box with three `sides` (m) along its axes; `look` as for all shapes."""
+        return shape("box", _lengths(sides, "sides of a box", (3,)), **look)
 
     @staticmethod
-    def cylinder(radius, length, *, axis="z", at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":
-        """A cylinder of `radius` and `length` (m) along `axis` ("x", "y" or "z"); `at`, `turn`, `colour`, `opacity` as for all shapes."""
-        sizes = [_lengths(radius, "radius of a cylinder", ()), _lengths(length, "length of a cylinder", ())]
-        return _about(axis, "cylinder", sizes, at, turn, colour, opacity)
+    def cylinder(radius, length, *, axis="z", **look: Unpack[Look]) -> "Visual":
+        """A cylinder of `radius` and `length` (m) along `axis` ("x", "y" or "z"); `look` as for all shapes."""
+        return _about(axis, "cylinder", [_lengths(radius, "radius of a cylinder", ()), _lengths(length, "length of a cylinder", ())], **look)
 
     @staticmethod
-    def capsule(radius, length, *, axis="z", at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":
-        """A cylinder of `radius` and `length` (m) along `axis` with a half ball at each end; `at`, `turn`, `colour`, `opacity` as for all shapes."""
-        sizes = [_lengths(radius, "radius of a capsule", ()), _lengths(length, "length of a capsule", ())]
-        return _about(axis, "capsule", sizes, at, turn, colour, opacity)
+    def capsule(radius, length, *, axis="z", **look: Unpack[Look]) -> "Visual":
+        """A cylinder of `radius` and `length` (m) along `axis` with a half ball at each end; `look` as for all shapes."""
+        return _about(axis, "capsule", [_lengths(radius, "radius of a capsule", ()), _lengths(length, "length of a capsule", ())], **look)
 
     @staticmethod
     def line(*points, radius=None, colour=None, opacity=1.0) -> "Visual":
@@ -111,11 +119,11 @@ class Visual(eqx.Module):
         return _checked(Visual("line", points, jnp.zeros(3), jnp.eye(3), radius / 6, None, colour, opacity))
 
     @staticmethod
-    def mesh(vertices, faces, *, scale=1.0, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":
+    def mesh(vertices, faces, *, scale=1.0, **look: Unpack[Look]) -> "Visual":
         """A body of flat faces.
 
         `vertices` (points, 3) in m and `faces`, one row of numbers of vertices for each, anticlockwise seen from outside, are known numbers; `scale`, one
-        factor or three, may depend on parameters. `at`, `turn`, `colour`, `opacity` as for all shapes.
+        factor or three, may depend on parameters. `look` as for all shapes.
         """
         if is_traced(vertices, faces):
             raise ValueError("the vertices of a mesh depend on parameters or coordinates, expected known numbers; use `scale`, `at` and `turn`")
@@ -126,13 +134,13 @@ class Visual(eqx.Module):
         if not polygons or any(len(face) < 3 or min(face) < 0 or max(face) >= len(corners) for face in polygons):
             raise ValueError(f"faces of a mesh: expected for each at least three numbers from 0 to {len(corners) - 1}, of its vertices in order")
         factors = jnp.broadcast_to(_lengths(scale, "scale of a mesh"), (3,))
-        return _placed("mesh", factors, at, turn, colour, opacity, Faces(corners, polygons))
+        return shape("mesh", factors, faces=Faces(corners, polygons), **look)
 
     @staticmethod
-    def from_file(path: str | os.PathLike, *, scale=1.0, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":
+    def from_file(path: str | os.PathLike, *, scale=1.0, **look: Unpack[Look]) -> "Visual":
         """The mesh in the file `path` that `trimesh` reads, such as .stl or .obj, times `scale` (0.001 for millimetres).
 
-        `at`, `turn`, `colour`, `opacity` as for all shapes. ImportError without `trimesh`; ValueError for a file that is missing, of an unknown format, or
+        `look` as for all shapes. ImportError without `trimesh`; ValueError for a file that is missing, of an unknown format, or
         without faces.
         """
         trimesh = needed("trimesh", "reading a mesh from a file")
@@ -144,25 +152,23 @@ class Visual(eqx.Module):
             raise ValueError(f"cannot read a mesh from `{os.fspath(path)}`: {reason}; give a file such as .stl or .obj") from None
         if not len(read.faces):
             raise ValueError(f"the file `{os.fspath(path)}` holds no faces, expected a mesh")
-        return Visual.mesh(read.vertices, read.faces, scale=scale, at=at, turn=turn, colour=colour, opacity=opacity)
+        return Visual.mesh(read.vertices, read.faces, scale=scale, **look)
 
 
 def _lengths(value, what: str, shape=None) -> Float[Array, "*shape"]:
-    value = checked_real(value, what, shape, advice="give it in m").astype(jnp.result_type(float))
-    if not is_traced(value) and not np.all(np.asarray(value) > 0):
-        raise ValueError(f"{what} is {np.asarray(value).tolist()}, expected more than zero; give it in m")
-    return value
+    return checked_positive(value, what, shape).astype(jnp.result_type(float))
 
 
-def _about(axis: str, kind: str, sizes, at, turn, colour, opacity) -> Visual:
+def _about(axis: str, kind: str, sizes, **look: Unpack[Look]) -> Visual:
     """A shape whose own z axis lies along `axis`."""
     k = _axis_index(axis)
     cyclic = np.eye(3)[:, [(k + 1) % 3, (k + 2) % 3, k]]
-    placed = _placed(kind, _stack(sizes), at, turn, colour, opacity)
+    placed = shape(kind, _stack(sizes), **look)
     return eqx.tree_at(lambda v: v.orientation, placed, placed.orientation @ cyclic)
 
 
-def _placed(kind: str, size, at, turn, colour, opacity, faces: Faces | None = None) -> Visual:
+def shape(kind: str, size, *, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0, faces: Faces | None = None) -> Visual:
+    """A shape of this kind; the other arguments as for all shapes."""
     at = checked_real(at, f"place of a {kind}", (3,), advice="give three components in the body frame, m").astype(jnp.result_type(float))
     turn = jnp.eye(3) if turn is None else checked_real(turn, f"turn of a {kind}", (3, 3), advice="give a rotation matrix")
     return _checked(Visual(kind, size, at, turn, None, faces, colour, opacity))

@@ -6,10 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from jourdain_jax.build.reference_parameters import once_per_values
-from jourdain_jax.build.structure import TRACED, WELL_CONDITIONED, Structure, structure_of
+from jourdain_jax.build.structure import WELL_CONDITIONED, Structure, structure_of, trust
 from jourdain_jax.build.usual_lengths import usual_lengths
 from jourdain_jax.calculus.pseudo_inverse import passing_cutoff, undecided
-from jourdain_jax.calculus.reals import described, is_traced
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.dynamics.accelerations import Baumgarte, as_reduction
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
@@ -121,8 +121,8 @@ def _vector_field(scene: Scene, formulation: Formulation, work: bool, backend: s
         return MinimalByMatrices(**common, rows=structure.kept_rows)
     loses_rank = bool(names_of_position_rows(scene)) or not structure.affine
     branches = cutoff is not None and isinstance(reduction, NullSpaceQR) and loses_rank
-    known = structure.affine or not is_traced(scene)  # usual sizes are; where not, nonlinear rows count as long a thousand times longer
-    return FullByMatrices(**common, undecided=undecided(jnp.result_type(float)) / (1.0 if known else TRACED) if branches else None)
+    known = 1.0 if structure.affine else trust(scene)  # how far usual sizes are; where not, nonlinear rows count as long a thousand times longer
+    return FullByMatrices(**common, undecided=undecided(jnp.result_type(float)) / known if branches else None)
 
 
 def reason_for_matrices(structure: Structure, constant: bool) -> str:
