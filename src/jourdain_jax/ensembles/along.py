@@ -24,8 +24,8 @@ def sampled(motion: Trajectory, quantity: str | Callable) -> tuple[Float[Array, 
 
     These are the saved times that were reached, and the end where it is none of them, in place of the last where it is near; all others repeat the end.
     """
-    reached = jnp.sum(motion.valid)
-    before, last = (motion.ts[jnp.maximum(reached - k, 0)] for k in (2, 1))
+    reached, ts = jnp.sum(motion.valid), jnp.asarray(motion.ts)
+    before, last = (ts[jnp.maximum(reached - k, 0)] for k in (2, 1))
     beyond = jnp.abs(motion.t_end - last)
     # of the time between values: an end that follows the last of them sooner takes its place, since a polynomial through both swings
     place = reached - ((beyond > 0) & (beyond <= (1 / 16) * jnp.abs(last - before)))  # of the end
@@ -35,7 +35,7 @@ def sampled(motion: Trajectory, quantity: str | Callable) -> tuple[Float[Array, 
         return jnp.concatenate([kept, end[None]])
 
     work = None if motion.work is None else with_end(motion.work, jnp.full_like(motion.t_end, jnp.nan))
-    times = with_end(motion.ts, motion.t_end)
+    times = with_end(ts, motion.t_end)
     whole = dataclasses.replace(motion, ts=times, q=with_end(motion.q, motion.q_end), u=with_end(motion.u, motion.u_end), work=work)
     values = whole[quantity] if isinstance(quantity, str) else quantity(whole)
     if getattr(values, "shape", None) != times.shape or jnp.iscomplexobj(values):
