@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import result_codes as results
 from numpy.testing import assert_allclose, assert_array_equal
-from test_along_batches import Oscillator
+from small_scenes import Oscillator
 
 import jourdain_jax as jj
 
-START = {"x": 1.0}
+SPRING, START = Oscillator(mass=1.0, damping=0.0, stiffness=4.0), {"x": 1.0}  # x = cos 2t
 WRONG = {
     "before the start": {"ts": [-0.5, 0.5, 1.0]},
     "before a later start": {"ts": [0.5, 0.7, 1.0], "t0": 0.8},
@@ -28,9 +28,9 @@ RIGHT = {"plain": {"ts": [0.0, 0.5, 1.0]}, "reversed": {"ts": [1.0, 0.5, 0.1], "
 def test_known_times_are_refused_alike_alone_in_lanes_and_inside_jit(times):
     sentences = []
     for run in (
-        lambda: jj.simulate(Oscillator(), START, **times),
-        lambda: jj.rollout(Oscillator(), {"x": np.array([1.0, 2.0])}, progress=False, **times),
-        lambda: jax.jit(lambda x: jj.simulate(Oscillator(), {"x": x}, **times).q)(1.0),
+        lambda: jj.simulate(SPRING, START, **times),
+        lambda: jj.rollout(SPRING, {"x": np.array([1.0, 2.0])}, progress=False, **times),
+        lambda: jax.jit(lambda x: jj.simulate(SPRING, {"x": x}, **times).q)(1.0),
     ):
         with pytest.raises(ValueError, match=r"`ts` (runs from|must be finite and strictly)|the span from") as refused:
             run()
@@ -42,7 +42,7 @@ def test_known_times_are_refused_alike_alone_in_lanes_and_inside_jit(times):
 def test_traced_times_that_do_not_go_together_end_in_a_code_of_their_own_and_no_state(solver):
     every = [{"t0": 0.0, "t1": times["ts"][-1]} | times for times in (WRONG | SHUFFLED | RIGHT).values()]
     stacked = {name: jnp.array([times[name] for times in every]) for name in ("ts", "t0", "t1")}
-    lanes = jax.jit(jax.vmap(lambda times: jj.simulate(Oscillator(), START, rtol=1e-7, atol=1e-7, solver=solver, work=False, **times)))(stacked)
+    lanes = jax.jit(jax.vmap(lambda times: jj.simulate(SPRING, START, rtol=1e-7, atol=1e-7, solver=solver, work=False, **times)))(stacked)
     wrong = len(WRONG) + len(SHUFFLED)
     assert lanes.result.tolist() == [results.BAD_TIMES] * wrong + [results.SUCCESS] * len(RIGHT)
     assert np.isnan(lanes.q[:wrong]).all()
@@ -54,8 +54,8 @@ def test_traced_times_that_do_not_go_together_end_in_a_code_of_their_own_and_no_
 
 def test_lanes_with_times_of_their_own_are_judged_one_by_one():
     begun = np.array([0.0, 0.5, 0.6, 1.2])
-    states = jax.vmap(lambda x, t: jj.start(Oscillator(), x=x, t0=t))(jnp.ones(4), jnp.asarray(begun))
-    lanes = jj.rollout(Oscillator(), states, ts=[0.5, 1.0], progress=False)
+    states = jax.vmap(lambda x, t: jj.start(SPRING, x=x, t0=t))(jnp.ones(4), jnp.asarray(begun))
+    lanes = jj.rollout(SPRING, states, ts=[0.5, 1.0], progress=False)
     assert lanes.result.tolist() == [results.SUCCESS, results.SUCCESS, results.BAD_TIMES, results.BAD_TIMES]
     assert np.isnan(lanes.lanes.q[2:]).all()
     assert_allclose(lanes["x"][:2, -1], np.cos(2.0 * (1.0 - begun[:2])), atol=1e-6)
@@ -72,6 +72,6 @@ def test_even_times_of_any_span_go_together():
     @jax.jit
     @jax.vmap
     def code(t0, t1):
-        return jj.simulate(Oscillator(stiffness=0.0), {"x": 1.0}, t0=t0, t1=t1, rtol=1e-5, atol=1e-5, max_steps=1000).result
+        return jj.simulate(SPRING.replace(stiffness=0.0), {"x": 1.0}, t0=t0, t1=t1, rtol=1e-5, atol=1e-5, max_steps=1000).result
 
     assert not np.any(np.asarray(code(*jnp.asarray(ends.T))) == results.BAD_TIMES)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
-from jourdain_jax.lowering.pivots import FEW, Pivot, Pivots
+from jourdain_jax.lowering.pivots import FEW, Pivot, Pivots, products
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.identity_test import IdentityProbes
@@ -48,10 +48,16 @@ def eliminate(graph: Graph, A: list[list[int]], right: list[list[int]], probes: 
         order.append(system.best())
         system.eliminated(order[-1])
     solution: dict[int, list[int]] = {}
-    for row, column, _ in reversed(order):
-        A, over = system.A[row], graph.div(graph.one, system.A[row][column])
-        known = [graph.total(graph.mul(A[k], x[j]) for k, x in solution.items() if A[k] != graph.zero) for j in range(len(system.right[row]))]
-        solution[column] = [graph.mul(over, graph.sub(b, x)) for b, x in zip(system.right[row], known, strict=True)]
+    for pivot in reversed(order):
+        rest = [
+            [
+                graph.sub(b, graph.total(graph.mul(system.A[r][k], x[j]) for k, x in solution.items() if system.A[r][k] != graph.zero))
+                for j, b in enumerate(system.right[r])
+            ]
+            for r in pivot.rows
+        ]
+        found = [products(graph, b, pivot.inverse) for b in zip(*rest, strict=True)]
+        solution |= dict(zip(pivot.columns, map(list, zip(*found, strict=True)), strict=True)) if found else {c: [] for c in pivot.columns}
     return Eliminated([solution[c] for c in range(count)], [pivot.monitored for pivot in order if graph.op[pivot.monitored] != "const"])
 
 

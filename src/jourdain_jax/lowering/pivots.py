@@ -2,8 +2,9 @@
 
 A pivot that is a number or depends on parameters alone cannot vanish on the way and is taken first; the others are judged by the smallest
 value they take, relative to their row, at all probes. Among good pivots the one that fills in least is taken. Where only entries that may
-vanish are left, or no order of elimination serves, rows are combined: those of one column, a_1, a_2, ..., into one row with the pivot sum w_i a_i^2, which
-depends on parameters alone where these are components of a vector in turned axes, such as the velocity of a hitch. From that row the
+vanish are left, two rows and two columns are eliminated together if their determinant cannot vanish: components of a vector in turned axes, such as
+the velocity of a hitch, have one that depends on parameters alone, while each entry is zero at some angle.
+Where no order of elimination serves, rows are combined: those of one column, a_1, a_2, ..., into one row with the pivot sum w_i a_i^2, from which the
 others are made orthogonal. Rows of a rolling wheel along the world's axes so become rows along and across its heading. In exact numbers such a pivot is
 the squared distance of its column from those before it, which is no smaller than the smallest singular value squared, and it serves as well where there
 are more rows than unknowns and each row vanishes somewhere.
@@ -12,7 +13,7 @@ are more rows than unknowns and each row vanishes somewhere.
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float
@@ -25,11 +26,13 @@ GOOD = 0.02  # of a pivot, relative to its row, at the worst probe
 FEW = 12  # equations: with more, the operations that lead to a pivot are not counted when it is chosen
 
 
-class Pivot(NamedTuple):
-    """A row and a column that are eliminated."""
+@dataclass(frozen=True)
+class Pivot:
+    """Rows and columns eliminated together: one of each, or two."""
 
-    row: int
-    column: int
+    rows: tuple[int, ...]
+    columns: tuple[int, ...]
+    inverse: tuple[tuple[int, ...], ...]  # of A[rows][columns]
     monitored: int  # must not vanish
 
 
@@ -39,21 +42,6 @@ class _Entry:
 
     worst: float  # of its row, at the worst probe
     fixed: bool  # it depends on parameters alone
-
-
-class _Combined(NamedTuple):
-    """A column, the rows that hold it with their weights, and what their combination promises as a pivot."""
-
-    column: int
-    rows: list[int]
-    weights: list[float]
-    squares: int  # sum of weights times entries squared
-    worst: float  # beside the sizes of the rows, at the worst probe
-
-    @property
-    def serves(self) -> bool:
-        """Whether it is large at every probe."""
-        return self.worst > GOOD
 
 
 class Pivots:
@@ -70,25 +58,26 @@ class Pivots:
         self._sizes: dict[int, np.ndarray] = {}  # of what a row was made of
         self._entries: dict[int, list[int]] = {}  # columns of a row that hold something
         self._judged: dict[int, dict[int, _Entry]] = {}
-        self._combined: dict[tuple, _Combined] = {}  # by column and entries
+        self._determinants: dict[tuple[int, int, int, int], int | None] = {}  # of two rows and columns, where it serves as a pivot
 
     def eliminated(self, pivot: Pivot) -> None:
-        """Subtract multiples of the pivot's row from the rows that are left."""
+        """Subtract multiples of the pivot's rows from the rows that are left."""
         graph, A = self.graph, self.A
-        r, c = pivot.row, pivot.column
-        self.rows.remove(r)
-        self.columns.remove(c)
-        over = graph.div(graph.one, A[r][c])
+        self.rows -= set(pivot.rows)
+        self.columns -= set(pivot.columns)
         for other in sorted(self.rows):
-            factor = graph.mul(A[other][c], over)
-            if factor == graph.zero:
+            if all(A[other][c] == graph.zero for c in pivot.columns):
                 continue
-            if self._tall:
-                self._sizes[other] = self._size(other) + np.abs(self._at([factor])[0]) * self._size(r)
-            for k in self._in_row(r):
-                A[other][k] = graph.sub(A[other][k], graph.mul(factor, A[r][k]))
-            self._changed(other)
-            self.right[other] = [graph.sub(a, graph.mul(factor, b)) for a, b in zip(self.right[other], self.right[r], strict=True)]
+            factors = products(graph, [A[other][c] for c in pivot.columns], zip(*pivot.inverse, strict=True))
+            for factor, r in zip(factors, pivot.rows, strict=True):
+                if factor == graph.zero:
+                    continue
+                if self._tall:
+                    self._sizes[other] = self._size(other) + np.abs(self._at([factor])[0]) * self._size(r)
+                for k in self._in_row(r):
+                    A[other][k] = graph.sub(A[other][k], graph.mul(factor, A[r][k]))
+                self._changed(other)
+                self.right[other] = [graph.sub(a, graph.mul(factor, b)) for a, b in zip(self.right[other], self.right[r], strict=True)]
 
     def _changed(self, *rows: int) -> None:
         """Some rows were changed; all of them, where none is named."""
@@ -119,33 +108,35 @@ class Pivots:
         if good:
             r, c, entry = min(good, key=cost)
             if entry.fixed:
-                return Pivot(r, c, A[r][c])
-        combined = self._best_column()
-        if combined is not None and combined.serves and not graph.varies[combined.squares]:
-            return self._by_column(combined)
+                return self._single(r, c)
+        pair = self._best_pair()
+        if pair is not None:
+            return pair
         good.sort(key=cost)
         serving = next(((r, c) for r, c, entry in good if entry.fixed or self._regular_everywhere((r, c))), None)
         if serving is not None:
-            r, c = serving
-            return Pivot(r, c, A[r][c])
+            return self._single(*serving)
         r, c, _ = good[0] if good else max(judged, key=lambda place: place[2].worst)
-        if combined is None or combined.worst <= _least(np.abs(self._beside_row((r, c)))[self._regular]):
-            return Pivot(r, c, A[r][c])
-        return self._by_column(combined)
+        return self._by_column((r, c))
 
     def _judged_row(self, row: int) -> dict[int, "_Entry"]:
         """The entries of a row by column, judged; kept until the row changes."""
         if row not in self._judged or not self.columns.issuperset(self._judged[row]):
             columns = self._in_row(row)
-            ratio = np.abs(self._ratios(row, columns, self.probes)) if columns else np.empty((0, 1))
+            nodes, places = [self.A[row][c] for c in columns], [(row, c) for c in columns]
+            ratio = _ratios(self.probes(nodes), places, self._sizes_at(places, self.probes.count)) if columns else np.empty((0, 1))
             worst = np.min(np.where(np.isfinite(ratio), ratio, 0.0), axis=1)  # at any probe
-            self._judged[row] = {c: _Entry(w, bool(w > 0) and self._is_fixed(self.A[row][c])) for c, w in zip(columns, worst, strict=True)}
+            self._judged[row] = {c: _Entry(w, bool(w > 0) and self._is_fixed(n)) for c, n, w in zip(columns, nodes, worst, strict=True)}
         return self._judged[row]
 
     def _is_fixed(self, node: int) -> bool:
         """Whether a node depends on parameters alone, none of which turns it through zero."""
         graph = self.graph
         return not graph.varies[node] and (graph.is_const(node) or not any(turns(graph, n) for n in graph.reachable([node])))
+
+    def _single(self, row: int, column: int, monitored: int | None = None) -> Pivot:
+        entry = self.A[row][column]
+        return Pivot((row,), (column,), ((self.graph.div(self.graph.one, entry),),), entry if monitored is None else monitored)
 
     # judgement: at the probes of the domain, and at full turns of all angles where the system itself is regular
 
@@ -160,18 +151,10 @@ class Pivots:
     def _beside_row(self, place: tuple[int, int]) -> Float[np.ndarray, "probes"]:
         """An entry beside the largest of its row, with its sign."""
         r, c = place
-        columns = self._in_row(r)
-        return self._ratios(r, columns, self._at)[columns.index(c)]
-
-    def _ratios(self, row: int, columns: list[int], values_of: Callable) -> Float[np.ndarray, "columns probes"]:
-        """Entries beside the largest of their row, and, unless a row that vanishes makes the system singular anyway, beside what that was made of."""
-        values = values_of([self.A[row][c] for c in columns])
-        largest = np.max(np.abs(values), axis=0)
-        if self._tall:
-            size = self._size(row)
-            largest = np.fmax(largest, np.fmax(size, np.nanmedian(size))[: len(largest)])
-        with np.errstate(all="ignore"):
-            return values / np.where(largest > 0, largest, 1.0)
+        columns = [k for k in sorted(self.columns) if self.A[r][k] != self.graph.zero]
+        places, values = [(r, k) for k in columns], self._at([self.A[r][k] for k in columns])
+        k = columns.index(c)
+        return np.sign(values[k]) * _ratios(values, places, self._sizes_at(places))[k]
 
     @property
     def _regular(self) -> np.ndarray:
@@ -201,34 +184,69 @@ class Pivots:
             self._sizes[row] = np.max(np.abs(self._at(self.A[row])), axis=0)
         return self._sizes[row]
 
+    def _sizes_at(self, places, count: int | None = None) -> np.ndarray | None:
+        """What entries are compared with besides their row, at the first probes; None where a row that vanishes makes the system singular anyway."""
+        if not self._tall:
+            return None
+        return np.stack([np.fmax(self._size(r), np.nanmedian(self._size(r)))[:count] for r, _ in places])
+
+    # two rows and two columns
+
+    def _best_pair(self) -> Pivot | None:
+        """Two rows and columns whose determinant depends on parameters alone, with the least fill-in; None where there are none."""
+        graph, A = self.graph, self.A
+        used = {r: set(self._in_row(r)) for r in self.rows}
+        users: dict[int, list[int]] = {c: [] for c in self.columns}
+        for r in sorted(self.rows):
+            for c in used[r]:
+                users[c].append(r)
+        found = []
+        for r, s in sorted({pair for c in self.columns for pair in combinations(users[c], 2)}):
+            for c, d in combinations(sorted(used[r] & used[s]), 2):
+                entries = A[r][c], A[s][d], A[r][d], A[s][c]
+                if entries not in self._determinants:
+                    self._determinants[entries] = self._determinant_of(*entries)
+                determinant = self._determinants[entries]
+                if determinant is not None:
+                    fill = (len(used[r] | used[s]) - 2) * len({*users[c], *users[d]} - {r, s})
+                    found.append((fill, r, s, c, d, determinant))
+        if not found:
+            return None
+        _, r, s, c, d, determinant = min(found)
+        over = [graph.div(n, determinant) for n in (A[s][d], A[r][d], A[s][c], A[r][c])]
+        return Pivot((r, s), (c, d), ((over[0], graph.neg(over[1])), (graph.neg(over[2]), over[3])), determinant)
+
+    def _determinant_of(self, a: int, b: int, c: int, d: int) -> int | None:
+        """a b - c d, where it depends on parameters alone and is not small; None otherwise."""
+        graph, probes = self.graph, self.probes
+        both = graph.mul(a, b), graph.mul(c, d)
+        determinant = self.forms.simplified(graph.sub(*both))
+        regular = not graph.varies[determinant] and np.all(np.abs(probes([determinant])) > GOOD * np.sum(np.abs(probes(both)), axis=0))
+        return determinant if regular else None
+
     # rows combined
 
-    def _best_column(self) -> "_Combined | None":
-        """The column with the best pivot by all rows that hold it, combined; None where each is held by one."""
+    def _by_column(self, single: tuple[int, int]) -> Pivot:
+        """One column by all rows that hold it, combined; the entry at the place `single` where that is no better."""
+        graph, A, regular = self.graph, self.A, self._regular
         found = []
         for c in sorted(self.columns):
-            users = [r for r in sorted(self.rows) if self.A[r][c] != self.graph.zero]
+            users = [r for r in sorted(self.rows) if A[r][c] != graph.zero]
             if len(users) < 2:
                 continue
-            key = c, *((r, self.A[r][c]) for r in users)
-            if key not in self._combined:
-                self._combined[key] = self._combination(c, users)
-            combined = self._combined[key]
-            fill = len({k for r in users for k in self._in_row(r)}) * len(users)
-            found.append((not combined.serves, self.graph.varies[combined.squares], fill, -combined.worst, c, combined))
-        return min(found)[-1] if found else None
-
-    def _combination(self, c: int, users: list[int]) -> "_Combined":
-        graph, weights = self.graph, self._weights(users)
-        squares = graph.total(graph.mul(graph.const(w), graph.mul(self.A[r][c], self.A[r][c])) for r, w in zip(users, weights, strict=True))
-        squares = self.forms.simplified(squares)
-        size = sum(w * self._size(r) ** 2 for r, w in zip(users, weights, strict=True))
-        with np.errstate(all="ignore"):
-            return _Combined(c, users, weights, squares, _least(np.sqrt(self._at([squares])[0] / size)[self._regular]))
-
-    def _by_column(self, combined: "_Combined") -> Pivot:
-        turned = len(combined.rows) == 2 and len(self.rows) <= len(self.columns)
-        return (self._turned if turned else self._orthogonal)(combined.column, combined.rows, combined.weights, combined.squares)
+            weights = self._weights(users)
+            terms = [graph.mul(graph.const(w), graph.mul(A[r][c], A[r][c])) for r, w in zip(users, weights, strict=True)]
+            squares = self.forms.simplified(graph.total(terms))
+            size = sum(w * self._size(r) ** 2 for r, w in zip(users, weights, strict=True))
+            with np.errstate(all="ignore"):
+                worst = _least(np.sqrt(self._at([squares])[0] / size)[regular])
+            fill = len({k for r in users for k in self.columns if A[r][k] != graph.zero}) * len(users)
+            found.append((worst <= GOOD, graph.varies[squares], fill, -worst, c, users, weights, squares))
+        if not found or -min(found)[3] <= _least(np.abs(self._beside_row(single))[regular]):
+            return self._single(*single)
+        *_, c, users, weights, squares = min(found)
+        combined = self._turned if len(users) == 2 and len(self.rows) <= len(self.columns) else self._orthogonal
+        return combined(c, users, weights, squares)
 
     def _weights(self, rows: list[int]) -> list[float]:
         """The weights of rows in a combination: one where their sizes are alike."""
@@ -255,7 +273,7 @@ class Pivots:
             row[s] = [self.forms.simplified(graph.sub(graph.mul(b, x), graph.mul(a, y))) for x, y in pairs]
         A[r][c], A[s][c] = squares, graph.zero
         self._changed()
-        return Pivot(r, c, graph.call("sqrt", squares))
+        return self._single(r, c, graph.call("sqrt", squares))
 
     def _orthogonal(self, c: int, users: list[int], weights: list[float], squares: int) -> Pivot:
         """All rows of a column combined into a new one, and made orthogonal to the column (Gram and Schmidt)."""
@@ -277,7 +295,17 @@ class Pivots:
         self._changed()
         self.rows.add(new)
         self._tall = True
-        return Pivot(new, c, graph.call("sqrt", squares))
+        return self._single(new, c, graph.call("sqrt", squares))
+
+
+def _ratios(values: Float[np.ndarray, "places probes"], places, sizes) -> np.ndarray:
+    """Entries beside the largest of their row, which come one after another, and beside `sizes`."""
+    values = np.abs(values)
+    starts = np.flatnonzero([k == 0 or places[k][0] != places[k - 1][0] for k in range(len(places))])  # places come row by row
+    largest = np.repeat(np.maximum.reduceat(values, starts), np.diff([*starts, len(places)]), axis=0)
+    largest = largest if sizes is None else np.fmax(largest, sizes)
+    with np.errstate(all="ignore"):
+        return values / np.where(largest > 0, largest, 1.0)
 
 
 def turns(graph: Graph, node: int) -> bool:
@@ -289,3 +317,7 @@ def _least(ratio: Float[np.ndarray, "probes"]) -> float:
     """The smallest; zero where none is a number."""
     return float(np.min(ratio[np.isfinite(ratio)], initial=np.inf)) if np.isfinite(ratio).any() else 0.0
 
+
+def products(graph: Graph, a: Sequence[int], rows) -> list[int]:
+    """The products of a vector with some rows."""
+    return [graph.dot(row, a) for row in rows]
