@@ -226,7 +226,7 @@ CHECKS = (
         lambda x: abs(x[:, 0] - x[:, 1]) > TOLERANCE * x[:, 2],
         lambda x: (
             f"moves along its normal at {x[0]:.4g} m/s by `origin` and `tilt`, but at {x[1]:.4g} m/s by `velocity` and `angular_velocity`; state the motion "
-            "in both: velocity = d origin/dt, angular_velocity = (0, d tilt/dt, 0); where coordinates move it, leave the contact away and "
+            "in both: velocity = d origin/dt, angular_velocity = (0, d tilt/dt, 0); where coordinates move it, omit the contact and "
             f"{_ROWS_INSTEAD}"
         ),
         group="grounds",

@@ -12,9 +12,9 @@ cannot try one again: what would refuse it ends the motion with a code of its ow
 shifts, which are tiny, are steps of Tsit5, whose derivatives are those of the motion.
 
 Where rows are about to lose rank, sigma being the sine between a row and those before it, round-off eps of a row is a velocity eps/sigma^2 across it, which
-fills the error of short steps. In a step that starts at sigma < 0.1 the stages are put back onto the rows; of the error counts what lies along the rows,
-beyond n^2, and how far the projection moves the state, beyond n, with n = 16 eps/sigma^2, at most eps^0.4, for the smallest sigma of the stages: n across the
-rows moves a state by n^2 along them. So what is passed depends on the position, and on no tolerance.
+fills the error of short steps. In a step that starts at sigma < 0.1 the stages are put back onto the rows. Its error is the larger of two parts: the error
+along the rows, less n^2, and the distance that the projection moves the state, less n. Here n = 16 eps/sigma^2, at most eps^0.4, for the smallest sigma of
+the stages; a displacement n across the rows moves the state by n^2 along them. Whether a motion passes thus depends on the position, not on the tolerance.
 
 In single precision the state is summed with compensation (Kahan): what rounding leaves off an increment is added to the next one. Otherwise a state whose
 increments are smaller than its last digit stands still while time passes, and no error estimate sees it.
