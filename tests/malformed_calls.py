@@ -245,7 +245,7 @@ IMPOSSIBLE = {
         "moves with another body, but its `velocity` and"
     ),
     "jj.structure_of(OnLift(lambda q, up: jj.Plane(up)))": (
-        "the plane of contact `back` of `OnLift` moves along its normal ... where coordinates move it, leave"
+        "the plane of contact `back` of `OnLift` moves along its normal ... where coordinates move it, omit the contact"
     ),
     "jj.structure_of(OnLift(lambda q, up: jj.Plane(tilt=q.rise)))": "the plane of contact `back` of `OnLift` moves along its normal",
 }
