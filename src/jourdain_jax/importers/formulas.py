@@ -29,19 +29,18 @@ def sympy_package() -> Any:
 
 
 class Formulas:
-    """Several lists of expressions, evaluated together: a function of the values of their symbols."""
+    """Several lists of expressions by name, evaluated together: a function of the values of their symbols."""
 
-    def __init__(self, lists: Mapping[str, Sequence[Any]], leaves: Sequence[Any]):
-        """The `lists` of expressions, by name, in what is called `leaves`. ValueError for a function that JAX does not have."""
+    def __init__(self, lists: Mapping[Any, Any], leaves: Sequence[Any]):
+        """The `lists` (or matrices) of expressions in what is called `leaves`. ValueError for a function that JAX does not have."""
         sympy = sympy_package()
         self._lengths = {name: len(expressions) for name, expressions in lists.items()}
         flat = [sympy.sympify(e) for expressions in lists.values() for e in expressions]
-        known = set(leaves)
         for expression in flat:
-            check_functions(expression, known)
+            check_functions(expression, set(leaves))
         self._steps, self._results = sympy.cse(flat, symbols=sympy.numbered_symbols("s", cls=sympy.Dummy))
 
-    def values(self, leaves: Mapping[Any, Any], on: ModuleType = jnp) -> dict[str, list]:
+    def values(self, leaves: Mapping[Any, Any], on: ModuleType = jnp) -> dict[Any, list]:
         """The values of all lists where the `leaves` have these, worked out by the functions of `on`: `jax.numpy` or `numpy`."""
         known = dict(leaves)
         for symbol, expression in self._steps:
@@ -49,7 +48,7 @@ class Formulas:
         flat = iter([_value(expression, known, on) for expression in self._results])
         return {name: [next(flat) for _ in range(length)] for name, length in self._lengths.items()}
 
-    def numbers(self, leaves: Mapping[Any, float]) -> dict[str, np.ndarray]:
+    def numbers(self, leaves: Mapping[Any, float]) -> dict[Any, np.ndarray]:
         """The values of all lists as known numbers, in double precision."""
         with np.errstate(all="ignore"):
             found = self.values({symbol: np.float64(x) for symbol, x in leaves.items()}, np)

@@ -11,8 +11,9 @@ from jourdain_jax.calculus.reals import checked_real, described
 from jourdain_jax.importers.formulas import Formulas, sympy_package
 from jourdain_jax.importers.identifiers import class_name, identifiers
 from jourdain_jax.importers.scene_class import scene_class
-from jourdain_jax.importers.sympy_forces import Forces, forces_of, velocity_rows
-from jourdain_jax.importers.sympy_kinematics import Pose, RandomStates, poses_of, symbols_in
+from jourdain_jax.importers.sympy_forces import forces_of, velocity_rows
+from jourdain_jax.importers.sympy_kinematics import Pose, poses_of
+from jourdain_jax.importers.sympy_samples import symbols_in
 from jourdain_jax.importers.sympy_system import MechanicalSystem, mechanical_system
 from jourdain_jax.scene.bodies import Particle, RigidBody
 from jourdain_jax.scene.coordinates import coordinates, inputs, speeds
@@ -32,11 +33,15 @@ class _Expressions:
     inputs: tuple[Any, ...]
     fields: dict[Any, str]  # constant -> name of the field
     is_rigid: dict[str, bool]  # body -> whether it is a rigid one
-    bodies: Formulas
-    rates: Formulas
-    loads: Formulas  # by body, or name of a speed, and kind: "disc force"
-    geometric: Formulas
-    velocity: Formulas
+    formulas: dict[str, Formulas]  # bodies, rates, loads, and geometric and velocity rows
+
+    def values(self, part: str, scene: "SympyScene", t, q, *others) -> dict[Any, list[Float[Array, ""]]]:
+        """The values of a part; `others`: speeds and inputs, where it depends on these."""
+        leaves = {self.time: t} | {constant: getattr(scene, name) for constant, name in self.fields.items()}
+        for symbols, named in zip((self.q, self.u, self.inputs), (q, *others), strict=False):
+            leaves |= {symbol: named.array[k] for k, symbol in enumerate(symbols)}
+        dtype = jnp.result_type(float)
+        return {key: [jnp.asarray(value, dtype) for value in values] for key, values in self.formulas[part].values(leaves).items()}
 
 
 class SympyScene(Scene):
@@ -46,13 +51,12 @@ class SympyScene(Scene):
 
     def bodies(self, t, q):
         """Poses by SymPy's positions and rotation matrices."""
-        known = self._expressions
-        values = known.bodies.values(self._leaves(t, q))
+        values = {key: jnp.stack(several) for key, several in self._expressions.values("bodies", self, t, q).items()}
         found: dict[str, Particle | RigidBody] = {}
-        for name, rigid in known.is_rigid.items():
-            mass, position = _vector(values[f"{name} mass"])[0], _vector(values[f"{name} position"])
+        for name, rigid in self._expressions.is_rigid.items():
+            mass, position = values["mass", name][0], values["position", name]
             if rigid:
-                inertia, orientation = (_vector(values[f"{name} {what}"]).reshape(3, 3) for what in ("inertia", "orientation"))
+                inertia, orientation = (values[what, name].reshape(3, 3) for what in ("inertia", "orientation"))
                 found[name] = RigidBody(mass, inertia, position, orientation)
             else:
                 found[name] = Particle(mass, position)
@@ -60,47 +64,25 @@ class SympyScene(Scene):
 
     def coordinate_rates(self, t, q, u):
         """SymPy's kinematic equations, solved for the rates."""
-        return _vector(self._expressions.rates.values(self._leaves(t, q, u))["rates"])
+        return jnp.stack(self._expressions.values("rates", self, t, q, u)["rates"])
 
     def loads(self, motion):
         """SymPy's loads; those that are constant have a potential."""
-        kinds = {"weight": {}, "force": {}, "torque": {}, "generalized": {}}
-        for key, value in self._expressions.loads.values(self._leaves_of(motion)).items():
-            name, _, kind = key.rpartition(" ")
-            kinds[kind][name] = _vector(value)
-        weights, forces, torques, generalized = kinds.values()
-        found = ()
-        if weights:
-            found += (Load(forces=weights, potential=-sum(force @ motion[name].position for name, force in weights.items())),)
-        if forces or torques or generalized:
-            found += (Load(forces, torques, {name: value[0] for name, value in generalized.items()}),)
-        return found
+        kinds: dict[str, dict] = {"weight": {}, "force": {}, "torque": {}, "generalized": {}}
+        for (kind, name), value in self._expressions.values("loads", self, motion.t, motion.q, motion.u, motion.inputs).items():
+            kinds[kind][name] = value[0] if kind == "generalized" else jnp.stack(value)
+        weights, *others = kinds.values()
+        found = [Load(forces=weights, potential=-sum(force @ motion[name].position for name, force in weights.items()))] if weights else []
+        return (*found, Load(*others)) if any(others) else tuple(found)
 
     def geometric_constraints(self, pose):
         """SymPy's configuration constraints."""
-        return _rows("configuration", self._expressions.geometric.values(self._leaves(pose.t, pose.q))["rows"])
+        return {f"configuration {k}": row for k, row in enumerate(self._expressions.values("geometric", self, pose.t, pose.q)["rows"], 1)}
 
     def velocity_constraints(self, motion):
         """SymPy's velocity constraints that are not rates of the others."""
-        return _rows("velocity", self._expressions.velocity.values(self._leaves_of(motion))["rows"])
-
-    def _leaves(self, t, q, u=None) -> dict[Any, Float[Array, ""]]:
-        known = self._expressions
-        leaves = {known.time: t} | {constant: getattr(self, name) for constant, name in known.fields.items()}
-        leaves |= {symbol: q.array[k] for k, symbol in enumerate(known.q)}
-        return leaves if u is None else leaves | {symbol: u.array[k] for k, symbol in enumerate(known.u)}
-
-    def _leaves_of(self, motion) -> dict[Any, Float[Array, ""]]:
-        leaves = self._leaves(motion.t, motion.q, motion.u)
-        return leaves | {symbol: motion.inputs.array[k] for k, symbol in enumerate(self._expressions.inputs)}
-
-
-def _vector(values: list) -> Float[Array, "values"]:
-    return jnp.stack([jnp.asarray(value, jnp.result_type(float)) for value in values])
-
-
-def _rows(kind: str, values: list) -> dict[str, Float[Array, ""]]:
-    return {f"{kind} {k + 1}": jnp.asarray(value, jnp.result_type(float)) for k, value in enumerate(values)}
+        rows = self._expressions.values("velocity", self, motion.t, motion.q, motion.u, motion.inputs)["rows"]
+        return {f"velocity {k}": row for k, row in enumerate(rows, 1)}
 
 
 def from_sympy(system, origin=None, values: Mapping[Any, Any] | None = None, *, name: str = "SympyScene") -> type[Scene]:
@@ -139,45 +121,37 @@ def from_sympy(system, origin=None, values: Mapping[Any, Any] | None = None, *, 
         Pendulum = jj.from_sympy(kane, O, {m: 1.0, l: 0.5, g: 9.81}, name="Pendulum")
         print(jj.simulate(Pendulum(), {"q": 0.3}, t1=1.0))
     """
-    given = _checked_values({} if values is None else values)
-    states = RandomStates(given)
-    known, poses = poses_of(mechanical_system(system, origin), states)
-    return _scene_class(known, poses, forces_of(known, poses), velocity_rows(known, states), given, name)
-
-
-def _checked_values(values: Mapping[Any, Any]) -> dict[str, float]:
-    """The values by the name of their symbol."""
-    if not isinstance(values, Mapping):
+    if not isinstance(values, Mapping | None):
         raise ValueError(f"`values` is {described(values)}, expected a dictionary: symbol -> number")
-    return {str(symbol): float(checked_real(value, f"value of `{symbol}`", (), advice="give one number")) for symbol, value in values.items()}
+    checked = {str(x): float(checked_real(value, f"value of `{x}`", (), advice="give one number")) for x, value in (values or {}).items()}
+    return _scene_class(*poses_of(mechanical_system(system, origin, checked)), name)
 
 
-def _scene_class(system: MechanicalSystem, poses: list[Pose], forces: Forces, rows: list[Any], given: dict[str, float], name: str) -> type[Scene]:
-    """The class, when all expressions are known."""
-    bodies: dict[str, list] = {}
+def _scene_class(system: MechanicalSystem, poses: list[Pose], name: str) -> type[Scene]:
+    """The class, when all poses are known."""
+    bodies: dict[Any, Any] = {}
     for pose in poses:
-        bodies |= {f"{pose.name} mass": [pose.mass], f"{pose.name} position": list(pose.position)}
-        if pose.orientation is not None and pose.inertia is not None:
-            bodies |= {f"{pose.name} inertia": list(pose.inertia), f"{pose.name} orientation": list(system.resolved(pose.orientation))}
-    u_names = identifiers([_name_of(x) for x in system.speeds], "speed")
-    loads = {f"{body} {kind}": list(value) for kind in ("weight", "force", "torque") for body, value in getattr(forces, f"{kind}s").items()}
-    loads |= {f"{u_names[_name_of(speed)]} generalized": [value] for speed, value in forces.generalized.items()}
-    parts = {
+        bodies |= {("mass", pose.name): [pose.mass], ("position", pose.name): pose.position}
+        if pose.orientation is not None:
+            bodies |= {("inertia", pose.name): pose.inertia, ("orientation", pose.name): system.resolved(pose.orientation)}
+    u_names = identifiers([str(x.func) for x in system.speeds], "speed")
+    loads = {(kind, u_names[str(where.func)] if kind == "generalized" else where): value for (kind, where), value in forces_of(system, poses).items()}
+    parts: dict[str, dict[Any, Any]] = {
         "bodies": bodies,
         "rates": {"rates": [system.rates[q.diff(system.time)] for q in system.coordinates]},
-        "loads": loads,
         "geometric": {"rows": [system.resolved(row) for row in system.configuration]},
-        "velocity": {"rows": rows},
+        "loads": loads,
+        "velocity": {"rows": velocity_rows(system)},
     }
-    used = symbols_in(e for lists in parts.values() for expressions in lists.values() for e in expressions) - {system.time}
-    leaves = [*system.coordinates, *system.speeds, system.time, *used]
-    constants = sorted((x for x in used if x.is_Symbol), key=str)
-    unknown = sorted((x for x in used if not x.is_Symbol and x not in (*system.coordinates, *system.speeds)), key=str)
-    _check_known(system, parts, constants, unknown, given)
-    formulas = {part: Formulas(lists, leaves) for part, lists in parts.items()}
+    symbols = {part: symbols_in(e for expressions in lists.values() for e in expressions) - {system.time} for part, lists in parts.items()}
+    used = sorted(set().union(*symbols.values()), key=str)
+    constants = [x for x in used if x.is_Symbol]
+    unknown = [x for x in used if not x.is_Symbol and x not in (*system.coordinates, *system.speeds)]
+    for x in unknown:
+        _check_input(system, x, symbols["bodies"] | symbols["rates"] | symbols["geometric"])
+    _check_values(system.given, {str(constant) for constant in constants})
     fields = identifiers(dict.fromkeys(map(str, constants)), "constant", taken=dir(SympyScene))
-    q_names = identifiers([_name_of(x) for x in system.coordinates], "coordinate")
-    input_names = identifiers([_name_of(x) for x in unknown], "input")
+    leaves = [*system.coordinates, *system.speeds, system.time, *used]
     expressions = _Expressions(
         system.time,
         system.coordinates,
@@ -185,39 +159,33 @@ def _scene_class(system: MechanicalSystem, poses: list[Pose], forces: Forces, ro
         tuple(unknown),
         {constant: fields[str(constant)] for constant in constants},
         {pose.name: pose.orientation is not None for pose in poses},
-        **formulas,
+        {part: Formulas(lists, leaves) for part, lists in parts.items()},
     )
-    parameters = {fields[str(x)]: parameter(given[str(x)], about=f"{x} of SymPy", positive=bool(x.is_positive)) for x in constants}
     attributes = {
-        "coordinates": coordinates(" ".join(q_names.values())),
+        "coordinates": coordinates(" ".join(identifiers([str(x.func) for x in system.coordinates], "coordinate").values())),
         "speeds": speeds(" ".join(u_names.values())),
-        "inputs": inputs(" ".join(input_names.values())),
+        "inputs": inputs(" ".join(identifiers([str(x.func) for x in unknown], "input").values())),
         "conventions": f"Axes are those of the inertial frame {system.frame.name} of SymPy, positions count from {system.origin.name}.",
         "_expressions": expressions,
     }
+    parameters = {fields[str(x)]: parameter(system.given[str(x)], about=f"{x} of SymPy", positive=bool(x.is_positive)) for x in constants}
     return scene_class(SympyScene, class_name(name), f"A scene from SymPy: {', '.join(pose.name for pose in poses)}.", parameters, attributes)
 
 
-def _name_of(function) -> str:
-    return str(function.func)
-
-
-def _check_known(system: MechanicalSystem, parts: dict[str, dict[str, list]], constants: list[Any], unknown: list[Any], given: dict[str, float]) -> None:
-    """A ValueError for rates that nothing gives, inputs where there can be none, constants without a value, and values of nothing."""
-    sympy = sympy_package()
-    for x in unknown:
-        if isinstance(x, sympy.Derivative):
-            speed = x.args[0] in system.speeds
-            advice = "loads and rows may depend on speeds, not on their rates" if speed else f"make `{x.args[0]}` a coordinate or a speed"
-            raise ValueError(f"`{x}` occurs, and no kinematic equation gives it; {advice}")
-    places = symbols_in(e for part in ("bodies", "rates", "geometric") for expressions in parts[part].values() for e in expressions)
-    misplaced = next((x for x in unknown if x in places), None)
-    if misplaced is not None:
+def _check_input(system: MechanicalSystem, x, of_poses: set[Any]) -> None:
+    """A ValueError for a function of time that no kinematic equation gives, where it can be no input: a rate, or one that poses depend on."""
+    if isinstance(x, sympy_package().Derivative):
+        speed = x.args[0] in system.speeds
+        advice = "loads and rows may depend on speeds, not on their rates" if speed else f"make `{x.args[0]}` a coordinate or a speed"
+        raise ValueError(f"`{x}` occurs, and no kinematic equation gives it; {advice}")
+    if x in of_poses:
         advice = "make it a coordinate; to drive it as a function of time, define `prescribed(self, t)` in a subclass"
-        raise ValueError(f"`{misplaced}` occurs in a position, an orientation or a configuration constraint, and is neither coordinate nor speed; {advice}")
-    names = {str(constant) for constant in constants}
-    missing = sorted(names - given.keys())
-    if missing:
+        raise ValueError(f"`{x}` occurs in a position, an orientation or a configuration constraint, and is neither coordinate nor speed; {advice}")
+
+
+def _check_values(given: Mapping[str, float], names: set[str]) -> None:
+    """A ValueError for constants without a value, and values of nothing."""
+    if missing := sorted(names - given.keys()):
         listed = ", ".join(f"`{symbol}`" for symbol in missing)
         raise ValueError(f"no value for {listed}; give `values={{{missing[0]}: 1.0}}`, a number for each constant, by symbol or name")
     for symbol in given:

@@ -1,6 +1,6 @@
 """What is taken from SymPy's mechanics: coordinates, speeds, their kinematic equations, bodies, loads and rows; no equation of motion."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,8 +12,9 @@ from jourdain_jax.importers.formulas import sympy_package
 class MechanicalSystem:
     """A system as SymPy describes it; expressions in q(t), u(t), t and constants."""
 
-    frame: Any  # the inertial one
+    given: Mapping[str, float]  # numbers of constants, by name
     origin: Any  # a point; positions count from it
+    frame: Any  # the inertial one
     coordinates: tuple[Any, ...]
     speeds: tuple[Any, ...]
     rates: dict[Any, Any]  # qdot -> expression in q, u, t
@@ -25,8 +26,12 @@ class MechanicalSystem:
 
     def resolved(self, expression):
         """The expression (or matrix) without rates of coordinates and auxiliary speeds."""
-        zero = dict.fromkeys(self.auxiliary, 0) | {speed.diff(self.time): 0 for speed in self.auxiliary}
-        return expression.xreplace(self.rates).xreplace(zero)
+        zero = dict.fromkeys((*self.auxiliary, *(speed.diff(self.time) for speed in self.auxiliary)), 0)
+        return sympy_package().sympify(expression).xreplace(self.rates).xreplace(zero)
+
+    def rates_of_configuration(self) -> tuple[Any, ...]:
+        """Rates of what vanishes, in those of the coordinates."""
+        return tuple(sympy_package().sympify(row).diff(self.time) for row in self.configuration)
 
     def with_coordinates(self, rates: dict[Any, Any]) -> "MechanicalSystem":
         """The system with further coordinates, whose rates are given."""
@@ -40,31 +45,30 @@ class MechanicalSystem:
 
     def is_constant(self, expression) -> bool:
         """Whether it depends on constants only."""
-        sympy = sympy_package()
-        return not expression.has(self.time) and not expression.atoms(sympy.core.function.AppliedUndef)
+        return not expression.has(self.time) and not expression.atoms(sympy_package().core.function.AppliedUndef)
 
 
-def mechanical_system(system, origin) -> MechanicalSystem:
+def mechanical_system(system, origin, given: Mapping[str, float]) -> MechanicalSystem:
     """What a `KanesMethod`, a `JointsMethod` whose equations are formed, or a `System` of SymPy says. ValueError for anything else, and for what is missing."""
-    sympy = sympy_package()
-    mechanics = sympy.physics.mechanics
+    mechanics = sympy_package().physics.mechanics
     system = getattr(system, "method", None) or system  # of a JointsMethod
     if isinstance(system, mechanics.KanesMethod):
-        return _of_kane(system, _checked_origin(mechanics, origin))
-    if type(system).__name__ == "System" and hasattr(system, "kdes") and hasattr(system, "holonomic_constraints"):
-        return _of_system(sympy, system, system.fixed_point if origin is None else _checked_origin(mechanics, origin))
-    raise ValueError(
-        f"`system` is {described(system)}, expected a `KanesMethod` or a `System` of sympy.physics.mechanics, or a `JointsMethod` after its `form_eoms()`"
-    )
-
-
-def _checked_origin(mechanics, origin):
+        read = _of_kane
+    elif type(system).__name__ == "System" and hasattr(system, "kdes") and hasattr(system, "holonomic_constraints"):
+        read, origin = _of_system, system.fixed_point if origin is None else origin
+    else:
+        raise ValueError(
+            f"`system` is {described(system)}, expected a `KanesMethod` or a `System` of sympy.physics.mechanics, or a `JointsMethod` after its `form_eoms()`"
+        )
     if not isinstance(origin, mechanics.Point):
         raise ValueError(f"`origin` is {described(origin)}, expected the point of SymPy that positions count from, such as Point('O')")
-    return origin
+    frame, rates, loads, *several = read(system)
+    q, u, bodies, configuration, velocity, auxiliary = map(tuple, several)
+    pairs = tuple((load[0], load[1]) for load in loads)
+    return MechanicalSystem(given, origin, frame, q, u, dict(rates), bodies, pairs, configuration, velocity, auxiliary)
 
 
-def _of_kane(kane, origin) -> MechanicalSystem:
+def _of_kane(kane) -> tuple:
     if kane.bodies is None:
         raise ValueError("the `KanesMethod` does not know its bodies; give it `bodies=` and `forcelist=`, or call its `kanes_equations(bodies, loads)` first")
     try:
@@ -72,43 +76,17 @@ def _of_kane(kane, origin) -> MechanicalSystem:
     except AttributeError:
         raise ValueError("the `KanesMethod` has no kinematic equations; give it `kd_eqs=`, which say how speeds move coordinates") from None
     velocity = kane._k_nh * kane.u + kane._f_nh if kane._f_nh else ()
-    return MechanicalSystem(
-        kane._inertial,
-        origin,
-        tuple(kane.q),
-        tuple(kane.u),
-        dict(rates),
-        tuple(kane.bodies),
-        _pairs(kane.forcelist or ()),
-        tuple(kane._f_h),
-        tuple(velocity),
-        tuple(kane._uaux),
-    )
+    return kane._inertial, rates, kane.forcelist or (), kane.q, kane.u, kane.bodies, kane._f_h, velocity, kane._uaux
 
 
-def _of_system(sympy, system, origin) -> MechanicalSystem:
-    time = sympy.physics.mechanics.dynamicsymbols._t
+def _of_system(system) -> tuple:
+    sympy = sympy_package()
     q, kinematic = sympy.Matrix(system.q), sympy.Matrix(system.kdes)
     if len(kinematic) != len(q):
         raise ValueError(f"the `System` has {len(kinematic)} kinematic equations for {len(q)} coordinates; add the missing ones by `add_kdes`")
-    qdot = q.diff(time)
+    qdot = q.diff(sympy.physics.mechanics.dynamicsymbols._t)
     # kinematic = A qdot + b = 0
-    coefficients, rest = kinematic.jacobian(qdot), kinematic.xreplace(dict.fromkeys(qdot, sympy.S.Zero))
-    solved = -coefficients.LUsolve(rest)
+    solved = -kinematic.jacobian(qdot).LUsolve(kinematic.xreplace(dict.fromkeys(qdot, sympy.S.Zero)))
     loads = [*system.loads, *(load for actuator in system.actuators for load in actuator.to_loads())]
-    return MechanicalSystem(
-        system.frame,
-        origin,
-        tuple(q),
-        tuple(system.u),
-        dict(zip(qdot, solved, strict=True)),
-        tuple(system.bodies),
-        _pairs(loads),
-        tuple(system.holonomic_constraints),
-        tuple(system.velocity_constraints),
-        tuple(system.u_aux),
-    )
-
-
-def _pairs(loads: Sequence[Any]) -> tuple[tuple[Any, Any], ...]:
-    return tuple((load[0], load[1]) for load in loads)
+    rows = system.holonomic_constraints, system.velocity_constraints
+    return system.frame, zip(qdot, solved, strict=True), loads, q, system.u, system.bodies, *rows, system.u_aux
