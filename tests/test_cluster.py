@@ -75,11 +75,10 @@ def deadly(motion):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("workers", ["processes of a cluster", "processes of the study"])
-def test_a_chunk_on_which_workers_die_is_named_and_left_out(workers, tmp_path, monkeypatch):
-    monkeypatch.undo()  # workers are processes of their own
+def test_a_chunk_on_which_workers_die_is_named_and_left_out(workers, tmp_path):
     radius = np.where(np.arange(LANES) == DEADLY, NUMBER, 0.5)
     study = jj.Study(jj.models.TiltingDisc(), vary={"radius": radius}, start={"lean": 0.3, "spin_rate": -3.0})
-    options = {"t1": 1.0, "rtol": 1e-6, "atol": 1e-6, "progress": False, "outputs": {"lean": deadly}}
+    options = {"t1": 1.0, "rtol": 1e-6, "atol": 1e-6, "progress": False, "outputs": {"lean": deadly}, "chunk": 2048}
     with ExitStack() as stack:
         if workers == "processes of a cluster":
             cluster = stack.enter_context(distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50))

@@ -30,7 +30,7 @@ from test_studies import assert_same
 
 import jourdain_jax as jj
 from jourdain_jax.calculus.writing import write_whole
-from jourdain_jax.ensembles import files, optional, store, task, workers
+from jourdain_jax.ensembles import files, store, task, workers
 from jourdain_jax.ensembles.identity import digest
 from jourdain_jax.ensembles.run import Runner, opened
 from jourdain_jax.ensembles.store import Store
@@ -300,11 +300,10 @@ def test_numbers_of_a_grid_are_within_their_ranges(grid, whole, tmp_path):
 def _with_receipts_of(path):
     """Receipts that belong to the grid that is there, as a hostile hand would write them."""
     opened = Store(path)
-    crc32c = optional.crc32c()
     for number in opened.receipts():
         file = path / "run" / "chunks" / str(number)
-        found = store._unpacked(file.read_bytes(), crc32c)
-        file.write_bytes(store._packed(replace(found, of=(opened.identity, opened._digests["run/grid.json"])), crc32c))
+        found = store.Receipt.unpacked(file.read_bytes(), len(opened.outputs))
+        file.write_bytes(replace(found, of=(opened.identity, opened._digests["run/grid.json"])).packed())
 
 
 def test_chunks_of_another_grid_do_not_count(whole, tmp_path, computed):

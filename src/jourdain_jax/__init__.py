@@ -117,7 +117,7 @@ if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.motion.integrators.implicit_midpoint import ImplicitMidpoint
     from jourdain_jax.motion.integrators.radau import RadauIIA
     from jourdain_jax.motion.trajectories.storage import load_rollout, load_trajectory, save
-    from jourdain_jax.plotting.animation import animate
+    from jourdain_jax.plotting.pictures import animate
     from jourdain_jax.plotting.quantities import plot
     from jourdain_jax.plotting.show import View, show
 
@@ -162,7 +162,7 @@ _ON_FIRST_USE = {
     "motion.integrators.implicit_midpoint": "ImplicitMidpoint",
     "motion.integrators.radau": "RadauIIA",
     "motion.trajectories.storage": "load_rollout load_trajectory save",
-    "plotting.animation": "animate",
+    "plotting.pictures": "animate",
     "plotting.quantities": "plot",
     "plotting.show": "View show",
 }
@@ -170,7 +170,7 @@ _GONE = {
     "Built": "it is `Model`, which `build` returns",
     "MuntheKaas": "the default solvers renormalise quaternions after each step, are as accurate and take half of its time",
 }
-_pictures = _module_on_first_use("jourdain_jax.plotting.scene_picture")
+_pictures = _module_on_first_use("jourdain_jax.plotting.pictures")
 _show_scenes_with(lambda scene: _pictures.scene_picture(scene))
 __getattr__, __dir__ = _names_on_first_use(globals(), {name: module for module, names in _ON_FIRST_USE.items() for name in names.split()}, _GONE)
 __version__ = _version_of("jourdain-jax")

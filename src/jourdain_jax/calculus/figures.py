@@ -4,10 +4,12 @@ import base64
 import html
 import io
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from jourdain_jax.calculus.on_first_use import needed
 
+pyplot = partial(needed, "matplotlib.pyplot", "a picture", "plot")
 DATA, MODEL, QUIET = "#d1495b", "#1b4f72", "#888888"
 
 

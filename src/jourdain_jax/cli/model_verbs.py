@@ -1,6 +1,7 @@
 """The verbs about models: `models`, `report`, `verify`, `simulate`."""
 
 import json
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -12,11 +13,11 @@ from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.models.registry import MODELS, counts_of, known_model, model
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import start
-from jourdain_jax.motion.trajectories.diagnostics import ContactExtremes, diagnose
+from jourdain_jax.motion.trajectories.diagnostics import diagnose
 from jourdain_jax.motion.trajectories.results import EVENT, FALLBACKS, SUCCESS
 from jourdain_jax.motion.trajectories.storage import save
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.plotting.animation import animate, check_suffix
+from jourdain_jax.plotting.pictures import animate, check_suffix
 from jourdain_jax.plotting.quantities import check_format, plot
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
@@ -103,14 +104,18 @@ def _models(options) -> bool:
 
 def _model_row(name: str) -> dict:
     scene = MODELS[name]()
-    counts = {key: {"value": getattr(scene, key)} for key in counts_of(type(scene))}
-    about = (type(scene).__doc__ or "").strip().splitlines()[0]
-    parameters = {key: {"value": np.asarray(value).tolist(), "unit": meta["unit"]} for key, value, meta in parameters_of(scene)}
-    names = {"coordinates": scene.coordinate_names.entries, "speeds": scene.speed_names.entries, "inputs": scene.inputs.entries}
-    domain = {key: [float(bound) for bound in bounds] for key, bounds in scene.domain.items()}
-    example = {key: np.asarray(value).tolist() for key, value in scene.example.items()}
-    more = {"events": names_of_events(scene), "domain": domain, "example": example, "example_span": scene.example_span, "conventions": scene.conventions}
-    return {"name": name, "about": about, **names, "parameters": parameters, "counts": counts, **more}
+    row = {
+        "name": name,
+        "about": (type(scene).__doc__ or "").strip().splitlines()[0],
+        "coordinates": scene.coordinate_names.entries,
+        "speeds": scene.speed_names.entries,
+        "inputs": scene.inputs.entries,
+        "parameters": {key: {"value": value, "unit": meta["unit"]} for key, value, meta in parameters_of(scene)},
+        "counts": {key: {"value": getattr(scene, key)} for key in counts_of(type(scene))},
+        "events": names_of_events(scene),
+        **{key: getattr(scene, key) for key in ("domain", "example", "example_span", "conventions")},
+    }
+    return plain(row)
 
 
 def _description(row: dict) -> str:
@@ -176,39 +181,34 @@ def _check_files(options) -> None:
         check_suffix(options.animate)
 
 
-def _contact_row(contact: ContactExtremes) -> dict:
-    friction = float(contact.friction_needed)
-    return {
-        "lowest_normal": float(contact.lowest_normal),
-        "highest_normal": float(contact.highest_normal),
-        "friction_needed": friction if np.isfinite(friction) else None,  # None: infinite
-        "pulls": not contact.honest,
-        "determined": bool(contact.determined),
-    }
-
-
 def _motion_row(name: str, trajectory: Trajectory) -> dict:
-    found = diagnose(trajectory)
-    final = dict(zip(trajectory.scene.coordinate_names.entries, np.asarray(trajectory.q_end).tolist(), strict=True))
-    final |= dict(zip(trajectory.scene.speed_names.entries, np.asarray(trajectory.u_end).tolist(), strict=True))
-    return {
+    found, scene = diagnose(trajectory), trajectory.scene
+    names = (*scene.coordinate_names.entries, *scene.speed_names.entries)
+    of_contact = ("lowest_normal", "highest_normal", "friction_needed", "pulls", "determined")  # friction_needed: none where it is infinite
+    contacts = {key: {what: getattr(contact, what) for what in of_contact} for key, contact in found.contacts.items()}
+    row = {
         "model": name,
-        "result": int(trajectory.result),
+        "result": trajectory.result,
         "message": trajectory.message,
-        "t_end": float(trajectory.t_end),
-        "warnings": list(trajectory.warnings),
+        "t_end": trajectory.t_end,
+        "warnings": trajectory.warnings,
         "fallback": FALLBACKS[int(trajectory.fallback)],
         "state": trajectory.state_form,
-        "steps_accepted": int(trajectory.accepted),
-        "steps_rejected": int(trajectory.rejected),
-        "energy_drift": float(found.energy_drift),
-        "energy_kind": found.energy_kind,
-        "position_residual": float(found.position_residual),
-        "velocity_residual": float(found.velocity_residual),
-        "smallest_singular_value": float(found.smallest_singular_value),
-        "rank": [int(rank) for rank in found.rank],
-        "start_moved": {"coordinates": float(trajectory.moved_q), "speeds": float(trajectory.moved_u)},
-        "invariant_drifts": {key: float(drift) for key, drift in found.invariant_drifts.items()},
-        "contacts": {key: _contact_row(contact) for key, contact in found.contacts.items()},
-        "final": final,
+        "steps_accepted": trajectory.accepted,
+        "steps_rejected": trajectory.rejected,
+        **{key: getattr(found, key) for key in vars(found) if key not in ("energy_size", "contacts")},
+        "start_moved": {"coordinates": trajectory.moved_q, "speeds": trajectory.moved_u},
+        "contacts": contacts,
+        "final": dict(zip(names, (*trajectory.q_end, *trajectory.u_end), strict=True)),
     }
+    return {key: plain(value) for key, value in row.items()}
+
+
+def plain(x):
+    """Numbers, texts and lists of them as JSON has them; what it has no number for is none."""
+    if isinstance(x, Mapping):
+        return {key: plain(value) for key, value in x.items()}
+    if isinstance(x, tuple | list):
+        return [plain(value) for value in x]
+    found = x if isinstance(x, str) else np.asarray(x).tolist()
+    return None if isinstance(found, float) and not np.isfinite(found) else found

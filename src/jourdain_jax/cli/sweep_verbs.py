@@ -22,7 +22,6 @@ rtol = 1e-6
 """
 
 import json
-import math
 import re
 import sys
 import tomllib
@@ -31,6 +30,7 @@ from pathlib import Path
 
 from jourdain_jax.calculus.reading import check_depth, parsed, read_text, whole_number
 from jourdain_jax.calculus.reals import described
+from jourdain_jax.cli.model_verbs import plain
 from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
 from jourdain_jax.ensembles.files import InUseError
 from jourdain_jax.ensembles.outputs import End, EventTime, Happened, Integral, Largest, LargestMagnitude, Smallest
@@ -131,21 +131,22 @@ def _varying(name: str, how):
     kinds = (*VARYING, "levels", "table")
     if not isinstance(how, Mapping) or len(how) != 1:
         raise ValueError(f"`{name}` varies as {described(how)}; write, for example, {name} = {{ normal = [1.0, 0.1] }}")
-    kind, numbers = next(iter(how.items()))
+    ((kind, numbers),) = how.items()
     if kind not in kinds or not isinstance(numbers, list):
         raise ValueError(f"`{name}` varies as `{kind}` = {numbers}, expected a list of numbers by one of these names; {nearest(kind, kinds)}")
-    if kind in VARYING and len(numbers) != 2:
+    if kind not in VARYING:
+        return Levels(numbers) if kind == "levels" else numbers
+    if len(numbers) != 2:
         raise ValueError(f"`{name}`: `{kind}` has {len(numbers)} numbers, expected 2")
-    return VARYING[kind](*numbers) if kind in VARYING else Levels(numbers) if kind == "levels" else numbers
+    return VARYING[kind](*numbers)
 
 
 def _output(name: str, how):
-    unit = dict(how).pop("unit", "") if isinstance(how, Mapping) else ""
-    kinds = [key for key in how if key != "unit"] if isinstance(how, Mapping) else []
-    if len(kinds) != 1 or kinds[0] not in OUTPUTS:
-        raise ValueError(f"output `{name}` is {described(how)}; write, for example, {{ end = 'lean', unit = 'rad' }}. {nearest(str(kinds[:1]), OUTPUTS)}")
-    kind = OUTPUTS[kinds[0]]
-    return kind(how[kinds[0]], unit) if kind not in (EventTime, Happened) else kind(how[kinds[0]])
+    stated = dict(how) if isinstance(how, Mapping) else {}
+    unit = stated.pop("unit", "")
+    if len(stated) != 1 or (kind := OUTPUTS.get(*stated)) is None:
+        raise ValueError(f"output `{name}` is {described(how)}; write, for example, {{ end = 'lean', unit = 'rad' }}. {nearest(str([*stated][:1]), OUTPUTS)}")
+    return kind(*stated.values(), *(() if kind in (EventTime, Happened) else (unit,)))
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -169,15 +170,14 @@ def _show(found: StudyResult, options) -> None:
     if not options.json:
         print(found)
         return
-    outputs = {}
-    for i, name in enumerate(found.outputs if found.counts else ()):
-        limits = {str(level): [_or_none(x) for x in found.quantile(name, level)] for level in LEVELS}
-        numbers = {"mean": _or_none(found.mean(name)), "deviation": _or_none(found.deviation(name)), "quantiles": limits}
-        outputs[name] = {"lanes": int(found.statistics.lanes[i, i])} | numbers
-    about = {"folder": str(found.store.path), "lanes": len(found), "complete": found.complete, "counts": found.counts, "failed": found.failed.tolist()}
-    print(json.dumps(about | {"outputs": outputs}, indent=2))
-
-
-def _or_none(x: float) -> float | None:
-    """What JSON has no number for is none."""
-    return x if math.isfinite(x) else None
+    outputs = {
+        name: {
+            "lanes": found.statistics.lanes[i, i],
+            "mean": found.mean(name),
+            "deviation": found.deviation(name),
+            "quantiles": {str(level): found.quantile(name, level) for level in LEVELS},
+        }
+        for i, name in enumerate(found.outputs if found.counts else ())
+    }
+    about = {"folder": str(found.store.path), "lanes": len(found), "complete": found.complete, "counts": found.counts, "failed": found.failed}
+    print(json.dumps(plain(about | {"outputs": outputs}), indent=2))

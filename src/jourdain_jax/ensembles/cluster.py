@@ -4,20 +4,13 @@ Dask starts a chunk again where its worker died. A chunk on which workers died a
 """
 
 import os
-import pickle
-import threading
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.ensembles import optional
-from jourdain_jax.ensembles.run import Runner
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
-from jourdain_jax.ensembles.workers import computed, keep_to_share, sent_to_others, whatever_dies
-
-_runners: dict[tuple, Runner] = {}  # of this worker: for the study that it worked on last, in one folder
-_one_at_a_time = threading.Lock()
+from jourdain_jax.ensembles.workers import chunk, computed, keep_to_share, sent_to_others, whatever_dies
 
 
 def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
@@ -28,22 +21,15 @@ def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
     sent = sent_to_others(task)
 
     def workers(store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:
-        path = str(store.path.resolve())
         study = client.submit(bytes, sent, pure=False)  # a task, and no scattered data: the scheduler knows how to have it again when a worker died
-        asked = study, path, os.getpid(), _places(distributed, client)
+        asked = study, str(store.path.resolve()), os.getpid(), _places(distributed, client)
         # chunks per thread of a worker: one under way, one that waits for it
         most = 2 * max(1, sum(client.nthreads().values()))
+        pool = client.get_executor(pure=False)
 
         def compute(numbers: list[int], alone: bool):
-            return computed(
-                lambda number: client.submit(_chunk, number, *asked, pure=False),
-                lambda running: distributed.wait(running, return_when="FIRST_COMPLETED").done,
-                distributed.KilledWorker,
-                store,
-                numbers,
-                interrupted,
-                1 if alone else most,
-            )
+            killed = distributed.KilledWorker
+            return computed(lambda number: pool.submit(_chunk, number, *asked), killed, store, numbers, interrupted, 1 if alone else most)
 
         return whatever_dies(store, numbers, interrupted, compute, 1)
 
@@ -60,20 +46,10 @@ def _places(distributed, client) -> dict[object, int] | None:
 
 
 def _chunk(number: int, sent: bytes, path: str, asking: int, places: dict | None) -> tuple[int, int]:
-    """Compute and keep a chunk in this worker, one at a time; what a worker kept before it died is not computed again.
-
-    `asking`: the process that asks; `places`: as `_places` says.
-    """
-    with _one_at_a_time:
-        if os.getpid() != asking and "JOURDAIN_JAX_THREADS" not in os.environ:  # a worker that is a process of its own keeps to its share of the cores
-            worker = optional.distributed().get_worker()
-            os.environ["JOURDAIN_JAX_THREADS"] = str(worker.state.nthreads)
-            if places and worker.name in places:
-                keep_to_share(places[worker.name], len(places))
-        which = sent, path, (Path(path) / "zarr.json").stat().st_mtime_ns
-        if which not in _runners:
-            _runners.clear()
-            _runners[which] = Runner(pickle.loads(sent), Store(path))
-        runner = _runners[which]
-        receipt = runner.store.receipt(number)
-        return receipt.lanes if receipt else runner.run(number)
+    """Compute and keep a chunk in this worker; `asking`: the process that asks; `places`: as `_places` says."""
+    if os.getpid() != asking and "JOURDAIN_JAX_THREADS" not in os.environ:  # a worker that is a process of its own keeps to its share of the cores
+        worker = optional.distributed().get_worker()
+        os.environ["JOURDAIN_JAX_THREADS"] = str(worker.state.nthreads)
+        if places and worker.name in places:
+            keep_to_share(places[worker.name], len(places))
+    return chunk(number, sent, path)

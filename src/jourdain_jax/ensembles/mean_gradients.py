@@ -75,19 +75,18 @@ def mean_gradients(task: Task, shared: Sequence[str]) -> MeanGradients:
     size = max(8, min(task.block, 2048 // (1 + len(columns))))
     common = {name: np.asarray(value, float) for name, value, _ in parameters_of(task.scene) if name in shared}
     of_block = _of_block(task, columns)
-    values, weighted, ends = [], [], []
+    blocks = []
     for first in range(0, len(task.design), size):
-        last = min(first + size, len(task.design))
-        drawn = task.design.values(first, last) | {name: np.full(last - first, value) for name, value in common.items()}
-        drawn = {name: np.pad(column, (0, size - (last - first)), mode="edge") for name, column in drawn.items()}
+        count = min(size, len(task.design) - first)
+        drawn = task.design.values(first, first + count) | {name: np.full(count, value) for name, value in common.items()}
+        drawn = {name: np.pad(column, (0, size - count), mode="edge") for name, column in drawn.items()}
         with nan_is_a_mark():
-            found, derivative, end = jax.tree.map(lambda x: np.asarray(x), of_block(drawn))
-        by_column = {name: derivative[i, : last - first] for i, name in enumerate(columns)}
-        by_number = [by_column[name] * factor[:, None] for name, factor in _factors(task, first, last)] + [by_column[name] for name in shared]
-        values.append(found[: last - first])
-        weighted.append(np.stack(by_number, axis=-1))
-        ends.append(end[: last - first])
-    return _gathered(task, _names(task, shared), np.concatenate(values), np.concatenate(weighted), np.concatenate(ends))
+            found, derivative, end = (np.asarray(x) for x in of_block(drawn))
+        numbers = _numbers(task, shared, first, first + count)
+        weighted = [derivative[columns.index(column), :count] * factor[:, None] for column, _, factor in numbers]
+        blocks.append((found[:count], np.stack(weighted, axis=-1), end[:count]))
+    names = [name for _, name, _ in numbers]
+    return _gathered(task, names, *map(np.concatenate, zip(*blocks, strict=True)))
 
 
 def _check_shared(task: Task, shared: Sequence[str]) -> None:
@@ -116,47 +115,39 @@ def _of_block(task: Task, columns: Sequence[str]):
     return eqx.filter_jit(of_block)
 
 
-def _factors(task: Task, first: int, last: int):
-    """Column and dx/dtheta (lanes,), of every number of every distribution."""
-    u = task.design.probabilities(first, last)
+def _numbers(task: Task, shared: Sequence[str], first: int, last: int) -> list[tuple[str, str, np.ndarray]]:
+    """The numbers with respect to which means are differentiated: column, name, and dx/dtheta (lanes,) of the column."""
+    u, even = task.design.probabilities(first, last), np.ones(last - first)
+    found = []
     for i, (name, how) in enumerate(task.design.variables.items()):
-        if isinstance(how, Distribution):
-            for derivative in how.derivatives(u[:, i]).values():
-                yield name, np.broadcast_to(derivative, (last - first,))
-        else:
-            yield name, np.ones(last - first)
-
-
-def _names(task: Task, shared: Sequence[str]) -> tuple[str, ...]:
-    numbers = {name: how.derivatives(np.array([0.5])) if isinstance(how, Distribution) else (SHIFT,) for name, how in task.design.variables.items()}
-    return (*(f"{name}.{number}" for name, known in numbers.items() for number in known), *shared)
+        factors = how.derivatives(u[:, i]) if isinstance(how, Distribution) else {SHIFT: even}
+        found += [(name, f"{name}.{number}", factor) for number, factor in factors.items()]
+    return found + [(name, name, even) for name in shared]
 
 
 def _gathered(task: Task, names, values: np.ndarray, derivatives: np.ndarray, ends: np.ndarray) -> MeanGradients:
     """Means over the lanes that have an output; `values` (lanes, outputs), `derivatives` (lanes, outputs, names)."""
-    there = np.isfinite(values)
+    there = np.isfinite(values)[:, :, None]
     count = there.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.where(there, values, 0.0).sum(axis=0) / count
-        kept = np.where(there[:, :, None], derivatives, 0.0)
-        gradient = kept.sum(axis=0) / count[:, None]
-        spread = np.where(there[:, :, None], derivatives - gradient, 0.0)
-        error = np.sqrt((spread**2).sum(axis=0) / (count * (count - 1.0))[:, None])
+        mean = np.sum(values[:, :, None], axis=0, where=there) / count
+        gradient = np.sum(derivatives, axis=0, where=there) / count
+        error = np.sqrt(np.sum((derivatives - gradient) ** 2, axis=0, where=there) / (count * (count - 1.0)))
     warned = []
     failed = int(np.sum(ends == -2))
     if failed:
         warned.append(f"{failed} of {len(values)} motions failed without being tried in another way, as `run` would, and are left out")
     if np.unique(ends[ends != -2]).size > 1:
-        none = [name for name, output in task.outputs.items() if isinstance(output, OfEvent)]
-        for name in none:
-            gradient[list(task.outputs).index(name)] = error[list(task.outputs).index(name)] = np.nan
-        if none:
-            warned.append(f"which lanes end at an event depends on what varies: the means of {', '.join(none)} have no pathwise derivative; take differences")
-        if len(none) < len(task.outputs):
+        of_event = np.array([isinstance(output, OfEvent) for output in task.outputs.values()])
+        gradient[of_event] = error[of_event] = np.nan
+        if of_event.any():
+            none = ", ".join(name for name, is_one in zip(task.outputs, of_event, strict=True) if is_one)
+            warned.append(f"which lanes end at an event depends on what varies: the means of {none} have no pathwise derivative; take differences")
+        if not of_event.all():
             warned.append(
                 f"{int(np.sum(ends >= 0))} of {len(values)} lanes end at an event, others do not, or at another one: where an output jumps from one "
                 "end to another, the share of lanes that pass between them is missing; compare with differences of the mean"
             )
     for text in warned:
         warnings.warn(text, SensitivityWarning, stacklevel=users_level())
-    return MeanGradients(tuple(task.outputs), tuple(names), mean, gradient, error, count, failed, tuple(warned))
+    return MeanGradients(tuple(task.outputs), tuple(names), mean[:, 0], gradient, error, count[:, 0], failed, tuple(warned))

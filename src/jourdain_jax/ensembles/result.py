@@ -12,10 +12,11 @@ import numpy as np
 from jourdain_jax.calculus.figures import figure
 from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.ensembles.sensitivity import SobolIndices, sobol_indices
-from jourdain_jax.ensembles.statistics import CELLS, Grid, Statistics, combined
+from jourdain_jax.ensembles.statistics import Grid, Statistics, Tally, combined
 from jourdain_jax.ensembles.store import Store
-from jourdain_jax.ensembles.task import CODES, Task
+from jourdain_jax.ensembles.task import Task
 from jourdain_jax.motion.trajectories import results
+from jourdain_jax.motion.trajectories.results import CODES
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.printing import Printed
@@ -51,41 +52,23 @@ class StudyResult(Printed):
     """What came out of a study, read from its folder.
 
     `store.path` is the folder; it opens with `xarray.open_zarr` too. Numbers cover the chunks that are done: `complete` says whether all are.
+    `left_out`: numbers of chunks whose receipt is damaged or of another study, so that they do not count; `study.run` computes them again.
     """
 
     def __init__(self, store: Store, task: Task | None = None):
         self.store, self.task = store, task
-        self._gathered = self._gather()
+        receipts = {number: store.receipt(number) for number in store.receipts()}
+        self.left_out = tuple(number for number, receipt in receipts.items() if receipt is None)
+        self._done = [receipt.tally for receipt in receipts.values() if receipt is not None]
+        self._tally = Tally.together(self._done, len(store.outputs))
 
     def __len__(self) -> int:
         return self.store.lanes
 
-    def _gather(self) -> dict:
-        """What the receipts hold, together."""
-        known = {number: self.store.receipt(number) for number in self.store.receipts()}
-        receipts = [receipt for receipt in known.values() if receipt is not None]
-        count = len(self.outputs)
-        cells = np.zeros(count * (CELLS + 2), np.int64)
-        for receipt in receipts:
-            place, more = receipt.arrays["cells"]
-            cells[place] += more
-        extremes = np.stack([[np.full(count, np.inf), np.full(count, -np.inf)], *(r.arrays["extremes"] for r in receipts)])
-        return {
-            "chunks": len(receipts),
-            "left_out": tuple(number for number, receipt in known.items() if receipt is None),
-            "codes": sum((np.pad(codes := r.arrays["codes"], (0, len(CODES) - codes.size)) for r in receipts), np.zeros(len(CODES), np.int64)),
-            "again": sum(int(r.arrays["again"][0]) for r in receipts),
-            "steps": sum((r.arrays["steps"] for r in receipts), np.zeros(2, np.int64)),
-            "failed": np.concatenate([np.zeros(0, np.int64), *(r.arrays["failed"] for r in receipts)]),
-            "sums": [r.arrays["sums"] for r in receipts],
-            "cells": cells.reshape(count, CELLS + 2),
-            "extremes": np.stack([extremes[:, 0].min(axis=0), extremes[:, 1].max(axis=0)]),
-        }
-
     @property
     def outputs(self) -> tuple[str, ...]:
         """Names of the outputs."""
-        return tuple(self.store.study["outputs"])
+        return self.store.outputs
 
     @property
     def varied(self) -> tuple[str, ...]:
@@ -95,22 +78,17 @@ class StudyResult(Printed):
     @property
     def complete(self) -> bool:
         """Whether all chunks are done."""
-        return self._gathered["chunks"] == self.store.chunks
-
-    @property
-    def left_out(self) -> tuple[int, ...]:
-        """Numbers of chunks of which there is a receipt that is damaged or of another study, so that they do not count; `study.run` computes them again."""
-        return self._gathered["left_out"]
+        return len(self._done) == self.store.chunks
 
     @property
     def counts(self) -> dict[str, int]:
         """Lanes per result code, by its name; those that no lane has are left out."""
-        return {name: int(count) for name, count in zip(CODES, self._gathered["codes"], strict=True) if count}
+        return {name: int(count) for name, count in zip(CODES, self._tally.codes, strict=True) if count}
 
     @property
     def failed(self) -> np.ndarray:
         """Numbers of the lanes that reached neither their end nor an event."""
-        return self._gathered["failed"]
+        return self._tally.failed
 
     def lane(self, number: int) -> Lane:
         """The lane `number`: its parameters and start, what is kept of it, and `.simulate()`; IndexError where there is none."""
@@ -132,9 +110,7 @@ class StudyResult(Printed):
         grid = self.store.read_grid()
         if grid is None:
             raise ValueError(f"no chunk of `{self.store.path}` is done yet, or `run/grid.json` is damaged; run the study first, which finds it again")
-        found = self._gathered
-        sums = [block for chunk in found["sums"] for block in chunk]
-        return combined(self.outputs, Grid.from_dict(grid, len(self.outputs)), sums, found["cells"], found["extremes"])
+        return combined(self.outputs, Grid.from_dict(grid, len(self.outputs)), self._tally)
 
     def mean(self, output: str) -> float:
         """Mean of an `output` over the lanes that have it."""
@@ -235,7 +211,7 @@ class StudyResult(Printed):
         whole.axes[0].set_ylabel("lanes")
 
     def _repr_html_(self) -> str:
-        drawn = [name for name in self.outputs if self._gathered["chunks"] and self._bars(name, 40)[0].sum() > 0]
+        drawn = [name for name in self.outputs if self._done and self._bars(name, 40)[0].sum() > 0]
         # outputs in a notebook
         shown = drawn[:12]
         more = f"and {len(drawn) - len(shown)} more" if len(drawn) > len(shown) else ""
@@ -251,16 +227,16 @@ class StudyResult(Printed):
         return f"{beyond[0]} {beyond[1]:.5g}" if beyond and low < high else f"{(low + high) / 2:.5g}"
 
     def _text(self) -> str:
-        found = self._gathered
-        done = int(found["codes"].sum())
+        tally = self._tally
+        done = int(tally.codes.sum())
         lines = [f"Study in {self.store.path}: {done} of {len(self)} lanes" + ("" if self.complete else "; run it again to go on")]
         lines += [f"  {count} {results.MESSAGES[CODES.index(name)].split(';')[0]}" for name, count in self.counts.items()]
         if self.failed.size:
             lines.append("  failed: lanes " + ", ".join(map(str, self.failed[:10])) + (" ..." if self.failed.size > 10 else ""))
-        if found["again"]:
-            lines.append(f"  {found['again']} were run again in another way")
+        if tally.again[0]:
+            lines.append(f"  {tally.again[0]} were run again in another way")
         if done:
-            lines.append(f"  {found['steps'][0] / done:.1f} steps accepted and {found['steps'][1] / done:.1f} rejected a lane")
+            lines.append(f"  {tally.steps[0] / done:.1f} steps accepted and {tally.steps[1] / done:.1f} rejected a lane")
             width = max(map(len, self.outputs))
             lines.append(f"  {'':<{width}} {'lanes':>9} {'mean':>12} {'deviation':>12} {'2.5 %':>12} {'median':>12} {'97.5 %':>12}")
             for i, name in enumerate(self.outputs):

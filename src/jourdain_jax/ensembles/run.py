@@ -22,9 +22,9 @@ import numpy as np
 from tqdm import tqdm
 
 from jourdain_jax.ensembles import memory
-from jourdain_jax.ensembles.statistics import Grid
+from jourdain_jax.ensembles.statistics import Grid, Tally
 from jourdain_jax.ensembles.store import Store
-from jourdain_jax.ensembles.task import Lanes, Task, receipt_of
+from jourdain_jax.ensembles.task import Lanes, Task
 from jourdain_jax.motion.trajectories.versions import version_of
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.tracebacks import users_level
@@ -60,9 +60,10 @@ class Runner:
         for block in range(first // self.task.block, -(-last // self.task.block)):
             blocks[block] = self._first if block == 0 else self._run_block(block)
         values = {name: np.concatenate([lanes.columns[name] for lanes in blocks.values()]) for name in self.store.columns}
-        receipt = receipt_of(self.task, self.grid, blocks)
-        self.store.write(number, values, receipt)
-        return last - first, receipt["failed"].size
+        tallies = [Tally.of_block(self.grid, block * self.task.block, lanes.columns, lanes.outputs) for block, lanes in blocks.items()]
+        tally = Tally.together(tallies, len(self.task.outputs))
+        self.store.write(number, values, tally)
+        return last - first, tally.failed.size
 
     def _run_block(self, number: int) -> Lanes:
         found = self.task.run_block(number)

@@ -14,10 +14,12 @@ the cell that holds it, and the smallest and largest values are exact.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+from jourdain_jax.motion.trajectories.results import CODES, EVENT, SUCCESS
 
 CELLS = 4096
 
@@ -59,28 +61,71 @@ class Grid:
         return cls(low, high, centre)
 
 
-def sums_of_block(grid: Grid, values: np.ndarray) -> np.ndarray:
-    """N, A and S of one block of values (lanes, outputs), shape (3, outputs, outputs)."""
-    finite = np.isfinite(values)
-    x = np.ascontiguousarray(np.where(finite, values - grid.centre, 0.0).T)
-    m = np.ascontiguousarray(finite.T, float)
-    # not by a library of matrices, whose rounding may depend on its threads
-    return np.stack([np.einsum("ik,jk->ij", a, b) for a, b in ((m, m), (x, m), (x, x))])
+@dataclass(frozen=True)
+class Tally:
+    """What is counted of some lanes, beside their columns; the arrays of a receipt."""
+
+    codes: np.ndarray  # lanes per result code
+    again: np.ndarray  # (1,): lanes that were run again
+    steps: np.ndarray  # (2,): accepted and rejected
+    failed: np.ndarray  # numbers of lanes
+    sums: np.ndarray  # (blocks, 3, outputs, outputs): N, A and S of each block
+    cells: np.ndarray  # (2, cells): places among (outputs, CELLS + 2) in which values lie, and how many; the first and last of each row are below and above
+    extremes: np.ndarray  # (2, outputs): smallest and largest value; infinite where there is none
+
+    @classmethod
+    def of_block(cls, grid: Grid, first: int, columns: Mapping[str, np.ndarray], values: np.ndarray) -> "Tally":
+        """The tally of a block that begins with the lane `first`, from columns of its lanes and values (lanes, outputs)."""
+        codes, finite = columns["result"], np.isfinite(values)
+        x = np.ascontiguousarray(np.where(finite, values - grid.centre, 0.0).T)
+        m = np.ascontiguousarray(finite.T, float)
+        counts = np.zeros((values.shape[1], CELLS + 2), np.int64)
+        for i, column in enumerate(values.T):
+            counts[i] = np.bincount(np.searchsorted(grid.edges(i), column[finite[:, i]], side="right"), minlength=CELLS + 2)
+        return cls(
+            np.bincount(codes, minlength=len(CODES)),
+            np.array([np.sum(columns["retries"] > 0)]),
+            np.array([np.sum(columns[name], dtype=np.int64) for name in ("steps", "rejected_steps")]),
+            first + np.flatnonzero((codes != SUCCESS) & (codes != EVENT)),
+            # not by a library of matrices, whose rounding may depend on its threads
+            np.stack([np.einsum("ik,jk->ij", a, b) for a, b in ((m, m), (x, m), (x, x))])[None],
+            _sparse(counts),
+            np.stack([np.min(values, axis=0, where=finite, initial=np.inf), np.max(values, axis=0, where=finite, initial=-np.inf)]),
+        )
+
+    @classmethod
+    def together(cls, several: Iterable["Tally"], outputs: int) -> "Tally":
+        """The tally of all lanes of `several`, of so many outputs."""
+        known = list(several)
+        counts = np.zeros((outputs, CELLS + 2), np.int64)
+        for one in known:
+            counts.reshape(-1)[one.cells[0]] += one.cells[1]
+        nothing = np.stack([np.full(outputs, np.inf), np.full(outputs, -np.inf)])
+        low, high = np.stack([nothing, *(one.extremes for one in known)], axis=1)
+        return cls(
+            sum((one.codes for one in known), np.zeros(len(CODES), np.int64)),
+            sum((one.again for one in known), np.zeros(1, np.int64)),
+            sum((one.steps for one in known), np.zeros(2, np.int64)),
+            np.concatenate([np.zeros(0, np.int64), *(one.failed for one in known)]),
+            np.concatenate([np.zeros((0, 3, outputs, outputs)), *(one.sums for one in known)]),
+            _sparse(counts),
+            np.stack([low.min(axis=0), high.max(axis=0)]),
+        )
+
+    @classmethod
+    def checked(cls, arrays: Mapping[str, np.ndarray], lanes: range, outputs: int) -> "Tally":
+        """The tally of some `lanes` that these arrays hold; ValueError where their numbers are out of their ranges."""
+        codes, again, steps, failed, sums, (place, counts), extremes = (arrays[name] for name in cls.__dataclass_fields__)
+        shapes = again.shape == (1,) and steps.shape == (2,) and sums.shape[1:] == (3, outputs, outputs) and extremes.shape == (2, outputs)
+        numbers = codes.sum() == len(lanes) and codes.size <= len(CODES) and min(codes.min(), again.min(), steps.min()) >= 0
+        within = np.all((failed >= lanes.start) & (failed < lanes.stop)) and np.all((place >= 0) & (place < outputs * (CELLS + 2)) & (counts > 0))
+        if not (shapes and numbers and within):
+            raise ValueError("the receipt of a chunk holds numbers that are out of their ranges")
+        return cls(**dict(arrays) | {"codes": np.pad(codes, (0, len(CODES) - codes.size))})
 
 
-def counts_of_block(grid: Grid, values: np.ndarray) -> np.ndarray:
-    """How many values of each output lie below, in each cell, and above, shape (outputs, CELLS + 2); what is not finite is nowhere."""
-    counts = np.zeros((values.shape[1], CELLS + 2), np.int64)
-    for i, column in enumerate(values.T):
-        finite = column[np.isfinite(column)]
-        counts[i] = np.bincount(np.searchsorted(grid.edges(i), finite, side="right"), minlength=CELLS + 2)
-    return counts
-
-
-def extremes_of_block(values: np.ndarray) -> np.ndarray:
-    """Smallest and largest value of each output, shape (2, outputs); infinite where there is none."""
-    finite = np.isfinite(values)
-    return np.stack([np.min(values, axis=0, where=finite, initial=np.inf), np.max(values, axis=0, where=finite, initial=-np.inf)])
+def _sparse(counts: np.ndarray) -> np.ndarray:
+    return np.stack([place := np.flatnonzero(counts), counts.reshape(-1)[place]])
 
 
 @dataclass(frozen=True)
@@ -121,11 +166,13 @@ class Statistics:
         return float(max(edges[cell], smallest)), float(min(edges[cell + 1], largest))
 
 
-def combined(names: Sequence[str], grid: Grid, sums: Iterable[np.ndarray], counts: np.ndarray, extremes: np.ndarray) -> Statistics:
-    """The statistics from the sums of all blocks (each of shape (3, outputs, outputs)), and the counts and extremes of all lanes."""
-    blocks = np.stack([*sums, np.zeros((3, len(names), len(names)))])
-    n, a, s = np.array([math.fsum(entries) for entries in blocks.reshape(len(blocks), -1).T]).reshape(blocks.shape[1:])
+def combined(names: Sequence[str], grid: Grid, tally: Tally) -> Statistics:
+    """The statistics of all lanes of a tally."""
+    sums = tally.sums.reshape(len(tally.sums), -1)
+    n, a, s = np.array([math.fsum(entries) for entries in sums.T]).reshape(3, len(names), len(names))
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = grid.centre + np.diag(a) / np.diag(n)
         covariance = np.where(n > 1, (s - a * a.T / n) / (n - 1), np.nan)
-    return Statistics(tuple(names), grid, n.astype(np.int64), mean, covariance, extremes, counts)
+    counts = np.zeros((len(names), CELLS + 2), np.int64)
+    counts.reshape(-1)[tally.cells[0]] = tally.cells[1]
+    return Statistics(tuple(names), grid, n.astype(np.int64), mean, covariance, tally.extremes, counts)

@@ -33,14 +33,12 @@ from jourdain_jax.calculus.writing import write_whole
 from jourdain_jax.ensembles import optional
 from jourdain_jax.ensembles.design import MOST_SAMPLES
 from jourdain_jax.ensembles.files import locked
-from jourdain_jax.ensembles.statistics import CELLS
-from jourdain_jax.motion.trajectories.results import CODES
+from jourdain_jax.ensembles.statistics import Tally
 
 FORMAT = 2
 _BEGIN = b"jourdain-jax chunk 2\n"
 MOST_CHUNKS, MOST_LANES = 2**24, 2**40  # of a study, of a chunk
-_MANIFEST = "run/manifest.json"
-RECEIPT = ("codes", "again", "steps", "failed", "sums", "cells", "extremes")  # arrays of a receipt
+_MANIFEST, _GRID = "run/manifest.json", "run/grid.json"
 
 
 @dataclass(frozen=True)
@@ -53,10 +51,6 @@ class Column:
     more: tuple[tuple[str, int], ...] = ()
     every: int = 1
 
-    def length(self, lanes: int) -> int:
-        """How many of so many lanes are kept."""
-        return -(-lanes // self.every)
-
 
 @dataclass(frozen=True)
 class Receipt:
@@ -64,14 +58,37 @@ class Receipt:
 
     first: int
     last: int
-    arrays: Mapping[str, np.ndarray]  # result codes and their counts, failed lanes, sums per block, cells and their counts, extremes
+    tally: Tally
     checksums: Mapping[str, int]
-    of: tuple[str, str]  # digests of the study and of its grid
+    of: Sequence[str]  # digests of the study and of its grid
 
     @property
     def lanes(self) -> tuple[int, int]:
         """How many lanes the chunk has, and how many of them failed."""
-        return self.last - self.first, self.arrays["failed"].size
+        return self.last - self.first, self.tally.failed.size
+
+    def packed(self) -> bytes:
+        """Bytes: a first line, a line of JSON that says what follows, the arrays, and the CRC-32C of all that."""
+        arrays = vars(self.tally) | {"cells": self.tally.cells.astype(np.int32)}
+        listed = [(name, array.dtype.str, array.shape) for name, array in arrays.items()]
+        head = vars(self) | {"checksums": dict(self.checksums), "arrays": listed}
+        del head["tally"]
+        return _ended(_BEGIN + json.dumps(head).encode() + b"\n" + b"".join(map(np.ndarray.tobytes, arrays.values())))
+
+    @staticmethod
+    def unpacked(content: bytes, outputs: int) -> "Receipt":
+        """The receipt in these bytes, of a study with so many outputs; ValueError, or another error of what reads it, where they are torn."""
+        if not content.startswith(_BEGIN) or content != _ended(content[:-4]):
+            raise ValueError("the receipt of a chunk is torn")
+        end = content.index(b"\n", len(_BEGIN))
+        head, at, arrays = json.loads(content[len(_BEGIN) : end]), end + 1, {}
+        for name, dtype, shape in head.pop("arrays"):
+            count = math.prod(shape)
+            if min(shape, default=0) < 0 or np.dtype(dtype).hasobject:
+                raise ValueError("the receipt of a chunk holds no numbers")
+            arrays[name] = np.frombuffer(content, dtype, count, at).reshape(shape)
+            at += count * np.dtype(dtype).itemsize
+        return Receipt(tally=Tally.checked(arrays, range(head["first"], head["last"]), outputs), **head)
 
 
 class Store:
@@ -83,6 +100,7 @@ class Store:
         self._digests = self._read_manifest()
         self.lanes, self.chunk = self.study["samples"], self.study["chunk"]
         self.columns = {name: Column(**entry | {"more": tuple(map(tuple, entry["more"]))}) for name, entry in self.study["columns"].items()}
+        self.outputs = tuple(self.study.get("outputs", ()))
         decides = [self.study.get(name) for name in ("identity", "samples", "chunk", "block", "outputs")]  # the same in all shares
         self.identity = hashlib.sha256(json.dumps(decides).encode()).hexdigest()
 
@@ -102,22 +120,21 @@ class Store:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # that consolidated metadata are not yet in the standard: xarray looks for them
                 group = zarr.create_group(beside, zarr_format=3, attributes=dict(attributes))
-                check = [zarr.codecs.Crc32cCodec()]
+
+                def array(name: str, axes: Sequence[str], shape, chunks, about: Mapping, **kind):
+                    options = {"dimension_names": axes, "compressors": [zarr.codecs.Crc32cCodec()], "attributes": dict(about)}
+                    return group.create_array(name, shape=shape, chunks=chunks, **options, **kind)
+
                 for name, column in columns.items():
-                    shape = (column.length(lanes), *(length for _, length in column.more))
-                    chunks = (chunk // column.every, *shape[1:])
-                    axis = "lane" if column.every == 1 else "saved_lane"
-                    options = {"compressors": check, "fill_value": column.fill, "dimension_names": (axis, *(name for name, _ in column.more))}
-                    group.create_array(name, shape=shape, chunks=chunks, dtype=column.dtype, attributes=dict(column.attributes), **options)
+                    axes, more = zip(("lane" if column.every == 1 else "saved_lane", 0), *column.more, strict=True)
+                    shape, chunks = ((-(-count // column.every), *more[1:]) for count in (lanes, chunk))
+                    array(name, axes, shape, chunks, column.attributes, dtype=column.dtype, fill_value=column.fill)
+                    (beside / name / "c").mkdir(exist_ok=True)
                 for name, (axis, values, about) in constants.items():
-                    array = group.create_array(name, shape=values.shape, chunks=values.shape, dtype=values.dtype, compressors=check,
-                                               dimension_names=(axis,), attributes=dict(about))  # fmt: skip
-                    array[:] = values
+                    array(name, (axis,), values.shape, values.shape, about, dtype=values.dtype)[:] = values
                 group.create_group("run")
                 zarr.consolidate_metadata(beside, zarr_format=3)
             (beside / "run" / "chunks").mkdir()
-            for name in columns:
-                (beside / name / "c").mkdir(exist_ok=True)
             entries = {name: vars(column) | {"attributes": dict(column.attributes)} for name, column in columns.items()}
             write_whole(beside / "run" / "study.json", json.dumps({"format": FORMAT, **study, "columns": entries}, indent=1).encode(), wait=True)
             files = [file for file in beside.rglob("*") if file.is_file()]
@@ -158,7 +175,7 @@ class Store:
         if not isinstance(digests, dict) or found.get("digest") != _digest_of(digests):
             raise self._damaged(_MANIFEST)
         for name in digests:
-            if name != "run/grid.json" and _digest(self._read(name)) != digests[name]:
+            if name != _GRID and _digest(self._read(name)) != digests[name]:
                 raise self._damaged(name)
         return digests
 
@@ -232,27 +249,25 @@ class Store:
                 text = f"{error.strerror or type(error).__name__}; {kept}: make room or mend the folder, and run the study again to go on"
             raise OSError(error.errno, text, str(self.path)) from error
 
-    def write(self, number: int, values: Mapping[str, np.ndarray], arrays: Mapping[str, np.ndarray]) -> None:
-        """Keep a chunk: the values of all columns, then its receipt with `arrays`."""
-        crc32c = optional.crc32c()
+    def write(self, number: int, values: Mapping[str, np.ndarray], tally: Tally) -> None:
+        """Keep a chunk: the values of all columns, then its receipt."""
         checksums = {}
         with self._named():
             for name, column in self.columns.items():
                 full = np.full((self.chunk // column.every, *(length for _, length in column.more)), column.fill, np.dtype(column.dtype).newbyteorder("<"))
                 full[: len(values[name])] = values[name]
-                content = full.tobytes()
-                checksums[name] = crc32c.value(content)
-                self._write(name, number, content + checksums[name].to_bytes(4, "little"))
-            of = self.identity, self._digests.get("run/grid.json", "")
-            write_whole(self._receipt_file(number), _packed(Receipt(*self.span(number), arrays, checksums, of), crc32c))
+                content = _ended(full.tobytes())
+                checksums[name] = int.from_bytes(content[-4:], "little")
+                self._write(name, number, content)
+            of = self.identity, self._digests.get(_GRID, "")
+            write_whole(self._receipt_file(number), Receipt(*self.span(number), tally, checksums, of).packed())
 
     def receipt(self, number: int) -> Receipt | None:
         """The receipt of a chunk; None where there is none, or it is torn, or of another chunk, study or grid."""
         try:
-            found = _unpacked(self._receipt_file(number).read_bytes(), optional.crc32c())
-            sound = (found.first, found.last) == self.span(number) and set(found.checksums) == set(self.columns)
-            grid = self._digests.get("run/grid.json", found.of[1])
-            return found if sound and found.of == (self.identity, grid) and _fits(found, len(self.study["outputs"])) else None
+            found = Receipt.unpacked(self._receipt_file(number).read_bytes(), len(self.outputs))
+            own = [self.identity, self._digests.get(_GRID, found.of[-1])]
+            return found if ((found.first, found.last), list(found.of), {*found.checksums}) == (self.span(number), own, {*self.columns}) else None
         except (OSError, ValueError, KeyError, TypeError, IndexError):
             return None
 
@@ -266,29 +281,29 @@ class Store:
 
     def is_whole(self, number: int) -> bool:
         """Whether a chunk has its receipt and all its arrays, and all of them are as they were written."""
-        receipt = self.receipt(number)
-        return receipt is not None and all(self._is_kept(name, number, receipt, optional.crc32c().value) for name in self.columns)
+        return self._wrong(number, whole=True) is None
 
-    def _is_kept(self, name: str, number: int, receipt: Receipt, computed=None) -> bool:
-        """Whether the file of a chunk ends in the checksum of its receipt, has its length and, where one is `computed`, that checksum."""
-        column = self.columns[name]
-        size = np.dtype(column.dtype).itemsize * (self.chunk // column.every) * math.prod(length for _, length in column.more)
-        try:
-            with open(self._file(name, number), "rb") as file:
-                content = file.read(size) if computed else file.seek(size)
-                stated, rest = file.read(4), file.read(1)
-        except OSError:
-            return False
-        right = int.from_bytes(stated, "little") == receipt.checksums[name] and len(stated) == 4 and not rest
-        return right and (computed is None or computed(content) == receipt.checksums[name])
+    def _wrong(self, number: int, *, whole: bool) -> str | None:
+        """An array of a chunk whose file has not the length and the checksum of its receipt; whether values go with that is seen only with `whole`."""
+        receipt = self.receipt(number)
+        for name, column in self.columns.items():
+            size = np.dtype(column.dtype).itemsize * (self.chunk // column.every) * math.prod(length for _, length in column.more)
+            try:
+                with open(self._file(name, number), "rb") as file:
+                    content = file.read(size) if whole else file.seek(size)
+                    stated = file.read(5)
+            except OSError:
+                return name
+            known = receipt and receipt.checksums[name]
+            if (int.from_bytes(stated, "little"), len(stated)) != (known, 4) or (whole and optional.crc32c().value(content) != known):
+                return name
+        return "receipt" if receipt is None else None
 
     def check_arrays(self, numbers: Iterable[int]) -> None:
         """ValueError where arrays of chunks are not those of their receipts; whether values go with their checksums is seen when Zarr reads them."""
         for number in numbers:
-            receipt = self.receipt(number)
-            wrong = list(self.columns) if receipt is None else [name for name in self.columns if not self._is_kept(name, number, receipt)]
-            if wrong:
-                text = f"`{wrong[0]}` is damaged in {self.lanes_of([number])}: its file, or the receipt of the chunk, is not what was written"
+            if self.columns and (wrong := self._wrong(number, whole=False)):
+                text = f"`{wrong}` is damaged in {self.lanes_of([number])}: its file, or the receipt of the chunk, is not what was written"
                 raise ValueError(f"{text}; run the study again, which computes them anew")
 
     def done(self) -> tuple[list[int], list[int]]:
@@ -304,8 +319,8 @@ class Store:
         """What `write_grid` kept; None where nothing was, or it is damaged (it is then found again)."""
         self._digests = self._read_manifest()
         with contextlib.suppress(ValueError, OSError):
-            content = self._read("run/grid.json")
-            if _digest(content) == self._digests.get("run/grid.json"):
+            content = self._read(_GRID)
+            if _digest(content) == self._digests.get(_GRID):
                 return json.loads(content)
         return None
 
@@ -313,8 +328,8 @@ class Store:
         """Keep the grid of the statistics, and return it as it is kept."""
         content = json.dumps(grid).encode()
         with self._named():
-            write_whole(self.path / "run" / "grid.json", content, wait=True)
-            self._digests = self._read_manifest() | {"run/grid.json": _digest(content)}
+            write_whole(self.path / _GRID, content, wait=True)
+            self._digests = self._read_manifest() | {_GRID: _digest(content)}
             _write_manifest(self.path, self._digests)
         return grid
 
@@ -348,34 +363,6 @@ def _write_manifest(path: Path, digests: Mapping[str, str]) -> None:
     write_whole(path / _MANIFEST, json.dumps({"digests": dict(digests), "digest": _digest_of(digests)}, indent=1).encode(), wait=True)
 
 
-def _packed(receipt: Receipt, crc32c) -> bytes:
-    """A receipt as bytes: a first line, a line of JSON that says what follows, the arrays, and the CRC-32C of all that."""
-    arrays = {name: np.ascontiguousarray(array) for name, array in receipt.arrays.items()}
-    listed = [(name, array.dtype.str, array.shape) for name, array in arrays.items()]
-    head = {"first": receipt.first, "last": receipt.last, "of": receipt.of, "checksums": dict(receipt.checksums), "arrays": listed}
-    content = _BEGIN + json.dumps(head).encode() + b"\n" + b"".join(array.tobytes() for array in arrays.values())
-    return content + crc32c.value(content).to_bytes(4, "little")
-
-
-def _unpacked(content: bytes, crc32c) -> Receipt:
-    if not content.startswith(_BEGIN) or crc32c.value(content[:-4]) != int.from_bytes(content[-4:], "little"):
-        raise ValueError("the receipt of a chunk is torn")
-    end = content.index(b"\n", len(_BEGIN))
-    head, at, arrays = json.loads(content[len(_BEGIN) : end]), end + 1, {}
-    for name, dtype, shape in head["arrays"]:
-        count = math.prod(shape)
-        if min(shape, default=0) < 0 or np.dtype(dtype).hasobject:
-            raise ValueError("the receipt of a chunk holds no numbers")
-        arrays[name] = np.frombuffer(content, dtype, count, at).reshape(shape)
-        at += count * np.dtype(dtype).itemsize
-    return Receipt(head["first"], head["last"], arrays, head["checksums"], tuple(head["of"]))
-
-
-def _fits(receipt: Receipt, outputs: int) -> bool:
-    """Whether the numbers of a receipt are within their ranges."""
-    codes, again, steps, failed, sums, (place, counts), extremes = (receipt.arrays[name] for name in RECEIPT)
-    lanes, _ = receipt.lanes
-    shapes = again.shape == (1,) and steps.shape == (2,) and sums.shape[1:] == (3, outputs, outputs) and extremes.shape == (2, outputs)
-    numbers = codes.sum() == lanes and codes.size <= len(CODES) and min(codes.min(), again.min(), steps.min()) >= 0
-    within = np.all((failed >= receipt.first) & (failed < receipt.last)) and np.all((place >= 0) & (place < outputs * (CELLS + 2)) & (counts > 0))
-    return bool(shapes and numbers and within)
+def _ended(content: bytes) -> bytes:
+    """Content, and its CRC-32C as Zarr's codec writes it."""
+    return content + optional.crc32c().value(content).to_bytes(4, "little")

@@ -6,7 +6,7 @@ run the same compiled programs on arrays of the same shapes, so a lane's numbers
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -19,15 +19,13 @@ from jaxtyping import Array, Float
 from jourdain_jax.ensembles.design import Design
 from jourdain_jax.ensembles.identity import digest
 from jourdain_jax.ensembles.outputs import Output
-from jourdain_jax.ensembles.statistics import Grid, counts_of_block, extremes_of_block, sums_of_block
 from jourdain_jax.ensembles.store import Column
 from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.motion.batches.rollout import rollout
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.options import AllOptions, stated
 from jourdain_jax.motion.simulate import simulate
-from jourdain_jax.motion.trajectories import results
-from jourdain_jax.motion.trajectories.labelled import CODES, FIELDS, OF_LANES
+from jourdain_jax.motion.trajectories.labelled import FIELDS, OF_LANES
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
@@ -58,13 +56,13 @@ class Task:
     options: AllOptions
     save: str
     every: int
-    largest_block: int | None = None  # lanes; default: LARGEST_BLOCK
+    largest_block: int = field(default_factory=lambda: LARGEST_BLOCK)  # lanes; the same in all processes
     memory: int | None = None  # bytes that each process which computes may hold
 
     @property
     def block(self) -> int:
         """Lanes of a block."""
-        block = min(self.largest_block or LARGEST_BLOCK, max(8, 1 << (len(self.design) - 1).bit_length()))
+        block = min(self.largest_block, max(8, 1 << (len(self.design) - 1).bit_length()))
         # bytes of saved states of a block, at most
         while block > 8 and block * self.bytes_of_lane > (2**26):
             block //= 2
@@ -185,20 +183,3 @@ class Task:
 
 def _unit(unit: str) -> dict[str, str]:
     return {"units": unit} if unit else {}
-
-
-def receipt_of(task: Task, grid: Grid, blocks: Mapping[int, Lanes]) -> dict[str, np.ndarray]:
-    """What is kept of a chunk besides its columns: counts per result code, failed lanes, sums of each block, counts per cell, extremes."""
-    code = {number: lanes.columns["result"] for number, lanes in blocks.items()}
-    wrong = {number: np.flatnonzero((codes != results.SUCCESS) & (codes != results.EVENT)) for number, codes in code.items()}
-    cells = sum(counts_of_block(grid, lanes.outputs) for lanes in blocks.values())
-    extremes = np.stack([extremes_of_block(lanes.outputs) for lanes in blocks.values()])
-    return {
-        "codes": sum(np.bincount(codes, minlength=len(CODES)) for codes in code.values()),
-        "again": np.array([sum(int(np.sum(lanes.columns["retries"] > 0)) for lanes in blocks.values())]),
-        "steps": np.array([sum(int(np.sum(lanes.columns[name], dtype=np.int64)) for lanes in blocks.values()) for name in ("steps", "rejected_steps")]),
-        "failed": np.concatenate([number * task.block + index for number, index in wrong.items()]).astype(np.int64),
-        "sums": np.stack([sums_of_block(grid, lanes.outputs) for lanes in blocks.values()]),
-        "cells": np.stack([place := np.flatnonzero(cells), cells.reshape(-1)[place]]).astype(np.int32),
-        "extremes": np.stack([extremes[:, 0].min(axis=0), extremes[:, 1].max(axis=0)]),
-    }

@@ -14,6 +14,7 @@ from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import connection, get_context, parent_process
+from pathlib import Path
 from typing import Any
 
 from jourdain_jax.ensembles.run import Runner
@@ -26,7 +27,8 @@ _NONE_BEGAN = (
     "no worker of this study could begin, as what it printed says. Each imports the program that was started: run studies in it under "
     '`if __name__ == "__main__":`, and define scenes and outputs in a module; or take processes=1'
 )
-_own: list[Runner | tuple[Task, Store]] = []  # of this worker, one: a runner since its first chunk, before what it is made of
+_runners: dict[tuple, Runner] = {}  # of this process: for the study that it worked on last, in one folder
+_one_at_a_time = threading.Lock()
 
 
 def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, int]]]:
@@ -35,16 +37,13 @@ def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, in
 
     def workers(store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:
         def compute(numbers: list[int], alone: bool):
-            most, begun = 1 if alone else count, get_context("spawn").Event()
-            with _pool(sent, store, most, begun) as pool:
+            context, most = get_context("spawn"), 1 if alone else count
+            begun, places = context.Event(), context.Queue()
+            for place in range(most):
+                places.put((place, most))
+            with ProcessPoolExecutor(most, mp_context=context, initializer=_begin, initargs=(sent, places, begun)) as pool:
                 died = yield from computed(
-                    lambda number: pool.submit(_chunk, number),
-                    lambda running: wait(running, return_when=FIRST_COMPLETED).done,
-                    BrokenProcessPool,
-                    store,
-                    numbers,
-                    interrupted,
-                    most,
+                    lambda number: pool.submit(chunk, number, sent, str(store.path)), BrokenProcessPool, store, numbers, interrupted, most
                 )
                 if died and not begun.is_set():
                     raise RuntimeError(_NONE_BEGAN)
@@ -53,6 +52,18 @@ def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, in
         return whatever_dies(store, numbers, interrupted, compute, MOST_DEATHS - 1)
 
     return workers
+
+
+def chunk(number: int, sent: bytes, path: str) -> tuple[int, int]:
+    """Compute and keep a chunk in this process, one at a time; what a process kept before it died is not computed again."""
+    with _one_at_a_time:
+        which = sent, path, (Path(path) / "zarr.json").stat().st_mtime_ns
+        if which not in _runners:
+            _runners.clear()
+            _runners[which] = Runner(pickle.loads(sent), Store(path))
+        runner = _runners[which]
+        receipt = runner.store.receipt(number)
+        return receipt.lanes if receipt else runner.run(number)
 
 
 def whatever_dies(store: Store, numbers, interrupted, compute: Callable, attempts: int) -> Iterator[tuple[int, int]]:
@@ -98,10 +109,10 @@ def sent_to_others(task: Task) -> bytes:
         raise ValueError(f"this study cannot be sent to other processes ({error}); {text}") from None
 
 
-def computed(submit, wait, deadly: type[Exception], store: Store, numbers, interrupted, most: int) -> Generator[tuple[int, int], None, list[int]]:
+def computed(submit, deadly: type[Exception], store: Store, numbers, interrupted, most: int) -> Generator[tuple[int, int], None, list[int]]:
     """Lanes and failed lanes of chunks as they come, at most `most` of them under way; returns the numbers of those on which a process died.
 
-    `submit(number)`: a future; `wait(futures)`: those of them that are done, at least one; `deadly`: the error of one whose process died.
+    `submit(number)`: a future of `concurrent.futures`; `deadly`: the error of one whose process died.
     """
     left = iter(numbers)
     running: dict[Any, int] = {}
@@ -116,7 +127,7 @@ def computed(submit, wait, deadly: type[Exception], store: Store, numbers, inter
             receipts = {number: store.receipt(number) for number in died}
             yield from (receipt.lanes for receipt in receipts.values() if receipt is not None)  # kept before the process died
             return [number for number, receipt in receipts.items() if receipt is None]
-        for future in wait(list(running)):
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
             number = running.pop(future)
             try:
                 yield future.result()
@@ -124,22 +135,13 @@ def computed(submit, wait, deadly: type[Exception], store: Store, numbers, inter
                 died.append(number)
 
 
-def _pool(sent: bytes, store: Store, count: int, begun) -> ProcessPoolExecutor:
-    """Workers of a study; `begun`: an event that is set once one of them can compute."""
-    context = get_context("spawn")
-    places = context.Queue()
-    for place in range(count):
-        places.put((place, count))
-    return ProcessPoolExecutor(count, mp_context=context, initializer=_begin, initargs=(sent, str(store.path), places, begun))
-
-
-def _begin(sent: bytes, path: str, places, begun) -> None:
-    """Start a worker: its cores, no Ctrl-C (which is for the parent), an end with the parent's."""
+def _begin(sent: bytes, places, begun) -> None:
+    """Start a worker: its cores, no Ctrl-C (which is for the parent), an end with the parent's; `begun`: an event that is set where it can compute."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if parent := parent_process():
         threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
     keep_to_share(*places.get())
-    _own.append((pickle.loads(sent), Store(path)))
+    pickle.loads(sent)
     begun.set()
 
 
@@ -156,9 +158,3 @@ def _end_with(parent: int) -> None:
     """End this process when its parent, a handle of the operating system, has ended, also where that was before this began."""
     connection.wait([parent])
     os._exit(1)
-
-
-def _chunk(number: int) -> tuple[int, int]:
-    runner = _own[0] if isinstance(_own[0], Runner) else Runner(*_own[0])
-    _own[0] = runner
-    return runner.run(number)

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.rotations import rot_z
+from jourdain_jax.calculus.rotations import rot_y, rot_z
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.constraints import knife_edge, pin
 from jourdain_jax.scene.coordinates import coordinates, inputs, speeds
@@ -37,29 +37,22 @@ class Skate(Scene):
     example_span = 10.0
 
     def bodies(self, t, q):
-        position = jnp.stack([q.x, q.y, jnp.zeros_like(q.x)])
-        moments = self.inertia * jnp.ones(3)  # only the one about z matters
-        return {"skate": RigidBody(self.mass, moments, position, rot_z(q.heading))}
+        return {"skate": _level(self.mass, self.inertia, q.x, q.y, rot_z(q.heading))}
 
     def loads(self, motion):
-        down = jnp.stack([jnp.sin(self.slope), jnp.zeros_like(self.slope), -jnp.cos(self.slope)])
-        return (gravity(motion, self.gravity, down),)
+        return (gravity(motion, self.gravity, -rot_y(self.slope)[2]),)
 
     def velocity_constraints(self, motion):
-        skate = motion["skate"]
-        return {"edge": knife_edge(skate, skate.position, skate.orientation[:, 1])}
+        return {"edge": _edge(motion["skate"])}
 
     def visuals(self, pose):
         blade = Visual.box((0.3, 0.008, 0.05), at=(0.0, 0.0, 0.025), colour="#8a8a86")
-        return {"skate": [blade, Visual.box((0.26, 0.09, 0.03), at=(0.0, 0.0, 0.065)), Visual.box((0.12, 0.08, 0.12), at=(-0.06, 0.0, 0.13))]}
+        return {"skate": [blade, Visual.box((0.26, 0.09, 0.12), at=(0.0, 0.0, 0.11))]}
 
     def invariants(self, motion):
-        q, u = motion.q, motion.u
-        forward = u.x_rate * jnp.cos(q.heading) + u.y_rate * jnp.sin(q.heading)
-        return {
-            "turn rate": u.heading_rate,
-            "speed and heading": forward * u.heading_rate - self.gravity * jnp.sin(self.slope) * jnp.sin(q.heading),
-        }
+        turn = motion.u.heading_rate
+        push = self.gravity * jnp.sin(self.slope)
+        return {"turn rate": turn, "speed and heading": _forward(motion) * turn - push * jnp.sin(motion.q.heading)}
 
 
 class ChaplyginSleigh(Scene):
@@ -85,31 +78,42 @@ class ChaplyginSleigh(Scene):
     example_span = 12.0
 
     def bodies(self, t, q):
-        position = jnp.stack([q.x, q.y, jnp.zeros_like(q.x)])
-        moments = self.inertia * jnp.ones(3)  # only the one about z matters
-        return {"sleigh": RigidBody(self.mass, moments, position, rot_z(q.heading))}
+        return {"sleigh": _level(self.mass, self.inertia, q.x, q.y, rot_z(q.heading))}
 
     def velocity_constraints(self, motion):
-        sleigh = motion["sleigh"]
-        return {"blade": knife_edge(sleigh, sleigh.place(self._blade()), sleigh.orientation[:, 1])}
+        return {"blade": _edge(motion["sleigh"], self._blade())}
 
     def visuals(self, pose):
         above = jnp.array([0.0, 0.0, 0.1])
-        corners = [self._blade() + above, jnp.array([0.3, 0.2, 0.1]), jnp.array([0.3, -0.2, 0.1])]
-        feet = [look for corner in corners[1:] for look in (Visual.line(corner, corner - above, radius=0.01), Visual.ball(0.025, at=corner - 0.75 * above))]
+        feet = [jnp.array([0.3, y, z]) for y, z in ((0.2, 0.0), (0.2, 0.1), (-0.2, 0.1), (-0.2, 0.0))]
+        corners = [feet[0], feet[1], self._blade() + above, feet[2], feet[3]]
         blade = Visual.box((0.14, 0.006, 0.1), at=self._blade() + 0.5 * above, colour="#8a8a86")
-        return {"sleigh": [Visual.line(*corners, corners[0], radius=0.014), *feet, blade, Visual.ball(0.035, at=above, colour="#444444")]}
+        return {"sleigh": [Visual.line(*corners, radius=0.014), blade, Visual.ball(0.035, at=above, colour="#444444")]}
 
     def invariants(self, motion):
-        q, u = motion.q, motion.u
+        turn = motion.u.heading_rate
         k = jnp.sqrt(self.inertia / self.mass + self.offset**2)
-        forward = u.x_rate * jnp.cos(q.heading) + u.y_rate * jnp.sin(q.heading)
         # d/dt atan(v / (k |w|)) = (a/k) |w|, and w keeps its sign
-        turned = jnp.sign(u.heading_rate) * jnp.arctan2(forward, k * jnp.abs(u.heading_rate))
-        return {"heading and slide": self.offset * q.heading - k * turned}
+        turned = jnp.sign(turn) * jnp.arctan2(_forward(motion), k * jnp.abs(turn))
+        return {"heading and slide": self.offset * motion.q.heading - k * turned}
 
     def _blade(self) -> Float[Array, "3"]:
         return jnp.stack([-self.offset, 0 * self.offset, 0 * self.offset])
+
+
+def _level(mass, inertia, x, y, orientation) -> RigidBody:
+    """A body that stays level, of whose moments of inertia only the one about z matters."""
+    return RigidBody(mass, inertia * jnp.ones(3), jnp.stack([x, y, jnp.zeros_like(x)]), orientation)
+
+
+def _edge(body, point=None) -> Float[Array, ""]:
+    """The row of a blade along body x, at a point of the body (default: its mass centre)."""
+    return knife_edge(body, body.position if point is None else body.place(point), body.orientation[:, 1])
+
+
+def _forward(motion) -> Float[Array, ""]:
+    """Speed of the mass centre along the blade, m/s."""
+    return motion.u.x_rate * jnp.cos(motion.q.heading) + motion.u.y_rate * jnp.sin(motion.q.heading)
 
 
 class Snakeboard(Scene):
@@ -141,42 +145,27 @@ class Snakeboard(Scene):
 
     def bodies(self, t, q):
         board = rot_z(q.heading)
-        middle = jnp.stack([q.x, q.y, jnp.zeros_like(q.x)])
-        reach = self.half_length * board[:, 0]
+        x, y, _ = self.half_length * board[:, 0]
         nothing = jnp.zeros_like(self.mass)  # the masses of rotor and wheels count in the board's
         return {
-            "board": RigidBody(self.mass, _about_z(self.board_inertia), middle, board),
-            "rotor": RigidBody(nothing, _about_z(self.rotor_inertia), middle, board @ rot_z(q.rotor)),
-            "front": RigidBody(nothing, _about_z(self.wheel_inertia), middle + reach, board @ rot_z(q.steer)),
-            "back": RigidBody(nothing, _about_z(self.wheel_inertia), middle - reach, board @ rot_z(-q.steer)),
+            "board": _level(self.mass, self.board_inertia, q.x, q.y, board),
+            "rotor": _level(nothing, self.rotor_inertia, q.x, q.y, board @ rot_z(q.rotor)),
+            "front": _level(nothing, self.wheel_inertia, q.x + x, q.y + y, board @ rot_z(q.steer)),
+            "back": _level(nothing, self.wheel_inertia, q.x - x, q.y - y, board @ rot_z(-q.steer)),
         }
 
     def visuals(self, pose):
-        l, wheel = self.half_length, 0.16 * self.half_length
-        deck = Visual.box(l * jnp.array([2.3, 0.3, 0.08]), at=l * jnp.array([0.0, 0.0, 0.42]))
-        plates = [Visual.cylinder(0.32 * l, 0.1 * l, at=l * jnp.array([x, 0.0, 0.48])) for x in (-1.0, 1.0)]
-        rotor = [Visual.box(l * jnp.array([1.3, 0.14, 0.1]), at=l * jnp.array([0.0, 0.0, 0.7])), *_balls(0.14 * l, 0.65 * l, 0.7 * l)]
+        l = self.half_length
+        deck, rotor = (Visual.box(l * jnp.array(sides), at=l * jnp.array([0.0, 0.0, z])) for sides, z in (((2.6, 0.3, 0.08), 0.42), ((1.3, 0.14, 0.1), 0.6)))
         ends = [l * jnp.array([0.0, y, 0.16]) for y in (-0.4, 0.4)]
-        trucks = [Visual.line(*ends, radius=0.05 * l), *(Visual.wheel(wheel, 0.1 * l, at=end) for end in ends)]
-        return {"board": [deck, *plates], "rotor": rotor, "front": trucks, "back": trucks}
+        trucks = [Visual.line(*ends, radius=0.05 * l), *(Visual.wheel(0.16 * l, 0.1 * l, at=end) for end in ends)]
+        return {"board": deck, "rotor": rotor, "front": trucks, "back": trucks}
 
     def loads(self, motion):
         return (generalized_force(motion, rotor_rate=motion.inputs.rotor_torque, steer_rate=motion.inputs.steer_torque),)
 
     def velocity_constraints(self, motion):
-        front, back = motion["front"], motion["back"]
-        return {
-            "front wheels": knife_edge(front, front.position, front.orientation[:, 1]),
-            "back wheels": knife_edge(back, back.position, back.orientation[:, 1]),
-        }
-
-
-def _about_z(moment) -> Float[Array, "3"]:
-    return moment * jnp.ones(3)  # only the one about z matters
-
-
-def _balls(radius, reach, height) -> list[Visual]:
-    return [Visual.ball(radius, at=jnp.stack([side * reach, 0 * reach, height])) for side in (-1, 1)]
+        return {"front wheels": _edge(motion["front"]), "back wheels": _edge(motion["back"])}
 
 
 class TrailerChain(Scene):
@@ -237,24 +226,19 @@ class TrailerChain(Scene):
         headings, lengths = jnp.asarray(headings), self._per_trailer(self.length)
         x = jnp.concatenate([jnp.zeros(1), -jnp.cumsum(lengths * jnp.cos(headings[1:]))])
         y = jnp.concatenate([jnp.zeros(1), -jnp.cumsum(lengths * jnp.sin(headings[1:]))])
-        values = {"forward0": jnp.asarray(forward), "turn0": jnp.asarray(turn)}
-        for i in range(self.trailers + 1):
-            values |= {f"x{i}": x[i], f"y{i}": y[i], f"heading{i}": headings[i]}
-        return values
+        values = {f"{name}{i}": given[i] for name, given in (("x", x), ("y", y), ("heading", headings)) for i in range(self.trailers + 1)}
+        return values | {"forward0": jnp.asarray(forward), "turn0": jnp.asarray(turn)}
 
     def bodies(self, t, q):
         masses = jnp.append(self.car_mass, self._per_trailer(self.trailer_mass))
         moments = jnp.append(self.car_inertia, self._per_trailer(self.trailer_inertia))
-        places = [jnp.stack([q[f"x{i}"], q[f"y{i}"], jnp.zeros_like(q.x0)]) for i in range(self.trailers + 1)]
-        return {_name(i): RigidBody(masses[i], moments[i] * jnp.ones(3), place, rot_z(q[f"heading{i}"])) for i, place in enumerate(places)}
+        return {_name(i): _level(mass, moments[i], q[f"x{i}"], q[f"y{i}"], rot_z(q[f"heading{i}"])) for i, mass in enumerate(masses)}
 
     def visuals(self, pose):
-        looks = {"car": [*_axle(), Visual.box((0.44, 0.26, 0.12), at=(0.06, 0.0, 0.15)), Visual.box((0.2, 0.22, 0.1), at=(0.0, 0.0, 0.26))]}
-        for i, length in enumerate(self._per_trailer(self.length), 1):
-            level = jnp.array([0.0, 0.0, 0.1])
-            tongue = Visual.line(level, level + length * jnp.array([1.0, 0.0, 0.0]), radius=0.015, colour="#8a8a86")
-            looks[_name(i)] = [*_axle(), Visual.box((0.36, 0.26, 0.14), at=(0.0, 0.0, 0.17)), tongue]
-        return looks
+        cart = [Visual.box((0.36, 0.26, 0.14), at=(0.0, 0.0, 0.17)), *(Visual.wheel(0.1, 0.05, at=(0.0, side, 0.1)) for side in (-0.18, 0.18))]
+        axle, ahead = jnp.array([0.0, 0.0, 0.1]), jnp.array([1.0, 0.0, 0.0])
+        tongues = [Visual.line(axle, axle + length * ahead, radius=0.015, colour="#8a8a86") for length in self._per_trailer(self.length)]
+        return {"car": cart} | {_name(i): [*cart, tongue] for i, tongue in enumerate(tongues, 1)}
 
     def coordinate_rates(self, t, q, u):
         rates = []
@@ -277,8 +261,7 @@ class TrailerChain(Scene):
         return rows
 
     def velocity_constraints(self, motion):
-        bodies = [motion[_name(i)] for i in range(self.trailers + 1)]
-        return {f"axle {i}": knife_edge(body, body.position, body.orientation[:, 1]) for i, body in enumerate(bodies)}
+        return {f"axle {i}": _edge(motion[_name(i)]) for i in range(self.trailers + 1)}
 
     def invariants(self, motion):
         """The car's turn rate, where no torque drives it."""
@@ -290,7 +273,3 @@ class TrailerChain(Scene):
 
 def _name(i: int) -> str:
     return "car" if i == 0 else f"trailer {i}"
-
-
-def _axle() -> list[Visual]:
-    return [Visual.wheel(0.1, 0.05, at=(0.0, side, 0.1)) for side in (-0.18, 0.18)]

@@ -58,7 +58,23 @@ class VerticalDisc(Scene):
         return {"turn rate": motion.u.heading_rate, "roll rate": motion.u.roll_rate}
 
 
-class TiltingDisc(Scene):
+class _ThinDisc(Scene):
+    """A uniform thin disc on a level plane; the axle is body y."""
+
+    mass: Scalar = parameter(1.0, unit="kg", positive=True)
+    radius: Scalar = parameter(0.5, unit="m", positive=True)
+    gravity: Scalar = parameter(9.81, unit="m/s^2")
+
+    example_span = 10.0
+
+    def _disc(self, centre, orientation) -> dict[str, RigidBody]:
+        return {"disc": RigidBody.thin_disc(self.mass, self.radius, axis="y", position=centre, orientation=orientation)}
+
+    def loads(self, motion):
+        return (gravity(motion, self.gravity),)
+
+
+class TiltingDisc(_ThinDisc):
     """A thin disc rolling without slip on a level plane, in angles: the classic of Appell and Korteweg.
 
     Contact and height are built into the coordinates (x, y: contact point). Two no-slip rows, three degrees of freedom.
@@ -68,23 +84,15 @@ class TiltingDisc(Scene):
     Uniform thin disc: yaw about z, lean about the heading, spin about the axle; x, y of the contact point.
     """
 
-    mass: Scalar = parameter(1.0, unit="kg", positive=True)
-    radius: Scalar = parameter(0.5, unit="m", positive=True)
-    gravity: Scalar = parameter(9.81, unit="m/s^2")
-
     coordinates = coordinates("x y yaw lean spin")
     domain = {"yaw": (-3.2, 3.2), "lean": (-1.2, 1.2), "spin": (-3.2, 3.2)}
     conventions = "z up; upright at lean = 0, heading along x at yaw = 0; axle along body y; positive spin rolls forward."
     example = {"lean": 0.3, "yaw_rate": 0.5, "lean_rate": 0.2, "spin_rate": -3.0}
-    example_span = 10.0
 
     def bodies(self, t, q):
         frame = rot_z(q.yaw) @ rot_x(q.lean)
         centre = jnp.stack([q.x, q.y, 0.0 * q.x]) + self.radius * frame[:, 2]
-        return {"disc": RigidBody.thin_disc(self.mass, self.radius, axis="y", position=centre, orientation=frame @ rot_y(q.spin))}
-
-    def loads(self, motion):
-        return (gravity(motion, self.gravity),)
+        return self._disc(centre, frame @ rot_y(q.spin))
 
     def contacts(self, pose):
         return {"rim": disc_contact(pose["disc"], self.radius, axis="y", height="coordinates")}
@@ -96,7 +104,7 @@ class TiltingDisc(Scene):
 _TILTED = TiltingDisc.example
 
 
-class TiltingDiscQuaternion(Scene):
+class TiltingDiscQuaternion(_ThinDisc):
     """A thin disc rolling without slip on a level plane, as a free body: position, quaternion, and the contact as rows.
 
     One height row and two no-slip rows on six speeds: three degrees of freedom, the motion of `TiltingDisc`. The coordinates fail
@@ -105,10 +113,6 @@ class TiltingDiscQuaternion(Scene):
 
     Uniform thin disc: x, y, z of the centre, attitude as a quaternion, body angular velocity; the axle is body y.
     """
-
-    mass: Scalar = parameter(1.0, unit="kg", positive=True)
-    radius: Scalar = parameter(0.5, unit="m", positive=True)
-    gravity: Scalar = parameter(9.81, unit="m/s^2")
 
     coordinates = coordinates("x y z", quaternion("attitude"))
     domain = {"z": (0.05, 0.5), **{f"attitude_omega_{axis}": (-3.0, 3.0) for axis in "xyz"}}
@@ -121,14 +125,9 @@ class TiltingDiscQuaternion(Scene):
         "attitude_omega_y": _TILTED["spin_rate"] + _TILTED["yaw_rate"] * math.sin(_TILTED["lean"]),
         "attitude_omega_z": _TILTED["yaw_rate"] * math.cos(_TILTED["lean"]),
     }
-    example_span = 10.0
 
     def bodies(self, t, q):
-        centre, turned = jnp.stack([q.x, q.y, q.z]), quaternion_to_matrix(q.attitude)
-        return {"disc": RigidBody.thin_disc(self.mass, self.radius, axis="y", position=centre, orientation=turned)}
-
-    def loads(self, motion):
-        return (gravity(motion, self.gravity),)
+        return self._disc(jnp.stack([q.x, q.y, q.z]), quaternion_to_matrix(q.attitude))
 
     def contacts(self, pose):
         return {"rim": disc_contact(pose["disc"], self.radius, height="row")}

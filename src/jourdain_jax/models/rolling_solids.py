@@ -3,7 +3,6 @@
 import math
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import quaternion_rate, quaternion_to_matrix, rot_x, rot_y, rot_z
@@ -68,8 +67,7 @@ class BallOnTurntable(Scene):
     def visuals(self, pose):
         axes, width = self._axes().T, 0.2 * self.radius
         turned = axes @ rot_z(self.turn_rate * pose.t)
-        table = Visual.wheel(12 * self.radius, width, axis="z", at=-width / 2 * axes[:, 2], turn=turned, colour="#b9b2a4")
-        return {"": table}
+        return {"": Visual.wheel(12 * self.radius, width, axis="z", at=-width / 2 * axes[:, 2], turn=turned, colour="#b9b2a4")}
 
     def invariants(self, motion):
         q, u = motion.q, motion.u
@@ -150,10 +148,6 @@ class Rattleback(Scene):
     def contacts(self, pose):
         return {"sole": ellipsoid_contact(pose["stone"], self._semi_axes(), centre=-self._below_centre())}
 
-    def visuals(self, pose):
-        corners, faces = _half_ball()
-        return {"stone": Visual.mesh(corners, faces, scale=self._semi_axes(), at=-self._below_centre())}
-
     def events(self, motion):
         return {"on edge": 1.4 - jnp.abs(motion.q.alpha)}
 
@@ -171,14 +165,3 @@ class Rattleback(Scene):
     def _inertia(self) -> Float[Array, "3 3"]:
         o = jnp.zeros_like(self.A)
         return jnp.stack([jnp.stack([self.A, self.D, o]), jnp.stack([self.D, self.B, o]), jnp.stack([o, o, self.C])])
-
-
-def _half_ball() -> tuple[np.ndarray, list]:
-    """Corners and faces of the half of a ball of radius 1 that is down, along body axis 3."""
-    rings, around = 10, 40
-    across, angle = np.linspace(0, np.pi / 2, rings + 1)[1:, None], 2 * np.pi * np.arange(around) / around
-    grid = np.stack([np.sin(across) * np.cos(angle), np.sin(across) * np.sin(angle), np.cos(across) + 0 * angle], axis=-1)
-    at = lambda i, j: 1 + i * around + j % around  # noqa: E731
-    cap = [(0, at(0, j), at(0, j + 1)) for j in range(around)]
-    bands = [(at(i, j), at(i + 1, j), at(i + 1, j + 1), at(i, j + 1)) for i in range(rings - 1) for j in range(around)]
-    return np.concatenate([[[0.0, 0.0, 1.0]], grid.reshape(-1, 3)]), [*cap, *bands, tuple(at(rings - 1, -j) for j in range(around))]

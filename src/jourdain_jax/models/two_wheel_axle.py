@@ -46,8 +46,7 @@ class _TwoWheelAxle(Scene):
     example_span = 10.0
 
     def loads(self, motion):
-        down = jnp.stack([jnp.sin(self.slope), jnp.zeros_like(self.slope), -jnp.cos(self.slope)])
-        return (gravity(motion, self.gravity, down),)
+        return (gravity(motion, self.gravity, -rot_y(self.slope)[2]),)
 
     def visuals(self, pose):
         return {"": Visual.line(pose["wheel1"].position, pose["wheel2"].position, radius=0.1 * self.radius)}

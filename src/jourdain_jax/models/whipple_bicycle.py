@@ -112,33 +112,25 @@ class WhippleBicycle(Scene):
         front_centre = on_steer_axis + front @ _vector(-self.c, -self.rF)
         frame_centre = rear_centre + rear @ _vector(self.xB, self.zB + self.rR)
         fork_centre = on_steer_axis + front @ _vector(self.xH - self.w - self.c, self.zH)
-        frame_inertia = _inertia(self.IBxx, self.IByy, self.IBzz, self.IBxz)
-        fork_inertia = _inertia(self.IHxx, self.IHyy, self.IHzz, self.IHxz)
         return {
             "rear wheel": _wheel(self.mR, self.rR, self.IRxx, self.IRyy, rear_centre, rear @ rot_y(q.rear_spin)),
-            "rear frame": RigidBody(self.mB, frame_inertia, frame_centre, rear),
-            "front frame": RigidBody(self.mH, fork_inertia, fork_centre, front),
+            "rear frame": RigidBody(self.mB, _inertia(self.IBxx, self.IByy, self.IBzz, self.IBxz), frame_centre, rear),
+            "front frame": RigidBody(self.mH, _inertia(self.IHxx, self.IHyy, self.IHzz, self.IHxz), fork_centre, front),
             "front wheel": _wheel(self.mF, self.rF, self.IFxx, self.IFyy, front_centre, front @ rot_y(q.front_spin)),
         }
 
     def visuals(self, pose):
-        """Frame, fork, handlebar and saddle as bars from the hubs to the steer axis; of the rider only the mass centre, as a ball."""
-        at_frame = lambda x, z: _vector(x - self.xB, z - self.zB)  # noqa: E731, points of the plane of symmetry in the source's axes
-        at_fork = lambda x, z: _vector(x - self.xH, z - self.zH)  # noqa: E731
-        on_axis = lambda z: (self.w + self.c + z * jnp.tan(self.lam), z)  # noqa: E731
-        head, top, hub, crank = on_axis(-2.1 * self.rF), on_axis(-2.6 * self.rF), (0.0, -self.rR), (0.42 * self.w, -0.85 * self.rR)
-        seat = (0.26 * self.w, -2.5 * self.rR)
-        thin, wide = 0.045 * self.rR, 0.22 * self.w
-        frame = [
-            Visual.line(*(at_frame(*p) for p in points), radius=thin) for points in ((hub, crank, head, (0.3 * self.w, -2.1 * self.rR), hub), (crank, seat))
-        ]
-        saddle = Visual.capsule(0.12 * self.rR, 0.5 * self.rR, axis="x", at=at_frame(*seat), colour="#444444")
-        rider = Visual.ball(0.2 * self.rR, at=jnp.zeros(3), opacity=0.6)
-        grips = [at_fork(top[0] - 0.1 * self.w, top[1]) + jnp.stack([0 * wide, side * wide, 0 * wide]) for side in (1, -1)]
-        fork = [Visual.line(at_fork(self.w, -self.rF), at_fork(*head), at_fork(*top), radius=thin)]
-        fork.append(Visual.line(grips[0], at_fork(*top), grips[1], radius=thin))
+        """Frame and fork as bars from the hubs to the steer axis; of the rider only the mass centre, as a ball."""
+        on_axis = lambda z: (self.w + self.c + z * jnp.tan(self.lam), z)  # noqa: E731, points of the plane of symmetry in the source's axes
+        head, top, hub, saddle = on_axis(-2.1 * self.rF), on_axis(-2.6 * self.rF), (0.0, -self.rR), (0.26 * self.w, -2.5 * self.rR)
+        crank = (0.42 * self.w, -0.85 * self.rR)
+        bars = {"rear frame": (self.xB, self.zB, (hub, crank, head, saddle, crank)), "front frame": (self.xH, self.zH, ((self.w, -self.rF), head, top))}
+        lines = {name: [Visual.line(*(_vector(px - x, pz - z) for px, pz in points), radius=0.045 * self.rR)] for name, (x, z, points) in bars.items()}
         wheels = {name: Visual.wheel(radius, 0.12 * radius) for name, radius in (("rear wheel", self.rR), ("front wheel", self.rF))}
-        return {"rear frame": [*frame, saddle, rider], "front frame": fork, **wheels}
+        grip = _vector(top[0] - self.xH, top[1] - self.zH)
+        lines["front frame"].append(Visual.cylinder(0.045 * self.rR, 0.44 * self.w, axis="y", at=grip))
+        lines["rear frame"].append(Visual.ball(0.2 * self.rR, opacity=0.6))
+        return lines | wheels
 
     def loads(self, motion):
         torques = generalized_force(motion, lean_rate=motion.inputs.lean_torque, steer_rate=motion.inputs.steer_torque)
@@ -174,7 +166,7 @@ def _vector(x, z) -> Float[Array, "3"]:
 def _inertia(xx, yy, zz, xz) -> Float[Array, "3 3"]:
     """Inertia in the engine's axes: the product changes sign under half a turn about x."""
     zero = jnp.zeros_like(xx)
-    return jnp.stack([jnp.stack([xx, zero, -xz]), jnp.stack([zero, yy, zero]), jnp.stack([-xz, zero, zz])])
+    return jnp.stack([xx, zero, -xz, zero, yy, zero, -xz, zero, zz]).reshape(3, 3)
 
 
 def _wheel(mass, radius, diametral, axial, centre, orientation) -> RigidBody:

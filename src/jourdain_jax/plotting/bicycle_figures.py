@@ -5,8 +5,8 @@ import os
 import numpy as np
 
 from jourdain_jax.bicycle.job import Study
-from jourdain_jax.plotting.animation import animate
-from jourdain_jax.plotting.backend import pyplot
+from jourdain_jax.calculus.figures import pyplot
+from jourdain_jax.plotting.pictures import animate
 from jourdain_jax.plotting.quantities import plot
 
 # columns of the eigenvalues; weave is a pair, two real ones below the double root
@@ -48,28 +48,25 @@ def _band(axis, speed, nominal, samples, colour, name) -> None:
 
 
 def _mark_range(study: Study, axes) -> None:
-    weave, capsize = (_value(study, name) for name in ("weave_speed", "capsize_speed"))
-    if weave is not None:
-        end = capsize if capsize is not None and capsize > weave else study.grid[-1]
-        for axis in axes:
-            axis.axvspan(weave, min(end, study.grid[-1]), color="tab:green", alpha=0.08, lw=0)
-    for name, value in (("weave", weave), ("capsize", capsize)):
-        if value is None or value > study.grid[-1]:
+    """The stable range in green, and the two speeds with their limits."""
+    speeds = {name: study.speeds[f"{name}_speed"] or {"value": np.inf, "low": None, "high": None} for name in ("weave", "capsize")}
+    weave, last = speeds["weave"]["value"], study.grid[-1]
+    end = speeds["capsize"]["value"] if speeds["capsize"]["value"] > weave else last
+    spans = [(weave, min(end, last), {"color": "tab:green", "alpha": 0.08})] if weave < np.inf else []
+    for name, speed in speeds.items():
+        value, low, high = (speed[part] for part in ("value", "low", "high"))
+        if value > last:
             continue
-        low, high = (_value(study, f"{name}_speed", limit) for limit in ("low", "high"))
-        limits = "" if low is None or high is None or low == high else f"\n({low:.2f} to {high:.2f})"
+        limits = "" if None in (low, high) or low == high else f"\n({low:.2f} to {high:.2f})"
+        spans += [(low, high, {"color": "0.4", "alpha": 0.2})] if limits else []
         for axis in axes:
             axis.axvline(value, color="0.4", lw=0.8, ls="--")
-            if limits:
-                axis.axvspan(low, high, color="0.4", alpha=0.2, lw=0)
         side, beside = ("right", -8) if name == "weave" else ("left", 8)
         text = f"{name} speed\n{value:.2f} m/s{limits}"
         axes[0].annotate(text, (value, _CEILING), xytext=(beside, -6), textcoords="offset points", ha=side, va="top", fontsize=9)
-
-
-def _value(study: Study, name: str, part: str = "value") -> float | None:
-    speed = study.speeds[name]
-    return None if speed is None else speed[part]
+    for axis in axes:
+        for low, high, paint in spans:
+            axis.axvspan(low, high, lw=0, **paint)
 
 
 def draw_rides(study: Study, path: str | os.PathLike) -> None:

@@ -49,24 +49,23 @@ def page_data(motions: list[Trajectory], display: Display) -> tuple[dict, Number
     """The description of the page, and its numbers."""
     drawn = [looks_of(motion, "show", 1000) for motion in motions]
     numbers, first = Numbers(), drawn[0]
-    near, far = _near(drawn), _far(drawn)
-    size, reach = (float(np.max(high - low)) for low, high in (near, far))
+    near, far = (np.stack([x.min(axis=0), x.max(axis=0)]) for x in (_around_the_middle(drawn), _everywhere(drawn)))
+    size, reach = (float(np.ptp(box, axis=0).max()) for box in (near, far))
     colours = {name: body.colour for one in drawn for name, body in one.bodies.items() if name}
     # by itself, where the whole motion is five times as long as its bodies
     follow = first.sized and reach > 5 * size and not _at_rest(first) if display.follow is None else display.follow
     shown = size if follow else max(size, reach / 3)
     arrows, longest = _arrows(motions, drawn, shown) if display.forces else ([[] for _ in drawn], "")
-    tile = _round_number(shown / 4)
+    power = 10.0 ** np.floor(np.log10(shown / 4))
+    tile = float(power * max(k for k in (1, 2, 5) if k * power <= shown / 4 * (1 + 1e-9)))
     grounds = grounds_of(motions[0], first, *far)
     squares = f"squares of the ground: {tile:g} m" if any(ground["kind"] == "plane" for ground in grounds) else ""
-    notes = [squares, longest]
-    parts = zip(motions, drawn, arrows, strict=True)
     page = {
         "title": display.title,
         "names": [{"name": name, "colour": display.colours.get(name, colour)} for name, colour in colours.items()],
-        "note": "; ".join(note for note in notes if note),
+        "note": "; ".join(note for note in (squares, longest) if note),
         "span": [float(first.ts[0]), float(first.ts[-1])],
-        "motions": [_motion(numbers, motion, one, own, display) for motion, one, own in parts],
+        "motions": [_motion(numbers, *one, display) for one in zip(motions, drawn, arrows, strict=True)],
         "grounds": [_ground(numbers, ground) for ground in grounds],
         "size": size,
         "reach": reach,
@@ -84,17 +83,16 @@ def page_data(motions: list[Trajectory], display: Display) -> tuple[dict, Number
 
 def _motion(numbers: Numbers, motion: Trajectory, drawn: Drawn, arrows: list, display: Display) -> dict:
     colour = {name: display.colours.get(name, body.colour) for name, body in drawn.bodies.items()}
-    ends = display.paths
-    if ends is not None:
-        paths = [(colour[name], np.asarray(motion.point(name, local))[drawn.reached]) for name, local in ends]
+    if display.paths is not None:
+        paths = [(name, np.asarray(motion.point(name, local))[drawn.reached]) for name, local in display.paths]
     elif drawn.contacts:
-        paths = [(colour[contact.body], np.asarray(contact.point)) for contact in drawn.contacts.values()]
+        paths = [(contact.body, np.asarray(contact.point)) for contact in drawn.contacts.values()]
     else:
-        paths = [(colour[name], body.positions) for name, body in drawn.bodies.items() if _moves(body)]
+        paths = [(name, body.positions) for name, body in drawn.bodies.items() if _moves(body)]
     return {
         "ts": numbers.add(drawn.ts),
         "bodies": [_body(numbers, body, drawn, colour[name]) for name, body in drawn.bodies.items()],
-        "paths": [{"colour": colour, "points": numbers.add(points)} for colour, points in paths],
+        "paths": [{"colour": colour[name], "points": numbers.add(points)} for name, points in paths],
         "forces": [{"name": name, "points": numbers.add(points), "vectors": numbers.add(vectors)} for name, points, vectors in arrows],
     }
 
@@ -113,12 +111,13 @@ def _body(numbers: Numbers, body: DrawnBody, drawn: Drawn, colour: str) -> dict:
 
 def _shape(numbers: Numbers, look: Look, colour: str, thin: float) -> dict:
     visual = look.visual
-    shape = {"kind": visual.kind, "colour": visual.colour or colour, "opacity": visual.opacity, "size": np.asarray(visual.size).ravel().tolist()}
+    shape: dict = {"kind": visual.kind, "colour": visual.colour or colour, "opacity": visual.opacity}
     if visual.kind == "line":
         return shape | {"size": [], "count": look.points.shape[1], "points": numbers.add(_still(look.points)), "radius": look.radius or thin}
-    quaternions = quaternions_of(look.orientations)
-    shape |= {"p": numbers.add(_still(look.positions)), "q": numbers.add(_still(quaternions)), "turns": [0]}
-    return shape | ({"mesh": numbers.add(np.asarray(visual.size) * triangles_of(visual)[:, :3])} if visual.kind == "mesh" else {})
+    if visual.kind == "mesh":
+        shape["mesh"] = numbers.add(np.asarray(visual.size) * triangles_of(visual)[:, :3])
+    placed = {"p": numbers.add(_still(look.positions)), "q": numbers.add(_still(quaternions_of(look.orientations))), "turns": [0]}
+    return shape | placed | {"size": np.asarray(visual.size).ravel().tolist()}
 
 
 def _ground(numbers: Numbers, ground: dict) -> dict:
@@ -170,16 +169,19 @@ def _far(drawn: list[Drawn]) -> np.ndarray:
     return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
-def _near(drawn: list[Drawn]) -> np.ndarray:
-    """The corners (2, 3), m, of the box around the bodies that holds them at any one time, from their middle."""
-    lows, highs = [], []
+def _everywhere(drawn: list[Drawn]) -> np.ndarray:
+    """Points (points, 3), m, whose box holds all bodies at all times."""
+    return np.concatenate([body.extents().reshape(-1, 3) for one in drawn for body in one.bodies.values()])
+
+
+def _around_the_middle(drawn: list[Drawn]) -> np.ndarray:
+    """Points (points, 3), m, whose box holds the bodies at any one time, from their middle at that time."""
+    points = []
     for one in drawn:
         moving = [body for name, body in one.bodies.items() if name and _moves(body)]
         middle = np.mean([body.positions for body in moving], axis=0) if moving else np.zeros((len(one.ts), 3))
-        points = np.concatenate([body.extents() for body in moving or one.bodies.values()], axis=1) - middle[:, None]
-        lows.append(points.min(axis=(0, 1)))
-        highs.append(points.max(axis=(0, 1)))
-    return np.stack([np.min(lows, axis=0), np.max(highs, axis=0)])
+        points += [(body.extents() - middle[:, None]).reshape(-1, 3) for body in moving or one.bodies.values()]
+    return np.concatenate(points)
 
 
 def _arrows(motions: list[Trajectory], drawn: list[Drawn], size: float) -> tuple[list, str]:
@@ -190,30 +192,20 @@ def _arrows(motions: list[Trajectory], drawn: list[Drawn], size: float) -> tuple
     """
     found = []
     for motion, one in zip(motions, drawn, strict=True):
-        forces = motion.contact_forces() if one.contacts else {}
         own = []
-        for name, force in forces.items():
-            plane = one.contacts[name].plane
+        for name, force in (motion.contact_forces() if one.contacts else {}).items():
+            contact = one.contacts[name]
             normal, tangential = np.asarray(force.normal)[one.reached], np.asarray(force.tangential)[one.reached]
-            vectors = normal[:, None] * np.asarray(plane.normal) + np.einsum("tk,tkj->tj", tangential, np.asarray(plane.tangents))
-            own.append((name, np.asarray(one.contacts[name].point), np.where(np.isfinite(vectors), vectors, 0.0)))
+            vectors = normal[:, None] * np.asarray(contact.plane.normal) + np.einsum("tk,tkj->tj", tangential, np.asarray(contact.plane.tangents))
+            own.append((name, np.asarray(contact.point), np.where(np.isfinite(vectors), vectors, 0.0)))
         found.append(own)
     sizes = np.concatenate([np.zeros(1), *(np.linalg.norm(vectors, axis=1) for own in found for _, _, vectors in own)])
     strongest = float(sizes.max())
-    if strongest == 0.0:
-        return [[(name, points, 0.0 * vectors) for name, points, vectors in own] for own in found], ""
-    usual = 2.0 * float(np.quantile(sizes[1:], 0.9))
-    longest = strongest if usual == 0.0 or strongest < 2.0 * usual else usual
+    usual = 2.0 * float(np.quantile(sizes[1:], 0.9)) if strongest else 0.0
+    longest = usual if 0.0 < 2.0 * usual <= strongest else strongest
+    told = f"longest arrow: {longest:.3g} N" + (f" and more, up to {strongest:.3g} N" if longest < strongest else "") if strongest else ""
 
     def scaled(vectors: np.ndarray) -> np.ndarray:
-        lengths = np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), longest)
-        return 0.4 * size * vectors / lengths
+        return 0.4 * size * vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), longest or 1.0)
 
-    told = f"longest arrow: {longest:.3g} N" + (f" and more, up to {strongest:.3g} N" if longest < strongest else "")
     return [[(name, points, scaled(vectors)) for name, points, vectors in own] for own in found], told
-
-
-def _round_number(length: float) -> float:
-    """The nearest of 1, 2 and 5 times a power of ten below a length."""
-    power = 10.0 ** np.floor(np.log10(length))
-    return float(power * max(k for k in (1, 2, 5) if k * power <= length * (1 + 1e-9)))

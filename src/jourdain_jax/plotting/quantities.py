@@ -1,23 +1,28 @@
-"""Named quantities of motions against time; of many motions, the bands that hold given parts of them."""
+"""Named quantities of motions against time, and of families of steady motions against one another; of many motions, the bands that hold given parts of them."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from jourdain_jax.analysis.families.family import Family
+from jourdain_jax.calculus.figures import pyplot
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.calculus.writing import check_place
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.plotting.backend import pyplot
-from jourdain_jax.plotting.families_drawn import plot_family
-from jourdain_jax.plotting.units import checked_units
 from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.names import UnknownNameError, nearest
 
 ENERGIES = ("energy", "kinetic energy", "potential energy")
+UNITS = {  # by what is measured in them, in those of SI
+    "time": {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0},
+    "coordinate": {"m": 1.0, "km": 1e3, "cm": 1e-2, "mm": 1e-3, "rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "turn": 2 * np.pi},
+    "speed": {"m/s": 1.0, "km/h": 1 / 3.6, "cm/s": 1e-2, "mm/s": 1e-3, "rad/s": 1.0, "deg/s": np.pi / 180, "turn/s": 2 * np.pi, "rpm": np.pi / 30},
+    "energy": {"J": 1.0, "kJ": 1e3, "mJ": 1e-3},
+}
 
 
 def check_format(path: str | os.PathLike) -> None:
@@ -61,37 +66,93 @@ def plot(
     if path is not None:
         check_format(path)
     if isinstance(motion, Family):
-        return plot_family(motion, names, units, title, path, axes)
-    motions = _checked_motions(motion)
-    labels, bands = _checked_labels(labels, len(motions)), _checked_bands(bands)
-    names = names or _scene(motions[0]).coordinate_names.entries
+        figure, axes = _plot_family(motion, names, units, title, axes)
+    else:
+        motions = _checked_motions(motion)
+        figure, axes = _plot_motions(motions, names, units, _checked_labels(labels, len(motions)), _checked_bands(bands), title, axes)
+    if path is not None:
+        figure.savefig(path, dpi=150)
+        pyplot().close(figure)
+    return figure, axes
+
+
+def _plot_motions(motions: list, names: tuple[str, ...], units, labels: list[str], bands: list[float], title: str | None, axes):
+    scenes = [_scene(one) for one in motions]
+    names = names or scenes[0].coordinate_names.entries
     values = [[_values(one, name, bands) for name in names] for one in motions]
-    sizes = checked_units(units, _kinds(motions))
-    plt = pyplot()
+    sizes = _checked_units(units, scenes)
     own = axes is None
-    if own:
-        figure, axes = plt.subplots(len(names), 1, sharex=True, figsize=(7.0, 1.2 + 1.4 * len(names)), squeeze=False, layout="constrained")
-        axes = axes[:, 0]
-    axes = np.atleast_1d(axes)
-    if len(axes) != len(names):
-        raise ValueError(f"`axes` holds {len(axes)} axes for {len(names)} names, expected one for each of {', '.join(names)}")
-    unit_of_time, second = sizes.get("t", ("s", 1.0))
+    axes = _panels(axes, names, 1.4)
     for k, (axis, name) in enumerate(zip(axes, names, strict=True)):
         unit, size = sizes.get(name, ("J" if name in ENERGIES else "", 1.0))
         for j, (one, label) in enumerate(zip(motions, labels, strict=True)):
-            _draw(axis, one, values[j][k] / size, second, bands, f"C{j}", label)
+            _draw(axis, one, values[j][k] / size, sizes["t"][1], bands, f"C{j}", label)
         axis.set_ylabel(f"{name} in {unit}" if unit else name)
-        axis.grid(alpha=0.3)
-    axes[-1].set_xlabel(f"t in {unit_of_time}")
-    figure = axes[0].figure
+    axes[-1].set_xlabel(f"t in {sizes['t'][0]}")
     if title is None and len(motions) == 1 and isinstance(motions[0], Rollout):
         stopped = int(np.sum(motions[0].result == results.EVENT))
         title = f"{len(motions[0])} lanes; {stopped} stopped at an event, {motions[0].failed.size} failed"
-    _head(figure if own else axes[0], axes[0], title, columns=len(motions))
-    if path is not None:
-        figure.savefig(path, dpi=150)
-        plt.close(figure)
-    return figure, axes
+    if title:
+        axes[0].set_title(title, fontsize="medium", loc="left")
+    handles, texts = axes[0].get_legend_handles_labels()
+    if texts:  # above all panels of a figure of our own, where it hides nothing: a column for each motion, or for each entry where there is one motion
+        row: dict[str, Any] = {"loc": "outside upper left", "ncols": min(len(motions) if len(motions) > 1 else len(texts), 4)}
+        (axes[0].figure if own else axes[0]).legend(handles, texts, fontsize="small", **(row if own else {}))
+    return axes[0].figure, axes
+
+
+def _plot_family(family: Family, names: tuple[str, ...], units, title: str | None, axes):
+    """Every further name against the first one: stable parts in full, others dashed, special points marked."""
+    if len(names) < 2:
+        raise ValueError(f"`plot` of a family takes the name along the horizontal axis and those against it, and {len(names)} were given")
+    scene = family.equations.scene
+    sizes = dict.fromkeys(names, ("", 1.0)) | _checked_units(units, [scene])
+    label = {name: f"{name} in {unit}" if unit else name for name, (unit, _) in sizes.items()}
+    axes = _panels(axes, names[1:], 2.4)
+    marks = {"fold": ("d", family.folds), "branch point": ("s", family.branches), "eigenvalues meet or cross": (".", family.changes)}
+    x = family[names[0]] / sizes[names[0]][1]
+    for axis, name in zip(axes, names[1:], strict=True):
+        y = family[name] / sizes[name][1]
+        axis.plot(x, y, "C0--", lw=1.0, label=None if family.stable.all() else "unstable")
+        axis.plot(x, np.where(family.stable, y, np.nan), "C0-", lw=2.0, label="stable" if family.stable.any() else None)
+        for kind, (mark, points) in marks.items():
+            xy = [[point[k] / sizes[k][1] for point in points] for k in (names[0], name)]
+            axis.plot(*xy, f"k{mark}", label=kind if points else None, ms=6, mfc="white" if mark == "d" else "black")
+        axis.set_ylabel(label[name])
+    axes[-1].set_xlabel(label[names[0]])
+    axes[0].legend(fontsize="x-small", loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False)
+    axes[0].set_title(title or f"steady motions of {type(scene).__name__}", pad=30)
+    return axes[0].figure, axes
+
+
+def _panels(axes, names: Sequence[str], height: float) -> np.ndarray:
+    """One panel for each name, below each other; those of the user where they are given."""
+    if axes is None:
+        size = 7.0, 1.2 + height * len(names)
+        axes = pyplot().subplots(len(names), 1, sharex=True, figsize=size, squeeze=False, layout="constrained")[1][:, 0]
+    axes = np.atleast_1d(axes)
+    if len(axes) != len(names):
+        raise ValueError(f"`axes` holds {len(axes)} axes for {len(names)} names, expected one for each of {', '.join(names)}")
+    for axis in axes:
+        axis.grid(alpha=0.3)
+    return axes
+
+
+def _checked_units(units, scenes: Sequence) -> dict[str, tuple[str, float]]:
+    """Name -> unit and its size in SI; KeyError for an unknown name, ValueError for an unknown unit, or one of something else."""
+    if not isinstance(units, Mapping | None):
+        raise ValueError(f'`units` is {described(units)}, expected a dictionary from names to units, such as {{"lean": "deg"}}')
+    kinds = {name: kind for scene in scenes for kind, of in (("coordinate", scene.coordinate_names), ("speed", scene.speed_names)) for name in of.entries}
+    kinds |= dict.fromkeys(ENERGIES, "energy") | {"t": "time"}
+    found = {"t": ("s", 1.0)}
+    for name, unit in (units or {}).items():
+        if name not in kinds:
+            raise UnknownNameError(f"`units` names `{name}`, which is nothing to plot; {nearest(str(name), tuple(kinds))}")
+        known = UNITS[kinds[name]]
+        if unit not in known:
+            raise ValueError(f"`{unit}` is no unit of the {kinds[name]} `{name}` that is known here; {nearest(str(unit), tuple(known))}")
+        found[name] = unit, known[unit]
+    return found
 
 
 def _checked_motions(given) -> list[Trajectory | Rollout]:
@@ -128,13 +189,6 @@ def _scene(motion: Trajectory | Rollout):
     return motion.lanes.scene if isinstance(motion, Rollout) else motion.scene
 
 
-def _kinds(motions: Sequence) -> dict[str, tuple[str, ...]]:
-    """Names that may be plotted, by what they are."""
-    coordinates = tuple(dict.fromkeys(name for one in motions for name in _scene(one).coordinate_names.entries))
-    speeds = tuple(dict.fromkeys(name for one in motions for name in _scene(one).speed_names.entries))
-    return {"coordinate": coordinates, "speed": speeds, "energy": ENERGIES, "time": ("t",)}
-
-
 def _draw(axis, motion, y: np.ndarray, second: float, bands: Sequence[float], colour: str, label: str) -> None:
     """A line; of a rollout the bands, widest and palest first, and the median, `y` as `_values` gives them."""
     if not isinstance(motion, Rollout):
@@ -145,20 +199,6 @@ def _draw(axis, motion, y: np.ndarray, second: float, bands: Sequence[float], co
         low, high = y[2 * k], y[2 * k + 1]
         axis.fill_between(ts, low, high, color=colour, alpha=0.2 if k else 0.4, lw=0, label=f"{named}{100 * part:.3g} % of lanes")
     axis.plot(ts, y[-1], color=colour, lw=1.5, label=f"{named}median")
-
-
-def _head(place, axis, title: str | None, columns: int) -> None:
-    """Title and legend of all panels; on a figure of our own above them, where they hide nothing, otherwise within the first panel, `place`.
-
-    One column of the legend for each motion, or one for each entry where there is one motion.
-    """
-    if title:
-        axis.set_title(title, fontsize="medium", loc="left")
-    handles, labels = axis.get_legend_handles_labels()
-    shown = [(handle, label) for handle, label in zip(handles, labels, strict=True) if label]
-    if shown:
-        row = {"loc": "outside upper left", "ncols": min(columns if columns > 1 else len(shown), 4)}
-        place.legend(*zip(*shown, strict=True), fontsize="small", **({"loc": "best"} if place is axis else row))
 
 
 def _values(motion: Trajectory | Rollout, name: str, bands: Sequence[float]) -> np.ndarray:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.plotting.backend import pyplot
+from jourdain_jax.calculus.figures import pyplot
 from jourdain_jax.plotting.grounds_drawn import floor_under
 from jourdain_jax.plotting.looks import Drawn
 from jourdain_jax.plotting.solids import Quads, faces_of, split

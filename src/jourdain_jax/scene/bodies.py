@@ -1,6 +1,6 @@
 """Particles and rigid bodies: what they weigh and where they are, as functions of the coordinates. Velocities come by autodiff.
 
-A body states its pose in the inertial frame; `outline` is a closed or open line in its own frame, for drawing only.
+A body states its pose in the inertial frame; `outline` is a line in its own frame, for drawing only.
 """
 
 import equinox as eqx
@@ -34,7 +34,8 @@ class RigidBody(eqx.Module):
     - `mass` in kg; `inertia`: (3, 3), or three principal moments, in kg m^2, about the mass centre, body axes.
     - `position` (3,) of the mass centre in m, inertial frame; `orientation` R (3, 3): body components to space components. Its column `R[:, k]` is body axis
       k in the inertial frame; a row `R[k]` is not, and nothing can tell the two apart for you.
-    - `outline`: (points, 3) in m, a line in the body frame, relative to the mass centre; for drawing only (default: none).
+    - `outline`: (points, 3) in m, a line in the body frame, relative to the mass centre; for drawing only (default: none). With `solid` "box", "ellipsoid" or
+      "wheel", the one point of it is the corner of a box that holds this solid.
 
     ValueError for other shapes. Velocities come by differentiating the pose.
     Where mass or inertia depend on time or coordinates, they count as they are at each instant, `m a` and `I alpha + omega x I omega`: what leaves or
@@ -46,8 +47,9 @@ class RigidBody(eqx.Module):
     position: Float[Array, "3"]  # m, mass centre, inertial frame
     orientation: Float[Array, "3 3"]  # body components to space components
     outline: Float[Array, "points 3"]  # m, body frame, relative to the mass centre; for drawing only
+    solid: str = eqx.field(static=True)
 
-    def __init__(self, mass, inertia, position, orientation, outline=None):
+    def __init__(self, mass, inertia, position, orientation, outline=None, solid=""):
         self.mass = checked_real(mass, "mass of a rigid body", ())
         what, advice = "inertia of a rigid body", "give three principal moments or a 3x3 matrix, kg m^2, about the mass centre"
         matrix = checked_real(inertia, what, advice=advice)
@@ -57,6 +59,7 @@ class RigidBody(eqx.Module):
         self.outline = jnp.zeros((0, 3)) if outline is None else checked_real(outline, "outline of a rigid body")
         if self.outline.ndim != 2 or self.outline.shape[1] != 3:
             raise ValueError(f"outline of a rigid body has shape {self.outline.shape}, expected (points, 3); give points of a line in its body frame, m")
+        self.solid = solid
 
     @staticmethod
     def thin_disc(mass, radius, *, axis: str, position, orientation, axial=None, diametral=None) -> "RigidBody":
@@ -72,7 +75,8 @@ class RigidBody(eqx.Module):
         k = _axis_index(axis)
         moments = [diametral] * 3
         moments[k] = axial
-        return RigidBody(mass, _stack(moments), position, orientation, radius * _wheel_outline(k))
+        corner = np.where(np.arange(3) == k, 0.1, 1.0)
+        return RigidBody(mass, _stack(moments), position, orientation, radius * corner[None], "wheel")
 
     @staticmethod
     def ball(mass, radius, *, position, orientation, factor=0.4) -> "RigidBody":
@@ -82,7 +86,7 @@ class RigidBody(eqx.Module):
         """
         mass, radius = checked_real(mass, "mass of a ball", ()), checked_real(radius, "radius of a ball", ())
         moment = checked_real(factor, "factor of a ball", (), advice="give 2/5 for a solid ball, 2/3 for a shell") * mass * radius**2
-        return RigidBody(mass, _stack([moment] * 3), position, orientation, radius * np.concatenate([_wheel_outline(k)[:41] for k in range(3)]))
+        return RigidBody(mass, _stack([moment] * 3), position, orientation, radius * np.ones((1, 3)), "ellipsoid")
 
     @staticmethod
     def rod(mass, length, *, axis: str, position, orientation) -> "RigidBody":
@@ -107,7 +111,7 @@ class RigidBody(eqx.Module):
         mass, sides = checked_real(mass, "mass of a box", ()), checked_real(sides, "sides of a box", (3,), advice="give three lengths, m")
         a, b, c = sides[0], sides[1], sides[2]
         moments = _stack([mass * (b**2 + c**2) / 12, mass * (a**2 + c**2) / 12, mass * (a**2 + b**2) / 12])
-        return RigidBody(mass, moments, position, orientation, _box_outline() * sides)
+        return RigidBody(mass, moments, position, orientation, sides[None] / 2, "box")
 
 
 Body = Particle | RigidBody
@@ -121,20 +125,3 @@ def _axis_index(axis: str) -> int:
     if axis not in _AXES:
         raise ValueError(f"body axis `{axis}` is unknown; expected one of `x`, `y`, `z`")
     return _AXES[axis]
-
-
-def _wheel_outline(k: int) -> np.ndarray:
-    """A circle with one diameter drawn, in the plane normal to axis `k`."""
-    angle = np.linspace(0, 2 * np.pi, 41)
-    i, j = [(1, 2), (2, 0), (0, 1)][k]
-    points = np.zeros((43, 3))
-    points[:41, i], points[:41, j] = np.cos(angle), np.sin(angle)
-    points[41, i] = -1.0
-    points[42, i] = 0.0
-    return points
-
-
-def _box_outline() -> np.ndarray:
-    corners = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 0), (0, 0, 1), (1, 0, 1), (1, 0, 0)]
-    corners += [(1, 0, 1), (1, 1, 1), (1, 1, 0), (1, 1, 1), (0, 1, 1), (0, 1, 0), (0, 1, 1), (0, 0, 1)]
-    return np.array(corners, float) - 0.5

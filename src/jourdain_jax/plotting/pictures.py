@@ -1,0 +1,132 @@
+"""Pictures by matplotlib, straight from a scene's bodies: animations, stills at a few times, and what a notebook shows of a scene."""
+
+import os
+from collections.abc import Sequence
+
+import numpy as np
+
+from jourdain_jax.calculus.figures import figure as figure_in_html
+from jourdain_jax.calculus.figures import pyplot
+from jourdain_jax.calculus.reals import described
+from jourdain_jax.motion.start import start
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.plotting.looks import Drawn, looks_at, looks_of
+from jourdain_jax.plotting.space import axes_in_space, box_of, draw, legend, painted
+from jourdain_jax.scene.arguments import of_known_numbers
+
+VIEWS = {"above": (90.0, -90.0), "side": (0.0, -90.0), "space": (28.0, -60.0)}  # elevation and azimuth, degrees
+
+
+def check_suffix(path: str | os.PathLike) -> None:
+    """ValueError where an animation cannot be written to a file of this name."""
+    if not str(path).lower().endswith(".gif"):
+        raise ValueError(f"cannot write `{path}`: an animation is a .gif file")
+
+
+@of_known_numbers
+def animate(
+    trajectory: Trajectory,
+    path: str | os.PathLike,
+    *,
+    frames: int = 60,
+    paths: Sequence[tuple[str, Sequence[float]]] | None = None,
+    follow: bool = False,
+    view: tuple[float, float] = (22.0, -60.0),
+    title: str | None = None,
+) -> None:
+    """Write an animation of a `trajectory` to `path` (.gif), drawn from the scene's bodies.
+
+    - `frames`: at most so many, evenly chosen from the saved times; the playing time is the motion's own, 2 to 12 s.
+    - `paths`: (body, body-frame point in m) pairs to trace; default: the mass centre of every body.
+    - `follow`: keep the view on the bodies as they move, instead of showing the whole path. `view`: elevation and azimuth in degrees.
+    - `title`: a line above the drawing (default: none).
+
+    ValueError for another suffix than .gif, or a motion that reached none of its times; ImportError without matplotlib.
+    """
+    _check_one(trajectory, "`animate`", "jj.animate(rollout.lane(0), 'lane-0.gif')")
+    if not isinstance(frames, int | np.integer) or frames < 1:
+        raise ValueError(f"`frames` is {frames!r}, expected a whole number of at least 1")
+    check_suffix(path)
+    plt = pyplot()
+    from matplotlib.animation import FuncAnimation, PillowWriter
+
+    drawn = looks_of(trajectory, "animate", int(frames))
+    traces = _traces(trajectory, drawn, [(name, np.zeros(3)) for name in drawn.bodies if name] if paths is None else paths)
+    bodies = [painted(drawn, k) for k in range(len(drawn.ts))]
+    boxes = np.stack([box_of(faces[:1]) for faces in bodies])
+    whole = box_of([*boxes, *traces])
+    half = np.ptp(boxes, axis=1).max() * 0.62  # of the side of the square that follows the bodies
+    figure = plt.figure(figsize=(6.0, 5.0))
+    axes = axes_in_space(figure, view, (0.03, 0.02, 0.9, 0.88))
+    clock = figure.text(0.03, 0.91, "", family="monospace")
+    figure.text(0.25, 0.91, title or "")
+    legend(figure, drawn)
+
+    def draw_frame(k: int):
+        shown = whole.copy()
+        if follow:
+            shown[:, :2] = boxes[k, :, :2].mean(axis=0) + np.array([[-half], [half]])
+        draw(axes, bodies[k], [trace[: k + 1] for trace in traces], shown)
+        clock.set_text(f"t = {drawn.ts[k]:6.2f} s")
+        return [clock]
+
+    count, seconds = len(drawn.ts), float(np.clip(abs(drawn.ts[-1] - drawn.ts[0]), 2.0, 12.0))
+    FuncAnimation(figure, draw_frame, frames=count, blit=False).save(path, writer=PillowWriter(fps=max(1, round(count / seconds))), dpi=80)
+    plt.close(figure)
+
+
+def draw_still(
+    trajectory: Trajectory,
+    path: str | os.PathLike,
+    *,
+    at: int | Sequence = 3,
+    paths: Sequence[tuple[str, Sequence]] | None = None,
+    view: str | tuple = "space",
+    size: tuple[int, int] = (640, 420),
+) -> None:
+    """Draw a motion as one picture: its bodies, solid, at a few times, earlier ones paler, and the paths of points.
+
+    - `at`: times in s (the nearest saved ones are drawn), or how many, evenly spaced from the start to the end.
+    - `paths`: (body, body-frame point in m) pairs to trace; default: the mass centre of the first body.
+    - `view`: "above", "side" or "space", or elevation and azimuth in degrees.
+    - `size`: width and height in pixels.
+
+    ValueError for a rollout, an unknown view or body, or a motion that reached none of its times; ImportError without matplotlib.
+    """
+    _check_one(trajectory, "`draw_still`", "rollout.lane(0)")
+    if isinstance(view, str) and view not in VIEWS:
+        raise ValueError(f"`view` is `{view}`, expected one of {', '.join(f'`{name}`' for name in VIEWS)}, or elevation and azimuth in degrees")
+    plt, drawn = pyplot(), looks_of(trajectory)
+    wanted = np.asarray(at, float) if not isinstance(at, int) else np.linspace(drawn.ts[0], drawn.ts[-1], at) if at > 1 else drawn.ts[-1:]
+    chosen = np.unique(np.argmin(np.abs(drawn.ts - wanted[:, None]), axis=1)).tolist()
+    traces = _traces(trajectory, drawn, [(next(name for name in drawn.bodies if name), np.zeros(3))] if paths is None else paths)
+    strengths = np.linspace(0.35, 1.0, len(chosen)) if len(chosen) > 1 else [1.0]
+    faces, colours = zip(*(painted(drawn, k, strength) for k, strength in zip(chosen, strengths, strict=True)), strict=True)
+    figure = plt.figure(figsize=(size[0] / 100, size[1] / 100), dpi=100)
+    axes = axes_in_space(figure, VIEWS[view] if isinstance(view, str) else view, (0.05, 0.07, 0.88, 0.83))
+    draw(axes, (np.concatenate(faces), np.concatenate(colours)), traces, box_of([*faces, *traces]))
+    legend(figure, drawn, len(traces))
+    figure.savefig(path)
+    plt.close(figure)
+
+
+def scene_picture(scene) -> str:
+    """HTML of the bodies of a scene where its `example` puts them, in space, on a floor with their shadows; empty where there is none to draw.
+
+    A scene that cannot be started has no picture: a notebook displays what is still being written, and `jj.start` says what is wrong.
+    """
+    try:
+        bodies = painted(looks_at(scene, start(scene, **scene.example)), 0)
+    except Exception:  # whatever the user's methods raise, and that numbers are not known
+        return ""
+    return figure_in_html(lambda whole: draw(axes_in_space(whole, VIEWS["space"]), bodies, [], box_of(bodies[:1])), 300, 200)
+
+
+def _check_one(trajectory, where: str, example: str) -> None:
+    if not isinstance(trajectory, Trajectory) or trajectory.q.ndim != 2:
+        raise ValueError(f"{where} was given {described(trajectory)}, expected one motion; of a rollout take one lane: {example}")
+
+
+def _traces(trajectory: Trajectory, drawn: Drawn, ends: Sequence) -> list[np.ndarray]:
+    """Paths (times, 3) of points of bodies, m."""
+    return [np.asarray(trajectory.point(*end))[drawn.reached] for end in ends]
