@@ -13,8 +13,7 @@ from seen_differently import Seen, other_names, views
 
 import jourdain_jax as jj
 from jourdain_jax import GibbsAppell, structure_of, velocity_residual
-from jourdain_jax.build.explicit_power import power_of_loads
-from jourdain_jax.build.reference_parameters import reference_parameters
+from jourdain_jax.build.trace import power_of_loads
 from jourdain_jax.calculus.null_space import null_space_qr, null_space_svd, present
 from jourdain_jax.dynamics.accelerations import diagnosed
 from jourdain_jax.dynamics.power import power
@@ -25,6 +24,7 @@ from jourdain_jax.equations.projection import closure_residual, project_position
 from jourdain_jax.equations.reductions import Partition, _by_null_space, reduce
 from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.equations.scaling import scaled
+from jourdain_jax.scene.identity import reference_parameters
 
 PUSH = 0.7  # value of the input, where a scene has one
 NEAR = 0.03  # smallest singular values of the rows, and of M, below which an instance counts as near a loss of rank and is left out

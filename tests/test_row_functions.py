@@ -11,7 +11,7 @@ import jourdain_jax as jj
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.projection import BY_AUTODIFF
-from jourdain_jax.motion.row_functions import row_functions
+from jourdain_jax.motion.put_on_rows import row_functions
 from jourdain_jax.native import ffi
 from jourdain_jax.program import interpret
 

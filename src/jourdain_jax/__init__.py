@@ -33,6 +33,7 @@ from jourdain_jax import models
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.guards import DifferentiationModeError
+from jourdain_jax.calculus.on_first_use import version_of as _version_of
 from jourdain_jax.calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
 from jourdain_jax.dynamics.accelerations import Accelerations, Baumgarte, accelerations, reductions
 from jourdain_jax.dynamics.newton_euler import newton_residual
@@ -53,14 +54,14 @@ from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators.taylor import Taylor
 from jourdain_jax.motion.model import Model, build
 from jourdain_jax.motion.options import Options
+from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import simulate
-from jourdain_jax.motion.start import State, consistent, start
+from jourdain_jax.motion.start import consistent, start
 from jourdain_jax.motion.trajectories.diagnostics import diagnose
 from jourdain_jax.motion.trajectories.results import SimulationError
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.motion.trajectories.versions import version_of as _version_of
-from jourdain_jax.motion.vector_fields.choice import Formulation
+from jourdain_jax.motion.vector_fields.field import Formulation
 from jourdain_jax.scene.bodies import Particle, RigidBody
 from jourdain_jax.scene.constraints import knife_edge, pin, rod, weld
 from jourdain_jax.scene.contacts import Contact, ball_contact, disc_contact, ellipsoid_contact, wheel_contact

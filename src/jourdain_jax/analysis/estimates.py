@@ -34,9 +34,9 @@ from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.build.plausibility import impossible_bodies
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.inputs import as_inputs
+from jourdain_jax.motion.model import modelled
+from jourdain_jax.motion.own_steps import moving_jumps
 from jourdain_jax.motion.simulate import simulate
-from jourdain_jax.motion.vector_fields.choice import vector_field
-from jourdain_jax.motion.watched import moving_jumps
 from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
@@ -53,7 +53,7 @@ def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> tuple[st
         one = run_of(run).at(layout, shared, local[index])
         scene = layout.scene(problem.scene, shared)
         motion = partial(one.motion, scene, simulate, options=options)
-        jumps = moving_jumps(vector_field(scene, work=False), scene, as_inputs(scene, None), True)
+        jumps = moving_jumps(modelled(scene).field(work=False), scene, as_inputs(scene, None), True)
         if jumps and one.motion(scene, simulate, one.ts, replace(options, events=False)).crossings:
             found.append(
                 f"the motion of run {index} crosses relations (`<`, `sign`, ...) at which loads jump: the slopes that are fitted by leave out how the times of "

@@ -32,8 +32,9 @@ from jourdain_jax.calculus.reals import checked_unless_traced, is_traced
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.inputs import Inputs, inputs_at
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
+from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.simulate import simulate
-from jourdain_jax.motion.start import State, consistent
+from jourdain_jax.motion.start import consistent
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import nearest

@@ -32,14 +32,14 @@ from jourdain_jax.analysis.layout import Layout, PossibleInertia
 from jourdain_jax.analysis.runs import Run, equal_runs, run_of
 from jourdain_jax.analysis.table import table
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
-from jourdain_jax.build.reference import Reference
-from jourdain_jax.build.reference_parameters import with_reference_parameters
+from jourdain_jax.build.structure import Reference
 from jourdain_jax.calculus.compiled import compiled
 from jourdain_jax.calculus.reals import array_module, described, is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.identity import with_reference_parameters
 from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
 from jourdain_jax.scene.parameters import Scalar
 from jourdain_jax.scene.printing import Printed

@@ -38,9 +38,9 @@ from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.calculus.reals import Numbers, is_traced
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.lowering.kinks import bent_load
-from jourdain_jax.motion.arguments import as_state
+from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.sensitivity import SensitivityWarning
-from jourdain_jax.motion.start import State
+from jourdain_jax.motion.simulate import as_state
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.printing import Printed

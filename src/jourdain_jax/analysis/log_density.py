@@ -25,13 +25,13 @@ from jourdain_jax.analysis.layout import Layout, PossibleInertia
 from jourdain_jax.analysis.likelihood import as_fit_options, as_runs, in_all_or_none, mapped, of_run
 from jourdain_jax.analysis.runs import Run, equal_runs
 from jourdain_jax.analysis.unknowns import check_starts, unknowns_of
-from jourdain_jax.build.reference import Reference
-from jourdain_jax.build.reference_parameters import reference_parameters
+from jourdain_jax.build.structure import Reference
 from jourdain_jax.calculus.compiled import compiled
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.identity import reference_parameters
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import Scalar
 from jourdain_jax.scene.scene import Scene

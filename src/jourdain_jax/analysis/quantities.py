@@ -28,7 +28,6 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array, Float
 
-from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.calculus.reals import array_module, checked_known, checked_real, described, is_traced
 from jourdain_jax.dynamics.accelerations import accelerations
@@ -37,6 +36,7 @@ from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
 from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.program.calls import Call
+from jourdain_jax.scene.identity import once_per_values
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.names_read import is_function, now_read_by

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 import jax
 
 from jourdain_jax.analysis.integrability import growth_vector, row_integrability
-from jourdain_jax.build.domain import COORDINATE_DOMAIN, SPEED_DOMAIN
+from jourdain_jax.build.assembling import COORDINATE_DOMAIN, SPEED_DOMAIN
 from jourdain_jax.build.plausibility import impossible_bodies
 from jourdain_jax.build.structure import structure_of, structure_whatever_its_faults
 from jourdain_jax.calculus.figures import MODEL, QUIET, figure
@@ -23,12 +23,11 @@ from jourdain_jax.dynamics.reduced import cyclic_coordinates, ignorable_coordina
 from jourdain_jax.lowering.comparison import DIFFERS
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import NotLowered
-from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.inputs import as_inputs
-from jourdain_jax.motion.model import Model, build
+from jourdain_jax.motion.model import Model, build, modelled
 from jourdain_jax.motion.native import native_motion
-from jourdain_jax.motion.start import State
-from jourdain_jax.motion.vector_fields.choice import vector_field
+from jourdain_jax.motion.put_on_rows import State
+from jourdain_jax.motion.simulate import as_state
 from jourdain_jax.native import nvidia
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers
 from jourdain_jax.scene.printing import Printed, preformatted
@@ -226,7 +225,7 @@ def _lowering(built: Model) -> str:
     if found is None:
         return f"not lowered: {built.not_lowered}"
     calls = "".join(f"; {reason} has no scalar form: kept as a call" for reason in found.calls)
-    reason = native_motion.reason_against(vector_field(built.scene), built.scene, as_inputs(built.scene, None), bool(built.events))
+    reason = native_motion.reason_against(modelled(built.scene).field(), built.scene, as_inputs(built.scene, None), bool(built.events))
     where = f"not to machine code: {reason}" if reason else "to machine code"
     if not reason and jax.default_backend() == "gpu":
         where += f" of the CPU and of NVIDIA GPUs ({nvidia.architecture()})"

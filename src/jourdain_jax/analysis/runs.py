@@ -30,7 +30,7 @@ from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.quantities import Channel, StopEvent
 from jourdain_jax.analysis.sensors import Drive, Numbers, Reading, Times, grid, ideal, intervals, with_numbers
 from jourdain_jax.analysis.shooting import LAST, NODE, begin, ended
-from jourdain_jax.build.reference import Reference
+from jourdain_jax.build.structure import Reference
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.options import AllOptions, alongside
 from jourdain_jax.motion.simulate import simulate

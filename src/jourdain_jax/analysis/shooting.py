@@ -29,7 +29,7 @@ from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.sensors import FEWEST_INTERVALS, latest
 from jourdain_jax.calculus.reals import Number, checked_real
 from jourdain_jax.motion.inputs import Inputs, Sampled
-from jourdain_jax.motion.start import State
+from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.scene import Scene
 

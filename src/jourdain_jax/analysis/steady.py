@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.analysis.tangent import flow_of, privileged_speeds
-from jourdain_jax.build.domain import coordinate_bounds
+from jourdain_jax.build.assembling import coordinate_bounds
 from jourdain_jax.build.probed_on_graph import coordinates_on_rows
 from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.calculus.damped import damped_search
@@ -24,7 +24,7 @@ from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
 from jourdain_jax.calculus.reals import Number, Numbers, described
 from jourdain_jax.dynamics.reduced import ignorable_coordinates
 from jourdain_jax.equations.projection import closure_residual
-from jourdain_jax.motion.start import State
+from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.printing import Printed

@@ -16,8 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jourdain_jax.build.privileged import best_privileged, pivots_at
-from jourdain_jax.build.reference_parameters import with_reference_parameters
+from jourdain_jax.build.rank import best_privileged, pivots_at
 from jourdain_jax.build.row_program import RowProgram, row_program
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import WELL_CONDITIONED, structure_of, usual_rows
@@ -34,11 +33,11 @@ from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
-from jourdain_jax.motion.row_functions import row_functions
-from jourdain_jax.motion.start import State
+from jourdain_jax.motion.put_on_rows import State, row_functions
 from jourdain_jax.native import ffi
 from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.identity import with_reference_parameters
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.scene import Scene
 

@@ -35,8 +35,9 @@ from jourdain_jax.equations.lagrange import lagrange_equations, speeds_are_rates
 from jourdain_jax.equations.listed import names_of_rows
 from jourdain_jax.equations.scaling import row_scale, speed_scale
 from jourdain_jax.equations.virtual_power import energies_at, equations_and_rows
-from jourdain_jax.motion.arguments import as_state
-from jourdain_jax.motion.start import State, consistent
+from jourdain_jax.motion.put_on_rows import State
+from jourdain_jax.motion.simulate import as_state
+from jourdain_jax.motion.start import consistent
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, of_known_numbers
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines

@@ -23,7 +23,7 @@ from jourdain_jax.bicycle.uncertainty import interval, sample_parameters
 from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 from jourdain_jax.motion.batches.rollout import Rollout, rollout
-from jourdain_jax.motion.start import State
+from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.trajectories.results import EVENT
 
 SPEEDS = ("weave_speed", "capsize_speed", "double_root_speed")

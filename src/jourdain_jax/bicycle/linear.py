@@ -16,7 +16,7 @@ from jourdain_jax.analysis.linearize import linearize
 from jourdain_jax.bicycle.stability import BicycleMatrices
 from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
-from jourdain_jax.motion.start import State
+from jourdain_jax.motion.put_on_rows import State
 
 _SPEED = 4.0  # m/s, of the second linearisation
 _DEPENDENT = ("pitch",)

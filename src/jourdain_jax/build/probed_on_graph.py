@@ -16,8 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.build.assembling import Assembled, assemble, speed_scales, typical_lengths, without_rows
-from jourdain_jax.build.domain import coordinate_bounds
+from jourdain_jax.build.assembling import Assembled, assemble, coordinate_bounds, speed_scales, typical_lengths, without_rows
 from jourdain_jax.build.plausibility import Numbers
 from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
 from jourdain_jax.calculus.gauss_newton import nearest_root, shortest
@@ -29,7 +28,7 @@ from jourdain_jax.program.derivative import derivatives, jacobian
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.identity_test import IdentityProbes, identity_probes, is_combination, on_rows
-from jourdain_jax.scene.once_per_class import once_per_class
+from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.scene import Scene
 
 TIMED = ("rows", "poses", "inertias", "coordinate rates", "loads", "potential")

@@ -14,14 +14,13 @@ import numpy as np
 
 from jourdain_jax.build.plausibility import CHECKS, any_wrong
 from jourdain_jax.build.probed_on_graph import LookedAt, looked_at
-from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.build.trace import TracedScene
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 from jourdain_jax.program.part import part_of
-from jourdain_jax.scene.once_per_class import once_per_class
+from jourdain_jax.scene.identity import once_per_class, with_reference_parameters
 from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.scene import Scene
 

@@ -9,8 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.build.assembling import Assembled
-from jourdain_jax.build.domain import coordinate_bounds, speed_bounds
+from jourdain_jax.build.assembling import Assembled, coordinate_bounds, speed_bounds
 from jourdain_jax.build.probed_on_graph import Probed, sampled_on_graph
 from jourdain_jax.calculus.reals import array_module
 from jourdain_jax.scene.arguments import as_scene, of_known_numbers

@@ -5,7 +5,10 @@ well at random states are singular; all are projected onto the geometric rows. P
 parameters are traced (numbers near the class's defaults stand in), so that the choice is static.
 """
 
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from numbers import Real
 
 import jax
 import numpy as np
@@ -13,17 +16,16 @@ from jaxtyping import Float
 
 from jourdain_jax.build.assembling import speed_scales, typical_row_lengths
 from jourdain_jax.build.plausibility import sentences
-from jourdain_jax.build.privileged import best_privileged, pivots_at, privileged_by_user, worst_pivot
 from jourdain_jax.build.probed_on_graph import TIMED, Probed, follow_from_others, probed_on_graph
-from jourdain_jax.build.rank import Scaled, contradictions, ranks_of, redundant_rows, scaled_states
-from jourdain_jax.build.reference_parameters import once_per_values
+from jourdain_jax.build.rank import Scaled, best_privileged, contradictions, pivots_at, privileged_by_user, ranks_of, redundant_rows, scaled_states, worst_pivot
 from jourdain_jax.build.sampling import drawn_states, no_numbers, symmetric_configurations, usable_states
 from jourdain_jax.build.smoothness import kinks
-from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.calculus.reals import is_traced, real_type
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.rows import UsualRows
 from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.arguments import as_scene
+from jourdain_jax.scene.identity import defaults, once_per_values, reference_parameters, with_reference_parameters
 from jourdain_jax.scene.scene import Scene
 
 RANDOM_PROBES = 24
@@ -339,3 +341,45 @@ def _far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> Scaled:
 def _describe(scene: Scene, q: np.ndarray) -> str:
     values = [f"{name} = {value:.4g}" for name, value in zip(scene.coordinate_names.entries, q, strict=True) if abs(value) > 1e-12]
     return ", ".join(values) or "all coordinates zero"
+
+
+class Reference:
+    """A scene whose numbers stand in for traced parameters of its class; a static argument of what is compiled.
+
+    Two are equal where their scenes lead to the same decisions (`Structure.decisions`): then one program serves both. So what a call runs is decided by its own
+    arguments, and not by which call was the first. Of parameters that are traced already, the class's defaults stand in.
+    """
+
+    @staticmethod
+    def where_free(scene: Scene, free: Collection[str]) -> "Reference":
+        """That of a scene some of whose parameters, `free`, are going to change: the defaults of its class stand in for these, where it has states there."""
+        leaves, treedef = jax.tree.flatten(scene)
+        for place, (name, default) in enumerate(defaults(scene)):
+            if name in free and isinstance(default, Real | np.ndarray | jax.Array) and np.shape(default) == np.shape(leaves[place]):
+                leaves[place] = np.asarray(default, real_type())
+        return _found(jax.tree.unflatten(treedef, leaves)) or Reference(scene)
+
+    def __init__(self, scene: Scene):
+        self.scene = with_reference_parameters(scene)
+        self._key = jax.tree.structure(scene), structure_whatever_its_faults(self.scene).decisions, jax.config.jax_enable_x64
+
+    @contextmanager
+    def stands_in(self) -> Iterator[None]:
+        """Inside, its numbers stand in."""
+        with reference_parameters(self.scene):
+            yield
+
+    def __hash__(self):
+        return hash(self._key)
+
+    def __eq__(self, other):
+        return isinstance(other, Reference) and self._key == other._key
+
+
+@once_per_values
+def _found(scene: Scene) -> Reference | None:
+    """That of a scene; None where no state of it is found."""
+    try:
+        return Reference(scene)
+    except (TypeError, ValueError):
+        return None

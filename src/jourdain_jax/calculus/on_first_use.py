@@ -11,6 +11,7 @@ diffrax, so `x` is compared with what needs no import first: with None, and with
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
 from types import ModuleType
 from typing import Any
 
@@ -62,3 +63,11 @@ def names_on_first_use(package: dict[str, Any], where: Mapping[str, str], gone: 
         return sorted({*package, *where})
 
     return __getattr__, __dir__
+
+
+def version_of(package: str) -> str:
+    """The installed version of a package; "unknown" where it runs without being installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "unknown"

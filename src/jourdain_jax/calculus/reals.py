@@ -1,6 +1,7 @@
 """Numbers as a user writes them (plain, of NumPy, in a list), made into floating-point arrays."""
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import lru_cache
 from types import ModuleType
 from typing import TypeAlias
@@ -78,7 +79,7 @@ def checked_real(value, what: str, shape: tuple[int, ...] | None = None, *, advi
 def checked_positive(value, what: str, shape: tuple[int, ...] | None = (), *, advice: str = "give it in m") -> Array:
     """As `checked_real`, with numbers above zero. ValueError where they are known not to be."""
     found = checked_real(value, what, shape, advice=advice)
-    if not is_traced(found) and not np.all(np.asarray(found) > 0):
+    if not np.all(known_numbers(found) > 0):
         raise ValueError(f"{what} is {np.asarray(found).tolist()}, expected more than zero; {advice}")
     return found
 
@@ -155,6 +156,11 @@ def is_traced(*trees) -> bool:
     return not known and any(is_traced_type(type(leaf)) for leaf in jax.tree.leaves(trees))
 
 
+def known_numbers(x) -> np.ndarray:
+    """Return numbers for a check where they are handed over; none where they are traced, so that the check has nothing to refuse."""
+    return np.zeros(0) if is_traced(x) else np.asarray(x)
+
+
 def array_module(x) -> ModuleType:
     """Return `jax.numpy` where something in `x` is traced, otherwise NumPy."""
     return jnp if is_traced(x) else np
@@ -163,6 +169,11 @@ def array_module(x) -> ModuleType:
 def nothing_is_traced() -> bool:
     """Whether this call stands outside of every transformation: no function around it is being traced, and so no argument."""
     return jax.extend.core.get_opaque_trace_state(convention="flax") == _NOTHING_TRACED
+
+
+def at_once():
+    """Return a context in which known numbers are computed at once, also where a function around this call is being traced."""
+    return nullcontext() if nothing_is_traced() else jax.ensure_compile_time_eval()
 
 
 with jax.ensure_compile_time_eval():

@@ -20,8 +20,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.build.explicit_power import explicit_rate, forces_for_potentials, power_of_loads
 from jourdain_jax.build.structure import Structure, structure_of
+from jourdain_jax.build.trace import explicit_rate, forces_for_potentials, power_of_loads
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.equations.kinematics import inertias, motion_at

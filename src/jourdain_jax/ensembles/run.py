@@ -21,11 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from jourdain_jax.calculus.on_first_use import version_of
 from jourdain_jax.ensembles import memory
 from jourdain_jax.ensembles.statistics import Grid, Tally
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Lanes, Task
-from jourdain_jax.motion.trajectories.versions import version_of
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.tracebacks import users_level
 

@@ -19,8 +19,8 @@ from jourdain_jax.ensembles.result import StudyResult
 from jourdain_jax.ensembles.run import bounded, in_this_process, run
 from jourdain_jax.ensembles.task import AT_START, SAVES, Task
 from jourdain_jax.ensembles.workers import in_processes
-from jourdain_jax.motion.arguments import span_and_times
 from jourdain_jax.motion.options import MotionFields, Options, as_options
+from jourdain_jax.motion.simulate import span_and_times
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import parameters_of

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 from jourdain_jax.equations.kinematics import shapes_along_motion
 from jourdain_jax.equations.rows import position_rows, row_names, velocity_rows
+from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import events_of, invariants_of, loads_of
 

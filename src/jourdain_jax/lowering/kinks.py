@@ -6,13 +6,13 @@ What a call of JAX hides (`jnp.interp`, a callback) is not seen.
 import numpy as np
 
 from jourdain_jax.build.probed_on_graph import looked_at
-from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.build.structure import structure_whatever_its_faults
 from jourdain_jax.build.trace import TracedScene, named_values, owned
 from jourdain_jax.lowering.relations import AGREE, branches, jumps, switches
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Unsupported
+from jourdain_jax.scene.identity import with_reference_parameters
 from jourdain_jax.scene.scene import Scene
 
 

@@ -11,7 +11,6 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.build.reference_parameters import varied, with_reference_parameters
 from jourdain_jax.build.sampling import random_states
 from jourdain_jax.build.structure import Structure, structure_of, structure_whatever_its_faults
 from jourdain_jax.build.trace import TracedScene, Variables, named_values, traced_scene
@@ -29,7 +28,7 @@ from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.identity_test import IdentityProbes, equal
 from jourdain_jax.program.part import part_of
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
-from jourdain_jax.scene.once_per_class import once_per_class
+from jourdain_jax.scene.identity import once_per_class, varied, with_reference_parameters
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 

@@ -5,9 +5,9 @@ from dataclasses import fields
 import jax
 import numpy as np
 
-from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.scene.identity import with_reference_parameters
 from jourdain_jax.scene.scene import Scene
 
 

@@ -21,11 +21,11 @@ from jourdain_jax.calculus.differentiated_as import by_modes
 from jourdain_jax.calculus.guards import SECOND_ORDER_MESSAGE
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.integrators import event_search, integrands
+from jourdain_jax.motion.model import modelled
+from jourdain_jax.motion.own_steps import reason_against_watching
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.motion.vector_fields.choice import Formulation, vector_field
-from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
-from jourdain_jax.motion.watched import reason_against_watching
+from jourdain_jax.motion.vector_fields.field import Formulation, Integrated, VectorField
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines, users_level
@@ -64,13 +64,13 @@ def diffrax_term(scene: Scene | BuiltFor, inputs=None) -> diffrax.ODETerm:
         )
         q, u = found.ys
     """
-    scene = as_scene(scene)
+    model, scene = modelled(scene, Formulation("full")), as_scene(scene)
     inputs = as_inputs(scene, inputs)
-    field = vector_field(scene, Formulation("full"), work=False, backend="auto", inputs=inputs)
+    field = model.field(inputs.constant, work=False)
     return diffrax.ODETerm(_Rates(field, scene, inputs, field.fixed(scene)))
 
 
-class Diffrax(Integrator):
+class Diffrax(eqx.Module, Integrator):
     """`diffrax.diffeqsolve`."""
 
     solver: diffrax.AbstractSolver

@@ -2,6 +2,16 @@
 
 Both give states at the saved times, which of those were reached, and where and why the motion ended; then speeds are worked out, and all is put into a
 `Trajectory`.
+
+Two more checks are result codes, inside `jit` and in every lane. Where nothing does work that no potential accounts for, T + V is constant for a right motion.
+Step-size control leaves in each number y of the state an error of about `atol + rtol |y|` per step. With dE the change of the energy by errors of that size in
+all numbers together, N steps change the energy by some N dE, and round-off by some N eps of it. Over all models, at tolerances from 1e-4 to 1e-11, no drift is
+larger than half of N dE (`bench/energy_drift.py`); ten times as much, and at least 1 % of the energy that moves, means that the motion is not that of the
+scene: it went through a singular position, or over a feature, without notice. And rows that depend on each other may contradict each other on the way,
+
+    A u + phi_0 = 0,   rank A < number of rows:   a row that is left out holds by itself only where phi_0 is in the range of A
+
+although the start meets all of them; where phi_0 = 0 they never do.
 """
 
 from dataclasses import replace
@@ -9,7 +19,7 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.plausibility import faults_at
 from jourdain_jax.build.row_program import row_program
@@ -17,20 +27,19 @@ from jourdain_jax.calculus.compiled import RUN_SELDOM
 from jourdain_jax.calculus.lanes_first import lanes_first
 from jourdain_jax.calculus.nan_where import entered, left
 from jourdain_jax.calculus.reals import in_default_precision
+from jourdain_jax.equations.projection import linearised_rows
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
-from jourdain_jax.motion.arguments import times_fit
-from jourdain_jax.motion.energy_check import MOST_STEP_ERRORS, conserves, energies_near, energy_lost
-from jourdain_jax.motion.input_programs import for_programs
+from jourdain_jax.motion.inputs import for_programs
 from jourdain_jax.motion.integrators import integrands
+from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod
 from jourdain_jax.motion.native import seen
-from jourdain_jax.motion.row_check import rows_violated
-from jourdain_jax.motion.setup import Begun, Setup, Solved
-from jourdain_jax.motion.start import State, projected
+from jourdain_jax.motion.own_steps import reason_against_watching
+from jourdain_jax.motion.put_on_rows import State
+from jourdain_jax.motion.setup import Begun, Setup, Solved, times_fit
+from jourdain_jax.motion.start import projected
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.motion.vector_fields.by_program import ByProgram
-from jourdain_jax.motion.vector_fields.field import Integrated
-from jourdain_jax.motion.watched import reason_against_watching
+from jourdain_jax.motion.vector_fields.field import ByProgram, Integrated
 from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.scene.parameters import parameter_faults
 
@@ -73,7 +82,7 @@ def _with_machine_code(setup: Setup) -> Setup:
 
 
 def integrate_lanes(setups: Setup) -> Trajectory:
-    """The motions of all lanes: `lockstep.width` lanes at a time where the rates are a scalar program, otherwise under `vmap`."""
+    """The motions of all lanes: `own_steps.width` lanes at a time where the rates are a scalar program, otherwise under `vmap`."""
     given = _with_machine_code(_prepared(setups))
     setups, asked = eqx.filter_vmap(_entered)(given)
     begun, fitting = eqx.filter_vmap(_begin)(setups), eqx.filter_vmap(Setup.fitting)(setups)
@@ -210,3 +219,52 @@ def _result(code, y_end: Integrated, start: State, pivot):
     code = jnp.where(pivot < SMALLEST_PIVOT, results.SINGULAR_PARTITION, code)
     tolerance = 1e3 * jnp.sqrt(jnp.finfo(start.q.dtype).eps)
     return jnp.where(start.residual <= tolerance, code, results.INCONSISTENT_START).astype(jnp.int32)
+
+
+MOST_STEP_ERRORS = 10  # times what N steps at their tolerance change
+DRIFTED = 1e-2  # of the energy that moves
+
+
+def conserves(setup: Setup) -> bool:
+    """Whether T + V is constant along a motion whose steps are taken by tolerances.
+
+    Integrated work is no part of the check: it may be the small rest of large powers, whose errors nothing at the ends of steps bounds.
+    """
+    return setup.field.conserves and not isinstance(setup.integrator.solver, FixedStepMethod)
+
+
+def energies_near(setup: Setup, args, t: Float[Array, "times"], y: Integrated) -> Float[Array, "2 times 2"]:
+    """T and V (J) at states, and both where each number is larger by the error that a step may leave in it."""
+    field, scene, inputs, fixed, _ = args
+    rtol, atol = setup.tolerances
+    off = jax.tree.map(lambda x: x + jnp.where(x < 0, -1.0, 1.0) * (atol + rtol * jnp.abs(x)), y)
+    every = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *jax.lax.stop_gradient(((t, y), (t, off))))
+    at = lambda state: field.energies(scene, fixed, state[0], state[1], inputs(state[0]))  # noqa: E731
+    # loads by matrices may be callbacks, which need not know batches
+    found = jax.lax.map(at, every) if field.lowered is None else jax.vmap(at)(every)
+    return found.reshape(2, -1, 2)
+
+
+def energy_lost(energies: Float[Array, "2 times 2"], steps) -> Bool[Array, ""]:
+    """Whether T + V changed by more than N `steps` explain."""
+    (T, V), off = energies[0].T, energies[1].T
+    error = jnp.abs(off[0] - T) + jnp.abs(off[1] - V) + jnp.finfo(T.dtype).eps * (T + jnp.abs(V))
+    moved = jnp.nanmax(T) + jnp.nanmax(V) - jnp.nanmin(V)
+    allowed = jnp.fmax(DRIFTED * moved, MOST_STEP_ERRORS * steps * jnp.nanmax(error))
+    return jnp.nanmax(T + V) - jnp.nanmin(T + V) > allowed
+
+
+def rows_violated(setup: Setup, t: Float[Array, "times"], q: Float[Array, "times coordinates"], u: Float[Array, "times speeds"]) -> Bool[Array, ""]:
+    """Whether some row is violated at some of these states; those that were not reached are NaN, and do not count.
+
+    |phi| > 1 % of |phi - A u| + |A| |u|, where that is largest
+    """
+    scene, inputs, states = jax.lax.stop_gradient((setup.scene, setup.inputs, (t, q, u)))
+
+    def left_and_size(state):
+        phi, A = linearised_rows(scene, *state, inputs(state[0]))
+        return jnp.abs(phi), jnp.abs(phi - A @ state[2]) + jnp.abs(A) @ jnp.abs(state[2])
+
+    left, size = jax.lax.map(left_and_size, states)  # rows may be callbacks, which need not know batches
+    # 1 % is far more than steps at loose tolerances leave
+    return jnp.any(left > 1e-2 * jnp.nanmax(size, axis=0))

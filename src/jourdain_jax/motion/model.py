@@ -1,23 +1,36 @@
 """Models: scenes with the choices that `build` made for their motions. `simulate` and its kin take a model in place of a scene."""
 
+from collections.abc import Callable, Hashable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
+from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 
-from jourdain_jax.build.reference import Reference
-from jourdain_jax.build.structure import Structure, structure_of, structure_whatever_its_faults
+from jourdain_jax.build.structure import WELL_CONDITIONED, Reference, Structure, structure_of, structure_whatever_its_faults, trust
+from jourdain_jax.calculus.pseudo_inverse import passing_cutoff, undecided
+from jourdain_jax.dynamics.accelerations import as_reduction
 from jourdain_jax.dynamics.power import needs_work
-from jourdain_jax.equations.listed import names_of_events, names_of_invariants
+from jourdain_jax.equations.listed import names_of_events, names_of_invariants, names_of_position_rows
+from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
 from jourdain_jax.lowering.lower import lowered
-from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.lowering.lowered import Lowered, NotLowered
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.native import native_motion
-from jourdain_jax.motion.vector_fields.choice import Formulation, as_formulation, vector_field
+from jourdain_jax.motion.put_on_rows import Usual, usual_sizes
+from jourdain_jax.motion.vector_fields.by_matrices import FullByMatrices, MinimalByMatrices, usual_lengths
+from jourdain_jax.motion.vector_fields.field import ByProgram, Formulation, VectorField, as_formulation, reason_for_matrices
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.identity import once_per_values
+from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
+
+_BACKENDS = ("auto", "native", "xla", "dense")
 
 
 @dataclass(frozen=True)
@@ -79,18 +92,50 @@ class Model(BuiltFor, Printed):
     """
 
     scene: Scene
-    formulation: Formulation  # its state is settled
+    formulation: Formulation  # of what `build` returns, its state is settled
     backend: str  # the argument of `build`
-    reference: Reference  # the scene whose numbers decided
+    decided: Reference | None  # the scene whose numbers decided; None: the model's own, and those of the class's defaults where these are traced
+    made: dict = dataclass_field(default_factory=dict)  # of these numbers: vector fields, sizes of rows, by what tells their cases apart
 
     def replace(self, **parameters) -> "Model":
         """Return the model with other values of the parameters named."""
-        return replace(self, scene=self.scene.replace(**parameters))
+        return replace(self, scene=self.scene.replace(**parameters), made={})
+
+    @property
+    def reference(self) -> Reference:
+        """The scene whose numbers stand in for traced ones."""
+        return self.decided or Reference(self.scene)
+
+    @property
+    def standing_in(self) -> AbstractContextManager:
+        """A context in which the numbers that decided stand in for traced ones."""
+        return nullcontext() if self.decided is None else self.decided.stands_in()
 
     @property
     def structure(self) -> Structure:
         """The findings of probing."""
-        return structure_of(self.reference.scene)
+        return structure_of(self.scene if self.decided is None else self.decided.scene)
+
+    def field(self, constant: bool = True, work: bool = True) -> VectorField:
+        """Return what is integrated, with `constant` inputs or with others, and with the `work` that no potential accounts for."""
+        return self.once((constant, work), lambda: _vector_field(self, constant, work))
+
+    def usual(self, determined: bool) -> Usual:
+        """Return the sizes by which states are put onto the rows; `determined`: rows determine the speeds that are free."""
+
+        def sizes() -> Usual:
+            found = usual_sizes(self.scene, determined, self.backend in ("auto", "native"))  # what it traces must not be computed at once
+            with jax.ensure_compile_time_eval():
+                return jax.device_put(found)  # handed over in a fifth of the time that arrays of NumPy take
+
+        return self.once(determined, sizes)
+
+    def once(self, case: Hashable, make: Callable[[], Any]) -> Any:
+        """Return what `make` finds for these numbers, made once for each case."""
+        if case not in self.made:
+            with self.standing_in:
+                self.made[case] = make()
+        return self.made[case]
 
     @property
     def state(self) -> str:
@@ -125,14 +170,18 @@ class Model(BuiltFor, Printed):
     @property
     def program(self) -> Lowered | None:
         """The scalar program; None where there is none."""
-        found = lowered(self.reference.scene, every_speed=self.state == "full")
+        found = self._lowered
         return found if isinstance(found, Lowered) else None
 
     @property
     def not_lowered(self) -> str:
         """Why there is no scalar program; empty where there is one."""
-        found = lowered(self.reference.scene, every_speed=self.state == "full")
+        found = self._lowered
         return "" if isinstance(found, Lowered) else str(found)
+
+    @property
+    def _lowered(self) -> Lowered | NotLowered:
+        return lowered(self.reference.scene, every_speed=self.state == "full")
 
     @property
     def events(self) -> tuple[str, ...]:
@@ -142,8 +191,7 @@ class Model(BuiltFor, Printed):
     @property
     def way(self) -> str:
         """How motions with constant inputs are integrated, machine code, XLA or dense matrices, and why no faster way serves."""
-        scene = self.reference.scene
-        field = vector_field(scene, self.formulation, backend=self.backend)
+        scene, field = self.reference.scene, self.field()
         if field.lowered is None:
             return f"dense matrices: {self.not_lowered or 'as asked'}"
         reason = "as asked" if self.backend == "xla" else native_motion.reason_against(field, scene, as_inputs(scene, None), bool(self.events))
@@ -206,13 +254,13 @@ def _decisions_where_traced(scene: Scene) -> tuple:
 
 def _flattened(model: Model) -> tuple[tuple, tuple]:
     arrays, rest = eqx.partition(model.formulation, eqx.is_array)
-    return (model.scene, arrays), (rest, model.backend, model.reference)
+    return (model.scene, arrays), (rest, model.backend, model.decided)
 
 
 def _unflattened(static: tuple, children: tuple) -> Model:
     model = object.__new__(Model)  # anything may stand in the place of numbers
-    (scene, arrays), (formulation, backend, reference) = children, static
-    vars(model).update(scene=scene, formulation=eqx.combine(arrays, formulation), backend=backend, reference=reference)
+    (scene, arrays), (formulation, backend, decided) = children, static
+    vars(model).update(scene=scene, formulation=eqx.combine(arrays, formulation), backend=backend, decided=decided, made={})
     return model
 
 
@@ -234,7 +282,111 @@ def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backe
     ValueError as of `structure_of` (no admissible state, no inertia along a free motion, numbers of bodies that cannot be), and where the formulation or
     the backend does not serve the scene.
     """
-    scene, asked = as_scene(scene), as_formulation(formulation)
+    scene = as_scene(scene)
     structure_of(scene)  # says what is wrong
-    field = vector_field(scene, asked, backend=backend)
-    return Model(scene, replace(asked, state="full" if field.independent is None else "minimal"), backend, Reference(scene))
+    model = modelled(scene, formulation, backend)
+    model.usual(False), model.usual(True)
+    settled = replace(model.formulation, state="full" if model.field().independent is None else "minimal")
+    return Model(scene, settled, backend, Reference(scene), model.made)
+
+
+def modelled(scene: Scene | BuiltFor, formulation: Formulation | None = None, backend: str = "auto") -> Model:
+    """Return the model of a scene, kept by its class and values; its choices are made when they are first asked for. Of a model, that itself, or with
+    another formulation and backend.
+    """
+    asked = as_formulation(formulation)
+    if isinstance(scene, Model):
+        same = scene.formulation is asked and scene.backend == backend
+        return scene if same else Model(scene.scene, asked, backend, scene.decided)
+    if asked.reduction is None and asked.baumgarte is None and isinstance(backend, str):
+        return _kept(as_scene(scene), asked.state, asked.stabilisation, backend)
+    return Model(as_scene(scene), asked, backend, None)
+
+
+def as_model(given: Scene | BuiltFor) -> Model:
+    """Return a model as it is, or that of a scene by default."""
+    return given if isinstance(given, Model) else modelled(given)
+
+
+def _by_words(scene: Scene, state, stabilisation, backend: str) -> Model:
+    """Return the model for a formulation that is texts alone: these are compared in no time."""
+    return Model(scene, Formulation(state, None, stabilisation), backend, None)
+
+
+_kept = once_per_values(_by_words, of_traced=_by_words)
+
+
+def _vector_field(model: Model, constant: bool, work: bool) -> VectorField:
+    scene, formulation, structure = model.scene, model.formulation, structure_of(model.scene)
+    state, reduction = formulation.state, formulation.reduction
+    _check(scene, structure, state, model.backend)
+    minimal = state == "minimal" or (state == "auto" and structure.has_minimal_state)
+    independent = structure.independent if minimal else None
+    inputs_in_rows = structure.rows_of_inputs and not constant
+    conserves = not needs_work(scene, structure)
+    with_work = work and not conserves
+    program = _program(scene, minimal, model.backend, formulation, reason_for_matrices(structure, constant))
+    cutoff = _cutoff(structure) if reduction is None and not minimal else None
+    reduction = as_reduction(scene, _default_reduction(structure, independent, program) if reduction is None else reduction)
+    common: dict[str, Any] = {
+        "independent": independent,
+        "reduction": reduction,
+        "with_work": with_work,
+        "conserves": conserves,
+        "projects_positions": formulation.projects and bool(names_of_position_rows(scene) or scene.coordinates.quaternions),
+        "projects_speeds": formulation.projects and not minimal and bool(structure.row_names),
+        "rows_may_contradict": (minimal or formulation.projects) and structure.rows_may_contradict,
+        "of_inputs": structure.potentials_of_inputs,
+        "event_names": names_of_events(scene),
+    }
+    if program is not None:
+        return ByProgram(**common, program=program, affine=structure.affine)
+    nonlinear = () if structure.affine or structure.dependent_rows else structure.kept_rows
+    common |= {"stabilisation": formulation.baumgarte, "usual": usual_lengths(scene), "inputs_in_rows": inputs_in_rows, "nonlinear_rows": nonlinear}
+    common["cutoff"] = cutoff
+    if minimal:
+        return MinimalByMatrices(**common, rows=structure.kept_rows)
+    loses_rank = bool(names_of_position_rows(scene)) or not structure.affine
+    branches = cutoff is not None and isinstance(reduction, NullSpaceQR) and loses_rank
+    known = 1.0 if structure.affine else trust(scene)  # how far usual sizes are; where not, nonlinear rows count as long a thousand times longer
+    return FullByMatrices(**common, undecided=undecided(jnp.result_type(float)) / known if branches else None)
+
+
+def _program(scene: Scene, minimal: bool, backend: str, formulation: Formulation, dense: str) -> Lowered | None:
+    """The scalar program that is integrated; None: dense matrices are. ValueError where a backend asks for a program and there is none."""
+    reason = dense
+    if formulation.reduction is not None or formulation.baumgarte is not None:
+        reason = "a reduction or a stabilisation of its own needs dense matrices"
+    if backend == "dense" or (backend == "auto" and reason):
+        return None
+    program = reason or lowered(scene, every_speed=not minimal)
+    if isinstance(program, Lowered):
+        return program
+    if backend != "auto":
+        why = reason or f"it has no scalar program ({program})"
+        raise ValueError(f"backend={backend!r} cannot integrate `{type(scene).__name__}`: {why}; use backend='auto' or 'dense'")
+    return None
+
+
+def _check(scene: Scene, structure: Structure, state, backend) -> None:
+    if backend not in _BACKENDS:
+        raise ValueError(f"unknown backend `{backend}`; {nearest(str(backend), _BACKENDS)}")
+    if state == "minimal" and not structure.affine:
+        raise ValueError(f"the rows of `{type(scene).__name__}` are nonlinear in the speeds and have no minimal state; use jj.Formulation('full')")
+    if state == "minimal" and structure.may_set_in:
+        named = ", ".join(f"`{name}`" for name in structure.may_set_in)
+        raise ValueError(f"rows {named} of `{type(scene).__name__}` may set in where they do not follow from the others; use jj.Formulation('full')")
+
+
+def _cutoff(structure: Structure) -> float | None:
+    """Where rows that are well conditioned at most states lose rank, motions pass more safely with a wider cut-off; None: round-off."""
+    return passing_cutoff(jnp.result_type(float)) if structure.typical_pivot >= WELL_CONDITIONED else None
+
+
+def _default_reduction(structure: Structure, independent: tuple[int, ...] | None, program: Lowered | None) -> Reduction:
+    """Privileged velocities for the minimal state; for the full one what a lowered program does, otherwise the null space by QR."""
+    if independent is not None:
+        return Privileged(independent)
+    if program is None:
+        return NullSpaceQR(_cutoff(structure))
+    return Privileged(structure.independent) if program.by_partition else Multipliers()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import jax
 import numpy as np
 
-from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, described, is_traced
+from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, described, known_numbers
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.integrators.tableaus import Method
@@ -17,7 +17,7 @@ from jourdain_jax.scene.arguments import BuiltFor
 from jourdain_jax.scene.names import nearest
 
 if TYPE_CHECKING:
-    from jourdain_jax.motion.vector_fields.choice import Formulation
+    from jourdain_jax.motion.vector_fields.field import Formulation
 
 TOLERANCE, MOST_STEPS = 1e-8, 100_000
 
@@ -160,7 +160,7 @@ def stated(options: AllOptions) -> dict[str, Any]:
     return {name: value for name, value in vars(options).items() if value is not getattr(_DEFAULT, name) and value != getattr(_DEFAULT, name)}
 
 
-_POSITIVE = lambda x: 0 < x < np.inf, "a positive finite number; give a tolerance such as 1e-8", "give one number, such as 1e-8"
+_POSITIVE = lambda x: (x > 0) & (x < np.inf), "a positive finite number; give a tolerance such as 1e-8", "give one number, such as 1e-8"
 _NUMBERS = {  # what fits, what is expected, and what to give
     "rtol": _POSITIVE,
     "atol": _POSITIVE,
@@ -179,7 +179,7 @@ def _check(options: AllOptions) -> None:
         if (type(value) is float and fits(value)) or (value is None and name == "max_step"):
             continue
         number = checked_unless_traced(value, f"`{name}`", (), advice=advice)
-        if not is_traced(number) and not fits(float(number)):
+        if not np.all(fits(known_numbers(number))):
             raise ValueError(f"`{name}` is {float(number):g}, expected {expected}")
     for name in ("events", "work", "retry"):
         if not isinstance(value := getattr(options, name), bool | np.bool_):

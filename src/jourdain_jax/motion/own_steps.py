@@ -1,21 +1,26 @@
 """Our own loop over steps as an integrator, with its derivatives: machine code where it serves, otherwise a loop of XLA.
 
-One motion, or lanes side by side: those of a scalar program in blocks of `lockstep.width`.
+One motion, or lanes side by side: those of a scalar program in blocks of `width`.
 """
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from dataclasses import dataclass
+from functools import partial
+from itertools import compress
 from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
+from jaxtyping import Array, Float, PyTree
 
 from jourdain_jax.calculus.differentiated_as import Rules, by_modes, pushed_by_jax, with_rules
 from jourdain_jax.calculus.guards import SECOND_ORDER_MESSAGE, DifferentiationModeError
-from jourdain_jax.motion.batches.lockstep import in_blocks, width
-from jourdain_jax.motion.inputs import Sampled
+from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.lowering.kinks import loads_have_relations, loads_may_jump
+from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.lowering.relations import MOST_WATCHED
+from jourdain_jax.motion.inputs import FunctionOfTime, Inputs, Sampled
 from jourdain_jax.motion.integrators import erk_loop, integrands
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
 from jourdain_jax.motion.integrators.problem import Problem
@@ -23,23 +28,29 @@ from jourdain_jax.motion.integrators.tableaus import Method, method_of
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.native.flow import OF_SAMPLES, flow
 from jourdain_jax.motion.native.functions import Form
+from jourdain_jax.motion.native.functions_of_time import numbers_of
+from jourdain_jax.motion.native.native_motion import driven
 from jourdain_jax.motion.native.pulled import reason_against_derivatives
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.motion.watched import watched
+from jourdain_jax.motion.vector_fields.field import VectorField
+from jourdain_jax.program.analyticity import depend_on
+from jourdain_jax.scene.scene import Scene
 
 Mode = Literal["forward", "reverse"]
 
 
+@jax.tree_util.register_static
+@dataclass(frozen=True)
 class OwnSteps(Integrator):
-    """Our own loop, by a tableau, an implicit method or Taylor series; a static object, the same for all calls with these options."""
+    """Our own loop, by a tableau, an implicit method or Taylor series."""
 
-    solver: Method | ImplicitMethod = eqx.field(static=True)
-    alongside: bool = eqx.field(static=True)  # whether one run gives values and tangents, of `jvp` and `jacfwd` alone
-    max_steps: int = eqx.field(static=True)
-    event_names: tuple[str, ...] = eqx.field(static=True)
-    native: bool = eqx.field(static=True)  # whether machine code may integrate
-    order: int | None = eqx.field(static=True)  # of Taylor series, by which machine code steps in place of the solver's tableau
+    solver: Method | ImplicitMethod
+    alongside: bool  # whether one run gives values and tangents, of `jvp` and `jacfwd` alone
+    max_steps: int
+    event_names: tuple[str, ...]
+    native: bool  # whether machine code may integrate
+    order: int | None  # of Taylor series, by which machine code steps in place of the solver's tableau
     projects_saved: ClassVar[bool] = True
     watches: ClassVar[bool] = True
 
@@ -71,16 +82,13 @@ class OwnSteps(Integrator):
         return forward if self.alongside else by_modes(forward, partial(by_xla, "reverse"), SECOND_ORDER_MESSAGE)
 
 
-_once: Callable[..., OwnSteps] = lru_cache(maxsize=64)(OwnSteps)
-
-
 def own_steps(solver, **static) -> OwnSteps | None:
     """Return our own loop where it has the solver; None for solvers of diffrax."""
     method = solver if isinstance(solver, Method | ImplicitMethod) else method_of(solver)
     if method is None:
         return None
     method = method.without_step() if isinstance(method, FixedStepMethod) else method
-    return _once(method, **static)
+    return OwnSteps(method, **static)
 
 
 def _by_xla(mode: Mode, setup: Setup, begun: Begun) -> Solved:
@@ -196,3 +204,88 @@ def _as_solved(goals, ys: PyTree, reached, end: erk_loop.Progress) -> Solved:
     ys = jax.tree.map(lambda x: x[:-1], ys)
     counted = (jnp.zeros_like(end.accepted), jnp.full_like(end.t, jnp.inf)) if end.crossings is None else (end.crossings.count, end.crossings.together)
     return Solved(goals[:-1], ys, reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, end.pivot, *counted)
+
+
+def watched(field: VectorField, inputs: Inputs, has_events: bool) -> tuple[Callable | None, int]:
+    """The numbers whose signs are watched, as a function (args, tau, y) -> (numbers, *lanes), and how many are relations; None where none are, or too many."""
+    if field.lowered is None:
+        return None, 0
+    program, nodes = _relations(field.lowered, inputs, has_events)
+    events = program.events if has_events and program.event_relations else ()
+    return (partial(_values, program, (*nodes, *events)), len(nodes)) if 0 < len(nodes) <= MOST_WATCHED else (None, 0)
+
+
+def reason_against_watching(setup: Setup) -> str:
+    """Why no step watches the relations that the loads of a scene, or its stop events, have; empty where one does, or they have none."""
+    if setup.field.lowered is None:
+        return "the scene has no scalar program" if loads_have_relations(setup.scene) else ""
+    count = len(_relations(setup.field.lowered, setup.inputs, bool(setup.integrator.event_names))[1])
+    if not setup.integrator.watches:
+        return "solvers of diffrax do not" if count else ""
+    return f"they are {count}, more than {MOST_WATCHED}" if count > MOST_WATCHED else ""
+
+
+def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies: bool) -> bool:
+    """Return whether rates may jump at a time that depends on the state, on numbers of inputs, or, where the `scene_varies`, on parameters."""
+    if field.lowered is None:
+        return loads_may_jump(scene)
+    program, _ = _relations(field.lowered, inputs, False)
+    if not program.jumps:
+        return False
+    lowered = [isinstance(channel, FunctionOfTime) and program is not field.lowered for channel in inputs.channels]
+    numbers = [varies for channel in compress(inputs.channels, lowered) for varies in numbers_of(jax.tree.map(is_traced, channel))]
+    others = [is_traced(channel) for channel, is_lowered in zip(inputs.channels, lowered, strict=True) if not is_lowered]
+    count = len(program.traced.q) + len(program.independent)
+    varies = [*[scene_varies] * len(field.lowered.fixed), *numbers, False, *[True] * count, *others]
+    return any(depend_on(program.graph, program.jumps, compress(program.variables, varies)))
+
+
+def _relations(program: Lowered, inputs: Inputs, has_events: bool) -> tuple[Lowered, tuple[int, ...]]:
+    """The program with the functions of time among the inputs, where it takes these, and the relations in it."""
+    found = driven(program, inputs)
+    program = program if isinstance(found, str) else found
+    return program, program.watched(has_events)
+
+
+@eqx.filter_jit
+def _values(program: Lowered, nodes: tuple[int, ...], args, tau, y) -> Float[Array, "numbers *lanes"]:
+    _, _, inputs, fixed, origin = args
+    t, given = origin + tau, partial(_given, len(program.inputs))
+    values = eqx.filter_vmap(given, out_axes=-1)(inputs, t) if jnp.ndim(tau) else given(inputs, t)
+    numbers = len(values) - len(program.inputs)
+    state = jax.lax.stop_gradient(((*fixed, *values[:numbers]), t, tuple(y.q), tuple(y.v), values[numbers:]))
+    return program.values(nodes, *state)
+
+
+def _given(count: int, inputs: Inputs, t) -> Float[Array, "given"]:
+    """Numbers of the functions of time, and values of the `count` inputs that are left to the program."""
+    functions = [channel for channel in inputs.channels if isinstance(channel, FunctionOfTime)] if count < len(inputs.channels) else []
+    numbers = [x for channel in functions for x in numbers_of(channel)]
+    values = [channel(t) for channel in inputs.channels if not (functions and isinstance(channel, FunctionOfTime))]
+    return jnp.stack([jnp.asarray(x, jnp.result_type(float)) for x in (*numbers, *values)]) if numbers or values else jnp.zeros(0)
+
+
+TOGETHER = 8  # lanes, where the loop is one function
+
+
+def in_blocks(function: Callable, lanes_at_once: int, *trees: PyTree) -> PyTree:
+    """`function` of trees whose arrays have a leading axis of lanes, some lanes at a time; the last block is filled up with copies."""
+    arrays, rest = eqx.partition(trees, eqx.is_array)
+    count = jax.tree.leaves(arrays)[0].shape[0]
+    blocks = -(-count // lanes_at_once)
+    if blocks == 1:
+        return function(*trees)
+    index = jnp.minimum(jnp.arange(blocks * lanes_at_once), count - 1).reshape(blocks, lanes_at_once)
+    found = jax.lax.map(lambda arrays: function(*eqx.combine(arrays, rest)), jax.tree.map(lambda x: x[index], arrays))
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], found)
+
+
+def width(program: Lowered) -> int:
+    """Return how many lanes of a lowered scene run in lockstep.
+
+    A step of a batch lasts until its slowest lane has ended, and what a step touches should stay in a core's fastest cache: so few lanes at a time are best,
+    if a step of few lanes costs little beside its arithmetic. On a CPU it does where XLA compiles the whole loop over steps into one function, which it does
+    for loops that touch little memory (see `jourdain_jax`); otherwise every operation is started on its own, and many lanes must share that cost.
+    """
+    # with more operations the loop touches too much memory to become one function (the bicycle, 2016, is still one)
+    return TOGETHER if program.operations <= 3000 and jax.default_backend() == "cpu" else 2**30

@@ -1,33 +1,76 @@
 """Coordinates and speeds put onto the rows: by machine code where that serves, by XLA where not, and for derivatives.
 
 g(t, q) = 0,  phi(t, q, u) = 0
+
+By machine code, the rows and the mass matrix are functions that JAX can differentiate: a derivative has two calls in it, in place of the scene itself.
+
+g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M(t, q)
+d o_i = sum_j J_ij d x_j     o: any of these numbers, x: parameters, time, coordinates, speeds, inputs;   J: derived on the graph (`values_of_nodes.py`)
 """
 
+from collections.abc import Sequence
 from functools import lru_cache, partial
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.build.domain import coordinate_bounds
+from jourdain_jax.build.assembling import coordinate_bounds
 from jourdain_jax.build.probed_on_graph import coordinates_on_rows
-from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.row_program import RowProgram, row_program
 from jourdain_jax.build.sampling import NEARLY_INSIDE
-from jourdain_jax.build.structure import closure_lengths, plain_row_lengths, rows_are_affine, usual_rows
+from jourdain_jax.build.structure import Structure, closure_lengths, plain_row_lengths, rows_are_affine, usual_rows
 from jourdain_jax.calculus.differentiated_as import differentiated_as
 from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions, project_positions, project_speeds
+from jourdain_jax.motion.native import onto_rows
 from jourdain_jax.motion.native.called import called
 from jourdain_jax.motion.native.onto_rows import Rows, write
 from jourdain_jax.motion.native.seen import entries
-from jourdain_jax.motion.row_functions import row_functions
+from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
 from jourdain_jax.native import ffi
+from jourdain_jax.native.scalar_program import unsupported
+from jourdain_jax.scene.coordinates import Names
+from jourdain_jax.scene.printing import Printed, in_digits
 from jourdain_jax.scene.scene import Scene
+
+
+class State(Printed, eqx.Module):
+    """A state on the constraints, and how far the guess was from it; `state["yaw"]`, `print(state)`.
+
+    q and u in the units of the scene's coordinates and speeds (SI, rad).
+    """
+
+    t: Float[Array, ""]  # s
+    q: Float[Array, "coordinates"]
+    u: Float[Array, "speeds"]
+    moved_q: Float[Array, ""]  # largest change of a coordinate by the projection
+    moved_u: Float[Array, ""]  # largest change of a speed by the projection
+    residual: Float[Array, ""]  # what is left of rows and quaternion norms
+    names: tuple[Names, Names] = eqx.field(static=True)
+    # that led here: 0, what was given; then others (`start`). A floating-point number, so that a loss can be differentiated with respect to a whole state
+    guess: Float[Array, ""] = eqx.field(default=0, converter=lambda k: jnp.asarray(k, real_type()))
+
+    def __getitem__(self, name: str):
+        """A coordinate, speed, quaternion or angular velocity by name."""
+        coordinates, speeds = (names.view(x) for names, x in zip(self.names, (self.q, self.u), strict=True))
+        return coordinates[name] if name in coordinates else speeds[name]
+
+    def __contains__(self, name: str) -> bool:
+        return any(name in names for names in self.names)
+
+    def _text(self) -> str:
+        if self.q.ndim > 1:
+            return f"States of shape {self.q.shape[:-1]}: {', '.join((*self.names[0].entries, *self.names[1].entries))}"
+        entries, values = (*self.names[0].entries, *self.names[1].entries), in_digits(np.concatenate([self.q, self.u]))
+        pairs = [f"{name} = {value}" for name, value in zip(entries, values, strict=True)]
+        moved = f"moved by {self.moved_q:.2e} (q), {self.moved_u:.2e} (u) onto the constraints; residual {self.residual:.1e}"
+        if int(self.guess):
+            moved += f"; from guess {int(self.guess)}: coordinates that were not given begin elsewhere in the domain, those near the reference lead nowhere"
+        return f"State at t = {self.t:.6g} s: " + ", ".join(pairs) + f"\n{moved}"
 
 
 class Usual(eqx.Module):
@@ -43,7 +86,8 @@ class Usual(eqx.Module):
     program: RowProgram | None = eqx.field(static=True)  # by which machine code puts a start onto them; None: XLA does
 
 
-def _worked_out(scene: Scene, determined: bool, native: bool) -> Usual:
+def usual_sizes(scene: Scene, determined: bool, native: bool) -> Usual:
+    """Return the sizes for the parameters of a scene; `determined`: as of `Usual`; `native`: whether machine code may put states onto the rows."""
     low, high = (x.astype(real_type()) for x in coordinate_bounds(scene))
     width = np.where(high > low, high - low, 1.0).astype(real_type())
     program = row_program(scene) if native and not ffi.reason_against() else None
@@ -61,15 +105,6 @@ def _found_within(scene: Scene, low, high) -> tuple[np.ndarray, np.ndarray]:
     bounded = coordinates_on_rows(scene) & [name in scene.domain for name in scene.coordinate_names.entries]
     more = NEARLY_INSIDE * (high - low)
     return np.where(bounded, low - more, -np.inf).astype(low.dtype), np.where(bounded, high + more, np.inf).astype(low.dtype)
-
-
-def _as_arrays(scene: Scene, determined: bool, native: bool) -> Usual:
-    found = _worked_out(scene, determined, native)  # on NumPy; what it traces must not be computed at once
-    with jax.ensure_compile_time_eval():
-        return jax.device_put(found)  # kept, and handed over in a fifth of the time that arrays of NumPy take
-
-
-usual_sizes = once_per_values(_as_arrays, of_traced=_worked_out)
 
 
 def put_positions(scene: Scene, t, q, free, usual: Usual, known: tuple | None = None) -> tuple[Float[Array, "coordinates"], Float[Array, "closures"]]:
@@ -128,3 +163,63 @@ def _put(rows: Rows, scene: Scene, t, *vectors) -> tuple[Array, Array]:
     real, given = real_type(), (*entries(scene, rows.program.parameters), t[None], *vectors)
     found = _kernel(rows, real)(jnp.concatenate([jnp.asarray(x, real) for x in given]))[0]
     return found[: len(rows.moving)], found[len(rows.moving) :]
+
+
+def may_contradict(scene: Scene, known: Structure, free_q: Bool[np.ndarray, "coordinates"], free_u: Bool[np.ndarray, "speeds"]) -> bool:
+    """Whether values that are held, where entries are not free, may contradict each other; `known`: of the scene.
+
+    rank G_f = rank G,   rank A_f = rank A,      G = dg/dq, A = dphi/du, f: their columns of what is free
+
+    Then they cannot, but for single configurations.
+    """
+    of_speeds = not all(free or k in known.independent for k, free in enumerate(free_u))  # otherwise rows determine the dependent ones
+    of_coordinates = not free_q.all() and bool(names_of_position_rows(scene) or scene.coordinates.quaternions)
+    if of_speeds and not known.affine:
+        return True
+    return (of_coordinates and _loses_rank(known.closure_slopes, free_q)) or (of_speeds and _loses_rank(known.row_slopes, free_u))
+
+
+def _loses_rank(matrices, free) -> bool:
+    return any(np.linalg.matrix_rank(one[:, free]) < np.linalg.matrix_rank(one) for one in matrices)
+
+
+@lru_cache(maxsize=64)
+def row_functions(program: RowProgram) -> RowFunctions:
+    """g and G, phi and A, and M, by the program; of what is no machine code, by autodiff."""
+    nodes = [*program.g, *program.G.values(), *program.phi, *program.A.values(), *(program.M or {}).values()]
+    if unsupported(program.graph, nodes) or program.graph.operations(nodes) > onto_rows.LARGEST_PROGRAM:
+        return BY_AUTODIFF
+    rows, speeds = len(program.phi), len(program.u)
+    closures, coordinates = len(program.g), len(program.q)
+    parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
+    at = [*parameters, program.t, *program.q]
+    of_closures = values_of_nodes(program.graph, _places(program.g, program.G, coordinates), closures * (1 + coordinates), at)
+    of_rows = values_of_nodes(program.graph, _places(program.phi, program.A, speeds), rows * (1 + speeds), [*at, *program.u, *program.inputs])
+    M = {key: node for (i, k), node in (program.M or {}).items() for key in ((i, k), (k, i))}
+    of_masses = values_of_nodes(program.graph, _places((), M, speeds), speeds**2, at)
+
+    def parameters_of(scene: Scene):
+        found = entries(scene, program.parameters)
+        return jnp.concatenate(found) if found else jnp.zeros(0, real_type())
+
+    def in_a_row(given, t, *vectors):
+        first = parameters_of(given) if isinstance(given, Scene) else given
+        return jnp.concatenate([jnp.asarray(x, real_type()) for x in (first, jnp.asarray(t)[None], *vectors)])
+
+    def closures_at(given, t, q):
+        found = of_closures(in_a_row(given, t, q))
+        return found[:closures], found[closures:].reshape(closures, coordinates)
+
+    def rows_at(given, t, q, u, inputs):
+        found = of_rows(in_a_row(given, t, q, u, inputs))
+        return found[:rows], found[rows:].reshape(rows, speeds)
+
+    def masses_at(given, t, q):
+        return of_masses(in_a_row(given, t, q)).reshape(speeds, speeds)
+
+    return RowFunctions(closures_at, rows_at, masses_at if program.M is not None else BY_AUTODIFF.masses, parameters_of)
+
+
+def _places(vector: Sequence[int], matrix: dict[tuple[int, int], int], columns: int) -> dict[int, int]:
+    """Where the nodes of a vector, and of a matrix after it, are among all numbers; those that have none are zero."""
+    return dict(enumerate(vector)) | {len(vector) + i * columns + k: node for (i, k), node in matrix.items()}

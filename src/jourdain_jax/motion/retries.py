@@ -20,7 +20,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.calculus.reals import is_traced, known_numbers
 from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
 from jourdain_jax.motion.integrators.radau import RadauIIA
 from jourdain_jax.motion.integrators.tableaus import DOPRI8
@@ -29,8 +29,7 @@ from jourdain_jax.motion.options import AllOptions
 from jourdain_jax.motion.setup import Setup
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.motion.vector_fields.choice import as_formulation
-from jourdain_jax.motion.vector_fields.field import VectorField
+from jourdain_jax.motion.vector_fields.field import VectorField, as_formulation
 
 OUT_OF_STEPS = (results.MAX_STEPS, results.SHRANK)
 
@@ -40,8 +39,6 @@ Motions = TypeVar("Motions", bound=Trajectory)
 
 def retried(run: Callable[[AllOptions], tuple[Setup, Trajectory]], setup: Setup, motion: Trajectory, options: AllOptions) -> Trajectory:
     """Return the motion, run again until a way succeeds or none is left; as it is where its result is traced."""
-    if is_traced(motion.result):
-        return motion
     while retries := _next_retry(setup.field, motion, setup.t0, options):
         setup, motion = run(_with_retries(retries, options))
         motion = _marked(motion, retries)
@@ -96,7 +93,7 @@ def _next_retry(field: VectorField, motion: Trajectory, t0, options: AllOptions)
 
     `field`: how it was integrated; `options`: those that were given.
     """
-    if np.asarray(motion.result) in (results.SUCCESS, results.EVENT):
+    if np.all(np.isin(known_numbers(motion.result), (results.SUCCESS, results.EVENT))):
         return results.AS_ASKED
     tried, solver, backend = int(motion.fallback), options.solver, options.backend
     lost = _has_another_form(field) and not isinstance(solver, DiscreteGradient) and int(motion.result) in lost_codes(field)

@@ -27,10 +27,10 @@ import numpy as np
 
 from jourdain_jax.calculus.cotangents import tap_cotangents, tap_tangents
 from jourdain_jax.calculus.reals import is_traced, nothing_is_traced
+from jourdain_jax.motion.own_steps import moving_jumps
 from jourdain_jax.motion.setup import Setup
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.field import VectorField
-from jourdain_jax.motion.watched import moving_jumps
 from jourdain_jax.scene.tracebacks import users_level
 
 
@@ -117,15 +117,16 @@ def _judge(amplification: float, rtol: float, steps: int) -> None:
 
 def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
     """`integrate(setup)`; its derivative, taken outside of `jit`, warns where the motion amplifies errors too much."""
-    if nothing_is_traced() or not is_traced(setup):
+    varies = () if nothing_is_traced() else tuple(name for name, part in setup._asdict().items() if is_traced(part))
+    if not varies:
         return integrate(setup)
     start, (rtol, atol) = setup.start, setup.tolerances
     known = _known((start.q, start.u, rtol, atol))
     if known is None:
         return integrate(setup)
-    only_start = not is_traced(eqx.tree_at(lambda s: s.start, setup, None))
     tolerances = float(known[2]), float(known[3])
-    sizes: list[tuple[Callable, _Growth | _Sizes]] = [(tap_tangents, _Growth(*tolerances, only_start)), (tap_cotangents, _Sizes(*tolerances))]
+    growth = _Growth(*tolerances, varies == ("start",))
+    sizes: list[tuple[Callable, _Growth | _Sizes]] = [(tap_tangents, growth), (tap_cotangents, _Sizes(*tolerances))]
     at_start = start.q, start.u
     for shown, size in sizes:
         at_start = shown(at_start, size.start(known[:2]))
@@ -134,8 +135,8 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
     seen = _known((*parts, motion.accepted))
     if seen is None:
         return motion
-    if is_traced((setup.scene, setup.start, setup.inputs, setup.t0)):
-        warn_of_jumps(setup.field, motion, is_traced(setup.scene))
+    if {"scene", "start", "inputs", "t0"}.intersection(varies):
+        warn_of_jumps(setup.field, motion, "scene" in varies)
     for shown, size in sizes:
         parts = shown(parts, size.ends(seen[:-1], int(seen[-1])))
     return eqx.tree_at(lambda m: (m.q, m.u, m.q_end, m.u_end), motion, parts)

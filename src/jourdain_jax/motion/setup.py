@@ -6,7 +6,7 @@ Rates, projection and events are given tau, and the scene and its inputs t0 + ta
 
 import abc
 from operator import attrgetter
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,18 +14,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jourdain_jax.build.reference import Reference
-from jourdain_jax.motion.arguments import fitting_times
+from jourdain_jax.build.structure import Reference
+from jourdain_jax.calculus.reals import array_module
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
 from jourdain_jax.motion.integrators.knots import knots_between
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.integrators.tableaus import Method
-from jourdain_jax.motion.put_on_rows import Usual
-from jourdain_jax.motion.start import State
+from jourdain_jax.motion.put_on_rows import State, Usual
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
 LONGEST = 1 / 16  # of the span: the longest step, by default
+_SHORT = 1e-9  # s, a span for motions that are not asked for
 
 
 class Solved(eqx.Module):
@@ -46,17 +46,17 @@ class Solved(eqx.Module):
     together: Float[Array, "*lanes"]
 
 
-class Integrator(eqx.Module):
+class Integrator(abc.ABC):
     """How a motion is integrated: by our own steps (`motion/own_steps.py`) or by diffrax (`motion/diffrax_steps.py`).
 
     What is a number of its own in every call stands in the `Setup`.
     """
 
-    max_steps: eqx.AbstractVar[int]
-    event_names: eqx.AbstractVar[tuple[str, ...]]
-    solver: eqx.AbstractVar["diffrax.AbstractSolver | Method | ImplicitMethod"]
-    watches: eqx.AbstractClassVar[bool]  # whether steps watch relations (`crossings.py`)
-    projects_saved: eqx.AbstractClassVar[bool]  # whether the states that it returns are on the rows
+    max_steps: int
+    event_names: tuple[str, ...]
+    solver: "diffrax.AbstractSolver | Method | ImplicitMethod"
+    watches: ClassVar[bool]  # whether steps watch relations (`crossings.py`)
+    projects_saved: ClassVar[bool]  # whether the states that it returns are on the rows
 
     @property
     @abc.abstractmethod
@@ -133,3 +133,22 @@ class Begun(eqx.Module):
     start: State
     args: tuple  # vector field, scene, inputs, what the rates need of the scene, the time from which times count
     y0: Integrated
+
+
+def times_fit(ts, t0, t1) -> "Bool[Array, ''] | np.bool_":
+    """Whether the span is finite and not empty, and the times to save at lie in it, one after another; also of traced times."""
+    xp = array_module((ts, t0, t1))
+    direction = xp.sign(t1 - t0)
+    # times at an end of the span may lie beyond it by four units in the last place
+    slack = 4 * np.finfo(ts.dtype).eps * xp.maximum(xp.abs(t0), xp.abs(t1))
+    from_start, to_end = (ts[0] - t0) * direction, (t1 - ts[-1]) * direction
+    return (direction != 0) & xp.isfinite(t1 - t0) & xp.all((ts[1:] - ts[:-1]) * direction > 0) & (from_start >= -slack) & (to_end >= -slack)
+
+
+def fitting_times(ts, t0, t1, dt0, longest):
+    """`ts`, `t0`, `t1`, the first step and the longest one where they go together, none beyond an end by round-off; otherwise those of a short span."""
+    fits, direction = times_fit(ts, t0, t1), jnp.sign(t1 - t0)
+    inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
+    short = _SHORT * jnp.linspace(0.0, 1.0, ts.shape[-1], dtype=ts.dtype), jnp.zeros_like(t0)
+    short += tuple(share * _SHORT * jnp.ones_like(x) for share, x in ((1.0, t1), (0.1, dt0), (1.0, longest)))
+    return tuple(jnp.where(fits, own, other) for own, other in zip((inside, t0, t1, dt0, longest), short, strict=True))

@@ -5,35 +5,33 @@ domain and the rows are linear or affine; otherwise the full one (coordinates an
 """
 
 import warnings
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Unpack, cast
 
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.on_first_use import module_on_first_use
-from jourdain_jax.calculus.reals import Number, as_array, is_traced, nothing_is_traced
-from jourdain_jax.motion.arguments import as_state, span_and_times
-from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
-from jourdain_jax.motion.inputs_in_rows import check_inputs_in_rows
+from jourdain_jax.calculus.reals import Number, as_array, checked_unless_traced, described, is_traced, known_numbers, nothing_is_traced, real_type
+from jourdain_jax.motion.inputs import Inputs, as_inputs, check_inputs_in_rows, inputs_at
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
 from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import nan_is_a_mark
+from jourdain_jax.motion.model import Model, as_model, modelled
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.own_steps import own_steps
-from jourdain_jax.motion.put_on_rows import Usual, usual_sizes
+from jourdain_jax.motion.put_on_rows import State, Usual
 from jourdain_jax.motion.retries import retried
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
-from jourdain_jax.motion.setup import LONGEST, Setup
-from jourdain_jax.motion.start import State, nearest_state
+from jourdain_jax.motion.setup import LONGEST, Setup, times_fit
+from jourdain_jax.motion.start import named_start, nearest_state
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.motion.vector_fields.choice import as_formulation, vector_field
-from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_scene, as_speeds
+from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_speeds
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines, users_level
 
@@ -93,22 +91,15 @@ def simulate(
         slope = jax.grad(lean_at_end)(0.5)
     """
     options = as_options(options, by_name, scene=scene)
-    run = partial(_run, scene, start, {"t0": t0, "t1": t1, "ts": ts, "inputs": inputs})
-    if isinstance(scene, BuiltFor):
-        with scene.reference.stands_in():
-            return _simulated(run, options)
-    return _simulated(run, options)
 
+    def run(options: AllOptions) -> tuple[Setup, Trajectory]:
+        model = modelled(scene, options.formulation, options.backend)
+        with model.standing_in:
+            setup = _set_up(model, start, t0, t1, ts, inputs, options)
+            return setup, warn_if_ill_conditioned(setup, _integrated)
 
-def _simulated(run: Callable[[AllOptions], tuple[Setup, Trajectory]], options: AllOptions) -> Trajectory:
     setup, motion = run(options)
     return retried(run, setup, motion, options) if options.retry else motion
-
-
-def _run(scene, start, span: dict, options: AllOptions) -> tuple[Setup, Trajectory]:
-    """Return the setup and its motion."""
-    setup = set_up(scene, start, **span, options=options)
-    return setup, warn_if_ill_conditioned(setup, _integrated)
 
 
 def _integrated(setup: Setup) -> Trajectory:
@@ -117,17 +108,18 @@ def _integrated(setup: Setup) -> Trajectory:
         return integrate(setup)
     with nan_is_a_mark():
         motion = integrate(setup)
-    if is_traced(motion.result) or int(motion.result) in (results.SUCCESS, results.EVENT):
-        return motion
-    return integrate(setup)
+    return motion if np.all(np.isin(known_numbers(motion.result), (results.SUCCESS, results.EVENT))) else integrate(setup)
 
 
 def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, inputs=None, options: Options | None = None, **by_name) -> Setup:
     """Return the setup that `simulate` integrates for its arguments."""
     options = as_options(options, by_name, scene=None if type(options) is AllOptions else scene)
-    reference = scene.reference if isinstance(scene, BuiltFor) else None
+    return _set_up(modelled(scene, options.formulation, options.backend), start, t0, t1, ts, inputs, options)
+
+
+def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Setup:
+    scene = model.scene
     solver, max_step = options.solver, options.max_step
-    scene, formulation = as_scene(scene), as_formulation(options.formulation)
     order, solver = (solver.order or order_for(options.rtol), None) if isinstance(solver, Taylor) else (None, solver)
     if isinstance(solver, FixedStepMethod):
         if max_step is not None:
@@ -136,9 +128,9 @@ def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, in
     native = options.backend in ("auto", "native")
     inputs = as_inputs(scene, inputs)
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
-    start, usual = _start(scene, start, t0, inputs, native, formulation.projects)
-    field = vector_field(scene, formulation, options.work, options.backend, inputs)
-    field = solver.fitted(scene, field, formulation.state) if isinstance(solver, ImplicitMethod) else field
+    start, usual = _start(model, start, t0, inputs)
+    field = model.field(inputs.constant, bool(options.work))
+    field = solver.fitted(scene, field, model.state) if isinstance(solver, ImplicitMethod) else field
     if not inputs.constant:
         check_inputs_in_rows(scene, inputs, t0, t1)
     warn_float32(start.q.dtype, options.rtol)
@@ -151,7 +143,7 @@ def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, in
     tolerances = tuple(as_array(x, start.q.dtype) for x in (options.rtol, options.atol))  # arrays: another tolerance is no other program
     first_step = (1.0 if isinstance(solver, FixedStepMethod) else 1e-4) * (t1 - t0)  # diffrax's own guess costs two more copies of the vector field to compile
     longest = as_array(LONGEST * abs(t1 - t0) if max_step is None else max_step, start.q.dtype)
-    setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, longest, integrator, usual, reference)
+    setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, longest, integrator, usual, model.decided)
     if own is None:
         diffrax_steps.check(setup)
     if (options.backend == "native" or order is not None) and (reason := setup.reason_against_machine_code):
@@ -163,15 +155,15 @@ def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, in
 _BY_SERIES = "solver=jj.Taylor()", "omit `solver`, or use solver=diffrax.Dopri8()"
 
 
-def _start(scene: Scene, given, t0, inputs: Inputs, native: bool, projects: bool) -> tuple[State, Usual | None]:
+def _start(model: Model, given, t0, inputs: Inputs) -> tuple[State, Usual | None]:
     """Return the start on its constraints; or a `State` as it is, and the sizes by which the program that integrates projects it."""
-    if not (projects and isinstance(given, State)):
-        return as_state(scene, given, t0=t0, inputs=inputs_at(inputs, t0), native=native), None
+    if not (model.formulation.projects and isinstance(given, State)):
+        return as_state(model, given, t0=t0, inputs=inputs_at(inputs, t0)), None
     if nothing_is_traced():
-        q, u = as_coordinates(scene, given.q), as_speeds(scene, given.u)
+        q, u = as_coordinates(model.scene, given.q), as_speeds(model.scene, given.u)
         as_given = q is given.q and u is given.u
-        return given if as_given else eqx.tree_at(lambda s: (s.q, s.u), given, (q, u)), usual_sizes(scene, False, native)
-    return nearest_state(scene, t0, given.q, given.u, inputs_at(inputs, t0), native=native), None
+        return given if as_given else eqx.tree_at(lambda s: (s.q, s.u), given, (q, u)), model.usual(False)
+    return nearest_state(model, t0, given.q, given.u, inputs_at(inputs, t0)), None
 
 
 def default_solver(rtol: Number) -> Method:
@@ -183,8 +175,65 @@ def default_solver(rtol: Number) -> Method:
 
 def warn_float32(dtype, rtol) -> None:
     """A warning where the precision does not hold the tolerance."""
-    if dtype == np.float32 and not isinstance(rtol, jax.core.Tracer) and rtol < 1e-5:
+    if dtype == np.float32 and np.any(known_numbers(rtol) < 1e-5):
         warnings.warn(
             f"rtol = {rtol} asks for more digits than float32 has; set jax.config.update('jax_enable_x64', True), or loosen rtol and atol to 1e-5",
             stacklevel=users_level(),
         )
+
+
+DEFAULT_SAMPLES = 201
+_EVEN = np.linspace(0.0, 1.0, DEFAULT_SAMPLES)
+
+
+def as_state(model: Model | Scene, given, *, what: str = "start", t0=0.0, inputs=None) -> State:
+    """A state from a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for the scene's example.
+
+    `inputs`: the scene's inputs at that instant, a vector or by name (default: zero); they count where velocity rows depend on them.
+    """
+    if isinstance(given, State):
+        return given
+    if given is not None and not isinstance(given, Mapping):
+        raise ValueError(
+            f"`{what}` is {described(given)}, expected a State (from `jj.start` or `jj.consistent`), a dictionary of named values, or None for the "
+            f"scene's example{'; write `.state` after it' if isinstance(getattr(given, 'state', None), State) else ''}"
+        )
+    model = as_model(model)
+    return named_start(model, model.scene.example if given is None else given, t0, inputs)
+
+
+def span_and_times(scene: Scene, start, t0, t1, ts):
+    """t0, the times to save at, t1; a ValueError where they are known and do not go together."""
+    real = real_type()
+    if isinstance(start, State) and start.q.ndim != 1:
+        raise ValueError(f"`start` holds a batch of shape {start.q.shape[:-1]}; use `jj.rollout` or `jax.vmap` for many starts")
+    ts = None if ts is None else saved_times(ts)
+    t0, t1 = (as_end(name, value) for name, value in (("t0", t0), ("t1", t1)))
+    if t0 is None:
+        t0 = as_end("t", start.t if isinstance(start, State) else 0.0)
+    if t1 is None:
+        t1 = t0 + scene.example_span if ts is None else ts[-1]
+    ends = known_numbers([t0, t1])
+    if not np.all(np.isfinite(ends)) or np.any(ends[:1] == ends[1:]):
+        raise ValueError(f"the span from t0 = {t0} to t1 = {t1} s is empty or not finite; give a finite `t1` different from `t0`")
+    if ts is None:
+        ts = t0 + (t1 - t0) * _EVEN  # of known ends: nothing to compile
+    elif not np.all(known_numbers(times_fit(ts, t0, t1))):
+        raise ValueError(f"`ts` runs from {ts[0]} to {ts[-1]} s, outside of the span from t0 = {t0} to t1 = {t1} s or against it; give `t0` and `t1` around it")
+    return tuple(as_array(x, real) for x in (t0, ts, t1))
+
+
+def as_end(name: str, value):
+    """One end of the span; None stays. A ValueError where it is no number."""
+    return None if value is None else checked_unless_traced(value, f"`{name}`", (), advice="give one time in s")
+
+
+def saved_times(ts) -> "Float[Array, 'times'] | Float[np.ndarray, 'times']":
+    """Times to save at, on NumPy where they are known; a ValueError where they are no monotonic vector of finite numbers."""
+    ts = checked_unless_traced(ts, "`ts`", advice="give a vector of times in s")
+    if ts.ndim != 1 or ts.shape[0] == 0:
+        raise ValueError(f"`ts` has shape {ts.shape}, expected a vector of at least one time in s")
+    steps = np.diff(known_numbers(ts))
+    if not (np.all(steps > 0) or np.all(steps < 0)) or not np.all(np.isfinite(known_numbers(ts))):
+        raise ValueError("`ts` must be finite and strictly increasing (or decreasing, for reversed time); sort it and drop repeated times")
+    return ts

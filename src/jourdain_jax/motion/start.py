@@ -4,9 +4,7 @@ g(t, q) = 0,  phi(t, q, u) = 0
 """
 
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
 from dataclasses import replace
-from functools import lru_cache
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -17,65 +15,28 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jourdain_jax.build.held_values import may_contradict
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.build.sampling import guesses_of
 from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.calculus.damped import first_root
-from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, described, is_traced, nothing_is_traced, real_type
+from jourdain_jax.calculus.reals import Number, Numbers, at_once, checked_unless_traced, described, is_traced, known_numbers, nothing_is_traced
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.motion.inputs import as_inputs, inputs_at
-from jourdain_jax.motion.put_on_rows import Usual, functions_of_rows, put_positions, put_speeds, usual_sizes
+from jourdain_jax.motion.model import Model, as_model, modelled
+from jourdain_jax.motion.put_on_rows import State, Usual, functions_of_rows, may_contradict, put_positions, put_speeds
 from jourdain_jax.program.analyticity import depend_on
-from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds
-from jourdain_jax.scene.coordinates import Names
+from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_speeds
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.printing import Printed, in_digits
 from jourdain_jax.scene.scene import Scene, vectors_named
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 _NOTHING: Mapping = MappingProxyType({})
 _OFF = 1e4  # units of round-off: a residual that is more
-
-
-class State(Printed, eqx.Module):
-    """A state on the constraints, and how far the guess was from it; `state["yaw"]`, `print(state)`.
-
-    q and u in the units of the scene's coordinates and speeds (SI, rad).
-    """
-
-    t: Float[Array, ""]  # s
-    q: Float[Array, "coordinates"]
-    u: Float[Array, "speeds"]
-    moved_q: Float[Array, ""]  # largest change of a coordinate by the projection
-    moved_u: Float[Array, ""]  # largest change of a speed by the projection
-    residual: Float[Array, ""]  # what is left of rows and quaternion norms
-    names: tuple[Names, Names] = eqx.field(static=True)
-    # that led here: 0, what was given; then others (`start`). A floating-point number, so that a loss can be differentiated with respect to a whole state
-    guess: Float[Array, ""] = eqx.field(default=0, converter=lambda k: jnp.asarray(k, real_type()))
-
-    def __getitem__(self, name: str):
-        """A coordinate, speed, quaternion or angular velocity by name."""
-        coordinates, speeds = (names.view(x) for names, x in zip(self.names, (self.q, self.u), strict=True))
-        return coordinates[name] if name in coordinates else speeds[name]
-
-    def __contains__(self, name: str) -> bool:
-        return any(name in names for names in self.names)
-
-    def _text(self) -> str:
-        if self.q.ndim > 1:
-            return f"States of shape {self.q.shape[:-1]}: {', '.join((*self.names[0].entries, *self.names[1].entries))}"
-        entries, values = (*self.names[0].entries, *self.names[1].entries), in_digits(np.concatenate([self.q, self.u]))
-        pairs = [f"{name} = {value}" for name, value in zip(entries, values, strict=True)]
-        moved = f"moved by {self.moved_q:.2e} (q), {self.moved_u:.2e} (u) onto the constraints; residual {self.residual:.1e}"
-        if int(self.guess):
-            moved += f"; from guess {int(self.guess)}: coordinates that were not given begin elsewhere in the domain, those near the reference lead nowhere"
-        return f"State at t = {self.t:.6g} s: " + ", ".join(pairs) + f"\n{moved}"
 
 
 def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tuple[str, ...] = ()) -> State:
@@ -86,18 +47,19 @@ def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tu
     Differentiable in any mode. What cannot be met stays in `residual`, which is infinite where numbers are not finite (no error: this also runs
     inside jit and vmap); the quaternion (0, 0, 0, 0) has no direction and stays as it is, with a residual of 1/2. ValueError for wrong shapes.
     """
-    return nearest_state(scene, t, q, u, inputs, held=held)
+    return nearest_state(modelled(scene), t, q, u, inputs, held=held)
 
 
-def nearest_state(scene: Scene, t, q, u, inputs, *, held: tuple[str, ...] = (), native: bool = True) -> State:
-    """Project as `consistent` does; `native`: whether machine code may."""
+def nearest_state(model: Model, t, q, u, inputs, *, held: tuple[str, ...] = ()) -> State:
+    """Project as `consistent` does."""
+    scene = model.scene
     coordinates, speeds = scene.coordinate_names.entries, scene.speed_names.entries
     t, q, u = _as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     for name in held:
         if name not in coordinates + speeds:
             raise ValueError(f"`held` names `{name}`, which is no coordinate or speed; {nearest(name, coordinates + speeds)}")
     free_q, free_u = (_free(names, tuple(held)) for names in (coordinates, speeds))
-    guess = _Guess(q, u, free_q, free_u, ~_free(coordinates, ()), usual_sizes(scene, False, native))
+    guess = _Guess(q, u, free_q, free_u, ~_free(coordinates, ()), model.usual(False))
     return _consistent(scene, t, guess, _as_input_vector(scene, inputs, q.dtype))
 
 
@@ -134,7 +96,7 @@ def _consistent(scene: Scene, t, start: _Guess, inputs, guesses: Callable | None
     if not nothing_is_traced() and is_traced(given):
         return _compiled_projection(*given, None if guesses is None else guesses())[0]
     # numbers are put onto the rows at once, also where a function around this call is being traced; elsewhere that would compile constants one by one
-    with nullcontext() if nothing_is_traced() else jax.ensure_compile_time_eval():
+    with at_once():
         state, arrived = _compiled_projection(*given, None)
         if guesses is not None and not np.asarray(arrived) and len(start.usual.closures):  # rare, and long to compile
             by_xla = start._replace(usual=replace(start.usual, program=None))
@@ -253,18 +215,18 @@ def start(scene: Scene | BuiltFor, given=None, *, near=None, t0: Number = 0.0, i
     ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints or that no state of the
     domain has; where they are not, `residual` is infinite, and a motion from there ends with a code.
     """
-    native = not isinstance(scene, BuiltFor) or scene.backend in ("auto", "native")
-    scene = as_scene(scene)
+    model = as_model(scene)
     if given is not None and not isinstance(given, Mapping):
         raise ValueError(f"`start` was given {described(given)}, expected named values: `jj.start(scene, lean=0.3)`, or a dictionary of them")
     if near is not None and not isinstance(near, Mapping):
         raise ValueError(f'`near` is {described(near)}, expected a dictionary of coordinates: near={{"z": -0.4}}')
-    return named_start(scene, {**(given or {}), **values}, t0, inputs_at(as_inputs(scene, inputs), _as_time(t0)), near=near or {}, native=native)
+    with model.standing_in:
+        return named_start(model, {**(given or {}), **values}, t0, inputs_at(as_inputs(model.scene, inputs), _as_time(t0)), near=near or {})
 
 
-def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, *, near: Mapping = _NOTHING, native: bool = True) -> State:
-    """Return the start that `start` describes; `inputs` at time `t0`: a vector, or by name (None: zero); `native`: as in `nearest_state`."""
-    scene = as_scene(scene)
+def named_start(model: Model, values: Mapping, t0, inputs, *, near: Mapping = _NOTHING) -> State:
+    """Return the start that `start` describes; `inputs` at time `t0`: a vector, or by name (None: zero)."""
+    scene = model.scene
     q, u, given = vectors_named(scene, {**near, **values})
     about = given if near else ()
     if near:
@@ -274,35 +236,35 @@ def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, *, near: M
                 raise ValueError(f"`near` names `{name}`, which is no coordinate; {nearest(name, scene.coordinate_names.entries)}")
     inputs = _as_input_vector(scene, inputs, q.dtype)
     t, free_q = _as_time(t0), _free(scene.coordinate_names.entries, given)
-    if is_traced(q, u, t) or not (np.isfinite(q).all() and np.isfinite(u).all() and np.isfinite(t)):
-        _check_finite({**near, **values, "t0": t0})
+    for name, value in {**near, **values, "t0": t0}.items():
+        if not np.all(np.isfinite(known_numbers(value))):
+            raise ValueError(f"start value `{name}` is {value}, expected a finite number; check where it was computed")
     known = structure_of(scene)
     free_u = _free(scene.speed_names.entries, (*given, *_resting(scene, known, given)))
     determined = known.affine and not any(free_u[i] for i in known.independent)  # rows determine the speeds that are free
-    usual = usual_sizes(scene, determined, native)
-    bounded = _bounded(usual.program, scene.coordinate_names.entries, given, about)
+    usual = model.usual(determined)
+    bounded = model.once((given, about), lambda: _bounded(usual.program, scene.coordinate_names.entries, given, about))
     guess = _Guess(q, u, free_q, free_u, bounded, usual)
     state = _consistent(scene, t, guess, inputs, lambda: guesses_of(scene, known.coordinates[: known.random], q, free_q))
     _check_residual(scene, guess, state, inputs, given)
-    return _moved_if_near(scene, state, inputs, native) if may_contradict(scene, known, free_q, free_u) else state
+    return _moved_if_near(model, state, inputs) if may_contradict(scene, known, free_q, free_u) else state
 
 
-def _moved_if_near(scene: Scene, start: State, inputs, native: bool) -> State:
+def _moved_if_near(model: Model, start: State, inputs) -> State:
     """Move the start as a whole where it is off the rows by less than counts as a contradiction.
 
     Where it is off by round-off alone, its numbers stay as they are, but what is traced gets the derivatives of a start that is moved: values that agree at
     these parameters contradict each other at others.
     """
     near = start.residual < _tolerance(start.q.dtype)
-    if not is_traced(near) and not (near and _is_off(start)):
+    if not np.all(known_numbers(near & _is_off(start))):
         return start
-    state = nearest_state(scene, start.t, start.q, start.u, inputs, native=native)
+    state = nearest_state(model, start.t, start.q, start.u, inputs)
     moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
     state = eqx.tree_at(lambda s: (s.moved_q, s.moved_u, s.guess), state, (*moved, start.guess))
     return jax.tree.map(lambda x, y: jnp.where(near, x, y), state, start)
 
 
-@lru_cache(maxsize=1024)
 def _bounded(program: RowProgram | None, names: tuple[str, ...], given: tuple[str, ...], about: tuple[str, ...]) -> Bool[np.ndarray, "coordinates"]:
     """Which coordinates rows may not find outside of the domain: those neither given nor guessed; none where the rows, affine in them, leave one place."""
     free = _free(names, given)
@@ -322,14 +284,8 @@ def _resting(scene: Scene, known: Structure, given: tuple[str, ...]) -> tuple[st
     return tuple(name for name in privileged if name not in given)
 
 
-def _check_finite(values: Mapping) -> None:
-    for name, value in values.items():
-        if not is_traced(value) and not np.all(np.isfinite(np.asarray(value, float))):
-            raise ValueError(f"start value `{name}` is {value}, expected a finite number; check where it was computed")
-
-
 def _check_residual(scene: Scene, start: _Guess, state: State, inputs, given: tuple[str, ...]) -> None:
-    if is_traced(state.residual) or np.asarray(state.residual) < _tolerance(state.q.dtype):
+    if np.all(known_numbers(state.residual) < _tolerance(state.q.dtype)):
         return
     who, held = type(scene).__name__, ", ".join(f"`{name}`" for name in given) or "none"
     g = np.abs(np.asarray(closure_residual(scene, state.t, state.q)))

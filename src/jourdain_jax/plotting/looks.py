@@ -8,7 +8,7 @@ import numpy as np
 
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.motion.start import State
+from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.trajectories.over_times import map_over_times
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.guesses import guessed

@@ -4,7 +4,6 @@ Kinds and shapes are known while a function is traced: no compiled program conta
 """
 
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
 from functools import wraps
 from typing import Any, TypeVar
 
@@ -14,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.guards import DifferentiationModeError
-from jourdain_jax.calculus.reals import checked_real, described, is_traced, nothing_is_traced, real_type
+from jourdain_jax.calculus.reals import at_once, checked_real, described, is_traced, real_type
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
@@ -58,7 +57,7 @@ def of_known_numbers(function: F) -> F:
             raise DifferentiationModeError(
                 f"`{function.__name__}` was called inside jit, vmap or a derivative, with numbers that are not known there; call it outside of them"
             )
-        with nullcontext() if nothing_is_traced() else jax.ensure_compile_time_eval():
+        with at_once():
             return function(known, *args, **kwargs)
 
     return called  # type: ignore[return-value]

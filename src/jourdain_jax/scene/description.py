@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jourdain_jax.calculus.reals import described, has_unit, is_traced
+from jourdain_jax.calculus.reals import described, has_unit, known_numbers
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.names_read import functions_in, names_in
@@ -127,15 +127,13 @@ def _check_domain(scene) -> None:
     kind, domain = type(scene), scene.domain
     _check_keys(kind, "domain", domain, (*scene.coordinate_names.entries, *scene.speed_names.entries))
     for name, pair in domain.items():
-        if not is_traced(pair) and (has_unit(pair) or np.shape(pair) != (2,) or not _is_finite(pair) or pair[0] > pair[1]):
+        if has_unit(pair) or np.shape(pair) != (2,) or not _is_ordered(known_numbers(pair)):
             raise ValueError(f"`domain` of `{kind.__name__}` gives {pair} for `{name}`, expected two finite numbers (low, high) with low <= high")
 
 
-def _is_finite(pair) -> bool:
-    try:
-        return bool(np.all(np.isfinite(np.asarray(pair, float))))
-    except (TypeError, ValueError):
-        return False
+def _is_ordered(pair: np.ndarray) -> bool:
+    """Whether numbers are finite and none falls below the one before."""
+    return pair.dtype.kind in "biuf" and bool(np.all(np.isfinite(pair)) and np.all(np.diff(pair) >= 0))
 
 
 def _check_keys(kind: type, what: str, given, valid) -> None:

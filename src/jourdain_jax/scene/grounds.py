@@ -14,9 +14,10 @@ from typing import TypedDict, Unpack
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Vector, as_real, checked_positive, checked_real, described, is_traced
+from jourdain_jax.calculus.reals import Vector, as_real, checked_positive, checked_real, described, known_numbers
 from jourdain_jax.calculus.rotations import rot_y
 
 
@@ -276,7 +277,7 @@ def _turned(tilt) -> Float[Array, "3 3"]:
 def _tangents_along(n, along) -> Float[Array, "2 3"]:
     along = checked_real(along, "`along` of a plane", (3,), advice="give a vector that is not normal to the plane")
     first = along - (n @ along) * n
-    if not is_traced(first, along) and not float(first @ first) > 1e-8 * float(along @ along):
+    if not np.all(known_numbers((first @ first) / (along @ along)) > 1e-8):
         raise ValueError("`along` of a plane is normal to it, expected a direction within it; give another vector")
     first = first / jnp.sqrt(first @ first)
     return jnp.stack([first, jnp.cross(n, first)])

@@ -4,12 +4,11 @@ from collections.abc import Iterator
 from dataclasses import MISSING
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.calculus.reals import as_real, described, has_unit
+from jourdain_jax.calculus.reals import as_real, described, has_unit, known_numbers
 
 Scalar = Float[Array, ""]
 
@@ -59,9 +58,7 @@ def check_parameters(scene) -> None:
             raise ValueError(f"{where} is {described(value)}, expected a number{_in(metadata)} or an array of numbers")
         if not jnp.issubdtype(value.dtype, jnp.floating):
             raise ValueError(f"{where} is of type {value.dtype}, expected real numbers{_in(metadata)}; check where it was computed")
-        if isinstance(value, jax.core.Tracer):
-            continue
-        numbers = np.asarray(value)
+        numbers = known_numbers(value)
         if not np.all(np.isfinite(numbers)):
             raise ValueError(f"{where} is {numbers}, expected finite numbers; check where it was computed")
         if metadata["positive"] and not np.all(numbers > 0):

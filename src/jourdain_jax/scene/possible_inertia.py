@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import checked_real, is_traced
+from jourdain_jax.calculus.reals import checked_real, known_numbers
 
 
 def inertia_from_log_cholesky(numbers) -> Float[Array, "3 3"]:
@@ -53,7 +53,7 @@ def log_cholesky(inertia, *, symmetric: bool = False) -> Float[Array, "numbers"]
     if I.shape != (3, 3):
         raise ValueError(f"`inertia` of `log_cholesky` has shape {I.shape}, expected (3, 3) or (3,): a matrix or three principal moments, kg m^2")
     S = jnp.trace(I) / 2 * jnp.eye(3, dtype=I.dtype) - I
-    if not is_traced(I):
+    if known_numbers(I).size:
         _check(np.asarray(I), np.asarray(S), symmetric)
     # from the last row up, since A is upper triangular: that of S with its rows and columns the other way round
     A = jnp.linalg.cholesky(S[::-1, ::-1])[::-1, ::-1]

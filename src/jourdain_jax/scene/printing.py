@@ -21,7 +21,11 @@ class Printed:
         return str(self)
 
     def _repr_html_(self) -> str:
-        return preformatted(str(self))
+        return preformatted(str(self)) + ("" if is_traced(self) else self._picture())
+
+    def _picture(self) -> str:
+        """What a notebook shows below the text, as HTML."""
+        return ""
 
     def _text(self) -> str:
         raise NotImplementedError(f"`{type(self).__name__}` does not say how it is printed; define `_text(self)`")

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import checked_unless_traced, described, has_unit, is_traced, real_type
+from jourdain_jax.calculus.reals import array_module, checked_unless_traced, described, has_unit, known_numbers, real_type
 from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.coordinates import Coordinates, Names
@@ -202,7 +202,7 @@ def _completed(parts: tuple[str, ...], q: list, first: int, given: list[str]) ->
         return []
     q[first : first + 4] = [value if name in named else 0.0 for name, value in zip(parts, q[first : first + 4], strict=True)]
     square = sum(value * value for value in q[first : first + 4])
-    if not is_traced(square) and abs(float(square) - 1) > 1e-4:  # parts may be typed with a few digits
+    if np.any(abs(known_numbers(square) - 1) > 1e-4):  # parts may be typed with a few digits
         group, told = parts[0].removesuffix("_w"), ", ".join(f"`{name}`" for name in named)
         raise ValueError(
             f"of the quaternion `{group}` only {told} is given, the squares of which sum up to {float(square):.4g}: many attitudes have that; give all four "
@@ -231,7 +231,7 @@ def _put(names: Names, entries: list, name: str, value) -> list[str]:
 
 
 def _vector(entries: list) -> Float[Array | np.ndarray, "entries"]:
-    if is_traced(entries):
+    if array_module(entries) is jnp:
         return jnp.stack([jnp.asarray(value, real_type()) for value in entries])
     return np.array([value if type(value) is float else np.asarray(value) for value in entries], real_type())  # at once: no small programs to compile
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import checked_real, is_traced
+from jourdain_jax.calculus.reals import checked_real, known_numbers
 
 
 class Spline(eqx.Module):
@@ -39,22 +39,29 @@ class Spline(eqx.Module):
     values: Float[Array, "samples"]
 
     def __init__(self, ts, values):
-        self.ts = checked_real(ts, "`ts` of `Spline`", advice="give times in s")
-        self.values = checked_real(values, "`values` of `Spline`", advice="give one number per time")
-        if self.ts.ndim != 1 or self.ts.shape[0] < 2 or self.values.shape != self.ts.shape:
-            raise ValueError(
-                f"`Spline` was given times of shape {self.ts.shape} and values of shape {self.values.shape}, expected two vectors of one length, at least 2; "
-                "give one value per time, and one `Spline` per coordinate"
-            )
-        if not is_traced(self.ts) and not (np.all(np.isfinite(self.ts)) and np.all(np.diff(np.asarray(self.ts)) > 0)):
-            raise ValueError("the times of `Spline` must be finite and increase from one to the next; sort the samples by time and merge repeated ones")
-        if not is_traced(self.values) and not np.all(np.isfinite(self.values)):
-            first = int(np.argmin(np.isfinite(self.values)))
-            raise ValueError(f"value {first} of `Spline` is {float(self.values[first])}, expected finite numbers; leave samples out that were not measured")
+        self.ts, self.values = checked_samples("Spline", ts, values, 2, "coordinate")
 
     def __call__(self, t):
         """Value at time t (s)."""
         return smooth_through_samples(jnp.asarray(t, jnp.result_type(float)), self.ts, self.values)
+
+
+def checked_samples(kind: str, ts, values, least: int, of: str) -> tuple[Float[Array, "samples"], Float[Array, "samples"]]:
+    """Return times and values, at least so many, one `kind` for each `of` a scene. ValueError for other shapes, and for numbers that cannot be samples."""
+    ts = checked_real(ts, f"`ts` of `{kind}`", advice="give times in s")
+    values = checked_real(values, f"`values` of `{kind}`", advice="give one number per time")
+    if ts.ndim != 1 or ts.shape[0] < least or values.shape != ts.shape:
+        raise ValueError(
+            f"`{kind}` was given times of shape {ts.shape} and values of shape {values.shape}, expected two vectors of one length, at least {least}; "
+            f"give one value per time, and one `{kind}` per {of}"
+        )
+    knots, numbers = known_numbers(ts), known_numbers(values)
+    if not (np.all(np.isfinite(knots)) and np.all(np.diff(knots) > 0)):
+        raise ValueError(f"the times of `{kind}` must be finite and increase from one to the next; sort the samples by time and merge repeated ones")
+    if not np.all(np.isfinite(numbers)):
+        first = int(np.argmin(np.isfinite(numbers)))
+        raise ValueError(f"value {first} of `{kind}` is {numbers[first]}, expected finite numbers; leave samples out that were not measured")
+    return ts, values
 
 
 @jax.jit  # so that its name stands in what JAX traces: it need not be looked at for kinks

@@ -16,8 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from jourdain_jax.build.domain import coordinate_bounds
-from jourdain_jax.build.reference_parameters import once_per_values
+from jourdain_jax.build.assembling import coordinate_bounds
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.dynamics.reduced import DEPENDS, PROBES
@@ -31,8 +30,8 @@ from jourdain_jax.program.derivative import derivatives, jacobian
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
+from jourdain_jax.scene.identity import once_per_class, once_per_values
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 

@@ -17,7 +17,7 @@ from jourdain_jax.analysis.steady import guessed
 from jourdain_jax.analysis.table import complex_numbers, table
 from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.calculus.reals import Numbers
-from jourdain_jax.motion.start import State
+from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, of_known_numbers
 from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
 from jourdain_jax.scene.printing import Printed, in_digits

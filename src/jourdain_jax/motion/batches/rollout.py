@@ -14,24 +14,21 @@ import numpy as np
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
-from jourdain_jax.build.reference import Reference
-from jourdain_jax.calculus.reals import checked_real, described, is_traced
-from jourdain_jax.motion.arguments import DEFAULT_SAMPLES, as_end, saved_times, span_and_times
-from jourdain_jax.motion.input_programs import for_programs
-from jourdain_jax.motion.inputs import Inputs, as_inputs
-from jourdain_jax.motion.inputs_in_rows import check_inputs_in_rows
+from jourdain_jax.build.structure import Reference
+from jourdain_jax.calculus.reals import checked_real, described, is_traced, known_numbers
+from jourdain_jax.motion.inputs import as_inputs, check_inputs_in_rows, for_programs
 from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import with_nan_as_a_mark
+from jourdain_jax.motion.model import modelled
 from jourdain_jax.motion.options import SPAN, AllOptions, MotionFields, Options, as_options
+from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.retries import RERUN_FIELDS, lanes_retried
 from jourdain_jax.motion.sensitivity import warn_of_jumps
-from jourdain_jax.motion.simulate import default_solver, set_up, warn_float32
-from jourdain_jax.motion.start import State
+from jourdain_jax.motion.simulate import DEFAULT_SAMPLES, as_end, default_solver, saved_times, set_up, span_and_times, warn_float32
 from jourdain_jax.motion.trajectories import labelled, results
 from jourdain_jax.motion.trajectories.sketch import sketch_of_lanes
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.motion.vector_fields.choice import vector_field
 from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import nearest
@@ -62,8 +59,10 @@ class Rollout(Printed, eqx.Module):
         if not -len(self) <= index < len(self):
             raise IndexError(f"lane {index} does not exist; this rollout has {len(self)} lanes, 0 to {len(self) - 1}")
         lane = jax.tree.map(lambda x: x[index], self.lanes)
-        reruns = {} if is_traced(lane.fallback) else dict(self.reruns)
-        return dataclasses.replace(lane, **dict(zip(RERUN_FIELDS, reruns.get(int(lane.fallback), ()), strict=False))) if reruns else lane
+        for way, how in self.reruns:
+            if np.any(known_numbers(lane.fallback) == way):
+                return dataclasses.replace(lane, **dict(zip(RERUN_FIELDS, how, strict=True)))
+        return lane
 
     @property
     def result(self) -> np.ndarray:
@@ -111,8 +110,8 @@ class Rollout(Printed, eqx.Module):
         """Coordinates and speeds as a `pandas.DataFrame`, one row for each lane and time (s). ImportError without pandas."""
         return labelled.frame(self.lanes)
 
-    def _repr_html_(self) -> str:
-        return super()._repr_html_() + ("" if is_traced(self) else sketch_of_lanes(self.lanes))
+    def _picture(self) -> str:
+        return sketch_of_lanes(self.lanes)
 
     def _text(self) -> str:
         lines = [f"Rollout of {type(self.lanes.scene).__name__}: {len(self)} lanes"]
@@ -177,7 +176,7 @@ def rollout(
     """
     span = {name: by_name.pop(name, None) for name in SPAN}
     options = as_options(options, by_name, "rollout", scene=scene)
-    reference, scene = scene.reference if isinstance(scene, BuiltFor) else Reference(as_scene(scene)), as_scene(scene)
+    model, scene = modelled(scene, options.formulation, options.backend), as_scene(scene)
     starts = dict(scene.example) if starts is None else starts
     for what, given in (("starts", starts), ("parameters", parameters)):
         if given is not None and not isinstance(given, Mapping) and not (what == "starts" and isinstance(given, State)):
@@ -191,11 +190,14 @@ def rollout(
     times = {name: None if span[name] is None else checked_real(span[name], f"`{name}`").astype(jnp.result_type(float)) for name in ("t0", "t1", "ts")}
 
     def run(options: AllOptions, varied, parameters) -> Trajectory:
-        return _run_lanes(reference, scene, fixed, span | times, _with_arrays(options), varied, parameters)
+        return _compiled(span["inputs"].programs)(model.reference, scene, fixed, span | times, _with_arrays(options), varied, parameters)
+
+    def form(options: AllOptions) -> VectorField:
+        return modelled(model, options.formulation, options.backend).field(span["inputs"].constant, bool(options.work))
 
     if is_traced((scene, fixed, varied, parameters, span, options)):
         lanes = run(options, varied, parameters)  # being differentiated or batched: one piece, no host loop
-        warn_of_jumps(_form(scene, options, span["inputs"]), lanes, is_traced((scene, parameters)))
+        warn_of_jumps(form(options), lanes, is_traced((scene, parameters)))
         return Rollout(lanes)
 
     def run_some(options: AllOptions, index: np.ndarray) -> Trajectory:
@@ -212,7 +214,7 @@ def rollout(
     if options.retry:
         own_times = isinstance(varied, State) and span["t0"] is None
         begun = varied.t if own_times else 0.0 if span["t0"] is None else span["t0"]
-        lanes, reruns = lanes_retried(run_some, lambda options: _form(scene, options, span["inputs"]), lanes, begun, options, chunk)
+        lanes, reruns = lanes_retried(run_some, form, lanes, begun, options, chunk)
     return Rollout(jax.tree.map(jnp.asarray, lanes), reruns)
 
 
@@ -229,16 +231,6 @@ def _check_times_of_lanes(scene: Scene, starts, span: dict) -> None:
         return
     t0, _, t1 = span_and_times(scene, None, t0, t1, ts)
     check_inputs_in_rows(scene, span["inputs"], t0, t1)
-
-
-def _form(scene: Scene, options: AllOptions, inputs: Inputs) -> VectorField:
-    """How the lanes' state is integrated."""
-    return vector_field(scene, options.formulation, options.work, options.backend, inputs)
-
-
-def _run_lanes(reference: Reference, scene, fixed, span, options: AllOptions, varied, parameters) -> Trajectory:
-    """All given lanes in lockstep; compiled once for scenes and lanes of one shape."""
-    return _compiled(span["inputs"].programs)(reference, scene, fixed, span, options, varied, parameters)
 
 
 def _lanes_in_lockstep(reference: Reference, scene, fixed, span, options: AllOptions, varied, parameters) -> Trajectory:

@@ -16,7 +16,7 @@ import numpy as np
 from jourdain_jax.build.trace import Variables
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.lowering.relations import jumps, switches
-from jourdain_jax.motion.input_programs import FunctionOfTime, TimeProgram
+from jourdain_jax.motion.inputs import FunctionOfTime, TimeProgram
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import ARRAYS, Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret

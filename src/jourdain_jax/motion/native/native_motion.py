@@ -12,8 +12,7 @@ from jaxtyping import Array, Float, PyTree
 from jourdain_jax.calculus.entries import entries_of
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.motion.input_programs import FunctionOfTime
-from jourdain_jax.motion.inputs import Constant, Inputs, Sampled
+from jourdain_jax.motion.inputs import Constant, FunctionOfTime, Inputs, Sampled
 from jourdain_jax.motion.integrators.erk_loop import code_at_end
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.native.flow_back import flow_back
@@ -24,8 +23,7 @@ from jourdain_jax.motion.native.layout import Layout
 from jourdain_jax.motion.native.pulled import check_derivatives
 from jourdain_jax.motion.native.times import moved
 from jourdain_jax.motion.setup import Begun, Setup, Solved
-from jourdain_jax.motion.vector_fields.by_program import ByProgram
-from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
+from jourdain_jax.motion.vector_fields.field import ByProgram, Integrated, VectorField
 from jourdain_jax.native import ffi, series
 from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.program.graph import Unsupported

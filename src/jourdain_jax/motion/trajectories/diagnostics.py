@@ -15,7 +15,7 @@ from jourdain_jax.motion.inputs import Constant, Sampled
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.trajectories.over_times import Checked, Checks, Record, map_over_times
 from jourdain_jax.motion.trajectories.results import FALLBACKS
-from jourdain_jax.motion.vector_fields.choice import reason_for_matrices
+from jourdain_jax.motion.vector_fields.field import reason_for_matrices
 
 
 class Energies(eqx.Module):

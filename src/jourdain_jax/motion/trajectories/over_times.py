@@ -20,8 +20,7 @@ from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.reductions import NullSpaceSVD
 from jourdain_jax.equations.rows import UsualRows, velocity_residual
 from jourdain_jax.equations.virtual_power import energies_at
-from jourdain_jax.motion.input_programs import for_programs
-from jourdain_jax.motion.inputs import Inputs
+from jourdain_jax.motion.inputs import Inputs, for_programs
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import invariants_of

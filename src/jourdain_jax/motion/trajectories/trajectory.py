@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.build.plausibility import known_faults_at
 from jourdain_jax.build.structure import usual_rows
 from jourdain_jax.calculus.nan_where import nan_where
-from jourdain_jax.calculus.reals import checked_real, is_traced
+from jourdain_jax.calculus.reals import checked_real
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions
 from jourdain_jax.equations.kinematics import motion_at
@@ -18,7 +18,8 @@ from jourdain_jax.equations.listed import names_of_bodies
 from jourdain_jax.lowering.kinks import bent_load
 from jourdain_jax.motion.inputs import inputs_at
 from jourdain_jax.motion.marks import nan_is_a_mark
-from jourdain_jax.motion.start import State, consistent
+from jourdain_jax.motion.put_on_rows import State
+from jourdain_jax.motion.start import consistent
 from jourdain_jax.motion.trajectories import labelled, over_times, results
 from jourdain_jax.motion.trajectories.diagnostics import Energies, diagnose, summary, warnings_of
 from jourdain_jax.motion.trajectories.over_times import Record, map_over_times
@@ -27,7 +28,7 @@ from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.parameters import parameter_faults
-from jourdain_jax.scene.printing import Printed, preformatted
+from jourdain_jax.scene.printing import Printed
 
 
 class Trajectory(Record, Printed):
@@ -126,8 +127,8 @@ class Trajectory(Record, Printed):
         with nan_is_a_mark():
             return summary(self, self.message) if self.q.ndim == 2 else f"Trajectories of {type(self.scene).__name__}, lanes {self.q.shape[:-2]}"
 
-    def _repr_html_(self) -> str:
-        return preformatted(str(self)) + ("" if self.q.ndim > 2 or is_traced(self) else sketch(self))
+    def _picture(self) -> str:
+        return "" if self.q.ndim > 2 else sketch(self)
 
     @property
     @of_known_numbers

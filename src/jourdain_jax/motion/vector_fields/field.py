@@ -7,21 +7,87 @@ Where some force or row does work that no potential accounts for, that work is i
 """
 
 import abc
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.build.explicit_power import stored_by_inputs
-from jourdain_jax.build.trace import event_values
+from jourdain_jax.build.structure import Structure
+from jourdain_jax.build.trace import event_values, stored_by_inputs
+from jourdain_jax.calculus.reals import described
+from jourdain_jax.dynamics.accelerations import Baumgarte
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.reductions import Reduction
 from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.motion.native import seen
+from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
+
+_STATES = ("auto", "minimal", "full")
+
+
+class Formulation(eqx.Module):
+    """Which equations `simulate` integrates. The default takes what serves the scene.
+
+    - `state`: "minimal", coordinates q and privileged speeds y; "full", coordinates and all speeds u; "auto" (default), the minimal one where the
+      privileged speeds are well conditioned over the scene's domain and the rows are linear or affine.
+    - `reduction`: how accelerations are found, a name or an object as in `accelerations` (default: the scene's scalar program where there is one).
+    - `stabilisation`: what keeps the state on rows that its form does not keep by itself, the start included: "projection" (default) puts it back after
+      each step; `jj.Baumgarte(alpha, beta)` adds its terms to the rows, for comparison; None leaves it alone.
+
+    ValueError for anything else.
+
+    **Examples**
+
+        rods = jj.models.DoublePendulumRods()
+        dense = jj.Formulation("full", reduction="kkt")                # all speeds, multipliers from one linear system
+        motion = jj.simulate(rods, t1=0.2, formulation=dense)
+        print(motion.state_form, motion.reduction)
+    """
+
+    state: Literal["auto", "minimal", "full"] = eqx.field(static=True, default="auto")
+    reduction: Reduction | GibbsAppell | str | None = None
+    stabilisation: Baumgarte | Literal["projection"] | None = "projection"
+
+    def __check_init__(self) -> None:
+        if self.state not in _STATES:
+            raise ValueError(f"unknown state form `{self.state}`; {nearest(str(self.state), _STATES)}")
+        stabilisation = self.stabilisation
+        if not (stabilisation is None or isinstance(stabilisation, Baumgarte) or (isinstance(stabilisation, str) and stabilisation == "projection")):
+            raise ValueError(f'`stabilisation` is {described(stabilisation)}, expected "projection", `jj.Baumgarte(alpha, beta)` or None')
+
+    @property
+    def projects(self) -> bool:
+        """Whether the state is put back onto the constraints after each step."""
+        return isinstance(self.stabilisation, str)
+
+    @property
+    def baumgarte(self) -> Baumgarte | None:
+        """The terms added to the rows; None where there are none."""
+        return self.stabilisation if isinstance(self.stabilisation, Baumgarte) else None
+
+
+_DEFAULT = Formulation()
+
+
+def as_formulation(formulation) -> Formulation:
+    """The formulation, the default one for None; ValueError for anything else."""
+    if formulation is None:
+        return _DEFAULT
+    if not isinstance(formulation, Formulation):
+        raise ValueError(f"`formulation` is {described(formulation)}, expected `jj.Formulation(state, reduction, stabilisation)` or None")
+    return formulation
+
+
+def reason_for_matrices(structure: Structure, constant: bool) -> str:
+    """Why dense matrices are integrated also of a scene with a scalar program, in words; empty where that serves. `constant`: all inputs are."""
+    if structure.rows_of_inputs and not constant:
+        return "velocity rows with inputs that change with time need dense matrices"
+    return ""
 
 
 class Integrated(eqx.Module):
@@ -53,7 +119,7 @@ class VectorField(eqx.Module):
     conserves: bool = eqx.field(static=True)  # T + V is constant along every motion
     projects_positions: bool = eqx.field(static=True)
     projects_speeds: bool = eqx.field(static=True)
-    rows_may_contradict: bool = eqx.field(static=True)  # each other, although the start meets all (`motion/row_check.py`)
+    rows_may_contradict: bool = eqx.field(static=True)  # each other, although the start meets all (`motion/integration.py`)
     of_inputs: tuple[int, ...] = eqx.field(static=True)  # numbers of the loads whose potential depends on inputs
     event_names: tuple[str, ...] = eqx.field(static=True)  # sorted
 
@@ -147,3 +213,78 @@ class VectorField(eqx.Module):
     @abc.abstractmethod
     def project(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
         """The state put back onto geometric rows, quaternion norms and (full state) velocity rows."""
+
+
+class ByProgram(VectorField):
+    """The minimal or the full state of a lowered scene."""
+
+    program: Lowered = eqx.field(static=True)
+    affine: bool = eqx.field(static=True)  # rows are, in the speeds
+    native: bool = eqx.field(static=True, default=False)  # machine code of our own works out what stands beside the steps
+
+    @property
+    def lowered(self) -> Lowered:
+        """The scalar program."""
+        return self.program
+
+    @property
+    def reduction_name(self) -> str:
+        return f"{super().reduction_name}, lowered"
+
+    @property
+    def lowers_events(self) -> bool:
+        return bool(self.program.events)
+
+    @property
+    def has_pivots(self) -> bool:
+        """Whether an elimination, or the rates of the coordinates, divide by numbers that must not vanish."""
+        return self.pivots > 0 or bool(self.program.directions) or self.near_rank_loss
+
+    @property
+    def pivots(self) -> int:
+        """Return how many are monitored: all, or with multipliers only those of the coordinate rates."""
+        return self.program.divisors if self.independent is None and not self.program.by_partition else len(self.program.pivots)
+
+    @property
+    def needs_pivot(self) -> bool:
+        """Whether a small pivot ends a motion: with multipliers a state is all there."""
+        return self.independent is not None or self.program.by_partition
+
+    @property
+    def near_rank_loss(self) -> bool:
+        """Whether rows are kept by multipliers, and put back onto."""
+        return self.projects and bool(self.program.squares)
+
+    def fixed(self, scene: Scene) -> tuple:
+        """What depends on parameters alone."""
+        return seen.fixed_values(self.program, scene) if self.native else self.program.fixed_values(scene)
+
+    def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "speeds"]:
+        return self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[0]
+
+    def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
+        """All speeds, and the smallest pivot of the elimination relative to its usual size."""
+        if self.native:
+            return seen.speeds_and_pivot(self.program, fixed, t, y.q, y.v, inputs)
+        return self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)
+
+    def energies(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "2"]:
+        return self.program.energy_values(fixed, t, tuple(y.q), tuple(y.v), inputs)
+
+    def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:
+        if self.program.events:
+            return self.program.event_values(fixed, t, tuple(y.q), tuple(y.v), inputs)
+        return super().events(scene, fixed, t, y, inputs)
+
+    def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Watched:
+        """Return `rates`, the pivots of the elimination relative to their usual sizes, and the eliminated rows."""
+        qdot, vdot, power, pivots, directions, sine = self.program.rates_and_pivots(fixed, t, tuple(y.q), tuple(y.v), inputs, self.with_work)
+        pivots = pivots[: self.pivots]
+        monitored = jnp.stack(pivots) if pivots else jnp.zeros((0, *y.q.shape[1:]))
+        rows = jnp.reshape(jnp.stack(directions), (-1, *y.v.shape)) if directions else jnp.zeros((0, *y.v.shape))
+        return Watched(Integrated(jnp.stack(qdot), jnp.stack(vdot) if vdot else y.v, power), monitored, rows, sine)
+
+    def project(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
+        """The state put back onto the rows."""
+        q, v = self.program.projected(fixed, t, tuple(y.q), tuple(y.v), inputs, self.affine)
+        return Integrated(jnp.stack(q), jnp.stack(v) if v else y.v, y.work)

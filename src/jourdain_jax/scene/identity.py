@@ -10,6 +10,7 @@ from contextvars import ContextVar
 from dataclasses import MISSING, fields
 from functools import lru_cache, wraps
 from operator import is_
+from threading import Lock
 from typing import Any
 
 import jax
@@ -17,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.calculus.reals import is_traced_type
+from jourdain_jax.scene.parameters import stacked_parameters
 from jourdain_jax.scene.scene import Scene
 
 
@@ -32,11 +34,11 @@ def once_per_values(probe, of_traced: Callable | None = None):
         leaves, treedef = jax.tree.flatten(scene)
         known = _asked_about_before(leaves, treedef)
         if known is None:
-            if any(is_traced_type(type(x)) for x in leaves):
+            reference = with_reference_parameters(scene)
+            if reference is not scene:
                 if of_traced is not None:
                     return of_traced(scene, *case)
-                scene = with_reference_parameters(scene)
-                leaves, treedef = jax.tree.flatten(scene)
+                leaves, treedef = jax.tree.flatten(reference)
             known = Values(leaves, treedef)
             if all(isinstance(x, jax.Array) for x in leaves):
                 _latest[:] = [known]
@@ -160,3 +162,40 @@ def _is_inertia(x: np.ndarray) -> bool:
     if x.shape != (3, 3) or not np.any(x) or np.any(np.abs(x - x.T) > 1e-9 * np.max(np.abs(x))) or np.allclose(x @ x.T, np.eye(3)):
         return False
     return bool(np.linalg.eigvalsh(_second_moments(x))[0] >= -0.01 * np.trace(x))
+
+
+_UNKNOWN = object()
+
+
+def once_per_class(describe: Callable, most: int = 1024) -> Callable:
+    """A function of a scene (and of what else tells its cases apart) that depends on its class and the shapes of its parameters only: worked out once.
+
+    `most`: cases that are kept.
+    """
+    known: dict = {}
+    keeping = Lock()  # threads may ask at the same time; they may work the same out
+
+    @wraps(describe)
+    def of(scene: Scene, *case: Hashable):
+        leaves, treedef = jax.tree.flatten(scene)
+        key = (treedef, tuple(np.shape(x) for x in leaves), jax.config.jax_enable_x64, case)
+        found = known.get(key, _UNKNOWN)
+        if found is _UNKNOWN:
+            found = _described(describe, scene, case)
+            with keeping:
+                known[key] = found
+                if len(known) > most:
+                    known.pop(next(iter(known)))  # the oldest
+        return found
+
+    vars(of)["cache_clear"] = known.clear
+    return of
+
+
+def _described(describe: Callable, scene: Scene, case: tuple):
+    try:
+        return describe(scene, *case)
+    except (TypeError, ValueError) as error:
+        if many := stacked_parameters(scene):
+            raise ValueError(f"{many} ({error})") from error
+        raise
