@@ -13,12 +13,13 @@ import jourdain_jax as jj
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.model import modelled
-from jourdain_jax.motion.start import named_start, nearest_state
+from jourdain_jax.motion.start import nearest_state
 from jourdain_jax.native import ffi
 
 pytestmark = pytest.mark.skipif(bool(ffi.reason_against()), reason=ffi.reason_against())
 
 BICYCLE = jj.models.WhippleBicycle()
+BACKENDS = "xla", "auto"
 
 
 def _near_rows(scene: jj.Scene, count: int) -> tuple[jax.Array, jax.Array]:
@@ -29,13 +30,9 @@ def _near_rows(scene: jj.Scene, count: int) -> tuple[jax.Array, jax.Array]:
     return q + 1e-2 * generator.standard_normal(q.shape), u + 0.3 * generator.standard_normal(u.shape)
 
 
-def _model(scene: jj.Scene, native: bool):
-    return modelled(scene, backend="auto" if native else "xla")
-
-
 def _put(native: bool, held=()):
     """`(scene, q, u)` -> the nearest state on the rows."""
-    return lambda scene, q, u: nearest_state(_model(scene, native), 0.2, q, u, jnp.full(len(scene.inputs), 0.3), held=held)
+    return lambda scene, q, u: nearest_state(modelled(scene, None, BACKENDS[native]), 0.2, q, u, jnp.full(len(scene.inputs), 0.3), held=held)
 
 
 def _by_both(scene: jj.Scene, q, u, **options):
@@ -64,7 +61,7 @@ def test_all_models_come_onto_the_rows_alike_and_lanes_do_not_see_each_other(nam
 @pytest.mark.parametrize("name", MODELS)
 def test_named_starts_of_all_models_are_alike(name):
     scene = MODELS[name]()
-    ours, theirs = (named_start(_model(scene, native), scene.example, 0.0, None) for native in (True, False))
+    theirs, ours = (jj.start(jj.build(scene, backend=backend), scene.example) for backend in BACKENDS)
     _same((ours.q, ours.u, ours.moved_q, ours.moved_u), (theirs.q, theirs.u, theirs.moved_q, theirs.moved_u))
     assert float(ours.residual) < 1e-12 * (1 + float(jnp.max(jnp.abs(ours.u))))
     assert int(ours.guess) == int(theirs.guess)
