@@ -4,7 +4,6 @@
 """
 
 import ctypes
-import functools
 import gc
 import importlib.metadata
 import os
@@ -68,25 +67,21 @@ def _less_effort():
         yield
 
 
-MOST_RESIDENT = 1.3e9  # bytes of a process between files: workers of two, with what a file adds, stay below 5 GB
+MOST_RESIDENT = 1.9e9  # bytes of a process between files: two workers, with what a file adds, stay below 5 GB
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _compiled_programs_are_dropped():
     """Compiled programs are dropped after a file where they hold much memory: machine code and its memory maps, of which a process may have 65530.
 
-    What a file leaves behind is kept by caches: it is not looked through for garbage until these are emptied, those of the package too, or else what
-    there is to look through grows from file to file, and with it the time that it takes.
+    What a file leaves behind is kept by caches: it is not searched for garbage until these are emptied, or else the search takes longer from file to file.
     """
     yield
     if psutil.Process().memory_info().rss > MOST_RESIDENT:
-        import jax
+        import jourdain_jax as jj
 
-        jax.clear_caches()
+        jj.clear_caches()
         gc.unfreeze()
-        for kept in gc.get_objects():
-            if isinstance(kept, functools._lru_cache_wrapper) and str(kept.__module__).startswith("jourdain_jax.") and ".native" not in kept.__module__:
-                kept.cache_clear()
         gc.collect()
         if sys.platform == "linux":
             ctypes.CDLL(None).malloc_trim(0)  # glibc keeps what was freed otherwise

@@ -1,8 +1,10 @@
 """Methods are traced once: what they read is refused where it has state, noticed where it is bound anew, and a constant where it is a class or a module."""
 
 import copy
+import gc
 import importlib
 import pickle
+import weakref
 
 import equinox as eqx
 import jax
@@ -189,6 +191,19 @@ def test_what_is_a_constant_is_read_anew_after_the_caches_are_cleared(kind):
     jj.clear_caches()
     assert stiffness(scene, "accelerations") == 4.0
     assert stiffness(scene, "simulate") == pytest.approx(4.0, abs=1e-6)
+
+
+def test_cleared_caches_hold_no_scene():
+    names = cell("k = 1.0", "k")
+    scene = names["Spring"](mass=jnp.asarray(1.25))
+    stiffness(scene, "accelerations")
+    stiffness(scene, "simulate")
+    kept = weakref.ref(scene.mass)
+    del scene
+    assert kept() is not None
+    jj.clear_caches()
+    gc.collect()
+    assert kept() is None
 
 
 def spring_around(gain):

@@ -39,6 +39,7 @@ def compiled(f: Callable, options: dict | Callable | None = None) -> Callable:
         found, kept = program(*structure, with_options)(arrays)
         return _whole(found, *kept.value)
 
+    vars(run)["cache_clear"] = program.cache_clear
     return run
 
 

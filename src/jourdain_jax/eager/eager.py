@@ -31,6 +31,7 @@ def eval_numpy(f: Callable) -> Callable:
         rest, treedef = jax.tree.flatten(others, is_leaf=lambda x: x is None)
         return program(treedef, tuple(rest), jax.config.jax_enable_x64)(numbers, *lanes)
 
+    vars(run)["cache_clear"] = program.cache_clear
     return run
 
 
@@ -48,4 +49,5 @@ def eager_if_concrete(f: Callable) -> Callable:
         arguments = bound.args
         return f(*arguments) if is_traced(arguments) else jax.tree.map(jnp.asarray, known(*arguments))
 
+    vars(run)["cache_clear"] = vars(known)["cache_clear"]
     return run

@@ -162,9 +162,7 @@ def _one_of_equals(program: TimeProgram) -> TimeProgram:
 
 def for_programs(f: Callable, options: Callable | None = None) -> Callable[[Hashable], Callable]:
     """`f` compiled for a set of input programs; what was compiled for one is dropped, machine code included, when as many other sets were used since."""
-    for_none = compiled(f, options)
-    for_some = lru_cache(maxsize=16)(lambda programs: compiled(f, options))
-    return lambda programs: for_some(programs) if programs else for_none
+    return lru_cache(maxsize=16)(lambda programs: compiled(f, options))
 
 
 class Sampled(eqx.Module):

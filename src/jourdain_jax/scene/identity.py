@@ -44,6 +44,7 @@ def once_per_values(probe, of_traced: Callable | None = None):
                 _latest[:] = [known]
         return cached(known, *case)
 
+    vars(of)["cache_clear"] = cached.cache_clear
     return of
 
 
@@ -77,6 +78,8 @@ def _asked_about_before(leaves: list, treedef) -> Values | None:
             return known
     return None
 
+
+vars(_asked_about_before)["cache_clear"] = _latest.clear
 
 _STAND_IN: ContextVar[Scene | None] = ContextVar("stand_in", default=None)
 

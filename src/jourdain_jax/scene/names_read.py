@@ -14,6 +14,7 @@ import dis
 import enum
 import functools
 import re
+import sys
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import fields, is_dataclass
 from decimal import Decimal
@@ -34,7 +35,6 @@ from jourdain_jax.calculus.reals import is_traced
 _UNSET = object()
 _BASE = f"{__name__.rpartition('.')[0]}.scene"  # the module of the base class, below which nothing of a user's stands
 _VALUES = (bool, int, float, complex, str, bytes, type(None), type(...), range, Fraction, Decimal, re.Pattern, np.dtype)
-_epoch = 0  # of `clear_caches`
 
 
 class StatefulError(ValueError):
@@ -42,9 +42,16 @@ class StatefulError(ValueError):
 
 
 def clear_caches() -> None:
-    """Trace, probe and compile every scene anew when it is next used, after a change of what helpers, modules or classes hold. Clears JAX's caches, too."""
-    global _epoch
-    _epoch += 1
+    """Empty the caches of this package and of JAX, and free their memory.
+
+    Every scene is traced, probed and compiled anew when it is next used: call this after a change of what helpers, modules or classes hold. Machine code
+    stays, since it depends on the text of its program alone and may be running.
+    """
+    for name, module in list(sys.modules.items()):
+        if name.startswith("jourdain_jax.") and ".native" not in name:
+            for value in list(vars(module).values()):
+                if clear := getattr(value, "cache_clear", None):
+                    clear()
     jax.clear_caches()
 
 
@@ -113,7 +120,7 @@ class _Watch:
 
     def version(self) -> int:
         """The number of the present content."""
-        same = self._epoch == _epoch and all(len(members) == size for members, size in self._sizes)
+        same = all(len(members) == size for members, size in self._sizes)
         if not same or not all(all(map(is_, map(get, names, repeat(_UNSET)), before)) for get, names, before in self._before):
             self._look()
         return self._number
@@ -141,8 +148,8 @@ class _Watch:
                     for space, names in spaces(f):
                         found = noted(space.get, names)
                         content += [(n, told(x, n, where)) for n, x in zip(names, found, strict=True)]
-        self._number = self._numbers.setdefault((_epoch, *content), len(self._numbers))
-        self._epoch, self._before, self._sizes = _epoch, before, sizes  # last: what is refused now is refused at the next call, too
+        self._number = self._numbers.setdefault(tuple(content), len(self._numbers))
+        self._before, self._sizes = before, sizes  # last: what is refused now is refused at the next call, too
 
 
 @functools.lru_cache(maxsize=1024)
