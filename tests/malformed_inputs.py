@@ -1,6 +1,6 @@
 """Malformed input to every public entry point, as one table: what is written, the kind of answer, and the words it must contain.
 
-The expressions are evaluated in the namespace of `PRELUDE`, in a process without the run-time type checks of the other tests, as a user sees them
+The expressions are evaluated in the namespace of `PRELUDE`, without the run-time type checks of the other tests, as a user sees them
 (`test_malformed_inputs.py`). Kinds: the name of an exception; `exit N`, an exit code of the command line with its text; `result N`, a result code of a motion
 with its message; `FAILED`, a check of `verify` with its culprit.
 """

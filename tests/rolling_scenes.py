@@ -184,32 +184,6 @@ class RouthSphere(jj.Scene):
         return {"Jellett": (I * w) @ r, "Routh": w[2] * jnp.sqrt(I[0] * I[2] + self.mass * jnp.sum(I * r * r))}
 
 
-class DiscOnHill(jj.Scene):
-    """A disc on a hill in angles: x, y of the contact, and yaw, lean and spin from the tangent plane there."""
-
-    mass: object = jj.parameter(1.3)
-    radius: object = jj.parameter(0.1)
-
-    coordinates = jj.coordinates("x y yaw lean spin")
-    domain = {"x": (-0.4, 0.4), "y": (-0.4, 0.4), "lean": (-0.6, 0.6)}
-
-    def bodies(self, t, q):
-        land = jj.HeightMap(hill)
-        point = land.point_at(q.x, q.y)
-        frame = land.plane_at(point).axes @ jj.rot_z(q.yaw) @ jj.rot_x(q.lean)
-        return {
-            "body": jj.RigidBody.thin_disc(self.mass, self.radius, axis="y", position=point + self.radius * frame[:, 2], orientation=frame @ jj.rot_y(q.spin))
-        }
-
-    def loads(self, motion):
-        return (jj.gravity(motion, GRAVITY),)
-
-    def contacts(self, pose):
-        land = jj.HeightMap(hill)
-        point = land.point_at(pose.q.x, pose.q.y)
-        return {"rim": jj.Contact(pose["body"], point, ground=land)}
-
-
 class TyredBicycle(jj.models.WhippleBicycle):
     """The Whipple bicycle with tyres of circular section; x, y under the circle within the rear tyre."""
 

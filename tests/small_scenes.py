@@ -23,6 +23,15 @@ class OnPlane(jj.Scene):
         return {"mass": jj.Particle(getattr(self, "mass", 1.0), jnp.stack([q.x, q.y, 0.0 * q.x]))}
 
 
+class InSpace(jj.Scene):
+    """A mass in space."""
+
+    coordinates = jj.coordinates("x y z")
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(getattr(self, "mass", 1.0), jnp.stack([q.x, q.y, q.z]))}
+
+
 class Upright(jj.Scene):
     """A mass in the upright plane of x and z."""
 
@@ -125,14 +134,10 @@ class Goursat(jj.Scene):
         return {f"row {k}": u[k] - q[k + 1] * u[0] for k in range(1, 5)}
 
 
-class AffineRows(jj.Scene):
+class AffineRows(InSpace):
     """A particle with an integrable row that is not homogeneous, and one that differs from an integrable row by `strength`."""
 
     strength: jnp.ndarray = jj.parameter(0.0)
-    coordinates = jj.coordinates("x y z")
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(1.0, q.array)}
 
     def velocity_constraints(self, motion):
         q, u = motion.q, motion.u

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from small_scenes import InSpace
 
 import jourdain_jax as jj
 from jourdain_jax.models import ChaplyginSleigh, DoublePendulumRods, TiltingDisc
@@ -102,14 +103,10 @@ def test_a_function_that_takes_scenes_only_says_what_to_pass(disc):
 def crane() -> type[jj.Scene]:
     """A new class of a scene whose parameters decide which speed is best kept independent."""
 
-    class Crane(jj.Scene):
+    class Crane(InSpace):
         arm: float = jj.parameter(1.0)
         rope: float = jj.parameter(1.0)
-        coordinates = jj.coordinates("x y z")
         domain = dict.fromkeys("xyz", (-1.0, 1.0))
-
-        def bodies(self, t, q):
-            return {"load": jj.Particle(1.0, jnp.stack([q.x, q.y, q.z]))}
 
         def velocity_constraints(self, motion):
             q, u = motion.q, motion.u

@@ -1,8 +1,5 @@
 """Bodies that roll on planes, cylinders, spheres, surfaces and height maps; and what cannot be a contact, which is refused by name."""
 
-import re
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -273,17 +270,3 @@ def test_the_tangents_of_any_normal_are_a_right_handed_frame():
     assert np.allclose(np.swapaxes(axes, 1, 2) @ axes, np.eye(3), atol=1e-14)
     assert np.allclose(np.linalg.det(axes), 1.0)
     assert np.allclose(axes[:, :, 2], normals)
-
-
-def test_the_scenes_of_the_guide_to_contacts_roll_on_their_grounds():
-    text = (Path(__file__).parents[1] / "docs" / "contacts.md").read_text()
-    names = {"jj": jj, "jnp": jnp}
-    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
-        exec(block, names)
-    assert np.allclose([names["pushed"][name][-1] for name in ("plank", "x")], [0.65625, 0.1875], rtol=1e-9)
-    for scene, contact, values in ((names["Bowl"](), "bowl", {"x": 0.1, "y": -0.05}), (names["DiscOnHill"](), "rim", {"x": 0.1, "y": 0.2, "lean": 0.3})):
-        pose = jj.pose_at(scene, 0.0, scene.named(**values)[0])
-        found = scene.contacts(pose)[contact]
-        assert abs(float(found.gap())) <= 1e-15
-        assert np.isclose(np.linalg.norm(found.point - next(iter(pose.bodies.values())).position), {"bowl": 0.05, "rim": 0.1}[contact], rtol=1e-12)
-

@@ -3,18 +3,16 @@
 import importlib.util
 import json
 import re
-from pathlib import Path
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from pages import DOCS, ROOT, code_of, run
 
 import jourdain_jax as jj
 
-ROOT = Path(__file__).parents[1]
-DOCS = ROOT / "docs"
 PAGES = sorted(page for page in DOCS.rglob("*.md") if not {"_build", "pages", "notebooks"} & set(page.relative_to(DOCS).parts))
 SEARCHED = DOCS / "_build" / "html" / "searchindex.js"
 WRITTEN_BY_THE_BUILD = ("gallery/pages/", "tutorials/notebooks/", "notebooks/")
@@ -68,8 +66,7 @@ def anchors(text: str) -> set[str]:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(DOCS)))
 def test_code_fits_the_width_of_a_page(page):
-    blocks = re.findall(r"```(?:\{code-cell\} ipython3|python)[^\n]*\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-    assert [line for block in blocks for line in block.splitlines() if len(line) > 112] == []
+    assert [line for block in code_of(page) for line in block.splitlines() if len(line) > 112] == []
 
 
 def test_each_formula_of_the_theory_is_followed_by_the_functions_that_compute_it():
@@ -97,17 +94,10 @@ def test_files_that_the_theory_names_exist():
         assert (ROOT / "src" / "jourdain_jax" / name).exists(), name
 
 
-def run(page: str, **names) -> tuple[str, dict]:
-    """The text of a page, and the names that its cells leave."""
-    text = (DOCS / page).read_text(encoding="utf-8")
-    for code in re.findall(r"```(?:\{code-cell\} ipython3|python)[^\n]*\n(.*?)```", text, re.DOTALL):
-        exec(code, names)
-    return text, names
-
-
 @pytest.mark.slow
 def test_the_results_of_the_paper_hold_where_they_are_shown():
-    text, page = run("paper_by_example.md")
+    page = run(DOCS / "paper_by_example.md")
+    text = (DOCS / "paper_by_example.md").read_text(encoding="utf-8")
     assert [f"S{number}" for number in range(1, 13)] == re.findall(r"^## (S\d+)\.", text, re.M)
     assert_allclose(page["force"][:2] @ page["blade"], 0.0, atol=1e-12)
     assert_allclose(page["force"][:2] @ page["across"], page["solved"].multipliers[0], rtol=1e-12)
@@ -119,7 +109,8 @@ def test_the_results_of_the_paper_hold_where_they_are_shown():
 
 @pytest.mark.slow
 def test_large_scenes_have_as_many_operations_as_their_page_says():
-    text, page = run("howto/large_scenes.md", jj=jj, jnp=jnp, eqx=eqx)
+    page = run(DOCS / "howto" / "large_scenes.md", jj=jj, jnp=jnp, eqx=eqx)
+    text = (DOCS / "howto" / "large_scenes.md").read_text(encoding="utf-8")
     rows = [[cell.strip().replace(",", "") for cell in row.split("|")[1:-1]] for row in re.findall(r"^\| \d+ .*$", text, re.M)]
     assert [row[0] for row in rows] == ["4", "16", "32", "64", "200"]
     for row in rows[:2]:
@@ -130,7 +121,7 @@ def test_large_scenes_have_as_many_operations_as_their_page_says():
 
 @pytest.mark.slow
 def test_redundant_rows_are_as_their_page_says(capsys):
-    _, page = run("howto/redundant_rows.md")
+    page = run(DOCS / "howto" / "redundant_rows.md")
     assert page["two"].succeeded
     assert_allclose(page["three"].q, page["two"].q, atol=1e-12)
     assert not np.any(page["three"].constraint_forces().determined)
@@ -141,7 +132,7 @@ def test_redundant_rows_are_as_their_page_says(capsys):
 
 @pytest.mark.slow
 def test_the_code_of_the_page_on_inputs_runs():
-    _, page = run("howto/inputs.md")
+    page = run(DOCS / "howto" / "inputs.md")
     # the blow of 0.9 N s on 2 kg shows in the speed right after it
     shortly = jj.simulate(page["Cart"](gain=0.0), ts=jnp.array([0.0, 1.002]), inputs={"push": page["blow"]})
     assert_allclose(shortly["x_rate"][-1], 0.45, rtol=5e-3)
@@ -149,7 +140,7 @@ def test_the_code_of_the_page_on_inputs_runs():
 
 @pytest.mark.slow
 def test_the_code_of_the_page_on_events_runs(capsys):
-    _, page = run("howto/events.md")
+    page = run(DOCS / "howto" / "events.md")
     fall = np.sqrt(2 * 1.0 / 9.81)
     assert_allclose(page["motion"].t_end, fall, rtol=1e-9)
     assert_allclose(page["second"].t_end, fall * (1 + 2 * 0.8), rtol=1e-7)
@@ -158,7 +149,7 @@ def test_the_code_of_the_page_on_events_runs(capsys):
 
 @pytest.mark.slow
 def test_the_code_of_the_page_on_what_is_learned_runs():
-    _, page = run("howto/learned.md")
+    page = run(DOCS / "howto" / "learned.md")
     assert page["errors"][-1] < 0.3 * page["errors"][0]
 
 

@@ -1,10 +1,4 @@
-"""What does not depend on time is as right far from t = 0 as near it, in both loops and both precisions."""
-
-import json
-import os
-import pathlib
-import subprocess
-import sys
+"""What does not depend on time is as right far from t = 0 as near it, in both loops (and in single precision: `test_float32.py`)."""
 
 import diffrax
 import jax
@@ -87,25 +81,3 @@ def test_lanes_far_in_time_are_the_ones_at_zero():
     starts = {"x": np.array([1.0, 0.5])}
     near, far = (jj.rollout(Oscillator(), starts, t0=t0, ts=[t0 + 0.5, t0 + 1.0], progress=False) for t0 in (0.0, 1.7e9))
     assert_array_equal(far.lanes.q, near.lanes.q)
-
-
-PROGRAM = """
-import json, sys
-sys.path[:0] = {path!r}
-import jax, test_far_times as here
-assert not jax.config.jax_enable_x64
-print(json.dumps(here.in_single_precision()))
-"""
-
-
-def in_single_precision():
-    options = {"rtol": 1e-5, "atol": 1e-5}
-    return [jj.simulate(Oscillator(stiffness=100.0), t0=t0, ts=[t0 + 0.5, t0 + 1.0], **options).q[:, 0].tolist() for t0 in (0.0, 1e4)]
-
-
-def test_single_precision_far_in_time_is_as_right_as_at_zero():
-    program = PROGRAM.format(path=[str(pathlib.Path(__file__).parent), *sys.path])
-    environment = {**os.environ, "JAX_ENABLE_X64": "0"}
-    near, far = json.loads(subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True).stdout)
-    assert far == near
-    assert_allclose(far, np.cos([5.0, 10.0]), rtol=0, atol=1e-3)

@@ -14,7 +14,7 @@ import small_scenes
 from jax.flatten_util import ravel_pytree
 from linkages import Parallelogram, SliderCrank, Windows, bennett, bricard
 from numpy.testing import assert_allclose, assert_array_equal
-from small_scenes import DiscWithHeightRow
+from small_scenes import DiscWithHeightRow, InSpace
 
 import jourdain_jax as jj
 from jourdain_jax import structure_of
@@ -74,15 +74,10 @@ def test_values_that_no_state_has_are_refused_with_the_row(name, given, row):
         jj.start(SCENES[name], **given)
 
 
-class Hanging(jj.Scene):
+class Hanging(InSpace):
     """A pendulum in Cartesian coordinates, of which the lower half is stated as the domain."""
 
     domain = {"x": (-0.9, 0.9), "y": (-0.9, 0.9), "z": (-1.0, -0.1)}
-    coordinates = jj.coordinates("x y z")
-
-    def bodies(self, t, q):
-        return {"bob": jj.Particle(1.0, q.array)}
-
     def geometric_constraints(self, pose):
         return {"rod": pose.q.array @ pose.q.array - 1.0}
 
@@ -192,13 +187,8 @@ def test_starts_in_lanes_find_what_single_ones_find_and_have_derivatives():
     assert_allclose(jax.jit(jax.grad(lambda x: crank(x)[0]))(places[0]), expected[0], rtol=1e-7)
 
 
-class Hidden(jj.Scene):
+class Hidden(InSpace):
     """A particle held by a row that is a number in a small disc of its domain only."""
-
-    coordinates = jj.coordinates("x y z")
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(1.0, q.array)}
 
     def geometric_constraints(self, pose):
         x, y = pose.q.x - 0.3, pose.q.y - 0.2
@@ -221,16 +211,13 @@ def test_steady_motions_keep_the_coordinates_on_which_nothing_depends():
     assert (float(found["x"]), float(found["y"]), float(found["heading"])) == (5.0, 0.0, 0.7)
 
 
-class Bowl(jj.Scene):
+class Bowl(InSpace):
     """A particle in a round bowl, which rolls along grooves: a geometric row that the reference is on, and a row of speeds."""
 
     radius: jnp.ndarray = jj.parameter(1.2, positive=True)
     slope: jnp.ndarray = jj.parameter(0.4)
 
     coordinates = jj.coordinates("z y x")
-
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(1.0, jnp.stack([q.x, q.y, q.z]))}
 
     def geometric_constraints(self, pose):
         q = pose.q

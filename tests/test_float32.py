@@ -34,8 +34,10 @@ import jax, jax.numpy as jnp, numpy as np
 import jourdain_jax as jj
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.trajectories import results
+from jourdain_jax.native import host
 
 gc.disable()  # a process of a minute
+host.EFFORT = 0  # of LLVM, as in the other tests
 names, ts, slow = json.loads(input())
 
 
@@ -151,6 +153,8 @@ if slow:
     nowhere = {"steer": jnp.pi / 2, "steer_rate": 0.5, "y_rate": 0.5, "heading_rate": 0.3}  # at parallel rows with a sideways velocity
     ended = jj.simulate(board, nowhere, ts=jnp.array([0.0, 1.0]), rtol=1e-5, atol=1e-5)
     found["no motion continues"] = [int(ended.result), int(ended.accepted + ended.rejected)]
+    options = {"rtol": 1e-5, "atol": 1e-5}
+    found["far in time"] = [jj.simulate(Beside(), {"x": 1.0}, t0=t0, ts=[t0 + 0.5, t0 + 1.0], **options)["x"].tolist() for t0 in (0.0, 1e4)]
     found["verified"] = str(jj.verify(sleigh, jj.start(sleigh, **sleigh.example)))
 print(json.dumps(found))
 """
@@ -247,6 +251,11 @@ def test_increments_below_the_last_digit_of_a_state_add_up(single):
     # at 1e6 m a step of 4 ms at 1 m/s is less than half of the last digit, 1/16 m
     for far in single["far away"]:
         assert np.max(np.abs(np.array(far) - (1e6 + TS))) <= 1 / 16
+
+
+def test_single_precision_far_in_time_is_as_right_as_at_zero(single):
+    near, far = single["far in time"]
+    assert far == near
 
 
 def test_rows_that_depend_on_each_other_do_so_at_rounded_coordinates(single):

@@ -5,12 +5,12 @@ import inspect
 import re
 import sys
 import textwrap
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from pages import DOCS, run
 from tolerances import tolerance
 
 import jourdain_jax as jj
@@ -278,7 +278,7 @@ def test_without_sympy_the_error_says_how_to_get_it(monkeypatch):
 
 
 pytest.importorskip("sympy")
-PAGE = Path(__file__).parents[1] / "docs" / "howto" / "from_other_tools.md"
+PAGE = DOCS / "howto" / "from_other_tools.md"
 
 
 def test_the_code_of_the_page_runs(tmp_path, monkeypatch, capsys):
@@ -286,9 +286,7 @@ def test_the_code_of_the_page_runs(tmp_path, monkeypatch, capsys):
     for name, content in re.findall(r"```\{code-block\} xml\n:caption: (\S+)\n\n(.*?)```", text, re.DOTALL):
         (tmp_path / name).write_text(content, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    scope: dict = {}
-    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
-        exec(compile(block, str(PAGE), "exec"), scope)
+    scope = run(PAGE)
     printed = capsys.readouterr().out
     assert printed.count("reached the end of its span") == text.count("print(motion)")
     assert [scope[name]().coordinate_names.entries[0] for name in ("Disc", "Robot", "Arm")] == ["yaw", "x", "shoulder"]

@@ -139,14 +139,6 @@ def test_imports_point_down_the_layer_table():
     assert not found, "\n".join(found)
 
 
-def _write(root: Path, files: dict[str, str]) -> Path:
-    for name, text in files.items():
-        path = root / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    return root
-
-
 CLEAN = {
     "__init__.py": "from pk.scene import Scene\nfrom pk.motion.simulate import simulate\n",
     "calculus/rotations.py": "import numpy as np\nrot_z = np.eye\n",

@@ -118,7 +118,7 @@ def test_a_double_pendulum_has_its_normal_frequencies():
     small = linearize(pendulum, jj.start(pendulum))
     q, u, _ = pendulum.named()
     M = jj.unconstrained_equations(pendulum, 0.0, q, u).M
-    K = jax.hessian(lambda q: jj.potential_energy(pendulum, jj.motion_at(pendulum, 0.0, q, u)))(q)
+    K = jax.jit(jax.hessian(lambda q: jj.potential_energy(pendulum, jj.motion_at(pendulum, 0.0, q, u))))(q)
     squared = np.sort(np.linalg.eigvals(np.linalg.solve(M, K)).real)
     found = np.sort(np.asarray(small.eigenvalues().imag) ** 2)
     assert relative_error(found, np.repeat(squared, 2)) < tolerance("round_off")
@@ -507,8 +507,8 @@ def test_critical_speeds_have_derivatives_by_all_parameters(bicycle, straight):
 
 
 def test_a_batch_says_which_bicycles_have_no_such_speed(bicycle, straight):
-    trails = jnp.array([0.02, 0.08, 0.3, -0.5, jnp.nan])
-    found = jax.vmap(lambda c: jj.critical(bicycle.replace(c=c), straight, "capsize"))(trails)
+    trails = np.array([0.02, 0.08, 0.3, -0.5, np.nan])
+    found = jax.jit(jax.vmap(lambda c: jj.critical(bicycle.replace(c=c), straight, "capsize")))(trails)
     for k, c in enumerate(trails):
         linear = stability_speeds(*linear_matrices({name: c if name == "c" else getattr(bicycle, name) for name in PARAMETER_NAMES}))
         assert (found.code[k] == 0) == bool(jnp.isfinite(linear.capsize_speed))
@@ -539,9 +539,9 @@ def test_critical_points_along_a_parameter_have_derivatives_of_both_orders():
     curve = jj.family(Fluttering(), {"x": 0.2}, vary="gain", until={"gain": 3.0})
     critical = lambda drag, stiffness: jj.critical(Fluttering(drag=drag, stiffness=stiffness), curve, "pair on the imaginary axis")  # noqa: E731
     assert float(critical(1.5, 5.0)["gain"]) == pytest.approx(1.5, rel=1e-12)
-    assert_allclose(jax.grad(lambda x: critical(*x)["gain"])(jnp.array([1.5, 5.0])), [1.0, 0.0], atol=1e-11)
-    of_stiffness = jax.hessian(lambda k: critical(1.5, k).eigenvalue.imag)(5.0)
-    assert float(of_stiffness) == pytest.approx(float(jax.hessian(frequency)(5.0)), rel=1e-9)
+    assert_allclose(jax.jit(jax.grad(lambda x: critical(*x)["gain"]))(jnp.array([1.5, 5.0])), [1.0, 0.0], atol=1e-11)
+    of_stiffness = jax.jit(jax.hessian(lambda k: critical(1.5, k).eigenvalue.imag))(5.0)
+    assert float(of_stiffness) == pytest.approx(float(jax.jit(jax.hessian(frequency))(5.0)), rel=1e-9)
 
 
 def test_points_that_meet_are_no_functions_of_parameters():

@@ -71,6 +71,7 @@ def a_ball_on_a_turntable_is_given_the_power_of_its_contact():
     scene, program = program_of("ball-on-turntable")
     t, q, u = (np.asarray(x) for x in jj.sample_states(scene, 3))
 
+    @jax.jit
     def dense(t, q, u):
         return power(scene, jj.motion_at(scene, t, q, u), jj.accelerations(scene, t, q, u)).total
 
@@ -448,7 +449,7 @@ def test_a_derivative_is_no_number_where_memory_does_not_hold_the_motion(monkeyp
     monkeypatch.setattr(recorded_adjoint, "_MEMORY", (2**27, 0))
     for windows, held in ((1, False), (40, True)):
         monkeypatch.setattr(recorded_adjoint, "_FEWEST", (16, windows))
-        found, _ = jax.grad(weighed("reverse", "saved times"), has_aux=True)(arguments("saved times"))
+        found, _ = jax.jit(jax.grad(weighed("reverse", "saved times"), has_aux=True))(arguments("saved times"))
         assert bool(np.isfinite(found["k"])) == held
 
 

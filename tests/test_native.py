@@ -90,13 +90,13 @@ def test_a_lane_does_not_depend_on_its_company(solver):
 @pytest.mark.parametrize("changed", [{"EFFORT": 2}, *({"threads": lambda count=count: count} for count in (1, 2, 5))], ids=["effort", "1", "2", "5"])
 def test_no_bit_depends_on_the_effort_spent_on_machine_code_or_the_number_of_threads(solver, changed, monkeypatch):
     """Of effort, what `conftest.py` takes for granted: tests run code made with little, users run code made with more."""
-    leans = jnp.tile(LEAN, 13)
-    expected = jax.vmap(lambda lean: ended(lean, solver))(leans)
+    leans, lanes = jnp.tile(LEAN, 13), jax.jit(jax.vmap(lambda lean: ended(lean, solver)))
+    expected = lanes(leans)
     ((name, value),) = changed.items()
     monkeypatch.setattr(host, name, value)
     kernels.kernel.cache_clear()
     jax.clear_caches()
-    for found, usual in zip(jax.vmap(lambda lean: ended(lean, solver))(leans), expected, strict=True):
+    for found, usual in zip(lanes(leans), expected, strict=True):
         assert_array_equal(found, usual)
     assert kernels.kernel.cache_info().currsize > 0
 

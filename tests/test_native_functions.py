@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import result_codes as results
 from numpy.testing import assert_allclose, assert_array_equal
+from small_scenes import OnPlane
 
 import jourdain_jax as jj
 
@@ -18,15 +19,12 @@ TIGHT = {"rtol": 1e-11, "atol": 1e-11, "work": False}
 both_modes = pytest.mark.parametrize("derivative", [jax.jacrev, jax.jacfwd])
 
 
-class Pushed(jj.Scene):
+class Pushed(OnPlane):
     """x'' = force - k x, and beside it y'' = aside; it stops where x has come to the wall, which the force moves."""
 
     k: float = jj.parameter(4.0)
     wall: float = jj.parameter(9.0)
-    coordinates, inputs = jj.coordinates("x y"), jj.inputs("force aside")
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(1.0, jnp.stack([q.x, q.y, 0 * q.x]))}
+    inputs = jj.inputs("force aside")
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=motion.inputs.force - self.k * motion.q.x, y_rate=motion.inputs.aside),)
@@ -56,7 +54,7 @@ def test_motions_and_derivatives_are_those_of_the_closed_form(derivative):
     assert found.reduction.endswith("machine code")
     assert_allclose(found["x"], position(TS, **X0), rtol=0, atol=1e-9)
     slopes = jax.jit(lambda x: derivative(lambda x: motion(**x)["x"])(x))(X0)
-    for name, expected in jax.jacfwd(lambda x: position(TS, **x))(X0).items():
+    for name, expected in jax.jit(jax.jacfwd(lambda x: position(TS, **x)))(X0).items():
         assert_allclose(slopes[name], expected, rtol=0, atol=1e-8, err_msg=name)
 
 

@@ -189,9 +189,8 @@ def saved_by_closed_form(x):
 
 def end_by_closed_form(x):
     """A number made of the time and the speed at which the bead comes down to the level."""
-    t = 1.125
-    for _ in range(6):  # steps of Newton's method: the last two have the first two derivatives of the root
-        t = t - (pushed_position(t, **x) + 0.1) / jax.grad(pushed_position)(t, **x)
+    step = lambda _, t: t - (pushed_position(t, **x) + 0.1) / jax.grad(pushed_position)(t, **x)  # noqa: E731
+    t = jax.lax.fori_loop(0, 6, step, 1.125)  # steps of Newton's method: the last two have the first two derivatives of the root
     return t + 0.3 * jax.grad(pushed_position)(t, **x)
 
 

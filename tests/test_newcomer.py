@@ -1,125 +1,82 @@
 """Four scenes as someone writes them who has read nothing but the pages of the site; and the slips that cost this reader time."""
 
 import re
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from pages import DOCS, code_of, run
 
 import jourdain_jax as jj
 
 G = 9.81
 
 
-class RobotWithTrailer(jj.Scene):
-    """A robot with two driven wheels that pulls a trailer."""
-
-    radius: object = jj.parameter(0.08, unit="m", positive=True)
-    half_track: object = jj.parameter(0.15, unit="m", positive=True)
-    hitch: object = jj.parameter(0.12, unit="m", positive=True)
-    bar: object = jj.parameter(0.5, unit="m", positive=True)
-
-    coordinates = jj.coordinates("x y heading left right angle")
-    inputs = jj.inputs("left_torque right_torque")
-    domain = {"angle": (-1.5, 1.5)}
-    carried = ("robot", "left wheel", "right wheel")
-
-    def bodies(self, t, q):
-        R, Rt = jj.rot_z(q.heading), jj.rot_z(q.heading + q.angle)
-        centre = jnp.stack([q.x, q.y, self.radius])
-        trailer = centre - self.hitch * R[:, 0] - self.bar * Rt[:, 0]
-        made = {
-            "robot": jj.RigidBody.box(5.0, (0.3, 0.2, 0.1), position=centre, orientation=R),
-            "trailer": jj.RigidBody.box(3.0, (0.3, 0.2, 0.1), position=trailer, orientation=Rt),
-        }
-        for side, sign in (("left", 1.0), ("right", -1.0)):
-            place = centre + sign * self.half_track * R[:, 1]
-            made[f"{side} wheel"] = jj.RigidBody.thin_disc(0.3, self.radius, axis="y", position=place, orientation=R @ jj.rot_y(q[side]))
-        return made
-
-    def contacts(self, pose):
-        return {side: jj.disc_contact(pose[f"{side} wheel"], self.radius, carried=self.carried) for side in ("left", "right")}
-
-    def velocity_constraints(self, motion):
-        trailer = motion["trailer"]
-        return {"trailer wheels": jj.knife_edge(trailer, trailer.position, trailer.orientation[:, 1])}
-
-    def loads(self, motion):
-        axle = motion["robot"].orientation[:, 1]
-        left, right = motion.inputs.left_torque, motion.inputs.right_torque
-        motors = [jj.torque(motion, f"{side} wheel", value * axle, reaction="robot") for side, value in (("left", left), ("right", right))]
-        return jj.gravity(motion, G), *motors
+PAGE = DOCS / "contacts.md"
 
 
-class Bowl(jj.Scene):
-    """The page on contacts: a ball in a bowl; without a `domain`, as who has not read on writes it."""
-
-    coordinates = jj.coordinates("x y", jj.quaternion("attitude"))
-
-    def bodies(self, t, q):
-        z = 0.4 - jnp.sqrt(0.35**2 - q.x**2 - q.y**2)
-        centre, turned = jnp.stack([q.x, q.y, z]), jj.quaternion_to_matrix(q.attitude)
-        return {"ball": jj.RigidBody.ball(0.7, 0.05, position=centre, orientation=turned)}
-
-    def loads(self, motion):
-        return (jj.gravity(motion, G),)
-
-    def contacts(self, pose):
-        return {"bowl": jj.ball_contact(pose["ball"], 0.05, ground=jj.Sphere(0.4, side="inside", origin=(0.0, 0.0, 0.4)))}
+@pytest.fixture(scope="module")
+def page():
+    """The scenes and motions of the page on contacts."""
+    return run(PAGE)
 
 
-class BowlInItsDomain(Bowl):
-    """The ball in a bowl with the domain that the page states."""
+def bowl_without_domain():
+    """The page's ball in a bowl without a `domain`, as who has not read on writes it; of a class of its own: where a class has started once is remembered."""
+    exec(code_of(PAGE)[0], names := {})
 
-    domain = {"x": (-0.15, 0.15), "y": (-0.15, 0.15)}
+    class Bowl(names["Bowl"]):
+        domain = {}
+
+    return Bowl()
 
 
-def test_code_on_the_page_about_contacts_runs():
-    page = (Path(__file__).parents[1] / "docs" / "contacts.md").read_text(encoding="utf-8")
-    made = {"jj": jj, "jnp": jnp}
-    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
-        exec(code, made)
-    scenes = {name: kind for name, kind in made.items() if isinstance(kind, type)}
+def test_code_on_the_page_about_contacts_runs(page):
+    scenes = {name: kind for name, kind in page.items() if isinstance(kind, type)}
     freedoms = {name: jj.build(kind()).freedoms.count for name, kind in scenes.items()}
-    assert freedoms == {"Bowl": 3, "RobotWithTrailer": 2, "DiscOnHill": 3}
-    assert made["motion"].q_end[2] > 0  # the right wheel is driven harder: it turns to the left
+    assert freedoms == {"Bowl": 3, "BallOnPlank": 3, "RobotWithTrailer": 2, "DiscOnHill": 3}
+    assert page["motion"].q_end[2] > 0  # the right wheel is driven harder: it turns to the left
+    assert_allclose([page["pushed"][name][-1] for name in ("plank", "x")], [0.65625, 0.1875], rtol=1e-9)
+    for name, contact, radius, values in (("Bowl", "bowl", 0.05, {"x": 0.1, "y": -0.05}), ("DiscOnHill", "rim", 0.1, {"x": 0.1, "y": 0.2, "lean": 0.3})):
+        scene = scenes[name]()
+        pose = jj.pose_at(scene, 0.0, scene.named(**values)[0])
+        found = scene.contacts(pose)[contact]
+        assert abs(float(found.gap())) <= 1e-15
+        assert_allclose(np.linalg.norm(found.point - next(iter(pose.bodies.values())).position), radius, rtol=1e-12)
 
 
-def test_a_trailer_that_is_carried_by_the_robot_lifts_a_wheel_and_the_summary_says_what_to_do():
-    class Whole(RobotWithTrailer):
-        carried = None
+def test_a_trailer_that_is_carried_by_the_robot_lifts_a_wheel_and_the_summary_says_what_to_do(page):
+    class Whole(page["RobotWithTrailer"]):
+        def contacts(self, pose):
+            return {side: jj.disc_contact(pose[side], self.radius) for side in ("left", "right")}
 
     asked = {"start": {"left_rate": 2.0, "right_rate": 3.0, "angle": 1.2}, "t1": 0.1, "ts": jnp.linspace(0.0, 0.1, 3)}
-    lifted, right = (str(jj.simulate(kind(), **asked)) for kind in (Whole, RobotWithTrailer))
+    lifted, right = (str(jj.simulate(kind(), **asked)) for kind in (Whole, page["RobotWithTrailer"]))
     assert "WOULD HAVE TO PULL" in lifted
     assert "name those that it does in `carried=`" in lifted
     assert "PULL" not in right
     assert "carried" not in right
 
 
-def test_a_ball_swings_in_a_bowl_as_fast_as_the_page_says():
-    swings = np.sort(np.abs(jj.linearize(BowlInItsDomain(), {}).state_eigenvalues().imag))[-4:]
+def test_a_ball_swings_in_a_bowl_as_fast_as_the_page_says(page):
+    swings = np.sort(np.abs(jj.linearize(page["Bowl"](), {}).state_eigenvalues().imag))[-4:]
     assert_allclose(swings, np.sqrt(5 * G / (7 * 0.35)), rtol=1e-9)
-
-
-class Fresh(Bowl):
-    """Of a class of its own: where a class has started once is remembered."""
 
 
 def test_a_scene_that_is_a_number_in_a_small_part_of_space_asks_for_a_domain():
     with pytest.raises(ValueError, match=r"the rows of `Bowl` are numbers at none of .*`x` from -3.2 to 3.2.* state a `domain`"):
-        jj.build(Bowl())
+        jj.build(bowl_without_domain())
     with pytest.raises(ValueError, match=r"the rows of `Bowl` are numbers at none of .* state a `domain`"):
-        jj.sample_states(Bowl(), 4)
+        jj.sample_states(bowl_without_domain(), 4)
 
 
-def test_a_scene_without_a_domain_starts_where_it_is_told():
+def test_a_scene_without_a_domain_starts_where_it_is_told(page):
+    scene = bowl_without_domain()
     start = {"x": 0.12, "attitude_omega_x": -8.0, "attitude_omega_y": 0.5, "attitude_omega_z": 0.0}
-    told, stated = (jj.simulate(kind(), start, ts=jnp.array([0.0, 1.0])) for kind in (Fresh, BowlInItsDomain))
+    told, stated = (jj.simulate(own, start, ts=jnp.array([0.0, 1.0])) for own in (scene, page["Bowl"]()))
     assert_allclose(told.q_end, stated.q_end, atol=1e-8)
-    _, q, u = jj.sample_states(Fresh(), 4)
+    _, q, u = jj.sample_states(scene, 4)
     assert np.all(np.isfinite(u))
     assert np.all(q[:, 0] ** 2 + q[:, 1] ** 2 < 0.35**2)
 

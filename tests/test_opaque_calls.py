@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from small_scenes import OnLine
 
 import jourdain_jax as jj
 from jourdain_jax.build.trace import event_values
@@ -236,11 +237,8 @@ def test_a_part_of_a_pose_is_a_call_whose_derivatives_are_those_of_jax(scene, re
         jax.tree.map(lambda a, b: assert_allclose(a, b, rtol=1e-11, atol=1e-12), found, expected)
 
 
-class Effective(OnCam):
+class Effective(OnLine):
     """A load that prints."""
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
 
     def loads(self, motion):
         jax.debug.callback(lambda x: None, motion.q.x)

@@ -163,12 +163,6 @@ def test_steps_without_control_are_taken_as_they_are():
     assert int(motion.result) == results.SUCCESS
 
 
-def test_the_derivative_of_a_motion_is_what_it_was_without_the_check():
-    """x = a cos(w t), dx/dk = -a t sin(w t)/(2 w)."""
-    slope = jax.grad(lambda k: jj.simulate(Spring(k), {"x": 0.3}, ts=[2.0], rtol=1e-11, atol=1e-11).q_end[0])(4.0)
-    assert_allclose(slope, -0.3 * 2.0 * np.sin(4.0) / 4.0, rtol=1e-8)
-
-
 # Speeds of a scene's own in which rates of coordinates become infinite: motions that come there end with a code.
 
 

@@ -3,8 +3,6 @@
 A cart with a spring and a damper is linear, so that its readings are sums of exponentials, also through a delay and a low-pass.
 """
 
-import re
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -419,9 +417,7 @@ def test_log_likelihood_knows_sensors_and_is_differentiable_in_them():
 
 def test_the_page_on_identification_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # it writes a report
-    page = (Path(__file__).parents[1] / "docs" / "howto" / "identification.md").read_text(encoding="utf-8")
-    names = {"jj": jj, "jnp": jnp, "np": np}
-    exec("\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL)), names)
+    names = run(DOCS / "howto" / "identification.md", jj=jj, jnp=jnp, np=np)
     found = names["found"]
     assert found.converged
     for name, value in (("gyro.gain", 1.1), ("gyro.delay", 0.05), ("run 0: gyro.bias", 0.02), ("offset", 0.25)):

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import pytest
-from small_scenes import BeadOnTurningWire, DiscWithHeightRow, DrivenPendulum, OnLine
+from small_scenes import BeadOnTurningWire, DiscWithHeightRow, DrivenPendulum, OnLine, OnPlane
 
 import jourdain_jax as jj
 from jourdain_jax import Verification
@@ -171,15 +171,11 @@ def test_the_result_for_machines_has_no_numbers_that_json_lacks():
     assert any(check["value"] is None for check in found.as_dict()["checks"])
 
 
-class TwoBlades(jj.Scene):
+class TwoBlades(OnPlane):
     """A particle held twice along the same line: the rows are dependent as long as the slopes are equal."""
 
     slopes: object = jj.parameter((0.5, 0.5))
     mass: object = jj.parameter(1.0)
-    coordinates = jj.coordinates("x y")
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, q.y, 0.0 * q.x]))}
 
     def velocity_constraints(self, motion):
         return {"blades": motion.u.y_rate - self.slopes * motion.u.x_rate}

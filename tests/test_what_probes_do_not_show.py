@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from small_scenes import OnPlane
+from small_scenes import InSpace, OnPlane
 
 import jourdain_jax as jj
 
@@ -85,19 +85,15 @@ def test_a_force_that_sets_in_later_acts_and_one_program_serves_all_parameters()
     assert_allclose(lanes.q_end[:, 0], [1.0, np.cos(2.0)], atol=1e-7)
 
 
-class Ground(jj.Scene):
+class Ground(InSpace):
     """A particle on ground that is flat, or has a bump far away, or a slope."""
 
-    coordinates = jj.coordinates("x y z")
     bump: object = jj.parameter(0.0)
     slope: object = jj.parameter(0.0)
     with_bump: bool = eqx.field(static=True, default=False)
 
-    def bodies(self, t, q):
-        return {"particle": jj.Particle(1.0, jnp.stack([q.x, q.y, q.z]))}
-
     def geometric_constraints(self, pose):
-        x, _, z = pose["particle"].position
+        x, _, z = pose["mass"].position
         return {"ground": z - self.slope * x - (self.bump * jnp.exp(-((x - 6.0) ** 2)) if self.with_bump else 0.0)}
 
 

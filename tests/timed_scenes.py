@@ -1,7 +1,7 @@
 """Small scenes in which something depends on time by itself, each with the closed form of the work that time does."""
 
 import jax.numpy as jnp
-from small_scenes import Upright
+from small_scenes import OnLine, Upright
 
 import jourdain_jax as jj
 
@@ -10,14 +10,10 @@ def along_x(x):
     return jnp.stack([x, 0.0 * x, 0.0 * x])
 
 
-class Bead(jj.Scene):
+class Bead(OnLine):
     """A free bead on a line."""
 
     mass: jnp.ndarray = jj.parameter(2.0, unit="kg", positive=True)
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(self.mass, along_x(q.x))}
 
 
 class GrowingField(Bead):
@@ -41,7 +37,7 @@ class ShakenAnchor(Bead):
 
     def loads(self, motion):
         anchor = jj.fixed_point(along_x(self.amplitude * jnp.sin(self.rate * motion.t)))
-        return (jj.spring(motion["bead"].point(), anchor, self.stiffness),)
+        return (jj.spring(motion["mass"].point(), anchor, self.stiffness),)
 
     def work(self, t):
         a, W, w = self.amplitude, self.rate, jnp.sqrt(self.stiffness / self.mass)
@@ -91,7 +87,7 @@ class LosingMass(Bead):
     example = {"x_rate": 1.5}
 
     def bodies(self, t, q):
-        return {"bead": jj.Particle(self.mass * jnp.exp(-self.loss * t), along_x(q.x))}
+        return {"mass": jj.Particle(self.mass * jnp.exp(-self.loss * t), along_x(q.x))}
 
     def work(self, t):
         return 0.5 * self.mass * 1.5**2 * (jnp.exp(-self.loss * t) - 1)
@@ -121,7 +117,7 @@ class Towed(Bead):
     inputs = jj.inputs("speed")
 
     def loads(self, motion):
-        return (jj.spring(motion["bead"].point(), jj.fixed_point((0.0, 0.0, 0.0)), self.stiffness),)
+        return (jj.spring(motion["mass"].point(), jj.fixed_point((0.0, 0.0, 0.0)), self.stiffness),)
 
     def velocity_constraints(self, motion):
         return {"tow": motion.u.x_rate - motion.inputs.speed}

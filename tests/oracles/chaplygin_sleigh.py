@@ -48,8 +48,3 @@ def motion(t, *, x0=0.0, y0=0.0, **parameters) -> dict[str, np.ndarray]:
     blade_y = y0 - a * np.sin(th0) + component(np.sin)
     x, y = blade_x + a * np.cos(result["th"]), blade_y + a * np.sin(result["th"])
     return {**result, "x": x, "y": y, "blade_x": blade_x, "blade_y": blade_y}
-
-
-def total_turn(*, mass, inertia, a, **_) -> float:
-    """Change of heading from t = -infinity to infinity: pi k / a."""
-    return float(np.pi * np.sqrt(inertia / mass + a**2) / a)
