@@ -119,18 +119,11 @@ def test_operands_are_compared_relative_to_their_size():
     assert_allclose(*ends(Small(), {"x": 1.0}), atol=1e-8)
 
 
-class Called(OnPlane):
-    """A callback that takes one state at a time."""
-
-    def loads(self, motion):
-        force = jax.pure_callback(lambda x: np.asarray(-np.sin(x)), jax.ShapeDtypeStruct((), motion.q.x.dtype), motion.q.x)
-        return (jj.generalized_force(motion, x_rate=force),)
-
-
 def test_a_callback_that_knows_no_batches_runs_alone_and_is_refused_by_name_in_batches():
-    assert_allclose(*ends(Called(), {"x": 1.0}, formulation=jj.Formulation(stabilisation=None)), atol=1e-7)
+    called = Pushed(lambda motion, _: jax.pure_callback(lambda x: np.asarray(-np.sin(x)), jax.ShapeDtypeStruct((), motion.q.x.dtype), motion.q.x))
+    assert_allclose(*ends(called, {"x": 1.0}, formulation=jj.Formulation(stabilisation=None)), atol=1e-7)
     with pytest.raises(NotImplementedError, match="vmap"):
-        jj.rollout(Called(), {"x": jnp.array([1.0, 1.1])}, t1=0.1)
+        jj.rollout(called, {"x": jnp.array([1.0, 1.1])}, t1=0.1)
 
 
 class Sorted(OnPlane):
@@ -149,19 +142,10 @@ def test_every_call_says_why_it_is_one():
     assert ";  has" not in jj.report(Sorted()).lowering
 
 
-class Oscillator(OnPlane):
-    """A spring."""
-
-    stiffness: object = jj.parameter(1.0)
-
-    def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=-self.stiffness * motion.q.x),)
-
-
 def test_a_start_that_hardly_depends_on_a_parameter_gives_no_warning(recwarn):
     def end(k):
         options = {"t1": 3.0, "rtol": 1e-8, "atol": 1e-8}
-        return jj.simulate(Oscillator(stiffness=k), {"x": 1.0 + 1e-6 * k}, **options).q_end[0]
+        return jj.simulate(Pushed(PUSHES["tiny by its parameter"], size=k), {"x": 1.0 + 1e-6 * k}, **options).q_end[0]
 
     slope = jax.jvp(end, (1.0,), (1.0,))[1]
     assert slope == pytest.approx(-1.5 * np.sin(3.0) + 1e-6 * np.cos(3.0) - 1.5e-6 * np.sin(3.0), rel=1e-6)
