@@ -19,19 +19,20 @@ from jaxtyping import Array, Complex, Float
 
 from jourdain_jax.analysis.families.critical import Sensitivities, sensitivities
 from jourdain_jax.analysis.families.spectrum import mode_names
+from jourdain_jax.analysis.instant import ByMatrices, instant_of, places_of
 from jourdain_jax.analysis.table import linearization_text
 from jourdain_jax.analysis.tangent import (
-    Flow,
-    Programs,
+    block_diagonal,
     carried_along,
     dependent_coordinates,
     eliminated,
-    flow_of,
+    inverse,
+    numeric,
     others,
     perturbations,
+    perturbed_names,
     privileged_at,
     privileged_speeds,
-    programs_of,
 )
 from jourdain_jax.build.structure import WELL_CONDITIONED
 from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
@@ -47,8 +48,7 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines, users_level
 
-_compiled = partial(compiled, options=RUN_SELDOM)  # of a bicycle in 2.3 s of processor time, not in 11.4; run as quickly
-
+_compiled = partial(compiled, options=RUN_SELDOM)
 
 class Modes(eqx.Module):
     """Free small motions `p(t) = shape exp(s t)`, one column per mode; the largest entry of a shape is 1."""
@@ -166,14 +166,14 @@ def linearize(
     f = f.astype(state.q.dtype)
     _warn_of_loads(scene, state, f)
     coordinates = None if coordinates is None else as_names(coordinates)
+    dependent = None if dependent is None else as_names(dependent)
     y = privileged_speeds(scene, privileged)
-    dependent_s = dependent_coordinates(scene, state, coordinates or (), None if dependent is None else as_names(dependent))
-    found = _linearize(scene, programs_of(built, y), state, f, y, tuple(dependent_s.tolist()), coordinates)
+    found = _about(instant_of(built, y, masses=True), scene, state, f, y, dependent, coordinates)
     if is_traced(found) or not found.pivot < WELL_CONDITIONED:
         return found
     if privileged is None and scene.privileged is None:
         chosen = privileged_at(scene, state, f, y)
-        found = found if chosen == y else _linearize(scene, None, state, f, chosen, tuple(dependent_s.tolist()), coordinates)
+        found = found if chosen == y else _about(ByMatrices(chosen), scene, state, f, chosen, dependent, coordinates)
     if found.pivot < SMALLEST_PIVOT:
         raise ValueError(
             f"the dependent speeds or coordinates of `{type(scene).__name__}` do not follow from its rows at this state (pivot {float(found.pivot):.1e}): "
@@ -192,80 +192,70 @@ def _warn_of_loads(scene: Scene, state: State, f) -> None:
         warnings.warn(text, SensitivityWarning, stacklevel=users_level())
 
 
-@_compiled
-def _linearize(
-    scene: Scene, programs: Programs | None, state: State, f, y: tuple[int, ...], dependent: tuple[int, ...], coordinates: tuple[str, ...] | None
-) -> Linearization:
-    perturbed = perturbations(scene, state.q)
-    dependent_s = np.array(dependent, int)
-    independent = tuple(perturbed.names[i] for i in others(dependent_s, len(perturbed.names)))
+def _about(instant, scene: Scene, state: State, f, y: tuple[int, ...], dependent: tuple[str, ...] | None, coordinates: tuple[str, ...] | None) -> Linearization:
+    v, D, mass = instant(scene, state.t, state.q, state.u, f)
+    at, names = places_of(scene), perturbed_names(scene)
+    q, known = state.q, not is_traced((D, state))
+    if known:
+        q, v, D, mass = map(np.asarray, (q, v, D, mass))
+    G = D[np.ix_(at.geometric, at.q)] if known and np.all(np.isfinite(D)) else None
+    following = [names[i] for i in dependent_coordinates(scene, state, coordinates or (), dependent, G)]
+    independent = tuple(name for name in names if name not in following)
+    speeds = tuple(scene.speed_names.entries[i] for i in y)
     if coordinates is None:
         coordinates = tuple(name for name in independent if _own_rate(scene, name) in y)
+    matrices = _matrices(scene, q, v, D, mass, independent, y, coordinates)
+    states, inputs = (*independent, *speeds), scene.inputs.entries
+    return Linearization(**matrices, states=states, inputs=inputs, coordinates=coordinates, about=(scene, state, f))
 
-    # the flow's derivative along every perturbation (ds, du, df) and, last, along the motion itself
-    now, slope, mass_matrix = jax.linearize(flow_of(scene, y, programs), state.t, state.q, state.u, f, has_aux=True)
-    counts = len(perturbed.names), state.u.shape[0], f.shape[0]
-    s, u, _ = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
-    ds, du, df = jnp.split(jnp.eye(sum(counts), dtype=f.dtype), np.cumsum(counts)[:-1])
-    dq, motion = perturbed.E @ ds, (jnp.ones_like(state.t), now.qdot, now.udot, jnp.zeros_like(f))
-    directions = [jnp.column_stack([d, m]) for d, m in zip((0 * dq[:1], dq, du, df), motion, strict=True)]
-    slopes = jax.vmap(lambda dt, *d: slope(dt[0], *d), in_axes=1, out_axes=1)(*directions)
-    along: Flow = jax.tree.map(lambda x: x[:, :-1], slopes)
-    change = slopes.udot[np.array(y, int), -1]
 
-    # all perturbations from the independent ones: first ds, then du
-    T, pivot_s = eliminated(along.g[:, s], dependent_s)
-    T = jax.scipy.linalg.block_diag(T, jnp.eye(counts[1] + counts[2], dtype=f.dtype))
-    dependent_u = T.shape[1] - counts[1] - counts[2] + others(y, counts[1])
-    U, pivot_u = eliminated(along.phi @ T, dependent_u)
+def _matrices(scene: Scene, q, v, D, mass, independent: tuple[str, ...], y: tuple[int, ...], coordinates: tuple[str, ...]) -> dict:
+    """What `Linearization` holds."""
+    at, names, xp, chosen = places_of(scene), perturbed_names(scene), numeric((q, D)), np.array(y, int)
+    kept, (count, m) = np.array([names.index(name) for name in independent], int), (len(names), len(at.u))
+    (E, back), constant = perturbations(scene, q), at.udot[chosen]
+    change = D[constant] @ xp.concatenate([np.ones(1), v[at.qdot], v[at.udot], np.zeros(len(at.f))])
+
+    # slopes along every perturbation (ds, du, df); all perturbations from the independent ones: first ds, then du
+    along = xp.concatenate([D[:, at.q] @ E, D[:, at.u], D[:, at.f]], axis=1)
+    T, pivot_s = eliminated(along[at.geometric, :count], others(kept, count))
+    T = block_diagonal([T, np.eye(m + len(at.f))])
+    U, pivot_u = eliminated(along[at.phi] @ T, len(kept) + others(chosen, m))
     T = T @ U
 
     # rows of A and B: rates of the independent ds in axes that go with the motion, and of the privileged speeds
-    read = perturbed.D[others(dependent_s, counts[0])]
-    drag = carried_along(scene, state.q, now.qdot) @ dq
-    rates = jnp.concatenate([read @ (along.qdot - drag), along.udot[np.array(y, int)]]) @ T
-    n = rates.shape[0]
-    A, B, Z = rates[:, :n], rates[:, n:], T[u][:, len(independent) : n]
-    M, C, K, F, coupling = _second_order(scene, A, B, Z.T @ mass_matrix @ Z, independent, y, coordinates)
-    acceleration = jnp.max(jnp.abs(now.udot[np.array(y, int)]), initial=0.0)
-    return Linearization(
-        A=A,
-        B=B,
-        M=M,
-        C=C,
-        K=K,
-        F=F,
-        acceleration=acceleration,
-        residual=jnp.maximum(acceleration, jnp.max(jnp.abs(change), initial=0.0)),
-        coupling=coupling,
-        pivot=jnp.minimum(pivot_s, pivot_u),
-        states=(*independent, *(scene.speed_names.entries[i] for i in y)),
-        inputs=scene.inputs.entries,
-        coordinates=coordinates,
-        about=(scene, state, f),
-    )
+    drag = carried_along(scene, q, v[at.qdot]) @ E @ T[:count]
+    rates = xp.concatenate([back[kept] @ (along[at.qdot] @ T - drag), along[constant] @ T])
+    n = len(kept) + len(y)
+    A, B, Z = rates[:, :n], rates[:, n:], T[count : count + m, len(kept) : n]
+    found = dict(zip(("M", "C", "K", "F", "coupling"), _second_order(scene, A, B, Z.T @ mass @ Z, independent, y, coordinates), strict=True))
+    acceleration = xp.max(xp.abs(v[constant]), initial=0.0)
+    residual = xp.maximum(acceleration, xp.max(xp.abs(change), initial=0.0))
+    found |= {"A": A, "B": B, "acceleration": acceleration, "residual": residual, "pivot": xp.minimum(pivot_s, pivot_u)}
+    return {name: jnp.asarray(x, q.dtype) for name, x in found.items()}
 
 
-def _second_order(scene: Scene, A, B, mass, independent: tuple[str, ...], y: tuple[int, ...], coordinates: tuple[str, ...]):
+def _second_order(scene: Scene, A, B, mass, independent: tuple[str, ...], y, coordinates: tuple[str, ...]):
     """M, C, K, F of the named coordinates and what couples them to the rest; `mass` is that of the privileged speeds."""
-    count, k = len(independent), len(coordinates)
+    count, k, xp = len(independent), len(coordinates), numeric(A)
     p = np.array([independent.index(name) for name in coordinates], int)
     # (ds, pdot, other privileged speeds) = change x
     kept = count + _speeds_beside(scene, y, coordinates)
-    change = jnp.concatenate([jnp.eye(count, A.shape[0], dtype=A.dtype), A[p], jnp.eye(A.shape[0], dtype=A.dtype)[kept]])
-    back = jnp.linalg.inv(change)
+    change = xp.concatenate([xp.eye(count, A.shape[0]), A[p], xp.eye(A.shape[0])[kept]])
+    back = inverse(change)
     rates, forced = (change @ A @ back)[count:], (change @ B)[count:]
     M = back[count:, count:].T @ mass @ back[count:, count:]
     K, C, F = -M @ rates[:, :count], -M @ rates[:, count:], M @ forced
     beside = others(p, count)
     neglected = [_relative(M[:k, k:], M[:k, :k]), _relative(C[:k, k:], C[:k, :k]), _relative(K[:k, beside], K[:k, p])]
-    return M[:k, :k], C[:k, :k], K[:k, p], F[:k], jnp.max(jnp.stack(neglected))
+    return M[:k, :k], C[:k, :k], K[:k, p], F[:k], xp.max(xp.stack(neglected))
 
 
 def _relative(neglected, kept):
     """Largest neglected entry over the largest kept one; the entry itself where nothing is kept."""
-    size = jnp.max(jnp.abs(kept), initial=0.0)
-    return jnp.max(jnp.abs(neglected), initial=0.0) / jnp.where(size > 0, size, 1.0)
+    xp = numeric(kept)
+    size = xp.max(xp.abs(kept), initial=0.0)
+    return xp.max(xp.abs(neglected), initial=0.0) / xp.where(size > 0, size, 1.0)
 
 
 @_compiled
@@ -297,7 +287,7 @@ def _own_rate(scene: Scene, name: str) -> int | None:
     return scene.speed_names.entries.index(speed)
 
 
-def _speeds_beside(scene: Scene, y: tuple[int, ...], coordinates: tuple[str, ...]) -> np.ndarray:
+def _speeds_beside(scene: Scene, y, coordinates: tuple[str, ...]) -> np.ndarray:
     """Positions in y of the privileged speeds that stay beside the rates of the named coordinates."""
     if len(coordinates) == len(y):
         return np.zeros(0, int)  # as many as there are freedoms: their rates are the new speeds, whatever y was

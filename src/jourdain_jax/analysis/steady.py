@@ -2,8 +2,8 @@
 
     g(t, q) = 0,   phi(t, q, u) = 0,   dy/dt = 0,   qdot_j = 0        y: the privileged speeds;  j: the coordinates not ignorable
 
-Whether what was found is steady is then judged without that list, by dy/dt and d2y/dt2 along the motion.
-Levenberg-Marquardt from the guess (`calculus/damped`).
+These are the equations of families of steady motions, too (`instant.py`). Whether what was found is steady is then judged without that list, by dy/dt and
+d2y/dt2 along the motion. Levenberg-Marquardt from the guess (`calculus/damped`).
 """
 
 from collections.abc import Mapping
@@ -15,15 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.analysis.tangent import flow_of, privileged_speeds
+from jourdain_jax.analysis.instant import ByMatrices, ByProgram, instant_of, on_rows, places_of
+from jourdain_jax.analysis.tangent import privileged_speeds
 from jourdain_jax.build.assembling import coordinate_bounds
-from jourdain_jax.build.probed_on_graph import coordinates_on_rows
 from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.calculus.damped import damped_search
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
 from jourdain_jax.calculus.reals import Number, Numbers, described
-from jourdain_jax.dynamics.reduced import ignorable_coordinates
-from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
 from jourdain_jax.scene.names import as_names, nearest
@@ -86,23 +84,23 @@ def steady(
     """
     if not isinstance(max_steps, int | np.integer) or max_steps < 1:
         raise ValueError(f"`max_steps` is {max_steps!r}, expected a whole number of at least 1")
-    scene = as_scene(scene)
+    built, scene = scene, as_scene(scene)
     t, q, u = guessed(scene, guess, t0)
     f = as_input_vector(scene, inputs, q.dtype).astype(q.dtype)
-    held = as_names(held)
-    names = scene.coordinate_names.entries + scene.speed_names.entries
+    held, entries = as_names(held), scene.coordinate_names.entries
+    names = entries + scene.speed_names.entries
     _check_names(scene, held, names)
-    ignorable = ignorable_coordinates(scene) if moving is None else ()
+    instant = instant_of(built, y := privileged_speeds(scene, privileged))
+    groups = {group: entries[first : first + length] for group, first, length in scene.coordinate_names.groups}
+    ignorable = {entry for name in instant.ignorable(scene) for entry in groups.get(name, (name,))}
     moving = ignorable if moving is None else as_names(moving)
-    groups = {group: scene.coordinate_names.entries[first : first + length] for group, first, length in scene.coordinate_names.groups}
-    _check_names(scene, moving, (*scene.coordinate_names.entries, *groups))
+    _check_names(scene, tuple(moving), (*entries, *groups))
     carried = {entry for name in moving for entry in groups.get(name, (name,))}
-    resting = tuple(i for i, name in enumerate(scene.coordinate_names.entries) if name not in carried)
-    on_rows = set(np.array(scene.coordinate_names.entries)[coordinates_on_rows(scene)])
+    resting = tuple(i for i, name in enumerate(entries) if name not in carried)
     # nothing that vanishes changes with them: they keep the guess's value, and no step runs away along them
-    idle = {entry for name in ignorable for entry in groups.get(name, (name,))} - on_rows
+    idle = ignorable - set(np.array(entries)[on_rows(scene)])
     free = jnp.array([name not in held and name not in idle for name in names], bool)
-    return _solve(_Problem(scene, t, f, privileged_speeds(scene, privileged), resting), q, u, free, max_steps)
+    return _solve(_Problem(scene, t, f, instant, y, resting), q, u, free, max_steps)
 
 
 def guessed(scene: Scene, guess, t0) -> tuple[Array, Array, Array]:
@@ -127,32 +125,30 @@ class _Problem(eqx.Module):
     scene: Scene
     t: Float[Array, ""]
     f: Float[Array, "inputs"]
+    instant: ByProgram | ByMatrices = eqx.field(static=True)
     privileged: tuple[int, ...] = eqx.field(static=True)
     resting: tuple[int, ...] = eqx.field(static=True)  # coordinates that must not move
 
-    def __call__(self, z: Float[Array, "unknowns"]) -> Float[Array, "residuals"]:
-        n = len(self.scene.coordinate_names)
-        now, _ = flow_of(self.scene, self.privileged)(self.t, z[:n], z[n:], self.f)
-        constant, still = now.udot[np.array(self.privileged, int)], now.qdot[np.array(self.resting, int)]
-        return jnp.concatenate([closure_residual(self.scene, self.t, z[:n]), now.phi, constant, still])
-
-    def unsteadiness(self, q, u) -> tuple[Float[Array, "freedoms"], Float[Array, "freedoms"]]:
-        """dy/dt and d2y/dt2."""
-        flow, y = flow_of(self.scene, self.privileged), np.array(self.privileged, int)
-        now, slope = jax.linearize(lambda t, q, u: flow(t, q, u, self.f)[0], self.t, q, u)
-        return now.udot[y], slope(jnp.ones_like(self.t), now.qdot, now.udot).udot[y]
+    def __call__(self, z: Float[Array, "unknowns"]) -> tuple[Array, Array, Array]:
+        """What vanishes, its slopes, and d2y/dt2."""
+        at = places_of(self.scene)
+        v, D, _ = self.instant(self.scene, self.t, z[: len(at.q)], z[len(at.q) :], self.f)
+        y = at.udot[np.array(self.privileged, int)]
+        rows = np.concatenate([at.g, at.phi, y, at.qdot[np.array(self.resting, int)]])
+        along = jnp.concatenate([jnp.ones(1, v.dtype), v[at.qdot], v[at.udot], jnp.zeros(len(at.f), v.dtype)])
+        return v[rows], D[rows][:, np.concatenate([at.q, at.u])], D[y] @ along
 
 
-@partial(compiled, options=RUN_SELDOM)  # of a bicycle in 6.5 s of processor time, not in 24; run in 0.11 s, not in 0.09
+@partial(compiled, options=RUN_SELDOM)
 def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], max_steps: int) -> SteadyMotion:
-    z = jnp.concatenate([q, u])
-    z = _root(problem, z, free, max_steps)
-    n = q.shape[0]
-    first, second = (jnp.max(jnp.abs(x), initial=0.0) for x in problem.unsteadiness(z[:n], z[n:]))
-    rows = jnp.max(jnp.abs(problem(z)[: -len(problem.privileged) - len(problem.resting)]), initial=0.0)
+    z = _root(problem, jnp.concatenate([q, u]), free, max_steps)
+    left, _, second = problem(z)
+    rows = len(left) - len(problem.privileged) - len(problem.resting)
+    of_rows, first, second = (jnp.max(jnp.abs(x), initial=0.0) for x in (left[:rows], left[rows : rows + len(problem.privileged)], second))
+    n = len(q)
     moved_q, moved_u = (jnp.max(jnp.abs(a - b), initial=0.0) for a, b in ((z[:n], q), (z[n:], u)))
-    residual = jnp.maximum(rows, jnp.maximum(first, second))
-    state = State(problem.t, z[:n], z[n:], moved_q, moved_u, rows, (problem.scene.coordinate_names, problem.scene.speed_names))
+    residual = jnp.maximum(of_rows, jnp.maximum(first, second))
+    state = State(problem.t, z[:n], z[n:], moved_q, moved_u, of_rows, (problem.scene.coordinate_names, problem.scene.speed_names))
     return SteadyMotion(state, first, residual, residual < _round_off_root(z.dtype))
 
 
@@ -162,10 +158,10 @@ def _root(problem: _Problem, z: Float[Array, "unknowns"], free: Bool[Array, "unk
     low, high = coordinate_bounds(problem.scene)
     sizes = np.concatenate([np.where(high > low, high - low, 1.0), np.full(z.shape[0] - low.size, _SPEEDS)])
     size = jnp.where(movable, jnp.asarray(sizes, z.dtype), 0.0)
-    found = damped_search(lambda z: (still(z), jax.jacfwd(still)(z)), guess, size, float(np.finfo(z.dtype).eps), most_steps=max_steps)
+    found = damped_search(lambda z: still(z)[:2], guess, size, float(np.finfo(z.dtype).eps), most_steps=max_steps)
     found = jax.lax.stop_gradient(found)
     inverse = size[:, None] * pseudo_inverse(found.J, _round_off_root(z.dtype))
-    return jax.lax.scan(lambda z, _: (z - inverse @ problem(z), None), jnp.where(free, found.best, z), length=_FINAL_STEPS)[0]
+    return jax.lax.scan(lambda z, _: (z - inverse @ problem(z)[0], None), jnp.where(free, found.best, z), length=_FINAL_STEPS)[0]
 
 
 def _round_off_root(dtype) -> float:

@@ -6,146 +6,84 @@
 of it is special. Dependent `ds` follow from the geometric rows g, dependent `du` from all velocity rows phi.
 """
 
-from collections.abc import Callable
-from functools import lru_cache
-from typing import NamedTuple
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from jourdain_jax.build.rank import best_privileged, pivots_at
-from jourdain_jax.build.row_program import RowProgram, row_program
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import WELL_CONDITIONED, structure_of, usual_rows
-from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff, singular_values
-from jourdain_jax.calculus.reals import real_type
-from jourdain_jax.calculus.rotations import quaternion_product
+from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
+from jourdain_jax.calculus.reals import Entries, is_traced
 from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.listed import names_of_position_rows
-from jourdain_jax.equations.reductions import Privileged
 from jourdain_jax.equations.rows import position_residual
-from jourdain_jax.equations.scaling import row_scale, scaled
+from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.equations.virtual_power import equations_and_rows
-from jourdain_jax.lowering.lower import lowered
-from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
-from jourdain_jax.motion.put_on_rows import State, row_functions
-from jourdain_jax.native import ffi
-from jourdain_jax.native.scalar_program import unsupported
-from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.scene.identity import with_reference_parameters
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.scene import Scene
 
 
-class Flow(eqx.Module):
-    """The motion at one instant, or its derivative along a perturbation (then every array has an axis of perturbations)."""
-
-    qdot: Float[Array, "coordinates *perturbations"]
-    udot: Float[Array, "speeds *perturbations"]  # by Appell's equations in the privileged speeds
-    phi: Float[Array, "rows *perturbations"]
-    g: Float[Array, "geometric_rows *perturbations"]
-
-
-class Perturbations(eqx.Module):
-    """Names of `ds`, and E, D of `dq = E ds`, `ds = D dq`."""
-
-    E: Float[Array, "coordinates perturbed"]
-    D: Float[Array, "perturbed coordinates"]
-    names: tuple[str, ...] = eqx.field(static=True)
-
-
-class Programs(NamedTuple):
-    """Scalar programs of a scene's rates in its privileged speeds, and of its rows, as machine code with derivatives of its own."""
-
-    rates: Lowered
-    rows: RowProgram
-
-
-def programs_of(scene: Scene | BuiltFor, privileged: tuple[int, ...]) -> Programs | None:
-    """The programs, where machine code serves for these privileged speeds; otherwise the scene's own matrices do, differentiated by JAX."""
-    if ffi.reason_against() or (isinstance(scene, BuiltFor) and scene.backend == "xla"):
-        return None
-    rates, rows = lowered(as_scene(scene)), row_program(as_scene(scene))
-    if not isinstance(rates, Lowered) or rates.independent != privileged or rows is None or rows.M is None:
-        return None
-    return None if unsupported(rates.graph, [*rates.qdot, *rates.ydot, *rates.guards]) else Programs(rates, rows)
-
-
-@lru_cache(maxsize=64)
-def _rates(program: Lowered) -> Callable[[Array], Array]:
-    """Coordinate rates, accelerations of the privileged speeds, and guards as a function of parameters, t, q, y and inputs in a row."""
-    of, nodes = program.traced, [*program.qdot, *program.ydot, *program.guards]
-    given = [*(n for part in of.parameters for n in part.ravel().tolist()), of.t, *of.q.tolist()]
-    given += [*(int(of.u[k]) for k in program.independent), *of.inputs.tolist()]
-    return values_of_nodes(program.graph, dict(enumerate(nodes)), len(nodes), given)
-
-
-def _flow_by(programs: Programs, scene: Scene):
-    rates, rows = _rates(programs.rates), row_functions(programs.rows)
-    geometric, n, chosen = len(names_of_position_rows(scene)), len(scene.coordinate_names), np.array(programs.rates.independent, int)
-
-    def flow(t, q, u, f):
-        parameters = [jnp.ravel(leaf) for leaf in jax.tree.leaves(scene)]
-        found = rates(jnp.concatenate([*parameters, t[None], q, u[chosen], f]).astype(real_type()))
-        guards = found[n + chosen.size :]
-        qdot = jnp.where(jnp.all(guards > 0), found[:n], jnp.nan)
-        udot = jnp.zeros_like(u).at[chosen].set(found[n : n + chosen.size])
-        return Flow(qdot, udot, rows.rows(scene, t, q, u, f)[0], rows.closures(scene, t, q)[0][:geometric]), rows.masses(scene, t, q)
-
-    return flow
-
-
-def flow_of(scene: Scene, privileged: tuple[int, ...], programs: Programs | None = None):
-    """`(t, q, u, f) -> (Flow, mass matrix)` with the accelerations in the given privileged speeds; by `programs` those of the other speeds are zero."""
-    if programs is not None:
-        return _flow_by(programs, scene)
-
-    def flow(t, q, u, f):
-        equations, rows = equations_and_rows(scene, t, q, u, f)
-        problem = scaled(equations, rows.judged_by(usual_rows(scene)))
-        w, _, _ = Privileged(privileged).solve(problem)
-        return Flow(coordinate_rates(scene, t, q, u), problem.c * w, rows.phi, position_residual(scene, t, q)), equations.M
-
-    return flow
-
-
-def perturbations(scene: Scene, q: Float[Array, "coordinates"]) -> Perturbations:
-    """Plain coordinates as they are, and three turns in body axes per quaternion: `attitude_turn_x`, `..._y`, `..._z`."""
+def perturbed_names(scene: Scene) -> tuple[str, ...]:
+    """Names of `ds`: plain coordinates as they are, and three turns in body axes per quaternion: `attitude_turn_x`, `..._y`, `..._z`."""
     names = list(scene.coordinate_names.entries)
-    E = D = jnp.eye(len(names), dtype=q.dtype)
-    dropped = []
-    for first, _ in scene.coordinates.quaternions:
-        here = slice(first, first + 4)
+    for first, _ in reversed(scene.coordinates.quaternions):
         group = names[first].removesuffix("_w")
-        names[here] = [f"{group}_w", *(f"{group}_turn_{axis}" for axis in "xyz")]
-        times = _left_product(q[here])
-        E, D = E.at[here, here].set(times / 2), D.at[here, here].set(2 * times.T)  # q is a unit quaternion: the inverse is the transpose
-        dropped.append(first)
-    kept = others(dropped, len(names))
-    return Perturbations(E[:, kept], D[kept], tuple(names[i] for i in kept))
+        names[first : first + 4] = [f"{group}_turn_{axis}" for axis in "xyz"]
+    return tuple(names)
 
 
-def carried_along(scene: Scene, q: Float[Array, "coordinates"], qdot: Float[Array, "coordinates"]) -> Float[Array, "coordinates coordinates"]:
+def perturbations(scene: Scene, q: Float[Entries, "coordinates"]) -> tuple[Float[Entries, "coordinates perturbed"], Float[Entries, "perturbed coordinates"]]:
+    """E and D of `dq = E ds`, `ds = D dq`; of a unit quaternion q the inverse of `x -> q x` is the transpose."""
+    return (
+        _by_blocks(scene, q, np.eye, lambda first: left_product(q[first : first + 4])[:, 1:] / 2),
+        _by_blocks(scene, q, np.eye, lambda first: 2 * left_product(q[first : first + 4]).T[1:]),
+    )
+
+
+def carried_along(scene: Scene, q: Float[Entries, "coordinates"], qdot: Float[Entries, "coordinates"]) -> Float[Entries, "coordinates coordinates"]:
     """W of `d(ds)/dt = D (d qdot - W dq)`: perturbing turns are measured in axes that turn with the unperturbed motion.
 
     Zero for plain coordinates. For a quaternion `d(q0^-1 q)/dt = q0^-1 (qdot - q0dot q0^-1 q)`, hence `W dq = q0dot q0^-1 dq`.
     """
-    W = jnp.zeros((q.shape[0], q.shape[0]), q.dtype)
+    return _by_blocks(scene, q, lambda n: np.zeros((n, n)), lambda first: left_product(qdot[first : first + 4]) @ left_product(q[first : first + 4]).T)
+
+
+def _by_blocks(scene: Scene, q, plain, turned):
+    blocks, begin = [], 0
     for first, _ in scene.coordinates.quaternions:
-        here = slice(first, first + 4)
-        conjugate = q[here] * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype)
-        W = W.at[here, here].set(_left_product(quaternion_product(qdot[here], conjugate)))
-    return W
+        blocks += [plain(first - begin), turned(first)]
+        begin = first + 4
+    return block_diagonal([*blocks, plain(q.shape[-1] - begin)])
 
 
-def _left_product(p: Float[Array, "4"]) -> Float[Array, "4 4"]:
-    """The matrix of `x -> p x`."""
-    return jax.vmap(lambda e: quaternion_product(p, e), out_axes=1)(jnp.eye(4, dtype=p.dtype))
+def left_product(p: Float[Entries, "4"]) -> Float[Entries, "4 4"]:
+    """The matrix of `x -> p x` of quaternions."""
+    w, x, y, z = p
+    return numeric(p).stack([numeric(p).stack(row) for row in ([w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w])])
+
+
+def block_diagonal(blocks: list) -> Float[Entries, "rows columns"]:
+    """Matrices along the diagonal of one that is zero elsewhere."""
+    xp, widths = numeric(blocks), np.cumsum([0, *(block.shape[1] for block in blocks)])
+    sides = [(np.zeros((len(x), first)), x, np.zeros((len(x), widths[-1] - last))) for x, first, last in zip(blocks, widths, widths[1:], strict=False)]
+    return xp.concatenate([xp.concatenate(row, axis=1) for row in sides])
+
+
+def numeric(x):
+    """`jax.numpy` where anything is traced, otherwise NumPy."""
+    return jnp if is_traced(x) else np
+
+
+def inverse(x: Float[Entries, "rows rows"]) -> Float[Entries, "rows rows"]:
+    """The inverse; NaN where there is none."""
+    try:
+        return numeric(x).linalg.inv(x)
+    except np.linalg.LinAlgError:
+        return np.full(x.shape, np.nan)
 
 
 def others(some, count: int) -> Int[np.ndarray, "rest"]:
@@ -153,19 +91,22 @@ def others(some, count: int) -> Int[np.ndarray, "rest"]:
     return np.setdiff1d(np.arange(count), np.asarray(some, int))
 
 
-def eliminated(rows: Float[Array, "rows all"], dependent: Int[np.ndarray, "dependent"]) -> tuple[Float[Array, "all independent"], Float[Array, ""]]:
+def eliminated(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]) -> tuple[Float[Entries, "all independent"], Float[Entries, ""]]:
     """All perturbations from the independent ones so that `rows @ perturbation = 0`; and the smallest singular value of the scaled block."""
-    independent = others(dependent, rows.shape[1])
-    basis = jnp.eye(rows.shape[1], dtype=rows.dtype)[:, independent]
+    xp, independent = numeric(rows), others(dependent, rows.shape[1])
     if dependent.size == 0:
-        return basis, jnp.ones((), rows.dtype)
+        return np.eye(rows.shape[1]), np.ones(())
+    if xp is np and not np.all(np.isfinite(rows)):
+        return np.full((rows.shape[1], len(independent)), np.nan), np.asarray(np.nan)
     block = rows[:, dependent]
-    d = row_scale(block)[:, None]
-    block, right = d * block, d * rows[:, independent]
-    below = jnp.linalg.solve(block, right) if block.shape[0] == block.shape[1] else pseudo_inverse(block) @ right
-    sigma = singular_values(block)
-    pivot = sigma[-1] if block.shape[0] >= block.shape[1] else jnp.zeros((), block.dtype)
-    return basis.at[dependent].set(-below), pivot
+    fixed = jax.lax.stop_gradient(block) if xp is jnp else block
+    length = xp.sqrt(xp.sum(fixed**2, axis=1, keepdims=True))
+    d = 1 / xp.where(length > 0, length, 1.0)
+    block, right, sigma = d * block, d * rows[:, independent], xp.linalg.svd(d * fixed, compute_uv=False)
+    below = -(inverse(block) if block.shape[0] == block.shape[1] else xp.linalg.pinv(block, rtol=rank_cutoff(block.dtype))) @ right
+    pivot = sigma[-1] if block.shape[0] >= block.shape[1] else 0.0
+    order = np.argsort(np.concatenate([independent, dependent]))
+    return xp.concatenate([np.eye(len(independent)), below])[order], xp.asarray(pivot)
 
 
 def privileged_speeds(scene: Scene, names: str | tuple[str, ...] | None = None) -> tuple[int, ...]:
@@ -197,12 +138,14 @@ def _scaled_rows(scene: Scene, t, q, u, f):
     return scaled(equations, rows.judged_by(usual_rows(scene))).A
 
 
-def dependent_coordinates(scene: Scene, state: State, named: tuple[str, ...], dependent: tuple[str, ...] | None) -> Int[np.ndarray, "dependent"]:
+def dependent_coordinates(
+    scene: Scene, state: State, named: tuple[str, ...], dependent: tuple[str, ...] | None, G: Float[np.ndarray, "rows coordinates"] | None = None
+) -> Int[np.ndarray, "dependent"]:
     """Indices of the perturbations `ds` that follow from the geometric rows: those named, else well conditioned ones.
 
-    The choice looks at the state, or at the scene's domain where the state or the parameters are traced.
+    The choice looks at the state, or at the scene's domain where the state or the parameters are traced. `G`: dg/dq at the state, if it is known.
     """
-    names = perturbations(scene, state.q).names
+    names = perturbed_names(scene)
     for name in (*named, *(dependent or ())):
         if name not in names:
             raise ValueError(f"`{type(scene).__name__}` has no coordinate `{name}` to perturb; {nearest(name, names)}")
@@ -216,16 +159,17 @@ def dependent_coordinates(scene: Scene, state: State, named: tuple[str, ...], de
     if not names_of_position_rows(scene):
         return np.zeros(0, int)
     t, q = state.t[None], state.q[None]
-    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((scene, state))):
+    if is_traced((scene, state)):
         scene = with_reference_parameters(scene)
         t, q, _ = sample_states(scene, 16)
-    return _pivots(_geometric_rows(scene, t, q), [names.index(name) for name in named], type(scene).__name__)
+    G = _geometric_rows(scene, t, q) if G is None else G[None]
+    return _pivots(G @ np.stack([perturbations(scene, x)[0] for x in np.asarray(q)]), [names.index(name) for name in named], type(scene).__name__)
 
 
 @eval_numpy
 def _geometric_rows(scene: Scene, t, q):
-    """dg over the perturbations, at every state."""
-    return jax.vmap(lambda t, q: jax.jacfwd(position_residual, 2)(scene, t, q) @ perturbations(scene, q).E)(t, q)
+    """dg/dq at every state."""
+    return jax.vmap(lambda t, q: jax.jacfwd(position_residual, 2)(scene, t, q))(t, q)
 
 
 def _pivots(G: Float[np.ndarray, "samples rows columns"], kept: list[int], scene: str) -> Int[np.ndarray, "dependent"]:

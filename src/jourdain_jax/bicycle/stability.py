@@ -11,10 +11,11 @@ With x = v^2 the coefficients are a4 = b4, a3 = v b3, a2 = b2(x), a1 = v b1(x), 
         D0 = b2^2 - 3 x b3 b1 + 12 b4 b0,
         D1 = 2 b2^3 - 9 x b3 b2 b1 + 27 x b3^2 b0 + 27 x b4 b1^2 - 72 b4 b2 b0
 
-All their positive roots are found, the one meant is told by how the eigenvalue moves there, ds/dv = - (dp/dv) / (dp/ds), and polished on its
-defining equation by Newton. Coefficients stand highest power first.
+All their positive roots are found, and polished by steps of Newton's method that carry derivatives. With H for the second one, which is the product of all sums
+of two eigenvalues times b4^3 v, its slope says which way a pair crosses: down where H' b3 > 0. A real one crosses zero upward where b0' b1 < 0; and two that
+meet become a pair where dp/dv and d2p/ds2 have one sign. Coefficients stand highest power first.
 
-Source: Meijaard, Papadopoulos, Ruina & Schwab, Proc. R. Soc. A 463 (2007), sections 6-8; Hurwitz determinant and discriminant of a quartic are textbook.
+Source: Meijaard, Papadopoulos, Ruina & Schwab, Proc. R. Soc. A 463 (2007), sections 6-8; Hurwitz determinant (Orlando) and discriminant are textbook.
 """
 
 from functools import reduce
@@ -28,7 +29,6 @@ from jax.typing import ArrayLike
 from jaxtyping import Bool, Complex, Float
 
 from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
-from jourdain_jax.calculus.newton import newton_root
 
 Scalar = Float[Array, ""]
 Polynomial = Float[Array, " coefficients"]
@@ -108,33 +108,36 @@ def stability_speeds(
 
 
 def _stability_speeds(matrices: BicycleMatrices, top: Scalar) -> StabilitySpeeds:
-    fixed = jax.lax.stop_gradient(matrices)
-    zero, opposite, coincident = (_speeds_at(polynomial, top) for polynomial in _in_speed(fixed))
-    growth = jax.vmap(lambda s, v: _growth(fixed, s, v).real)
-    upward = growth(jnp.zeros_like(zero), zero) > 0
-    downward = growth(1j * jax.vmap(lambda v: _pair_frequency(fixed, v))(opposite), opposite) < 0
+    _, b3, _, b1, b0 = _coefficients(matrices)
+    opposite, coincident = _in_speed(matrices)
+    (zeros, is_zero), (opposites, is_opposite), (coincidents, is_coincident) = (_roots(polynomial, top**2) for polynomial in (b0, opposite, coincident))
 
-    capsize_speed = _polished(lambda v, m: jnp.polyval(_in_speed(m)[0], v**2), jnp.where(upward, zero, jnp.inf).min(), matrices)
-    weave_speed = _polished(lambda v, m: jnp.polyval(_in_speed(m)[1], v**2), jnp.where(downward, opposite, -jnp.inf).max(), matrices)
-    has_weave = ~jnp.isnan(weave_speed)
-    weave_frequency = _pair_frequency(matrices, jnp.where(has_weave, weave_speed, 1.0))
+    upward = is_zero & (_slope(b0, zeros) * jnp.polyval(b1, zeros) < 0)
+    capsize = jnp.min(jnp.where(upward, zeros, jnp.inf), initial=jnp.inf)
+    frequencies = jnp.polyval(b1, opposites) / jnp.where(b3 == 0, jnp.inf, b3)
+    downward = is_opposite & (frequencies > 0) & (_slope(opposite, opposites) * b3 > 0)
+    weave = jnp.argmax(jnp.where(downward, opposites, -jnp.inf))
+    has_weave = downward[weave]
 
-    below = jnp.where(has_weave, jax.lax.stop_gradient(weave_speed), top)
-    double_root_eigenvalue, double_root_speed = _double_root(matrices, fixed, coincident, below)
-    stable_from, stable_to = _widest_stable_range(fixed, jnp.concatenate([zero, opposite]), top)
+    below = jnp.where(has_weave, jax.lax.stop_gradient(opposites[weave]), top**2)
+    eigenvalues, merges = jax.vmap(lambda x: _merging(matrices, x))(coincidents)
+    merges = is_coincident & merges & (coincidents < below)
+    last = jnp.argmax(jnp.where(merges, coincidents, -jnp.inf))
+    crossings = jnp.concatenate([jnp.where(is_zero, zeros, top**2), jnp.where(is_opposite, opposites, top**2)])
+    stable_from, stable_to = _widest_stable_range(matrices, opposite, crossings, top)
     return StabilitySpeeds(
-        weave_speed=weave_speed,
-        capsize_speed=capsize_speed,
-        double_root_speed=double_root_speed,
-        weave_frequency=jnp.where(has_weave, weave_frequency, jnp.nan),
-        double_root_eigenvalue=double_root_eigenvalue,
+        weave_speed=_root_where(has_weave, opposites[weave]),
+        capsize_speed=_root_where(jnp.isfinite(capsize), capsize),
+        double_root_speed=_root_where(merges[last], coincidents[last]),
+        weave_frequency=_root_where(has_weave, frequencies[weave]),
+        double_root_eigenvalue=jnp.where(merges[last], eigenvalues[last], jnp.nan),
         stable_from=stable_from,
         stable_to=stable_to,
         stable_range_exists=~jnp.isnan(stable_from),
     )
 
 
-_speeds = compiled(_stability_speeds, options=RUN_SELDOM)  # the first call in 2.5 s of processor time, not in 15; the second in 1 ms, not in 3 s
+_speeds = compiled(_stability_speeds, options=RUN_SELDOM)
 
 
 def _name_modes(values: Complex[Array, " 4"]) -> Complex[Array, " 4"]:
@@ -171,14 +174,14 @@ def _coefficients(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
     return tuple(map(jnp.stack, found))
 
 
-def _characteristic(matrices: BicycleMatrices, v: ArrayLike) -> Polynomial:
+def _characteristic(matrices: BicycleMatrices, v: Scalar) -> Polynomial:
     """a4, a3, a2, a1, a0 at one speed."""
-    b4, b3, b2, b1, b0 = (jnp.polyval(b, jnp.asarray(v) ** 2) for b in _coefficients(matrices))
+    b4, b3, b2, b1, b0 = (jnp.polyval(b, v**2) for b in _coefficients(matrices))
     return jnp.stack([b4, v * b3, b2, v * b1, b0])
 
 
 def _in_speed(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
-    """Polynomials in x of the module's head: zero where an eigenvalue is, where two sum to zero, and where two coincide."""
+    """Polynomials in x of the module's head: zero where two eigenvalues sum to zero, and where two coincide."""
     b4, b3, b2, b1, b0 = _coefficients(matrices)
     x = jnp.array([1.0, 0.0], b0.dtype)
 
@@ -189,85 +192,54 @@ def _in_speed(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:
     opposite = combined((1, b1, b2, b3), (-1, b4, b1, b1), (-1, b0, b3, b3))
     D0 = combined((1, b2, b2), (-3, x, b3, b1), (12, b4, b0))
     D1 = combined((2, b2, b2, b2), (-9, x, b3, b2, b1), (27, x, b3, b3, b0), (27, x, b4, b1, b1), (-72, b4, b2, b0))
-    return b0, opposite, combined((4, D0, D0, D0), (-1, D1, D1))
+    return opposite, combined((4, D0, D0, D0), (-1, D1, D1))
 
 
-def _speeds_at(polynomial: Polynomial, top: Scalar) -> Float[Array, " degree"]:
-    """The speeds (m/s) up to `top` at which a polynomial in v^2 is zero, NaN where there are fewer than its degree; to some digits.
+def _slope(polynomial: Polynomial, x: Array) -> Array:
+    return jax.lax.stop_gradient(jnp.polyval(jnp.polyder(polynomial), x))
 
-    Found as 1/v^2: coefficients of the highest powers may vanish.
+
+def _roots(polynomial: Polynomial, top: Scalar) -> tuple[Float[Array, " degree"], Bool[Array, " degree"]]:
+    """The positive real roots up to `top`, with derivatives of two orders, and which they are: others are 1.
+
+    Found as their inverses: coefficients of the highest powers may vanish.
     """
-    inverse = jnp.roots(polynomial[::-1], strip_zeros=False)
-    there = (inverse.imag == 0) & (inverse.real * top**2 > 1)
-    return jnp.where(there, 1 / jnp.sqrt(jnp.where(there, inverse.real, 1.0)), jnp.nan)
+    inverse = jnp.roots(jax.lax.stop_gradient(polynomial)[::-1], strip_zeros=False)
+    there = (inverse.imag == 0) & (inverse.real * top > 1)
+    x = jnp.where(there, 1 / jnp.where(there, inverse.real, 1.0), 1.0)
+    for _ in range(3):  # the last two carry one order of derivatives each
+        slope = _slope(polynomial, x)
+        x = x - jnp.polyval(polynomial, x) / jnp.where(there & (slope != 0), slope, jnp.inf)
+    return x, there
 
 
-def _growth(matrices: BicycleMatrices, s: Array, v: Scalar) -> Array:
-    """ds/dv = - (dp/dv) / (dp/ds) of the eigenvalue `s`, real or complex."""
-    coefficients, slopes = _with_slopes(matrices, v)
-    return -jnp.polyval(slopes, s) / jnp.polyval(jnp.polyder(coefficients), s)
+def _root_where(there, x: Scalar) -> Scalar:
+    """The square root of x, or NaN without derivative."""
+    return jnp.where(there, jnp.sqrt(jnp.where(there, x, 1.0)), jnp.nan)
 
 
-def _with_slopes(matrices: BicycleMatrices, v: Scalar) -> tuple[Polynomial, Polynomial]:
-    """Coefficients of p and of dp/dv at speed `v`."""
-    return jax.jvp(lambda v: _characteristic(matrices, v), (v,), (jnp.ones_like(v),))
+def _merging(matrices: BicycleMatrices, x: Scalar) -> tuple[Scalar, Bool[Array, ""]]:
+    """The double eigenvalue (1/s) at a root x, and whether two positive real ones become a pair there, as the speed grows."""
+    v = jnp.sqrt(x)
+    coefficients, slopes = jax.jvp(lambda v: _characteristic(matrices, v), (v,), (jnp.ones_like(v),))
+    roots = jnp.roots(jax.lax.stop_gradient(coefficients), strip_zeros=False)
+    i, j = jnp.triu_indices(4, 1)
+    pair = jnp.argmin(jnp.abs(roots[i] - roots[j]))
+    s, first = (roots[i[pair]] + roots[j[pair]]).real / 2, jnp.polyder(coefficients)
+    bend = _slope(first, s)
+    for _ in range(3):  # dp/ds has a simple root there
+        s = s - jnp.polyval(first, s) / jnp.where(bend == 0, jnp.inf, bend)
+    return s, (s > 0) & (jnp.polyval(slopes, s) * bend > 0)
 
 
-def _pair_frequency(matrices: BicycleMatrices, v: Scalar) -> Scalar:
-    """omega = sqrt(a1/a3) where +-i omega are eigenvalues; NaN, without derivative, where the two are real."""
-    _, a3, _, a1, _ = _characteristic(matrices, v)
-    is_pair = a1 * a3 > 0
-    squared = jnp.where(is_pair, a1, 1.0) / jnp.where(is_pair, a3, 1.0)
-    return jnp.where(is_pair, jnp.sqrt(squared), jnp.nan)
-
-
-def _coincident_eigenvalues(s_and_v, matrices):
-    """p and dp/ds, both zero at a double root."""
-    s, v = s_and_v
-    coefficients = _characteristic(matrices, v)
-    return jnp.stack([jnp.polyval(coefficients, s), jnp.polyval(jnp.polyder(coefficients), s)])
-
-
-def _polished(residual, guess: Scalar, matrices: BicycleMatrices) -> Scalar:
-    """The root near `guess`, differentiable; NaN where `guess` is not finite."""
-    return _root(residual, guess[None], matrices, jnp.isfinite(guess))[0]
-
-
-def _root(residual, guess: Float[Array, " n"], matrices: BicycleMatrices, present) -> Float[Array, " n"]:
-    """x with `residual(x, matrices) = 0` near a bracketed `guess`; NaN where no root is `present`."""
-    guess = jnp.where(present, guess, 1.0)
-    # where there is no root, another function has one: no division by zero enters a batch's derivatives
-    found = newton_root(lambda x: jnp.where(present, residual(x, matrices), x - guess), guess, 1.0 + jnp.abs(guess))
-    return jnp.where(present, found.x, jnp.nan)
-
-
-def _double_root(matrices: BicycleMatrices, fixed: BicycleMatrices, candidates: Float[Array, " speeds"], below: Scalar) -> tuple[Scalar, Scalar]:
-    """Eigenvalue (1/s) and speed (m/s) where two positive real eigenvalues last become a pair at a speed < `below`."""
-
-    def examine(v):
-        coefficients, slopes = _with_slopes(fixed, jnp.where(jnp.isnan(v), 1.0, v))
-        roots = jnp.roots(coefficients, strip_zeros=False)
-        i, j = jnp.triu_indices(4, 1)
-        pair = jnp.argmin(jnp.abs(roots[i] - roots[j]))
-        s = (roots[i[pair]] + roots[j[pair]]).real / 2
-        # 0 = p_ss ds^2 / 2 + p_v dv: a pair above v where p_ss and p_v have one sign.
-        becomes_pair = jnp.polyval(slopes, s) * jnp.polyval(jnp.polyder(coefficients, 2), s) > 0
-        return s, (s > 0) & becomes_pair & (v < below)
-
-    roots, merges = jax.vmap(examine)(candidates)
-    chosen = jnp.argmax(jnp.where(merges, candidates, -jnp.inf))
-    s, v = _root(_coincident_eigenvalues, jnp.stack([roots[chosen], candidates[chosen]]), matrices, merges[chosen])
-    return s, v
-
-
-def _widest_stable_range(matrices: BicycleMatrices, crossings: Float[Array, " crossings"], top: Scalar) -> tuple[Scalar, Scalar]:
-    """The widest interval between neighbouring crossings where all eigenvalues decay; NaN if there is none."""
-    ends = jnp.concatenate([jnp.zeros_like(top)[None], crossings, top[None]])
-    ends = jnp.sort(jnp.where(jnp.isnan(ends), top, ends))
-    middles = 0.5 * (ends[:-1] + ends[1:])
-    a4, a3, a2, a1, a0 = jax.vmap(lambda v: _characteristic(matrices, v))(middles).T
+def _widest_stable_range(matrices: BicycleMatrices, opposite: Polynomial, crossings: Float[Array, " crossings"], top: Scalar) -> tuple[Scalar, Scalar]:
+    """The widest interval of speeds between neighbouring crossings where all eigenvalues decay, without derivative; NaN if there is none."""
+    matrices, opposite, crossings = jax.lax.stop_gradient((matrices, opposite, crossings))
+    ends = jnp.sort(jnp.sqrt(jnp.concatenate([jnp.zeros_like(top)[None], crossings, top[None] ** 2])))
+    middles = (0.5 * (ends[:-1] + ends[1:])) ** 2
     # Lienard & Chipart: a0, a1, a3, a4 and the third Hurwitz determinant positive.
-    stable = (a0 > 0) & (a1 > 0) & (a3 > 0) & (a4 > 0) & (a1 * a2 * a3 - a4 * a1**2 - a0 * a3**2 > 0)
+    positive = jnp.stack([jnp.polyval(jnp.atleast_1d(p), middles) for p in (*_coefficients(matrices), opposite)])
+    stable = jnp.all(jnp.delete(positive, 2, axis=0) > 0, axis=0)
     widths = jnp.where(stable, ends[1:] - ends[:-1], 0.0)
     widest = jnp.argmax(widths)
     exists = widths[widest] > 0

@@ -3,11 +3,11 @@
     eigenvalue s     ds = y' dF x,    F x = s x,  y' F = s y',  y' x = 1,    dF with the change of the steady motion, J dz = -R_p dp
     special point    G(X, p) = 0,     dX = -G_X+ G_p dp,                     X = (z, a, b, w),  G = (R, C a, C b, size and phase of a and b, and
 
-    pair on the imaginary axis     F (a + i b) = i w (a + i b)
-    zero eigenvalue                F a = 0,  F b = 0           b: along the steady motions that go on at the same parameters
-    double root                    F a = w a,  F b = w b + a
+    F (a b) = (a b) S(w)         pair on the imaginary axis: F (a + i b) = i w (a + i b);   double root: F a = w a, F b = w b + a;
+                                 zero eigenvalue: F a = 0, F b = 0, with b along the steady motions that go on at the same parameters
 
-R, J, F, C, z: as in `equations.py`. G has more rows than it needs, and they agree: G_X has full column rank, and its pseudo-inverse comes from Q R.
+R, J, F, C, z: as in `equations.py`. G and its slopes are one scalar program. It has more rows than it needs, and they agree: G_X has full column rank, and its
+pseudo-inverse comes from Q R.
 """
 
 from functools import partial
@@ -23,10 +23,13 @@ from jourdain_jax.analysis.families.equations import Look, SteadyEquations
 from jourdain_jax.analysis.families.family import Family, FamilyPoint
 from jourdain_jax.analysis.families.special import SURE
 from jourdain_jax.analysis.families.spectrum import null_space
+from jourdain_jax.analysis.instant import ByProgram, Sloped, differentiable
 from jourdain_jax.analysis.table import complex_numbers, table
 from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.motion.put_on_rows import State
+from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers
+from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
@@ -40,6 +43,7 @@ MEANINGS = (
     "no smooth function of the parameters here: eigenvalues meet, or several special points do",
 )
 PAIR, ZERO, DOUBLE = "pair on the imaginary axis", "zero eigenvalue", "double root"
+SHAPES = {PAIR: ((0, 1, -1, 0), (0, 0, 0, 0)), ZERO: ((0, 0, 0, 0),) * 2, DOUBLE: ((1, 0, 0, 1), (0, 1, 0, 0))}  # S = w (first) + (second), by rows
 
 
 class Sensitivities(Printed, eqx.Module):
@@ -77,12 +81,20 @@ def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held
     x, y = right[:, np.argmin(apart)], left[:, np.argmin(np.abs(same - s))]
     condition = float(np.abs(y @ x))
     single = condition > 1e-6 and np.partition(np.append(apart, np.inf), 1)[1] > SURE * (1 + abs(s))
-    numbers, directions, y = equations.at(z), np.stack([x.real, x.imag]), y / (y @ x)
+    y = y / (y @ x)
 
-    by_all = equations.program.pulled(numbers, directions, np.zeros(len(look.R), complex), y)
+    program = _program(equations)
+    X, zero = np.concatenate([equations.at(z), x.real, x.imag, np.zeros(4)]), np.zeros(len(look.R), complex)
+
+    def pulled(of_rows, of_rates):
+        """Derivatives of `of_rows . R + of_rates . F x` by all numbers."""
+        weights = np.concatenate([of_rows, of_rates, 1j * of_rates])
+        real, imag = (np.asarray(program.pulled(X, part)) for part in (weights.real, weights.imag))
+        return (real + 1j * imag)[: len(equations.given)]
+
+    by_all = pulled(zero, y)
     inverse = np.linalg.pinv(np.vstack([look.J, np.eye(len(z))[fixed]]), rcond=1e-9)
-    adjoint = -(by_all[equations.places] * equations.size) @ inverse[:, : len(look.R)]
-    by_all = by_all + equations.program.pulled(numbers, directions, adjoint, 0 * y)
+    by_all = by_all + pulled(-(by_all[equations.places] * equations.size) @ inverse[:, : len(look.R)], 0 * y)
     if not single:
         by_all = by_all * np.nan
     leaves, treedef = jax.tree.flatten(scene)
@@ -137,10 +149,40 @@ class CriticalPoint(Printed, eqx.Module):
         return f"{self.kind}{varied}: {self.message}; eigenvalue {complex_numbers(self.eigenvalue[None])[0]} 1/s\n{self.state}"
 
 
+class _Program:
+    """R, what `F (a b) = (a b) S` leaves, C a and C b, with their slopes: functions of all numbers, a, b, and S by rows."""
+
+    def __init__(self, scene: Scene, instant: ByProgram, of: tuple[tuple[int, ...], ...]) -> None:
+        graph, (rows, rates, states, of_states, places) = instant.graph, of
+        x, m = [instant.columns[k] for k in states], len(states)
+        given = [graph.input(f"special {k}", True) for k in range(2 * m + 4)]
+        a, b, S = given[:m], given[m:-4], given[-4:]
+        moved, nodes, beside = [instant.v[k] for k in (*rates, *of_states)], [instant.v[k] for k in rows], []
+        for direction, p, q in ((a, S[0], S[2]), (b, S[1], S[3])):
+            found = derivatives(graph, moved, dict(zip(x, direction, strict=True)))
+            nodes += [graph.sub(f, graph.add(graph.mul(p, c), graph.mul(q, d))) for f, c, d in zip(found, a, b, strict=False)]
+            beside += found[m:]
+        nodes, variables = [*nodes, *beside], [*instant.given, *given]
+        self.of = Sloped(graph, nodes, [*(instant.given[k] for k in places), *given], variables, instant.guards)
+        self.values = differentiable(graph, nodes, variables)
+        self.pulled = jax.jit(lambda x, weights: jax.vjp(lambda x: self.values(x)[: len(weights)], x)[1](weights)[0])
+
+
+def _program(equations: SteadyEquations) -> _Program:
+    of = equations.rows, equations.rates, equations.states, equations.of_states, equations.places
+    return _program_of(equations.scene, equations.instant, tuple(tuple(part.tolist()) for part in of))
+
+
+@once_per_class
+def _program_of(scene: Scene, *parts) -> _Program:
+    return _Program(scene, *parts)
+
+
 class _Special(eqx.Module):
     """The equations of a special point, and the point of the family from which it is followed as parameters change."""
 
     equations: SteadyEquations = eqx.field(static=True)
+    program: _Program = eqx.field(static=True)
     held: tuple[int, ...] = eqx.field(static=True)
     kind: str = eqx.field(static=True)
     goes_on: bool = eqx.field(static=True)  # whether steady motions do at the same parameters
@@ -148,7 +190,7 @@ class _Special(eqx.Module):
 
     def parts(self, X: Float[Array, "all_unknowns"]) -> list[Array]:
         """z, a, b and w."""
-        n, m = len(self.equations.places), len(self.equations.program.in_states)
+        n, m = len(self.equations.places), len(self.equations.states)
         return jnp.split(X, [n, n + m, n + 2 * m])
 
     def numbers(self, scene: Scene, X: Float[Array, "all_unknowns"]) -> Float[Array, "numbers"]:
@@ -156,27 +198,53 @@ class _Special(eqx.Module):
         of, parameters = self.equations, jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(scene)])
         return jnp.concatenate([parameters, of.given[len(parameters) :]]).at[of.places].set(self.parts(X)[0] * of.size)
 
-    def rows(self, scene: Scene, X: Float[Array, "all_unknowns"]) -> Float[Array, "rows"]:
-        """G."""
-        (z, a, b, w), (z0, a0, b0, _) = self.parts(X), self.parts(self.X)
-        R, (Fa, Fb), C = self.equations.program.along(self.numbers(scene, X), jnp.stack([a, b]))
-        if self.kind == PAIR:
-            small = [Fa + w * b, Fb - w * a, jnp.stack([a0 @ a + b0 @ b - 1, a0 @ b - b0 @ a])]
-        elif self.kind == DOUBLE:
-            small = [Fa - w * a, Fb - w * b - a, jnp.stack([a0 @ a - 1, a0 @ b])]
-        else:
-            small = [Fa, Fb if self.goes_on else b, w, jnp.stack([a0 @ a - 1, b0 @ a, a0 @ b, b0 @ (b - b0)])]
-        held = np.array(self.held, int)
-        return jnp.concatenate([R, z[held] - z0[held], *small, jnp.ravel(C)])
+    def normal(self, X: Float[Array, "all_unknowns"]) -> Float[Array, "all_unknowns"]:
+        """X with a of unit length; of a pair a + i b."""
+        z, a, b, w = self.parts(X)
+        size = jnp.sqrt(a @ a + b @ b) if self.kind == PAIR else jnp.linalg.norm(a)
+        return jnp.concatenate([z, a / size, b if self.kind == ZERO else b / size, w])
 
-    def correction(self, scene: Scene, X: Float[Array, "all_unknowns"]) -> tuple[Array, Array, Array]:
+    def equations_at(self, scene: Scene, X: Float[Array, "all_unknowns"], near: Float[Array, "all_unknowns"], sloped: bool) -> tuple[Array, Array | None]:
+        """G, with size and phase of a and b by a normal point near by, and G_X if asked for."""
+        _, a, b, w = self.parts(X)
+        z, a0, b0, _ = self.parts(near)
+        n, m, (of_w, fixed) = len(z), len(a), np.array(SHAPES[self.kind])
+        no, one = jnp.zeros((m, m)), jnp.eye(m)
+        rows = {PAIR: [(a0, b0, 1.0), (-b0, a0, 0.0)], DOUBLE: [(a0, no[0], 1.0), (no[0], a0, 0.0)], ZERO: [(a0, no[0], 1.0)]}[self.kind]
+        if self.kind == ZERO:
+            rows += [(b0, no[0], 0.0), (no[0], a0, 0.0), (no[0], b0, b0 @ b0)] if self.goes_on else list(zip(no, one, jnp.zeros(m), strict=True))
+        held = np.array(self.held, int)
+        L = [jnp.eye(n, len(X))[held], *(jnp.concatenate([jnp.zeros(n), of_a, of_b, jnp.zeros(1)])[None] for of_a, of_b, _ in rows)]
+        c = [self.X[held], *(jnp.asarray(c)[None] for *_, c in rows)]
+        if self.kind == ZERO:
+            L, c = [*L, jnp.eye(len(X))[-1:]], [*c, jnp.zeros(1)]
+        L, c = jnp.concatenate(L), jnp.concatenate(c)
+        given = jnp.concatenate([self.numbers(scene, X), a, b, of_w * w + fixed])
+        if not sloped:
+            return jnp.concatenate([self.program.values(given), L @ X - c]), None
+        G, D, _ = self.program.of(given)
+        size = np.concatenate([self.equations.size, np.ones(2 * m)])
+        return jnp.concatenate([G, L @ X - c]), jnp.concatenate([jnp.column_stack([D[:, :-4] * size, D[:, -4:] @ of_w]), L])
+
+    def correction(self, scene: Scene, X: Float[Array, "all_unknowns"], near: Float[Array, "all_unknowns"]) -> tuple[Array, Array, Array]:
         """The step of Gauss and Newton, the pseudo-inverse of G_X, and its least pivot over the largest."""
-        Q, T = jnp.linalg.qr(jax.jacfwd(partial(self.rows, scene))(X))
+        G, slopes = self.equations_at(scene, X, near, sloped=True)
+        Q, T = jnp.linalg.qr(slopes)
         inverse, pivots = jax.scipy.linalg.solve_triangular(T, Q.T), jnp.abs(jnp.diagonal(T))
-        return inverse @ self.rows(scene, X), inverse, jnp.min(pivots) / jnp.max(pivots)
+        return inverse @ G, inverse, jnp.min(pivots) / jnp.max(pivots)
 
 
 @partial(compiled, options=RUN_SELDOM)
+def _solution(special: _Special, scene: Scene) -> tuple[Array, Array, Array, Array]:
+    """All numbers at the point and w, differentiable twice; its condition and code, of which all is NaN unless it is 0."""
+    X, inverse, condition, code = jax.lax.stop_gradient(_found(special, jax.lax.stop_gradient(scene)))
+    near = X
+    for _ in range(2):  # each carries one order of derivatives
+        X = X - inverse @ special.equations_at(scene, X, near, sloped=False)[0]
+    X = X * jnp.where(code == FOUND, 1.0, jnp.nan)
+    return special.numbers(scene, X), special.parts(X)[-1][0], condition, code
+
+
 def _found(special: _Special, scene: Scene) -> tuple[Array, Array, Array, Array]:
     """X, the pseudo-inverse of G_X, its least pivot over the largest, and a code.
 
@@ -188,18 +256,18 @@ def _found(special: _Special, scene: Scene) -> tuple[Array, Array, Array, Array]
         share = jnp.minimum(done + step, 1.0)
         there = jax.tree.map(lambda a, b: a + share * (b - a), special.equations.scene, scene)
 
-        def corrected(X, _):
-            change = special.correction(there, X)[0]
-            return X - change, jnp.max(jnp.abs(change))
+        def corrected(new, _):
+            change = special.correction(there, new, X)[0]
+            return new - change, jnp.max(jnp.abs(change))
 
         new, (first, second, third) = jax.lax.scan(corrected, X, length=3)
-        good = (first < 0.3) & (second <= 0.2 * first + 1e-9) & (third <= 0.2 * second + 1e-9)
-        return jnp.where(good, new, X), jnp.where(good, share, done), jnp.where(good, 2 * step, step / 4), count + 1
+        good = (first < 0.1) & (second <= 0.2 * first + 1e-9) & (third <= 0.2 * second + 1e-9)
+        return jnp.where(good, special.normal(new), X), jnp.where(good, share, done), jnp.where(good, 2 * step, step / 4), count + 1
 
-    start = special.X, jnp.zeros(()), jnp.ones(()), jnp.zeros((), jnp.int32)
+    start = special.normal(special.X), jnp.zeros(()), jnp.ones(()), jnp.zeros((), jnp.int32)
     X, done, *_ = jax.lax.while_loop(lambda c: (c[1] < 1) & (c[2] > 1e-3) & (c[3] < 100), once, start)
-    change, inverse, condition = special.correction(scene, X)
-    left = jnp.max(jnp.abs(special.rows(scene, X - change)))
+    change, inverse, condition = special.correction(scene, X, X)
+    left = jnp.max(jnp.abs(special.equations_at(scene, X - change, X, sloped=False)[0]))
     return X - change, inverse, condition, jnp.where((done == 1) & (left < 1e-8), jnp.where(condition < 1e-6, SINGULAR, FOUND), NOT_FOUND)
 
 
@@ -226,11 +294,8 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
     with jax.ensure_compile_time_eval():
         point = _chosen(motions, what)
         special = _special(motions, point)
-    X, inverse, condition, code = jax.lax.stop_gradient(_found(special, jax.lax.stop_gradient(scene)))
-    for _ in range(2):  # each carries one order of derivatives
-        X = X - inverse @ special.rows(scene, X)
-    X = X * jnp.where(code == FOUND, 1.0, jnp.nan)
-    numbers, w, none = special.numbers(scene, X), special.parts(X)[-1][0], jnp.zeros(())
+    numbers, w, condition, code = _solution(special, scene)
+    none = jnp.zeros(())
     q, u, varied = equations.split(numbers)
     state = State(jnp.asarray(equations.t), q, u, none, none, none, (scene.coordinate_names, scene.speed_names))
     return CriticalPoint(state, varied, jax.lax.complex(*((0 * w, w) if point.kind == PAIR else (w, 0 * w))), condition, code, point.kind, equations.vary)
@@ -271,4 +336,4 @@ def _special(curve: Family, point: FamilyPoint) -> _Special:
         a = np.linalg.svd(moved)[2][-1]
         a, b = E @ a, E @ np.linalg.lstsq(np.vstack([moved, a]), np.append(a, 0.0), rcond=None)[0]
     X = jnp.asarray(np.concatenate([z, a, b, [w]]))
-    return _Special(equations, tuple(equations.index(name) for name in held), point.kind, freedoms.shape[1] > 0, X)
+    return _Special(equations, _program(equations), tuple(equations.index(name) for name in held), point.kind, freedoms.shape[1] > 0, X)

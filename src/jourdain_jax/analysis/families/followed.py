@@ -24,7 +24,7 @@ class Followed:
     def freedoms(self, look: Look) -> np.ndarray:
         """Directions of (q, y) along which steady motions go on at the same parameters, in columns."""
         state = look.J.shape[1] - (self.equations.vary is not None)
-        J, count = look.J[: self.equations.program.rows, :state], len(self.held) + (self.equations.vary is None)
+        J, count = look.J[: len(self.equations.rows), :state], len(self.held) + (self.equations.vary is None)
         return self.equations.in_states(np.linalg.svd(J)[2][state - count :].T)
 
     def spectrum(self, point: Point) -> Modes:

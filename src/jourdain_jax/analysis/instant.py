@@ -1,0 +1,228 @@
+"""A motion at one instant with its slopes: what small motions, steady ones and families of these are made of.
+
+    v = (dq/dt, du/dt, g, phi),    D = dv/d(t, q, u, f, p)        g: geometric rows and unit norms;  p: a parameter that varies, where one does
+
+The scalar program of a class of scenes gives du/dt of its independent speeds and of those that are asked for; others are zero. It follows from t, q and the
+independent speeds alone: a dependent speed counts in phi only. Scenes without such a program have their dense matrices.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.build.row_program import row_program
+from jourdain_jax.build.structure import structure_of, usual_rows
+from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
+from jourdain_jax.calculus.reals import Entries, is_traced, real_type
+from jourdain_jax.dynamics.reduced import DEPENDS, ignorable_coordinates
+from jourdain_jax.equations.kinematics import coordinate_rates
+from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
+from jourdain_jax.equations.projection import closure_residual
+from jourdain_jax.equations.reductions import Privileged
+from jourdain_jax.equations.scaling import scaled
+from jourdain_jax.equations.virtual_power import equations_and_rows
+from jourdain_jax.lowering.lower import lower
+from jourdain_jax.lowering.lowered import Lowered, NotLowered
+from jourdain_jax.motion.native.called import nodes_called
+from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
+from jourdain_jax.native import ffi
+from jourdain_jax.native.scalar_program import unsupported
+from jourdain_jax.program.derivative import derivatives, jacobian
+from jourdain_jax.program.emit import run
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.graph import Graph
+from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.identity import once_per_class
+from jourdain_jax.scene.scene import Scene
+
+Slopes = tuple[Float[Entries, "values"], Float[Entries, "values columns"], Float[Entries, "_ _"]]
+Matrix = tuple[tuple[int, int], dict[tuple[int, int], int]]  # a shape, and nodes by row and column; others are zero
+
+
+class Places(NamedTuple):
+    """Where parts of v are, and of the columns of D; the geometric rows are the first of g."""
+
+    qdot: np.ndarray
+    udot: np.ndarray
+    g: np.ndarray
+    phi: np.ndarray
+    t: np.ndarray
+    q: np.ndarray
+    u: np.ndarray
+    f: np.ndarray
+    geometric: np.ndarray
+
+
+def places_of(scene: Scene) -> Places:
+    """The places for a scene."""
+    n, m, geometric = len(scene.coordinate_names.entries), len(scene.speed_names.entries), len(names_of_position_rows(scene))
+    of_rows = _ranges(n, m, geometric + len(scene.coordinates.quaternions), len(names_of_rows(scene)))
+    return Places._make([*of_rows, *_ranges(1, n, m, len(scene.inputs)), of_rows[2][:geometric]])
+
+
+def _ranges(*counts: int) -> list[np.ndarray]:
+    return np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+
+
+class Sloped:
+    """Values of nodes v, their slopes D, and maybe another matrix, as machine code or by NumPy: a function of the numbers given, which may be traced."""
+
+    def __init__(self, graph: Graph, v: Sequence[int], columns: Sequence[int], given: Sequence[int], guards: Sequence[int], matrix: Matrix = ((0, 0), {})):
+        column = {x: k for k, x in enumerate(columns)}
+        slopes = {(i, column[x]): node for i, row in enumerate(jacobian(graph, v, columns)) for x, node in row.items()}
+        parts = ((len(v), 1), {(i, 0): node for i, node in enumerate(v)}), ((len(v), len(columns)), slopes), matrix
+        nodes = [node for _, entries in parts for node in entries.values()]
+        self.which, first = [], 0
+        for shape, entries in parts:
+            self.which.append(np.full(shape, len(nodes) + len(guards)))  # where there is a zero
+            for k, place in enumerate(entries):
+                self.which[-1][place] = first + k
+            first += len(entries)
+        self.guards, self.is_made = slice(first, None), is_made(graph, [*nodes, *guards])
+        self._parts = graph, [*nodes, *guards], given
+        self._known = _evaluated(*self._parts)
+
+    @cached_property
+    def _traced(self) -> Callable[[Array], Array]:
+        return differentiable(*self._parts)
+
+    def __call__(self, numbers: Float[Entries, "numbers"]) -> Slopes:
+        """v, D and the other matrix; NaN where a guard is not positive."""
+        xp = jnp if is_traced(numbers) else np
+        found = (self._traced if xp is jnp else self._known)(numbers)
+        found = xp.where(xp.all(found[self.guards] > 0), found, xp.nan)
+        found = xp.concatenate([found, xp.zeros(1, found.dtype)])
+        v, D, matrix = (found[which] for which in self.which)
+        return v[:, 0], D, matrix
+
+
+class ByProgram:
+    """v, D and, if asked for, the mass matrix of a class of scenes as one scalar program of all numbers in a row: parameters, t, q, u, inputs."""
+
+    def __init__(self, scene: Scene, program: Lowered, constant: tuple[int, ...], varied: int | None, masses: bool) -> None:
+        rows = row_program(scene)
+        if rows is None or (masses and rows.M is None):
+            raise NotLowered(f"the rows of `{type(scene).__name__}` have no scalar program")
+        graph, of, n, m = Graph(), program.traced, len(program.coordinates), len(program.speeds)
+        first = sum(np.size(leaf) for leaf in jax.tree.leaves(scene))
+        given = [graph.input(f"x{k}", True) for k in range(first + 1 + n + m + len(scene.inputs))]
+        t, q, u = given[first], given[first + 1 :][:n], given[first + 1 + n :][:m]
+        asked = [k for k in constant if k not in program.independent]
+        of_rates = [program.qdot, program.ydot, program.z if asked else (), program.guards]
+        if set(program.usual) & set(program.graph.reachable([n for part in of_rates for n in part])):
+            raise NotLowered(f"the rates of `{type(scene).__name__}` depend on what its rows usually are")
+        qdot, ydot, z, self.guards = _copied(graph, of_rates, program.graph, (of.parameters, of.t, of.q, of.u, of.inputs), given)
+        M = (rows.M or {}) if masses else {}
+        g, phi, of_masses = _copied(graph, [rows.g, rows.phi, M.values()], rows.graph, (rows.parameters, rows.t, rows.q, rows.u, rows.inputs), given)
+        udot = dict(zip(program.independent, ydot, strict=True))
+        if asked:
+            motion = {t: graph.one} | dict(zip(q, qdot, strict=True)) | {u[k]: node for k, node in udot.items()}
+            dependent = dict(zip(program.dependent, z, strict=True))
+            udot |= dict(zip(asked, derivatives(graph, [dependent[k] for k in asked], motion), strict=True))
+        self.graph, self.given, self.program, self.states = graph, given, program, (first + 1, n, m)
+        self.v = [*qdot, *(udot.get(k, graph.zero) for k in range(m)), *g, *phi]
+        self.columns = [*given[first:], *([] if varied is None else [given[varied]])]
+        matrix = (m * masses, m), {key: node for (i, k), node in zip(M, of_masses, strict=True) for key in ((i, k), (k, i))}
+        self.of = Sloped(graph, self.v, self.columns, given, self.guards, matrix)
+
+    def __call__(self, scene: Scene, t, q, u, f) -> Slopes:
+        """v, D and the mass matrix of a scene at an instant."""
+        return self.of(numbers_of(scene, t, q, u, f))
+
+    def ignorable(self, scene: Scene) -> tuple[str, ...]:
+        """Names of the coordinates on which no acceleration depends."""
+        return self.program.held
+
+
+def numbers_of(scene: Scene, t, q, u, f) -> Float[Entries, "numbers"]:
+    """All numbers in a row: parameters, t, q, u, inputs."""
+    xp = jnp if is_traced((scene, t, q, u, f)) else np
+    parts = [*jax.tree.leaves(scene), t, q, u, f]
+    return xp.concatenate([xp.ravel(xp.asarray(x, real_type())) for x in parts])
+
+
+@dataclass(frozen=True)
+class ByMatrices:
+    """v, D and the mass matrix by a scene's own matrices, differentiated by JAX; accelerations in the speeds that are to be constant."""
+
+    constant: tuple[int, ...]
+
+    def __call__(self, scene: Scene, t, q, u, f) -> Slopes:
+        """v, D and the mass matrix of a scene at an instant."""
+        return _by_matrices(scene, self.constant, t, q, u, f)
+
+    def ignorable(self, scene: Scene) -> tuple[str, ...]:
+        """Names of the coordinates on which no acceleration depends."""
+        return ignorable_coordinates(scene)
+
+
+@partial(compiled, options=RUN_SELDOM)
+def _by_matrices(scene: Scene, constant: tuple[int, ...], t, q, u, f):
+    at = places_of(scene)
+
+    def instant(x):
+        t, q, u, f = x[at.t[0]], x[at.q], x[at.u], x[at.f]
+        equations, rows = equations_and_rows(scene, t, q, u, f)
+        problem = scaled(equations, rows.judged_by(usual_rows(scene)))
+        udot = problem.c * Privileged(constant).solve(problem)[0]
+        return jnp.concatenate([coordinate_rates(scene, t, q, u), udot, closure_residual(scene, t, q), rows.phi]), equations.M
+
+    x = jnp.concatenate([t[None], q, u, f])
+    v, slope, M = jax.linearize(instant, x, has_aux=True)
+    return v, jax.vmap(slope, out_axes=1)(jnp.eye(len(x), dtype=x.dtype)), M
+
+
+def instant_of(scene: Scene | BuiltFor, constant: tuple[int, ...], masses: bool = False) -> "ByProgram | ByMatrices":
+    """How a scene's instants are computed, where these speeds are to be constant or independent."""
+    if ffi.reason_against() or (isinstance(scene, BuiltFor) and scene.backend == "xla"):
+        return ByMatrices(constant)
+    try:
+        found = by_program(as_scene(scene), lower(scene), constant, None, masses)
+    except NotLowered:
+        return ByMatrices(constant)
+    return found if found.of.is_made else ByMatrices(constant)
+
+
+@once_per_class
+def by_program(scene: Scene, *parts) -> ByProgram:
+    """The program of a class of scenes; `parts`: as of `ByProgram`. `NotLowered` where there is none."""
+    return ByProgram(scene, *parts)
+
+
+def on_rows(scene: Scene) -> np.ndarray:
+    """Which coordinates geometric rows and unit norms depend on, at some probed state."""
+    return np.any(np.abs(structure_of(scene).closure_slopes) > DEPENDS, axis=(0, 1))
+
+
+def _copied(graph: Graph, parts: Sequence, of: Graph, variables: tuple, given: Sequence[int]) -> list[list[int]]:
+    """Lists of nodes of another graph in this one, with what is given in the place of its parameters by leaf, t, q, u and inputs."""
+    parameters, *rest = variables
+    places = [int(n) for part in (*parameters, *rest) for n in np.ravel(part)]
+    new = graph.copied([n for part in parts for n in part], of, {n: x for n, x in zip(places, given, strict=True) if n >= 0})
+    return [[new[n] for n in part] for part in parts]
+
+
+def _evaluated(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[np.ndarray], np.ndarray]:
+    """Values of nodes as a function of those of the variables: by machine code where it is made, otherwise by NumPy, operation by operation."""
+    if jax.config.jax_enable_x64 and is_made(graph, nodes):
+        kernel = jax.jit(nodes_called(graph, nodes, variables, effort=0))
+        return lambda given: np.asarray(kernel(given))
+    return lambda given: Probes(graph, dict(zip([graph.value[n] for n in variables], given[:, None], strict=True)))(nodes)[:, 0]
+
+
+def differentiable(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[Array], Array]:
+    """Values of nodes as a function that JAX differentiates: by machine code where it is made, otherwise by XLA."""
+    if is_made(graph, nodes):
+        return values_of_nodes(graph, dict(enumerate(nodes)), len(nodes), variables)
+    return lambda x: jnp.stack([jnp.asarray(value, x.dtype) for value in run(graph, nodes, dict(zip(variables, x, strict=True)))])
+
+
+def is_made(graph: Graph, nodes: Sequence[int]) -> bool:
+    """Whether machine code of the nodes is made."""
+    return not ffi.reason_against() and not unsupported(graph, nodes)
