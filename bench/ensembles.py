@@ -36,8 +36,8 @@ from distributed import Client, LocalCluster
 from figures import HERE, Figures, figure, main
 
 import jourdain_jax as jj
+from jourdain_jax.ensembles.run import Runner
 from jourdain_jax.ensembles.store import Store
-from jourdain_jax.ensembles.task import Task
 
 MODEL, SPAN, TOLERANCE = "tilting-disc", 2.0, 1e-6
 WIDTH = 8  # lanes of a vector
@@ -75,14 +75,14 @@ def timed(lanes: int, folder: Path, **options) -> dict:
 
 def logged(lanes: int, folder: Path, log: Path) -> jj.StudyResult:
     """A study that writes a byte for every block that it begins to compute."""
-    before = Task.run_block
+    before = Runner.run_block
 
     def run_block(*what):
         with open(log, "ab") as file:
             file.write(b".")
         return before(*what)
 
-    Task.run_block = run_block
+    Runner.run_block = run_block
     return run(lanes, folder / "timed")
 
 

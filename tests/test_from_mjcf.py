@@ -1,5 +1,7 @@
 """Scenes from MJCF files: mass matrix, bias forces, accelerations and energies are those of MuJoCo."""
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -46,7 +48,16 @@ EVERYTHING = """
 """
 DEGREES = EVERYTHING.format(angle="degree", sequence="xyz", a=10, b=20, c=30)
 RADIANS = EVERYTHING.format(angle="radian", sequence="ZYx", a=0.2, b=-0.3, c=0.5)
-TEXTS = {"degrees": DEGREES, "radians": RADIANS, "no-gravity": DEGREES.replace('gravity="0.5 1 -9"', 'gravity="0 0 0"')}
+CHANGES = {
+    'joint="reach" gear="3"': 'site="s" gear="1 2 3 0.4 0.5 0.6"',
+    '<body name="tip" pos="0.2 0 0">': '<body name="tip" pos="0.2 0 0"><site name="s" pos="0.1 0.2 0" euler="0 50 0"/>',
+    '<geom class="main"': '<frame pos="0.1 0 0.2" euler="10 20 30"><frame axisangle="1 0 1 40"><geom class="main"',
+    'zaxis="1 1 1"/>': 'zaxis="1 1 1"/></frame></frame>',
+    '<body pos="0 0 0.1">': '<frame childclass="main" xyaxes="0 1 0 1 0 1"><body pos="0 0 0.1">',
+    '<geom size="0.04"/></body>': '<geom size="0.04"/></body></frame>',
+}
+FRAMED = functools.reduce(lambda text, change: text.replace(*change), CHANGES.items(), DEGREES)
+TEXTS = {"frames": FRAMED, "degrees": DEGREES, "radians": RADIANS, "no-gravity": DEGREES.replace('gravity="0.5 1 -9"', 'gravity="0 0 0"')}
 
 
 @pytest.mark.parametrize("name", TEXTS)
@@ -219,6 +230,7 @@ BAD = {
     "include": (_body(HINGE, '<include file="x.xml"/>'), r"x.xml: cannot be read"),
     "servo": (_body(HINGE, '<actuator><position name="p" joint="j"/></actuator>'), r"`position` `p` in `actuator` is not read"),
     "motor-of-nothing": (_body(HINGE, '<actuator><motor name="p" joint="k"/></actuator>'), r"motor `p` pushes `k`, which is no hinge or slide"),
+    "motor-of-no-site": (_body(HINGE, '<actuator><motor name="p" site="s"/></actuator>'), r"motor `p` pushes the site `s`, which is none"),
     "massless": (f'<mujoco><worldbody><body name="b">{HINGE}</body></worldbody></mujoco>', r"link `b`, which `j` moves, has no mass"),
     "mesh-of-unknown-mass": (_body(f'{HINGE}<geom type="mesh" mesh="m"/>'), r"the mass of a geom of body `b`, of the type `mesh`, is not read"),
     "no-inertia": (_body(f'{HINGE}<inertial pos="0 0 0" mass="1"/>'), r"`inertial` of body `b` has neither `diaginertia` nor `fullinertia`"),

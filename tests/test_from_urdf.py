@@ -125,6 +125,21 @@ class Robot(jj.from_urdf(ROBOT, base="planar", motors=["left", "right"])):
         return {side: jj.disc_contact(pose[f"{side}_wheel"], 0.033, axis="z") for side in ("left", "right")}
 
 
+def test_a_locked_joint_holds_its_link_where_it_would_have_moved_it():
+    arm, held = jj.from_urdf(ARM)(), jj.from_urdf(ARM, locked={"turn": 0.3})()
+    assert held.coordinate_names.entries == ("slide", "follow")
+    own, expected = jj.pose_at(held, 0.0, jnp.array([0.2, 0.5])), jj.pose_at(arm, 0.0, jnp.array([0.3, 0.2, 0.5]))
+    assert_allclose(own["third"].position, expected["third"].position, atol=1e-15)
+    assert_allclose(own["third"].orientation, expected["third"].orientation, atol=1e-15)
+
+
+def test_a_link_without_mass_may_be_fixed_and_a_joint_be_called_as_a_coordinate_of_the_base():
+    tool = _joint("fixed", "b", "c", '<mimic joint="x"/>', "k")
+    scene = jj.from_urdf(_robot(_joint("continuous", name="x"), tool, WEIGHT.format(0), links="ab"), base="planar")()
+    assert scene.coordinate_names.entries == ("x", "y", "heading", "x_")
+    assert (float(scene.c_mass), float(scene.c_inertia[2])) == (0.0, 1.0)
+
+
 def test_a_robot_on_two_wheels_follows_its_closed_form():
     # with v, omega of the middle of the axle, mass centre of the platform at -d, half track b, wheels of J, A:
     #   (m + 2 mw + 2 J/r^2) vdot + m d omega^2 = (tr + tl)/r,   (I + 2 J b^2/r^2) omegadot - m d v omega = b (tr - tl)/r
@@ -245,6 +260,7 @@ BAD = {
     "unknown-leader": (_robot(_joint(inside='<mimic joint="x"/>')), r"`mimic` of joint `j`: `x` is no joint"),
     "leader-of-itself": (_robot(_joint(inside='<mimic joint="j" multiplier="2"/>')), r"joint `j` mimics itself"),
     "nothing-moves": (_robot(_joint("fixed")), r"no joint moves anything"),
+    "unknown-locked": (_robot(_joint("planar")), r"`locked` names `j`, which is no joint of one coordinate"),
     "no-name": ("<robot><link/></robot>", r"a link has no `name`"),
     "two-names-become-one": (
         _robot(_joint(child="b-c"), _joint(child="b_c", name="k"), links=["a", "b-c", "b_c"]),
@@ -255,7 +271,7 @@ BAD = {
         r"visual of link `c` has no shape",
     ),
 }
-OPTIONS = {"unknown-base": {"base": "loose"}, "unknown-motor": {"motors": ["jj"]}, "unknown-free-link": {"free": "bb"}}
+OPTIONS = {"unknown-base": {"base": "loose"}, "unknown-motor": {"motors": ["jj"]}, "unknown-free-link": {"free": "bb"}, "unknown-locked": {"locked": {"j": 0}}}
 
 
 @pytest.mark.parametrize("case", BAD)

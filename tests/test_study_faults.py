@@ -30,7 +30,7 @@ from test_studies import assert_same
 
 import jourdain_jax as jj
 from jourdain_jax.calculus.writing import write_whole
-from jourdain_jax.ensembles import files, store, task, workers
+from jourdain_jax.ensembles import files, store, workers
 from jourdain_jax.ensembles.identity import digest
 from jourdain_jax.ensembles.run import Runner, opened
 from jourdain_jax.ensembles.store import Store
@@ -56,8 +56,8 @@ def whole(tmp_path_factory, small_blocks):
 @pytest.fixture
 def computed(monkeypatch):
     """Numbers of the blocks that are computed, in order."""
-    numbers, before = [], task.Task.run_block
-    monkeypatch.setattr(task.Task, "run_block", lambda self, number: numbers.append(number) or before(self, number))
+    numbers, before = [], Runner.run_block
+    monkeypatch.setattr(Runner, "run_block", lambda self, number: numbers.append(number) or before(self, number))
     return numbers
 
 

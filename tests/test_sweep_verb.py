@@ -8,7 +8,7 @@ import pytest
 import xarray
 
 from jourdain_jax.cli import main
-from jourdain_jax.ensembles import task
+from jourdain_jax.ensembles import run
 
 FILE = """
 model = "tilting-disc"
@@ -137,7 +137,7 @@ def test_a_study_that_stops_says_why_in_one_line(error, tmp_path, monkeypatch, c
         raise error
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(task.Task, "run_block", stops)
+    monkeypatch.setattr(run.Runner, "run_block", stops)
     (tmp_path / "discs.toml").write_text(FILE)
     assert main(["sweep", "discs.toml", "--quiet"]) == 1
     assert capsys.readouterr().err == f"jourdain-jax: {error}\n"

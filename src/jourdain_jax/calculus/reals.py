@@ -105,6 +105,13 @@ def checked_unless_traced(value, what: str, shape: tuple[int, ...] | None = None
     return checked_known(value, what, shape, advice=advice)
 
 
+def checked_whole(value, what: str, low: int, high: int | None = None, *, expected: str) -> int:
+    """A whole number from `low` to `high`. ValueError, which says that one was `expected`, for anything else."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low or (high is not None and value > high):
+        raise ValueError(f"{what} is {value!r}, expected a whole number {expected}")
+    return int(value)
+
+
 def has_unit(x) -> bool:
     """Whether it is a quantity, or a list with one in it, whose unit would be lost where it becomes a number: 1,300 g would be 1,300 kg."""
     if isinstance(x, list | tuple):

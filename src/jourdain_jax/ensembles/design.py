@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from jourdain_jax.calculus.reals import checked_known, described, has_unit
+from jourdain_jax.calculus.reals import checked_known, checked_whole, described, has_unit
 from jourdain_jax.ensembles.distributions import Distribution, Levels
 from jourdain_jax.ensembles.optional import special_functions
 from jourdain_jax.ensembles.samplers import MOST_SOBOL, SAMPLERS
@@ -51,8 +51,7 @@ class Design(Printed):
             found = "nothing varies" if not kinds else f"there are {' and '.join(sorted(kinds))} at once"
             raise ValueError(f"{found}; give distributions, or `Levels` that are crossed, or the columns of one table")
         kind = kinds.pop()
-        if isinstance(self.seed, bool) or not isinstance(self.seed, int | np.integer) or not 0 <= self.seed < 2**63:
-            raise ValueError(f"`seed` is {self.seed!r}, expected a whole number from 0 to 2^63 - 1")
+        checked_whole(self.seed, "`seed`", 0, 2**63 - 1, expected="from 0 to 2^63 - 1")
         if kind == "distributions":
             self._check_sampler()
         else:
@@ -81,13 +80,12 @@ class Design(Printed):
             raise ValueError(f"a {self.sampler} takes {'`jj.Levels`' if self.sampler == GRID else 'columns of numbers'}, but `{name}` varies as {what!r}")
         if not isinstance(self.sampler, str) or self.sampler not in SAMPLERS:
             raise ValueError(f"unknown sampler `{self.sampler}`; {nearest(str(self.sampler), SAMPLERS)} Grids take `jj.Levels`, tables columns.")
-        if isinstance(self.samples, bool) or not isinstance(self.samples, int | np.integer) or not 1 <= self.samples <= MOST_SAMPLES:
-            raise ValueError(f"`samples` is {self.samples!r}, expected a whole number of at least 1 and at most {MOST_SAMPLES}")
-        if self.sampler in ("sobol", "saltelli") and self.samples > MOST_SOBOL:
-            raise ValueError(f"`samples` is {self.samples}, expected at most {MOST_SOBOL} for a Sobol sequence; take sampler='random'")
+        samples = checked_whole(self.samples, "`samples`", 1, MOST_SAMPLES, expected=f"of at least 1 and at most {MOST_SAMPLES}")
+        if self.sampler in ("sobol", "saltelli") and samples > MOST_SOBOL:
+            raise ValueError(f"`samples` is {samples}, expected at most {MOST_SOBOL} for a Sobol sequence; take sampler='random'")
         group = len(self.variables) + 2
-        if self.sampler == "saltelli" and (self.samples % group or self.correlation):
-            wrong = "variables are correlated, for which Sobol' indices are not defined" if self.correlation else f"`samples` is {self.samples}"
+        if self.sampler == "saltelli" and (samples % group or self.correlation):
+            wrong = "variables are correlated, for which Sobol' indices are not defined" if self.correlation else f"`samples` is {samples}"
             raise ValueError(f"{wrong}; sampler 'saltelli' takes independent variables and a multiple of {group} samples (variables + 2)")
 
     def _check_given(self, kind: str) -> None:

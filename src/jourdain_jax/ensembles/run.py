@@ -10,12 +10,13 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from platform import python_version
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,11 +26,22 @@ from jourdain_jax.calculus.on_first_use import version_of
 from jourdain_jax.ensembles import memory
 from jourdain_jax.ensembles.statistics import Grid, Tally
 from jourdain_jax.ensembles.store import Store
-from jourdain_jax.ensembles.task import Lanes, Task
+from jourdain_jax.ensembles.task import Task
+from jourdain_jax.motion.batches.rollout import rollout
+from jourdain_jax.motion.marks import nan_is_a_mark
+from jourdain_jax.motion.trajectories.labelled import FIELDS, OF_LANES
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.tracebacks import users_level
 
 PACKAGES = ("jourdain-jax", "jax", "jaxlib", "diffrax", "numpy", "scipy", "zarr", "llvmlite")
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """What a block gave: values of the columns, by name, and those of all outputs, shape (lanes, outputs)."""
+
+    columns: Mapping[str, np.ndarray]
+    outputs: np.ndarray
 
 
 class Runner:
@@ -42,7 +54,8 @@ class Runner:
         self.task, self.store = task, store
         if task.memory:
             memory.give_back_at_once()
-        self._first = self._run_block(0)
+        self._outputs_of = eqx.filter_jit(eqx.filter_vmap(task.outputs_of_lane))
+        self._first = self.run_block(0)
         found = Grid.of(self._first.outputs).as_dict()
         kept = store.read_grid() or store.write_grid(found)
         if kept != found:
@@ -56,20 +69,33 @@ class Runner:
     def run(self, number: int) -> tuple[int, int]:
         """Compute and keep a chunk; how many lanes it has, and how many of them failed."""
         first, last = self.store.span(number)
-        blocks: dict[int, Lanes] = {}
-        for block in range(first // self.task.block, -(-last // self.task.block)):
-            blocks[block] = self._first if block == 0 else self._run_block(block)
-        values = {name: np.concatenate([lanes.columns[name] for lanes in blocks.values()]) for name in self.store.columns}
-        tallies = [Tally.of_block(self.grid, block * self.task.block, lanes.columns, lanes.outputs) for block, lanes in blocks.items()]
+        numbers = range(first // self.task.block, -(-last // self.task.block))
+        blocks = [self.run_block(block) if block else self._first for block in numbers]
+        values = {name: np.concatenate([lanes.columns[name] for lanes in blocks]) for name in self.store.columns}
+        tallies = [Tally.of_block(self.grid, block * self.task.block, lanes.columns, lanes.outputs) for block, lanes in zip(numbers, blocks, strict=True)]
         tally = Tally.together(tallies, len(self.task.outputs))
         self.store.write(number, values, tally)
         return last - first, tally.failed.size
 
-    def _run_block(self, number: int) -> Lanes:
-        found = self.task.run_block(number)
-        if self.task.memory:
-            memory.check(self.task.memory)
-        return found
+    def run_block(self, number: int) -> Lanes:
+        """All lanes of a block."""
+        task = self.task
+        first = number * task.block
+        count = min(task.block, len(task.design) - first)
+        starts, parameters = task.arguments(first, first + count, np.minimum(np.arange(task.block), count - 1))
+        rolled = rollout(task.scene, starts, parameters=parameters or None, chunk=task.block, progress=False, **task.span, options=task.options).lanes
+        with nan_is_a_mark():
+            outputs = np.array(self._outputs_of(rolled))[:count]
+        columns = {name: np.asarray(getattr(rolled, FIELDS[name]))[:count].astype(dtype) for name, (dtype, _, _) in OF_LANES.items()}
+        if task.save != "statistics":
+            columns |= task.design.values(first, first + count) | dict(zip(task.outputs, outputs.T, strict=True))
+        if task.save == "trajectories":
+            kept = slice(-first % task.every, count, task.every)
+            for names, array in ((task.scene.coordinate_names, rolled.q), (task.scene.speed_names, rolled.u)):
+                columns |= dict(zip(names.entries, np.moveaxis(np.asarray(array)[kept], -1, 0), strict=True))
+        if task.memory:
+            memory.check(task.memory)
+        return Lanes(columns, outputs)
 
 
 def bounded(task: Task, path, chunk: int | None, allowed: int | None, *, here: bool) -> tuple[Task, int | None]:
@@ -99,14 +125,11 @@ def bounded(task: Task, path, chunk: int | None, allowed: int | None, *, here: b
 
 def opened(task: Task, path, chunk: int | None, command: str) -> Store:
     """The folder of the task: a new one, or the one that holds it already; ValueError where it holds another study."""
-    names = task.column_names()
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ValueError(f"`{twice[0]}` would name two arrays of the study; its names are {', '.join(map(repr, names))}: call the output otherwise")
+    columns = task.columns()
     if Store.is_taken(path):
         store = Store(path)
     else:
-        store = Store.make(path, _study(task, chunk, command), task.columns(), _constants(task), attributes(task))
+        store = Store.make(path, _study(task, chunk, command), columns, _constants(task), attributes(task))
     _check_same(store, task, chunk)
     return store
 

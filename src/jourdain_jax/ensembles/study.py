@@ -8,7 +8,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from jourdain_jax.calculus.reals import checked_unless_traced, described, has_unit
+from jourdain_jax.calculus.reals import checked_unless_traced, checked_whole, described, has_unit
 from jourdain_jax.ensembles.cluster import on_cluster
 from jourdain_jax.ensembles.design import Design
 from jourdain_jax.ensembles.distributions import Distribution, Levels
@@ -116,8 +116,8 @@ class Study(Printed):
         """All that decides the numbers of a run; arguments as in `run`: `t1`, `ts`, `t0` in s, `outputs`, `save`, `every`, `inputs`, `options`, `by_name`."""
         if save not in SAVES:
             raise ValueError(f"`save` is {save!r}; {nearest(str(save), SAVES)}")
-        if isinstance(every, bool) or not isinstance(every, int | np.integer) or every < 1 or (every > 1 and save != "trajectories"):
-            raise ValueError(f"`every` is {every!r}, expected a whole number of at least 1; it says of which lanes save='trajectories' keeps the trajectory")
+        about = "of at least 1; it says of which lanes save='trajectories' keeps the trajectory"
+        every = checked_whole(every, "`every`", 1, None if save == "trajectories" else 1, expected=about)
         options = as_options(options, by_name, "Study.run", REFUSED, self._given)
         known = as_outputs(self.scene, outputs)
         first, times, last = span_and_times(self.scene, None, t0, t1, ts)
@@ -127,7 +127,7 @@ class Study(Printed):
             text = f"`ts` begins at {times[0]:g} s, and the motion at {first:g} s: the integral `{missed[0]}` would leave out what is between"
             raise ValueError(f"{text}; let `ts` begin where the motion does")
         span = {"t0": float(first), "t1": float(last), "ts": np.asarray(times, float), "inputs": inputs}
-        return Task(self.scene, self.design, self._constants, known, span, options, save, int(every))
+        return Task(self.scene, self.design, self._constants, known, span, options, save, every)
 
     def run(
         self,
@@ -172,8 +172,7 @@ class Study(Printed):
         shards = tuple(shard)
         if len(shards) != 2 or not all(isinstance(x, int) for x in shards) or not 1 <= shards[0] <= shards[1]:
             raise ValueError(f"`shard` is {shard}, expected (k, n) with 1 <= k <= n")
-        if isinstance(processes, bool) or not isinstance(processes, int) or processes < 1:
-            raise ValueError(f"`processes` is {processes!r}, expected a whole number of at least 1")
+        checked_whole(processes, "`processes`", 1, expected="of at least 1")
         if client is not None and processes != 1:
             raise ValueError("`client` and `processes` are both given; the workers of a cluster compute, or processes of this machine")
         here = client is None and processes == 1

@@ -7,10 +7,8 @@ run the same compiled programs on arrays of the same shapes, so a lane's numbers
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,11 +19,9 @@ from jourdain_jax.ensembles.identity import digest
 from jourdain_jax.ensembles.outputs import Output
 from jourdain_jax.ensembles.store import Column
 from jourdain_jax.equations.listed import names_of_events
-from jourdain_jax.motion.batches.rollout import rollout
-from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.options import AllOptions, stated
 from jourdain_jax.motion.simulate import simulate
-from jourdain_jax.motion.trajectories.labelled import FIELDS, OF_LANES
+from jourdain_jax.motion.trajectories.labelled import OF_LANES
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
@@ -34,14 +30,6 @@ LARGEST_BLOCK = 2048  # lanes: enough that few wait for the last one, few enough
 AT_START = "_at_start"  # how columns of start values are called, after the coordinate or speed
 RESERVED = ("lane", "saved_lane", "run", "zarr.json")  # axes, and names of files beside the arrays
 SAVES = ("statistics", "outputs", "trajectories")
-
-
-@dataclass(frozen=True)
-class Lanes:
-    """What a block gave: values of the columns, by name, and those of all outputs, shape (lanes, outputs)."""
-
-    columns: Mapping[str, np.ndarray]
-    outputs: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -101,39 +89,10 @@ class Task:
         span = {name: by_name.pop(name, value) for name, value in self.span.items()}
         return simulate(own, first, **span, options=self.options, **by_name)
 
-    def run_block(self, number: int) -> Lanes:
-        """All lanes of a block."""
-        first = number * self.block
-        last = min(first + self.block, len(self.design))
-        starts, parameters = self.arguments(first, last, np.minimum(np.arange(self.block), last - first - 1))
-        rolled = rollout(self.scene, starts, parameters=parameters or None, chunk=self.block, progress=False, **self.span, options=self.options).lanes
-        with nan_is_a_mark():
-            outputs = np.array(self._outputs_of(rolled))[: last - first]
-        if self.save == "statistics":
-            return Lanes(self._of_lanes(rolled, last - first), outputs)
-        columns = self.design.values(first, last) | self._of_lanes(rolled, last - first) | dict(zip(self.outputs, outputs.T, strict=True))
-        if self.save == "trajectories":
-            kept = slice(-first % self.every, last - first, self.every)
-            for names, array in ((self.scene.coordinate_names, rolled.q), (self.scene.speed_names, rolled.u)):
-                values = np.asarray(array)[kept]
-                columns |= {name: values[..., i] for i, name in enumerate(names.entries)}
-        return Lanes(columns, outputs)
-
-    @staticmethod
-    def _of_lanes(rolled: Trajectory, count: int) -> dict[str, np.ndarray]:
-        return {name: np.asarray(getattr(rolled, FIELDS[name]))[:count].astype(dtype) for name, (dtype, _, _) in OF_LANES.items()}
-
     def outputs_of_lane(self, motion: Trajectory) -> Float[Array, "outputs"]:
         """The outputs of one motion; NaN where it failed."""
         sound = motion.nan_if_failed()
         return jnp.stack([jnp.where(motion.succeeded, output.of(sound), jnp.nan) for output in self.outputs.values()])
-
-    @cached_property
-    def _outputs_of(self):
-        return eqx.filter_jit(eqx.filter_vmap(self.outputs_of_lane))
-
-    def __getstate__(self):
-        return {name: value for name, value in vars(self).items() if name != "_outputs_of"}  # what was compiled stays in its process
 
     @property
     def settled(self) -> dict[str, Any]:
@@ -141,31 +100,24 @@ class Task:
         return {name: value for name, value in self.span.items() if value is not None} | stated(self.options)
 
     def columns(self) -> dict[str, Column]:
-        """The arrays of the store."""
-        if self.save == "statistics":
-            return {}
-        events: dict = {"event_names": list(names_of_events(self.scene))}
+        """The arrays of the store. ValueError where two have one name, or that of an axis or of another file in the store."""
         units = {name: about["unit"] for name, _, about in parameters_of(self.scene)}
-        found = {}
+        found = []
         for name in self.design.names:
             about = f"start value of {name.removesuffix(AT_START)}" if name.endswith(AT_START) else f"parameter {name}"
-            found[name] = Column("float64", math.nan, {"long_name": about, "role": "varied"} | _unit(units.get(name, "")))
-        for name, (dtype, fill, about) in OF_LANES.items():
-            found[name] = Column(dtype, fill, about | (events if name == "event" else {}))
+            found.append((name, Column("float64", math.nan, {"long_name": about, "role": "varied"} | _unit(units.get(name, "")))))
+        for name, (dtype, fill, attributes) in OF_LANES.items():
+            events: dict = {"event_names": list(names_of_events(self.scene))} if name == "event" else {}
+            found.append((name, Column(dtype, fill, attributes | events)))
         for name, output in self.outputs.items():
-            found[name] = Column("float64", math.nan, {"long_name": name, "role": "output"} | _unit(output.unit))
-        for name in self._along:
-            found[name] = Column("float64", math.nan, {"long_name": f"{name} along the motion"}, (("time", len(self.ts)),), self.every)
-        return found
-
-    @property
-    def _along(self) -> tuple[str, ...]:
-        """Names of the columns that hold states along the motions."""
-        return (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries) if self.save == "trajectories" else ()
-
-    def column_names(self) -> list[str]:
-        """Names of all arrays, in order, and of what else the store holds; a name may occur twice."""
-        return [*self.design.names, *OF_LANES, *self.outputs, *self._along, *(("time",) if self._along else ()), *RESERVED]
+            found.append((name, Column("float64", math.nan, {"long_name": name, "role": "output"} | _unit(output.unit))))
+        along = (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries) if self.save == "trajectories" else ()
+        for name in along:
+            found.append((name, Column("float64", math.nan, {"long_name": f"{name} along the motion"}, (("time", len(self.ts)),), self.every)))
+        names = [*(name for name, _ in found), *(("time",) if along else ()), *RESERVED]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"`{twice[0]}` would name two arrays of the study; its names are {', '.join(map(repr, names))}: call the output otherwise")
+        return {} if self.save == "statistics" else dict(found)
 
     def identity(self) -> dict[str, str]:
         """Digests of all that decides the numbers, by what a user would call it."""

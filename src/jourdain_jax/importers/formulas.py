@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.on_first_use import needed
+from jourdain_jax.calculus.reading import shortened
 
 _FUNCTIONS = {
     **{name: name for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sign", "floor")},
@@ -64,15 +65,10 @@ def check_functions(expression, leaves) -> None:
     name = type(expression).__name__
     if name not in _KNOWN:
         raise ValueError(
-            f"the function `{name}` in `{_clipped(expression)}` has no counterpart in JAX; write it by elementary functions, or give it as an input"
+            f"the function `{name}` in `{shortened(expression)}` has no counterpart in JAX; write it by elementary functions, or give it as an input"
         )
     for argument in expression.args:
         check_functions(argument, leaves)
-
-
-def _clipped(expression) -> str:
-    text = str(expression)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _value(expression, known: dict, on: ModuleType):

@@ -14,12 +14,15 @@ from jourdain_jax.importers.identifiers import identifier
 from jourdain_jax.importers.mjcf_elements import TABLE, Defaults, all_of
 from jourdain_jax.importers.placing import about, by_euler_angles, by_quaternion, combined, onto_axis
 from jourdain_jax.importers.solids import SIZES, moments, volume
-from jourdain_jax.importers.tree import Closure, Follower, Joint, Link, Look, Mass, Matrix, Motor, Tree, Vector
+from jourdain_jax.importers.tree import Closure, Follower, Joint, Link, Look, Mass, Matrix, Motor, Push, Tree, Vector
 from jourdain_jax.importers.tree_scene import tree_scene
 from jourdain_jax.importers.xml_file import Element, Part, XmlFile
 from jourdain_jax.scene.names import as_labels, nearest
 from jourdain_jax.scene.scene import Scene
 
+Place = tuple[Vector, Matrix]  # position and rotation
+Geom = tuple[Part, str, Place]  # its attributes, its type, and its frame in that of the body
+HERE = np.zeros(3), np.eye(3)
 _TYPES = ("free", "ball", "slide", "hinge")
 _ATTITUDE = tuple(f"attitude_{part}" for part in "wxyz")
 _TURNS = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}  # numbers
@@ -39,11 +42,11 @@ def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> 
       "inertia", moments of inertia that no body has are taken as they are.
 
     **Returns** a class. Hinges and slides are coordinates of their own names, a ball joint is a quaternion of its name, a free one `<joint>_x`, `_y`, `_z` and
-    the quaternion `<joint>_attitude`; joints without a name are called `<body>_joint`, with a number from the second on. Speeds are those of MuJoCo. Motors
-    are inputs, held within `ctrlrange` and their force within `forcerange` where these are limits, as MuJoCo holds them. Fields, as far as they are not
-    zero: `<body>_mass` (kg), `<body>_mass_centre` (m, in the body's frame), `<body>_inertia` (kg m^2, about the mass centre), `<joint>_damping`,
-    `<joint>_stiffness` and `gravity` (m/s^2); and of bodies that `free` names `<body>_origin` (m). Inertias of geoms come from their mass or density. The pose
-    that the file states is the `example`.
+    the quaternion `<joint>_attitude`; joints without a name are called `<body>_joint`, with a number from the second on. Speeds are those of MuJoCo. Motors of
+    joints and of sites are inputs, held within `ctrlrange` and their force within `forcerange` where these are limits, as MuJoCo holds them. Fields, as far as
+    they are not zero: `<body>_mass` (kg), `<body>_mass_centre` (m, in the body's frame), `<body>_inertia` (kg m^2, about the mass centre),
+    `<joint>_damping`, `<joint>_stiffness` and `gravity` (m/s^2); and of bodies that `free` names `<body>_origin` (m). Inertias of geoms come from their mass or
+    density. The pose that the file states is the `example`.
 
     `connect`, `weld` and `joint` of `equality` are geometric rows, which hold exactly: loops are closed as they are in the stated pose.
 
@@ -70,14 +73,16 @@ class _Reader:
             raise self.compiler.fault("`eulerseq`", f"`{self.settings['eulerseq']}`, expected three letters out of x, y, z, X, Y, Z")
         self.meshes = {mesh.get("name") or (mesh.get("file") or "").rpartition("/")[2].partition(".")[0]: mesh for mesh in file.root.findall("asset/mesh")}
         self.links: list[Link] = []
+        self.sites: dict[str, tuple[str | None, Vector, Matrix]] = {}  # the body that each is on, and its place there
         self.moving: set[str | None] = set()  # names of links
         self.start: dict[str, float] = {}
 
     def tree(self, free: tuple[str, ...]) -> Tree:
         """The whole mechanism."""
         for section in self.file.root.findall("worldbody"):
-            looks = self._looks(section, None, "the world")
-            self.links.append(Link("world" if not self.links else f"world {len(self.links) + 1}", None, np.zeros(3), np.eye(3), looks=looks))
+            name = "world" if not self.links else f"world {len(self.links) + 1}"
+            looks = self._looks(self._geoms(section, None, "the world"))
+            self.links.append(Link(name, None, np.zeros(3), np.eye(3), looks=looks))
             self._children(section, None, None)
         gravity = all_of(self.file, "option").numbers("gravity", 3, [0.0, 0.0, -9.81])
         if any(flag.get("gravity") == "disable" for flag in self.file.root.findall("option/flag")):
@@ -106,14 +111,25 @@ class _Reader:
                 yield Closure(element.get("name") or tie.what, one, other, tie.numbers("anchor", 3), False)
 
     def _children(self, holder: Element, parent: str | None, childclass: str | None) -> None:
-        for element in holder.findall("body"):
-            self._body(element, parent, childclass)
+        for site, given, frame in self._held(holder, "site", childclass):
+            self.sites[site.get("name", "")] = parent, *_within(frame, self._place(self.defaults.of(site, given, f"site `{site.get('name')}`")))
+        for element, given, frame in self._held(holder, "body", childclass):
+            self._body(element, parent, given, frame)
 
-    def _body(self, body: Element, parent: str | None, childclass: str | None) -> None:
+    def _held(self, holder: Element, kind: str, childclass: str | None, frame: Place = HERE) -> Iterable[tuple[Element, str | None, Place]]:
+        """The elements of a kind in a body, and in frames in it: each with the class around it, and its frame in that of the body."""
+        for child in holder:
+            if child.tag == kind:
+                yield child, childclass, frame
+            elif child.tag == "frame":
+                inner = _within(frame, self._place(Part(self.file, f"frame `{child.get('name')}`", child)))
+                yield from self._held(child, kind, child.get("childclass") or childclass, inner)
+
+    def _body(self, body: Element, parent: str | None, childclass: str | None, frame: Place) -> None:
         name = body.get("name") or f"body{len(self.links)}"
         what, childclass = f"body `{name}`", body.get("childclass") or childclass
         part = Part(self.file, what, body)
-        position, turn = self._place(part)
+        position, turn = _within(frame, self._place(part))
         joints = tuple(self._joint(element, childclass, name, k) for k, element in enumerate(part.children("joint", "freejoint")))
         if any(joint.kind == "free" for joint in joints):
             if parent is not None or len(joints) > 1:
@@ -124,8 +140,9 @@ class _Reader:
         moves = bool(joints) or parent in self.moving
         if moves:
             self.moving.add(name)
-        mass = self._mass(part, childclass) if moves else None  # what never moves needs none
-        self.links.append(Link(name, parent, position, turn, joints, mass, self._looks(body, childclass, what)))
+        geoms = self._geoms(body, childclass, what)
+        mass = self._mass(part, geoms) if moves else None  # what never moves needs none
+        self.links.append(Link(name, parent, position, turn, joints, mass, self._looks(geoms)))
         self._children(body, name, childclass)
 
     def _joint(self, element: Element, childclass: str | None, body: str, number: int) -> Joint:
@@ -146,11 +163,11 @@ class _Reader:
         axis, anchor, limits = given.direction("axis", [0.0, 0.0, 1.0]), given.numbers("pos", 3, np.zeros(3)), (float(low), float(high)) if low < high else None
         return Joint(name, kind, axis, anchor, reference * unit, damping, stiffness, rest * unit, limits)
 
-    def _mass(self, body: Part, childclass: str | None) -> Mass | None:
+    def _mass(self, body: Part, geoms: list[Geom]) -> Mass | None:
         rule = self.settings["inertiafromgeom"]
         if body.children("inertial") and rule != "true":
             return self._stated_mass(body.child("inertial"))
-        masses = [] if rule == "false" else [self._mass_of_geom(geom, childclass, body.what) for geom in body.children("geom")]
+        masses = [] if rule == "false" else [self._mass_of_geom(*geom) for geom in geoms]
         heavy = [mass for mass in masses if mass is not None]
         return combined(heavy) if heavy else None
 
@@ -163,15 +180,16 @@ class _Reader:
             inertia = np.diag(inertial.numbers("diaginertia", 3))
         else:
             raise self.file.fault(f"{inertial.what} has neither `diaginertia` nor `fullinertia`; give one")
-        return inertial.mass(inertial.number("mass"), position, turn @ inertia @ turn.T)
+        return inertial.mass(inertial.number("mass"), position, turn @ inertia @ turn.T, moved=True)
 
-    def _geom(self, geom: Element, childclass: str | None, where: str) -> tuple[Part, str]:
-        """A geom and its type."""
-        given = self.defaults.of(geom, childclass, f"geom `{geom.get('name')}` of {where}" if geom.get("name") else f"a geom of {where}")
-        return given, given.given.get("type", "mesh" if "mesh" in given else "sphere")
+    def _geoms(self, holder: Element, childclass: str | None, where: str) -> list[Geom]:
+        found = []
+        for geom, around, frame in self._held(holder, "geom", childclass):
+            given = self.defaults.of(geom, around, f"geom `{geom.get('name')}` of {where}" if geom.get("name") else f"a geom of {where}")
+            found.append((given, given.given.get("type", "mesh" if "mesh" in given else "sphere"), frame))
+        return found
 
-    def _mass_of_geom(self, geom: Element, childclass: str | None, body: str) -> Mass | None:
-        given, kind = self._geom(geom, childclass, body)
+    def _mass_of_geom(self, given: Part, kind: str, frame: Place) -> Mass | None:
         word = "mass" if "mass" in given else "density"
         number = given.number(word, 1000.0)  # kg/m^3, of geoms that state neither
         if number < 0:
@@ -181,11 +199,11 @@ class _Reader:
         if kind not in SIZES:
             self.file.refuse(kind, f"the mass of {given.what}, of the type `{kind}`,", 'give body an `inertial`, or the geom mass="0"')
             return None
-        position, turn, size = self._solid(given, kind)
+        position, turn, size = self._solid(given, kind, frame)
         mass = number if word == "mass" else number * volume(kind, size)
         return Mass(mass, position, turn @ np.diag(mass * moments(kind, size)) @ turn.T)
 
-    def _solid(self, given: Part, kind: str) -> tuple[Vector, Matrix, np.ndarray]:
+    def _solid(self, given: Part, kind: str, frame: Place) -> tuple[Vector, Matrix, np.ndarray]:
         """Middle, axes and size of a geom."""
         position, turn = self._place(given)
         size = given.numbers("size", None)
@@ -197,29 +215,28 @@ class _Reader:
             size = np.array([size[0], half] if kind in ("capsule", "cylinder") else [size[0], size[0], half])
         if len(size) < SIZES[kind] or np.any(size[: SIZES[kind]] <= 0):
             raise given.fault("size", f"`{given.given.get('size')}`, expected {SIZES[kind]} lengths above zero for the type `{kind}`")
-        return position, turn, size[: SIZES[kind]]
+        return *_within(frame, (position, turn)), size[: SIZES[kind]]
 
-    def _looks(self, holder: Element, childclass: str | None, where: str) -> tuple[Look, ...]:
-        found = [self._look(*self._geom(geom, childclass, where)) for geom in holder.findall("geom")]
-        return tuple(look for look in found if look is not None)
+    def _looks(self, geoms: list[Geom]) -> tuple[Look, ...]:
+        return tuple(look for look in (self._look(*geom) for geom in geoms) if look is not None)
 
-    def _look(self, given: Part, kind: str) -> Look | None:
+    def _look(self, given: Part, kind: str, frame: Place) -> Look | None:
         colour, opacity = given.colour()
         if opacity == 0:
             return None
         if kind in _LOOKS:
             look, factors = _LOOKS[kind]
-            position, turn, size = self._solid(given, kind)
+            position, turn, size = self._solid(given, kind, frame)
             return Look(look, tuple(map(float, size * factors)), position, turn, colour, opacity)
         if kind == "mesh" and given.given.get("mesh") in self.meshes:
             mesh = Part(self.file, f"the mesh of {given.what}", self.meshes[given.given["mesh"]])
             path = self.file.folder / self.settings.get("meshdir", self.settings.get("assetdir", "")) / mesh.given.get("file", "")
             if os.path.isfile(path):
-                return Look("mesh", tuple(mesh.numbers("scale", 3, [1.0] * 3)), *self._place(given), colour, opacity, str(path))
+                return Look("mesh", tuple(mesh.numbers("scale", 3, [1.0] * 3)), *_within(frame, self._place(given)), colour, opacity, str(path))
         self.file.leave_out(f"geom of type {kind}")
         return None
 
-    def _place(self, given: Part) -> tuple[Vector, Matrix]:
+    def _place(self, given: Part) -> Place:
         """Position and rotation that attributes state. ValueError for several rotations, or numbers that say none."""
         position = given.numbers("pos", 3, np.zeros(3))
         stated = [word for word in _TURNS if word in given]
@@ -250,13 +267,23 @@ class _Reader:
         return np.stack([along, across, np.cross(along, across)], axis=1)
 
     def _motors(self, names: list[str]) -> Iterable[Motor]:
+        heavy = {link.name for link in self.links if link.mass is not None}
         for k, element in enumerate(self.file.root.findall("actuator/motor")):
-            joint = self.defaults.of(element, None, f"motor `{element.get('name') or k + 1}`").given.get("joint")
-            name = element.get("name") or f"{joint}_motor"
-            motor = self.defaults.of(element, None, f"motor `{name}`")
-            if joint not in names:
-                raise self.file.fault(f"{motor.what} pushes `{joint}`, which is no hinge or slide; {nearest(str(joint), names)}")
-            yield Motor(name, joint, float(motor.numbers("gear", None, [1.0])[0]), self._limits(motor, "ctrl"), self._limits(motor, "force"))
+            motor = self.defaults.of(element, None, f"motor `{element.get('name') or k + 1}`")
+            joint, site = motor.given.get("joint", ""), motor.given.get("site")
+            name, gear, push = element.get("name") or f"{site or joint}_motor", motor.numbers("gear", None, [1.0]), None
+            motor.what = f"motor `{name}`"
+            if site is not None:
+                if site not in self.sites:
+                    raise self.file.fault(f"{motor.what} pushes the site `{site}`, which is none; {nearest(site, self.sites)}")
+                link, position, turn = self.sites[site]
+                if link not in heavy:
+                    raise self.file.fault(f"{motor.what} pushes the site `{site}` of {f'body `{link}`' if link else 'the world'}, which has no mass that moves")
+                force, moment = np.pad(gear, (0, 6 - len(gear))).reshape(2, 3) @ turn.T
+                gear, push = np.ones(1), Push(link, position, force, moment)
+            elif joint not in names:
+                raise self.file.fault(f"{motor.what} pushes `{joint}`, which is no hinge or slide; {nearest(joint, names)}")
+            yield Motor(name, joint, float(gear[0]), self._limits(motor, "ctrl"), self._limits(motor, "force"), push)
 
     def _limits(self, motor: Part, what: str) -> tuple[float, float] | None:
         """The range of a motor's control or force, where it has one: stated, and not switched off."""
@@ -265,3 +292,8 @@ class _Reader:
         if (limited == "true" and low >= high) or (limited == "auto" and not inferred and (low, high) != (0.0, 0.0)):
             raise self.file.fault(f'`{what}range` of {motor.what} and `{what}limited` contradict each other; state low < high and `{what}limited="true"`')
         return (float(low), float(high)) if limited == "true" or (limited == "auto" and low < high) else None
+
+
+def _within(frame: Place, inner: Place) -> Place:
+    """A place in a frame, in that which the frame is in."""
+    return frame[0] + frame[1] @ inner[0], frame[1] @ inner[1]

@@ -9,7 +9,7 @@ _PLACE = "pos quat axisangle xyaxes zaxis euler"
 _CONTACT = "contype conaffinity condim group priority friction solmix solref solimp margin gap user fitscale fluidcoef"
 # actuators that share their defaults with `motor`, as far as it has the attribute
 _ACTUATORS = {"general", "position", "velocity", "intvelocity", "damper", "cylinder", "muscle"}
-_IDLE = "camera light site visual statistic size sensor keyframe custom contact texture material hfield skin"
+_IDLE = "camera light visual statistic size sensor keyframe custom contact texture material hfield skin"
 _SOFT = "class solref solimp"
 _SWITCH, _RANGED = ("true", "false"), ("true", "false", "auto")
 # What elements may hold, the attributes of their classes included; all else is refused by name. Idle is what has to do with contacts, limits, drawing, and how
@@ -47,13 +47,15 @@ TABLE = {
         words={"gravity": ("enable", "disable")},
     ),
     "default": Holds("class", many="default", idle=f"{' '.join(_ACTUATORS)} motor adhesion mesh material joint geom site camera light pair equality tendon"),
-    "worldbody": Holds(many="geom body", listed=_IDLE),
+    "worldbody": Holds(many="geom body site frame", listed=_IDLE),
+    "frame": Holds(f"name childclass {_PLACE}", many="geom body site frame", listed=_IDLE),
+    "site": Holds(f"name class {_PLACE}", idle="type size fromto material rgba group user"),
     "asset": Holds(many="mesh", idle="texture material hfield skin model"),
     "mesh": Holds("name class file scale", idle="content_type vertex normal texcoord face refpos refquat smoothnormal maxhullvert inertia builtin params"),
     "body": Holds(
         f"name childclass {_PLACE}",
         one="inertial",
-        many="joint freejoint geom body",
+        many="joint freejoint geom body site frame",
         idle="user sleep",
         listed=_IDLE,
         off={"mocap": "false", "gravcomp": "0"},
@@ -81,7 +83,7 @@ TABLE = {
     "weld": Holds("name active body1 body2 anchor", idle=f"torquescale {_SOFT}", off={"relpose": "0 1 0 0 0 0 0"}, words={"active": _SWITCH}),
     "equality/joint": Holds("name active joint1 joint2 polycoef", idle=_SOFT, words={"active": _SWITCH}),
     "motor": Holds(
-        "name class joint gear ctrllimited ctrlrange forcelimited forcerange", idle="group user", words={"ctrllimited": _RANGED, "forcelimited": _RANGED}
+        "name class joint site gear ctrllimited ctrlrange forcelimited forcerange", idle="group user", words={"ctrllimited": _RANGED, "forcelimited": _RANGED}
     ),
 }
 

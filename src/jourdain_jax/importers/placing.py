@@ -52,7 +52,7 @@ def combined(masses: list[Mass]) -> Mass:
     I = sum I_i + m_i (d_i.d_i - d_i d_i').
     """
     total = sum(one.mass for one in masses)
-    centre = sum(one.mass * one.centre for one in masses) / total
+    centre = sum(one.mass * one.centre for one in masses) / total if total else masses[0].centre
     inertia = np.zeros((3, 3))
     for one in masses:
         d = one.centre - centre

@@ -83,14 +83,25 @@ class Closure:
 
 
 @dataclass(frozen=True)
+class Push:
+    """A force at a point of a link, and a torque on it, in its frame."""
+
+    link: str
+    point: Vector  # m
+    force: Vector  # N
+    torque: Vector  # N m
+
+
+@dataclass(frozen=True)
 class Motor:
     """An input that pushes a hinge or slide with `gear` times its value, which is held between limits: those of the input first, then those of the force."""
 
     name: str
-    joint: str
+    joint: str  # "" where it pushes none
     gear: float = 1.0
     control: tuple[float, float] | None = None
     force: tuple[float, float] | None = None  # before the gear
+    push: Push | None = None  # what it does for a value of 1, where it pushes no joint
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ from jourdain_jax.calculus.rotations import quaternion_to_matrix
 from jourdain_jax.importers.identifiers import class_name, identifiers
 from jourdain_jax.importers.placing import combined, cross_matrix, onto_axis
 from jourdain_jax.importers.scene_class import scene_class
-from jourdain_jax.importers.tree import Follower, Joint, Link, Look, Mass, Tree
+from jourdain_jax.importers.tree import Follower, Joint, Link, Look, Mass, Push, Tree
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.coordinates import Quaternion, coordinates, inputs, quaternion
-from jourdain_jax.scene.loads import Load, generalized_force, gravity
+from jourdain_jax.scene.loads import Load, generalized_force, gravity, point_force, torque
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
@@ -56,7 +56,10 @@ class TreeScene(Scene):
             push = motion.inputs[self._names[motor.name]]
             for limits in (motor.control, motor.force):
                 push = push if limits is None else jnp.clip(push, *limits)
-            found.append(generalized_force(motion, **{f"{self._names[motor.joint]}_rate": motor.gear * push}))
+            if motor.push is None:
+                found.append(generalized_force(motion, **{f"{self._names[motor.joint]}_rate": motor.gear * push}))
+            else:
+                found += self._of_push(motion, motor.push, push)
         return tuple(found)
 
     def geometric_constraints(self, pose):
@@ -107,6 +110,13 @@ class TreeScene(Scene):
     def _centre(self, link: Link):
         """Mass centre in the frame of the link, m."""
         return getattr(self, f"{self._names[link.name]}_mass_centre", np.zeros(3))
+
+    def _of_push(self, motion, push: Push, size):
+        """The force and the torque of a motor."""
+        body, link = motion[push.link], next(link for link in self._tree.links if link.name == push.link)
+        yield point_force(body.point(push.point - self._centre(link)), size * (body.orientation @ push.force))
+        if np.any(push.torque):
+            yield torque(motion, push.link, size * (body.orientation @ push.torque))
 
     def _of_joint(self, motion, joint: Joint):
         name = self._names[joint.name]
@@ -194,7 +204,8 @@ def tree_scene(tree: Tree, source: str, ignore: tuple[str, ...] = ()) -> type[Sc
             raise ValueError(f"`free` names `{name}`, which is no link; {nearest(name, known)}")
     joints = [joint for link in tree.links for joint in link.joints]
     link_names = identifiers([link.name for link in tree.links], "link")
-    joint_names = identifiers([joint.name for joint in joints if joint.name], "joint")
+    of_base = () if all(joint.name for joint in joints) else ("x", "y", "z", "heading", "attitude")
+    joint_names = identifiers([joint.name for joint in joints if joint.name], "joint", taken=of_base)
     names = {"": ""} | link_names | joint_names | identifiers([motor.name for motor in tree.motors], "motor")
     parameters: dict[str, Any] = {}
     for link in tree.links:
@@ -229,7 +240,7 @@ def _mass_parameters(link: Link, name: str) -> dict[str, Any]:
     inertia = np.where(np.abs(link.mass.inertia) > POINT * link.mass.mass, link.mass.inertia, 0.0)
     is_diagonal = not np.any(inertia - np.diag(np.diag(inertia)))
     found = {
-        f"{name}_mass": parameter(link.mass.mass, unit="kg", positive=True),
+        f"{name}_mass": parameter(link.mass.mass, unit="kg", positive=link.mass.mass > 0),
         f"{name}_inertia": parameter(np.diag(inertia) if is_diagonal else inertia, unit="kg m^2", about="about its mass centre, along its axes"),
     }
     if np.any(link.mass.centre):

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jourdain_jax.importers.placing import by_roll_pitch_yaw
+from jourdain_jax.calculus.reals import checked_known
+from jourdain_jax.importers.placing import about, by_roll_pitch_yaw
 from jourdain_jax.importers.tree import Follower, Joint, Link, Look, Mass, Matrix, Motor, Tree, Vector
 from jourdain_jax.importers.tree_scene import tree_scene
 from jourdain_jax.importers.xml_file import Holds, Part, XmlFile
@@ -53,7 +54,14 @@ _TABLE = {
 
 
 def from_urdf(
-    path, *, base: str = "fixed", motors: Iterable[str] = (), free: Iterable[str] = (), packages: Mapping[str, str] | None = None, ignore: Iterable[str] = ()
+    path,
+    *,
+    base: str = "fixed",
+    motors: Iterable[str] = (),
+    free: Iterable[str] = (),
+    locked: Mapping[str, float] | None = None,
+    packages: Mapping[str, str] | None = None,
+    ignore: Iterable[str] = (),
 ) -> type[Scene]:
     """A class of scenes from a URDF file: its links are bodies, its joints coordinates.
 
@@ -65,15 +73,16 @@ def from_urdf(
     - `base`: how the root link moves: "fixed"; "planar", coordinates `x`, `y` (m) and `heading`; "free", `x`, `y`, `z` and the quaternion `attitude`.
     - `motors`: names of revolute, continuous or prismatic joints that an input pushes, `<joint>_motor` in N m or N.
     - `free`: names of links whose place in the frame of their parent is a parameter.
+    - `locked`: revolute, continuous or prismatic joint -> the coordinate (rad or m) at which it is held: `locked={"thumb": 0.0}`.
     - `packages`: name -> folder, for meshes at `package://name/...` (default: folders of that name above the file).
     - `ignore`: what may be left out without a word: names of elements and attributes, "friction", or "text" between elements. With
       "inertia", moments of inertia that no body has are taken as they are.
 
     **Returns** a class. A joint is a coordinate of its own name; a floating one is `<joint>_x`, `_y`, `_z` and the quaternion `<joint>_attitude`, a planar
-    one `<joint>_x`, `_y`, `_heading`. Fields, as far as they are not zero in the file: `<link>_mass` (kg), `<link>_mass_centre` (m, in the link's frame),
-    `<link>_inertia` (kg m^2, about the mass centre), `<joint>_damping` and `gravity` (m/s^2); and of links that `free` names `<link>_origin` (m). Limits of
-    joints stop nothing; they become the `domain`. `mimic` is a geometric row. Shapes of `visual` are drawn; `collision` is not read: rolling is stated in
-    `contacts` of a subclass.
+    one `<joint>_x`, `_y`, `_heading`; a joint that is called as a coordinate of the base is, such as `x`, is `x_`. Fields, as far as they are not zero in the
+    file: `<link>_mass` (kg), `<link>_mass_centre` (m, in the link's frame), `<link>_inertia` (kg m^2, about the mass centre), `<joint>_damping` and `gravity`
+    (m/s^2); and of links that `free` names `<link>_origin` (m). Limits of joints stop nothing; they become the `domain`. `mimic` is a geometric row, and
+    counts for nothing on joints that are fixed or locked. Shapes of `visual` are drawn; `collision` is not read: rolling is stated in `contacts` of a subclass.
 
     **Raises** ValueError with the name of the link or joint: a file that cannot be read, an unknown type of joint, a parent or child that does not exist, a
     loop, a mass without inertia, moments of inertia that no body has (the largest above the sum of the others by more than 5 %), a joint that moves no mass, a
@@ -83,7 +92,7 @@ def from_urdf(
     file = XmlFile(path, _TABLE, "URDF", ignore)
     if base not in _BASES:
         raise ValueError(f"`base` is {base!r}, expected one of {', '.join(map(repr, _BASES))}")
-    tree = _Reader(file, packages or {}).tree(base, as_labels(motors), as_labels(free))
+    tree = _Reader(file, packages or {}, locked or {}).tree(base, as_labels(motors), as_labels(free))
     file.warn()
     return tree_scene(tree, file.source, file.ignore)
 
@@ -91,12 +100,16 @@ def from_urdf(
 class _Reader:
     """Reads the elements of one file."""
 
-    def __init__(self, file: XmlFile, packages: Mapping[str, str]):
+    def __init__(self, file: XmlFile, packages: Mapping[str, str], locked: Mapping[str, float]):
         self.file, self.packages = file, packages
+        self.locked = {name: float(checked_known(value, f"`locked` of `{name}`", (), advice="give one number")) for name, value in locked.items()}
         self.links, self.joints = file.named("link"), file.named("joint")
         self.colours = {m.get("name"): Part(file, "a material", m) for m in file.root.findall("material")}
         if not self.links:
             raise file.fault("it has no links")
+        for name in self.locked:
+            if name not in self.joints or _KINDS.get(self.joints[name].given.get("type", "")) not in ("hinge", "slide"):
+                raise ValueError(f"`locked` names `{name}`, which is no joint of one coordinate; {nearest(name, self.joints)}")
 
     def tree(self, base: str, motors: tuple[str, ...], free: tuple[str, ...]) -> Tree:
         """The whole mechanism."""
@@ -110,18 +123,20 @@ class _Reader:
         if len(roots) != 1:
             found = f"links {', '.join(f'`{name}`' for name in roots)} have none" if roots else "there is a loop"
             raise self.file.fault(f"expected one link without a parent, the root; {found}")
-        links = [Link(roots[0], None, np.zeros(3), np.eye(3), () if base == "fixed" else (Joint("", base),), *self._content(self.links[roots[0]]))]
+        at_root = () if base == "fixed" else (Joint("", base),)
+        links = [Link(roots[0], None, np.zeros(3), np.eye(3), at_root, *self._content(self.links[roots[0]], base != "fixed"))]
         for link in links:  # it grows
             links += [self._link(name, joint, parent) for name, (joint, parent) in above.items() if parent == link.name]
         if len(links) < len(self.links):
             lost = next(name for name in self.links if name not in {link.name for link in links})
             raise self.file.fault(f"link `{lost}` hangs in a loop of joints; a URDF is a tree, close loops by `geometric_constraints` in a subclass")
-        names = [joint.name for link in links for joint in link.joints if joint.kind in ("hinge", "slide")]
+        joints = [joint for link in links for joint in link.joints]
+        names = [joint.name for joint in joints if joint.kind in ("hinge", "slide")]
         for name in motors:
             if name not in names:
                 raise ValueError(f"`motors` names `{name}`, which is no joint of one coordinate; {nearest(name, names)}")
-        mimics = {name: joint.child("mimic") for name, joint in self.joints.items() if joint.given.get("type") != "fixed" and joint.children("mimic")}
-        followers = tuple(self._follower(name, mimic, names) for name, mimic in mimics.items())
+        mimics = {joint.name: self.joints[joint.name].child("mimic") for joint in joints if joint.name}
+        followers = tuple(self._follower(name, mimic, names) for name, mimic in mimics.items() if mimic.element is not None)
         pushed = tuple(Motor(f"{name}_motor", name) for name in motors)
         return Tree(self.file.root.get("name") or "Robot", tuple(links), np.array([0.0, 0.0, -9.81]), pushed, followers, free=free)
 
@@ -138,8 +153,11 @@ class _Reader:
         kind = joint.given.get("type")
         if kind not in _KINDS:
             raise self.file.fault(f"{joint.what} is of the type `{kind}`; {nearest(str(kind), _KINDS)}")
-        moved = (self._joint(joint, label, kind),) if _KINDS[kind] else ()
-        return Link(name, parent, *_origin(joint), moved, *self._content(self.links[name]))
+        joints, (position, turn) = (self._joint(joint, label, kind),) if _KINDS[kind] else (), _origin(joint)
+        if label in self.locked:
+            axis, value, joints = joints[0].axis, self.locked[label], ()
+            position, turn = (position + turn @ axis * value, turn) if kind == "prismatic" else (position, turn @ about(axis, value))
+        return Link(name, parent, position, turn, joints, *self._content(self.links[name], bool(joints)))
 
     def _joint(self, joint: Part, name: str, kind: str) -> Joint:
         dynamics, limit = joint.child("dynamics"), joint.child("limit")
@@ -161,12 +179,12 @@ class _Reader:
             raise self.file.fault(f"joint `{name}` mimics itself; expected another joint")
         return Follower(name, leader, (mimic.number("offset", 0.0), mimic.number("multiplier", 1.0)))
 
-    def _content(self, link: Part) -> tuple[Mass | None, tuple[Look, ...]]:
+    def _content(self, link: Part, moved: bool) -> tuple[Mass | None, tuple[Look, ...]]:
         """Mass and shapes of a link."""
         looks = [self._look(Part(self.file, f"visual of {link.what}", visual)) for visual in link.children("visual")]
-        return self._mass(link), tuple(look for look in looks if look is not None)
+        return self._mass(link, moved), tuple(look for look in looks if look is not None)
 
-    def _mass(self, link: Part) -> Mass | None:
+    def _mass(self, link: Part, moved: bool) -> Mass | None:
         if not link.children("inertial"):
             return None
         inertial = link.child("inertial")
@@ -175,7 +193,8 @@ class _Reader:
                 raise self.file.fault(f"{link.what} has an `inertial` without `{kind}`; give both")
         centre, turn = _origin(inertial)
         xx, xy, xz, yy, yz, zz = (inertial.child("inertia").number(f"i{axes}") for axes in ("xx", "xy", "xz", "yy", "yz", "zz"))
-        return link.mass(inertial.child("mass").number("value"), centre, turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T)
+        inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
+        return link.mass(inertial.child("mass").number("value"), centre, inertia, moved=moved)
 
     def _look(self, visual: Part) -> Look | None:
         geometry, material = visual.child("geometry"), visual.child("material")

@@ -189,11 +189,11 @@ class Part:
         """The error of an attribute that is not as it should be."""
         return self.file.fault(f"{word} of {self.what} is {what}")
 
-    def mass(self, mass: float, centre: Vector, inertia: Matrix) -> Mass | None:
-        """What an element weighs; None where it states zeros. ValueError for other masses that are not positive."""
+    def mass(self, mass: float, centre: Vector, inertia: Matrix, *, moved: bool) -> Mass | None:
+        """What an element weighs; None where it states zeros. ValueError for other masses that are not positive, but for those of 0 that no joint moves."""
         if mass == 0 and not np.any(inertia):
             return None
-        if not mass > 0:
+        if not mass > 0 and (moved or mass < 0):
             raise self.fault("mass", f"{mass:g}, expected a number above zero")
         return Mass(mass, centre, inertia)
 

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import checked_whole
 from jourdain_jax.calculus.rotations import rot_y, rot_z
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.constraints import knife_edge, pin
@@ -31,7 +32,6 @@ class Skate(Scene):
     gravity: Scalar = parameter(9.81, unit="m/s^2")
 
     coordinates = coordinates("x y heading")
-    domain = {"heading": (-3.2, 3.2)}
     conventions = "x down the slope, y across it, z along its normal; heading from x towards y; the blade is along body x."
     example = {"heading_rate": 1.3}
     example_span = 10.0
@@ -72,7 +72,6 @@ class ChaplyginSleigh(Scene):
     offset: Scalar = parameter(0.25, unit="m", about="a, of the mass centre ahead of the blade; negative behind it")
 
     coordinates = coordinates("x y heading")
-    domain = {"heading": (-3.2, 3.2)}
     conventions = "z up; heading from x towards y; the blade is along body x; x, y of the mass centre."
     example = {"x_rate": -0.6, "heading_rate": 0.9}  # backwards at first
     example_span = 12.0
@@ -139,7 +138,7 @@ class Snakeboard(Scene):
 
     coordinates = coordinates("x y heading rotor steer")
     inputs = inputs("rotor_torque steer_torque")
-    domain = {"heading": (-3.2, 3.2), "rotor": (-3.2, 3.2), "steer": (-1.2, 1.2)}
+    domain = {"steer": (-1.2, 1.2)}
     conventions = "z up; heading from x towards y; all angles positive counterclockwise seen from above."
     example = {"steer": 0.3, "steer_rate": 0.5, "x_rate": 1.0, "rotor_rate": 0.4}
 
@@ -197,8 +196,7 @@ class TrailerChain(Scene):
     conventions = "z up; headings from x towards y; x, y of the axle; hitch of a trailer on the axle of the body ahead."
 
     def __check_init__(self):
-        if not isinstance(self.trailers, int) or self.trailers < 0:
-            raise ValueError(f"`trailers` of `TrailerChain` is {self.trailers!r}, expected a whole number >= 0")
+        checked_whole(self.trailers, "`trailers` of `TrailerChain`", 0, expected=">= 0")
 
     @property
     def coordinates(self):

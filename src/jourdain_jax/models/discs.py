@@ -31,7 +31,6 @@ class VerticalDisc(Scene):
 
     coordinates = coordinates("x y heading roll")
     privileged = ("heading_rate", "roll_rate")
-    domain = {"heading": (-3.2, 3.2), "roll": (-3.2, 3.2)}
     conventions = "z up; heading from x towards y; axle along body y; positive roll moves forwards."
     example = {"heading_rate": 2.0, "roll_rate": 1.0}
     example_span = 1.0
@@ -85,7 +84,7 @@ class TiltingDisc(_ThinDisc):
     """
 
     coordinates = coordinates("x y yaw lean spin")
-    domain = {"yaw": (-3.2, 3.2), "lean": (-1.2, 1.2), "spin": (-3.2, 3.2)}
+    domain = {"lean": (-1.2, 1.2)}
     conventions = "z up; upright at lean = 0, heading along x at yaw = 0; axle along body y; positive spin rolls forward."
     example = {"lean": 0.3, "yaw_rate": 0.5, "lean_rate": 0.2, "spin_rate": -3.0}
 

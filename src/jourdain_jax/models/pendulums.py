@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import checked_whole
 from jourdain_jax.scene.bodies import Particle
 from jourdain_jax.scene.constraints import rod
 from jourdain_jax.scene.coordinates import coordinates
@@ -43,7 +44,7 @@ class DoublePendulumAngles(_DoublePendulum):
     """
 
     coordinates = coordinates("theta1 theta2")
-    domain = {"theta1": (-3.2, 3.2), "theta2": (-3.2, 3.2), "theta1_rate": (-3.0, 3.0), "theta2_rate": (-3.0, 3.0)}
+    domain = {"theta1_rate": (-3.0, 3.0), "theta2_rate": (-3.0, 3.0)}
     conventions = "x horizontal, z up; pivot at the origin; angles from straight down, positive towards +x."
     example = {"theta1": 0.8, "theta2": -0.4, "theta1_rate": 0.3, "theta2_rate": 0.5}
 
@@ -154,8 +155,7 @@ class PendulumChain(Scene):
     example_span = 3.0
 
     def __check_init__(self):
-        if not isinstance(self.links, int) or self.links < 1:
-            raise ValueError(f"`links` of `PendulumChain` is {self.links!r}, expected a whole number of particles >= 1")
+        checked_whole(self.links, "`links` of `PendulumChain`", 1, expected="of particles >= 1")
 
     @property
     def coordinates(self):

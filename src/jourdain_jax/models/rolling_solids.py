@@ -40,7 +40,7 @@ class BallOnTurntable(Scene):
     coordinates = coordinates("x y", quaternion("attitude"))
     speeds = speeds("x_rate y_rate roll_x roll_y spin")
     privileged = ("x_rate", "y_rate", "spin")
-    domain = {"roll_x": (-10.0, 10.0), "roll_y": (-10.0, 10.0), "spin": (-10.0, 10.0)}
+    domain = dict.fromkeys(("roll_x", "roll_y", "spin"), (-10.0, 10.0))
     conventions = "z up; x, y along the table (x downhill when tilt > 0, y level), which turns anticlockwise about its normal."
     example = {"x": 0.2, "x_rate": 0.1, "y_rate": 0.3, "spin": 1.0}
     example_span = 10.0
@@ -112,14 +112,7 @@ class Rattleback(Scene):
     coordinates = coordinates("x y alpha beta gamma")
     speeds = speeds("x_rate y_rate w1 w2 w3")
     privileged = ("w1", "w2", "w3")
-    domain = {
-        "alpha": (-1.0, 1.0),
-        "beta": (-1.0, 1.0),
-        "gamma": (-3.2, 3.2),
-        "w1": (-5.0, 5.0),
-        "w2": (-5.0, 5.0),
-        "w3": (-5.0, 5.0),
-    }
+    domain = {"alpha": (-1.0, 1.0), "beta": (-1.0, 1.0)} | dict.fromkeys(("w1", "w2", "w3"), (-5.0, 5.0))
     conventions = (
         "x, y, z inertial with z up, of the mass centre; angles and w1, w2, w3 refer to axes with n3 = -z down: R = rot3(gamma) "
         "rot1(alpha) rot2(beta), body axis 3 down at zero angles, so that w3 > 0 turns clockwise seen from above."

@@ -25,9 +25,6 @@ from jourdain_jax.scene.parameters import Scalar, parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 
-_TURN = (-3.2, 3.2)
-_ANGLES = {"psi1": _TURN, "psi2": _TURN}
-
 
 class _TwoWheelAxle(Scene):
     """What the four scenes share: the parameters, a wheel, the weight, the known integrals."""
@@ -86,7 +83,7 @@ class _FreeWheels(_TwoWheelAxle):
 
     coordinates = coordinates("x1 y1 z1 phi1 theta1 psi1 x2 y2 z2 phi2 theta2 psi2")
     privileged = ("psi1_rate", "phi1_rate")
-    domain = {"z1": (0.1, 0.5), "z2": (0.1, 0.5), "phi1": _TURN, "phi2": _TURN, **_ANGLES}
+    domain = {"z1": (0.1, 0.5), "z2": (0.1, 0.5)}
     example = {"y2": 0.8, "psi1_rate": 0.7 / 0.3, "phi1_rate": 1.1}
 
     def bodies(self, t, q):
@@ -130,7 +127,6 @@ class _UprightWheels(_TwoWheelAxle):
     """Two upright wheels of one heading in the seven coordinates of Methods II and III."""
 
     coordinates = coordinates("x1 y1 psi1 x2 y2 psi2 phi")
-    domain = {"phi": _TURN, **_ANGLES}
 
     def bodies(self, t, q):
         upright = jnp.zeros_like(q.phi)

@@ -67,14 +67,7 @@ class WhippleBicycle(Scene):
     coordinates = coordinates("x y yaw lean pitch steer rear_spin front_spin")
     inputs = inputs("lean_torque steer_torque")
     privileged = ("lean_rate", "steer_rate", "front_spin_rate")  # regular at any steer; the rear wheel stands still at a right angle
-    domain = {
-        "yaw": (-3.2, 3.2),
-        "lean": (-0.8, 0.8),
-        "pitch": (-0.1, 0.1),
-        "steer": (-1.0, 1.0),
-        "rear_spin": (-3.2, 3.2),
-        "front_spin": (-3.2, 3.2),
-    }
+    domain = {"lean": (-0.8, 0.8), "pitch": (-0.1, 0.1), "steer": (-1.0, 1.0)}
     conventions = (
         "z up, x forward, y to the left at yaw = 0; parameters in the z-down frame of Meijaard et al. (2007). Turns in the order "
         "yaw, lean, pitch. Positive: yaw left, lean right, pitch nose down, steer right, spins rolling forward."

@@ -24,17 +24,6 @@ PLAIN = "#8a8a86"  # of what belongs to no body
 
 
 @dataclass(frozen=True)
-class Look:
-    """A shape and where it is in the frame of its body, at all times."""
-
-    visual: Visual  # at the first time
-    positions: np.ndarray  # (times, 3), m
-    orientations: np.ndarray  # (times, 3, 3)
-    points: np.ndarray  # (times, points, 3), m: of a line; (times, 0, 3) of others
-    radius: float  # m, of a line; 0: thin
-
-
-@dataclass(frozen=True)
 class DrawnBody:
     """A body at all times; the inertial frame is one of the name `""`, at rest."""
 
@@ -43,13 +32,12 @@ class DrawnBody:
     positions: np.ndarray  # (times, 3), m
     orientations: np.ndarray  # (times, 3, 3)
     angular_velocities: np.ndarray  # (times, 3), rad/s, inertial frame
-    looks: list[Look]
+    looks: list[Visual]  # all arrays with a leading axis of times; sizes are those at the first
 
     def extents(self) -> np.ndarray:
         """Points (times, points, 3) in space, m, whose box holds the body."""
-        corners = np.concatenate([_corners_of(look.visual) for look in self.looks])
-        local = np.concatenate([np.broadcast_to(corners, (len(self.positions), *corners.shape)), *(look.points for look in self.looks)], axis=1)
-        return np.einsum("tij,tpj->tpi", self.orientations, local) + self.positions[:, None]
+        local = [np.broadcast_to(points, (len(self.positions), *points.shape[-2:])) for points in map(_corners_of, self.looks)]
+        return np.einsum("tij,tpj->tpi", self.orientations, np.concatenate(local, axis=1)) + self.positions[:, None]
 
 
 @dataclass(frozen=True)
@@ -105,10 +93,10 @@ def _drawn(ts: np.ndarray, reached: np.ndarray, seen) -> Drawn:
     drawn = {}
     for k, (name, body) in enumerate(bodies.items()):
         turned = np.asarray(body.orientation) if isinstance(body, RigidBody) else np.broadcast_to(np.eye(3), (len(reached), 3, 3))
-        drawn[name] = DrawnBody(name, PALETTE[k % len(PALETTE)], np.asarray(body.position), turned, velocities[name], [_look(v) for v in stated[name]])
+        drawn[name] = DrawnBody(name, PALETTE[k % len(PALETTE)], np.asarray(body.position), turned, velocities[name], stated[name])
     if stated.get(""):
         still = np.zeros((len(reached), 3))
-        drawn[""] = DrawnBody("", PLAIN, still, np.broadcast_to(np.eye(3), (len(reached), 3, 3)), still, [_look(v) for v in stated[""]])
+        drawn[""] = DrawnBody("", PLAIN, still, np.broadcast_to(np.eye(3), (len(reached), 3, 3)), still, stated[""])
     return Drawn(ts, reached, drawn, contacts, sized)
 
 
@@ -135,18 +123,11 @@ def _same_at_all(visual: Visual, times: int) -> Visual:
     return jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), (times, *np.shape(x))), visual)
 
 
-def _look(visual: Visual) -> Look:
-    """A shape with a leading axis of times."""
-    first = _at(visual, 0)
-    points = np.asarray(visual.size) if visual.kind == "line" else np.zeros((len(visual.position), 0, 3))
-    return Look(first, np.asarray(visual.position), np.asarray(visual.orientation), points, 0.0 if first.radius is None else float(first.radius))
-
-
 def _corners_of(visual: Visual) -> np.ndarray:
-    """Points (points, 3) in the frame of its body, m, whose box holds the shape at the first time; of a line none."""
-    size = np.asarray(visual.size)
+    """Points (points, 3) in the frame of its body, m, whose box holds the shape at the first time; of a line its own, with a leading axis of times."""
     if visual.kind == "line":
-        return np.zeros((0, 3))
+        return np.asarray(visual.size)
+    size = np.asarray(visual.size)[0]
     if visual.kind == "mesh":
         own = visual.faces.corners * size  # type: ignore[union-attr]
     else:
@@ -154,4 +135,4 @@ def _corners_of(visual: Visual) -> np.ndarray:
         if half is None:
             half = np.array([size[0], size[0], size[1] / 2 + (size[0] if visual.kind == "capsule" else 0.0)])
         own = half * np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
-    return own @ np.asarray(visual.orientation).T + np.asarray(visual.position)
+    return own @ np.asarray(visual.orientation)[0].T + np.asarray(visual.position)[0]

@@ -8,8 +8,9 @@ import numpy as np
 from jourdain_jax.calculus.rotations import matrices_to_quaternions
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.grounds_drawn import grounds_of
-from jourdain_jax.plotting.looks import Drawn, DrawnBody, Look, looks_of
-from jourdain_jax.plotting.solids import triangles_of
+from jourdain_jax.plotting.looks import Drawn, DrawnBody, looks_of
+from jourdain_jax.plotting.solids import radius_of, triangles_of
+from jourdain_jax.scene.visuals import Visual
 
 
 @dataclass(frozen=True)
@@ -109,15 +110,15 @@ def _body(numbers: Numbers, body: DrawnBody, drawn: Drawn, colour: str) -> dict:
     }
 
 
-def _shape(numbers: Numbers, look: Look, colour: str, thin: float) -> dict:
-    visual = look.visual
+def _shape(numbers: Numbers, visual: Visual, colour: str, thin: float) -> dict:
     shape: dict = {"kind": visual.kind, "colour": visual.colour or colour, "opacity": visual.opacity}
+    size = np.asarray(visual.size)
     if visual.kind == "line":
-        return shape | {"size": [], "count": look.points.shape[1], "points": numbers.add(_still(look.points)), "radius": look.radius or thin}
+        return shape | {"size": [], "count": size.shape[1], "points": numbers.add(_still(size)), "radius": radius_of(visual) or thin}
     if visual.kind == "mesh":
-        shape["mesh"] = numbers.add(np.asarray(visual.size) * triangles_of(visual)[:, :3])
-    placed = {"p": numbers.add(_still(look.positions)), "q": numbers.add(_still(quaternions_of(look.orientations))), "turns": [0]}
-    return shape | placed | {"size": np.asarray(visual.size).ravel().tolist()}
+        shape["mesh"] = numbers.add(size[0] * triangles_of(visual)[:, :3])
+    places, turns = np.asarray(visual.position), quaternions_of(np.asarray(visual.orientation))
+    return shape | {"p": numbers.add(_still(places)), "q": numbers.add(_still(turns)), "turns": [0], "size": size[0].ravel().tolist()}
 
 
 def _ground(numbers: Numbers, ground: dict) -> dict:
@@ -156,7 +157,7 @@ def _still(values: np.ndarray) -> np.ndarray:
 
 def _at_rest(drawn: Drawn) -> bool:
     """Whether something stands in the inertial frame, such as a table."""
-    return "" in drawn.bodies and any(len(_still(look.positions)) == 1 and look.visual.kind != "line" for look in drawn.bodies[""].looks)
+    return "" in drawn.bodies and any(len(_still(np.asarray(look.position))) == 1 and look.kind != "line" for look in drawn.bodies[""].looks)
 
 
 def _moves(body: DrawnBody) -> bool:

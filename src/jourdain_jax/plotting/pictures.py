@@ -7,7 +7,7 @@ import numpy as np
 
 from jourdain_jax.calculus.figures import figure as figure_in_html
 from jourdain_jax.calculus.figures import pyplot
-from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.reals import checked_whole, described
 from jourdain_jax.motion.start import start
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.looks import Drawn, looks_at, looks_of
@@ -44,13 +44,12 @@ def animate(
     ValueError for another suffix than .gif, or a motion that reached none of its times; ImportError without matplotlib.
     """
     _check_one(trajectory, "`animate`", "jj.animate(rollout.lane(0), 'lane-0.gif')")
-    if not isinstance(frames, int | np.integer) or frames < 1:
-        raise ValueError(f"`frames` is {frames!r}, expected a whole number of at least 1")
+    frames = checked_whole(frames, "`frames`", 1, expected="of at least 1")
     check_suffix(path)
     plt = pyplot()
     from matplotlib.animation import FuncAnimation, PillowWriter
 
-    drawn = looks_of(trajectory, "animate", int(frames))
+    drawn = looks_of(trajectory, "animate", frames)
     traces = _traces(trajectory, drawn, [(name, np.zeros(3)) for name in drawn.bodies if name] if paths is None else paths)
     bodies = [painted(drawn, k) for k in range(len(drawn.ts))]
     boxes = np.stack([box_of(faces[:1]) for faces in bodies])

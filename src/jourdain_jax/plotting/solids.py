@@ -6,22 +6,20 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jourdain_jax.plotting.guesses import across
-from jourdain_jax.plotting.looks import Look
 from jourdain_jax.scene.visuals import Visual
 
 Quads = Float[np.ndarray, "faces 4 3"]  # m; corners anticlockwise, seen from outside
 
 
-def faces_of(look: Look, k: int, thin: float) -> tuple[Quads, Float[np.ndarray, "faces"]]:
+def faces_of(visual: Visual, k: int, thin: float) -> tuple[Quads, Float[np.ndarray, "faces"]]:
     """Faces of a shape at the time with number `k` in its own axes (a line: in those of its body), and how dark each is painted, 0 to 1.
 
     `thin`: radius of a line that has none, m.
     """
-    visual, size = look.visual, np.asarray(look.visual.size)
-    dark = None
+    size, dark = np.asarray(visual.size)[0], None
     if visual.kind == "line":
-        points = look.points[k]
-        found = np.concatenate([_bar(a, b, look.radius or thin) for a, b in pairwise(points) if np.any(a != b)] or [np.zeros((0, 4, 3))])
+        points, radius = np.asarray(visual.size)[k], radius_of(visual) or thin
+        found = np.concatenate([_bar(a, b, radius) for a, b in pairwise(points) if np.any(a != b)] or [np.zeros((0, 4, 3))])
     elif visual.kind == "ellipsoid":  # its octants are painted in turn, so that one sees it roll
         found = size * quads(revolved(_arc(np.pi, 13), 24))
         dark = np.kron(0.35 * np.eye(2)[[0, 1, 0, 1]].T, np.ones((6, 6))).ravel()
@@ -39,6 +37,11 @@ def faces_of(look: Look, k: int, thin: float) -> tuple[Quads, Float[np.ndarray, 
             quarters = np.repeat([0.0, 0.35, 0.0, 0.35], around // 4)
             dark = np.concatenate([quarters, np.full(around, 0.5), quarters])
     return found, np.zeros(len(found)) if dark is None else dark
+
+
+def radius_of(line: Visual) -> float:
+    """The radius of a line, m; 0: thin."""
+    return 0.0 if line.radius is None else float(np.asarray(line.radius)[0])
 
 
 def quads(grid: Float[np.ndarray, "rows columns 3"]) -> Quads:
@@ -84,13 +87,9 @@ def _bar(a: np.ndarray, b: np.ndarray, radius: float) -> Quads:
 
 def split(faces: Quads, longest: float) -> tuple[Float[np.ndarray, "parts 4 3"], Int[np.ndarray, "parts"]]:
     """Faces in parts with edges of at most about `longest`, so that nearer things hide no more than what is behind them; and of which face each part is."""
-    along, upwards = (np.linalg.norm(faces - np.roll(faces, 1, axis=1), axis=2).reshape(-1, 2, 2).max(axis=1) / longest).T
-    cells = np.clip(np.ceil(np.stack([upwards, along], axis=1)), 1, 20).astype(int)
-    parts, whose = [], []
-    for rows, columns in np.unique(cells, axis=0):
-        which = np.flatnonzero(np.all(cells == [rows, columns], axis=1))
-        r, s = np.linspace(0, 1, rows + 1)[:, None], np.linspace(0, 1, columns + 1)
-        weights = np.stack([(1 - r) * (1 - s), (1 - r) * s, r * s, r * (1 - s)], axis=-1)
-        parts += [quads(weights @ face) for face in faces[which]]
-        whose.append(np.repeat(which, rows * columns))
-    return np.concatenate([faces[:0], *parts]), np.concatenate([np.zeros(0, int), *whose])
+    edges = np.linalg.norm(faces - np.roll(faces, 1, axis=1), axis=2)  # from the last corner to the first, from there to the second, ...
+    rows, columns = np.clip(np.ceil(edges.reshape(-1, 2, 2).max(axis=(0, 1), initial=0.0) / longest), 1, 20).astype(int)
+    r, s = np.linspace(0, 1, rows + 1)[:, None], np.linspace(0, 1, columns + 1)
+    weights = np.stack([(1 - r) * (1 - s), (1 - r) * s, r * s, r * (1 - s)], axis=-1)
+    parts = [quads(weights @ face) for face in faces]
+    return np.concatenate([faces[:0], *parts]), np.repeat(np.arange(len(faces)), rows * columns)

@@ -22,14 +22,14 @@ def painted(drawn: Drawn, k: int, strength: float = 1.0) -> Painted:
         for look in body.looks:
             own, dark = faces_of(look, k, drawn.thin)
             own, whose = split(own, size / 12)
-            if look.visual.kind != "line":
-                own = own @ look.orientations[k].T + look.positions[k]
+            if look.kind != "line":
+                own = own @ np.asarray(look.orientation)[k].T + np.asarray(look.position)[k]
             own = own @ body.orientations[k].T + body.positions[k]
             lit = normals_of(own) @ _LIGHT
             shade = (0.7 + 0.3 * np.maximum(lit, 0.0)) * (1 - dark[whose])
-            colour = 1 - strength * (1 - shade[:, None] * rgb(look.visual.colour or body.colour))
+            colour = 1 - strength * (1 - shade[:, None] * rgb(look.colour or body.colour))
             corners.append(own)
-            colours.append(np.column_stack([colour, np.full(len(own), look.visual.opacity)]))
+            colours.append(np.column_stack([colour, np.full(len(own), look.opacity)]))
     return np.concatenate(corners), np.concatenate(colours)
 
 
