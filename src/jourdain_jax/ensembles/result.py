@@ -15,6 +15,7 @@ from jourdain_jax.ensembles.sensitivity import SobolIndices, sobol_indices
 from jourdain_jax.ensembles.statistics import Grid, Statistics, Tally, combined
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
+from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.results import CODES
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -37,7 +38,9 @@ class Lane(Printed):
 
     def simulate(self, **options) -> Trajectory:
         """The motion of this lane, with the options of the study; `options` replace some, such as `ts=` or `rtol=`."""
-        return self.task.simulated(self.number, **options)
+        task = self.task
+        own = task.scene.replace(**self.parameters) if self.parameters else task.scene
+        return simulate(own, self.starts, **dict(task.span) | {"options": task.options} | options)
 
     def _text(self) -> str:
         given = {name: f"{np.asarray(value).tolist()}" for name, value in (self.parameters | self.starts).items()}
@@ -96,13 +99,12 @@ class StudyResult(Printed):
             raise IndexError(f"lane {number} does not exist; this study has {len(self)} lanes, 0 to {len(self) - 1}")
         if self.task is None:
             raise ValueError("which scene this was is not known here; call `study.run` with the same arguments, which computes nothing twice")
-        starts, parameters = self.task.arguments(number, number + 1)
-        first = {name: value if name in self.task.constants else float(value[0]) for name, value in starts.items()}
         kept = {}
         if self.store.columns:
             self.store.check_arrays({number // self.store.chunk}.intersection(self.store.receipts()))
             kept = {name: float(array[number]) for name, array in self._opened().items() if array.dims == ("lane",)}
-        return Lane(self.task, number, first, {name: float(value[0]) for name, value in parameters.items()}, kept)
+        values = {name: float(column[0]) for name, column in self.task.design.values(number, number + 1).items()}
+        return Lane(self.task, number, *self.task.starts_and_parameters(values), kept)
 
     @cached_property
     def statistics(self) -> Statistics:

@@ -82,13 +82,14 @@ class Runner:
         task = self.task
         first = number * task.block
         count = min(task.block, len(task.design) - first)
-        starts, parameters = task.arguments(first, first + count, np.minimum(np.arange(task.block), count - 1))
+        values = task.design.values(first, first + count)
+        starts, parameters = task.starts_and_parameters({name: np.pad(column, (0, task.block - count), mode="edge") for name, column in values.items()})
         rolled = rollout(task.scene, starts, parameters=parameters or None, chunk=task.block, progress=False, **task.span, options=task.options).lanes
         with nan_is_a_mark():
             outputs = np.array(self._outputs_of(rolled))[:count]
         columns = {name: np.asarray(getattr(rolled, FIELDS[name]))[:count].astype(dtype) for name, (dtype, _, _) in OF_LANES.items()}
         if task.save != "statistics":
-            columns |= task.design.values(first, first + count) | dict(zip(task.outputs, outputs.T, strict=True))
+            columns |= values | dict(zip(task.outputs, outputs.T, strict=True))
         if task.save == "trajectories":
             kept = slice(-first % task.every, count, task.every)
             for names, array in ((task.scene.coordinate_names, rolled.q), (task.scene.speed_names, rolled.u)):

@@ -20,7 +20,6 @@ from jourdain_jax.ensembles.outputs import Output
 from jourdain_jax.ensembles.store import Column
 from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.motion.options import AllOptions, stated
-from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.trajectories.labelled import OF_LANES
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.parameters import parameters_of
@@ -71,23 +70,10 @@ class Task:
         """Saved times, s."""
         return np.asarray(self.span["ts"])
 
-    def arguments(self, first: int, last: int, places: np.ndarray | None = None) -> tuple[dict, dict]:
-        """Start values and parameters of some lanes, counted from `first`: those at `places`, or all."""
-        values = self.design.values(first, last)
-        return self.starts_and_parameters(values if places is None else {name: column[places] for name, column in values.items()})
-
     def starts_and_parameters(self, values: Mapping) -> tuple[dict, dict]:
         """Start values, those that all lanes share among them, and parameters, from the columns of the design by name."""
         starts = {name.removesuffix(AT_START): column for name, column in values.items() if name.endswith(AT_START)}
         return dict(self.constants) | starts, {name: column for name, column in values.items() if not name.endswith(AT_START)}
-
-    def simulated(self, lane: int, **by_name) -> Trajectory:
-        """Return the motion of one sample alone; span, inputs and options by name replace the study's."""
-        starts, parameters = self.arguments(lane, lane + 1)
-        own = self.scene.replace(**{name: column[0] for name, column in parameters.items()}) if parameters else self.scene
-        first = {name: value if name in self.constants else value[0] for name, value in starts.items()}
-        span = {name: by_name.pop(name, value) for name, value in self.span.items()}
-        return simulate(own, first, **span, options=self.options, **by_name)
 
     def outputs_of_lane(self, motion: Trajectory) -> Float[Array, "outputs"]:
         """The outputs of one motion; NaN where it failed."""

@@ -10,24 +10,20 @@ SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}  # 
 
 def volume(kind: str, size: Float[np.ndarray, "_"]) -> float:
     """Volume of a solid, m^3."""
-    if kind == "sphere":
-        return 4 / 3 * math.pi * size[0] ** 3
-    if kind == "ellipsoid":
-        return 4 / 3 * math.pi * math.prod(size)
+    if kind in ("sphere", "ellipsoid"):
+        return 4 / 3 * math.pi * math.prod(np.broadcast_to(size, 3))
     if kind == "box":
         return 8 * math.prod(size)
     cylinder = 2 * math.pi * size[0] ** 2 * size[1]
-    return cylinder + volume("sphere", size) if kind == "capsule" else cylinder
+    return cylinder + volume("sphere", size[:1]) if kind == "capsule" else cylinder
 
 
 def moments(kind: str, size: Float[np.ndarray, "_"]) -> Float[np.ndarray, "3"]:
     """Principal moments about the middle for a mass of 1 kg; the axis of cylinders and capsules is z."""
-    if kind == "sphere":
-        return np.full(3, 0.4 * size[0] ** 2)
-    if kind in ("ellipsoid", "box"):
-        squares = np.square(size[:3])
-        return (np.sum(squares) - squares) / (5 if kind == "ellipsoid" else 3)
-    radius, half = size[:2]
+    if kind in ("sphere", "ellipsoid", "box"):
+        squares = np.square(np.broadcast_to(size, 3))
+        return (np.sum(squares) - squares) / (3 if kind == "box" else 5)
+    radius, half = size
     straight = np.array([(3 * radius**2 + 4 * half**2) / 12] * 2 + [radius**2 / 2])
     if kind == "cylinder":
         return straight

@@ -22,16 +22,12 @@ def draw_eigenvalues(study: Study, path: str | os.PathLike) -> None:
     for name, columns, colour in _MODES:
         for column in columns:
             _band(real, study.grid, nominal[:, column].real, samples[:, :, column].real, colour, name if column == columns[0] else None)
-    weave = nominal[:, 2].imag
-    _band(imaginary, study.grid, np.abs(weave), np.abs(samples[:, :, 2].imag), "tab:blue", "weave")
+    _band(imaginary, study.grid, np.abs(nominal[:, 2].imag), np.abs(samples[:, :, 2].imag), "tab:blue", "weave")
     _mark_range(study, (real, imaginary))
     real.axhline(0.0, color="0.3", lw=0.8)
-    real.set_ylim(-_CEILING, _CEILING)
-    real.set_ylabel("real part in 1/s")
-    imaginary.set_ylabel("imaginary part in rad/s")
+    real.set(ylim=(-_CEILING, _CEILING), ylabel="real part in 1/s")
+    imaginary.set(ylabel="imaginary part in rad/s", xlabel="forward speed in m/s", xlim=(study.grid[0], study.grid[-1]))
     imaginary.set_ylim(bottom=0.0)
-    imaginary.set_xlabel("forward speed in m/s")
-    imaginary.set_xlim(study.grid[0], study.grid[-1])
     real.set_title(f"{study.bicycle.name}: eigenvalues of upright running; bands, grey for the speeds, hold 95 % of {len(samples)} samples", fontsize=10)
     real.legend(loc="lower right", fontsize=9)
     for axis in (real, imaginary):

@@ -18,14 +18,14 @@ _CELLS = 48  # of a mesh, along each of its two parameters
 
 def grounds_of(trajectory: Trajectory, drawn: Drawn, low: np.ndarray, high: np.ndarray) -> list[dict]:
     """Planes {kind, origin, axes} and meshes {kind, triangles (n, 3, 3)} within or around the box from `low` to `high`, m, as they are at the first time."""
-    found: list[dict] = []
+    found: dict[bytes, dict] = {}
     for name, contact in drawn.contacts.items():
         if _moves(contact):  # the body that carries it shows it, or the tangent planes of a ground that was not given
             continue
         ground = _ground(trajectory, drawn, name, contact, low, high)
-        if not any(_same(ground, other) for other in found):
-            found.append(ground)
-    return found or [_plane(np.array([0.0, 0.0, floor_under(low, high)]), np.eye(3), low, high)]
+        numbers = [ground["triangles"]] if ground["kind"] == "mesh" else [ground["origin"], ground["axes"][:, 2]]
+        found.setdefault(b"".join((np.round(x, 9) + 0.0).tobytes() for x in numbers), ground)  # of several contacts with one ground once
+    return [*found.values()] or [_plane(np.array([0.0, 0.0, floor_under(low, high)]), np.eye(3), low, high)]
 
 
 def _ground(trajectory: Trajectory, drawn: Drawn, name: str, contact: Contact, low, high) -> dict:
@@ -61,14 +61,6 @@ def floor_under(low, high) -> float:
     """Height (m) of a floor under the box from `low` to `high`: z = 0 where bodies stand on it, else below them."""
     side = float(max(high - low))
     return 0.0 if -0.05 * side < low[2] < 0.2 * side else low[2] - 0.05 * side
-
-
-def _same(one: dict, other: dict) -> bool:
-    if one["kind"] != other["kind"]:
-        return False
-    key = "origin" if one["kind"] == "plane" else "triangles"
-    same_axes = one["kind"] == "mesh" or np.allclose(one["axes"][:, 2], other["axes"][:, 2])
-    return one[key].shape == other[key].shape and np.allclose(one[key], other[key]) and same_axes
 
 
 def _mesh(grid: np.ndarray) -> dict:
