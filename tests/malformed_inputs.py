@@ -483,7 +483,7 @@ ANALYSIS: dict[str, Case] = {
     "jj.linearize(b, {}, 3)": "names were expected, in one text or several, and `3` was given",
     "jj.linearize(b, {}, ('x', 'x'))": "`coordinates` names one twice (x, x); name each once",
     "jj.linearize(sleigh, {}, dependent=('hedding',))": "`ChaplyginSleigh` has no coordinate `hedding` to perturb; did you mean `heading`?",
-    "jj.linearize(sleigh, {}, ('x',), privileged=('heading_rate',))": "`privileged` names 1 speeds of `ChaplyginSleigh` (heading_rate), which has 2",
+    "jj.linearize(sleigh, {}, ('x',), privileged=('heading_rate',))": "`privileged` of `ChaplyginSleigh` names 1 speeds, but the scene has 2",
     "jj.linearize(sleigh, {}, privileged=('heading_rat', 'x_rate'))": "unknown privileged speed of `ChaplyginSleigh`: `heading_rat`; did you mean",
     "jj.linearize(chain, None, inputs={'trun': 1.0})": "`TrailerChain` has no input `trun`; did you mean `turn`?",
     "jj.steady(Bead, {})": "`scene` is the class `Bead`",

@@ -103,22 +103,21 @@ class Sloped:
 
 
 class ByProgram:
-    """v, D and, if asked for, the mass matrix of a class of scenes as one scalar program of all numbers in a row: parameters, t, q, u, inputs."""
+    """v, D and, unless it is too large, the mass matrix of a class of scenes as one scalar program of all numbers in a row: parameters, t, q, u, inputs."""
 
-    def __init__(self, scene: Scene, program: Lowered, constant: tuple[int, ...], varied: int | None, masses: bool) -> None:
+    def __init__(self, scene: Scene, program: Lowered, asked: tuple[int, ...], varied: int | None) -> None:
         rows = row_program(scene)
-        if rows is None or (masses and rows.M is None):
+        if rows is None:
             raise NotLowered(f"the rows of `{type(scene).__name__}` have no scalar program")
         graph, of, n, m = Graph(), program.traced, len(program.coordinates), len(program.speeds)
         first = sum(np.size(leaf) for leaf in jax.tree.leaves(scene))
         given = [graph.input(f"x{k}", True) for k in range(first + 1 + n + m + len(scene.inputs))]
         t, q, u = given[first], given[first + 1 :][:n], given[first + 1 + n :][:m]
-        asked = [k for k in constant if k not in program.independent]
         of_rates = [program.qdot, program.ydot, program.z if asked else (), program.guards]
         if set(program.usual) & set(program.graph.reachable([n for part in of_rates for n in part])):
             raise NotLowered(f"the rates of `{type(scene).__name__}` depend on what its rows usually are")
         qdot, ydot, z, self.guards = _copied(graph, of_rates, program.graph, (of.parameters, of.t, of.q, of.u, of.inputs), given)
-        M = (rows.M or {}) if masses else {}
+        M, self.has_masses = rows.M or {}, rows.M is not None
         g, phi, of_masses = _copied(graph, [rows.g, rows.phi, M.values()], rows.graph, (rows.parameters, rows.t, rows.q, rows.u, rows.inputs), given)
         udot = dict(zip(program.independent, ydot, strict=True))
         if asked:
@@ -128,7 +127,7 @@ class ByProgram:
         self.graph, self.given, self.program, self.states = graph, given, program, (first + 1, n, m)
         self.v = [*qdot, *(udot.get(k, graph.zero) for k in range(m)), *g, *phi]
         self.columns = [*given[first:], *([] if varied is None else [given[varied]])]
-        matrix = (m * masses, m), {key: node for (i, k), node in zip(M, of_masses, strict=True) for key in ((i, k), (k, i))}
+        matrix = (m, m), {key: node for (i, k), node in zip(M, of_masses, strict=True) for key in ((i, k), (k, i))}
         self.of = Sloped(graph, self.v, self.columns, given, self.guards, matrix)
 
     def __call__(self, scene: Scene, t, q, u, f) -> Slopes:
@@ -179,14 +178,15 @@ def _by_matrices(scene: Scene, constant: tuple[int, ...], t, q, u, f):
 
 
 def instant_of(scene: Scene | BuiltFor, constant: tuple[int, ...], masses: bool = False) -> "ByProgram | ByMatrices":
-    """How a scene's instants are computed, where these speeds are to be constant or independent."""
+    """How a scene's instants are computed, where these speeds are to be constant or independent; `masses`: whether their mass matrix is needed."""
     if ffi.reason_against() or (isinstance(scene, BuiltFor) and scene.backend == "xla"):
         return ByMatrices(constant)
     try:
-        found = by_program(as_scene(scene), lower(scene), constant, None, masses)
+        program = lower(scene)
+        found = by_program(as_scene(scene), program, tuple(k for k in constant if k not in program.independent), None)
     except NotLowered:
         return ByMatrices(constant)
-    return found if found.of.is_made else ByMatrices(constant)
+    return found if found.of.is_made and (found.has_masses or not masses) else ByMatrices(constant)
 
 
 @once_per_class

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jourdain_jax.build.rank import best_privileged, pivots_at
+from jourdain_jax.build.rank import best_privileged, named_speeds, pivots_at
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import WELL_CONDITIONED, structure_of, usual_rows
 from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
@@ -23,7 +23,7 @@ from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.scene.identity import with_reference_parameters
-from jourdain_jax.scene.names import as_names, nearest
+from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
 
@@ -111,17 +111,8 @@ def eliminated(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dep
 
 def privileged_speeds(scene: Scene, names: str | tuple[str, ...] | None = None) -> tuple[int, ...]:
     """Indices of the independent speeds: those named, else the scene's own choice, else the engine's."""
-    names = scene.privileged if names is None else names
-    if names is None:
-        return structure_of(scene).independent
-    chosen = tuple(scene.speed_names.index(name, f"privileged speed of `{type(scene).__name__}`:") for name in as_names(names))
-    freedoms = structure_of(scene).degrees_of_freedom
-    if len(set(chosen)) != freedoms or len(chosen) != freedoms:
-        raise ValueError(
-            f"`privileged` names {len(set(chosen))} speeds of `{type(scene).__name__}` ({', '.join(as_names(names))}), which has {freedoms} degrees of "
-            f"freedom; name {freedoms} independent speeds"
-        )
-    return chosen
+    known = structure_of(scene)
+    return known.independent if names is None else named_speeds(scene, names, known.degrees_of_freedom)
 
 
 def privileged_at(scene: Scene, state: State, f, usual: tuple[int, ...]) -> tuple[int, ...]:

@@ -114,15 +114,13 @@ def _are_bounded(c: np.ndarray) -> bool:
     return bool(np.all(np.abs(c) < 20.0) and not np.any(poles & (np.max(np.abs(c), axis=0, initial=0.0) > 2)))
 
 
-def privileged_by_user(scene: Scene, freedoms: int) -> tuple[int, ...] | None:
-    """Numbers of the speeds that the scene names; None where it names none. ValueError for unknown names, and for others than `freedoms` speeds."""
-    if scene.privileged is None:
-        return None
-    if not isinstance(scene.privileged, str | Iterable):
-        raise ValueError(f"`privileged` of `{type(scene).__name__}` is {described(scene.privileged)}, expected names of speeds")
-    chosen = tuple(scene.speed_names.index(name, f"privileged speed of `{type(scene).__name__}`:") for name in as_names(scene.privileged))
+def named_speeds(scene: Scene, names: str | Iterable[str], freedoms: int) -> tuple[int, ...]:
+    """Numbers of the privileged speeds with these names. ValueError for unknown names, and for others than `freedoms` speeds."""
+    if not isinstance(names, str | Iterable):
+        raise ValueError(f"`privileged` of `{type(scene).__name__}` is {described(names)}, expected names of speeds")
+    chosen = tuple(scene.speed_names.index(name, f"privileged speed of `{type(scene).__name__}`:") for name in as_names(names))
     if len(set(chosen)) != len(chosen):
-        raise ValueError(f"`privileged` of `{type(scene).__name__}` names a speed twice ({', '.join(as_names(scene.privileged))}); name independent ones")
+        raise ValueError(f"`privileged` of `{type(scene).__name__}` names a speed twice ({', '.join(as_names(names))}); name independent ones")
     if len(chosen) != freedoms:
         raise ValueError(
             f"`privileged` of `{type(scene).__name__}` names {len(chosen)} speeds, but the scene has {freedoms} degrees of freedom; "

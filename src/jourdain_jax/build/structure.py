@@ -17,7 +17,7 @@ from jaxtyping import Float
 from jourdain_jax.build.assembling import speed_scales, typical_row_lengths
 from jourdain_jax.build.plausibility import sentences
 from jourdain_jax.build.probed_on_graph import TIMED, Probed, follow_from_others, probed_on_graph
-from jourdain_jax.build.rank import Scaled, best_privileged, contradictions, pivots_at, privileged_by_user, ranks_of, redundant_rows, scaled_states, worst_pivot
+from jourdain_jax.build.rank import Scaled, best_privileged, contradictions, named_speeds, pivots_at, ranks_of, redundant_rows, scaled_states, worst_pivot
 from jourdain_jax.build.sampling import drawn_states, no_numbers, symmetric_configurations, usable_states
 from jourdain_jax.build.smoothness import kinks
 from jourdain_jax.calculus.reals import is_traced, real_type
@@ -241,10 +241,9 @@ def _probed_structure(scene: Scene) -> Structure:
     rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
     if not faults:  # a negative mass is named as such
         _check_inertia(scene, jax.tree.map(lambda x: x[generic & (np.array(ranks) == rank)], scaled), rank)
-    independent, by_user = privileged_by_user(scene, count - rank), True
     candidates = scaled.A[[r == rank for r in ranks]]  # at isolated losses of rank no partition of generic size exists
-    if independent is None:
-        independent, by_user = best_privileged(candidates, count, rank), False
+    by_user = scene.privileged
+    independent = best_privileged(candidates, count, rank) if by_user is None else named_speeds(scene, by_user, count - rank)
     dependent = [i for i in range(count) if i not in independent]
     pivots = pivots_at(candidates, dependent, rank)
     full_everywhere, eps, unproved = all(r == rank for r in ranks), float(np.finfo(found.A.dtype).eps), found.unproved
@@ -279,7 +278,7 @@ def _probed_structure(scene: Scene) -> Structure:
         varying_inertia=acts("inertia"),
         potentials_of_inputs=tuple(sorted(int(name.split()[1]) for name in found.vanishing if name.startswith("potential ") and acts(name))),
         rows_of_inputs=rows_of_inputs,
-        chosen_by_user=by_user,
+        chosen_by_user=by_user is not None,
         kinks=rough,
         odd_grounds=grounds,
         faults=faults,

@@ -10,7 +10,7 @@ R, J, F, C, z: as in `equations.py`. G and its slopes are one scalar program. It
 pseudo-inverse comes from Q R.
 """
 
-from functools import partial
+from functools import cached_property, partial
 from itertools import combinations
 
 import equinox as eqx
@@ -163,9 +163,14 @@ class _Program:
             nodes += [graph.sub(f, graph.add(graph.mul(p, c), graph.mul(q, d))) for f, c, d in zip(found, a, b, strict=False)]
             beside += found[m:]
         nodes, variables = [*nodes, *beside], [*instant.given, *given]
-        self.of = Sloped(graph, nodes, [*(instant.given[k] for k in places), *given], variables, instant.guards)
+        self._sloped = graph, nodes, [*(instant.given[k] for k in places), *given], variables, instant.guards
         self.values = differentiable(graph, nodes, variables)
         self.pulled = jax.jit(lambda x, weights: jax.vjp(lambda x: self.values(x)[: len(weights)], x)[1](weights)[0])
+
+    @cached_property
+    def of(self) -> Sloped:
+        """Values of the equations with slopes by z, a, b and S."""
+        return Sloped(*self._sloped)
 
 
 def _program(equations: SteadyEquations) -> _Program:

@@ -43,7 +43,7 @@ class SteadyEquations:
         self.names, at, program = (*scene.coordinate_names.entries, *scene.speed_names.entries), places_of(scene), lower(scene)
         self.given = np.asarray(numbers_of(scene, self.t, q, u, inputs), float)
         first, varied = sum(np.size(leaf) for leaf in jax.tree.leaves(scene)), self._place_of(vary)
-        self.instant = by_program(scene, program, (), *(varied or (None,)), False)
+        self.instant = by_program(scene, program, (), *(varied or (None,)))
         matters, bound = np.array([name not in program.held for name in program.coordinates], bool), on_rows(scene)
         kept, y = np.flatnonzero(matters | bound), np.array(program.independent, int)
         columns = np.concatenate([at.q[kept], at.u])
