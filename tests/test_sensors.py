@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import machine_code
 import numpy as np
+import pages
 import pytest
 from numpy.testing import assert_allclose
 from small_scenes import Cart, OnLine
@@ -417,7 +418,7 @@ def test_log_likelihood_knows_sensors_and_is_differentiable_in_them():
 
 def test_the_page_on_identification_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # it writes a report
-    names = run(DOCS / "howto" / "identification.md", jj=jj, jnp=jnp, np=np)
+    names = pages.run(pages.DOCS / "howto" / "identification.md", jj=jj, jnp=jnp, np=np)
     found = names["found"]
     assert found.converged
     for name, value in (("gyro.gain", 1.1), ("gyro.delay", 0.05), ("run 0: gyro.bias", 0.02), ("offset", 0.25)):
