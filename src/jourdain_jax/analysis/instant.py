@@ -219,7 +219,7 @@ def _evaluated(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> 
 def differentiable(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[Array], Array]:
     """Values of nodes as a function that JAX differentiates: by machine code where it is made, otherwise by XLA."""
     if is_made(graph, nodes):
-        return values_of_nodes(graph, dict(enumerate(nodes)), len(nodes), variables)
+        return values_of_nodes(graph, nodes, variables)
     return lambda x: jnp.stack([jnp.asarray(value, x.dtype) for value in run(graph, nodes, dict(zip(variables, x, strict=True)))])
 
 

@@ -44,8 +44,18 @@ def _parted(arguments: tuple) -> tuple[list, _Leaves]:
     return leaves, _Leaves(treedef, rest)
 
 
+def is_zero(tangent) -> bool:
+    """Return whether nothing changes, as a rule with symbolic zeros is told."""
+    return isinstance(tangent, SymbolicZero)
+
+
+def filled(tangent):
+    """Return the tangent as an array."""
+    return jnp.zeros(tangent.shape, tangent.dtype) if is_zero(tangent) else tangent
+
+
 def _moving(tangents: Sequence) -> list[int]:
-    return [i for i, t in enumerate(tangents) if not isinstance(t, SymbolicZero)]
+    return [i for i, t in enumerate(tangents) if not is_zero(t)]
 
 
 def differentiated_as(differentiable: Callable, run: Callable) -> Callable:

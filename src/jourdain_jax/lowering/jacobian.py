@@ -12,6 +12,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
+from jourdain_jax.calculus.differentiated_as import is_zero
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.fused import fused
@@ -43,7 +44,7 @@ def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int
 
     @partial(own.defjvp, symbolic_zeros=True)
     def rule(values, tangents):
-        moving = [not isinstance(v, jax.custom_derivatives.SymbolicZero) for v in tangents]
+        moving = [not is_zero(v) for v in tangents]
         used = [(i, j, node) for i, j, node in entries if moving[j]]
         varying = list(dict.fromkeys(node for *_, node in used if not graph.is_const(node)))
         found = values_of([*outputs, *monitored, *varying], values)

@@ -187,15 +187,17 @@ class Lowered:
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
         """
         out = self.values([*self.z, *self.pivots], fixed, t, q, y, inputs)
-        order = np.argsort([*self.independent, *self.dependent])
-        real, count = jnp.result_type(*q), len(self.z)
-        every = [*y, *out[:count]]
-        u = jnp.stack([jnp.asarray(every[i], real) for i in order])
-        pivot = jnp.ones((), real)
-        for value, size in zip(out[count:], self.pivot_sizes(fixed), strict=True):
-            ratio = jax.lax.stop_gradient(value) / size
+        every = [*y, *out[: len(self.z)]]
+        u = jnp.stack([every[i] for i in np.argsort([*self.independent, *self.dependent])])
+        return u, self.smallest_pivot(fixed, out[len(self.z) :])
+
+    def smallest_pivot(self, fixed, values: Float[Array, "pivots *lanes"]) -> Float[Array, "*lanes"]:
+        """Return the smallest of the pivots, given their values, relative to its usual size; its sign is the product of theirs."""
+        pivot = jnp.ones(values.shape[1:], values.dtype)
+        for value, size in zip(jax.lax.stop_gradient(values), self.pivot_sizes(fixed), strict=True):
+            ratio = value / size
             pivot = jnp.sign(pivot) * jnp.sign(ratio) * jnp.minimum(jnp.abs(pivot), jnp.abs(ratio))
-        return u, pivot
+        return pivot
 
     def energy_values(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "2 *lanes"]:
         """Kinetic and potential energy, J: numbers to differentiation. `fixed`, `q`, `y`, `inputs`: as in `rates`."""

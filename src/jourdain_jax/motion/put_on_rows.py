@@ -8,7 +8,6 @@ g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M(t, q)
 d o_i = sum_j J_ij d x_j     o: any of these numbers, x: parameters, time, coordinates, speeds, inputs;   J: derived on the graph (`values_of_nodes.py`)
 """
 
-from collections.abc import Sequence
 from functools import lru_cache, partial
 
 import equinox as eqx
@@ -193,10 +192,14 @@ def row_functions(program: RowProgram) -> RowFunctions:
     closures, coordinates = len(program.g), len(program.q)
     parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
     at = [*parameters, program.t, *program.q]
-    of_closures = values_of_nodes(program.graph, _places(program.g, program.G, coordinates), closures * (1 + coordinates), at)
-    of_rows = values_of_nodes(program.graph, _places(program.phi, program.A, speeds), rows * (1 + speeds), [*at, *program.u, *program.inputs])
+
+    def matrix(entries: dict[tuple[int, int], int], rows: int, columns: int) -> list[int]:
+        return [entries.get((i, k), program.graph.zero) for i in range(rows) for k in range(columns)]
+
+    of_closures = values_of_nodes(program.graph, [*program.g, *matrix(program.G, closures, coordinates)], at)
+    of_rows = values_of_nodes(program.graph, [*program.phi, *matrix(program.A, rows, speeds)], [*at, *program.u, *program.inputs])
     M = {key: node for (i, k), node in (program.M or {}).items() for key in ((i, k), (k, i))}
-    of_masses = values_of_nodes(program.graph, _places((), M, speeds), speeds**2, at)
+    of_masses = values_of_nodes(program.graph, matrix(M, speeds, speeds), at)
 
     def parameters_of(scene: Scene):
         found = entries(scene, program.parameters)
@@ -218,8 +221,3 @@ def row_functions(program: RowProgram) -> RowFunctions:
         return of_masses(in_a_row(given, t, q)).reshape(speeds, speeds)
 
     return RowFunctions(closures_at, rows_at, masses_at if program.M is not None else BY_AUTODIFF.masses, parameters_of)
-
-
-def _places(vector: Sequence[int], matrix: dict[tuple[int, int], int], columns: int) -> dict[int, int]:
-    """Where the nodes of a vector, and of a matrix after it, are among all numbers; those that have none are zero."""
-    return dict(enumerate(vector)) | {len(vector) + i * columns + k: node for (i, k), node in matrix.items()}

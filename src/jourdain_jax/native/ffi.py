@@ -3,21 +3,22 @@
 Layouts are those of `xla/ffi/api/c_api.h` on 64-bit machines (major version 0). The header that comes with jaxlib says which version it speaks; another
 major version, or a frame with other members, is one that is not known here.
 
-Machine code works on doubles. Arrays in single precision are converted where a call begins and ends, so that their results are rounded once.
+Machine code works on doubles. Arrays in single precision are converted by XLA before and after a call, so that their results are rounded once.
 """
 
 import ctypes
 import functools
 import hashlib
-import math
 import re
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
+import numpy as np
+from jax.interpreters import mlir
 
 from jourdain_jax.native import disk, host, nvidia
 from jourdain_jax.native.ir import Value, Writer
@@ -103,24 +104,11 @@ def write_handler(w: Writer, arguments: int, results: int, body: Callable[[list[
     """A handler that calls `body` with all arguments, and pointers to the data of all results; on a GPU the kernel that does so."""
     if w.device:
         return _write_kernel(w, arguments, results, body)
-    _write_doubles(w)
-    _write_rounded(w)
     with w.function(HANDLER, "ptr", {"frame": "ptr"}, how="") as (frame,):
-        nothing = Value(w, "ptr", "null")
         answer_metadata(w, frame)
         arrays, returned = w.load("ptr", frame, ARGS), w.load("ptr", frame, RETS)
-        inputs = [w.load("ptr", arrays, k) for k in range(arguments)]
-        outputs = [w.load("ptr", returned, k) for k in range(results)]
-        failed = w.room("i64")
-        w.store(w.literal(0, "i64"), failed)
-        taken = [w.call("doubles", "ptr", x, w.literal(1, "i1"), failed) for x in inputs]
-        found = [w.call("doubles", "ptr", x, w.literal(0, "i1"), failed) for x in outputs]
-        with w.when(w.load("i64", failed).equals(0)):
-            body([given(w, x)._replace(data=data) for x, data in zip(inputs, taken, strict=True)], found)
-        for buffers, pointers, are_results in ((inputs, taken, 0), (outputs, found, 1)):
-            for x, data in zip(buffers, pointers, strict=True):
-                w.call("rounded", "void", x, data, w.literal(are_results, "i1"), failed)
-        w.give(nothing)
+        body([given(w, w.load("ptr", arrays, k)) for k in range(arguments)], [given(w, w.load("ptr", returned, k)).data for k in range(results)])
+        w.give(Value(w, "ptr", "null"))
 
 
 def answer_metadata(w: Writer, frame: Value) -> None:
@@ -158,46 +146,18 @@ def given(w: Writer, buffer: Value) -> Given:
     return Given(w.load("ptr", buffer, 3), w.load("ptr", buffer, 5), w.load("i64", buffer, 4))
 
 
-def _is_single(w: Writer, buffer: Value) -> Value:
-    # 11: the type of arrays in single precision
-    return w.load("i32", buffer, 4).equals(11)
+def in_doubles(ctx: mlir.LoweringRuleContext, arguments: Sequence, call: Callable, *more) -> list:
+    """The results of a `call` of machine code in a program of JAX, arrays in single precision converted; `more`: avals of results besides, which go."""
 
+    def converted(x, old, new):
+        if old.dtype == new.dtype:
+            return x
+        convert = mlir.lower_fun(lambda x: jax.lax.convert_element_type_p.bind(x, new_dtype=new.dtype, weak_type=False, sharding=None), multiple_results=False)
+        return convert(ctx.replace(primitive=None, avals_in=[old], avals_out=[new]), x)[0]
 
-def _write_doubles(w: Writer) -> None:
-    """`doubles(buffer, filled, failed)`: its data; of an array in single precision, memory for as many doubles, `filled` with them or not.
-
-    As `rounded`, it is not optimised: that takes LLVM 20 ms for each kernel, and makes no motion faster by more than noise.
-    """
-    with w.function("doubles", "ptr", {"buffer": "ptr", "filled": "i1", "failed": "ptr"}, attributes="noinline optnone") as (buffer, filled, failed):
-        x, data = given(w, buffer), w.room("ptr")
-        w.store(x.data, data)
-        with w.when(_is_single(w, buffer)):
-            count = product(w, x, 0)
-            new = w.external("malloc", "ptr", (count + 1) * 8)
-            w.store(new, data)
-            there = w.converted("ptrtoint", new, "i64").differs(0)
-            with w.when(~there):
-                w.store(w.literal(1, "i64"), failed)
-            with w.when(there & filled), w.counted(0, count) as k:
-                w.store(w.converted("fpext", w.load("float", x.data, k), "double"), new, k)
-        w.give(w.load("ptr", data))
-
-
-def _write_rounded(w: Writer) -> None:
-    """`rounded(buffer, doubles, is_result, failed)`: puts a result into an array in single precision, NaN where memory failed, and frees its doubles."""
-    arguments = {"buffer": "ptr", "doubles": "ptr", "is_result": "i1", "failed": "ptr"}
-    with w.function("rounded", "void", arguments, attributes="noinline optnone") as (buffer, doubles, is_result, failed):
-        x = given(w, buffer)
-        with w.when(_is_single(w, buffer)):
-            there = w.load("i64", failed).equals(0)
-            with w.when(is_result), w.counted(0, product(w, x, 0)) as k:
-                value = w.room("double")
-                w.store(w.literal(math.nan, "double"), value)
-                with w.when(there):
-                    w.store(w.load("double", doubles, k), value)
-                w.store(w.converted("fptrunc", w.load("double", value), "float"), x.data, k)
-            w.external("free", "void", doubles)
-        w.give()
+    taken, found = ([x.update(dtype=np.dtype(np.float64), weak_type=False) for x in avals] for avals in (ctx.avals_in, ctx.avals_out))
+    results = call(ctx.replace(primitive=None, avals_in=taken, avals_out=[*found, *more]), *map(converted, arguments, ctx.avals_in, taken))
+    return list(map(converted, results, found, ctx.avals_out))
 
 
 def registered(text: str, effort: int = 2) -> str:

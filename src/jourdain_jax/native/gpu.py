@@ -10,6 +10,7 @@ import functools
 import hashlib
 import threading
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -128,24 +129,12 @@ def registered(text: str, scratch: tuple[int, int]) -> Kernel:
 
 
 def lowered(ctx: mlir.LoweringRuleContext, arguments: Sequence, kernel: Kernel) -> list:
-    """The call of a kernel, on arrays of doubles; those in single precision are converted."""
+    """The call of a kernel."""
     lanes = int(np.prod(ctx.avals_in[-1].shape[:-1]))
     needed, most = kernel.scratch
     blocks = min(nvidia.blocks(lanes, kernel.loaded), max(1, MOST_SCRATCH // (8 * nvidia.WARP * max(needed, 1))))
     each = 8 * blocks * nvidia.WARP * max(needed, 1)
     times = min(most, max(1, min(MOST_SCRATCH, nvidia.memory() // 8) // max(each, 1)))
-    doubles = [x.update(dtype=np.dtype(np.float64), weak_type=False) for x in (*ctx.avals_in, *ctx.avals_out)]
-    given, found = doubles[: len(arguments)], doubles[len(arguments) :]
-    scratch = found[0].update(shape=(ffi.FIRST_OF_SCRATCH + blocks * nvidia.WARP * needed * times,))
-    inner = ctx.replace(primitive=None, avals_in=given, avals_out=[*found, scratch])
-    wide = [_converted(ctx, x, aval, double) for x, aval, double in zip(arguments, ctx.avals_in, given, strict=True)]
-    call = jax.ffi.ffi_lowering(_handler())
-    results = call(inner, *wide, blocks=np.int64(blocks), kernel=np.int64(kernel.number))
-    return [_converted(ctx, x, double, aval) for x, double, aval in zip(results, found, ctx.avals_out, strict=False)]
-
-
-def _converted(ctx: mlir.LoweringRuleContext, x, given, to):
-    (found,) = mlir.lower_fun(lambda x: jax.lax.convert_element_type_p.bind(x, new_dtype=to.dtype, weak_type=False, sharding=None), multiple_results=False)(
-        ctx.replace(primitive=None, avals_in=[given], avals_out=[to]), x
-    )
-    return found
+    scratch = ctx.avals_out[0].update(shape=(ffi.FIRST_OF_SCRATCH + blocks * nvidia.WARP * needed * times,), dtype=np.dtype(np.float64), weak_type=False)
+    call = partial(jax.ffi.ffi_lowering(_handler()), blocks=np.int64(blocks), kernel=np.int64(kernel.number))
+    return ffi.in_doubles(ctx, arguments, call, scratch)

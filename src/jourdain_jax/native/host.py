@@ -34,7 +34,7 @@ _engines: list = []  # what machine code lives in: as long as the process, which
 
 
 # Functions of C that machine code calls besides those of libm. LLVM ends the process where it finds one of them missing.
-_CALLED = ("aligned_alloc", "free", "malloc", "memcpy", "memset", "pthread_attr_init", "pthread_attr_setstacksize", "pthread_create", "pthread_join")
+_CALLED = ("aligned_alloc", "free", "memcpy", "memset", "pthread_attr_init", "pthread_attr_setstacksize", "pthread_create", "pthread_join")
 # A module with what llvmlite must be able to read: those of LLVM 15 and older are not.
 _TRIAL = "define <2 x double> @trial(ptr %at) {\n  %x = load <2 x double>, ptr %at\n  %y = fadd <2 x double> %x, splat (double 1.0)\n  ret <2 x double> %y\n}\n"
 

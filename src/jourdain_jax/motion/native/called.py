@@ -65,7 +65,7 @@ def _results(*arguments, shapes: Callable, **_) -> list:
 def on_cpu(ctx: mlir.LoweringRuleContext, *arguments, handler: Callable, lanes: int, threads: int, **_):
     """The call in a program for the CPU."""
     _check_here(ctx)
-    return jax.ffi.ffi_lowering(handler(lanes, threads))(ctx, *arguments)
+    return ffi.in_doubles(ctx, arguments, jax.ffi.ffi_lowering(handler(lanes, threads)))
 
 
 def _on_nvidia(ctx: mlir.LoweringRuleContext, *arguments, kernel: Callable, **_):

@@ -11,13 +11,13 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
+from jourdain_jax.calculus.differentiated_as import filled, is_zero
 from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.kernel import Found, Start, kernel
 from jourdain_jax.motion.native.pulled import check_derivatives
 from jourdain_jax.motion.native.taylor import products
-from jourdain_jax.motion.native.times import filled, is_zero
 
 OF_SAMPLES = 'machine code does not differentiate with respect to samples of an input; `jj.simulate(..., backend="xla")` does'
 

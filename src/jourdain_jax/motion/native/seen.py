@@ -1,7 +1,7 @@
-"""Numbers beside the steps of a motion, as machine code: those that depend on parameters alone, and derivatives of all speeds at saved states.
+"""Numbers beside the steps of a motion, as machine code: those that depend on parameters alone, and all speeds, pivots and energies at saved states.
 
-Each is a function of JAX on one state or scene; under `vmap` all lanes go to one call. Speeds and energies at saved states are XLA's (`lowering/lowered.py`):
-machine code, for which rows of numbers are put together, takes longer there.
+Each is a function of JAX on one state or scene; under `vmap` all lanes go to one call, for which rows of the numbers that are needed are put together. Speeds
+of few operations are XLA's (`lowering/lowered.py`).
 """
 
 import math
@@ -15,12 +15,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.row_program import RowProgram
-from jourdain_jax.calculus.differentiated_as import Rules, with_rules
 from jourdain_jax.calculus.entries import entries_of
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.native.called import called, nodes_called
-from jourdain_jax.motion.native.values_of_nodes import Derivatives, values_of_nodes
+from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.math_functions import FUNCTIONS
 from jourdain_jax.native.scalar_program import as_real, unsupported, written
@@ -37,13 +36,20 @@ class Beside(NamedTuple):
     needed: tuple[tuple[int, ...], ...]  # nodes of those entries of the scene's parameters on which something that is fixed depends, -1 for others
     fixed: Callable[[Array], Array]  # of those entries and of what is usual
     usual: Callable[[Array], Array] | None  # of those entries; JAX does not differentiate it
-    speeds: Derivatives | None  # of all speeds, and of the pivot, a number to differentiation; None where XLA's are quicker
+    at_states: "AtStates | None"  # None where XLA is quicker
+
+
+class AtStates(NamedTuple):
+    """Functions of what is fixed, of time, coordinates, privileged speeds and inputs."""
+
+    speeds: Callable[..., Array]  # all of them
+    numbers: Callable[..., Array]  # pivots, then energies, which JAX does not differentiate
 
 
 @lru_cache(maxsize=64)
 def beside(program: Lowered) -> Beside | None:
     """All this; None where it cannot be machine code."""
-    graph, nodes = program.graph, [*program.z, *program.fixed, *program.usual.values()]
+    graph, nodes = program.graph, [*program.z, *program.pivots, *program.energies, *program.fixed, *program.usual.values()]
     truths = any(_is_truth(graph, n) for n in program.fixed)  # which XLA hands on as such
     # 60_000 operations
     if truths or graph.operations(nodes) > 60_000 or unsupported(graph, nodes):
@@ -52,15 +58,32 @@ def beside(program: Lowered) -> Beside | None:
     needed = tuple(tuple(n if n in used else -1 for n in np.ravel(leaf).tolist()) for leaf in program.traced.parameters)
     given = [n for leaf in needed for n in leaf if n >= 0]
     usual = called(partial(_write_usual, program, given), lambda *_: ((len(program.usual),),), effort=1) if program.usual else None
-    fixed = values_of_nodes(graph, dict(enumerate(program.fixed)), len(program.fixed), [*given, *program.usual])
-    # Operations from which on derivatives are machine code. Measured, gradients of batches over all saved states,
-    # by XLA and here: 5 operations, 28 and 42 ms; 66, 98 and 69; 228, 405 and 108. One motion of 16 trailers
-    # compiles in 16 to 19 s and 4.5 s.
-    if graph.operations(program.z) < 60:
-        return Beside(needed, fixed, usual, None)
+    return Beside(needed, values_of_nodes(graph, program.fixed, [*given, *program.usual]), usual, _at_states(program))
+
+
+def _at_states(program: Lowered) -> AtStates | None:
+    # Operations from which on speeds, pivots and energies are machine code. Measured, ms by XLA and here: one motion of 8 trailers (228 operations) 0.69 and
+    # 0.54, of 16 (436) 2.6 and 1.8, derivatives of which compile in 13 and 6 s; 256 bicycles (460) 25 and 15, their gradient 85 and 72; 1,024 chains of
+    # 4 trailers (124) 44 and 39, their gradient 111 and 108; gradients of 256 rattlebacks (70) 29 and 42.
+    if program.graph.operations(program.z) < 100:
+        return None
     every = [*(int(program.traced.u[k]) for k in program.independent), *program.z]
-    places = dict(zip([*program.independent, *program.dependent], every, strict=True))
-    return Beside(needed, fixed, usual, Derivatives(graph, places, len(every) + 1, program.variables))
+    speeds = [every[i] for i in np.argsort([*program.independent, *program.dependent])]
+    numbers = _at_state(program, [*program.pivots, *program.energies], nodes_called)
+    return AtStates(_at_state(program, speeds, values_of_nodes), lambda *state: numbers(*jax.lax.stop_gradient(state)))
+
+
+def _at_state(program: Lowered, nodes: Sequence[int], function: Callable) -> Callable[..., Array]:
+    """Machine code of nodes, which is given those numbers alone that it needs of what is fixed."""
+    used = set(program.graph.reachable(nodes))
+    which = [k for k, n in enumerate(program.fixed) if n in used]
+    run = function(program.graph, nodes, [*(program.fixed[k] for k in which), *program.variables[len(program.fixed) :]])
+
+    def values(fixed, t, q, y, inputs) -> Float[Array, "nodes"]:
+        known = jnp.stack([*(fixed[k] for k in which), t])
+        return run(jnp.concatenate([jnp.asarray(x, real_type()) for x in (known, q, y, inputs)]))
+
+    return values
 
 
 def _is_truth(graph: Graph, node: int) -> bool:
@@ -90,27 +113,18 @@ def fixed_values(program: Lowered, scene: Scene) -> tuple[Float[Array, ""], ...]
 
 
 def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
-    """As `Lowered.speeds_and_pivot`; where speeds take many operations, derivatives are machine code."""
+    """As `Lowered.speeds_and_pivot`."""
+    if (own := beside(program)) is None or own.at_states is None:
+        return program.speeds_and_pivot(fixed, t, tuple(q), tuple(y), inputs)
+    pivots = own.at_states.numbers(fixed, t, q, y, inputs)[:-2]
+    return own.at_states.speeds(fixed, t, q, y, inputs), program.smallest_pivot(fixed, pivots)
 
-    def by_xla(fixed, t, q, y, inputs):
-        return program.speeds_and_pivot(entries_of(fixed), t, tuple(q), tuple(y), inputs)
 
-    def push(arguments, tangents):
-        along = [jnp.zeros_like(x) if dx is None else dx for x, dx in zip(arguments, tangents, strict=True)]
-        found = derivatives.along(_in_a_row(*arguments), _in_a_row(*along))
-        return values(*arguments), (found[:-1], found[-1])
-
-    def pull(perturbed, arguments, found, g):
-        x = _in_a_row(*arguments)
-        found = derivatives.back(x, jnp.concatenate([g[0], jnp.zeros_like(x, shape=(1,))]))
-        parts = jnp.split(found, np.cumsum([jnp.size(x) for x in arguments])[:-1])
-        return tuple(jnp.reshape(part, jnp.shape(x)) for x, part in zip(arguments, parts, strict=True))
-
-    given = jnp.stack(fixed) if fixed else jnp.zeros(0, real_type()), jnp.asarray(t, real_type()), q, y, inputs
-    if (own := beside(program)) is None or (derivatives := own.speeds) is None:
-        return by_xla(*given)
-    values = with_rules(by_xla, Rules(push, pull))
-    return values(*given)
+def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
+    """As `Lowered.energy_values`."""
+    if (own := beside(program)) is None or own.at_states is None:
+        return program.energy_values(fixed, t, tuple(q), tuple(y), inputs)
+    return own.at_states.numbers(fixed, t, q, y, inputs)[-2:]
 
 
 def is_right(program: RowProgram, scene: Scene, t, q) -> Bool[Array, ""]:
@@ -123,10 +137,6 @@ def is_right(program: RowProgram, scene: Scene, t, q) -> Bool[Array, ""]:
 def _kernel_of_right(program: RowProgram):
     given = [*(n for leaf in program.parameters for n in leaf if n >= 0), program.t, *program.q]
     return nodes_called(program.graph, [program.right], given)
-
-
-def _in_a_row(fixed, t, q, y, inputs) -> Float[Array, "given"]:
-    return jnp.concatenate([jnp.asarray(x, real_type()) for x in (fixed, jnp.asarray(t)[None], q, y, inputs)])
 
 
 def _write_usual(program: Lowered, given: Sequence[int], w: Writer) -> None:

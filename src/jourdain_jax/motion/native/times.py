@@ -12,10 +12,9 @@ from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.differentiated_as import Rules, with_rules
+from jourdain_jax.calculus.differentiated_as import Rules, filled, is_zero, with_rules
 from jourdain_jax.lowering.jacobian import on_its_own
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
@@ -29,23 +28,20 @@ def moved(form: Form) -> Callable[[Float[Array, "z"], Float[Array, ""]], Float[A
     """
     rates = _rates(form)
 
-    @jax.custom_jvp
-    def along(z, d, v):
-        return v
+    def moving_with_time(slope: Callable) -> Callable:
+        @jax.custom_jvp
+        def same(z, d, v):
+            return v
 
-    @partial(along.defjvp, symbolic_zeros=True)
-    def along_rule(at, tangents):
-        (z, _, v), (_, dd, dv) = at, tangents
-        return along(*at), _sum(dv, dd, lambda: jax.jvp(rates, (z,), (v,))[1])
+        @partial(same.defjvp, symbolic_zeros=True)
+        def rule(at, tangents):
+            (z, _, v), (_, dd, dv) = at, tangents
+            return same(*at), filled(dv) if is_zero(dd) else filled(dv) + scaled(slope(z, v), dd)
 
-    @jax.custom_jvp
-    def back(z, d, g):
-        return g
+        return same
 
-    @partial(back.defjvp, symbolic_zeros=True)
-    def back_rule(at, tangents):
-        (z, _, g), (_, dd, dg) = at, tangents
-        return back(*at), _sum(dg, dd, lambda: jax.vjp(rates, z)[1](g)[0])
+    along = moving_with_time(lambda z, v: jax.jvp(rates, (z,), (v,))[1])
+    back = moving_with_time(lambda z, g: jax.vjp(rates, z)[1](g)[0])
 
     def push(arguments, tangents):
         (z, d), (dz, dd) = arguments, tangents
@@ -68,25 +64,9 @@ def _rates(form: Form) -> Callable[[Float[Array, "z"]], Float[Array, "z"]]:
     work = [graph.input("work", True)] if layout.with_work else []
     slopes = [graph.input(f"slope of input {i}", True) for i in form.sampled]
     z = [*variables[first + 1 : first + 1 + count], *work, variables[first], *variables[:first], *variables[first + 1 + count :], *slopes]
-    places = dict(enumerate(rates)) | {layout.y: graph.one}
-    places |= {layout.y + 1 + first + i: slope for i, slope in zip(form.sampled, slopes, strict=True)}
-    return values_of_nodes(graph, places, len(z), z)
-
-
-def _sum(tangent, by, slope: Callable):
-    """`tangent + slope() by`; what is zero is left out."""
-    tangent = filled(tangent)
-    return tangent if is_zero(by) else tangent + scaled(slope(), filled(by))
-
-
-def is_zero(tangent) -> bool:
-    """Whether nothing changes."""
-    return isinstance(tangent, SymbolicZero)
-
-
-def filled(tangent):
-    """The tangent as an array."""
-    return jnp.zeros(tangent.shape, tangent.dtype) if is_zero(tangent) else tangent
+    of_inputs = dict(zip(form.sampled, slopes, strict=True))
+    known = [graph.zero] * first + [of_inputs.get(i, graph.zero) for i in range(len(program.inputs))]
+    return values_of_nodes(graph, [*rates, graph.one, *known, *[graph.zero] * len(slopes)], z)
 
 
 @jax.custom_jvp

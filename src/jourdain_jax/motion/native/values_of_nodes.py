@@ -12,10 +12,9 @@ from functools import cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
-from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as, with_rules
+from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as, filled, is_zero, with_rules
 from jourdain_jax.lowering.jacobian import on_its_own
 from jourdain_jax.motion.native.called import nodes_called
 from jourdain_jax.native.scalar_program import unsupported
@@ -24,100 +23,82 @@ from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import Graph, Unsupported
 
 
-def values_of_nodes(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array]:
-    """Values of nodes, at their places among so many numbers that are zero otherwise, as a function of the values of the variables."""
-    program = Derivatives(graph, places, size, variables)
+def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[Array], Array]:
+    """Values of nodes, of which zeros cost nothing, as a function of the values of the variables."""
+    graph, nodes, variables = on_its_own(graph, nodes, variables)
+    by_xla, by_machine_code = _both(graph, nodes, variables)
+    there = np.flatnonzero([n != graph.zero for n in nodes])
 
-    def push(arguments, tangents):
-        return values(*arguments), program.along(*arguments, *tangents)
-
-    def pull(perturbed, arguments, found, g):
-        return (program.back(*arguments, g),)
-
-    values = with_rules(program.values, Rules(push, pull))
-    return values
-
-
-class Derivatives:
-    """Machine code of derivatives of values of nodes, as of `values_of_nodes`."""
-
-    along: Callable[[Array, Array], Array]  # f'(x) v as a function of x and v
-    back: Callable[[Array, Array], Array]  # g f'(x) as a function of x and g
-
-    def __init__(self, graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> None:
-        places = dict(sorted(places.items()))
-        self.graph, nodes, self.variables = on_its_own(graph, list(places.values()), variables)
-        self.places, self.size = dict(zip(places, nodes, strict=True)), size
-        self._by_xla, self.values = _by_xla_and_machine_code(self.graph, self.places, size, self.variables)
-        self._function = cache(self._made)
-        self.along, self.back = self._linear(back=False), self._linear(back=True)
-
-    def _linear(self, back: bool) -> Callable[[Array, Array], Array]:
-        """A function of x and v, or (`back`) g; its derivative along x is machine code where that serves."""
-
-        def taken(v):
-            return v[np.array(list(self.places), int)] if back else v
-
-        def first(x, v):
-            if (function := self._function(back, 1)) is not None:
-                return function(jnp.concatenate([x, taken(v)]))
-            return jax.vjp(self._by_xla, x)[1](v)[0] if back else jax.jvp(self._by_xla, (x,), (v,))[1]
-
-        linear = jax.custom_jvp(first)
-
-        @partial(linear.defjvp, symbolic_zeros=True)
-        def rule(at, tangents):
-            found, (dx, dv) = linear(*at), tangents
-            moves, turns = (not isinstance(d, SymbolicZero) for d in tangents)
-            second = self._function(back, 2) if moves else None
-            if moves and second is None:
-                return jax.jvp(first, at, (dx, dv if turns else jnp.zeros_like(at[1])))
-            rates = [linear(at[0], dv)] if turns else []
-            rates += [second(jnp.concatenate([at[0], taken(at[1]), dx]))] if second else []
-            return found, sum(rates[1:], rates[0]) if rates else jnp.zeros_like(found)
-
-        return linear
-
-    def _made(self, back: bool, order: int) -> Callable[[Array], Array] | None:
+    @cache
+    def derivative(back: bool, order: int) -> Callable[[Array], Array] | None:
         """The derivative as a function of x, v or g, and w in a row; None where it is too large, or no machine code."""
-        graph, variables, size = self.graph, self.variables, len(self.places if back else self.variables)
-        weights, w = ([graph.input(f"{name} {i}", True) for i in range(count)] for name, count in (("v", size), ("w", len(variables))))
+        weights = [graph.input(f"v {i}", True) for i in range(len(there if back else variables))]
+        w = [graph.input(f"w {i}", True) for i in range(len(variables))]
 
         def along(nodes, direction: list[int]) -> list[int]:
             return derivatives(graph, nodes, dict(zip(variables, direction, strict=True)))
 
         try:
-            nodes = along(self.places.values(), w) if order == 2 else list(self.places.values())
-            if back:
-                found = dict(enumerate(cotangents(graph, nodes, weights, variables)))
-            else:
-                found = dict(zip(self.places, along(nodes, weights), strict=True))
+            first = along(nodes, w) if order == 2 else nodes
+            found = cotangents(graph, [first[i] for i in there], weights, variables) if back else along(first, weights)
         except Unsupported:
             return None
-        found = {place: node for place, node in found.items() if node != graph.zero}
         # operations of a derivative; machine code of so many takes 1.4 MB of the stack, and 0.3 s to make
-        if unsupported(graph, found.values()) or graph.operations(found.values()) > 40_000:
+        if unsupported(graph, found) or graph.operations(found) > 40_000:
             return None
-        given = [*variables, *weights, *(w if order == 2 else ())]
-        return differentiated_as(*_by_xla_and_machine_code(graph, found, len(variables) if back else self.size, given))
+        return differentiated_as(*_both(graph, found, [*variables, *weights, *(w if order == 2 else ())]))
+
+    def linear(back: bool) -> Callable[[Array, Array], Array]:
+        """A function of x and v, or (`back`) g; its derivative along x is machine code where that serves."""
+
+        def taken(v):
+            return v[there] if back else v
+
+        @jax.custom_jvp
+        def first(x, v):
+            if (by_graph := derivative(back, 1)) is not None:
+                return by_graph(jnp.concatenate([x, taken(v)]))
+            return jax.vjp(by_xla, x)[1](v)[0] if back else jax.jvp(by_xla, (x,), (v,))[1]
+
+        @partial(first.defjvp, symbolic_zeros=True)
+        def rule(at, tangents):
+            (x, v), (dx, dv) = at, tangents
+            found, second = first(x, v), None if is_zero(dx) else derivative(back, 2)
+            if not is_zero(dx) and second is None:
+                return jax.jvp(first.fun, at, (dx, filled(dv)))
+            rates = [] if is_zero(dv) else [first(x, dv)]
+            rates += [second(jnp.concatenate([x, taken(v), dx]))] if second else []
+            return found, sum(rates[1:], rates[0]) if rates else jnp.zeros_like(found)
+
+        return first
+
+    along, back = linear(False), linear(True)
+
+    def push(arguments, tangents):
+        return values(*arguments), along(*arguments, *tangents)
+
+    def pull(perturbed, arguments, found, g):
+        return (back(*arguments, g),)
+
+    values = with_rules(by_machine_code, Rules(push, pull))
+    return values
 
 
-def _by_xla_and_machine_code(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> tuple[Callable, Callable]:
-    """Values of nodes at their places, as a function of the values of the variables: by XLA, and by machine code.
+def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple[Callable, Callable]:
+    """Values of nodes as a function of the values of the variables: by XLA, and by machine code.
 
     Machine code returns the numbers that are not zero: a whole matrix of 32 trailers lay beyond the end of its stack.
     """
-    nodes = list(dict.fromkeys(places.values()))
-    number = {n: k for k, n in enumerate(nodes)}
-    which = np.full(size, len(nodes))
-    which[list(places)] = [number[n] for n in places.values()]
-    in_order = bool(nodes) and np.array_equal(which, np.arange(len(nodes)))
-    kernel = nodes_called(graph, nodes, variables, effort=0)
+    number = {n: k for k, n in enumerate(dict.fromkeys(n for n in nodes if n != graph.zero))}
+    which = np.array([number.get(n, len(number)) for n in nodes], int)
+    in_order = bool(number) and np.array_equal(which, np.arange(len(number)))
+    kernel = nodes_called(graph, list(number), variables, effort=0)
 
     def placed(found, x):
-        return jnp.concatenate(found) if in_order else jnp.concatenate([*found, jnp.zeros(1, x.dtype)])[which]
+        return found if in_order else jnp.append(found, jnp.zeros((), x.dtype))[which]
 
     def by_xla(x):
-        return placed([jnp.asarray(value, x.dtype)[None] for value in run(graph, nodes, dict(zip(variables, x, strict=True)))], x)
+        found = [jnp.asarray(value, x.dtype) for value in run(graph, list(number), dict(zip(variables, x, strict=True)))]
+        return placed(jnp.stack(found) if found else x[:0], x)
 
-    return by_xla, lambda x: placed([kernel(x)], x)
+    return by_xla, lambda x: placed(kernel(x), x)

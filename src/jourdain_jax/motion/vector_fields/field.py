@@ -269,6 +269,8 @@ class ByProgram(VectorField):
         return self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)
 
     def energies(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "2"]:
+        if self.native:
+            return seen.energies(self.program, fixed, t, y.q, y.v, inputs)
         return self.program.energy_values(fixed, t, tuple(y.q), tuple(y.v), inputs)
 
     def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:
