@@ -18,6 +18,7 @@ from test_mutants import Mutant
 
 import jourdain_jax as jj
 from jourdain_jax.motion import integration, put_on_rows
+from jourdain_jax.motion.integrators import event_search
 from jourdain_jax.motion.native import back, crossings, functions, kernel, loop, native_motion, onto_rows, pulled, search, step
 from jourdain_jax.motion.simulate import set_up
 
@@ -301,31 +302,29 @@ TRIED, WRONG = "_tried_by_stages", "derivative with respect to"
 MUTANTS = [
     Mutant("a wrong weight", step, TRIED, "weighted(w, method.b, k", "weighted(w, method.b * (1 + 1e-6), k", FORM, "closed form"),
     Mutant("the whole step for its error", step, TRIED, "weighted(w, method.b_error, k", "weighted(w, method.b, k", FORM, "too many|closed form"),
-    Mutant("every step accepted", step, TRIED, "(size_of_error <= 1.0)", "(size_of_error <= 1e30)", FORM, "closed form"),
+    Mutant("every step accepted", step, "judged", "(error <= 1.0)", "(error <= 1e30)", FORM, "closed form"),
     Mutant("rows of the tableau too small", step, "_stages", "weighted(w, method.A[i], k", "weighted(w, 0.999 * method.A[i], k", FORM, "closed form|too many"),
     Mutant("stages at the first time", step, "_stages", "w.fma(step, float(method.c[i]), t)", "t", FORM, "closed form|too many"),
-    Mutant("a rejected step takes time", step, "_take", '"t": w.where(accept, t1, t)', '"t": t1', FORM, "closed form"),
+    Mutant("a rejected step takes time", step, "taken", '"t": w.where(accept, aim.t_1, p["t"])', '"t": aim.t_1', FORM, "closed form"),
     Mutant("a rejected step is taken", step, "_take", "w.where(accept, w.load(w.real, y1, i), w.load(w.real, y, i))", "w.load(w.real, y1, i)", FORM, "closed"),
     Mutant("a goal that stays", loop, "_save", "number * times + last)", "number * times + saved)", FORM, "closed form"),
     Mutant("starts of another lane", loop, "_write_begin", "number * given + row), lanes", "0 * given + row), lanes", LANES, "lanes"),
     Mutant("goals of another lane", loop, "_write_begin", "number * w.load", "0 * w.load", LANES, "lanes"),
     Mutant("states of another lane", loop, "_save", "(number * times + k)", "(0 * number + k)", LANES, "lanes"),
-    Mutant("no bound of steps", step, TRIED, ', p["longest"])', ", w.number(math.inf))", LONGEST, "the longest step"),
+    Mutant("no bound of steps", step, "judged", ', p["longest"])', ", math.inf)", LONGEST, "the longest step"),
     Mutant("no bound of series", step, "_tried_by_series", 'rows), p["longest"])', "rows), math.inf)", SERIES_LONGEST, "the longest step"),
-    Mutant("no start at an event", search, "at_start", "rises = (rate > 0.0)", "rises = (rate > 1e9)", LEAVES, "leaves"),
-    Mutant("every start at an event", search, "at_start", "& (w.magnitude(a) <= reach_of_noise(w, p) * rate)", "", LEAVES_BELOW, "below"),
-    Mutant("no step refused", crossings, "watched", "(fits & (count > 0.0) & (", "(fits & (count < 0.0) & (", STRIP, "strip"),
-    Mutant("steps as long as the way that is left", crossings, "reach", "w.larger(0.5 * (", "w.larger(1.0 * (", STRIP, "too many|crossings"),
-    Mutant("signs of the first state", crossings, "note", "[w.where(counts, new, old)", "[w.where(counts, old, old)", STRIP, "crossings"),
-    Mutant("a change that is never behind", crossings, "note", "passed = counts & (", "passed = counts & ~counts & (", STRIP, "too many|crossings|strip"),
-    Mutant("only the ends of a step", crossings, "watched", "w.load(w.real, hidden, 0), 2.0", "w.load(w.real, hidden, 0), 0.0", NAMED, "not named"),
-    Mutant(
-        "no event between the ends of a step", crossings, "watched", "w.load(w.real, hidden, 1) > 0.0", "w.load(w.real, hidden, 1) > 9.0", WINDOW, "passed over"
-    ),
+    Mutant("no start at an event", event_search, "at_start", "rises = (rate > 0.0)", "rises = (rate > 1e9)", LEAVES, "leaves"),
+    Mutant("every start at an event", event_search, "at_start", "& (w.magnitude(a) <= reach_of_noise(w, span) * rate)", "", LEAVES_BELOW, "below"),
+    Mutant("no step refused", crossings, "watched_by", "(fits & (count > 0.0) & (", "(fits & (count < 0.0) & (", STRIP, "strip"),
+    Mutant("steps as long as the way that is left", step, "reach", "w.larger(0.5 * (", "w.larger(1.0 * (", STRIP, "too many|crossings"),
+    Mutant("signs of the first state", crossings, "noted", "w.where(counts, new, old)", "w.where(counts, old, old)", STRIP, "crossings"),
+    Mutant("a change that is never behind", crossings, "noted", "passed = counts & (", "passed = counts & ~counts & (", STRIP, "too many|crossings|strip"),
+    Mutant("only the ends of a step", crossings, "watched_by", "2.0, 0.0)", "0.0, 0.0)", NAMED, "not named"),
+    Mutant("no event between the ends of a step", crossings, "watched_by", "hidden[relations:]) > 0.0", "hidden[relations:]) > 9.0", WINDOW, "passed over"),
     Mutant("no projection", step, "_project", 'w.call("project", "void", p.pointer, t1, y1)', "None", CIRCLE, "circle"),
-    Mutant("no events", step, "_monitored", "~search.no_event(w, c_1)", "~search.no_event(w, c_0)", EVENT, "event"),
-    Mutant("no dips", step, "_monitored", "accept & (dips | again)", "accept & again", DIP, "passed over"),
-    Mutant("a bracket with the wrong end", search, "advance", "w.where(same_side, t[1], t[0])", "t[0]", EVENT, "event"),
+    Mutant("no events", search, "decided", "~no_event(c_1)", "~no_event(c_0)", EVENT, "event"),
+    Mutant("no dips", search, "decided", "((share < 1.0) | again)", "again", DIP, "passed over"),
+    Mutant("a bracket with the wrong end", search, "advanced", "w.where(same, old.t[1], old.t[0])", "old.t[0]", EVENT, "event"),
     Mutant("rows by half", onto_rows, "_write_moved", "- w.where(moves, change, 0.0)", "- 0.5 * w.where(moves, change, 0.0)", ROWS, "coordinates|speeds"),
     Mutant(
         "rows that are not scaled",
@@ -354,9 +353,9 @@ MUTANTS = [
     Mutant("an event at a number for a time", back, "_write_event_back", "-total / rate", "total / rate", EVENT_BACK, WRONG),
     Mutant("the level of an event forgotten", back, "_write_event_back", "w.where(usable, w.load(w.real, out, i), 0.0)", "w.number(0.0)", EVENT_BACK, WRONG),
     Mutant("tangents of states alone", functions, "outputs_of", "| {len(y) + i: n for i, n in known[k].items()}", "", ALONG, WRONG),
-    Mutant("the time of an event fixed", step, "_put_tangents_at_event", "-dc / slope", "0.0 * dc", EVENT_ALONG, WRONG),
-    Mutant("the wrong way from an event", step, "_move_rows", "w.fma(w.load(w.real, k, i + rates), dt, before)", "before", EVENT_ALONG, WRONG),
-    Mutant("tangents of an event by rates of before it moved", step, "_put_tangents_at_event", "if part > 1:", "if part > 9:", EVENT_TWICE, WRONG),
+    Mutant("the time of an event fixed", search, "_put_tangents", "-dc / slope", "0.0 * dc", EVENT_ALONG, WRONG),
+    Mutant("the wrong way from an event", search, "_move_rows", "w.fma(w.load(w.real, k, i + rates), dt, before)", "before", EVENT_ALONG, WRONG),
+    Mutant("tangents of an event by rates of before it moved", search, "_put_tangents", "if part > 1:", "if part > 9:", EVENT_TWICE, WRONG),
     Mutant("the tangent at the time of an event", back, "_write_event_back", "dt * w.load(w.real, f, i)", "0.0 * dt", BENT, WRONG),
     Mutant("the tangent of an event forgotten", back, "_moved_back", "w.where(usable, w.load(w.real, out, i), 0.0)", "w.number(0.0)", BENT, WRONG),
     Mutant("an event that stays while its tangent moves", back, "_moved_back", "w.load(w.real, added, asked)", "0.0 * g_dt", BENT, WRONG),

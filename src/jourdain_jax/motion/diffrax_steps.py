@@ -169,7 +169,7 @@ def _over_at_start(begun: Begun, t0, t1) -> Bool[Array, "events"]:
     """Return which events have happened at the start, which diffrax does not check."""
     rates = integrands.rates(t0, begun.y0, begun.args)
     values, along = jax.jvp(lambda t, y: integrands.events(t, y, begun.args), (t0, begun.y0), (jnp.ones_like(t0), rates))
-    return event_search.at_start(values, jnp.sign(t1 - t0) * along, values, jnp.abs(t1 - t0))[0]
+    return jnp.stack(event_search.at_start(event_search.OnArrays(t0), values, along, values, jnp.sign(t1 - t0), t1 - t0)[0])
 
 
 def _lowest(t, y: PyTree, args, *, terms, **kwargs):

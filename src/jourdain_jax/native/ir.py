@@ -79,6 +79,9 @@ class Value:
     def __or__(self, other) -> "Value":
         return self.writer.bitwise("or", self, other)
 
+    def __xor__(self, other) -> "Value":
+        return self.writer.bitwise("xor", self, other)
+
     def __invert__(self) -> "Value":
         return self.writer.bitwise("xor", self, -1)
 
@@ -89,6 +92,8 @@ class Writer:
     `threads`: among which many lanes are shared on a CPU; `device`: whether the module is for a GPU. There `scratch` says how many doubles of memory outside
     a thread each thread needs, and how many times as many it can use.
     """
+
+    eps = 2.0**-52
 
     def __init__(self, lanes: int, fused: bool, threads: int = 1, device: bool = False) -> None:
         self.lanes, self.fused, self.threads, self.device = lanes, fused, threads, device
@@ -268,7 +273,7 @@ class Writer:
         """The square root of a number."""
         return self.intrinsic("sqrt", a)
 
-    def equal(self, a: Value, b) -> Value:
+    def equal(self, a, b) -> Value:
         """Whether two values are equal."""
         return a.equals(b)
 

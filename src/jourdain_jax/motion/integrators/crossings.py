@@ -12,16 +12,17 @@ Where one number k changes its sign in a step, all are also looked at where it v
 
 so that |x - a| < w is met although it holds at neither end: that counts as two changes more. After the relations come the values of stop events, if
 relations decide these: one that is not positive at y* makes the step end there.
+
+The formulas are those of arrays of JAX and of values of machine code: `w` is `event_search.OnArrays`, or a `Writer`. Numbers are lists.
 """
 
+import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float
 
 # Of the span. Measured, a mass that passes brake strips of 0.03 to 30 % of half of its way, at a tolerance of 1e-8: 88 to 131 tried steps with 1/1,000 and
 # 1/10,000, errors of 3e-8; with 1/100 strips of less than 0.2 % are passed in one step, and flagged. Without any, strips of 10 % are stepped over.
@@ -29,63 +30,72 @@ RESOLVED = 1e-3
 LONGER = 1.01  # times that: a step that ends at a time asked for may be longer than the one that was meant
 
 
-class Crossings(eqx.Module):
+class Crossings(NamedTuple):
     """The signs of relations, and how often they have changed."""
 
-    last: Float[Array, "numbers *lanes"] | None  # what they were last that was not zero
-    by: Float[Array, "*lanes"] | None  # the time by which one is known to change, infinite where none is, with the sign of the motion
-    count: Int[Array, "*lanes"]
-    together: Float[Array, "*lanes"]  # the end of the first step in which two or more have changed; infinite: none
-
-    def reach(self, t, direction, span) -> Float[Array, "*lanes"]:
-        """How long a step from t may be."""
-        return jnp.maximum(0.5 * (self.by - t) * direction, RESOLVED * span)
-
-    def watched(
-        self, values: Callable, relations: int, start: tuple[Array, PyTree], end: tuple[Array, PyTree], fits: Bool[Array, "*lanes"], h, span
-    ) -> "Watched":
-        """What a step h crosses from its `start` to its `end`, (t, y); `values`: (t, y) -> numbers, first `relations`; `fits`: it would be accepted."""
-        now = _unless_zero(values(*end), self.last)
-        crossed = _apart(now, self.last) & (jnp.arange(len(now)) < relations).reshape(-1, *[1] * h.ndim)
-        count = jnp.sum(crossed, axis=0, dtype=jnp.int32)
-        share = jnp.sum(jnp.where(crossed, self.last / (self.last - now), 0.0), axis=0)
-        state = jax.tree.map(lambda a, b: a + jnp.where(count == 1, share, 0.0).astype(a.dtype) * (b - a), start, end)
-        between = jax.lax.cond(eqxi.unvmap_any(count == 1), lambda: _unless_zero(values(*state), now), lambda: now)
-        hidden = (count == 1) & _apart(between, now) & _apart(between, self.last)
-        falls = fits & jnp.any(hidden[relations:], axis=0)
-        count = count + 2 * jnp.any(hidden[:relations], axis=0)
-        refused = falls | (fits & (count > 0) & (jnp.abs(h) > LONGER * RESOLVED * span))
-        return jax.lax.stop_gradient(Watched(now, count, refused, falls, share * jnp.abs(h)))
+    last: Any  # what they were last that was not zero
+    by: Any  # the time by which one is known to change, infinite where none is, with the sign of the motion
+    count: Any
+    together: Any  # the end of the first step in which two or more have changed; infinite: none
 
 
 class Watched(NamedTuple):
     """A step as relations see it."""
 
-    last: Float[Array, "numbers *lanes"]
-    count: Int[Array, "*lanes"]
-    refused: Bool[Array, "*lanes"]
-    falls: Bool[Array, "*lanes"]  # whether a stop event has happened where the one relation that changes does
-    to_event: Float[Array, "*lanes"]  # the step that ends there
-
-    def noted(self, before: Crossings, t_1, direction, counts: Bool[Array, "*lanes"]) -> Crossings:
-        """The signs after a step to `t_1`, which `counts` or not."""
-        passed = counts & ((self.count > 0) | ((t_1 - before.by) * direction >= 0))
-        by = jnp.where(self.refused, t_1, jnp.where(passed, direction * jnp.inf, before.by))
-        first = counts & (self.count > 1) & jnp.isinf(before.together)
-        last = jnp.where(counts, self.last, before.last)
-        return Crossings(last, by, before.count + jnp.where(counts, self.count, 0), jnp.where(first, t_1, before.together))
-
-
-def _unless_zero(values, otherwise):
-    return jnp.where((values > 0) | (values < 0), values, otherwise)
-
-
-def _apart(a, b) -> Bool[Array, "..."]:
-    """Whether their signs differ."""
-    return ((a > 0) & (b < 0)) | ((a < 0) & (b > 0))
+    last: Any
+    count: Any
+    refused: Any
+    falls: Any  # whether a stop event has happened where the one relation that changes does
+    to_event: Any  # the step that ends there
 
 
 def begun(values: Float[Array, "numbers *lanes"], direction) -> Crossings:
-    """The signs at a start."""
+    """Return the signs at a start."""
     never = jnp.full(values.shape[1:], jnp.inf, values.dtype)
-    return jax.lax.stop_gradient(Crossings(_unless_zero(values, 0.0), direction * never, jnp.zeros(values.shape[1:], jnp.int32), never))
+    last = jnp.where((values > 0) | (values < 0), values, 0.0)
+    return jax.lax.stop_gradient(Crossings(last, direction * never, jnp.zeros(values.shape[1:], jnp.int32), never))
+
+
+def reach(w, before: Crossings, t, direction, span):
+    """Return how long a step from t may be."""
+    return w.larger(0.5 * ((before.by - t) * direction), RESOLVED * w.magnitude(span))
+
+
+def unless_zero(w, values: Any, otherwise: Any) -> tuple:
+    """Return the values, and what is otherwise where one has no sign."""
+    return tuple(w.where((x > 0.0) | (x < 0.0), x, other) for x, other in zip(values, otherwise, strict=True))
+
+
+def _apart(a, b):
+    """Return whether their signs differ."""
+    return ((a > 0.0) & (b < 0.0)) | ((a < 0.0) & (b > 0.0))
+
+
+def _counted(w, found: Any):
+    return sum((w.where(x, 1.0, 0.0) for x in found), start=0.0)
+
+
+def watched(w, before: Crossings, values: Any, relations: int, between: Callable, fits, h, span) -> Watched:
+    """Return what a step `h` crosses; `values`: of all numbers at its end, the first so many of them `relations`; `fits`: it would be accepted.
+
+    `between`: (where one alone changes, after which part of the step, otherwise) -> values there.
+    """
+    now = unless_zero(w, values, before.last)
+    crossed = [_apart(a, b) for a, b in zip(before.last, now, strict=True)][:relations]
+    count = _counted(w, crossed)
+    shares = [w.where(is_crossed, a / (a - b), 0.0) for is_crossed, a, b in zip(crossed, before.last, now, strict=False)]
+    share, once = sum(shares, start=0.0), w.equal(count, 1.0)
+    hidden = [once & _apart(x, a) & _apart(x, b) for a, b, x in zip(before.last, now, between(once, share, now), strict=True)]
+    falls = fits & (_counted(w, hidden[relations:]) > 0.0)
+    count = count + w.where(_counted(w, hidden[:relations]) > 0.0, 2.0, 0.0)
+    refused = falls | (fits & (count > 0.0) & (w.magnitude(h) > LONGER * (RESOLVED * w.magnitude(span))))
+    return Watched(now, count, refused, falls, share * w.magnitude(h))
+
+
+def noted(w, before: Crossings, step: Watched, t_1, direction, counts) -> Crossings:
+    """Return the signs after a step to `t_1`, which `counts` or not."""
+    passed = counts & ((step.count > 0.0) | ((t_1 - before.by) * direction >= 0.0))
+    by = w.where(step.refused, t_1, w.where(passed, direction * math.inf, before.by))
+    first = counts & (step.count > 1.0) & w.equal(before.together, math.inf)
+    last = tuple(w.where(counts, new, old) for new, old in zip(step.last, before.last, strict=True))
+    return Crossings(last, by, before.count + w.where(counts, step.count, 0.0), w.where(first, t_1, before.together))

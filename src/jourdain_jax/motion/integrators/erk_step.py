@@ -20,9 +20,10 @@ In single precision the state is summed with compensation (Kahan): what rounding
 increments are smaller than its last digit stands still while time passes, and no error estimate sees it.
 """
 
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import equinox.internal as eqxi
@@ -33,13 +34,12 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.integrators import crossings, event_search
 from jourdain_jax.motion.integrators.crossings import Crossings
-from jourdain_jax.motion.integrators.event_search import Search
+from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING, OnArrays, Search
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod, Solution, even_step
 from jourdain_jax.motion.integrators.problem import Problem, as_in
 from jourdain_jax.motion.integrators.tableaus import TSIT5, Method
 from jourdain_jax.motion.trajectories import results
 
-RUNNING, LOCATING = -1, -2
 NOISE = 0.6  # exponent of round-off: its power 0.6 counts as noise anywhere, and no more than its power 0.4
 NEAR_SINE, AMPLIFIED = 0.1, 16.0  # below it rows are about to lose rank; the number of round-offs over its square that count as noise
 SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
@@ -96,19 +96,54 @@ def advanced(problem: Problem, method: Method | ImplicitMethod, p: Progress, goa
     return jax.tree.map(lambda new, old: jnp.where(moving, new, old), _tried(problem, method, p, goal, last_goal, direction), p)
 
 
+class Aim(NamedTuple):
+    """The step that is tried; of arrays of JAX or values of machine code, as all that `w` (`event_search.OnArrays`, or a `Writer`) works with."""
+
+    t_1: Any  # its end
+    h: Any  # its length, as rounded: the state and the time advance together
+    size: Any  # its magnitude, but of a search for an event
+    locating: Any  # whether it is part of one
+
+
+def aimed(w, p, target, reach, shift=None) -> Aim:
+    """Return the step to the `target`, half of the way there, or as far as `reach`; `shift`: of a search for an event, where there may be one."""
+    locating, rest = w.equal(p["code"], float(LOCATING)), w.magnitude(target - p["t"])
+    lands = ~locating & (reach >= 0.999 * rest)
+    size = w.where(lands, rest, w.where(2.0 * reach > rest, 0.5 * rest, reach))
+    h = p["direction"] * size if shift is None else w.where(locating, shift, p["direction"] * size)
+    t_1 = w.where(lands, target, p["t"] + h)
+    return Aim(t_1, t_1 - p["t"], size, locating)
+
+
+def judged(w, power: Callable, p, aim: Aim, error, order: int) -> tuple:
+    """Return whether a step of this `error` is accepted, and the next step."""
+    accept = aim.locating | (error <= 1.0)
+    factor = SAFETY * power(w.where(error > 0.0, error, 1e-30), -1 / order)
+    factor = w.larger(w.where(error < math.inf, factor, 0.0), LEAST_FACTOR)
+    proposed = w.smaller(aim.size * w.smaller(factor, w.where(accept, LARGEST_FACTOR, 1.0)), p["longest"])
+    return accept, w.where(accept & (aim.size < p["h"]), w.larger(proposed, p["h"]), proposed)
+
+
+def taken(w, p, aim: Aim, accept, next_h) -> dict[str, Any]:
+    """Return time, next step, code and counts after a step."""
+    accepted = p["accepted"] + w.where(accept & ~aim.locating, 1.0, 0.0)
+    rejected = p["rejected"] + w.where(accept, 0.0, 1.0)
+    too_short = (next_h < p["shortest"]) | w.equal(aim.t_1 + p["direction"] * next_h, aim.t_1)  # the second: no time would pass
+    arrived = accept & w.equal(aim.t_1, p["last_goal"])
+    code = w.where((accepted + rejected >= p["max_steps"]) & ~arrived, float(results.MAX_STEPS), float(RUNNING))
+    code = w.where(too_short, float(results.STEP_TOO_SMALL), code)
+    return {"t": w.where(accept, aim.t_1, p["t"]), "h": next_h, "code": code, "accepted": accepted, "rejected": rejected}
+
+
 def _tried(problem: Problem, method: Method | ImplicitMethod, p: Progress, goal, last_goal, direction) -> Progress:
-    locating = jnp.array(False) if p.search is None else p.code == LOCATING
+    w, events, watches = OnArrays(p.t), problem.events is not None, problem.relations is not None
+    known = vars(p) | {"direction": direction, "last_goal": last_goal, "max_steps": problem.max_steps, "longest": problem.longest, "shortest": problem.shortest}
     knot = problem.knot_ahead(p.t, p.knot, direction)
     target = jnp.where((knot - goal) * direction < 0, knot, goal)
-    rest = jnp.abs(target - p.t)
-    reach = p.h if p.crossings is None else jnp.minimum(p.h, p.crossings.reach(p.t, direction, problem.span))
-    reach = jnp.minimum(reach, even_step(problem.longest, rest)) if method.even else reach
-    lands = ~locating & (reach >= 0.999 * rest)
-    size = jnp.where(lands, rest, jnp.where(2 * reach > rest, 0.5 * rest, reach))
-    shortened = size < p.h
-    h = direction * size if p.search is None else jnp.where(locating, p.search.shift, direction * size)
-    t1 = jnp.where(lands, target, p.t + h)
-    h = t1 - p.t  # as rounded: the state and the time advance together
+    reach = jnp.minimum(p.h, crossings.reach(w, p.crossings, p.t, direction, problem.span)) if watches else p.h
+    reach = jnp.minimum(reach, even_step(problem.longest, jnp.abs(target - p.t))) if method.even else reach
+    aim = aimed(w, known, target, reach, p.search.shift if events else None)
+    t1, h, locating = aim.t_1, aim.h, aim.locating
     if isinstance(method, Method):
         y1, slopes, _, pivots, rank = stages(problem, method, p.t, p.y, h, monitored=True)
         increments = jax.tree.map(lambda k: as_in(h, k) * weighted(method.b, k), slopes)
@@ -137,40 +172,47 @@ def _tried(problem: Problem, method: Method | ImplicitMethod, p: Progress, goal,
         # a step in which a pivot changes its sign passes over a singularity, which no error estimate need notice
         fault = jnp.where(solved & pivots.changed_sign, results.SINGULAR_PARTITION, fault)
     size_of_error = jnp.where((fault != RUNNING) & ~locating, jnp.inf, size_of_error)
-    accept = locating | (size_of_error <= 1)
-    factor = SAFETY * jnp.where(size_of_error > 0, size_of_error, 1e-30) ** (-1 / method.order)
-    factor = jnp.clip(jnp.where(jnp.isfinite(size_of_error), factor, 0.0), LEAST_FACTOR, jnp.where(accept, LARGEST_FACTOR, 1.0))
-    proposed = jnp.minimum(size * factor, problem.longest)
-    next_h = jnp.where(accept & shortened, jnp.maximum(proposed, p.h), proposed)
-    watched = None
-    if p.crossings is not None and problem.relations is not None:
-        watched = p.crossings.watched(
-            partial(problem.relations, problem.args), problem.relation_count, (p.t, p.y), (t1, y1), accept & ~locating & (not method.even), h, problem.span
-        )
+    accept, next_h = judged(w, jnp.power, known, aim, size_of_error, method.order)
+    if watches:
+        fits = accept & ~locating & (not method.even)
+        watched = _watched(w, problem, p, (t1, y1), fits, h)
         accept, next_h = accept & ~watched.refused, jnp.where(watched.refused, jnp.where(watched.falls, watched.to_event, p.h), next_h)
-    accepted, rejected = p.accepted + (accept & ~locating).astype(jnp.int32), p.rejected + (~accept).astype(jnp.int32)
-    too_short = (next_h < problem.shortest) | (t1 + direction * next_h == t1)  # the second: no time would pass
-    code = jnp.where(too_short, results.STEP_TOO_SMALL, RUNNING)
-    code = jnp.where((code == RUNNING) & (accepted + rejected >= problem.max_steps) & ~(accept & (t1 == last_goal)), results.MAX_STEPS, code).astype(jnp.int32)
+    new = taken(w, known, aim, accept, next_h)
     y = jax.tree.map(lambda new, old: jnp.where(accept, as_in(new, old), old), y1, p.y)
     rest = jax.tree.map(lambda new, old: jnp.where(accept & ~locating, new, old), rest, p.rest)
-    passed = p.knot + (accept & ~locating & (t1 == knot)).astype(jnp.int32)
-    moved = Progress(
-        jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, passed, accepted, rejected, p.event, p.search, p.pivot, rest, p.crossings
-    )
-    if problem.events is not None:
-        moved = _monitored(problem, p, moved, h, ends, accept & ~locating & (code == RUNNING))
+    moved = _with(replace(p, y=y, rest=rest, knot=p.knot + (accept & ~locating & (t1 == knot))), new)
+    if events:
+        moved = _monitored(w, problem, known, moved, h, ends, accept & ~locating & (moved.code == RUNNING))
     if not isinstance(method, Method):
         fails = ~accept if method.even else locating & (fault == results.UNSOLVED_STEP)
-        moved = replace(moved, code=jnp.where(fails, fault, moved.code).astype(jnp.int32))
+        moved = _with(moved, {"code": jnp.where(fails, fault, moved.code)})
     # what lies beyond an event does not count
     counts = accept & ~locating & (moved.code == RUNNING) & (moved.t == t1)
-    if watched is not None and p.crossings is not None:
-        moved = replace(moved, crossings=watched.noted(p.crossings, t1, direction, counts | (locating & (moved.code == results.EVENT))))
+    if watches:
+        noted = crossings.noted(w, p.crossings, watched, t1, direction, counts | (locating & (moved.code == results.EVENT)))
+        moved = replace(moved, crossings=noted._replace(last=jnp.stack(noted.last), count=noted.count.astype(jnp.int32)))
     if pivots is None:
         return moved
     pivot = jnp.where(counts, jnp.minimum(p.pivot, pivots.smallest), p.pivot)
-    return replace(moved, pivot=pivot, code=jnp.where(counts & (pivot < SMALLEST_PIVOT), results.SINGULAR_PARTITION, moved.code).astype(jnp.int32))
+    return _with(moved, {"pivot": pivot, "code": jnp.where(counts & (pivot < SMALLEST_PIVOT), results.SINGULAR_PARTITION, moved.code)})
+
+
+def _with(p: Progress, new: Mapping) -> Progress:
+    """Return the progress with new numbers, whole ones as such; the next step has no derivative."""
+    whole = {name: jnp.asarray(new[name], jnp.int32) for name in ("code", "accepted", "rejected", "event") if name in new}
+    return replace(p, **(dict(new) | whole | ({"h": jax.lax.stop_gradient(new["h"])} if "h" in new else {})))
+
+
+def _watched(w: OnArrays, problem: Problem, p: Progress, end: tuple, fits, h) -> crossings.Watched:
+    """Return what a step to its `end` (t, y) crosses; `fits`: it would be accepted."""
+
+    def between(once, share, now):
+        state = jax.tree.map(lambda a, b: a + jnp.where(once, share, 0.0).astype(a.dtype) * (b - a), (p.t, p.y), end)
+        there = lambda: jnp.stack(crossings.unless_zero(w, problem.relations(problem.args, *state), now))  # noqa: E731
+        return jax.lax.cond(eqxi.unvmap_any(once), there, lambda: jnp.stack(now))
+
+    values = problem.relations(problem.args, *end)
+    return jax.lax.stop_gradient(crossings.watched(w, p.crossings, values, problem.relation_count, between, fits, h, problem.span))
 
 
 def _by_equations(problem: Problem, method: ImplicitMethod, p: Progress, h) -> tuple[Solution, list[PyTree], "Pivots | None"]:
@@ -307,47 +349,36 @@ def weighted(weights, slopes: Float[Array, "stages *shape"]) -> Float[Array, "*s
     return sum((as_in(weights[j], slopes) * slopes[j] for j in used[1:]), start=as_in(weights[used[0]], slopes) * slopes[used[0]])
 
 
-def _monitored(problem: Problem, p: Progress, moved: Progress, h, slopes, accept) -> Progress:
-    """The step from `p` by `h` to `moved`, in which an event may have happened or is being located; `slopes`: at its ends, `accept`: a step of the motion."""
+def _monitored(w: OnArrays, problem: Problem, known: Mapping, moved: Progress, h, slopes, accept) -> Progress:
+    """Return what becomes of a step by `h` to `moved` in which an event may have happened or is being located; `known`: the progress before it.
+
+    `slopes`: at its ends; `accept`: it is a step of the motion.
+    """
+    t, y, so_far = known["t"], known["y"], known["search"]
+    one, (first_slope, last_slope) = jnp.ones_like(t), slopes
 
     def events(t, y):
         return problem.events(t, y, problem.args)
 
-    so_far = p.search
-    assert so_far is not None  # where there are events
-    one, locating, (first_slope, last_slope) = jnp.ones_like(p.t), p.code == LOCATING, slopes
-    first_values, first_rates = jax.jvp(events, (p.t, p.y), (one, first_slope))
-    values, last_rates = jax.jvp(events, (moved.t, moved.y), (one, jax.lax.stop_gradient(last_slope)))
-    dip = event_search.dip(h, first_values, first_rates, values, last_rates)
-    sunk, sinks = event_search.at_start(first_values, jnp.sign(h) * first_rates, values, problem.span)
-    again = jnp.any(sinks, axis=0) & (jnp.abs(h) > event_search.reach_of_noise(problem.span))
-    dip = event_search.Dip(dip.happens | again, jnp.where(again, 0.5, dip.share))
-    known = [jnp.all(jnp.isfinite(x), axis=tuple(range(x.ndim - p.t.ndim))) for x in jax.tree.leaves(p.y)]  # a state that is lost is no event
-    fresh = (p.accepted + p.rejected == 0) & jnp.all(jnp.stack(known), axis=0)
-    over = jnp.any((fresh & sunk) | (accept & ~again & sinks), axis=0)  # at the start
-    dips = accept & dip.happens
-    happened = accept & ~dips & ~event_search.no_event(values)
-    search = jax.lax.cond(
-        eqxi.unvmap_any(happened | locating),
-        lambda: jax.tree.map(
-            lambda new, old: jnp.where(happened | locating, new, old),
-            event_search.advanced(so_far, happened, p.t, first_values, first_rates, moved.t, values),
-            so_far,
-        ),
-        lambda: so_far,
-    )
-    # trials start at the last state before the event; a step that passes over a dip is tried again to its bottom
-    found, back = locating & (search.left == 0), (happened | locating) & search.trying
-    t = jnp.where(found, moved.t + search.shift, jnp.where(back | dips, p.t, moved.t))
-    y = jax.tree.map(lambda y, y_0, f: jnp.where(found, y + as_in(search.shift, y) * f, jnp.where(back | dips, y_0, y)), moved.y, p.y, first_slope)
-    event = jnp.where(happened | (locating & so_far.trying), search.known.first, p.event)
-    next_h = jnp.where(dips, dip.share * jnp.abs(h), jnp.where(locating, p.h, moved.h))
-    code = jnp.where(happened, LOCATING, jnp.where(found, results.EVENT, jnp.where(locating, LOCATING, moved.code))).astype(jnp.int32)
-    tried = dips.astype(jnp.int32)
-    knot = jnp.where(dips, p.knot, moved.knot)
-    rest = jax.tree.map(lambda new, old: jnp.where(dips, old, new), moved.rest, p.rest)
-    accepted, rejected = moved.accepted - tried, moved.rejected + tried
-    after = Progress(t, y, jax.lax.stop_gradient(next_h), code, knot, accepted, rejected, event, search, moved.pivot, rest, moved.crossings)
-    first = jnp.argmax(sunk | sinks, axis=0).astype(jnp.int32)
-    none = replace(p, code=jnp.full_like(code, results.EVENT), event=first, search=search)
-    return jax.tree.map(lambda a, b: jnp.where(over, a, b), none, after)
+    c_0, rate_0 = map(tuple, jax.jvp(events, (t, y), (one, first_slope)))
+    c_1, rate_1 = map(tuple, jax.jvp(events, (moved.t, moved.y), (one, jax.lax.stop_gradient(last_slope))))
+
+    def advance(begins, changes):
+        def changed():
+            new, first = event_search.advanced_arrays(w, so_far, begins, (t, c_0, rate_0), (moved.t, c_1))
+            new = jax.tree.map(lambda new, old: jnp.where(changes, new, old), new, so_far)
+            return new, jnp.broadcast_to(jnp.asarray(first, t.dtype), t.shape)
+
+        return jax.lax.cond(eqxi.unvmap_any(changes), changed, lambda: (so_far, jnp.zeros_like(t)))
+
+    numbers = [jnp.all(jnp.isfinite(x), axis=tuple(range(x.ndim - t.ndim))) for x in jax.tree.leaves(y)]
+    sound = jnp.all(jnp.stack(numbers), axis=0)
+    ends = jax.lax.stop_gradient((c_0, rate_0, c_1, rate_1))
+    found = event_search.decided(w, known, vars(moved), h, ends, accept, sound, (so_far, advance))
+
+    def state(after, before, slope):
+        return jnp.where(found.found, after + as_in(found.search.shift, after) * slope, jnp.where(found.stays, before, after))
+
+    y = jax.tree.map(state, moved.y, y, first_slope)
+    knot, rest = jax.tree.map(lambda old, new: jnp.where(found.undone, old, new), (known["knot"], known["rest"]), (moved.knot, moved.rest))
+    return _with(replace(moved, y=y, knot=knot, rest=rest, search=found.search), found.new)

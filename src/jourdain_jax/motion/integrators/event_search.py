@@ -1,5 +1,7 @@
 """Which stop event of a step came first, and when: trials of shorter steps from the last state before it.
 
+The formulas are those of arrays of JAX and of values of machine code: `w` is `OnArrays`, or a `Writer`. Values of events are lists, one for each event.
+
 An event happens where its value falls through zero. A motion that starts with a value of zero, as round-off has it, and a rate that raises it goes on
 
     |c_0| <= noise c_0',   noise = eps^0.6 span
@@ -24,95 +26,92 @@ Source: T. R. Chandrupatla, Advances in Engineering Software 28 (1997) 145-149.
 """
 
 import math
+import operator
+from collections.abc import Callable, Mapping
+from functools import reduce
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
+from jourdain_jax.motion.trajectories import results
+
+RUNNING, LOCATING = -1, -2  # codes of a motion on its way, and of one that searches for an event
 MOST_STEPS = 72
 DIFFERENTIABLE = 2
 FLAT = 1e-8  # of its mean rate over a step: a value that falls through zero so slowly has a root of several fold, or as good as that
 LEAVES = 0.6  # exponent of round-off
 LATE = 0.98  # of a step: a dip that is later is left to the next one
 
-
-def reach_of_noise(span) -> Float[Array, "*lanes"]:
-    """The time in which a value rises by no more than it may be below zero at a start."""
-    return jnp.finfo(span.dtype).eps ** LEAVES * span
-
-
-def at_start(c_0, c_dot_0, c_1, span) -> tuple[Bool[Array, "events *lanes"], Bool[Array, "events *lanes"]]:
-    """Which events have happened at a state, of a start; and which values, though they rise from zero there, are not positive after a step."""
-    c_0, c_dot_0, c_1 = jax.lax.stop_gradient((c_0, c_dot_0, c_1))
-    rises = (c_dot_0 > 0) & (jnp.abs(c_0) <= reach_of_noise(span) * c_dot_0)
-    beyond = ~(c_0 > 0)
-    return beyond & ~rises, beyond & rises & ~(c_1 > 0)
-
-
-class Bracket(eqx.Module):
-    """Three times with the values of all events there: the last one tried, one on the other side of the event, and one that was either before."""
-
-    t: Float[Array, "3 *lanes"]
-    c: Float[Array, "3 events *lanes"]
-
-    @property
-    def before(self) -> Bool[Array, "*lanes"]:
-        """Whether the last time tried is before the event."""
-        return no_event(self.c[0])
-
-    @property
-    def ends(self) -> tuple[Float[Array, "events *lanes"], Float[Array, "events *lanes"]]:
-        """Values before and after the event."""
-        return jnp.where(self.before, self.c[0], self.c[1]), jnp.where(self.before, self.c[1], self.c[0])
-
-    @property
-    def first(self) -> Int[Array, "*lanes"]:
-        """Index of the event that is the first to happen, by its secant."""
-        before, after = self.ends
-        share = before / (before - after)
-        share = jnp.where(jnp.isfinite(share), share, 1.0)
-        return jnp.argmin(jnp.where(after > 0, jnp.inf, share), axis=0).astype(jnp.int32)
-
-    def narrowed(self, t: Float[Array, "*lanes"], c: Float[Array, "events *lanes"]) -> "Bracket":
-        """The bracket, narrowed by the values at a time in between."""
-        same = no_event(c) == self.before
-        older = (jnp.where(same, self.t[1], self.t[0]), jnp.where(same, self.t[0], self.t[1]))
-        older_c = (jnp.where(same, self.c[1], self.c[0]), jnp.where(same, self.c[0], self.c[1]))
-        return Bracket(jnp.stack([t, *older]), jnp.stack([c, *older_c]))
-
-
-def no_event(values: Float[Array, "events *lanes"]) -> Bool[Array, "*lanes"]:
-    """Whether all values are positive, which NaN is not."""
-    return jnp.all(values > 0, axis=0)
-
-
-def bracket(t_0: Float[Array, "*lanes"], c_0, t_1: Float[Array, "*lanes"], c_1) -> Bracket:
-    """What is known after a step from `t_0`, before the event, to `t_1`, after it."""
-    t_0, c_0, t_1, c_1 = jax.lax.stop_gradient((t_0, c_0, t_1, c_1))
-    return Bracket(jnp.stack([t_1, t_0, jnp.full_like(t_0, jnp.inf)]), jnp.stack([c_1, c_0, jnp.full_like(c_0, jnp.nan)]))
-
-
-class Trial(eqx.Module):
-    """Where to look next, or that the last time tried is near enough."""
-
-    t: Float[Array, "*lanes"]
-    near: Bool[Array, "*lanes"]
+Values = Any  # one for each event
 
 
 class OnArrays:
-    """What the formulas of the search take of a `Writer` of machine code, for arrays of JAX."""
+    """What the formulas of a step take of a `Writer` of machine code, for arrays of JAX."""
 
-    where, magnitude, larger, smaller, root, equal = map(staticmethod, (jnp.where, jnp.abs, jnp.maximum, jnp.minimum, jnp.sqrt, jnp.equal))
+    where, magnitude, larger, smaller, root, equal, is_nan = map(staticmethod, (jnp.where, jnp.abs, jnp.maximum, jnp.minimum, jnp.sqrt, jnp.equal, jnp.isnan))
 
-
-def next_trial(known: Bracket, step: Float[Array, "*lanes"], last: Bool[Array, "*lanes"]) -> Trial:
-    """The next time to try in a step of length `step`; with `last` the search ends, at a time where the value is a number."""
-    return Trial(*trial(OnArrays, known.t, [chosen(known.first, c) for c in known.c], step, last, float(jnp.finfo(known.t.dtype).eps)))
+    def __init__(self, like) -> None:
+        self.eps = float(jnp.finfo(like.dtype).eps)
 
 
-def trial(w, t, c, step, last, eps: float) -> tuple:
-    """The formulas of `next_trial`, of the times and values of a bracket; `w`: `OnArrays`, or a `Writer` of machine code."""
+def any_of(found: Values):
+    """Return whether any holds."""
+    return reduce(operator.or_, found)
+
+
+def no_event(values: Values):
+    """Return whether all values are positive, which NaN is not."""
+    return reduce(operator.and_, [c > 0.0 for c in values])
+
+
+def chosen(w, index, values: Values):
+    """Return the value with this index, of the first one where there is none."""
+    found = values[0]
+    for i in range(1, len(values)):
+        found = w.where(w.equal(index, float(i)), values[i], found)
+    return found
+
+
+def _each(w, condition, a: Values, b: Values) -> tuple:
+    return tuple(w.where(condition, x, y) for x, y in zip(a, b, strict=True))
+
+
+def reach_of_noise(w, span):
+    """Return the time in which a value rises by no more than it may be below zero at a start."""
+    return w.eps**LEAVES * w.magnitude(span)
+
+
+def at_start(w, c_0: Values, c_dot_0: Values, c_1: Values, direction, span) -> tuple[list, list]:
+    """Return which events have happened at a state, of a start; and which values, though they rise from zero there, are not positive after a step."""
+    sunk, sinks = [], []
+    for a, slope, b in zip(c_0, c_dot_0, c_1, strict=True):
+        rate = slope * direction
+        rises = (rate > 0.0) & (w.magnitude(a) <= reach_of_noise(w, span) * rate)
+        sunk.append(~(a > 0.0) & ~rises)
+        sinks.append(~(a > 0.0) & rises & ~(b > 0.0))
+    return sunk, sinks
+
+
+def first_event(w, before: Values, after: Values):
+    """Return the index of the event that is the first to happen, by its secant."""
+    best, first = None, 0.0
+    for i, (b, a) in enumerate(zip(before, after, strict=True)):
+        share = b / (b - a)
+        share = w.where(a > 0.0, math.inf, w.where(w.magnitude(share) < math.inf, share, 1.0))
+        if best is not None:
+            first = w.where(share < best, float(i), first)
+        best = share if best is None else w.where(share < best, share, best)
+    return first
+
+
+def trial(w, t, c, step, last) -> tuple:
+    """Return the next time to try in a step of length `step`, and whether the last one is near enough, of the times and values of a bracket.
+
+    With `last` the search ends, at a time where the value is a number.
+    """
+    eps = w.eps
     (t_1, t_2, t_3), (c_1, c_2, c_3) = t, c
     width, tiny = t_2 - t_1, 2 * eps * (w.magnitude(t_1) + w.magnitude(t_2))
     xi, phi = (t_1 - t_2) / (t_3 - t_2), (c_1 - c_2) / (c_3 - c_2)
@@ -132,55 +131,155 @@ def trial(w, t, c, step, last, eps: float) -> tuple:
     return w.where(closed, t_2, t_1 + clipped * width), near | (closed & (w.magnitude(c_1) < math.inf))
 
 
-class Search(eqx.Module):
-    """What is known of the event's time, for each lane."""
+class Search(NamedTuple):
+    """What is known of the event's time.
 
-    known: Bracket
-    step: Float[Array, "*lanes"]  # length of the step in which the event lies
-    left: Int[Array, "*lanes"]  # steps; 0: found
-    shift: Float[Array, "*lanes"]  # the next step, with its sign
-    slope: Float[Array, "events *lanes"]  # magnitude of the mean rate of the values over that step
+    A bracket: three times with the values of all events there, the last one tried, one on the other side of the event, and one that was either before.
+    """
+
+    t: Values
+    c: Any
+    step: Any  # length of the step in which the event lies
+    left: Any  # steps; 0: found
+    shift: Any  # the next step, with its sign
+    slope: Values  # magnitude of the mean rate of the values over that step
 
     @property
-    def trying(self) -> Bool[Array, "*lanes"]:
+    def trying(self):
         """Whether trials start at the last state before the event; then Newton's shifts do, each where the last one ended."""
-        return self.left > DIFFERENTIABLE + 1
+        return self.left > DIFFERENTIABLE + 1.0
+
+
+class Followed(NamedTuple):
+    """The event that a search follows."""
+
+    first: Any  # its index
+    trying: Any  # whether the next shift is a trial
+    usable: Any  # whether Newton's shift says something
+    beyond: Any  # whether its value is no number after the event
+
+
+def advanced(w, old: Search, begins, start: tuple, end: tuple) -> tuple[Search, Followed]:
+    """Return the search after a step, its `start` (time, values of all events, rates) and `end` (time, values); `begins`: it is the step of the event.
+
+    The next shift is that of a trial; Newton's is the caller's.
+    """
+    (t_0, c_0, rate_0), (t_1, c_1) = start, end
+    # narrowed: the time tried, one on the other side of the event, and one that was either before
+    same = ~(no_event(c_1) ^ no_event(old.c[0]))
+    narrowed_t = t_1, w.where(same, old.t[1], old.t[0]), w.where(same, old.t[0], old.t[1])
+    narrowed_c = c_1, _each(w, same, old.c[1], old.c[0]), _each(w, same, old.c[0], old.c[1])
+    t = tuple(w.where(begins, a, w.where(old.trying, b, kept)) for a, b, kept in zip((t_1, t_0, math.inf), narrowed_t, old.t, strict=True))
+    fresh_c = c_1, c_0, [math.nan] * len(c_1)
+    c = tuple(_each(w, begins, a, _each(w, old.trying, b, kept)) for a, b, kept in zip(fresh_c, narrowed_c, old.c, strict=True))
+    step = w.where(begins, w.magnitude(t_1 - t_0), old.step)
+    left = w.where(begins, float(MOST_STEPS), w.larger(old.left - 1.0, 0.0))
+    is_before = no_event(c[0])
+    before, after = _each(w, is_before, c[0], c[1]), _each(w, is_before, c[1], c[0])
+    first = first_event(w, before, after)
+    tried, near = trial(w, t, [chosen(w, first, x) for x in c], step, left <= DIFFERENTIABLE + 3.0)
+    trying = begins | old.trying
+    left = w.where(trying & near, DIFFERENTIABLE + 1.0, left)
+    far = w.magnitude(t[0] - t[1]) + math.sqrt(w.eps) * step
+    value, rate = chosen(w, first, c_1), chosen(w, first, rate_0)
+    usable = (old.left > 0.0) & (w.magnitude(value) < far * w.magnitude(rate)) & (w.magnitude(rate) < math.inf)
+    slope = []
+    for a, b, kept in zip(c_0, c_1, old.slope, strict=True):
+        mean = w.magnitude((b - a) / (t_1 - t_0))
+        slope.append(w.where(begins, w.where(mean < math.inf, mean, 0.0), kept))
+    new = Search(t, c, step, left, w.where(near, 0.0, tried - t_0), tuple(slope))
+    return new, Followed(first, trying, usable, w.is_nan(chosen(w, first, after)))
+
+
+def is_flat(w, c_dot, slope):
+    """Return whether a value has no slope where it falls through zero, as far as its digits tell, beside its mean `slope` over the step."""
+    return w.magnitude(c_dot) <= FLAT * slope
+
+
+def lowest(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values):
+    """Return after which part of a step `h` the first dip is lowest, a value that falls below zero between the ends; 1 where none does.
+
+    p(s) = c_0 + m_0 s + A s^2 + B s^3,   lowest at s = -m_0/(A + sqrt(A^2 - 3 B m_0))
+    """
+    share = None
+    for a, slope_a, b, slope_b in zip(c_0, c_dot_0, c_1, c_dot_1, strict=True):
+        m_0, m_1 = h * slope_a, h * slope_b
+        rise = b - a
+        A, B = 3.0 * rise - 2.0 * m_0 - m_1, m_0 + m_1 - 2.0 * rise
+        s = -m_0 / (A + w.root(w.larger(A * A - 3.0 * B * m_0, 0.0)))
+        value = a + s * (m_0 + s * (A + s * B))
+        dips = (b > 0.0) & (m_0 < 0.0) & (m_1 > 0.0) & (s < LATE) & (value < -1e-12 * (a + b))
+        found = w.where(dips, s, 1.0)
+        share = found if share is None else w.smaller(share, found)
+    return share
+
+
+class Decided(NamedTuple):
+    """What becomes of a step in which an event may have happened or is being located, or before which one has."""
+
+    new: dict[str, Any]  # time, step size, code, counts and event
+    found: Any  # whether the event is found: the state moves by the search's shift, along the rates at the start of the step
+    stays: Any  # whether the state is that before the step
+    undone: Any  # whether the step was none
+    search: Search
+
+
+def decided(w, p, new: Mapping, h, known: tuple, accept, sound, following: tuple[Search, Callable]) -> Decided:
+    """Return what becomes of a step `h` from the progress `p` to `new`.
+
+    `known`: values and rates of all events at its start, then at its end. `accept`: whether it is a step of the motion. `sound`: whether the state before it
+    is one; a state that is lost is no event. `following`: the search so far, and (which lanes begin one, which have one) -> the search, and its event.
+    """
+    (c_0, rate_0, c_1, rate_1), (search, advance) = known, following
+    locating = w.equal(p["code"], float(LOCATING))
+    fresh = w.equal(p["accepted"] + p["rejected"], 0.0) & sound
+    share = lowest(w, h, c_0, rate_0, c_1, rate_1)
+    sunk, sinks = at_start(w, c_0, rate_0, c_1, p["direction"], p["last_goal"])
+    again = any_of(sinks) & (w.magnitude(h) > reach_of_noise(w, p["last_goal"]))
+    dips, share = accept & ((share < 1.0) | again), w.where(again, 0.5, share)
+    happened = accept & ~dips & ~no_event(c_1)
+    was_trying, changes = search.trying, happened | locating
+    search, first = advance(happened, changes)
+    # trials start at the last state before the event; a step that passes over a dip is tried again to its bottom
+    found, back = locating & w.equal(search.left, 0.0), changes & search.trying
+    over = (fresh & any_of(sunk)) | (accept & ~again & any_of(sinks))  # at the start
+    stays, undone = back | dips | over, dips | over
+    which = float(len(c_0) - 1)
+    for i in reversed(range(len(c_0) - 1)):
+        which = w.where(sunk[i] | sinks[i], float(i), which)
+    code = w.where(happened, float(LOCATING), w.where(found, float(results.EVENT), w.where(locating, float(LOCATING), new["code"])))
+    tried = w.where(dips, 1.0, 0.0)
+    after = {
+        "t": w.where(found, new["t"] + search.shift, w.where(stays, p["t"], new["t"])),
+        "h": w.where(over, p["h"], w.where(dips, share * w.magnitude(h), w.where(locating, p["h"], new["h"]))),
+        "code": w.where(over, float(results.EVENT), code),
+        "accepted": w.where(over, p["accepted"], new["accepted"] - tried),
+        "rejected": w.where(over, p["rejected"], new["rejected"] + tried),
+        "event": w.where(over, which, w.where(happened | (locating & was_trying), first, p["event"])),
+    }
+    return Decided(after, found, stays, undone, search)
+
+
+# Of arrays of JAX alone: derivatives.
 
 
 def none(t: Float[Array, "*lanes"], values: Float[Array, "events *lanes"]) -> Search:
-    """Nothing to search for."""
+    """Return a search for nothing."""
     t, c = jax.lax.stop_gradient((t, values))
-    return Search(bracket(t, c, t, c), jnp.zeros_like(t), jnp.zeros(jnp.shape(t), jnp.int32), jnp.zeros_like(t), jnp.zeros_like(c))
+    bracket = jnp.stack([t, t, jnp.full_like(t, jnp.inf)]), jnp.stack([c, c, jnp.full_like(c, jnp.nan)])
+    return Search(*bracket, *[jnp.zeros_like(t)] * 3, jnp.zeros_like(c))
 
 
-def advanced(search: Search, begins: Bool[Array, "*lanes"], t_0, c_0, c_dot_0, t_1, c_1) -> Search:
-    """The search after a step from `t_0` to `t_1`, with the values of all events there and the rates of the first; `begins`: it is the step of the event."""
-    now, c = jax.lax.stop_gradient((t_1, c_1))
-    fresh, narrowed = bracket(t_0, c_0, now, c), search.known.narrowed(now, c)
-    trying = begins | search.trying
-    known = jax.tree.map(lambda new, old, kept: jnp.where(begins, new, jnp.where(trying, old, kept)), fresh, narrowed, search.known)
-    step = jnp.where(begins, jnp.abs(now - jax.lax.stop_gradient(t_0)), search.step)
-    left = jnp.where(begins, MOST_STEPS, jnp.maximum(search.left - 1, 0))
-    trial = next_trial(known, step, left <= DIFFERENTIABLE + 3)
-    left = jnp.where(trying & trial.near, DIFFERENTIABLE + 1, left).astype(jnp.int32)
-    shift = jnp.where(trial.near, 0.0, trial.t - jax.lax.stop_gradient(t_0))
-    first = known.first
-    slope = jnp.where(begins, mean_slope(fresh), search.slope)
-    newton = newton_shift(known, step, chosen(first, c_1), chosen(first, c_dot_0), search.left > 0)
-    newton = without_slope(newton, chosen(first, c_1), (search.left == 1) & is_flat(chosen(first, c_dot_0), chosen(first, slope)))
-    return Search(known, step, left, jnp.where(trying, shift, newton), slope)
-
-
-def mean_slope(known: Bracket) -> Float[Array, "events *lanes"]:
-    """The magnitude of the mean rate of the values between the first two times of a bracket; zero where one of them is not finite."""
-    slope = jnp.abs(known.c[0] - known.c[1]) / jnp.abs(known.t[0] - known.t[1])
-    return jnp.where(jnp.isfinite(slope), slope, 0.0)
-
-
-def is_flat(c_dot: Float[Array, "*lanes"], slope: Float[Array, "*lanes"]) -> Bool[Array, "*lanes"]:
-    """Whether a value has no slope where it falls through zero, as far as its digits tell, beside its mean `slope` over the step."""
-    c_dot, slope = jax.lax.stop_gradient((c_dot, slope))
-    return jnp.abs(c_dot) <= FLAT * slope
+def advanced_arrays(w: OnArrays, old: Search, begins: Bool[Array, "*lanes"], start: tuple, end: tuple) -> tuple[Search, Array]:
+    """Return the search after a step, and the index of the event it follows. The times tried are numbers to differentiation, Newton's shifts are not."""
+    new, event = jax.lax.stop_gradient(advanced(w, *jax.lax.stop_gradient((old, begins, start, end))))
+    c, c_dot = chosen(w, event.first, end[1]), chosen(w, event.first, start[2])
+    flat = (old.left == 1) & jax.lax.stop_gradient(is_flat(w, c_dot, chosen(w, event.first, new.slope)))
+    c_dot = jnp.where(event.beyond, jax.lax.stop_gradient(c_dot), c_dot)
+    newton = jnp.where(event.usable, -c / jnp.where(event.usable, c_dot, 1.0), 0.0)
+    newton = without_slope(jnp.where(event.beyond, newton - jax.lax.stop_gradient(newton), newton), c, flat)
+    stacked = {"t": jnp.stack(new.t), "c": jnp.stack([jnp.stack(c) for c in new.c]), "slope": jnp.stack(new.slope)}
+    return new._replace(shift=jnp.where(event.trying, new.shift, newton), **stacked), event.first
 
 
 @jax.custom_jvp
@@ -193,51 +292,3 @@ def without_slope(shift, c, flat: Bool[Array, "*lanes"]) -> Float[Array, "*lanes
 def _without_slope_jvp(primals, tangents):
     (shift, _, flat), (d_shift, dc, _) = primals, tangents
     return shift, jnp.where(flat, 0.0, 1.0) * d_shift + jnp.where(flat, jnp.nan, 0.0) * dc
-
-
-def newton_shift(known: Bracket, step, c, c_dot, searching) -> Float[Array, "*lanes"]:
-    """Newton's shift to c = 0, and zero where it says nothing; `step`: length of the step in which the event lies."""
-    _, after = known.ends
-    beyond = jnp.isnan(chosen(known.first, after))
-    c_dot = jnp.where(beyond, jax.lax.stop_gradient(c_dot), c_dot)
-    far = jnp.abs(known.t[0] - known.t[1]) + jnp.sqrt(jnp.finfo(known.t.dtype).eps) * step
-    usable = searching & (jnp.abs(c) < far * jnp.abs(c_dot)) & jnp.isfinite(c_dot)
-    shift = jnp.where(usable, -c / jnp.where(usable, c_dot, 1.0), 0.0)
-    return jnp.where(beyond, shift - jax.lax.stop_gradient(shift), shift)
-
-
-class Dip(eqx.Module):
-    """Whether a value that is positive at both ends of a step falls below zero in between, and after which part of the step the first one is lowest."""
-
-    happens: Bool[Array, "*lanes"]
-    share: Float[Array, "*lanes"]
-
-
-def dip(h: Float[Array, "*lanes"], c_0, c_dot_0, c_1, c_dot_1) -> Dip:
-    """The dips of the cubics through values (those at the start positive) and rates (events, *lanes) at the ends of a step `h`."""
-    share = lowest(OnArrays, jnp.ones_like(h), *jax.lax.stop_gradient((h, c_0, c_dot_0, c_1, c_dot_1)))
-    return Dip(share < 1, share)
-
-
-def lowest(w, share, h, c_0, c_dot_0, c_1, c_dot_1):
-    """After which part of a step, of which all is the `share` at first, the first dip is lowest; `w`: as of `trial`.
-
-    p(s) = c_0 + m_0 s + A s^2 + B s^3,   lowest at s = -m_0/(A + sqrt(A^2 - 3 B m_0))
-    """
-    for a, slope_a, b, slope_b in zip(c_0, c_dot_0, c_1, c_dot_1, strict=True):
-        m_0, m_1 = h * slope_a, h * slope_b
-        rise = b - a
-        A, B = 3.0 * rise - 2.0 * m_0 - m_1, m_0 + m_1 - 2.0 * rise
-        s = -m_0 / (A + w.root(w.larger(A * A - 3.0 * B * m_0, 0.0)))
-        value = a + s * (m_0 + s * (A + s * B))
-        dips = (b > 0.0) & (m_0 < 0.0) & (m_1 > 0.0) & (s < LATE) & (value < -1e-12 * (a + b))
-        share = w.smaller(share, w.where(dips, s, 1.0))
-    return share
-
-
-def chosen(index, values: Float[Array, "events *lanes"]) -> Float[Array, "*lanes"]:
-    """The value with this index, of the first one where there is none."""
-    chosen = values[0]
-    for i in range(1, len(values)):
-        chosen = jnp.where(index == i, values[i], chosen)
-    return chosen

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jourdain_jax.calculus.promotion import with_usual_promotion
 from jourdain_jax.motion.integrators import step_adjoint
 from jourdain_jax.motion.integrators.erk_step import LOCATING, Progress, advanced, begun, running, standing
-from jourdain_jax.motion.integrators.event_search import MOST_STEPS, chosen, is_flat
+from jourdain_jax.motion.integrators.event_search import MOST_STEPS, OnArrays, chosen, is_flat
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
 from jourdain_jax.motion.integrators.problem import Problem
 from jourdain_jax.motion.integrators.tableaus import Method
@@ -140,7 +140,7 @@ def _recorded(perturbed, moving, control, forward, method):
 
     (end, _, record), (ys, reached) = jax.lax.scan(to_goal, (start, start, empty), jnp.arange(len(goals), dtype=jnp.int32))
     record = replace(record, window=record.window.towards(jnp.asarray(len(goals), jnp.int32)))
-    slope = None if end.search is None else chosen(end.event, end.search.slope)
+    slope = None if end.search is None else chosen(OnArrays(end.t), end.event, end.search.slope)
     end = replace(end, search=None)
     return (ys, reached, end), (record, reached, end, slope)
 
@@ -254,17 +254,17 @@ def _back_from_event(end: Progress, located, slope, g: _Cotangents, differentiab
     t = t_e - c(t_e, y)/cdot,   y_e = y - f c(t_e, y)/cdot      zero in value, t_e a number;  NaN where c has no slope there
     """
     (rates, _, args), events = eqx.combine(differentiable, fixed)
-    f = rates(end.t, end.y, args)
-    _, rate = jax.jvp(lambda t, y: chosen(end.event, events(t, y, args)), (end.t, end.y), (jnp.ones_like(end.t), f))
+    w, f = OnArrays(end.t), rates(end.t, end.y, args)
+    _, rate = jax.jvp(lambda t, y: chosen(w, end.event, events(t, y, args)), (end.t, end.y), (jnp.ones_like(end.t), f))
     usable = located & (rate != 0) & jnp.isfinite(rate)
     asked = g.t + step_adjoint.product(g.y, f, end.t.ndim)
     by_value = jnp.where(usable, -asked / jnp.where(usable, rate, 1.0), 0.0)
-    flat = located & is_flat(rate, slope)
+    flat = located & is_flat(w, rate, slope)
     by_value = jnp.where(flat & (asked != 0), jnp.nan, by_value)
 
     def value(y, differentiable):
         (_, _, args), events = eqx.combine(differentiable, fixed)
-        return chosen(end.event, events(end.t, y, args))
+        return chosen(w, end.event, events(end.t, y, args))
 
     _, pull = jax.vjp(value, end.y, differentiable)
     by_y, (by_shared, by_events) = pull(jnp.asarray(by_value, rate.dtype))

@@ -17,14 +17,16 @@ import math
 from collections.abc import Sequence
 from functools import partial
 
-from jourdain_jax.motion.integrators.erk_step import RUNNING, Method
-from jourdain_jax.motion.native import samples, search
+from jourdain_jax.motion.integrators.erk_step import Method
+from jourdain_jax.motion.integrators.event_search import RUNNING, chosen
+from jourdain_jax.motion.native import samples
 from jourdain_jax.motion.native.functions import Form
-from jourdain_jax.motion.native.layout import Lanes
+from jourdain_jax.motion.native.layout import Lanes, each_row
 from jourdain_jax.motion.native.loop import COUNT, FIRST_OF_SAMPLES, TIMES, write_functions, write_job
 from jourdain_jax.motion.native.pulled import write_pulled
 from jourdain_jax.motion.native.record import GOALS, STARTS, TO_ENDS, TO_STATES, Slot, prepare, write_record
-from jourdain_jax.motion.native.step import IDLE, each_row, near_rank_loss, put_near_rows, squares_of, weighted
+from jourdain_jax.motion.native.search import slope_is_flat
+from jourdain_jax.motion.native.step import IDLE, near_rank_loss, put_near_rows, squares_of, weighted
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native.ffi import write_handler
 from jourdain_jax.native.ir import Value, Writer
@@ -218,7 +220,7 @@ def _write_event_back(w: Writer, form: Form, asked: int) -> None:
                 lanes["dt"] = w.number(0.0)
                 w.call("rates", "void", state, t, state, f, pivots)
             w.call("events", "void", state, t, state, f, values, rates)
-            rate = search.chosen(w, lanes["event"], [w.load(w.real, rates, i) for i in range(layout.events)])
+            rate = chosen(w, lanes["event"], [w.load(w.real, rates, i) for i in range(layout.events)])
             usable = located & rate.differs(0.0) & (w.magnitude(rate) < math.inf)
             each_row(w, range(asked + 1), added, lambda i: w.number(0.0))
             total = w.load(w.real, g_t)
@@ -226,7 +228,7 @@ def _write_event_back(w: Writer, form: Form, asked: int) -> None:
                 total = total + _moved_back(w, form, lanes, usable, (g, w.load(w.real, g_t, 1)), (out, added), asked)
             for i in range(count):
                 total = w.fma(w.load(w.real, g, i), w.load(w.real, f, i), total)
-            flat = located & search.is_flat(w, lanes, rate) & total.differs(0.0)
+            flat = located & slope_is_flat(w, lanes, rate) & total.differs(0.0)
             by_value = w.where(flat, math.nan, w.where(usable, -total / rate, 0.0))
             usable = usable | flat
             for i in range(layout.events):

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.motion.integrators.erk_step import RUNNING
+from jourdain_jax.motion.integrators.event_search import RUNNING
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.native import back, loop, samples
 from jourdain_jax.motion.native.called import called

@@ -9,6 +9,7 @@ a step by Taylor series, `before` is the time at which it began, and `bound` how
 whose signs are watched, and by the time `crossing_by` one of them is known to change (`motion/integrators/crossings.py`).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -116,3 +117,27 @@ class Lanes:
     def set(self, name: str, lane: Value, value) -> None:
         """Sets the number of one lane."""
         self.w.store(self.w.literal(value, "double"), self.place(self.layout.rows[name].start, lane))
+
+
+def for_rows(w: Writer, rows: range, body: Callable[[int | Value], object]) -> None:
+    """`body` for the number of every row."""
+    # 12 numbers of a state; more are gone through by loops, whose code is short
+    if len(rows) <= 12:
+        for i in rows:
+            body(i)
+    else:
+        with w.counted(rows.start, rows.stop) as i:
+            body(i)
+
+
+def each_row(w: Writer, rows: range, into: Value, value: Callable[[int | Value], Value]) -> None:
+    """Sets rows of a state in memory."""
+    for_rows(w, rows, lambda i: w.store(value(i), into, i))
+
+
+def over_rows(w: Writer, rows: range, start: float, added: Callable[[Value, int | Value], Value]) -> Value:
+    """What `added(total, i)` makes of all rows one after the other."""
+    total = w.room(w.real)
+    w.store(w.number(start), total)
+    for_rows(w, rows, lambda i: w.store(added(w.load(w.real, total), i), total))
+    return w.load(w.real, total)

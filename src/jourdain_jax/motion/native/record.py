@@ -8,11 +8,11 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from jourdain_jax.motion.integrators.erk_step import LOCATING, RUNNING, Method
+from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
+from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.native.functions import Form
-from jourdain_jax.motion.native.layout import Lanes
+from jourdain_jax.motion.native.layout import Lanes, each_row, for_rows
 from jourdain_jax.motion.native.loop import COUNT, FIRST_ARRAY, NEXT, OWN, TIMES
-from jourdain_jax.motion.native.step import each_row, for_rows
 from jourdain_jax.native.ffi import FIRST_OF_SCRATCH
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.threads import lanes_taken, next_lane
