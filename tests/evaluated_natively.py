@@ -19,25 +19,25 @@ def function(graph: Graph, outputs: Sequence[int], inputs: Sequence[int]) -> Cal
 
     def block(arguments: list[ffi.Given], found: list[Value]) -> None:
         (points,) = arguments
-        count = w.load("i64", points.sizes)
-        given, results = w.room(w.real, len(inputs)), w.room(w.real, len(outputs))
-        first = w.room("i64")
+        count = w.load(points.sizes, type="i64")
+        given, results = w.room(len(inputs)), w.room(len(outputs))
+        first = w.room(type="i64")
         w.store(w.literal(0, "i64"), first)
         with w.repeated() as leave:
-            begin = w.load("i64", first)
+            begin = w.load(first, type="i64")
             leave(begin >= count)
             for lane in range(w.lanes):
                 point = begin + lane
                 inside = w.where(point < count, point, count - 1)  # the last point fills up
                 for k in range(len(inputs)):
-                    w.store(w.load("double", points.data, inside * len(inputs) + k), given, k * w.lanes + lane)
-            values = written(w, graph, outputs, {n: w.load(w.real, given, k) for k, n in enumerate(inputs)})
+                    w.store(w.load(points.data, inside * len(inputs) + k, "double"), given, k * w.lanes + lane)
+            values = written(w, graph, outputs, {n: w.load(given, k) for k, n in enumerate(inputs)})
             for k, value in enumerate(values):
                 w.store(as_real(w, value), results, k)
             for lane in range(w.lanes):
                 with w.when(begin + lane < count):
                     for k in range(len(outputs)):
-                        w.store(w.load("double", results, k * w.lanes + lane), found[0], (begin + lane) * len(outputs) + k)
+                        w.store(w.load(results, k * w.lanes + lane, "double"), found[0], (begin + lane) * len(outputs) + k)
             w.store(begin + w.lanes, first)
 
     ffi.write_handler(w, 1, 1, block)

@@ -80,7 +80,7 @@ NUMBER = 77
 def _write_doubled(w: Writer) -> None:
     with w.function("row", "void", {"state": "ptr", "found": "ptr"}) as (state, found):
         for k in range(2):
-            w.store(w.load(w.real, state, k) * 2.0, found, k)
+            w.store(w.load(state, k) * 2.0, found, k)
         w.give()
     write_rows(w, 2, 2)
 

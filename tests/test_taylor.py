@@ -31,7 +31,7 @@ def coefficients(graph: Graph, s: int, outputs, at, known=None) -> np.ndarray:
     w = Writer(host.lanes(), host.fuses())
 
     def block(arguments, found):
-        start = w.load(w.real, arguments[0].data)
+        start = w.load(arguments[0].data)
         # z' = f(s), s' = 1: coefficients of z are those of f over their order plus one
         given = {clock: w.number(0.0)} | {node: w.number(value) for node, value in (known or {}).items()}
         series = Series(w, graph, given, [s, *[None] * len(outputs)], [graph.one, *outputs], [start, *[w.number(0.0)] * len(outputs)], ORDER, clock)

@@ -67,13 +67,13 @@ def tangent(w: Writer, x: Value) -> Value:
 
 def _or_far(w: Writer, x: Value, quick: Sequence[Value], far_ones: dict[str, Callable]) -> list[Value]:
     """The quick values, but others in the lanes whose angle is large; these are functions of their own, so that what is usual runs past them."""
-    far, places = w.magnitude(x) > LARGEST_ANGLE, [w.room(w.real) for _ in quick]
+    far, places = w.magnitude(x) > LARGEST_ANGLE, [w.room() for _ in quick]
     for value, place in zip(quick, places, strict=True):
         w.store(value, place)
     with w.when(w.any(far)):
         for value, place, (name, function) in zip(quick, places, far_ones.items(), strict=True):
             w.store(w.where(far, w.shared(name, lambda w, x, function=function: function(w, _reduced_far(w, x)), x), value), place)
-    return [w.load(w.real, place) for place in places]
+    return [w.load(place) for place in places]
 
 
 def _sine_and_cosine(w: Writer, angle: tuple[Value, Value, Value]) -> tuple[Value, Value]:
@@ -121,28 +121,42 @@ def _reduced_far(w: Writer, x: Value) -> tuple[Value, Value, Value]:
     x = m 2^e with a whole number m of 53 bits; of 2/pi those 192 bits count whose products with m are no multiples of whole turns, and not far below 2^-126.
     """
     bits = (  # the first 1,216 of 2/pi, 64 in each
-        0xA2F9836E4E441529, 0xFC2757D1F534DDC0, 0xDB6295993C439041, 0xFE5163ABDEBBC561,
-        0xB7246E3A424DD2E0, 0x06492EEA09D1921C, 0xFE1DEB1CB129A73E, 0xE88235F52EBB4484,
-        0xE99C7026B45F7E41, 0x3991D639835339F4, 0x9C845F8BBDF9283B, 0x1FF897FFDE05980F,
-        0xEF2F118B5A0A6D1F, 0x6D367ECF27CB09B7, 0x4F463F669E5FEA2D, 0x7527BAC7EBE5F17B,
-        0x3D0739F78A5292EA, 0x6BFB5FB11F8D5D08, 0x56033046FC7B6BAB,
+        0xA2F9836E4E441529,
+        0xFC2757D1F534DDC0,
+        0xDB6295993C439041,
+        0xFE5163ABDEBBC561,
+        0xB7246E3A424DD2E0,
+        0x06492EEA09D1921C,
+        0xFE1DEB1CB129A73E,
+        0xE88235F52EBB4484,
+        0xE99C7026B45F7E41,
+        0x3991D639835339F4,
+        0x9C845F8BBDF9283B,
+        0x1FF897FFDE05980F,
+        0xEF2F118B5A0A6D1F,
+        0x6D367ECF27CB09B7,
+        0x4F463F669E5FEA2D,
+        0x7527BAC7EBE5F17B,
+        0x3D0739F78A5292EA,
+        0x6BFB5FB11F8D5D08,
+        0x56033046FC7B6BAB,
     )
     w.whole_numbers("two_over_pi", (0, *(word - 2**64 * (word >> 63) for word in bits)))
     w.once("far_angle", "void", dict.fromkeys(("x", "r", "over", "quadrant"), "ptr"), _write_far_angle)
-    given, r, over, quadrant = w.room(w.real), w.room(w.real), w.room(w.real), w.room(w.whole)
+    given, r, over, quadrant = w.room(), w.room(), w.room(), w.room(type=w.whole)
     w.store(x, given)
     w.store(w.number(math.nan), r)
     w.store(w.number(0.0), over)
     w.store(w.literal(0, w.whole), quadrant)
     with w.counted(0, w.lanes) as lane:
-        one = w.intrinsic("fabs", w.load("double", given, lane))
+        one = w.intrinsic("fabs", w.load(given, lane, "double"))
         with w.when((one > LARGEST_ANGLE) & (one < math.inf)):
-            w.call("far_angle", "void", *(w.at(place, lane, "double") for place in (given, r, over, quadrant)))
-    return w.load(w.real, r), w.load(w.real, over), w.load(w.whole, quadrant)
+            w.run("far_angle", *(w.at(place, lane, "double") for place in (given, r, over, quadrant)))
+    return w.load(r), w.load(over), w.load(quadrant, type=w.whole)
 
 
 def _write_far_angle(w: Writer, x: Value, r: Value, over: Value, quadrant: Value) -> None:
-    bits = w.load("i64", x)
+    bits = w.load(x, type="i64")
     m = w.converted("zext", (bits & (2**52 - 1)) | 2**52, "i128")
     start = (w.bitwise("lshr", bits, 52) & 2047) - (1077 - 64)  # of the bits of 2/pi, after a word of zeros
     word, shift = w.bitwise("ashr", start, 6), start & 63
@@ -150,8 +164,8 @@ def _write_far_angle(w: Writer, x: Value, r: Value, over: Value, quadrant: Value
     def digits(k: int) -> Value:
         """64 bits of 2/pi."""
         table = Value(w, "ptr", "@two_over_pi")
-        both = w.bitwise("shl", w.converted("zext", w.load("i64", table, word + k), "i128"), 64) | w.converted(
-            "zext", w.load("i64", table, word + (k + 1)), "i128"
+        both = w.bitwise("shl", w.converted("zext", w.load(table, word + k, "i64"), "i128"), 64) | w.converted(
+            "zext", w.load(table, word + (k + 1), "i64"), "i128"
         )
         return w.bitwise("lshr", w.bitwise("shl", both, w.converted("zext", shift, "i128")), 64)
 
@@ -194,7 +208,7 @@ def arctangent(w: Writer, x: Value) -> Value:
 def arctangent_of_two(w: Writer, y: Value, x: Value) -> Value:
     """atan2(y, x); tiny and huge numbers are scaled."""
     a, b = w.magnitude(y), w.magnitude(x)
-    huge, place = ~(a + b < 2.0**60), w.room(w.real)
+    huge, place = ~(a + b < 2.0**60), w.room()
     w.store(_direction(w, a, x), place)
     far = huge | _tiny(a) | _tiny(b)
     with w.when(w.any(far)):
@@ -202,8 +216,8 @@ def arctangent_of_two(w: Writer, y: Value, x: Value) -> Value:
         near_a, near_b = (w.where(c.equals(math.inf), 1.0, w.where(endless, c - c, c * scale)) for c in (a, b))
         found = _direction(w, near_a, w.intrinsic("copysign", near_b, x))
         flat = ~(w.converted("bitcast", x, w.whole) < 0) & (near_a < 2.0**-900) & (near_b > 2.0**-600)
-        w.store(w.where(far, w.where(flat, a / b, found), w.load(w.real, place)), place)
-    return w.intrinsic("copysign", w.load(w.real, place), y)
+        w.store(w.where(far, w.where(flat, a / b, found), w.load(place)), place)
+    return w.intrinsic("copysign", w.load(place), y)
 
 
 def _tiny(a: Value) -> Value:

@@ -86,18 +86,18 @@ class Given(NamedTuple):
 
 def last_size(w: Writer, x: Given) -> Value:
     """The size of the last axis."""
-    return w.load("i64", x.sizes, 0 if w.device else x.rank - 1)
+    return w.load(x.sizes, 0 if w.device else x.rank - 1, "i64")
 
 
 def product(w: Writer, x: Given, but: int) -> Value:
     """The product of the sizes of all axes but the last ones, 1 or 3 of them on a GPU, where the host has found it."""
     if w.device:
-        return w.load("i64", x.sizes, (1, 3).index(but) + 1)
-    total = w.room("i64")
+        return w.load(x.sizes, (1, 3).index(but) + 1, "i64")
+    total = w.room(type="i64")
     w.store(w.literal(1, "i64"), total)
     with w.counted(0, x.rank - but) as axis:
-        w.store(w.load("i64", total) * w.load("i64", x.sizes, axis), total)
-    return w.load("i64", total)
+        w.store(w.load(total, type="i64") * w.load(x.sizes, axis, "i64"), total)
+    return w.load(total, type="i64")
 
 
 def write_handler(w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Value]], None]) -> None:
@@ -106,8 +106,8 @@ def write_handler(w: Writer, arguments: int, results: int, body: Callable[[list[
         return _write_kernel(w, arguments, results, body)
     with w.function(HANDLER, "ptr", {"frame": "ptr"}, how="") as (frame,):
         answer_metadata(w, frame)
-        arrays, returned = w.load("ptr", frame, ARGS), w.load("ptr", frame, RETS)
-        body([given(w, w.load("ptr", arrays, k)) for k in range(arguments)], [given(w, w.load("ptr", returned, k)).data for k in range(results)])
+        arrays, returned = w.load(frame, ARGS, "ptr"), w.load(frame, RETS, "ptr")
+        body([given(w, w.load(arrays, k, "ptr")) for k in range(arguments)], [given(w, w.load(returned, k, "ptr")).data for k in range(results)])
         w.give(Value(w, "ptr", "null"))
 
 
@@ -115,15 +115,15 @@ def answer_metadata(w: Writer, frame: Value) -> None:
     """Where the frame asks for the version of the interface, says it and returns."""
     known = version()
     assert known is not None
-    extension = w.load("ptr", frame, 1)
+    extension = w.load(frame, 1, "ptr")
     asked, called = w.label(), w.label()
     is_asked = w.label()
     none = w.compared("eq", w.converted("ptrtoint", extension, "i64"), 0)
     w.go(called, none, is_asked)
     w.place(is_asked)
-    w.go(asked, w.load("i32", extension, 2).equals(1), called)  # the kind of an extension, in its second word
+    w.go(asked, w.load(extension, 2, "i32").equals(1), called)  # the kind of an extension, in its second word
     w.place(asked)
-    metadata = w.load("ptr", extension, 3)
+    metadata = w.load(extension, 3, "ptr")
     for place, number in enumerate((*known, 0), 6):  # major and minor version in the fourth word, then flags
         w.store(w.literal(number, "i32"), metadata, place)
     w.give(Value(w, "ptr", "null"))
@@ -134,7 +134,7 @@ def _write_kernel(w: Writer, arguments: int, results: int, body: Callable[[list[
     """`kernel(words)`, which every thread of a GPU runs; the last result is memory of the call's own."""
     with w.function(KERNEL, "void", {"words": f"ptr byval([{WORDS * MOST_BUFFERS} x i64]) align 8"}, how="ptx_kernel"):
         words = Value(w, "ptr", "%words")
-        each = [Given(w.load("ptr", words, WORDS * k), w.at(words, WORDS * k + 1, "i64"), words) for k in range(arguments + results + 1)]
+        each = [Given(w.load(words, WORDS * k, "ptr"), w.at(words, WORDS * k + 1, "i64"), words) for k in range(arguments + results + 1)]
         w.own = each[-1].data, last_size(w, each[-1])
         body(each[:arguments], [x.data for x in each[arguments:-1]])
         w.give()
@@ -143,7 +143,7 @@ def _write_kernel(w: Writer, arguments: int, results: int, body: Callable[[list[
 def given(w: Writer, buffer: Value) -> Given:
     """What a handler is given of an array."""
     # words of a buffer: 2 the type, 3 the data, 4 the rank, 5 the sizes
-    return Given(w.load("ptr", buffer, 3), w.load("ptr", buffer, 5), w.load("i64", buffer, 4))
+    return Given(w.load(buffer, 3, "ptr"), w.load(buffer, 5, "ptr"), w.load(buffer, 4, "i64"))
 
 
 def in_doubles(ctx: mlir.LoweringRuleContext, arguments: Sequence, call: Callable, *more) -> list:

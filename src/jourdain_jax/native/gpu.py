@@ -46,45 +46,45 @@ def handler_text() -> str:
     with w.function(ffi.HANDLER, "ptr", {"frame": "ptr"}, how="") as (frame,):
         ffi.answer_metadata(w, frame)
         # words of a frame: 2 the interface, 3 the context, 20 the attributes; sizes of lists stand two words before their pointers
-        nothing, attributes = Value(w, "ptr", "null"), w.load("ptr", frame, 20)
-        blocks, number = (w.load("i64", w.load("ptr", w.load("ptr", attributes, k), 1)) for k in (_BLOCKS, _KERNEL))
-        words, count = w.room("i64", ffi.WORDS * ffi.MOST_BUFFERS), w.room("i64")
+        nothing, attributes = Value(w, "ptr", "null"), w.load(frame, 20, "ptr")
+        blocks, number = (w.load(w.load(w.load(attributes, k, "ptr"), 1, "ptr"), type="i64") for k in (_BLOCKS, _KERNEL))
+        words, count = w.room(ffi.WORDS * ffi.MOST_BUFFERS, "i64"), w.room(type="i64")
         w.store(w.literal(0, "i64"), count)
         for of, buffers in ((ffi.ARGS - 2, ffi.ARGS), (ffi.RETS - 2, ffi.RETS)):
-            with w.counted(0, w.load("i64", frame, of)) as k:
-                place = w.load("i64", count)
-                w.call("described", "void", w.load("ptr", w.load("ptr", frame, buffers), k), w.at(words, place * ffi.WORDS, "i64"))
+            with w.counted(0, w.load(frame, of, "i64")) as k:
+                place = w.load(count, type="i64")
+                w.run("described", w.load(w.load(frame, buffers, "ptr"), k, "ptr"), w.at(words, place * ffi.WORDS, "i64"))
                 w.store(place + 1, count)
-        scratch = w.load("i64", words, (w.load("i64", count) - 1) * ffi.WORDS)
-        table, entry = Value(w, "ptr", "@jourdain_jax_kernels"), w.room("i64")
+        scratch = w.load(words, (w.load(count, type="i64") - 1) * ffi.WORDS, "i64")
+        table, entry = Value(w, "ptr", "@jourdain_jax_kernels"), w.room(type="i64")
         w.declare("jourdain_jax_kernels", "@jourdain_jax_kernels = external global i64")
         w.store(w.literal(0, "i64"), entry)
         with w.repeated() as leave:
-            leave(w.load("i64", table, w.load("i64", entry)).equals(number))
-            w.store(w.load("i64", entry) + _WORDS, entry)
-        function = w.load("ptr", table, w.load("i64", entry) + _FUNCTION)
-        api, asked = w.load("ptr", frame, 2), w.room("i64", 4)
-        for word, value in enumerate((w.literal(32, "i64"), w.literal(0, "i64"), w.load("i64", frame, 3), w.literal(0, "i64"))):
+            leave(w.load(table, w.load(entry, type="i64"), "i64").equals(number))
+            w.store(w.load(entry, type="i64") + _WORDS, entry)
+        function = w.load(table, w.load(entry, type="i64") + _FUNCTION, "ptr")
+        api, asked = w.load(frame, 2, "ptr"), w.room(4, "i64")
+        for word, value in enumerate((w.literal(32, "i64"), w.literal(0, "i64"), w.load(frame, 3, "i64"), w.literal(0, "i64"))):
             w.store(value, asked, word)
-        failed = w.through(w.load("ptr", api, 10), "ptr", asked)  # `XLA_FFI_Stream_Get`
+        failed = w.through(w.load(api, 10, "ptr"), "ptr", asked)  # `XLA_FFI_Stream_Get`
         with w.when(w.converted("ptrtoint", failed, "i64").differs(0)):
             w.give(failed)
             w.place(w.label())
-        stream, code, parameters = w.load("ptr", asked, 3), w.room("i32"), w.room("ptr")
+        stream, code, parameters = w.load(asked, 3, "ptr"), w.room(type="i32"), w.room(type="ptr")
         w.store(words, parameters)
         w.store(w.external("cuMemsetD32Async", "i32", scratch, w.literal(0, "i32"), w.literal(2, "i64"), stream), code)
         one, zero = w.literal(1, "i32"), w.literal(0, "i32")
-        with w.when(w.load("i32", code).equals(0)):
+        with w.when(w.load(code, type="i32").equals(0)):
             shape = [w.converted("trunc", blocks, "i32"), one, one, w.literal(nvidia.WARP, "i32"), one, one, zero]
             w.store(w.external("cuLaunchKernel", "i32", function, *shape, stream, parameters, nothing), code)
-        with w.when(w.load("i32", code).differs(0)):
-            message, error = w.room("ptr"), w.room("i64", 4)
-            w.external("cuGetErrorString", "i32", w.load("i32", code), message)
+        with w.when(w.load(code, type="i32").differs(0)):
+            message, error = w.room(type="ptr"), w.room(4, "i64")
+            w.external("cuGetErrorString", "i32", w.load(code, type="i32"), message)
             # the driver is out of memory: XLA's resources are exhausted; otherwise its error is an internal one
-            kind = w.where(w.load("i32", code).equals(2), w.literal(8, "i64"), 13)
-            for word, value in enumerate((w.literal(28, "i64"), w.literal(0, "i64"), w.load("i64", message), kind)):
+            kind = w.where(w.load(code, type="i32").equals(2), w.literal(8, "i64"), 13)
+            for word, value in enumerate((w.literal(28, "i64"), w.literal(0, "i64"), w.load(message, type="i64"), kind)):
                 w.store(value, error, word)
-            w.give(w.through(w.load("ptr", api, 6), "ptr", error))  # `XLA_FFI_Error_Create`
+            w.give(w.through(w.load(api, 6, "ptr"), "ptr", error))  # `XLA_FFI_Error_Create`
             w.place(w.label())
         w.give(nothing)
     return w.text

@@ -120,6 +120,18 @@ class Writer:
         yield [Value(self, type, f"%{n}") for n, type in arguments.items()]
         self._lines.append("}\n")
 
+    @contextmanager
+    def procedure(self, name: str, arguments: str) -> Iterator[list[Value]]:
+        """A function that returns nothing; `arguments`: names of pointers, and `name:type` of others.
+
+        Of these, `real` is one number per lane, `noalias` a pointer to what no other one points to.
+        """
+        pairs = (argument.partition(":")[::2] for argument in arguments.split())
+        types = {n: {"": "ptr", "real": self.real, "noalias": "ptr noalias"}.get(type, type) for n, type in pairs}
+        with self.function(name, "void", types, attributes="noinline") as given:
+            yield given
+            self.give()
+
     def give(self, value: Value | None = None) -> None:
         """Returns from the function."""
         self._lines.append("  ret void" if value is None else f"  ret {value.type} {value.name}")
@@ -166,10 +178,10 @@ class Writer:
     @contextmanager
     def counted(self, first: Value | int, end: Value | int) -> Iterator[Value]:
         """A loop over whole numbers from `first` up to before `end`."""
-        number = self.room("i64")
+        number = self.room(type="i64")
         self.store(self.literal(first, "i64"), number)
         with self.repeated() as leave:
-            now = self.load("i64", number)
+            now = self.load(number, type="i64")
             leave(now >= end)
             yield now
             self.store(now + 1, number)
@@ -227,6 +239,10 @@ class Writer:
             self._lines.append(f"  {text}")
             return Value(self, "void", "")
         return self.instruction(result, text)
+
+    def run(self, function: str, *arguments: Value) -> None:
+        """Calls a function that returns nothing."""
+        self.call(function, "void", *arguments)
 
     def external(self, function: str, result: str, *arguments: Value) -> Value:
         """As `call`, of a function from outside the module."""
@@ -323,18 +339,21 @@ class Writer:
         self._declared[name] = f"@{name} = internal constant [{len(texts)} x i64] [{', '.join(texts)}]"
         return Value(self, "ptr", f"@{name}")
 
-    def room(self, type: str, count: int = 1) -> Value:
-        """Memory for some values, one piece per call of the function."""
+    def room(self, count: int = 1, type: str = "") -> Value:
+        """Memory for some values (one number per lane, unless of another type), one piece per call of the function."""
         self._count += 1
+        type = type or self.real
         self._lines.insert(self._entry, f"  %v{self._count} = alloca {type}, i64 {count}, align 64")
         return Value(self, "ptr", f"%v{self._count}")
 
-    def at(self, pointer: Value, index, type: str) -> Value:
+    def at(self, pointer: Value, index, type: str = "") -> Value:
         """The place of the value with this index."""
+        type = type or self.real
         return self.instruction("ptr", f"getelementptr {type}, ptr {pointer.name}, i64 {self.literal(index, 'i64').name}")
 
-    def load(self, type: str, pointer: Value, index=0) -> Value:
+    def load(self, pointer: Value, index=0, type: str = "") -> Value:
         """What is in memory."""
+        type = type or self.real
         place = self.at(pointer, index, type).name
         return replace(self.instruction(type, f"load {type}, ptr {place}"), place=place)
 
@@ -347,9 +366,9 @@ class Writer:
     def opaque(self, pointer: Value, rows: Iterable[int]) -> list[Value]:
         """Pointers to some rows of memory, each in a register of its own, unknown to LLVM as related: rows nearby are reached by short offsets."""
         assert not self.device
-        found, place = [], self.room("ptr")
+        found, place = [], self.room(type="ptr")
         for row in rows:
-            self.store(self.at(pointer, row, self.real), place)
+            self.store(self.at(pointer, row), place)
             found.append(self.instruction("ptr", f"load volatile ptr, ptr {place.name}"))
         return found
 

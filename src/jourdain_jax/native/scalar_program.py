@@ -75,7 +75,7 @@ class _AtHand:
         self.turns: list[Turn] = []
         if len(steps) > LONG and not w.device:
             self.turns, rows = turns(steps, values, host.registers())
-            self.rooms = w.opaque(w.room(w.real, max(rows, 1)), range(REACH, rows + REACH, 2 * REACH))
+            self.rooms = w.opaque(w.room(max(rows, 1)), range(REACH, rows + REACH, 2 * REACH))
 
     def before(self, i: int) -> None:
         """Takes what the value with this number is made of."""

@@ -51,38 +51,37 @@ def write(w: Writer, form: Form, method: Method, asked: Sequence[int]) -> None:
 
 def _write_begin(w: Writer, form: Form) -> None:
     """`begin(job, state, who, lane)`: the start of the lane of the batch that has this place; where there is none, it is idle."""
-    with w.function("begin", "void", {"job": "ptr", "state": "ptr", "who": "ptr", "lane": "i64"}, attributes="noinline") as (job, state, who, lane):
+    with w.procedure("begin", "job state who lane:i64") as (job, state, who, lane):
         lanes, given = Lanes(w, form.layout, state), form.layout.given
-        number = w.load("i64", who, lane)
+        number = w.load(who, lane, "i64")
         there = number >= 0
         with w.when(there):
-            starts = w.load("ptr", job, STARTS)
+            starts = w.load(job, STARTS, "ptr")
             with w.counted(0, given) as row:
-                w.store(w.load("double", starts, number * given + row), lanes.place(row, lane))
-            lanes.set("goal", lane, w.load("double", w.load("ptr", job, GOALS), number * w.load("i64", job, TIMES)))
+                w.store(w.load(starts, number * given + row, "double"), lanes.place(row, lane))
+            lanes.set("goal", lane, w.load(w.load(job, GOALS, "ptr"), number * w.load(job, TIMES, "i64"), "double"))
         with w.when(~there):
             lanes.set("code", lane, IDLE)
         if form.sampled:  # places without a lane are worked out too
             words = w.at(job, FIRST_OF_SAMPLES, "i64")
-            samples.begin(w, form.layout, words, w.load("i64", job, COUNT), lanes, lane, w.where(there, number, 0))
+            samples.begin(w, form.layout, words, w.load(job, COUNT, "i64"), lanes, lane, w.where(there, number, 0))
             lanes.set("goal", lane, samples.nearer(w, lanes, lane, lanes.of("goal", lane)))
         lanes.set("taken", lane, 0.0)
         if form.has_events:
             lanes.set("search_left", lane, 0.0)
-        w.give()
 
 
 def _write_note(w: Writer, form: Form) -> None:
     """`note(job, state, who, saved)`: counts the times that were reached, sets the next one, and ends lanes that have reached all."""
-    with w.function("note", "void", {"job": "ptr", "state": "ptr", "who": "ptr", "saved": "ptr"}, attributes="noinline") as (job, state, who, saved):
+    with w.procedure("note", "job state who saved") as (job, state, who, saved):
         lanes = Lanes(w, form.layout, state)
         with w.when(w.any(lanes["code"].equals(float(RUNNING)) & lanes["t"].equals(lanes["goal"]))), w.counted(0, w.lanes) as lane:
-            times, number = w.load("i64", job, TIMES), w.load("i64", who, lane)
+            times, number = w.load(job, TIMES, "i64"), w.load(who, lane, "i64")
             with w.repeated() as leave:
                 leave(~(lanes.of("code", lane).equals(float(RUNNING)) & lanes.of("t", lane).equals(lanes.of("goal", lane))))
-                before, goals = w.converted("fptosi", w.load("double", saved, lane), "i64"), w.load("ptr", job, GOALS)
+                before, goals = w.converted("fptosi", w.load(saved, lane, "double"), "i64"), w.load(job, GOALS, "ptr")
                 if form.sampled:
-                    at_knot = lanes.of("t", lane).differs(w.load("double", goals, number * times + before))
+                    at_knot = lanes.of("t", lane).differs(w.load(goals, number * times + before, "double"))
                     with w.when(at_knot):
                         samples.pass_knot(w, lanes, lane)
                     reached = before + w.where(at_knot, w.literal(0, "i64"), 1)
@@ -92,71 +91,67 @@ def _write_note(w: Writer, form: Form) -> None:
                 with w.when(reached >= times):
                     lanes.set("code", lane, float(results.SUCCESS))
                 with w.when(reached < times):
-                    goal = w.load("double", goals, number * times + reached)
+                    goal = w.load(goals, number * times + reached, "double")
                     lanes.set("goal", lane, samples.nearer(w, lanes, lane, goal) if form.sampled else goal)
-        w.give()
 
 
 def _write_added(w: Writer, form: Form) -> None:
     """`added(job, who, first, end, g)`: adds the cotangents of the states saved at the times number `first` to `end - 1`."""
     count = form.layout.integrated
-    arguments = {"job": "ptr", "who": "ptr", "first": w.real, "end": w.real, "g": "ptr"}
-    with w.function("added", "void", arguments, attributes="noinline") as (job, who, first, end, g):
-        firsts, ends = w.room(w.real), w.room(w.real)
+    with w.procedure("added", "job who first:real end:real g") as (job, who, first, end, g):
+        firsts, ends = w.room(), w.room()
         w.store(first, firsts)
         w.store(end, ends)
         with w.when(w.any(first < end)), w.counted(0, w.lanes) as lane:
-            number, times = w.load("i64", who, lane), w.load("i64", job, TIMES)
+            number, times = w.load(who, lane, "i64"), w.load(job, TIMES, "i64")
             with w.when(number >= 0):
-                a, b = (w.converted("fptosi", w.load("double", x, lane), "i64") for x in (firsts, ends))
+                a, b = (w.converted("fptosi", w.load(x, lane, "double"), "i64") for x in (firsts, ends))
                 with w.counted(a, b) as k, w.counted(0, count) as row:
-                    more = w.load("double", w.load("ptr", job, TO_STATES), (number * times + k) * count + row)
+                    more = w.load(w.load(job, TO_STATES, "ptr"), (number * times + k) * count + row, "double")
                     place = w.at(g, row * w.lanes + lane, "double")
-                    w.store(w.load("double", place) + more, place)
-        w.give()
+                    w.store(w.load(place, type="double") + more, place)
 
 
 def _write_step_back(w: Writer, form: Form, method: Method, asked: int) -> None:
     """`step_back(state, here, g, by_known)`: back over the step in the slot `here`, in lanes that went on in it."""
     layout, slot = form.layout, Slot.of(form, method)
     rows, count = range(layout.integrated), layout.integrated
-    arguments = dict.fromkeys(("state", "here", "g", "by_known"), "ptr")
-    with w.function("step_back", "void", arguments, attributes="noinline") as (state, here, g, by_known):
-        h, t = w.load(w.real, here, slot.taken), w.load(w.real, here, slot.t)
-        took, k = h.differs(0.0), w.at(here, slot.y, w.real)
-        g1, v, at, G, added = (w.room(w.real, n) for n in (count, count, count, count * method.needed, max(asked, 1)))
-        each_row(w, rows, g1, lambda i: w.load(w.real, g, i))
+    with w.procedure("step_back", "state here g by_known") as (state, here, g, by_known):
+        h, t = w.load(here, slot.taken), w.load(here, slot.t)
+        took, k = h.differs(0.0), w.at(here, slot.y)
+        g1, v, at, G, added = (w.room(n) for n in (count, count, count, count * method.needed, max(asked, 1)))
+        each_row(w, rows, g1, lambda i: w.load(g, i))
         each_row(w, range(asked), added, lambda i: w.number(0.0))
         if form.projects:
-            each_row(w, rows, at, lambda i: w.fma(h, weighted(w, method.b, k, layout, i), w.load(w.real, here, i)))
+            each_row(w, rows, at, lambda i: w.fma(h, weighted(w, method.b, k, layout, i), w.load(here, i)))
             _project_back(w, form, state, t + h, at, g1, added)
 
         def state_at(stage: int, i: int | Value) -> Value:
-            start = w.load(w.real, here, i)
+            start = w.load(here, i)
             return w.fma(h, weighted(w, method.A[stage], k, layout, i), start) if stage else start
 
         def cotangent(stage: int, later: list[int], i: int | Value) -> Value:
-            total = w.load(w.real, g1, i) * float(method.b[stage])
+            total = w.load(g1, i) * float(method.b[stage])
             for j in later:
-                total = w.fma(w.load(w.real, G, j * count + i), float(method.A[j][stage]), total)
+                total = w.fma(w.load(G, j * count + i), float(method.A[j][stage]), total)
             return h * total
 
         used: list[int] = []
         near = None
         if form.squares:
-            pivots = w.room(w.real, len(form.monitored))
-            w.call("rates", "void", state, t, here, v, pivots)
+            pivots = w.room(len(form.monitored))
+            w.run("rates", state, t, here, v, pivots)
             near = near_rank_loss(squares_of(w, form, pivots))
         for stage in reversed(range(method.needed)):
             later = [j for j in used if method.A[j][stage] != 0]
             if method.b[stage] == 0 and not later:
                 continue
-            of_stage, time = w.at(G, stage * count, w.real), w.fma(h, float(method.c[stage]), t)
+            of_stage, time = w.at(G, stage * count), w.fma(h, float(method.c[stage]), t)
             each_row(w, rows, at, partial(state_at, stage))
             each_row(w, rows, v, partial(cotangent, stage, later))
             if near is not None and stage:
                 put_near_rows(w, layout, state, near, time, at)
-            w.call("pull_rates", "void", state, time, at, v, of_stage, added)
+            w.run("pull_rates", state, time, at, v, of_stage, added)
             if near is not None and stage:
                 with w.when(w.any(near)):
                     each_row(w, rows, at, partial(state_at, stage))
@@ -164,88 +159,85 @@ def _write_step_back(w: Writer, form: Form, method: Method, asked: int) -> None:
             used.append(stage)
 
         def total(i: int | Value) -> Value:
-            found = w.load(w.real, g1, i)
+            found = w.load(g1, i)
             for stage in used:
-                found = found + w.load(w.real, G, stage * count + i)
-            return w.where(took, found, w.load(w.real, g, i))
+                found = found + w.load(G, stage * count + i)
+            return w.where(took, found, w.load(g, i))
 
         each_row(w, rows, g, total)
-        each_row(w, range(asked), by_known, lambda i: w.load(w.real, by_known, i) + w.where(took, w.load(w.real, added, i), 0.0))
-        w.give()
+        each_row(w, range(asked), by_known, lambda i: w.load(by_known, i) + w.where(took, w.load(added, i), 0.0))
 
 
 def _project_back_where(w: Writer, form: Form, near: Value, at: tuple[Value, Value, Value], g: Value, added: Value, asked: int) -> None:
     """Cotangents `g` of a stage's state, put back onto the rows in lanes that are `near` a loss of rank; `at`: lanes, time, and the state before."""
-    rows, pulled, more = range(form.layout.integrated), w.room(w.real, form.layout.integrated), w.room(w.real, max(asked, 1))
-    each_row(w, rows, pulled, lambda i: w.load(w.real, g, i))
-    each_row(w, range(asked), more, lambda i: w.load(w.real, added, i))
+    rows, pulled, more = range(form.layout.integrated), w.room(form.layout.integrated), w.room(max(asked, 1))
+    each_row(w, rows, pulled, lambda i: w.load(g, i))
+    each_row(w, range(asked), more, lambda i: w.load(added, i))
     _project_back(w, form, *at, pulled, more)
-    each_row(w, rows, g, lambda i: w.where(near, w.load(w.real, pulled, i), w.load(w.real, g, i)))
-    each_row(w, range(asked), added, lambda i: w.where(near, w.load(w.real, more, i), w.load(w.real, added, i)))
+    each_row(w, rows, g, lambda i: w.where(near, w.load(pulled, i), w.load(g, i)))
+    each_row(w, range(asked), added, lambda i: w.where(near, w.load(more, i), w.load(added, i)))
 
 
 def _project_back(w: Writer, form: Form, state: Value, t1: Value, free: Value, g: Value, added: Value) -> None:
     """Cotangents `g` of a state put back onto the rows become those of the state `free` before."""
     moves = form.moves
     rows, count = range(form.layout.integrated), form.layout.integrated
-    before = w.room(w.real, count * len(moves))
+    before = w.room(count * len(moves))
     for number, q_moves in enumerate(moves):
-        each_row(w, rows, w.at(before, number * count, w.real), lambda i: w.load(w.real, free, i))
-        w.call("projected_once", "void", state, t1, free, w.literal(q_moves, "i1"))
-    out = w.room(w.real, count)
+        each_row(w, rows, w.at(before, number * count), lambda i: w.load(free, i))
+        w.run("projected_once", state, t1, free, w.literal(q_moves, "i1"))
+    out = w.room(count)
     for number, q_moves in reversed(list(enumerate(moves))):
-        w.call("pull_q" if q_moves else "pull_u", "void", state, t1, w.at(before, number * count, w.real), g, out, added)
-        each_row(w, rows, g, lambda i: w.load(w.real, out, i))
+        w.run("pull_q" if q_moves else "pull_u", state, t1, w.at(before, number * count), g, out, added)
+        each_row(w, rows, g, lambda i: w.load(out, i))
 
 
 def _write_event_back(w: Writer, form: Form, asked: int) -> None:
     """`event_back(job, state, who, g, by_known)`: cotangents at the time and state of an event become those of a state at a number for a time."""
     layout, count = form.layout, form.layout.integrated
-    arguments = dict.fromkeys(("job", "state", "who", "g", "by_known"), "ptr")
-    with w.function("event_back", "void", arguments, attributes="noinline") as (job, state, who, g, by_known):
+    with w.procedure("event_back", "job state who g by_known") as (job, state, who, g, by_known):
         lanes = Lanes(w, layout, state)
         located = lanes["code"].equals(float(results.EVENT)) & (lanes["accepted"] > 0.0)
         with w.when(w.any(located)):
-            f, out, pivots, added = (w.room(w.real, max(n, 1)) for n in (count, count, len(form.monitored), asked + 1))
-            values, rates, weights = (w.room(w.real, layout.events) for _ in range(3))
-            t, g_t = lanes["t"], w.room(w.real, 1 + len(form.moving))
+            f, out, pivots, added = (w.room(max(n, 1)) for n in (count, count, len(form.monitored), asked + 1))
+            values, rates, weights = (w.room(layout.events) for _ in range(3))
+            t, g_t = lanes["t"], w.room(1 + len(form.moving))
             with w.counted(0, w.lanes) as lane, w.counted(0, 1 + len(form.moving)) as row:
-                number = w.load("i64", who, lane)
-                there = w.load("double", w.load("ptr", job, TO_ENDS), w.where(number >= 0, number, 0) * layout.ends + count + row)
+                number = w.load(who, lane, "i64")
+                there = w.load(w.load(job, TO_ENDS, "ptr"), w.where(number >= 0, number, 0) * layout.ends + count + row, "double")
                 w.store(there, w.at(g_t, row * w.lanes + lane, "double"))
-            w.call("rates", "void", state, t, state, f, pivots)
+            w.run("rates", state, t, state, f, pivots)
             if form.moving:  # the tangent, and its rates, at a number for a time
-                dy, dt = w.at(state, layout.y, w.real), lanes["dt"]
-                each_row(w, range(layout.y), dy, lambda i: w.load(w.real, dy, i) - w.where(dt.differs(0.0), dt * w.load(w.real, f, i), 0.0))
+                dy, dt = w.at(state, layout.y), lanes["dt"]
+                each_row(w, range(layout.y), dy, lambda i: w.load(dy, i) - w.where(dt.differs(0.0), dt * w.load(f, i), 0.0))
                 lanes["dt"] = w.number(0.0)
-                w.call("rates", "void", state, t, state, f, pivots)
-            w.call("events", "void", state, t, state, f, values, rates)
-            rate = chosen(w, lanes["event"], [w.load(w.real, rates, i) for i in range(layout.events)])
+                w.run("rates", state, t, state, f, pivots)
+            w.run("events", state, t, state, f, values, rates)
+            rate = chosen(w, lanes["event"], [w.load(rates, i) for i in range(layout.events)])
             usable = located & rate.differs(0.0) & (w.magnitude(rate) < math.inf)
             each_row(w, range(asked + 1), added, lambda i: w.number(0.0))
-            total = w.load(w.real, g_t)
+            total = w.load(g_t)
             if form.moving:
-                total = total + _moved_back(w, form, lanes, usable, (g, w.load(w.real, g_t, 1)), (out, added), asked)
+                total = total + _moved_back(w, form, lanes, usable, (g, w.load(g_t, 1)), (out, added), asked)
             for i in range(count):
-                total = w.fma(w.load(w.real, g, i), w.load(w.real, f, i), total)
+                total = w.fma(w.load(g, i), w.load(f, i), total)
             flat = located & slope_is_flat(w, lanes, rate) & total.differs(0.0)
             by_value = w.where(flat, math.nan, w.where(usable, -total / rate, 0.0))
             usable = usable | flat
             for i in range(layout.events):
                 w.store(w.where(lanes["event"].equals(float(i)), by_value, 0.0), weights, i)
-            w.call("pull_events", "void", state, t, state, weights, out, added)
-            each_row(w, range(count), g, lambda i: w.load(w.real, g, i) + w.where(usable, w.load(w.real, out, i), 0.0))
-            each_row(w, range(asked), by_known, lambda i: w.load(w.real, by_known, i) + w.where(usable, w.load(w.real, added, i), 0.0))
-        w.give()
+            w.run("pull_events", state, t, state, weights, out, added)
+            each_row(w, range(count), g, lambda i: w.load(g, i) + w.where(usable, w.load(out, i), 0.0))
+            each_row(w, range(asked), by_known, lambda i: w.load(by_known, i) + w.where(usable, w.load(added, i), 0.0))
 
 
 def _moved_back(w: Writer, form: Form, lanes: Lanes, usable: Value, cotangents: tuple[Value, Value], rooms: tuple[Value, Value], asked: int) -> Value:
     """The derivative along time of what an event adds to a tangent; changes the cotangents `g` of the state, the first of these, and adds to the others."""
     (g, g_dt), (out, added), layout = cotangents, rooms, form.layout
-    given, count = w.room(w.real, layout.integrated + 2), layout.integrated
-    each_row(w, range(count), given, lambda i: w.load(w.real, g, i))
+    given, count = w.room(layout.integrated + 2), layout.integrated
+    each_row(w, range(count), given, lambda i: w.load(g, i))
     w.store(g_dt, given, count)
     w.store(lanes["event"], given, count + 1)
-    w.call("pull_moved", "void", lanes.pointer, lanes["t"], lanes.pointer, given, out, added)
-    each_row(w, range(count), g, lambda i: w.load(w.real, given, i) + w.where(usable, w.load(w.real, out, i), 0.0))
-    return w.load(w.real, added, asked)
+    w.run("pull_moved", lanes.pointer, lanes["t"], lanes.pointer, given, out, added)
+    each_row(w, range(count), g, lambda i: w.load(given, i) + w.where(usable, w.load(out, i), 0.0))
+    return w.load(added, asked)

@@ -105,11 +105,10 @@ def nodes_called(graph: Graph, nodes: Sequence[int], variables: Sequence[int], e
     """Values of nodes of a graph as a function of the values of the variables."""
 
     def write(w: Writer) -> None:
-        with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
-            known = {n: w.load(w.real, state, k) for k, n in enumerate(variables)}
+        with w.procedure("row", "state found") as (state, found):
+            known = {n: w.load(state, k) for k, n in enumerate(variables)}
             for k, value in written_in_turn(w, graph, nodes, known):
                 w.store(as_real(w, value), found, k)
-            w.give()
         write_rows(w, len(variables), len(nodes))
 
     kernel = called(write, lambda *_: ((len(nodes),),), effort=effort)

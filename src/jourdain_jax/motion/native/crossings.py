@@ -24,9 +24,9 @@ def write_begin(w: Writer, form: Form, p: Lanes) -> None:
 
 
 def _values(w: Writer, form: Form, p: Lanes, t: Value, y: Value) -> list[Value]:
-    values = w.room(w.real, len(form.watched))
-    w.call("relations", "void", p.pointer, t, y, values)
-    return [w.load(w.real, values, i) for i in range(len(form.watched))]
+    values = w.room(len(form.watched))
+    w.run("relations", p.pointer, t, y, values)
+    return [w.load(values, i) for i in range(len(form.watched))]
 
 
 def watched(w: Writer, form: Form, p: Lanes, t1: Value, step: Value, y1: Value, fits: Value) -> Watched:
@@ -34,17 +34,17 @@ def watched(w: Writer, form: Form, p: Lanes, t1: Value, step: Value, y1: Value, 
     layout = form.layout
 
     def between(once: Value, share: Value, now: tuple[Value, ...]) -> list[Value]:
-        found = w.room(w.real, len(now))
+        found = w.room(len(now))
         for i, x in enumerate(now):
             w.store(x, found, i)
         with w.when(w.any(once)):
-            y, part = w.room(w.real, layout.integrated), w.where(once, share, 0.0)
+            y, part = w.room(layout.integrated), w.where(once, share, 0.0)
             for i in range(layout.coordinates + layout.speeds):
-                start = w.load(w.real, p.pointer, i)
-                w.store(w.fma(part, w.load(w.real, y1, i) - start, start), y, i)
+                start = w.load(p.pointer, i)
+                w.store(w.fma(part, w.load(y1, i) - start, start), y, i)
             for i, x in enumerate(unless_zero(w, _values(w, form, p, w.fma(part, step, p["t"]), y), now)):
                 w.store(x, found, i)
-        return [w.load(w.real, found, i) for i in range(len(now))]
+        return [w.load(found, i) for i in range(len(now))]
 
     return watched_by(w, of_lanes(p), _values(w, form, p, t1, y1), len(form.relations), between, fits, step, p["last_goal"])
 

@@ -151,7 +151,7 @@ def given_values(w: Writer, form: Form, own: Outputs, known: dict[int, Value], s
     """Values of all nodes of outputs that are given from outside; `known`: as from `known_values`."""
     given, lanes = dict(zip(own.variables, known.values(), strict=True)), Lanes(w, form.layout, state)
     for k, states in enumerate(own.states):
-        given |= {n: w.load(w.real, y, (k + 1) * form.layout.y + i) for i, n in enumerate(states)}
+        given |= {n: w.load(y, (k + 1) * form.layout.y + i) for i, n in enumerate(states)}
     given |= dict(zip(own.known, lanes.every("dknown"), strict=True)) if own.known else {}
     given |= dict(zip(own.times, lanes.every("dt"), strict=True)) if own.times else {}
     given |= dict(zip(own.slopes, looked_up(w, form.layout, state, tau, True)[form.layout.sampled :], strict=True)) if own.slopes else {}
@@ -161,7 +161,7 @@ def given_values(w: Writer, form: Form, own: Outputs, known: dict[int, Value], s
 def known_values(w: Writer, form: Form, state: Value, tau: Value, y: Value) -> dict[int, Value]:
     """Values of all nodes that are given from outside."""
     program, layout, lanes = form.program, form.layout, Lanes(w, form.layout, state)
-    states = [w.load(w.real, y, k) for k in range(layout.coordinates + layout.speeds)]
+    states = [w.load(y, k) for k in range(layout.coordinates + layout.speeds)]
     known, fixed, t = lanes.every("known"), len(program.fixed), lanes["origin"] + tau
     found = dict(zip(form.sampled, looked_up(w, layout, state, tau, form.time_moves), strict=False))
     inputs = [found.get(i, x) for i, x in enumerate(known[fixed:])]
@@ -189,7 +189,7 @@ def write_rates(w: Writer, form: Form) -> None:
 def write_projection(w: Writer, form: Form) -> None:
     """`project(state, tau, y)`: puts the state `y` back onto the rows."""
     program, layout = form.program, form.layout
-    with w.function("projected_once", "void", {"state": "ptr", "tau": w.real, "y": "ptr", "q_moves": "i1"}, attributes="noinline") as (state, tau, y, q_moves):
+    with w.procedure("projected_once", "state tau:real y q_moves:i1") as (state, tau, y, q_moves):
         known = known_values(w, form, state, tau, y)
         for condition, nodes, first in ((q_moves, program.projected_q, 0), (~q_moves, program.projected_u, layout.coordinates)):
             with w.when(condition):
@@ -197,10 +197,9 @@ def write_projection(w: Writer, form: Form) -> None:
                 for k, part in enumerate([found, *tangents]):
                     for i, x in enumerate(part):
                         w.store(x, y, k * layout.y + first + i)
-        w.give()
     with w.function("project", "void", {"state": "ptr", "tau": w.real, "y": "ptr"}) as (state, tau, y):
         for q_moves in form.moves:
-            w.call("projected_once", "void", state, tau, y, w.literal(q_moves, "i1"))
+            w.run("projected_once", state, tau, y, w.literal(q_moves, "i1"))
         w.give()
     if form.squares:
         _write_along(w, form)
@@ -209,21 +208,19 @@ def write_projection(w: Writer, form: Form) -> None:
 def _write_along(w: Writer, form: Form) -> None:
     """`along(state, tau, y)`: after a state `y` on the rows stands its error, which becomes the part of it along the rows: what a projection leaves."""
     program, layout, moved = form.program, form.layout, replace(form, moving=((),), time_moves=False)
-    with w.function("along", "void", {"state": "ptr", "tau": w.real, "y": "ptr"}, attributes="noinline") as (state, tau, y):
+    with w.procedure("along", "state tau:real y") as (state, tau, y):
         for nodes, first in ((program.projected_q, 0), (program.projected_u, layout.coordinates)):
             known = known_values(w, form, state, tau, y)
             _, (tangent,) = _found(w, form, outputs_of(moved, nodes, len(nodes)), known, state, tau, y)
             for i, x in enumerate(tangent):
                 w.store(x, y, layout.y + first + i)
-        w.give()
 
 
 def write_relations(w: Writer, form: Form) -> None:
     """`relations(state, tau, y, values)`: the numbers whose signs are watched, of the state `y`."""
-    with w.function("relations", "void", {"state": "ptr", "tau": w.real, "y": "ptr", "values": "ptr"}, attributes="noinline") as (state, tau, y, values):
+    with w.procedure("relations", "state tau:real y values") as (state, tau, y, values):
         for i, x in written_in_turn(w, form.program.graph, form.watched, known_values(w, form, state, tau, y)):
             w.store(as_real(w, x), values, i)
-        w.give()
 
 
 class EventProgram(NamedTuple):
@@ -250,18 +247,15 @@ def event_program(form: Form) -> EventProgram:
 def write_events(w: Writer, form: Form) -> None:
     """`events(state, tau, y, slope, c, rate)`: the values of all stop events of the state `y`, and their rates where `y` changes at the rate `slope`."""
     program, own, count = form.program, event_program(form), form.layout.events
-    arguments = {"state": "ptr", "tau": w.real, "y": "ptr", "slope": "ptr", "c": "ptr", "rate": "ptr"}
-    with w.function("events", "void", arguments, attributes="noinline") as (state, tau, y, slope, c, rate):
+    with w.procedure("events", "state tau:real y slope c rate") as (state, tau, y, slope, c, rate):
         known = dict(zip(own.variables, known_values(w, form, state, tau, y).values(), strict=True))
-        known |= {n: w.load(w.real, slope, i) for i, n in enumerate(own.slopes)}
+        known |= {n: w.load(slope, i) for i, n in enumerate(own.slopes)}
         found = [as_real(w, x) for x in written(w, own.graph, [*own.values, *own.rates], known)]
         for i in range(count):
             w.store(found[i], c, i)
             w.store(found[count + i], rate, i)
-        w.give()
     if form.moving:
-        with w.function("event_tangents", "void", {"state": "ptr", "tau": w.real, "y": "ptr", "dc": "ptr"}, attributes="noinline") as (state, tau, y, dc):
+        with w.procedure("event_tangents", "state tau:real y dc") as (state, tau, y, dc):
             _, tangents = _found(w, form, outputs_of(form, program.events, count), known_values(w, form, state, tau, y), state, tau, y)
             for i, x in enumerate(x for part in tangents for x in part):
                 w.store(x, dc, i)
-            w.give()

@@ -99,7 +99,7 @@ class Lanes:
 
     def every(self, name: str) -> list[Value]:
         """The vectors of all rows of this name."""
-        return [self.w.load(self.w.real, self.pointer, row) for row in self.layout.rows[name]]
+        return [self.w.load(self.pointer, row) for row in self.layout.rows[name]]
 
     def put(self, name: str, values: list[Value]) -> None:
         """Sets all rows of this name."""
@@ -112,7 +112,7 @@ class Lanes:
 
     def of(self, name: str, lane: Value, type: str = "double") -> Value:
         """The number of one lane."""
-        return self.w.load(type, self.place(self.layout.rows[name].start, lane))
+        return self.w.load(self.place(self.layout.rows[name].start, lane), type=type)
 
     def set(self, name: str, lane: Value, value) -> None:
         """Sets the number of one lane."""
@@ -137,7 +137,7 @@ def each_row(w: Writer, rows: range, into: Value, value: Callable[[int | Value],
 
 def over_rows(w: Writer, rows: range, start: float, added: Callable[[Value, int | Value], Value]) -> Value:
     """What `added(total, i)` makes of all rows one after the other."""
-    total = w.room(w.real)
+    total = w.room()
     w.store(w.number(start), total)
-    for_rows(w, rows, lambda i: w.store(added(w.load(w.real, total), i), total))
-    return w.load(w.real, total)
+    for_rows(w, rows, lambda i: w.store(added(w.load(total), i), total))
+    return w.load(total)

@@ -54,19 +54,19 @@ def write_job(w: Writer, form: Form, arguments: list[Given], results: list[Value
     """All lanes, by this thread and by others that it starts and waits for; the last of the arguments is an array of lanes and times."""
     of_samples, arguments, times = arguments[: samples.arguments(form.layout)], arguments[samples.arguments(form.layout) :], arguments[-1]
     arrays = [*(x.data for x in arguments), *results]
-    job = w.room("i64", FIRST_ARRAY + len(arrays))
+    job = w.room(FIRST_ARRAY + len(arrays), "i64")
     for word, pointer in enumerate(arrays):
         w.store(pointer, job, FIRST_ARRAY + word)
-    count = w.room("i64")
+    count = w.room(type="i64")
     w.store(product(w, times, 1), count)
-    w.store(w.load("i64", count), job, COUNT)
+    w.store(w.load(count, type="i64"), job, COUNT)
     w.store(last_size(w, times), job, TIMES)
     start_counting(w, job, NEXT)
     if w.device:
         w.store(w.own[1], job, OWN)
     if form.sampled:
         samples.store_words(w, w.at(job, FIRST_OF_SAMPLES, "i64"), of_samples)
-    share(w, job, w.load("i64", count))
+    share(w, job, w.load(count, type="i64"))
 
 
 def _write_loop(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
@@ -78,40 +78,40 @@ def _write_loop(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
 
 def _write_lanes(w: Writer, form: Form, method: Method | TaylorSteps, job: Value) -> None:
     # of each place, which lane is there and how many of its times are saved; after them, at how many places there is one
-    state, who, k = w.room(w.real, form.layout.all), w.room("i64", 2 * w.lanes + 1), w.room(w.real, form.layout.integrated * method.needed)
+    state, who, k = w.room(form.layout.all), w.room(2 * w.lanes + 1, "i64"), w.room(form.layout.integrated * method.needed)
     w.store(w.literal(w.lanes, "i64"), who, 2 * w.lanes)
     with w.counted(0, form.layout.all) as row:
         w.store(w.number(1.0), state, row)
     lanes = Lanes(w, form.layout, state)
     with w.counted(0, w.lanes) as lane:
-        w.call("begin", "void", job, state, who, lane)
-        w.call("serve", "void", job, state, who, lane)
+        w.run("begin", job, state, who, lane)
+        w.run("serve", job, state, who, lane)
     with w.repeated() as leave:
-        leave(~w.together(w.load("i64", who, 2 * w.lanes).differs(0)))
-        w.call("step", "void", state, k)
+        leave(~w.together(w.load(who, 2 * w.lanes, "i64").differs(0)))
+        w.run("step", state, k)
         if isinstance(method, TaylorSteps):
-            w.call("save_within", "void", job, state, who, k)
+            w.run("save_within", job, state, who, k)
         code = lanes["code"]
         on_its_way = (code.equals(float(RUNNING)) & lanes["t"].differs(lanes["goal"])) | code.equals(float(LOCATING)) | code.equals(IDLE)
         with w.when(w.any(~on_its_way)), w.counted(0, w.lanes) as lane:
-            w.call("serve", "void", job, state, who, lane)
+            w.run("serve", job, state, who, lane)
 
 
 def _write_begin(w: Writer, form: Form) -> None:
     """`begin(job, state, who, lane)`: the next lane of the batch takes this place; where there is none, it is idle."""
-    with w.function("begin", "void", {"job": "ptr", "state": "ptr", "who": "ptr", "lane": "i64"}, attributes="noinline") as (job, state, who, lane):
+    with w.procedure("begin", "job state who lane:i64") as (job, state, who, lane):
         lanes, given = Lanes(w, form.layout, state), form.layout.given
         number = next_lane(w, job, NEXT)
-        there = number < w.load("i64", job, COUNT)
+        there = number < w.load(job, COUNT, "i64")
         with w.when(there):
             w.store(number, who, lane)
             w.store(w.literal(0, "i64"), who, lane + w.lanes)
-            starts = w.load("ptr", job, _STARTS)
+            starts = w.load(job, _STARTS, "ptr")
             with w.counted(0, given) as row:
-                w.store(w.load("double", starts, number * given + row), lanes.place(row, lane))
-            goal = w.load("double", w.load("ptr", job, _GOALS), number * w.load("i64", job, TIMES))
+                w.store(w.load(starts, number * given + row, "double"), lanes.place(row, lane))
+            goal = w.load(w.load(job, _GOALS, "ptr"), number * w.load(job, TIMES, "i64"), "double")
             if form.sampled:
-                samples.begin(w, form.layout, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load("i64", job, COUNT), lanes, lane, number)
+                samples.begin(w, form.layout, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load(job, COUNT, "i64"), lanes, lane, number)
                 goal = samples.nearer(w, lanes, lane, goal)
             lanes.set("goal", lane, goal)
             lanes.set("bound", lane, math.inf)
@@ -119,23 +119,22 @@ def _write_begin(w: Writer, form: Form) -> None:
                 lanes.set("search_left", lane, 0.0)
         with w.when(~there):
             lanes.set("code", lane, IDLE)
-            w.store(w.load("i64", who, 2 * w.lanes) - 1, who, 2 * w.lanes)
+            w.store(w.load(who, 2 * w.lanes, "i64") - 1, who, 2 * w.lanes)
             if form.sampled:  # rates are worked out there too
-                samples.begin(w, form.layout, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load("i64", job, COUNT), lanes, lane, w.literal(0, "i64"))
-        w.give()
+                samples.begin(w, form.layout, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load(job, COUNT, "i64"), lanes, lane, w.literal(0, "i64"))
 
 
 def _write_serve(w: Writer, form: Form) -> None:
     """`serve(job, state, who, lane)`: saves what is due, and where the lane has ended, hands it back and begins with the next one."""
-    with w.function("serve", "void", {"job": "ptr", "state": "ptr", "who": "ptr", "lane": "i64"}, attributes="noinline") as (job, state, who, lane):
+    with w.procedure("serve", "job state who lane:i64") as (job, state, who, lane):
         lanes = Lanes(w, form.layout, state)
         with w.repeated() as leave:
             code, t, goal = (lanes.of(name, lane) for name in ("code", "t", "goal"))
             runs = code.equals(float(RUNNING))
             leave(code.equals(IDLE) | code.equals(float(LOCATING)) | (runs & t.differs(goal)))
             if form.sampled:
-                place = w.load("i64", who, lane) * w.load("i64", job, TIMES) + w.load("i64", who, lane + w.lanes)
-                next_time = w.load("double", w.load("ptr", job, _GOALS), place)
+                place = w.load(who, lane, "i64") * w.load(job, TIMES, "i64") + w.load(who, lane + w.lanes, "i64")
+                next_time = w.load(w.load(job, _GOALS, "ptr"), place, "double")
                 at_knot = runs & t.differs(next_time)
                 with w.when(at_knot):
                     samples.pass_knot(w, lanes, lane)
@@ -144,56 +143,54 @@ def _write_serve(w: Writer, form: Form) -> None:
                     _save(w, form, job, who, lanes, lane, runs)
             else:
                 _save(w, form, job, who, lanes, lane, runs)
-        w.give()
 
 
 def _write_save_within(w: Writer, form: Form, method: TaylorSteps) -> None:
     """`save_within(job, state, who, k)`: saves what is due before the end of a step, by the Taylor coefficients `k` of its start."""
-    with w.function("save_within", "void", {"job": "ptr", "state": "ptr", "who": "ptr", "k": "ptr"}, attributes="noinline") as (job, state, who, k):
+    with w.procedure("save_within", "job state who k") as (job, state, who, k):
         layout, lanes = form.layout, Lanes(w, form.layout, state)
-        every, flags, y = layout.integrated, w.room(w.real), w.room(w.real, layout.integrated)
-        times, goals, states = (w.load("i64", job, TIMES), *(w.load("ptr", job, word) for word in (_GOALS, _STATES)))
+        every, flags, y = layout.integrated, w.room(), w.room(layout.integrated)
+        times, goals, states = (w.load(job, TIMES, "i64"), *(w.load(job, word, "ptr") for word in (_GOALS, _STATES)))
         with w.repeated() as leave:
             goal = lanes["goal"]
             due = ((goal - lanes["t"]) * lanes["direction"] < 0.0) & lanes["code"].differs(IDLE)
             leave(~w.any(due))
             s = goal - lanes["before"]
             with w.counted(0, every) as row:
-                total = w.load(w.real, k, row + method.order * every)
+                total = w.load(k, row + method.order * every)
                 for j in reversed(range(method.order)):
-                    total = w.fma(total, s, w.load(w.real, k, row + j * every))
+                    total = w.fma(total, s, w.load(k, row + j * every))
                 w.store(total, y, row)
             if form.projects:
-                w.call("project", "void", state, goal, y)
+                w.run("project", state, goal, y)
             w.store(w.where(due, 1.0, w.number(0.0)), flags)
-            with w.counted(0, w.lanes) as lane, w.when(w.load("double", flags, lane) > 0.0):
-                saved = w.load("i64", who, lane + w.lanes)
-                place = w.load("i64", who, lane) * times + saved
+            with w.counted(0, w.lanes) as lane, w.when(w.load(flags, lane, "double") > 0.0):
+                saved = w.load(who, lane + w.lanes, "i64")
+                place = w.load(who, lane, "i64") * times + saved
                 with w.counted(0, every) as row:
-                    w.store(w.load("double", y, row * w.lanes + lane), states, place * every + row)
+                    w.store(w.load(y, row * w.lanes + lane, "double"), states, place * every + row)
                 w.store(saved + 1, who, lane + w.lanes)
                 lanes.set("goal", lane, lanes.of("direction", lane) * math.inf)  # where an event was found a rounding beyond the last time
                 with w.when((saved + 1) < times):
-                    lanes.set("goal", lane, w.load("double", goals, place + 1))
-        w.give()
+                    lanes.set("goal", lane, w.load(goals, place + 1, "double"))
 
 
 def _save(w: Writer, form: Form, job: Value, who: Value, lanes: Lanes, lane: Value, runs: Value) -> None:
     """The state of a lane at a time to save at; or at the end, where it stands for all that is left, and the next lane begins."""
-    layout, times = form.layout, w.load("i64", job, TIMES)
-    goals, states, ends = (w.load("ptr", job, word) for word in (_GOALS, _STATES, _ENDS))
-    number, saved = w.load("i64", who, lane), w.load("i64", who, lane + w.lanes)
+    layout, times = form.layout, w.load(job, TIMES, "i64")
+    goals, states, ends = (w.load(job, word, "ptr") for word in (_GOALS, _STATES, _ENDS))
+    number, saved = w.load(who, lane, "i64"), w.load(who, lane + w.lanes, "i64")
     last = w.where(runs, saved + 1, times)
     with w.counted(saved, last) as k, w.counted(0, layout.integrated) as row:
-        w.store(w.load("double", lanes.place(row, lane)), states, (number * times + k) * layout.integrated + row)
+        w.store(w.load(lanes.place(row, lane), type="double"), states, (number * times + k) * layout.integrated + row)
     w.store(last, who, lane + w.lanes)
     with w.when(last < times):
-        goal = w.load("double", goals, number * times + last)
+        goal = w.load(goals, number * times + last, "double")
         lanes.set("goal", lane, samples.nearer(w, lanes, lane, goal) if form.sampled else goal)
     with w.when(last >= times):
         each = layout.returned + 1
         with w.counted(0, layout.returned) as row:
-            w.store(w.load("double", lanes.place(row, lane)), ends, number * each + row)
+            w.store(w.load(lanes.place(row, lane), type="double"), ends, number * each + row)
         reached = w.where(runs, times, saved)
         w.store(w.converted("sitofp", reached, "double"), ends, number * each + layout.returned)
-        w.call("begin", "void", job, lanes.pointer, who, lane)
+        w.run("begin", job, lanes.pointer, who, lane)

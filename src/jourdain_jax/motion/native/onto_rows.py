@@ -99,29 +99,27 @@ def write(w: Writer, of: Rows, cutoff: float) -> None:
 
 def _write_values(w: Writer, of: Rows, name: str, nodes: dict[int, int]) -> None:
     """`name(state, found)`: values of nodes, each at its place in `found`."""
-    with w.function(name, "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
-        known = {n: w.load(w.real, state, k) for k, n in enumerate(of.given)}
+    with w.procedure(name, "state found") as (state, found):
+        known = {n: w.load(state, k) for k, n in enumerate(of.given)}
         places = list(nodes)
         for k, value in written_in_turn(w, of.program.graph, nodes.values(), known):
             w.store(as_real(w, value), found, places[k])
-        w.give()
 
 
 def _write_metric(w: Writer, of: Rows) -> None:
     """`metric(state, L, c)`: scales of the speeds, and the Cholesky factor of the mass matrix in scaled speeds; the identity among speeds that are held."""
     n, first_free = len(of.moving), len(of.given)
-    with w.function("metric", "void", {"state": "ptr", "L": "ptr", "c": "ptr"}, attributes="noinline") as (state, L, c):
+    with w.procedure("metric", "state L c") as (state, L, c):
         cleared(w, L, n * n)
-        w.call("masses", "void", state, L)
+        w.run("masses", state, L)
         with w.counted(0, n) as i:
-            w.store(_scale_of_speed(w, w.load(w.real, L, i * n + i)), c, i)
+            w.store(_scale_of_speed(w, w.load(L, i * n + i)), c, i)
         with w.counted(0, n) as i, w.counted(0, i + 1) as k:
-            scaled = w.load(w.real, c, i) * w.load(w.real, L, i * n + k) * w.load(w.real, c, k)
-            both = (w.load(w.real, state, i + first_free) > 0.0) & (w.load(w.real, state, k + first_free) > 0.0)
+            scaled = w.load(c, i) * w.load(L, i * n + k) * w.load(c, k)
+            both = (w.load(state, i + first_free) > 0.0) & (w.load(state, k + first_free) > 0.0)
             alone = w.spread(w.converted("uitofp", i.equals(k), "double"))
             w.store(w.where(both, scaled, alone), L, i * n + k)
-        w.call("cholesky", "void", L)
-        w.give()
+        w.run("cholesky", L)
 
 
 def _scale_of_speed(w: Writer, own: Value) -> Value:
@@ -134,97 +132,93 @@ def _write_factored(w: Writer, of: Rows) -> None:
     """`factored(state, L, c, B, d, weights)`: the matrix of the rows, turned as by `rotated`, and the scales of the rows."""
     rows, columns, first_free = len(of.residuals), len(of.moving), len(of.given)
     width, first_typical = rows + columns, first_free + columns
-    with w.function("factored", "void", dict.fromkeys(("state", "L", "c", "B", "d", "weights"), "ptr"), attributes="noinline") as (state, L, c, B, d, weights):
+    with w.procedure("factored", "state L c B d weights") as (state, L, c, B, d, weights):
         cleared(w, B, rows * width)
-        w.call("slopes", "void", state, B)
+        w.run("slopes", state, B)
         with w.counted(0, rows) as i:
-            row, square = w.at(B, i * width, w.real), w.room(w.real)
+            row, square = w.at(B, i * width), w.room()
             with w.counted(0, columns) as k:
-                slope = w.load(w.real, row, k)
-                slope = slope if of.metric is None else slope * w.load(w.real, c, k)
-                w.store(w.where(w.load(w.real, state, k + first_free) > 0.0, slope, 0.0), row, k)
+                slope = w.load(row, k)
+                slope = slope if of.metric is None else slope * w.load(c, k)
+                w.store(w.where(w.load(state, k + first_free) > 0.0, slope, 0.0), row, k)
             if of.metric is not None:
-                w.call("forward", "void", L, row)
+                w.run("forward", L, row)
             w.store(w.number(0.0), square)
             with w.counted(0, columns) as k:
-                slope = w.load(w.real, row, k)
-                w.store(w.fma(slope, slope, w.load(w.real, square)), square)
-            length = w.larger(w.root(w.load(w.real, square)), w.load(w.real, state, i + first_typical))
+                slope = w.load(row, k)
+                w.store(w.fma(slope, slope, w.load(square)), square)
+            length = w.larger(w.root(w.load(square)), w.load(state, i + first_typical))
             there = length > 0.0
             scale = w.where(there, w.number(1.0) / w.where(there, length, 1.0), 1.0)
             w.store(scale, d, i)
             with w.counted(0, columns) as k:
-                w.store(w.load(w.real, row, k) * scale, row, k)
+                w.store(w.load(row, k) * scale, row, k)
             w.store(w.number(1.0), row, i + columns)
-        w.call("rotated", "void", B)
-        w.call("inverted", "void", B, weights)
-        w.give()
+        w.run("rotated", B)
+        w.run("inverted", B, weights)
 
 
 def _write_moved(w: Writer, of: Rows) -> None:
     """`moved(state, L, c, B, d, weights, x)`: what moves after one step, by the matrix of the rows that was `factored`."""
     rows, columns, first_free = len(of.residuals), len(of.moving), len(of.given)
     first = of.given.index(of.moving[0])
-    arguments = dict.fromkeys(("state", "L", "c", "B", "d", "weights", "x"), "ptr")
-    with w.function("moved", "void", arguments, attributes="noinline") as (state, L, c, B, d, weights, x):
-        left = w.room(w.real, rows)
-        w.call("residuals", "void", state, left)
+    with w.procedure("moved", "state L c B d weights x") as (state, L, c, B, d, weights, x):
+        left = w.room(rows)
+        w.run("residuals", state, left)
         with w.counted(0, rows) as i:
-            w.store(w.load(w.real, left, i) * w.load(w.real, d, i), left, i)
-        w.call("solved", "void", B, weights, left, x)
+            w.store(w.load(left, i) * w.load(d, i), left, i)
+        w.run("solved", B, weights, left, x)
         if of.metric is not None:
-            w.call("backward", "void", L, x)
+            w.run("backward", L, x)
         with w.counted(0, columns) as k:
-            change = w.load(w.real, x, k)
-            change = change if of.metric is None else change * w.load(w.real, c, k)
-            moves = w.load(w.real, state, k + first_free) > 0.0  # what is held does not move by round-off either
-            w.store(w.load(w.real, state, k + first) - w.where(moves, change, 0.0), x, k)
-        w.give()
+            change = w.load(x, k)
+            change = change if of.metric is None else change * w.load(c, k)
+            moves = w.load(state, k + first_free) > 0.0  # what is held does not move by round-off either
+            w.store(w.load(state, k + first) - w.where(moves, change, 0.0), x, k)
 
 
 def _write_row(w: Writer, of: Rows) -> None:
     """`row(state, found)`: the lanes of a block, from what they are given to what they return."""
     rows, columns = len(of.residuals), len(of.moving)
     first = of.given.index(of.moving[0])
-    with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
+    with w.procedure("row", "state found") as (state, found):
         n = columns if of.metric is not None else 0
-        factors = [w.room(w.real, max(count, 1)) for count in (n * n, n, rows * (rows + columns), rows, rows)]
-        _write_putting(w, of, first, state, factors, w.room(w.real, columns))
+        factors = [w.room(max(count, 1)) for count in (n * n, n, rows * (rows + columns), rows, rows)]
+        _write_putting(w, of, first, state, factors, w.room(columns))
         with w.counted(0, columns) as k:
-            w.store(w.load(w.real, state, k + first), found, k)
-        w.call("residuals", "void", state, w.at(found, columns, w.real))
-        w.give()
+            w.store(w.load(state, k + first), found, k)
+        w.run("residuals", state, w.at(found, columns))
 
 
 def _write_putting(w: Writer, of: Rows, first: int, state: Value, factors: list[Value], x: Value) -> None:
     """What moves, put onto the rows in its place."""
     if of.metric is not None:
-        w.call("metric", "void", state, *factors[:2])
+        w.run("metric", state, *factors[:2])
     if not of.affine:
         _write_iteration(w, of, first, (state, *factors, x))
         return
-    w.call("factored", "void", state, *factors)
+    w.run("factored", state, *factors)
     for _ in range(2):
-        w.call("moved", "void", state, *factors, x)
+        w.run("moved", state, *factors, x)
         with w.counted(0, len(of.moving)) as k:
-            w.store(w.load(w.real, x, k), state, k + first)
+            w.store(w.load(x, k), state, k + first)
 
 
 def _write_iteration(w: Writer, of: Rows, first: int, places: tuple[Value, ...]) -> None:
     """Steps until they change nothing, as those of `calculus/fixed_point.py`."""
     state, *factors, x = places
-    columns, quiet, changed = len(of.moving), w.room(w.real), w.room(w.real)
+    columns, quiet, changed = len(of.moving), w.room(), w.room()
     w.store(w.number(0.0), quiet)
     with w.counted(0, MOST_MOVES_OF_POSITIONS if of.kind == "positions" else MOST_MOVES_OF_SPEEDS):
-        going = w.load(w.real, quiet) < float(QUIET)
+        going = w.load(quiet) < float(QUIET)
         with w.when(w.any(going)):
-            w.call("factored", "void", state, *factors)
-            w.call("moved", "void", state, *factors, x)
+            w.run("factored", state, *factors)
+            w.run("moved", state, *factors, x)
             w.store(w.number(-math.inf), changed)
             with w.counted(0, columns) as k:
-                old, new = w.load(w.real, state, k + first), w.load(w.real, x, k)
+                old, new = w.load(state, k + first), w.load(x, k)
                 beyond = w.magnitude(new - old) > (w.magnitude(old) + 1.0) * (ROUND_OFF * _EPS)
-                w.store(w.where(beyond, 1.0, w.load(w.real, changed)), changed)
+                w.store(w.where(beyond, 1.0, w.load(changed)), changed)
                 w.store(w.where(going, new, old), state, k + first)
-            still = w.where(w.load(w.real, changed) > 0.0, 0.0, w.load(w.real, quiet) + 1.0)
-            w.store(w.where(going, still, w.load(w.real, quiet)), quiet)
+            still = w.where(w.load(changed) > 0.0, 0.0, w.load(quiet) + 1.0)
+            w.store(w.where(going, still, w.load(quiet)), quiet)

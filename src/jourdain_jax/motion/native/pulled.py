@@ -20,7 +20,6 @@ from jourdain_jax.program.graph import Graph
 
 # Operations of a derivative of the first order, of which reverse mode keeps some on the stack, and of the second.
 LARGEST_DERIVATIVE = 10_000, 40_000
-_ARGUMENTS = ("state", "tau", "y", "g", "to_y", "to_known")
 
 
 class Pulled(NamedTuple):
@@ -136,14 +135,13 @@ def _state_nodes(form: Form) -> list[int]:
 def _write(w: Writer, form: Form, name: str, pulled: Pulled, work_stays: bool = False) -> None:
     layout, each = form.layout, form.layout.coordinates + form.layout.speeds
     end = each * (1 + len(form.moving))
-    with w.function(name, "void", dict.fromkeys(_ARGUMENTS, "ptr") | {"tau": w.real}, attributes="noinline") as (state, tau, y, g, to_y, to_known):
+    with w.procedure(name, "state tau:real y g to_y to_known") as (state, tau, y, g, to_y, to_known):
         given = given_values(w, form, pulled.own, known_values(w, form, state, tau, y), state, tau, y)
-        given |= {n: w.load(w.real, g, row) for row, n in pulled.weights.items()}
+        given |= {n: w.load(g, row) for row, n in pulled.weights.items()}
         for i, x in written_in_turn(w, pulled.graph, pulled.found, given):
             if i < end:
                 w.store(as_real(w, x), to_y, i // each * layout.y + i % each)
             else:
-                w.store(w.load(w.real, to_known, i - end) + as_real(w, x), to_known, i - end)
+                w.store(w.load(to_known, i - end) + as_real(w, x), to_known, i - end)
         for row in range(each, layout.integrated, layout.y) if layout.with_work else ():
-            w.store(w.load(w.real, g, row) if work_stays else w.number(0.0), to_y, row)
-        w.give()
+            w.store(w.load(g, row) if work_stays else w.number(0.0), to_y, row)

@@ -62,8 +62,8 @@ class _Rooms(NamedTuple):
     @staticmethod
     def of(w: Writer, form: Form, asked: int) -> "_Rooms":
         rows = form.layout.all, form.layout.integrated, max(asked, 1)
-        state, g, by_known = (w.room(w.real, count) for count in rows)
-        return _Rooms(state, w.room("i64", w.lanes), w.room(w.real), g, by_known, w.room("i64"))
+        state, g, by_known = (w.room(count) for count in rows)
+        return _Rooms(state, w.room(w.lanes, "i64"), w.room(), g, by_known, w.room(type="i64"))
 
 
 def write_record(w: Writer, form: Form, method: Method, asked: int, job: Value) -> None:
@@ -100,70 +100,70 @@ def _write_blocks(w: Writer, form: Form, method: Method, asked: int, job: Value)
     size = slot.all * w.lanes * 8
     rooms = _Rooms.of(w, form, asked)
     state, who, count = rooms.state, rooms.who, rooms.tries
-    record, bytes_there, lanes = w.room("ptr"), w.room("i64"), Lanes(w, layout, state)
+    record, bytes_there, lanes = w.room(type="ptr"), w.room(type="i64"), Lanes(w, layout, state)
     w.store(w.literal(FIRST_SLOTS * size, "i64"), bytes_there)
     w.store(w.external("aligned_alloc", "ptr", w.literal(64, "i64"), w.literal(FIRST_SLOTS * size, "i64")), record)
 
     def has_room() -> Value:
-        return w.converted("ptrtoint", w.load("ptr", record), "i64").differs(0)
+        return w.converted("ptrtoint", w.load(record, type="ptr"), "i64").differs(0)
 
     with w.repeated() as leave:
-        leave(w.load("i64", job, NEXT) >= w.load("i64", job, COUNT))
+        leave(w.load(job, NEXT, "i64") >= w.load(job, COUNT, "i64"))
         leave(~has_room())
         _take(w, job, who)
         _write_start(w, form, job, rooms)
         with w.repeated() as ended:
-            code, number = lanes["code"], w.load("i64", count)
+            code, number = lanes["code"], w.load(count, type="i64")
             ended(~w.any(code.equals(float(RUNNING)) | code.equals(float(LOCATING))))
-            with w.when((number + 1) * size > w.load("i64", bytes_there)):
-                w.store(w.call("more_room", "ptr", w.load("ptr", record), w.load("i64", bytes_there)), record)
-                w.store(w.load("i64", bytes_there) * 2, bytes_there)
+            with w.when((number + 1) * size > w.load(bytes_there, type="i64")):
+                w.store(w.call("more_room", "ptr", w.load(record, type="ptr"), w.load(bytes_there, type="i64")), record)
+                w.store(w.load(bytes_there, type="i64") * 2, bytes_there)
             ended(~has_room())
-            _write_try(w, form, slot, job, rooms, w.at(w.load("ptr", record), number * slot.all, w.real))
+            _write_try(w, form, slot, job, rooms, w.at(w.load(record, type="ptr"), number * slot.all))
         leave(~has_room())
         _write_ends(w, form, asked, job, rooms)
         with w.repeated() as at_start:
-            at_start(w.load("i64", count) <= 0)
-            _write_try_back(w, slot, job, rooms, w.at(w.load("ptr", record), (w.load("i64", count) - 1) * slot.all, w.real))
+            at_start(w.load(count, type="i64") <= 0)
+            _write_try_back(w, slot, job, rooms, w.at(w.load(record, type="ptr"), (w.load(count, type="i64") - 1) * slot.all))
         _write_found(w, form, asked, job, rooms)
     with w.when(~has_room()):
         _give_nan(w, form, asked, job, who)
-    w.external("free", "void", w.load("ptr", record))
+    w.external("free", "void", w.load(record, type="ptr"))
 
 
 def _write_windows(w: Writer, form: Form, method: Method, asked: int, job: Value) -> None:
     """As `_write_blocks`, on a GPU: the lanes of a warp, in memory for so many of the last slots; the numbers of its threads stand side by side."""
     slot, rooms = Slot.of(form, method), _Rooms.of(w, form, asked)
-    lanes, here, end = Lanes(w, form.layout, rooms.state), w.room(w.real, slot.all), w.room("i64")
+    lanes, here, end = Lanes(w, form.layout, rooms.state), w.room(slot.all), w.room(type="i64")
     (thread, threads), count = w.thread(), rooms.tries
-    record = w.at(w.load("ptr", job, NEXT), thread + FIRST_OF_SCRATCH, w.real)
-    slots = w.binary("sdiv", w.load("i64", job, OWN) - FIRST_OF_SCRATCH, threads * slot.all)
+    record = w.at(w.load(job, NEXT, "ptr"), thread + FIRST_OF_SCRATCH)
+    slots = w.binary("sdiv", w.load(job, OWN, "i64") - FIRST_OF_SCRATCH, threads * slot.all)
 
     def place(number: Value, row: int | Value) -> Value:
-        return w.at(record, (w.binary("srem", number, slots) * slot.all + row) * threads, w.real)
+        return w.at(record, (w.binary("srem", number, slots) * slot.all + row) * threads)
 
     with w.repeated() as leave:
-        leave(~w.together(lanes_taken(w, job, NEXT) < w.load("i64", job, COUNT)))
+        leave(~w.together(lanes_taken(w, job, NEXT) < w.load(job, COUNT, "i64")))
         _take(w, job, rooms.who)
         w.store(w.literal(2**62, "i64"), end)
         with w.repeated() as done:
             _write_start(w, form, job, rooms)
             with w.repeated() as ended:
-                code, number = lanes["code"], w.load("i64", count)
+                code, number = lanes["code"], w.load(count, type="i64")
                 on_its_way = w.any(code.equals(float(RUNNING)) | code.equals(float(LOCATING)))
-                ended(~w.together(on_its_way & (number < w.load("i64", end))))
+                ended(~w.together(on_its_way & (number < w.load(end, type="i64"))))
                 _write_try(w, form, slot, job, rooms, here)
-                for_rows(w, range(slot.all), lambda row, number=number: w.store(w.load(w.real, here, row), place(number, row)))
-            with w.when(w.load("i64", end).equals(2**62)):
+                for_rows(w, range(slot.all), lambda row, number=number: w.store(w.load(here, row), place(number, row)))
+            with w.when(w.load(end, type="i64").equals(2**62)):
                 _write_ends(w, form, asked, job, rooms)
-            first = w.load("i64", count) - slots
+            first = w.load(count, type="i64") - slots
             w.store(w.where(first > 0, first, 0), end)
             with w.repeated() as at_start:
-                number = w.load("i64", count) - 1
-                at_start(~w.together(number >= w.load("i64", end)))
-                for_rows(w, range(slot.all), lambda row, number=number: w.store(w.load(w.real, place(number, row)), here, row))
+                number = w.load(count, type="i64") - 1
+                at_start(~w.together(number >= w.load(end, type="i64")))
+                for_rows(w, range(slot.all), lambda row, number=number: w.store(w.load(place(number, row)), here, row))
                 _write_try_back(w, slot, job, rooms, here)
-            done(~w.together(w.load("i64", end) > 0))
+            done(~w.together(w.load(end, type="i64") > 0))
         _write_found(w, form, asked, job, rooms)
 
 
@@ -171,7 +171,7 @@ def _take(w: Writer, job: Value, who: Value) -> None:
     """The next lanes of the batch; -1 where there is none."""
     with w.counted(0, w.lanes) as lane:
         number = next_lane(w, job, NEXT)
-        w.store(w.where(number < w.load("i64", job, COUNT), number, -1), who, lane)
+        w.store(w.where(number < w.load(job, COUNT, "i64"), number, -1), who, lane)
 
 
 def _write_start(w: Writer, form: Form, job: Value, rooms: "_Rooms") -> None:
@@ -179,80 +179,80 @@ def _write_start(w: Writer, form: Form, job: Value, rooms: "_Rooms") -> None:
     with w.counted(0, form.layout.all) as row:
         w.store(w.number(1.0), rooms.state, row)
     with w.counted(0, w.lanes) as lane:
-        w.call("begin", "void", job, rooms.state, rooms.who, lane)
+        w.run("begin", job, rooms.state, rooms.who, lane)
     w.store(w.number(0.0), rooms.saved)
-    w.call("note", "void", job, rooms.state, rooms.who, rooms.saved)
+    w.run("note", job, rooms.state, rooms.who, rooms.saved)
     w.store(w.literal(0, "i64"), rooms.tries)
 
 
 def _write_try(w: Writer, form: Form, slot: Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
     """A step that is tried, and its slot `here`."""
     lanes = Lanes(w, form.layout, rooms.state)
-    each_row(w, range(form.layout.integrated), here, lambda i: w.load(w.real, rooms.state, i))
+    each_row(w, range(form.layout.integrated), here, lambda i: w.load(rooms.state, i))
     w.store(lanes["t"], here, slot.t)
-    w.store(w.load(w.real, rooms.saved), here, slot.saved)
-    w.call("step", "void", rooms.state, w.at(here, slot.y, w.real))
+    w.store(w.load(rooms.saved), here, slot.saved)
+    w.run("step", rooms.state, w.at(here, slot.y))
     w.store(lanes["taken"], here, slot.taken)
-    w.call("note", "void", job, rooms.state, rooms.who, rooms.saved)
-    w.store(w.load("i64", rooms.tries) + 1, rooms.tries)
+    w.run("note", job, rooms.state, rooms.who, rooms.saved)
+    w.store(w.load(rooms.tries, type="i64") + 1, rooms.tries)
 
 
 def _write_ends(w: Writer, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
     """Cotangents of the states at the end of a block."""
     g, layout = rooms.g, form.layout
     each_row(w, range(asked), rooms.by_known, lambda i: w.number(0.0))
-    ends, per_end = w.load("ptr", job, TO_ENDS), layout.ends
+    ends, per_end = w.load(job, TO_ENDS, "ptr"), layout.ends
     with w.counted(0, w.lanes) as lane:
-        number = w.load("i64", rooms.who, lane)
+        number = w.load(rooms.who, lane, "i64")
         with w.counted(0, layout.integrated) as row:
-            found = w.load("double", ends, w.where(number >= 0, number, 0) * per_end + row)
+            found = w.load(ends, w.where(number >= 0, number, 0) * per_end + row, "double")
             w.store(w.where(number >= 0, found, w.literal(0.0, "double")), w.at(g, row * w.lanes + lane, "double"))
     # what was not reached repeats the last state
-    all_times = w.room(w.real)
+    all_times = w.room()
     with w.counted(0, w.lanes) as lane:
-        w.store(w.converted("sitofp", w.load("i64", job, TIMES), "double"), w.at(all_times, lane, "double"))
-    w.call("added", "void", job, rooms.who, w.load(w.real, rooms.saved), w.load(w.real, all_times), g)
+        w.store(w.converted("sitofp", w.load(job, TIMES, "i64"), "double"), w.at(all_times, lane, "double"))
+    w.run("added", job, rooms.who, w.load(rooms.saved), w.load(all_times), g)
     if form.has_events:
-        w.call("event_back", "void", job, rooms.state, rooms.who, g, rooms.by_known)
+        w.run("event_back", job, rooms.state, rooms.who, g, rooms.by_known)
 
 
 def _write_try_back(w: Writer, slot: Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
     """Back over the try in a slot."""
-    before = w.load(w.real, here, slot.saved)
-    w.call("added", "void", job, rooms.who, before, w.load(w.real, rooms.saved), rooms.g)
+    before = w.load(here, slot.saved)
+    w.run("added", job, rooms.who, before, w.load(rooms.saved), rooms.g)
     w.store(before, rooms.saved)
-    with w.when(w.any(w.load(w.real, here, slot.taken).differs(0.0))):
-        w.call("step_back", "void", rooms.state, here, rooms.g, rooms.by_known)
-    w.store(w.load("i64", rooms.tries) - 1, rooms.tries)
+    with w.when(w.any(w.load(here, slot.taken).differs(0.0))):
+        w.run("step_back", rooms.state, here, rooms.g, rooms.by_known)
+    w.store(w.load(rooms.tries, type="i64") - 1, rooms.tries)
 
 
 def _write_found(w: Writer, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
     """The results of a block."""
     g, layout = rooms.g, form.layout
-    w.call("added", "void", job, rooms.who, w.number(0.0), w.load(w.real, rooms.saved), g)
-    found, each = w.load("ptr", job, FOUND), layout.integrated + asked
+    w.run("added", job, rooms.who, w.number(0.0), w.load(rooms.saved), g)
+    found, each = w.load(job, FOUND, "ptr"), layout.integrated + asked
     with w.counted(0, w.lanes) as lane:
-        number = w.load("i64", rooms.who, lane)
+        number = w.load(rooms.who, lane, "i64")
         with w.when(number >= 0):
             with w.counted(0, layout.integrated) as row:
-                w.store(w.load("double", g, row * w.lanes + lane), found, number * each + row)
+                w.store(w.load(g, row * w.lanes + lane, "double"), found, number * each + row)
             with w.counted(0, asked) as row:
-                w.store(w.load("double", rooms.by_known, row * w.lanes + lane), found, number * each + layout.integrated + row)
+                w.store(w.load(rooms.by_known, row * w.lanes + lane, "double"), found, number * each + layout.integrated + row)
 
 
 def _give_nan(w: Writer, form: Form, asked: int, job: Value, who: Value) -> None:
     """Where no memory is left: NaN for this block and for all lanes that are left."""
-    found, each = w.load("ptr", job, FOUND), form.layout.integrated + asked
+    found, each = w.load(job, FOUND, "ptr"), form.layout.integrated + asked
 
     def lost(number: Value) -> None:
         with w.counted(0, each) as row:
             w.store(w.literal(math.nan, "double"), found, number * each + row)
 
     with w.counted(0, w.lanes) as lane:
-        number = w.load("i64", who, lane)
+        number = w.load(who, lane, "i64")
         with w.when(number >= 0):
             lost(number)
     with w.repeated() as leave:
         number = next_lane(w, job, NEXT)
-        leave(number >= w.load("i64", job, COUNT))
+        leave(number >= w.load(job, COUNT, "i64"))
         lost(number)

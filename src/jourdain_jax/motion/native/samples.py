@@ -36,20 +36,20 @@ def store_words(w: Writer, words: Value, given: list[Given]) -> None:
 
 def begin(w: Writer, layout: Layout, words: Value, count: Value, lanes: Lanes, lane: Value, number: Value) -> None:
     """A place takes the table and the knots of the lane with this number, of so many."""
-    size = w.load("i64", words, _SAMPLES)
+    size = w.load(words, _SAMPLES, "i64")
 
     def share(of: int) -> Value:
-        return w.binary("sdiv", number * w.load("i64", words, of), count)
+        return w.binary("sdiv", number * w.load(words, of, "i64"), count)
 
-    table = w.at(w.load("ptr", words, _TABLES), share(_TABLE_COUNT) * size * (2 * layout.sampled), "double")
-    knot = w.at(w.load("ptr", words, _KNOTS), share(_KNOT_COUNT) * w.load("i64", words, _KNOTS_EACH), "double")
+    table = w.at(w.load(words, _TABLES, "ptr"), share(_TABLE_COUNT) * size * (2 * layout.sampled), "double")
+    knot = w.at(w.load(words, _KNOTS, "ptr"), share(_KNOT_COUNT) * w.load(words, _KNOTS_EACH, "i64"), "double")
     for name, value in (("table", table), ("samples", size), ("knot", knot)):
         lanes.set(name, lane, value)
 
 
 def nearer(w: Writer, lanes: Lanes, lane: Value, goal: Value) -> Value:
     """The next knot or the goal, whichever comes first."""
-    knot = w.load("double", lanes.of("knot", lane, "ptr"))
+    knot = w.load(lanes.of("knot", lane, "ptr"), type="double")
     return w.where((knot - goal) * lanes.of("direction", lane) < 0.0, knot, goal)
 
 
@@ -60,32 +60,31 @@ def pass_knot(w: Writer, lanes: Lanes, lane: Value) -> None:
 
 def write_inputs(w: Writer, layout: Layout, with_slopes: bool) -> None:
     """`sampled_inputs(state, t, values)`: the values of all inputs that are given by samples, at the time t since the start, of each lane; then df/dt."""
-    with w.function("sampled_inputs", "void", {"state": "ptr", "t": w.real, "values": "ptr"}, attributes="noinline") as (state, t, values):
-        lanes, times, low, high = Lanes(w, layout, state), w.room(w.real), w.room("i64"), w.room("i64")
+    with w.procedure("sampled_inputs", "state t:real values") as (state, t, values):
+        lanes, times, low, high = Lanes(w, layout, state), w.room(), w.room(type="i64"), w.room(type="i64")
         w.store(t, times)
         with w.counted(0, w.lanes) as lane:
-            now, count = w.load("double", times, lane), lanes.of("samples", lane, "i64")
+            now, count = w.load(times, lane, "double"), lanes.of("samples", lane, "i64")
             for i in range(layout.sampled):
                 ts = w.at(lanes.of("table", lane, "ptr"), count * (2 * i), "double")
                 fs = w.at(ts, count, "double")
                 w.store(w.literal(0, "i64"), low)
                 w.store(count - 1, high)
                 with w.repeated() as leave:
-                    a, b = w.load("i64", low), w.load("i64", high)
+                    a, b = w.load(low, type="i64"), w.load(high, type="i64")
                     leave((b - a) <= 1)
                     middle = w.binary("sdiv", a + b, 2)
-                    after = w.load("double", ts, middle) <= now
+                    after = w.load(ts, middle, "double") <= now
                     w.store(w.where(after, middle, a), low)
                     w.store(w.where(after, b, middle), high)
-                k = w.load("i64", low)
-                t_k, f_k = w.load("double", ts, k), w.load("double", fs, k)
-                span, rise = w.load("double", ts, k + 1) - t_k, w.load("double", fs, k + 1) - f_k
+                k = w.load(low, type="i64")
+                t_k, f_k = w.load(ts, k, "double"), w.load(fs, k, "double")
+                span, rise = w.load(ts, k + 1, "double") - t_k, w.load(fs, k + 1, "double") - f_k
                 there = (now - t_k) / span
                 share = w.smaller(w.larger(there, 0.0), 1.0)
                 w.store(f_k + share * rise, w.at(values, i * w.lanes + lane, "double"))
                 if with_slopes:
                     w.store(w.where(there.equals(share), rise / span, 0.0), w.at(values, (layout.sampled + i) * w.lanes + lane, "double"))
-        w.give()
 
 
 def looked_up(w: Writer, layout: Layout, state: Value, t: Value, with_slopes: bool) -> list[Value]:
@@ -93,6 +92,6 @@ def looked_up(w: Writer, layout: Layout, state: Value, t: Value, with_slopes: bo
     if not layout.sampled:
         return []
     count = layout.sampled * (1 + with_slopes)
-    values = w.room(w.real, count)
-    w.call("sampled_inputs", "void", state, t, values)
-    return [w.load(w.real, values, i) for i in range(count)]
+    values = w.room(count)
+    w.run("sampled_inputs", state, t, values)
+    return [w.load(values, i) for i in range(count)]

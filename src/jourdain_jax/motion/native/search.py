@@ -24,15 +24,15 @@ def monitored(w: Writer, form: Form, p: Lanes, k: tuple[Value, Value], y1: Value
     layout, count, y, t = form.layout, form.layout.events, p.pointer, p["t"]
 
     def events(t: Value, y: Value, slope: Value) -> list[list[Value]]:
-        values, rates = w.room(w.real, count), w.room(w.real, count)
-        w.call("events", "void", p.pointer, t, y, slope, values, rates)
-        return [[w.load(w.real, place, i) for i in range(count)] for place in (values, rates)]
+        values, rates = w.room(count), w.room(count)
+        w.run("events", p.pointer, t, y, slope, values, rates)
+        return [[w.load(place, i) for i in range(count)] for place in (values, rates)]
 
     c_0, rate_0 = events(t, y, k[0])
     c_1, rate_1 = events(new["t"], y1, k[1])
 
     def advance(begins: Value, changes: Value) -> tuple[Search, Value]:
-        first = w.room(w.real)
+        first = w.room()
         w.store(p["event"], first)
         with w.when(w.any(changes)):
             old = _of_lanes(p, count)
@@ -43,15 +43,15 @@ def monitored(w: Writer, form: Form, p: Lanes, k: tuple[Value, Value], y1: Value
             for name, values in rows.items():
                 p.put(f"search_{name}", [w.where(changes, a, b) for a, b in zip(values, p.every(f"search_{name}"), strict=True)])
             w.store(w.literal(event.first, w.real), first)
-        return _of_lanes(p, count), w.load(w.real, first)
+        return _of_lanes(p, count), w.load(first)
 
     # a motion that starts beyond an event has no motion at all
-    sound = over_rows(w, range(layout.y), 0.0, lambda total, i: total + 0.0 * w.load(w.real, y, i)).equals(0.0)
+    sound = over_rows(w, range(layout.y), 0.0, lambda total, i: total + 0.0 * w.load(y, i)).equals(0.0)
     found = decided(w, p, new, h, (c_0, rate_0, c_1, rate_1), accept, sound, (_of_lanes(p, count), advance))
 
     def state(i: int | Value) -> Value:
-        after = w.load(w.real, y1, i)
-        return w.where(found.stays, w.load(w.real, y, i), w.where(found.found, w.fma(found.search.shift, w.load(w.real, k[0], i), after), after))
+        after = w.load(y1, i)
+        return w.where(found.stays, w.load(y, i), w.where(found.found, w.fma(found.search.shift, w.load(k[0], i), after), after))
 
     each_row(w, range(layout.integrated), y1, state)
     if form.moving:
@@ -75,18 +75,18 @@ def _put_tangents(w: Writer, form: Form, p: Lanes, k: Value, found: Value, t: Va
     """
     layout, count, times = form.layout, form.layout.events, form.layout.rows["dt"]
     with w.when(w.any(found)):
-        values, pivots = w.room(w.real, count * len(times)), w.room(w.real, max(len(form.monitored), 1))
+        values, pivots = w.room(count * len(times)), w.room(max(len(form.monitored), 1))
         slope = chosen(w, p["event"], rate)
         usable = found & slope.differs(0.0) & (w.magnitude(slope) < math.inf)
         flat = found & slope_is_flat(w, p, slope)
         for part, row in enumerate(times, 1):
             if part > 1:  # what is known of the rates is of the state as it was
-                k = w.room(w.real, layout.integrated)
-                w.call("rates", "void", p.pointer, t, y1, k, pivots)
-            w.call("event_tangents", "void", p.pointer, t, y1, values)
-            dc = chosen(w, p["event"], [w.load(w.real, values, (part - 1) * count + i) for i in range(count)])
+                k = w.room(layout.integrated)
+                w.run("rates", p.pointer, t, y1, k, pivots)
+            w.run("event_tangents", p.pointer, t, y1, values)
+            dc = chosen(w, p["event"], [w.load(values, (part - 1) * count + i) for i in range(count)])
             dt = w.where(flat, math.nan, w.where(usable, -dc / slope, 0.0))
-            w.store(w.where(found, dt, w.load(w.real, p.pointer, row)), p.pointer, row)
+            w.store(w.where(found, dt, w.load(p.pointer, row)), p.pointer, row)
             for other in range(len(times) + 1):
                 if not other & part:
                     _move_rows(w, layout, y1, k, (other | part) * layout.y, other * layout.y, dt, usable | flat)
@@ -96,7 +96,7 @@ def _move_rows(w: Writer, layout: Layout, y: Value, k: Value, rows: int, rates: 
     """Adds the rates that begin with row `rates` of `k`, times `dt`, to those that begin with row `rows` of `y`."""
 
     def moved(i: int | Value) -> Value:
-        before = w.load(w.real, y, i + rows)
-        return w.where(moves, w.fma(w.load(w.real, k, i + rates), dt, before), before)
+        before = w.load(y, i + rows)
+        return w.where(moves, w.fma(w.load(k, i + rates), dt, before), before)
 
     for_rows(w, range(layout.y), lambda i: w.store(moved(i), y, i + rows))

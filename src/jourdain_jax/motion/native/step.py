@@ -34,15 +34,14 @@ class Trial(NamedTuple):
 
 def write_step(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
     """`step(state, k)`: one step, tried by all lanes that are on their way; `k`: room for the slopes of its stages, or for Taylor coefficients."""
-    with w.function("step", "void", {"state": "ptr noalias", "k": "ptr noalias"}, attributes="noinline") as (state, k):
+    with w.procedure("step", "state:noalias k:noalias") as (state, k):
         lanes = Lanes(w, form.layout, state)
         if form.relations:
             crossings.write_begin(w, form, lanes)
         if isinstance(method, TaylorSteps):
-            _take(w, form, method, lanes, w.at(k, form.layout.integrated, w.real), _tried_by_series(w, form, method, lanes, k))
+            _take(w, form, method, lanes, w.at(k, form.layout.integrated), _tried_by_series(w, form, method, lanes, k))
         else:
             _take(w, form, method, lanes, k, _tried_by_stages(w, form, method, lanes, k))
-        w.give()
 
 
 def _tried_by_stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value) -> Trial:
@@ -51,8 +50,8 @@ def _tried_by_stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value) 
     aim = aimed(w, p, p["goal"], _reach(w, form, p, p["h"]), p["search_shift"] if form.has_events else None)
     t1, step = aim.t_1, aim.h
     smallest, changed_sign, rank = _stages(w, form, method, p, k, p["t"], step)
-    y1, error = w.room(w.real, layout.integrated), w.room(w.real, layout.y)
-    each_row(w, range(layout.integrated), y1, lambda i: w.fma(step, weighted(w, method.b, k, layout, i), w.load(w.real, y, i)))
+    y1, error = w.room(layout.integrated), w.room(layout.y)
+    each_row(w, range(layout.integrated), y1, lambda i: w.fma(step, weighted(w, method.b, k, layout, i), w.load(y, i)))
     each_row(w, range(layout.y), error, lambda i: step * weighted(w, method.b_error, k, layout, i))
     if form.projects:
         _project(w, layout, p, t1, y1, error, rank)
@@ -85,14 +84,14 @@ def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Va
     step = w.where(locating, p["search_shift"], direction * size) if form.has_events else direction * size
     t1 = w.where(lands, last_goal, t + step)
     step = t1 - t
-    y1, pivot, accept = w.room(w.real, count), None, size > 0.0
+    y1, pivot, accept = w.room(count), None, size > 0.0
     for row, series in enumerate(rows):
         w.store(at_time(w, series, step), y1, row)
         if form.has_events:
             w.store(at_time(w, slope(series), step), k, (method.order + 1) * count + row)
     at_end = monitored_at(w, form, p, t1, y1)
     holds = at_start.holds & at_end.holds
-    w.store(w.where(holds, w.load(w.real, y1), math.nan), y1)
+    w.store(w.where(holds, w.load(y1), math.nan), y1)
     accept, length = accept & holds, w.where(at_start.holds, length, 0.0)
     for a, b in zip(at_start.values[: form.pivots], at_end.values, strict=False):
         least = w.smaller(w.magnitude(a), w.magnitude(b))
@@ -100,7 +99,7 @@ def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Va
         accept = accept & ~(((a < 0.0) & (b > 0.0)) | ((a > 0.0) & (b < 0.0)))
     accept = accept & ~_turns_round(w, form, at_start.values, at_end.values)
     if form.projects:
-        error = w.room(w.real, layout.y)
+        error = w.room(layout.y)
         each_row(w, range(layout.y), error, lambda i: w.number(0.0))
         _project(w, layout, p, t1, y1, error)
         accept = accept & (_norm(w, layout, p, error, y1) <= 1.0)
@@ -120,9 +119,9 @@ def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Valu
         accept, next_h = accept & ~watched.refused, w.where(watched.refused, w.where(watched.falls, watched.to_event, p["h"]), next_h)
     new = taken(w, p, aim, accept, next_h)
     new["taken"] = w.where(accept, aim.h, 0.0)  # by how far the state has gone on
-    each_row(w, rows, y1, lambda i: w.where(accept, w.load(w.real, y1, i), w.load(w.real, y, i)))
+    each_row(w, rows, y1, lambda i: w.where(accept, w.load(y1, i), w.load(y, i)))
     if form.has_events:
-        ends = k, w.at(k, method.at_the_end * layout.integrated, w.real)
+        ends = k, w.at(k, method.at_the_end * layout.integrated)
         new = search.monitored(w, form, p, ends, y1, new, aim.h, accept & ~locating & new["code"].equals(float(RUNNING)))
     counts = accept & ~locating & new["code"].equals(float(RUNNING)) & new["t"].equals(t1)
     stays = counts | (locating & new["code"].equals(float(results.EVENT)))
@@ -132,7 +131,7 @@ def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Valu
     moving = locating | p["code"].equals(float(RUNNING))
     if watched is not None:
         crossings.note(w, p, watched, t1, moving, stays)
-    each_row(w, rows, y, lambda i: w.where(moving, w.load(w.real, y1, i), w.load(w.real, y, i)))
+    each_row(w, rows, y, lambda i: w.where(moving, w.load(y1, i), w.load(y, i)))
     for name, value in new.items():
         p[name] = w.where(moving, value, w.number(0.0) if name == "taken" else p[name])
 
@@ -149,12 +148,12 @@ def _stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value, t: Value,
     layout, count = form.layout, form.pivots
     every, turned = layout.integrated, w.literal(0, w.truth)
     first: list[Value] = []
-    at, pivots = w.room(w.real, every), w.room(w.real, max(len(form.monitored), 1))
-    rank, square = None, w.room(w.real)
+    at, pivots = w.room(every), w.room(max(len(form.monitored), 1))
+    rank, square = None, w.room()
     low, high = [w.number(math.inf)] * count, [w.number(-math.inf)] * count
 
     def next_state(i: int, row: int | Value) -> Value:
-        start = w.load(w.real, p.pointer, row)
+        start = w.load(p.pointer, row)
         return w.fma(step, weighted(w, method.A[i], k, layout, row), start) if i else start
 
     for i in range(method.needed):
@@ -162,15 +161,15 @@ def _stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value, t: Value,
         each_row(w, range(every), at, partial(next_state, i))
         if rank is not None:
             put_near_rows(w, layout, p.pointer, rank.near, time, at)
-        w.call("rates", "void", p.pointer, time, at, w.at(k, i * every, w.real), pivots)
-        now = [w.load(w.real, pivots, j) for j in range(len(form.monitored) - len(form.squares))]
+        w.run("rates", p.pointer, time, at, w.at(k, i * every), pivots)
+        now = [w.load(pivots, j) for j in range(len(form.monitored) - len(form.squares))]
         if form.squares:
             by_rows = squares_of(w, form, pivots)
             if rank is None:
                 rank = Rank(near_rank_loss(by_rows), square)
                 w.store(w.number(math.inf), square)
             with w.when(w.any(rank.near)):
-                w.store(reduce(w.smaller, [left / size for left, size in by_rows], w.load(w.real, square)), square)
+                w.store(reduce(w.smaller, [left / size for left, size in by_rows], w.load(square)), square)
         first = first or now
         turned = turned | _turns_round(w, form, first, now)
         low, high = [w.smaller(a, b) for a, b in zip(low, now, strict=False)], [w.larger(a, b) for a, b in zip(high, now, strict=False)]
@@ -178,12 +177,12 @@ def _stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value, t: Value,
     for a, b in zip(low, high, strict=True):
         smallest = w.smaller(smallest, w.smaller(w.magnitude(a), w.magnitude(b)))
         changed = changed | ((a < 0.0) & (b > 0.0))
-    return smallest, changed, rank if rank is None else rank._replace(square=w.load(w.real, square))
+    return smallest, changed, rank if rank is None else rank._replace(square=w.load(square))
 
 
 def squares_of(w: Writer, form: Form, monitored: Value) -> list[tuple[Value, Value]]:
     """What is left of each row beside those before it, and its size, squared."""
-    found = [w.load(w.real, monitored, j) for j in range(len(form.monitored) - len(form.squares), len(form.monitored))]
+    found = [w.load(monitored, j) for j in range(len(form.monitored) - len(form.squares), len(form.monitored))]
     return list(zip(found[::2], found[1::2], strict=True))
 
 
@@ -195,10 +194,10 @@ def near_rank_loss(squares: list[tuple[Value, Value]]) -> Value:
 def put_near_rows(w: Writer, layout: Layout, state: Value, near: Value, t: Value, y: Value) -> None:
     """Puts the state `y` of a stage back onto the rows in lanes that are `near` a loss of rank."""
     with w.when(w.any(near)):
-        put = w.room(w.real, layout.integrated)
-        each_row(w, range(layout.integrated), put, lambda i: w.load(w.real, y, i))
-        w.call("project", "void", state, t, put)
-        each_row(w, range(layout.integrated), y, lambda i: w.where(near, w.load(w.real, put, i), w.load(w.real, y, i)))
+        put = w.room(layout.integrated)
+        each_row(w, range(layout.integrated), put, lambda i: w.load(y, i))
+        w.run("project", state, t, put)
+        each_row(w, range(layout.integrated), y, lambda i: w.where(near, w.load(put, i), w.load(y, i)))
 
 
 def _turns_round(w: Writer, form: Form, first: list[Value], now: list[Value]) -> Value:
@@ -210,33 +209,33 @@ def _turns_round(w: Writer, form: Form, first: list[Value], now: list[Value]) ->
 def weighted(w: Writer, weights: np.ndarray, k: Value, layout: Layout, row: int | Value) -> Value:
     """sum_j w_j k_j of one number of the state."""
     used = [j for j in range(len(weights)) if weights[j] != 0]
-    total = w.load(w.real, k, used[0] * layout.integrated + row) * float(weights[used[0]])
+    total = w.load(k, used[0] * layout.integrated + row) * float(weights[used[0]])
     for j in used[1:]:
-        total = w.fma(w.load(w.real, k, j * layout.integrated + row), float(weights[j]), total)
+        total = w.fma(w.load(k, j * layout.integrated + row), float(weights[j]), total)
     return total
 
 
 def _project(w: Writer, layout: Layout, p: Lanes, t1: Value, y1: Value, error: Value, rank: Rank | None = None) -> None:
     """Puts `y1` back onto the rows; the error is no smaller than how far that moved it, beyond noise."""
-    free = w.room(w.real, layout.y)
-    each_row(w, range(layout.y), free, lambda i: w.load(w.real, y1, i))
-    w.call("project", "void", p.pointer, t1, y1)
+    free = w.room(layout.y)
+    each_row(w, range(layout.y), free, lambda i: w.load(y1, i))
+    w.run("project", p.pointer, t1, y1)
     amplified = None if rank is None else w.where(rank.near, w.smaller(AMPLIFIED * w.eps / rank.square, w.eps ** (1 - NOISE)), 0.0)
     if rank is not None:
         with w.when(w.any(rank.near)):
-            both = w.room(w.real, 2 * layout.y)
-            each_row(w, range(layout.y), both, lambda i: w.load(w.real, y1, i))
-            each_row(w, range(layout.y), w.at(both, layout.y, w.real), lambda i: w.load(w.real, error, i))
-            w.call("along", "void", p.pointer, t1, both)
-            each_row(w, range(layout.y), error, lambda i: w.where(rank.near, w.load(w.real, both, i + layout.y), w.load(w.real, error, i)))
+            both = w.room(2 * layout.y)
+            each_row(w, range(layout.y), both, lambda i: w.load(y1, i))
+            each_row(w, range(layout.y), w.at(both, layout.y), lambda i: w.load(error, i))
+            w.run("along", p.pointer, t1, both)
+            each_row(w, range(layout.y), error, lambda i: w.where(rank.near, w.load(both, i + layout.y), w.load(error, i)))
     for part in layout.parts:
-        largest = over_rows(w, part, 0.0, lambda largest, i: w.larger(largest, w.magnitude(w.load(w.real, y1, i))))
+        largest = over_rows(w, part, 0.0, lambda largest, i: w.larger(largest, w.magnitude(w.load(y1, i))))
         noise = (w.eps**NOISE if amplified is None else w.larger(amplified, w.eps**NOISE)) * largest
         by_rows = None if amplified is None else amplified * amplified * largest
 
         def larger_error(i: int | Value, noise: Value = noise, by_rows: Value | None = by_rows) -> Value:
-            moved = w.magnitude(w.load(w.real, y1, i) - w.load(w.real, free, i)) - noise
-            along = w.magnitude(w.load(w.real, error, i))
+            moved = w.magnitude(w.load(y1, i) - w.load(free, i)) - noise
+            along = w.magnitude(w.load(error, i))
             return w.larger(along if by_rows is None else along - by_rows, w.larger(moved, 0.0))
 
         each_row(w, part, error, larger_error)
@@ -247,8 +246,8 @@ def _norm(w: Writer, layout: Layout, p: Lanes, error: Value, y1: Value) -> Value
     rtol, atol, count = p["rtol"], p["atol"], layout.coordinates + layout.speeds
 
     def added(total: Value, i: int | Value) -> Value:
-        size = w.larger(w.magnitude(w.load(w.real, p.pointer, i)), w.magnitude(w.load(w.real, y1, i)))
-        relative = w.load(w.real, error, i) / w.fma(rtol, size, atol)
+        size = w.larger(w.magnitude(w.load(p.pointer, i)), w.magnitude(w.load(y1, i)))
+        relative = w.load(error, i) / w.fma(rtol, size, atol)
         return w.fma(relative, relative, total)
 
     total = over_rows(w, range(count), 0.0, added) / float(count)

@@ -66,7 +66,7 @@ def jet(w: Writer, form: Form, p: Lanes, t: Value, order: int) -> Jet:
 
     moved = [n for part in (states, *own.states) for n in with_work(part, None)]
     nodes = [n for part in (own.values[: len(rates)], *own.tangents) for n in with_work(part, own.graph.zero)]
-    start = [w.load(w.real, y, i) for i in range(layout.integrated)]
+    start = [w.load(y, i) for i in range(layout.integrated)]
     found = Series(w, own.graph, given, moved, nodes, start, order, own.variables[first])
     values = {n: w.number(0.0) if x[0] is None else x[0] for n, x in found.of.items()}
     return Jet(found.state, _evaluated(w, form, own.graph, own.values[len(rates) :], values, known))
@@ -101,7 +101,7 @@ def _evaluated(w: Writer, form: Form, graph, nodes: Sequence[int], values: Mappi
 def radius(w: Writer, layout: Layout, p: Lanes, rows: Sequence[Coefficients]) -> Value:
     """How long a step may be; zero where a coefficient is no number."""
     rtol, atol, count = p["rtol"], p["atol"], layout.coordinates + layout.speeds
-    inverse = [1.0 / w.fma(rtol, w.magnitude(w.load(w.real, p.pointer, i)), atol) for i in range(count)]
+    inverse = [1.0 / w.fma(rtol, w.magnitude(w.load(p.pointer, i)), atol) for i in range(count)]
     order, least = len(rows[0]) - 1, w.number(math.inf)  # of log h
     for k in (order - 1, order):
         square = w.number(0.0)  # of N_k, times `count`
