@@ -151,7 +151,7 @@ class Lowered:
 
         `fixed`, `t` (s), `q`, `y`, `inputs`, `with_power`: as in `rates`.
         """
-        found = list(self._program_of_rates(with_power)(*self._known(fixed, t, q, y, inputs).values()))
+        found = list(_program_of_rates(self, with_power)(*self._known(fixed, t, q, y, inputs).values()))
         found, squares = found[: len(found) - len(self.squares)], found[len(found) - len(self.squares) :]
         ratios = [left / size for left, size in zip(squares[::2], squares[1::2], strict=True)]
         sine = jnp.sqrt(jnp.maximum(functools.reduce(jnp.minimum, ratios), 0.0)) if ratios else None
@@ -165,14 +165,6 @@ class Lowered:
         at = len(self.qdot)
         power = found[count - 1] if with_power else None
         return tuple(found[:at]), tuple(found[at : at + len(self.ydot)]), power, pivots, directions, sine
-
-    @functools.cached_property
-    def _program_of_rates(self) -> Callable[[bool], Callable[..., tuple]]:
-        def made(with_power: bool):
-            outputs = [*self.qdot, *self.ydot, *([self.power] if with_power else []), *self.guards]
-            return differentiable(self.graph, outputs, self.variables, like=len(self.fixed) + 1, monitored=(*self.pivots, *self.directions, *self.squares))
-
-        return functools.cache(made)
 
     @property
     def variables(self) -> list[int]:
@@ -251,6 +243,13 @@ class Lowered:
     def calls(self) -> tuple[str, ...]:
         """Why each call of JAX in the rates and stop events is one: a part of a load or event that has no scalar form."""
         return tuple(self.graph.value[n].reason for n in self.graph.calls([*self.qdot, *self.ydot, *self.events]))
+
+
+@functools.lru_cache(maxsize=64)
+def _program_of_rates(program: Lowered, with_power: bool) -> Callable[..., tuple]:
+    outputs = [*program.qdot, *program.ydot, *([program.power] if with_power else []), *program.guards]
+    monitored = *program.pivots, *program.directions, *program.squares
+    return differentiable(program.graph, outputs, program.variables, like=len(program.fixed) + 1, monitored=monitored)
 
 
 def _usual(sizes: Float[Array, "states"]) -> Float[Array, ""]:

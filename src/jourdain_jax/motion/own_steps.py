@@ -142,7 +142,7 @@ def _on_times(run: Callable[[Setup, Begun], Solved], setup: Setup, begun: Begun)
     otherwise.
     """
     numbers, (field, scene, inputs, fixed, start) = jax.lax.stop_gradient, begun.args
-    moved = partial(native_motion.moved_by, begun.args, _form(setup))
+    moved = native_motion.mover(begun.args, _form(setup))
     goals, later = setup.goals(setup.ts), start - numbers(start)
     y0 = moved(begun.y0, start, -later)
     setup = setup._replace(**{name: numbers(getattr(setup, name)) for name in ("ts", "t0", "t1")})

@@ -11,7 +11,6 @@ whose signs are watched, and by the time `crossing_by` one of them is known to c
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
 
 from jourdain_jax.native.ir import Value, Writer
@@ -55,7 +54,7 @@ class Layout:
         ends = [0, self.coordinates, self.coordinates + self.speeds, self.y]
         return [range(a, b) for a, b in pairwise(ends) if b > a]
 
-    @cached_property
+    @property
     def rows(self) -> dict[str, range]:
         """Name -> rows."""
         search = {"search_t": 3, "search_c": 3 * self.events, "search_step": 1, "search_left": 1, "search_shift": 1, "search_slope": self.events}
@@ -89,7 +88,7 @@ class Lanes:
     """The rows of the lanes side by side, in memory at `pointer`."""
 
     def __init__(self, w: Writer, layout: Layout, pointer: Value) -> None:
-        self.w, self.layout, self.pointer = w, layout, pointer
+        self.w, self.layout, self.pointer, self.rows = w, layout, pointer, layout.rows
 
     def __getitem__(self, name: str) -> Value:
         return self.every(name)[0]
@@ -99,11 +98,11 @@ class Lanes:
 
     def every(self, name: str) -> list[Value]:
         """The vectors of all rows of this name."""
-        return [self.w.load(self.pointer, row) for row in self.layout.rows[name]]
+        return [self.w.load(self.pointer, row) for row in self.rows[name]]
 
     def put(self, name: str, values: list[Value]) -> None:
         """Sets all rows of this name."""
-        for row, value in zip(self.layout.rows[name], values, strict=True):
+        for row, value in zip(self.rows[name], values, strict=True):
             self.w.store(value, self.pointer, row)
 
     def place(self, row, lane: Value) -> Value:
@@ -112,11 +111,11 @@ class Lanes:
 
     def of(self, name: str, lane: Value, type: str = "double") -> Value:
         """The number of one lane."""
-        return self.w.load(self.place(self.layout.rows[name].start, lane), type=type)
+        return self.w.load(self.place(self.rows[name].start, lane), type=type)
 
     def set(self, name: str, lane: Value, value) -> None:
         """Sets the number of one lane."""
-        self.w.store(self.w.literal(value, "double"), self.place(self.layout.rows[name].start, lane))
+        self.w.store(self.w.literal(value, "double"), self.place(self.rows[name].start, lane))
 
 
 def for_rows(w: Writer, rows: range, body: Callable[[int | Value], object]) -> None:

@@ -109,15 +109,19 @@ def cotangents(form: Form, method: Method, start: Start, asked: Sequence[bool], 
     return _state(form.layout, found[: form.layout.y]), [known.get(i) for i in range(len(asked))]
 
 
-def moved_by(args: tuple, form: Form, y: Integrated, t: Float[Array, ""], d: Float[Array, ""]) -> Integrated:
-    """The state at a time, as a function of a time d that is zero, by which it is moved along its rates (`times.py`)."""
-    others, fixed = _others(args[2]), len(form.program.fixed)
-    known = known_of(args)
-    values, slopes = zip(*(jax.jvp(others[i], (t,), (jnp.ones_like(t),)) for i in form.sampled), strict=True) if form.sampled else ((), ())
-    for i, value in zip(form.sampled, values, strict=True):
-        known[fixed + i] = value
-    z = jnp.concatenate([_packed(y), jnp.stack([jnp.asarray(x, real_type()) for x in (t, *known, *slopes)])])
-    return _state(form.layout, moved(form)(z, d)[: form.layout.y])
+def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integrated]:
+    """The state at a time t, as a function of it, of t, and of a time d that is zero, by which it is moved along its rates (`times.py`)."""
+    others, fixed, along_rates = _others(args[2]), len(form.program.fixed), moved(form)
+
+    def moved_by(y, t, d):
+        known = known_of(args)
+        values, slopes = zip(*(jax.jvp(others[i], (t,), (jnp.ones_like(t),)) for i in form.sampled), strict=True) if form.sampled else ((), ())
+        for i, value in zip(form.sampled, values, strict=True):
+            known[fixed + i] = value
+        z = jnp.concatenate([_packed(y), jnp.stack([jnp.asarray(x, real_type()) for x in (t, *known, *slopes)])])
+        return _state(form.layout, along_rates(z, d)[: form.layout.y])
+
+    return moved_by
 
 
 def start_of(setup: Setup, begun: Begun) -> Start:

@@ -130,13 +130,8 @@ def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
 def is_right(program: RowProgram, scene: Scene, t, q) -> Bool[Array, ""]:
     """Whether parameters are right, and the masses and inertias that they make; as `parameter_faults` and `body_faults`."""
     parts = [*entries(scene, program.parameters), jnp.asarray(t)[None], q]
-    return _kernel_of_right(program)(jax.lax.stop_gradient(jnp.concatenate([jnp.asarray(x, real_type()) for x in parts])))[0] > 0
-
-
-@lru_cache(maxsize=64)
-def _kernel_of_right(program: RowProgram):
-    given = [*(n for leaf in program.parameters for n in leaf if n >= 0), program.t, *program.q]
-    return nodes_called(program.graph, [program.right], given)
+    run = nodes_called(program.graph, [program.right], [*(n for leaf in program.parameters for n in leaf if n >= 0), program.t, *program.q])
+    return run(jax.lax.stop_gradient(jnp.concatenate([jnp.asarray(x, real_type()) for x in parts])))[0] > 0
 
 
 def _write_usual(program: Lowered, given: Sequence[int], w: Writer) -> None:

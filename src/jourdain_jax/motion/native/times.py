@@ -8,7 +8,7 @@ A start is moved by less than its time, t_0 = number - d, what is found by more.
 """
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,6 @@ from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
 
 
-@lru_cache(maxsize=64)
 def moved(form: Form) -> Callable[[Float[Array, "z"], Float[Array, ""]], Float[Array, "z"]]:
     """Return z itself as a function of z and of the time by which it is moved, which is zero.
 
