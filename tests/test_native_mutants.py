@@ -171,7 +171,7 @@ def a_bead_stays_on_its_circle():
 
 def a_start_is_put_onto_its_rows():
     scene = Round()
-    usual = put_on_rows._worked_out(scene, False, True)
+    usual = put_on_rows.usual_sizes(scene, False, True)
     assert usual.program is not None
     t, q, u = jnp.zeros(()), jnp.array([0.9, 0.7]), jnp.array([0.3, 1.1])
     q_near, _ = jax.jit(lambda q: put_on_rows.put_positions(scene, t, q, jnp.ones(2, bool), usual))(q)
@@ -307,8 +307,8 @@ MUTANTS = [
     Mutant("stages at the first time", step, "_stages", "w.fma(step, float(method.c[i]), t)", "t", FORM, "closed form|too many"),
     Mutant("a rejected step takes time", step, "taken", '"t": w.where(accept, aim.t_1, p["t"])', '"t": aim.t_1', FORM, "closed form"),
     Mutant("a rejected step is taken", step, "_take", "w.where(accept, w.load(y1, i), w.load(y, i))", "w.load(y1, i)", FORM, "closed"),
-    Mutant("a goal that stays", loop, "_save", "number * times + last)", "number * times + saved)", FORM, "closed form"),
-    Mutant("starts of another lane", loop, "_write_begin", "number * given + row), lanes", "0 * given + row), lanes", LANES, "lanes"),
+    Mutant("a goal that stays", loop, "_save", "number * times + last,", "number * times + saved,", FORM, "closed form"),
+    Mutant("starts of another lane", loop, "_write_begin", "number * given + row,", "0 * given + row,", LANES, "lanes"),
     Mutant("goals of another lane", loop, "_write_begin", "number * w.load", "0 * w.load", LANES, "lanes"),
     Mutant("states of another lane", loop, "_save", "(number * times + k)", "(0 * number + k)", LANES, "lanes"),
     Mutant("no bound of steps", step, "judged", ', p["longest"])', ", math.inf)", LONGEST, "the longest step"),

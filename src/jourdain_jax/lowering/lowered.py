@@ -184,7 +184,10 @@ class Lowered:
         return u, self.smallest_pivot(fixed, out[len(self.z) :])
 
     def smallest_pivot(self, fixed, values: Float[Array, "pivots *lanes"]) -> Float[Array, "*lanes"]:
-        """Return the smallest of the pivots, given their values, relative to its usual size; its sign is the product of theirs."""
+        """Return the smallest of the pivots, given their `values`, relative to its usual size; its sign is the product of theirs.
+
+        `fixed`: as in `rates`.
+        """
         pivot = jnp.ones(values.shape[1:], values.dtype)
         for value, size in zip(jax.lax.stop_gradient(values), self.pivot_sizes(fixed), strict=True):
             ratio = value / size

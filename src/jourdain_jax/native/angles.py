@@ -141,12 +141,12 @@ def _reduced_far(w: Writer, x: Value) -> tuple[Value, Value, Value]:
         0x6BFB5FB11F8D5D08,
         0x56033046FC7B6BAB,
     )
-    w.whole_numbers("two_over_pi", (0, *(word - 2**64 * (word >> 63) for word in bits)))
+    w.constants("two_over_pi", (0, *(word - 2**64 * (word >> 63) for word in bits)), "i64")
     w.once("far_angle", "void", dict.fromkeys(("x", "r", "over", "quadrant"), "ptr"), _write_far_angle)
     given, r, over, quadrant = w.room(), w.room(), w.room(), w.room(type=w.whole)
     w.store(x, given)
-    w.store(w.number(math.nan), r)
-    w.store(w.number(0.0), over)
+    w.store(math.nan, r)
+    w.store(0.0, over)
     w.store(w.literal(0, w.whole), quadrant)
     with w.counted(0, w.lanes) as lane:
         one = w.intrinsic("fabs", w.load(given, lane, "double"))
@@ -241,7 +241,7 @@ def _direction(w: Writer, across: Value, x: Value) -> Value:
     rest = w.fma(q * square, polynomial(w, ATAN, square), w.fma(over, square, -over))
     # the angle is n pi/4 and this arc, or less it
     back = w.converted("bitcast", x, w.whole) < 0
-    n = w.where(middle, 1.0, w.number(0.0))
+    n = w.where(middle, 1.0, 0.0)
     n = w.where(steep, 2.0 - n, n)
     n = w.where(back, 4.0 - n, n)
     way = w.where(w.bitwise("xor", steep, back), -1.0, w.number(1.0))
@@ -264,7 +264,7 @@ def arccosine(w: Writer, x: Value) -> Value:
     """acos x"""
     large, s, rest = _of_half(w, x)
     negative = x < 0.0
-    halves = w.where(large, w.where(negative, 1.0, w.number(0.0)), 0.5)
+    halves = w.where(large, w.where(negative, 1.0, 0.0), 0.5)
     return _arc(w, halves, w.where(large, 2.0, w.number(-1.0)) * w.where(negative, -1.0, w.number(1.0)), s, rest)
 
 

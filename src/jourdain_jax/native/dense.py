@@ -17,7 +17,7 @@ _EPS = sys.float_info.epsilon
 def _product_of_rows(w: Writer, a: Value, b: Value, count) -> Value:
     """The sum of products of so many numbers from two places on."""
     total = w.room()
-    w.store(w.number(0.0), total)
+    w.store(0.0, total)
     with w.counted(0, count) as k:
         w.store(w.fma(w.load(a, k), w.load(b, k), w.load(total)), total)
     return w.load(total)
@@ -26,7 +26,7 @@ def _product_of_rows(w: Writer, a: Value, b: Value, count) -> Value:
 def cleared(w: Writer, place: Value, count: int) -> None:
     """Zeros at so many places from one on."""
     with w.counted(0, count) as k:
-        w.store(w.number(0.0), place, k)
+        w.store(0.0, place, k)
 
 
 def write_rotated(w: Writer, rows: int, columns: int) -> None:
@@ -63,7 +63,7 @@ def write_inverted(w: Writer, rows: int, columns: int, cutoff: float) -> None:
     """`inverted(B, weights)`: after `rotated`, the weights S^-2 of the rows; zero for rows shorter than `cutoff` times the longest."""
     with w.procedure("inverted", "B weights") as (B, weights):
         longest, width = w.room(), rows + columns
-        w.store(w.number(0.0), longest)
+        w.store(0.0, longest)
         with w.counted(0, rows) as i:
             row = w.at(B, i * width)
             length = w.root(_product_of_rows(w, row, row, columns))
@@ -80,7 +80,7 @@ def write_solved(w: Writer, rows: int, columns: int) -> None:
     width = rows + columns
     with w.procedure("solved", "B weights b x") as (B, weights, b, x):
         with w.counted(0, columns) as k:
-            w.store(w.number(0.0), x, k)
+            w.store(0.0, x, k)
         with w.counted(0, rows) as i:
             row = w.at(B, i * width)
             share = w.load(weights, i) * _product_of_rows(w, w.at(row, columns), b, rows)
@@ -92,8 +92,8 @@ def write_cholesky(w: Writer, n: int) -> None:
     """`cholesky(M)`: L in place of the lower triangle of M; the identity where M is not positive definite to round-off, NaN where it is not finite."""
     with w.procedure("cholesky", "M") as (M,):
         finite, smallest = w.room(), w.room()
-        w.store(w.number(0.0), finite)  # stays zero where all entries are finite
-        w.store(w.number(1.0), smallest)
+        w.store(0.0, finite)  # stays zero where all entries are finite
+        w.store(1.0, smallest)
         with w.counted(0, n) as i, w.counted(0, n) as j:
             w.store(w.fma(w.load(M, i * n + j), 0.0, w.load(finite)), finite)
         with w.counted(0, n) as i:

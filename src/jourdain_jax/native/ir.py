@@ -122,12 +122,9 @@ class Writer:
 
     @contextmanager
     def procedure(self, name: str, arguments: str) -> Iterator[list[Value]]:
-        """A function that returns nothing; `arguments`: names of pointers, and `name:type` of others.
-
-        Of these, `real` is one number per lane, `noalias` a pointer to what no other one points to.
-        """
-        pairs = (argument.partition(":")[::2] for argument in arguments.split())
-        types = {n: {"": "ptr", "real": self.real, "noalias": "ptr noalias"}.get(type, type) for n, type in pairs}
+        """A function that returns nothing; `arguments`: names of pointers, and `name:type` of others, `real` for one number per lane."""
+        known, pairs = {"": "ptr", "real": self.real, "noalias": "ptr noalias"}, (argument.partition(":") for argument in arguments.split())
+        types = {n: known.get(type, type) for n, _, type in pairs}
         with self.function(name, "void", types, attributes="noinline") as given:
             yield given
             self.give()
@@ -233,20 +230,19 @@ class Writer:
         return self.instruction(a.type, f"select {condition.type} {condition.name}, {a.type} {a.name}, {b.type} {b.name}")
 
     def call(self, function: str, result: str, *arguments: Value) -> Value:
-        """The result of a function; of `void` none is to be used."""
-        text = f"call {result} @{function}({', '.join(f'{a.type} {a.name}' for a in arguments)})"
-        if result == "void":
-            self._lines.append(f"  {text}")
-            return Value(self, "void", "")
-        return self.instruction(result, text)
+        """The result of a function."""
+        return self.instruction(result, f"call {result} @{function}({', '.join(f'{a.type} {a.name}' for a in arguments)})")
 
     def run(self, function: str, *arguments: Value) -> None:
         """Calls a function that returns nothing."""
-        self.call(function, "void", *arguments)
+        self._lines.append(f"  call void @{function}({', '.join(f'{a.type} {a.name}' for a in arguments)})")
 
     def external(self, function: str, result: str, *arguments: Value) -> Value:
         """As `call`, of a function from outside the module."""
         self._declared[function] = f"declare {result} @{function}({', '.join(a.type for a in arguments)})"
+        if result == "void":
+            self.run(function, *arguments)
+            return Value(self, "void", "")
         return self.call(function, result, *arguments)
 
     def declare(self, name: str, text: str) -> None:
@@ -327,16 +323,10 @@ class Writer:
 
     # memory
 
-    def constants(self, name: str, numbers: Iterable[float]) -> Value:
+    def constants(self, name: str, numbers: Iterable, type: str = "double") -> Value:
         """Numbers that stand in the module."""
-        texts = [f"double {self.literal(x, 'double').name}" for x in numbers]
-        self._declared[name] = f"@{name} = internal constant [{len(texts)} x double] [{', '.join(texts)}]"
-        return Value(self, "ptr", f"@{name}")
-
-    def whole_numbers(self, name: str, numbers: Iterable[int]) -> Value:
-        """Whole numbers that stand in the module."""
-        texts = [f"i64 {int(x)}" for x in numbers]
-        self._declared[name] = f"@{name} = internal constant [{len(texts)} x i64] [{', '.join(texts)}]"
+        texts = [f"{type} {self.literal(x, type).name}" for x in numbers]
+        self._declared[name] = f"@{name} = internal constant [{len(texts)} x {type}] [{', '.join(texts)}]"
         return Value(self, "ptr", f"@{name}")
 
     def room(self, count: int = 1, type: str = "") -> Value:
@@ -376,8 +366,9 @@ class Writer:
         """A whole number in memory, which becomes one more, also where several threads ask."""
         return self.instruction("i64", f"atomicrmw add ptr {self.at(pointer, index, 'i64').name}, i64 1 monotonic")
 
-    def store(self, value: Value, pointer: Value, index=0) -> Value:
-        """Puts a value into memory; the value, as one that is there."""
+    def store(self, value, pointer: Value, index=0) -> Value:
+        """Puts a value, or a number in all lanes, into memory; the value, as one that is there."""
+        value = self.literal(value, self.real)
         place = self.at(pointer, index, value.type).name
         self._lines.append(f"  store {value.type} {value.name}, ptr {place}")
         return replace(value, place=place)

@@ -33,8 +33,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.integrators import crossings, event_search
-from jourdain_jax.motion.integrators.crossings import Crossings
-from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING, OnArrays, Search
+from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING, OnArrays
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod, Solution, even_step
 from jourdain_jax.motion.integrators.problem import Problem, as_in
 from jourdain_jax.motion.integrators.tableaus import TSIT5, Method
@@ -56,10 +55,10 @@ class Progress(eqx.Module):
     accepted: Int[Array, "*lanes"]
     rejected: Int[Array, "*lanes"]
     event: Int[Array, "*lanes"]  # index of the event that ended the motion, or -1
-    search: Search | None  # for that event
+    search: Any  # `event_search.Search` for that event; None where there are none
     pivot: Float[Array, "*lanes"]  # smallest magnitude so far of a pivot, at any stage of an accepted step
     rest: PyTree  # what rounding has left off `y`, to be added by the next step; None where that cannot add up to much
-    crossings: Crossings | None  # of relations, where there are any
+    crossings: Any  # `crossings.Crossings` of relations; None where there are none
 
 
 def begun(problem: Problem, y0: PyTree, t0: Float[Array, "*lanes"], dt0, direction) -> Progress:
@@ -107,7 +106,7 @@ class Aim(NamedTuple):
 
 def aimed(w, p, target, reach, shift=None) -> Aim:
     """Return the step to the `target`, half of the way there, or as far as `reach`; `shift`: of a search for an event, where there may be one."""
-    locating, rest = w.equal(p["code"], float(LOCATING)), w.magnitude(target - p["t"])
+    locating, rest = w.equal(p["code"], LOCATING), w.magnitude(target - p["t"])
     lands = ~locating & (reach >= 0.999 * rest)
     size = w.where(lands, rest, w.where(2.0 * reach > rest, 0.5 * rest, reach))
     h = p["direction"] * size if shift is None else w.where(locating, shift, p["direction"] * size)
@@ -130,8 +129,8 @@ def taken(w, p, aim: Aim, accept, next_h) -> dict[str, Any]:
     rejected = p["rejected"] + w.where(accept, 0.0, 1.0)
     too_short = (next_h < p["shortest"]) | w.equal(aim.t_1 + p["direction"] * next_h, aim.t_1)  # the second: no time would pass
     arrived = accept & w.equal(aim.t_1, p["last_goal"])
-    code = w.where((accepted + rejected >= p["max_steps"]) & ~arrived, float(results.MAX_STEPS), float(RUNNING))
-    code = w.where(too_short, float(results.STEP_TOO_SMALL), code)
+    code = w.where((accepted + rejected >= p["max_steps"]) & ~arrived, results.MAX_STEPS, RUNNING)
+    code = w.where(too_short, results.STEP_TOO_SMALL, code)
     return {"t": w.where(accept, aim.t_1, p["t"]), "h": next_h, "code": code, "accepted": accepted, "rejected": rejected}
 
 

@@ -70,7 +70,7 @@ def chosen(w, index, values: Values):
     """Return the value with this index, of the first one where there is none."""
     found = values[0]
     for i in range(1, len(values)):
-        found = w.where(w.equal(index, float(i)), values[i], found)
+        found = w.where(w.equal(index, i), values[i], found)
     return found
 
 
@@ -101,7 +101,7 @@ def first_event(w, before: Values, after: Values):
         share = b / (b - a)
         share = w.where(a > 0.0, math.inf, w.where(w.magnitude(share) < math.inf, share, 1.0))
         if best is not None:
-            first = w.where(share < best, float(i), first)
+            first = w.where(share < best, i, first)
         best = share if best is None else w.where(share < best, share, best)
     return first
 
@@ -231,7 +231,7 @@ def decided(w, p, new: Mapping, h, known: tuple, accept, sound, following: tuple
     is one; a state that is lost is no event. `following`: the search so far, and (which lanes begin one, which have one) -> the search, and its event.
     """
     (c_0, rate_0, c_1, rate_1), (search, advance) = known, following
-    locating = w.equal(p["code"], float(LOCATING))
+    locating = w.equal(p["code"], LOCATING)
     fresh = w.equal(p["accepted"] + p["rejected"], 0.0) & sound
     share = lowest(w, h, c_0, rate_0, c_1, rate_1)
     sunk, sinks = at_start(w, c_0, rate_0, c_1, p["direction"], p["last_goal"])
@@ -246,13 +246,13 @@ def decided(w, p, new: Mapping, h, known: tuple, accept, sound, following: tuple
     stays, undone = back | dips | over, dips | over
     which = float(len(c_0) - 1)
     for i in reversed(range(len(c_0) - 1)):
-        which = w.where(sunk[i] | sinks[i], float(i), which)
-    code = w.where(happened, float(LOCATING), w.where(found, float(results.EVENT), w.where(locating, float(LOCATING), new["code"])))
+        which = w.where(sunk[i] | sinks[i], i, which)
+    code = w.where(happened, LOCATING, w.where(found, results.EVENT, w.where(locating, LOCATING, new["code"])))
     tried = w.where(dips, 1.0, 0.0)
     after = {
         "t": w.where(found, new["t"] + search.shift, w.where(stays, p["t"], new["t"])),
         "h": w.where(over, p["h"], w.where(dips, share * w.magnitude(h), w.where(locating, p["h"], new["h"]))),
-        "code": w.where(over, float(results.EVENT), code),
+        "code": w.where(over, results.EVENT, code),
         "accepted": w.where(over, p["accepted"], new["accepted"] - tried),
         "rejected": w.where(over, p["rejected"], new["rejected"] + tried),
         "event": w.where(over, which, w.where(happened | (locating & was_trying), first, p["event"])),
@@ -266,8 +266,8 @@ def decided(w, p, new: Mapping, h, known: tuple, accept, sound, following: tuple
 def none(t: Float[Array, "*lanes"], values: Float[Array, "events *lanes"]) -> Search:
     """Return a search for nothing."""
     t, c = jax.lax.stop_gradient((t, values))
-    bracket = jnp.stack([t, t, jnp.full_like(t, jnp.inf)]), jnp.stack([c, c, jnp.full_like(c, jnp.nan)])
-    return Search(*bracket, *[jnp.zeros_like(t)] * 3, jnp.zeros_like(c))
+    times, values, zero = jnp.stack([t, t, jnp.full_like(t, jnp.inf)]), jnp.stack([c, c, jnp.full_like(c, jnp.nan)]), jnp.zeros_like(t)
+    return Search(times, values, zero, zero, zero, jnp.zeros_like(c))
 
 
 def advanced_arrays(w: OnArrays, old: Search, begins: Bool[Array, "*lanes"], start: tuple, end: tuple) -> tuple[Search, Array]:

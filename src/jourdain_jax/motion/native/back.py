@@ -21,7 +21,7 @@ from jourdain_jax.motion.integrators.erk_step import Method
 from jourdain_jax.motion.integrators.event_search import RUNNING, chosen
 from jourdain_jax.motion.native import samples
 from jourdain_jax.motion.native.functions import Form
-from jourdain_jax.motion.native.layout import Lanes, each_row
+from jourdain_jax.motion.native.layout import Lanes, copied, each_row
 from jourdain_jax.motion.native.loop import COUNT, FIRST_OF_SAMPLES, TIMES, write_functions, write_job
 from jourdain_jax.motion.native.pulled import write_pulled
 from jourdain_jax.motion.native.record import GOALS, STARTS, TO_ENDS, TO_STATES, Slot, prepare, write_record
@@ -75,10 +75,10 @@ def _write_note(w: Writer, form: Form) -> None:
     """`note(job, state, who, saved)`: counts the times that were reached, sets the next one, and ends lanes that have reached all."""
     with w.procedure("note", "job state who saved") as (job, state, who, saved):
         lanes = Lanes(w, form.layout, state)
-        with w.when(w.any(lanes["code"].equals(float(RUNNING)) & lanes["t"].equals(lanes["goal"]))), w.counted(0, w.lanes) as lane:
+        with w.when(w.any(lanes["code"].equals(RUNNING) & lanes["t"].equals(lanes["goal"]))), w.counted(0, w.lanes) as lane:
             times, number = w.load(job, TIMES, "i64"), w.load(who, lane, "i64")
             with w.repeated() as leave:
-                leave(~(lanes.of("code", lane).equals(float(RUNNING)) & lanes.of("t", lane).equals(lanes.of("goal", lane))))
+                leave(~(lanes.of("code", lane).equals(RUNNING) & lanes.of("t", lane).equals(lanes.of("goal", lane))))
                 before, goals = w.converted("fptosi", w.load(saved, lane, "double"), "i64"), w.load(job, GOALS, "ptr")
                 if form.sampled:
                     at_knot = lanes.of("t", lane).differs(w.load(goals, number * times + before, "double"))
@@ -89,7 +89,7 @@ def _write_note(w: Writer, form: Form) -> None:
                     reached = before + 1
                 w.store(w.converted("sitofp", reached, "double"), w.at(saved, lane, "double"))
                 with w.when(reached >= times):
-                    lanes.set("code", lane, float(results.SUCCESS))
+                    lanes.set("code", lane, results.SUCCESS)
                 with w.when(reached < times):
                     goal = w.load(goals, number * times + reached, "double")
                     lanes.set("goal", lane, samples.nearer(w, lanes, lane, goal) if form.sampled else goal)
@@ -115,15 +115,15 @@ def _write_added(w: Writer, form: Form) -> None:
 def _write_step_back(w: Writer, form: Form, method: Method, asked: int) -> None:
     """`step_back(state, here, g, by_known)`: back over the step in the slot `here`, in lanes that went on in it."""
     layout, slot = form.layout, Slot.of(form, method)
-    rows, count = range(layout.integrated), layout.integrated
+    count = layout.integrated
     with w.procedure("step_back", "state here g by_known") as (state, here, g, by_known):
         h, t = w.load(here, slot.taken), w.load(here, slot.t)
         took, k = h.differs(0.0), w.at(here, slot.y)
         g1, v, at, G, added = (w.room(n) for n in (count, count, count, count * method.needed, max(asked, 1)))
-        each_row(w, rows, g1, lambda i: w.load(g, i))
-        each_row(w, range(asked), added, lambda i: w.number(0.0))
+        copied(w, count, g, g1)
+        each_row(w, asked, added, lambda i: 0.0)
         if form.projects:
-            each_row(w, rows, at, lambda i: w.fma(h, weighted(w, method.b, k, layout, i), w.load(here, i)))
+            each_row(w, count, at, lambda i: w.fma(h, weighted(w, method.b, k, layout, i), w.load(here, i)))
             _project_back(w, form, state, t + h, at, g1, added)
 
         def state_at(stage: int, i: int | Value) -> Value:
@@ -147,14 +147,14 @@ def _write_step_back(w: Writer, form: Form, method: Method, asked: int) -> None:
             if method.b[stage] == 0 and not later:
                 continue
             of_stage, time = w.at(G, stage * count), w.fma(h, float(method.c[stage]), t)
-            each_row(w, rows, at, partial(state_at, stage))
-            each_row(w, rows, v, partial(cotangent, stage, later))
+            each_row(w, count, at, partial(state_at, stage))
+            each_row(w, count, v, partial(cotangent, stage, later))
             if near is not None and stage:
                 put_near_rows(w, layout, state, near, time, at)
             w.run("pull_rates", state, time, at, v, of_stage, added)
             if near is not None and stage:
                 with w.when(w.any(near)):
-                    each_row(w, rows, at, partial(state_at, stage))
+                    each_row(w, count, at, partial(state_at, stage))
                     _project_back_where(w, form, near, (state, time, at), of_stage, added, asked)
             used.append(stage)
 
@@ -164,32 +164,33 @@ def _write_step_back(w: Writer, form: Form, method: Method, asked: int) -> None:
                 found = found + w.load(G, stage * count + i)
             return w.where(took, found, w.load(g, i))
 
-        each_row(w, rows, g, total)
-        each_row(w, range(asked), by_known, lambda i: w.load(by_known, i) + w.where(took, w.load(added, i), 0.0))
+        each_row(w, count, g, total)
+        each_row(w, asked, by_known, lambda i: w.load(by_known, i) + w.where(took, w.load(added, i), 0.0))
 
 
 def _project_back_where(w: Writer, form: Form, near: Value, at: tuple[Value, Value, Value], g: Value, added: Value, asked: int) -> None:
     """Cotangents `g` of a stage's state, put back onto the rows in lanes that are `near` a loss of rank; `at`: lanes, time, and the state before."""
-    rows, pulled, more = range(form.layout.integrated), w.room(form.layout.integrated), w.room(max(asked, 1))
-    each_row(w, rows, pulled, lambda i: w.load(g, i))
-    each_row(w, range(asked), more, lambda i: w.load(added, i))
+    count = form.layout.integrated
+    pulled, more = w.room(count), w.room(max(asked, 1))
+    copied(w, count, g, pulled)
+    copied(w, asked, added, more)
     _project_back(w, form, *at, pulled, more)
-    each_row(w, rows, g, lambda i: w.where(near, w.load(pulled, i), w.load(g, i)))
-    each_row(w, range(asked), added, lambda i: w.where(near, w.load(more, i), w.load(added, i)))
+    copied(w, count, pulled, g, near)
+    copied(w, asked, more, added, near)
 
 
 def _project_back(w: Writer, form: Form, state: Value, t1: Value, free: Value, g: Value, added: Value) -> None:
     """Cotangents `g` of a state put back onto the rows become those of the state `free` before."""
     moves = form.moves
-    rows, count = range(form.layout.integrated), form.layout.integrated
+    count = form.layout.integrated
     before = w.room(count * len(moves))
     for number, q_moves in enumerate(moves):
-        each_row(w, rows, w.at(before, number * count), lambda i: w.load(free, i))
+        copied(w, count, free, w.at(before, number * count))
         w.run("projected_once", state, t1, free, w.literal(q_moves, "i1"))
     out = w.room(count)
     for number, q_moves in reversed(list(enumerate(moves))):
         w.run("pull_q" if q_moves else "pull_u", state, t1, w.at(before, number * count), g, out, added)
-        each_row(w, rows, g, lambda i: w.load(out, i))
+        copied(w, count, out, g)
 
 
 def _write_event_back(w: Writer, form: Form, asked: int) -> None:
@@ -197,7 +198,7 @@ def _write_event_back(w: Writer, form: Form, asked: int) -> None:
     layout, count = form.layout, form.layout.integrated
     with w.procedure("event_back", "job state who g by_known") as (job, state, who, g, by_known):
         lanes = Lanes(w, layout, state)
-        located = lanes["code"].equals(float(results.EVENT)) & (lanes["accepted"] > 0.0)
+        located = lanes["code"].equals(results.EVENT) & (lanes["accepted"] > 0.0)
         with w.when(w.any(located)):
             f, out, pivots, added = (w.room(max(n, 1)) for n in (count, count, len(form.monitored), asked + 1))
             values, rates, weights = (w.room(layout.events) for _ in range(3))
@@ -209,13 +210,13 @@ def _write_event_back(w: Writer, form: Form, asked: int) -> None:
             w.run("rates", state, t, state, f, pivots)
             if form.moving:  # the tangent, and its rates, at a number for a time
                 dy, dt = w.at(state, layout.y), lanes["dt"]
-                each_row(w, range(layout.y), dy, lambda i: w.load(dy, i) - w.where(dt.differs(0.0), dt * w.load(f, i), 0.0))
+                each_row(w, layout.y, dy, lambda i: w.load(dy, i) - w.where(dt.differs(0.0), dt * w.load(f, i), 0.0))
                 lanes["dt"] = w.number(0.0)
                 w.run("rates", state, t, state, f, pivots)
             w.run("events", state, t, state, f, values, rates)
             rate = chosen(w, lanes["event"], [w.load(rates, i) for i in range(layout.events)])
             usable = located & rate.differs(0.0) & (w.magnitude(rate) < math.inf)
-            each_row(w, range(asked + 1), added, lambda i: w.number(0.0))
+            each_row(w, asked + 1, added, lambda i: 0.0)
             total = w.load(g_t)
             if form.moving:
                 total = total + _moved_back(w, form, lanes, usable, (g, w.load(g_t, 1)), (out, added), asked)
@@ -225,19 +226,19 @@ def _write_event_back(w: Writer, form: Form, asked: int) -> None:
             by_value = w.where(flat, math.nan, w.where(usable, -total / rate, 0.0))
             usable = usable | flat
             for i in range(layout.events):
-                w.store(w.where(lanes["event"].equals(float(i)), by_value, 0.0), weights, i)
+                w.store(w.where(lanes["event"].equals(i), by_value, 0.0), weights, i)
             w.run("pull_events", state, t, state, weights, out, added)
-            each_row(w, range(count), g, lambda i: w.load(g, i) + w.where(usable, w.load(out, i), 0.0))
-            each_row(w, range(asked), by_known, lambda i: w.load(by_known, i) + w.where(usable, w.load(added, i), 0.0))
+            each_row(w, count, g, lambda i: w.load(g, i) + w.where(usable, w.load(out, i), 0.0))
+            each_row(w, asked, by_known, lambda i: w.load(by_known, i) + w.where(usable, w.load(added, i), 0.0))
 
 
 def _moved_back(w: Writer, form: Form, lanes: Lanes, usable: Value, cotangents: tuple[Value, Value], rooms: tuple[Value, Value], asked: int) -> Value:
     """The derivative along time of what an event adds to a tangent; changes the cotangents `g` of the state, the first of these, and adds to the others."""
     (g, g_dt), (out, added), layout = cotangents, rooms, form.layout
     given, count = w.room(layout.integrated + 2), layout.integrated
-    each_row(w, range(count), given, lambda i: w.load(g, i))
+    copied(w, count, g, given)
     w.store(g_dt, given, count)
     w.store(lanes["event"], given, count + 1)
     w.run("pull_moved", lanes.pointer, lanes["t"], lanes.pointer, given, out, added)
-    each_row(w, range(count), g, lambda i: w.load(given, i) + w.where(usable, w.load(out, i), 0.0))
+    each_row(w, count, g, lambda i: w.load(given, i) + w.where(usable, w.load(out, i), 0.0))
     return w.load(added, asked)

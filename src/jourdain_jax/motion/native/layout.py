@@ -129,14 +129,19 @@ def for_rows(w: Writer, rows: range, body: Callable[[int | Value], object]) -> N
             body(i)
 
 
-def each_row(w: Writer, rows: range, into: Value, value: Callable[[int | Value], Value]) -> None:
-    """Sets rows of a state in memory."""
-    for_rows(w, rows, lambda i: w.store(value(i), into, i))
+def each_row(w: Writer, rows: range | int, into: Value, value: Callable[[int | Value], Value | float]) -> None:
+    """Sets rows of a state in memory, so many of them, or these."""
+    for_rows(w, range(rows) if isinstance(rows, int) else rows, lambda i: w.store(value(i), into, i))
+
+
+def copied(w: Writer, rows: int, source: Value, into: Value, where: Value | None = None) -> None:
+    """Sets so many rows to those from another place, in lanes `where` this holds."""
+    each_row(w, rows, into, lambda i: w.load(source, i) if where is None else w.where(where, w.load(source, i), w.load(into, i)))
 
 
 def over_rows(w: Writer, rows: range, start: float, added: Callable[[Value, int | Value], Value]) -> Value:
     """What `added(total, i)` makes of all rows one after the other."""
     total = w.room()
-    w.store(w.number(start), total)
+    w.store(start, total)
     for_rows(w, rows, lambda i: w.store(added(w.load(total), i), total))
     return w.load(total)

@@ -81,7 +81,7 @@ def _write_lanes(w: Writer, form: Form, method: Method | TaylorSteps, job: Value
     state, who, k = w.room(form.layout.all), w.room(2 * w.lanes + 1, "i64"), w.room(form.layout.integrated * method.needed)
     w.store(w.literal(w.lanes, "i64"), who, 2 * w.lanes)
     with w.counted(0, form.layout.all) as row:
-        w.store(w.number(1.0), state, row)
+        w.store(1.0, state, row)
     lanes = Lanes(w, form.layout, state)
     with w.counted(0, w.lanes) as lane:
         w.run("begin", job, state, who, lane)
@@ -92,7 +92,7 @@ def _write_lanes(w: Writer, form: Form, method: Method | TaylorSteps, job: Value
         if isinstance(method, TaylorSteps):
             w.run("save_within", job, state, who, k)
         code = lanes["code"]
-        on_its_way = (code.equals(float(RUNNING)) & lanes["t"].differs(lanes["goal"])) | code.equals(float(LOCATING)) | code.equals(IDLE)
+        on_its_way = (code.equals(RUNNING) & lanes["t"].differs(lanes["goal"])) | code.equals(LOCATING) | code.equals(IDLE)
         with w.when(w.any(~on_its_way)), w.counted(0, w.lanes) as lane:
             w.run("serve", job, state, who, lane)
 
@@ -130,8 +130,8 @@ def _write_serve(w: Writer, form: Form) -> None:
         lanes = Lanes(w, form.layout, state)
         with w.repeated() as leave:
             code, t, goal = (lanes.of(name, lane) for name in ("code", "t", "goal"))
-            runs = code.equals(float(RUNNING))
-            leave(code.equals(IDLE) | code.equals(float(LOCATING)) | (runs & t.differs(goal)))
+            runs = code.equals(RUNNING)
+            leave(code.equals(IDLE) | code.equals(LOCATING) | (runs & t.differs(goal)))
             if form.sampled:
                 place = w.load(who, lane, "i64") * w.load(job, TIMES, "i64") + w.load(who, lane + w.lanes, "i64")
                 next_time = w.load(w.load(job, _GOALS, "ptr"), place, "double")
@@ -163,7 +163,7 @@ def _write_save_within(w: Writer, form: Form, method: TaylorSteps) -> None:
                 w.store(total, y, row)
             if form.projects:
                 w.run("project", state, goal, y)
-            w.store(w.where(due, 1.0, w.number(0.0)), flags)
+            w.store(w.where(due, 1.0, 0.0), flags)
             with w.counted(0, w.lanes) as lane, w.when(w.load(flags, lane, "double") > 0.0):
                 saved = w.load(who, lane + w.lanes, "i64")
                 place = w.load(who, lane, "i64") * times + saved

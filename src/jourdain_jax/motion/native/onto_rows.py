@@ -143,7 +143,7 @@ def _write_factored(w: Writer, of: Rows) -> None:
                 w.store(w.where(w.load(state, k + first_free) > 0.0, slope, 0.0), row, k)
             if of.metric is not None:
                 w.run("forward", L, row)
-            w.store(w.number(0.0), square)
+            w.store(0.0, square)
             with w.counted(0, columns) as k:
                 slope = w.load(row, k)
                 w.store(w.fma(slope, slope, w.load(square)), square)
@@ -153,7 +153,7 @@ def _write_factored(w: Writer, of: Rows) -> None:
             w.store(scale, d, i)
             with w.counted(0, columns) as k:
                 w.store(w.load(row, k) * scale, row, k)
-            w.store(w.number(1.0), row, i + columns)
+            w.store(1.0, row, i + columns)
         w.run("rotated", B)
         w.run("inverted", B, weights)
 
@@ -208,13 +208,13 @@ def _write_iteration(w: Writer, of: Rows, first: int, places: tuple[Value, ...])
     """Steps until they change nothing, as those of `calculus/fixed_point.py`."""
     state, *factors, x = places
     columns, quiet, changed = len(of.moving), w.room(), w.room()
-    w.store(w.number(0.0), quiet)
+    w.store(0.0, quiet)
     with w.counted(0, MOST_MOVES_OF_POSITIONS if of.kind == "positions" else MOST_MOVES_OF_SPEEDS):
         going = w.load(quiet) < float(QUIET)
         with w.when(w.any(going)):
             w.run("factored", state, *factors)
             w.run("moved", state, *factors, x)
-            w.store(w.number(-math.inf), changed)
+            w.store(-math.inf, changed)
             with w.counted(0, columns) as k:
                 old, new = w.load(state, k + first), w.load(x, k)
                 beyond = w.magnitude(new - old) > (w.magnitude(old) + 1.0) * (ROUND_OFF * _EPS)

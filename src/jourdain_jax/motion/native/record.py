@@ -11,7 +11,7 @@ from typing import NamedTuple
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.native.functions import Form
-from jourdain_jax.motion.native.layout import Lanes, each_row, for_rows
+from jourdain_jax.motion.native.layout import Lanes, copied, each_row, for_rows
 from jourdain_jax.motion.native.loop import COUNT, FIRST_ARRAY, NEXT, OWN, TIMES
 from jourdain_jax.native.ffi import FIRST_OF_SCRATCH
 from jourdain_jax.native.ir import Value, Writer
@@ -114,7 +114,7 @@ def _write_blocks(w: Writer, form: Form, method: Method, asked: int, job: Value)
         _write_start(w, form, job, rooms)
         with w.repeated() as ended:
             code, number = lanes["code"], w.load(count, type="i64")
-            ended(~w.any(code.equals(float(RUNNING)) | code.equals(float(LOCATING))))
+            ended(~w.any(code.equals(RUNNING) | code.equals(LOCATING)))
             with w.when((number + 1) * size > w.load(bytes_there, type="i64")):
                 w.store(w.call("more_room", "ptr", w.load(record, type="ptr"), w.load(bytes_there, type="i64")), record)
                 w.store(w.load(bytes_there, type="i64") * 2, bytes_there)
@@ -150,7 +150,7 @@ def _write_windows(w: Writer, form: Form, method: Method, asked: int, job: Value
             _write_start(w, form, job, rooms)
             with w.repeated() as ended:
                 code, number = lanes["code"], w.load(count, type="i64")
-                on_its_way = w.any(code.equals(float(RUNNING)) | code.equals(float(LOCATING)))
+                on_its_way = w.any(code.equals(RUNNING) | code.equals(LOCATING))
                 ended(~w.together(on_its_way & (number < w.load(end, type="i64"))))
                 _write_try(w, form, slot, job, rooms, here)
                 for_rows(w, range(slot.all), lambda row, number=number: w.store(w.load(here, row), place(number, row)))
@@ -177,10 +177,10 @@ def _take(w: Writer, job: Value, who: Value) -> None:
 def _write_start(w: Writer, form: Form, job: Value, rooms: "_Rooms") -> None:
     """All lanes at their starts."""
     with w.counted(0, form.layout.all) as row:
-        w.store(w.number(1.0), rooms.state, row)
+        w.store(1.0, rooms.state, row)
     with w.counted(0, w.lanes) as lane:
         w.run("begin", job, rooms.state, rooms.who, lane)
-    w.store(w.number(0.0), rooms.saved)
+    w.store(0.0, rooms.saved)
     w.run("note", job, rooms.state, rooms.who, rooms.saved)
     w.store(w.literal(0, "i64"), rooms.tries)
 
@@ -188,7 +188,7 @@ def _write_start(w: Writer, form: Form, job: Value, rooms: "_Rooms") -> None:
 def _write_try(w: Writer, form: Form, slot: Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
     """A step that is tried, and its slot `here`."""
     lanes = Lanes(w, form.layout, rooms.state)
-    each_row(w, range(form.layout.integrated), here, lambda i: w.load(rooms.state, i))
+    copied(w, form.layout.integrated, rooms.state, here)
     w.store(lanes["t"], here, slot.t)
     w.store(w.load(rooms.saved), here, slot.saved)
     w.run("step", rooms.state, w.at(here, slot.y))
@@ -200,7 +200,7 @@ def _write_try(w: Writer, form: Form, slot: Slot, job: Value, rooms: "_Rooms", h
 def _write_ends(w: Writer, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
     """Cotangents of the states at the end of a block."""
     g, layout = rooms.g, form.layout
-    each_row(w, range(asked), rooms.by_known, lambda i: w.number(0.0))
+    each_row(w, asked, rooms.by_known, lambda i: 0.0)
     ends, per_end = w.load(job, TO_ENDS, "ptr"), layout.ends
     with w.counted(0, w.lanes) as lane:
         number = w.load(rooms.who, lane, "i64")

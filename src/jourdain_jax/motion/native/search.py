@@ -53,7 +53,7 @@ def monitored(w: Writer, form: Form, p: Lanes, k: tuple[Value, Value], y1: Value
         after = w.load(y1, i)
         return w.where(found.stays, w.load(y, i), w.where(found.found, w.fma(found.search.shift, w.load(k[0], i), after), after))
 
-    each_row(w, range(layout.integrated), y1, state)
+    each_row(w, layout.integrated, y1, state)
     if form.moving:
         _put_tangents(w, form, p, k[0], found.found, new["t"], rate_0, y1)
     return new | found.new | {"taken": w.where(found.stays, 0.0, new["taken"])}

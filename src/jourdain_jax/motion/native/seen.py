@@ -143,14 +143,14 @@ def _write_usual(program: Lowered, given: Sequence[int], w: Writer) -> None:
     with w.procedure("row", "state found") as (state, found):
         totals = w.room(2 * len(nodes))  # of logarithms, and of how many these are
         for k in range(2 * len(nodes)):
-            w.store(w.number(0.0), totals, k)
+            w.store(0.0, totals, k)
         known = {n: w.load(state, k) for k, n in enumerate(given)}
         with w.counted(0, probes) as p:
             at = {n: w.spread(w.load(table, p * len(states) + k, "double")) for k, n in enumerate(states)}
             for k, value in enumerate(written(w, program.graph, nodes, known | at)):
                 size = w.magnitude(as_real(w, value))
                 counts = (size > 0.0) & (size < math.inf)
-                more = log(w, w.where(counts, size, w.number(1.0))), w.where(counts, 1.0, w.number(0.0))
+                more = log(w, w.where(counts, size, w.number(1.0))), w.where(counts, 1.0, 0.0)
                 for place, x in zip((2 * k, 2 * k + 1), more, strict=True):
                     w.store(w.load(totals, place) + x, totals, place)
         for k in range(len(nodes)):

@@ -13,7 +13,7 @@ from jourdain_jax.motion.integrators.erk_step import AMPLIFIED, NEAR_SINE, NOISE
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING, any_of
 from jourdain_jax.motion.native import crossings, search
 from jourdain_jax.motion.native.functions import Form
-from jourdain_jax.motion.native.layout import Lanes, Layout, each_row, over_rows
+from jourdain_jax.motion.native.layout import Lanes, Layout, copied, each_row, over_rows
 from jourdain_jax.motion.native.taylor import TaylorSteps, at_time, jet, monitored_at, radius, slope
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native.exponentials import power
@@ -51,8 +51,8 @@ def _tried_by_stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value) 
     t1, step = aim.t_1, aim.h
     smallest, changed_sign, rank = _stages(w, form, method, p, k, p["t"], step)
     y1, error = w.room(layout.integrated), w.room(layout.y)
-    each_row(w, range(layout.integrated), y1, lambda i: w.fma(step, weighted(w, method.b, k, layout, i), w.load(y, i)))
-    each_row(w, range(layout.y), error, lambda i: step * weighted(w, method.b_error, k, layout, i))
+    each_row(w, layout.integrated, y1, lambda i: w.fma(step, weighted(w, method.b, k, layout, i), w.load(y, i)))
+    each_row(w, layout.y, error, lambda i: step * weighted(w, method.b_error, k, layout, i))
     if form.projects:
         _project(w, layout, p, t1, y1, error, rank)
     size_of_error = _norm(w, layout, p, error, y1)
@@ -71,7 +71,7 @@ def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Va
     """A step by Taylor series, which goes over the times to save at; puts the coefficients into `k`, and after them the slope at the end of the step."""
     layout, count = form.layout, form.layout.integrated
     t, last_goal, direction = p["t"], p["last_goal"], p["direction"]
-    locating = p["code"].equals(float(LOCATING))
+    locating = p["code"].equals(LOCATING)
     rows, at_start = jet(w, form, p, t, method.order)
     for row, series in enumerate(rows):
         for j, x in enumerate(series):
@@ -100,7 +100,7 @@ def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Va
     accept = accept & ~_turns_round(w, form, at_start.values, at_end.values)
     if form.projects:
         error = w.room(layout.y)
-        each_row(w, range(layout.y), error, lambda i: w.number(0.0))
+        each_row(w, layout.y, error, lambda i: 0.0)
         _project(w, layout, p, t1, y1, error)
         accept = accept & (_norm(w, layout, p, error, y1) <= 1.0)
     accept = locating | accept
@@ -111,7 +111,7 @@ def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Va
 
 def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Value, trial: Trial) -> None:
     """What becomes of the lanes after a step that was tried; `k`: slopes, the one at the start first."""
-    layout, y, rows = form.layout, p.pointer, range(form.layout.integrated)
+    layout, y, count = form.layout, p.pointer, form.layout.integrated
     aim, y1, accept, next_h, smallest = trial
     t1, locating = aim.t_1, aim.locating
     watched = crossings.watched(w, form, p, t1, aim.h, y1, accept & ~locating) if form.relations else None
@@ -119,19 +119,19 @@ def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Valu
         accept, next_h = accept & ~watched.refused, w.where(watched.refused, w.where(watched.falls, watched.to_event, p["h"]), next_h)
     new = taken(w, p, aim, accept, next_h)
     new["taken"] = w.where(accept, aim.h, 0.0)  # by how far the state has gone on
-    each_row(w, rows, y1, lambda i: w.where(accept, w.load(y1, i), w.load(y, i)))
+    each_row(w, count, y1, lambda i: w.where(accept, w.load(y1, i), w.load(y, i)))
     if form.has_events:
         ends = k, w.at(k, method.at_the_end * layout.integrated)
-        new = search.monitored(w, form, p, ends, y1, new, aim.h, accept & ~locating & new["code"].equals(float(RUNNING)))
-    counts = accept & ~locating & new["code"].equals(float(RUNNING)) & new["t"].equals(t1)
-    stays = counts | (locating & new["code"].equals(float(results.EVENT)))
+        new = search.monitored(w, form, p, ends, y1, new, aim.h, accept & ~locating & new["code"].equals(RUNNING))
+    counts = accept & ~locating & new["code"].equals(RUNNING) & new["t"].equals(t1)
+    stays = counts | (locating & new["code"].equals(results.EVENT))
     if smallest is not None:
         pivot = w.where(counts, w.smaller(p["pivot"], smallest), p["pivot"])
-        new |= {"pivot": pivot, "code": w.where(counts & (pivot < SMALLEST_PIVOT), float(results.SINGULAR_PARTITION), new["code"])}
-    moving = locating | p["code"].equals(float(RUNNING))
+        new |= {"pivot": pivot, "code": w.where(counts & (pivot < SMALLEST_PIVOT), results.SINGULAR_PARTITION, new["code"])}
+    moving = locating | p["code"].equals(RUNNING)
     if watched is not None:
         crossings.note(w, p, watched, t1, moving, stays)
-    each_row(w, rows, y, lambda i: w.where(moving, w.load(y1, i), w.load(y, i)))
+    copied(w, count, y1, y, moving)
     for name, value in new.items():
         p[name] = w.where(moving, value, w.number(0.0) if name == "taken" else p[name])
 
@@ -158,7 +158,7 @@ def _stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value, t: Value,
 
     for i in range(method.needed):
         time = w.fma(step, float(method.c[i]), t)
-        each_row(w, range(every), at, partial(next_state, i))
+        each_row(w, every, at, partial(next_state, i))
         if rank is not None:
             put_near_rows(w, layout, p.pointer, rank.near, time, at)
         w.run("rates", p.pointer, time, at, w.at(k, i * every), pivots)
@@ -167,7 +167,7 @@ def _stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value, t: Value,
             by_rows = squares_of(w, form, pivots)
             if rank is None:
                 rank = Rank(near_rank_loss(by_rows), square)
-                w.store(w.number(math.inf), square)
+                w.store(math.inf, square)
             with w.when(w.any(rank.near)):
                 w.store(reduce(w.smaller, [left / size for left, size in by_rows], w.load(square)), square)
         first = first or now
@@ -195,9 +195,9 @@ def put_near_rows(w: Writer, layout: Layout, state: Value, near: Value, t: Value
     """Puts the state `y` of a stage back onto the rows in lanes that are `near` a loss of rank."""
     with w.when(w.any(near)):
         put = w.room(layout.integrated)
-        each_row(w, range(layout.integrated), put, lambda i: w.load(y, i))
+        copied(w, layout.integrated, y, put)
         w.run("project", state, t, put)
-        each_row(w, range(layout.integrated), y, lambda i: w.where(near, w.load(put, i), w.load(y, i)))
+        copied(w, layout.integrated, put, y, near)
 
 
 def _turns_round(w: Writer, form: Form, first: list[Value], now: list[Value]) -> Value:
@@ -218,16 +218,16 @@ def weighted(w: Writer, weights: np.ndarray, k: Value, layout: Layout, row: int 
 def _project(w: Writer, layout: Layout, p: Lanes, t1: Value, y1: Value, error: Value, rank: Rank | None = None) -> None:
     """Puts `y1` back onto the rows; the error is no smaller than how far that moved it, beyond noise."""
     free = w.room(layout.y)
-    each_row(w, range(layout.y), free, lambda i: w.load(y1, i))
+    copied(w, layout.y, y1, free)
     w.run("project", p.pointer, t1, y1)
     amplified = None if rank is None else w.where(rank.near, w.smaller(AMPLIFIED * w.eps / rank.square, w.eps ** (1 - NOISE)), 0.0)
     if rank is not None:
         with w.when(w.any(rank.near)):
             both = w.room(2 * layout.y)
-            each_row(w, range(layout.y), both, lambda i: w.load(y1, i))
-            each_row(w, range(layout.y), w.at(both, layout.y), lambda i: w.load(error, i))
+            copied(w, layout.y, y1, both)
+            copied(w, layout.y, error, w.at(both, layout.y))
             w.run("along", p.pointer, t1, both)
-            each_row(w, range(layout.y), error, lambda i: w.where(rank.near, w.load(both, i + layout.y), w.load(error, i)))
+            each_row(w, layout.y, error, lambda i: w.where(rank.near, w.load(both, i + layout.y), w.load(error, i)))
     for part in layout.parts:
         largest = over_rows(w, part, 0.0, lambda largest, i: w.larger(largest, w.magnitude(w.load(y1, i))))
         noise = (w.eps**NOISE if amplified is None else w.larger(amplified, w.eps**NOISE)) * largest
