@@ -167,8 +167,6 @@ class Arrow(ByMember):
 def with_prior(arrow: Arrow, residual: ByUnknown, weight: np.ndarray, M: Float[np.ndarray, "shared shared"]) -> Arrow:
     """Add one `residual` (theta - mean) * weight for each unknown, zero where nothing is known; those of shared ones times M. The scores stay."""
     (r_s, r_l), (J_s, J_l) = arrow.split(residual), arrow.split(np.broadcast_to(weight, residual.shape))
-    every, M = M, np.eye(J_s.shape[1])  # where there is one run, its own unknowns count as shared, after the others
-    M[: len(every), : len(every)] = every
     tops, left = eliminated(arrow.local, J_l, residual=r_l)
     below = np.concatenate([M * J_s[:, None], M @ r_s[..., None]], axis=-1)
     return Arrow(tops, np.linalg.qr(np.concatenate([arrow.shared, left, below], axis=1), mode="r"), arrow.scores)
@@ -218,9 +216,7 @@ def by_singular_values(shared: np.ndarray, D: np.ndarray, damping: PerMember, cu
 def arrow(triangles: Float[np.ndarray, "members runs width width"], local: int) -> Arrow:
     """Makes an arrow of the triangles of all runs, with `local` unknowns of their own in the first columns."""
     members, runs, width, _ = triangles.shape
-    if runs == 1 and not local:
-        return Arrow(triangles[:, :, :0], triangles[:, 0], np.zeros((members, 1, width - 1)))  # there is nothing to compare one run with
     rest = triangles[:, :, local:, local:]
     scores = (rest[..., None, :, -1] @ rest[..., :-1])[..., 0, :]
     together = rest.reshape(members, runs * (width - local), width - local)
-    return Arrow(triangles[:, :, :local], np.linalg.qr(together, mode="r"), scores)
+    return Arrow(triangles[:, :, :local], np.linalg.qr(together, mode="r") if runs > 1 else together, scores)

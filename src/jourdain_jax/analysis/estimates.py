@@ -136,7 +136,7 @@ def statistics(problem: Problem, found: Minimum, at_bounds: AtBounds) -> Statist
         scene = jax.tree.map(lambda x, own: jnp.asarray(x if x is not own else np.broadcast_to(own, (len(theta), *own.shape))), scene, problem.scene)
     return Statistics(
         scene=scene,
-        starts=tuple(unknowns.layout.start(run.start, one(local[:, i])) for i, run in enumerate(problem.runs)),
+        starts=tuple(unknowns.layout.start(run.start, one(shared), one(local[:, i])) for i, run in enumerate(problem.runs)),
         sizes=here(size),
         standard_errors=known.standard_errors,
         low=np.where(values <= low, low, np.where(values >= high, limit, np.maximum(values - reach, low))),
@@ -162,12 +162,10 @@ def statistics(problem: Problem, found: Minimum, at_bounds: AtBounds) -> Statist
 
 def _determined(known: Information, unknowns: Unknowns) -> Float[np.ndarray, "members"]:
     """How many unknowns the samples determined: rank - tr(C P)."""
-    q, p = known.shared.shape[-1], len(unknowns.whitening)
-    M, weight = np.eye(q), unknowns.prior_weight
-    M[:p, :p] = unknowns.whitening
-    rows = M * weight[:q]
+    p, weight = len(unknowns.whitening), unknowns.prior_weight
+    rows = unknowns.whitening * weight[:p]
     of_shared = np.einsum("ij,bjk,ik->b", rows, known.shared, rows)
-    return known.rank - of_shared - variances(known.shared, known.own, known.follow)[:, q:] @ weight[q:] ** 2
+    return known.rank - of_shared - variances(known.shared, known.own, known.follow)[:, p:] @ weight[p:] ** 2
 
 
 class Estimated(Printed, eqx.Module):

@@ -23,7 +23,7 @@ from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.layout import PossibleInertia
 from jourdain_jax.analysis.levenberg_marquardt import Control, Minimum
 from jourdain_jax.analysis.likelihood import as_fit_options, as_runs, in_all_or_none
-from jourdain_jax.analysis.piecewise import Piecewise, Shot, problem_of
+from jourdain_jax.analysis.piecewise import Piecewise
 from jourdain_jax.analysis.problem import LEAST_SQUARES, Asked, Loss, Problem, Span
 from jourdain_jax.analysis.shooting import MultipleShooting, check_shooting
 from jourdain_jax.analysis.shooting_steps import cutoff_of, shot
@@ -111,10 +111,10 @@ def with_memory(problem: Problem, found: Minimum) -> Minimum:
     return found
 
 
-def off_bounds(problem: Problem, found: Minimum, pieces: Piecewise | None) -> tuple[Minimum, AtBounds]:
+def off_bounds(problem: Problem, found: Minimum) -> tuple[Minimum, AtBounds]:
     """The minimum, gone on from where unknowns at a bound let it be lower away from it; and what is known of those that stay."""
     for _ in range(20):
-        with nullcontext() if pieces is None else pieces.unmoved():
+        with problem.unmoved() if isinstance(problem, Piecewise) else nullcontext():
             told = limits_at_bounds(problem, found)
         if not told.lower:
             break
@@ -230,24 +230,24 @@ def _fit(asked: Asked, data: Data, repeats: bool = False) -> Fit:
     _check_control(asked.control)
     runs = as_runs(scene, data, repeats=repeats)
     _check_noise(runs, asked)
-    unknowns = unknowns_of(scene, runs, asked.free)
+    unknowns = unknowns_of(scene, runs, asked.free, apart=asked.shooting is not None)
     members = _repeats(runs) if repeats else None
     enough = _check_enough(runs, unknowns, repeats)
-    problem, pieces = problem_of(asked, runs, unknowns, members)
     theta = unknowns.first_guesses(asked.guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
-    found = minimum(problem, theta) if pieces is None else shot(problem, pieces, theta)
+    problem = Problem(asked, runs, unknowns, members) if asked.shooting is None else Piecewise(asked, runs, unknowns)
+    found = shot(problem, theta) if isinstance(problem, Piecewise) else minimum(problem, theta)
     if problem.failed or not found.steps.all():  # no step shows whether starts go along with the unknowns
         check_starts(scene, runs, unknowns)
     same = np.zeros(members, int) if members else np.asarray(found.agreeing(0.05))
-    if pieces is not None:
-        pieces.keep(int(np.argmin(found.at.cost)))
-        problem.asked = replace(asked, control=replace(asked.control, cutoff=cutoff_of(pieces, asked.control, np.arange(len(pieces.at.theta)))))
+    if isinstance(problem, Piecewise):
+        problem.keep(int(np.argmin(found.at.cost)))
+        problem.asked = replace(asked, control=replace(asked.control, cutoff=cutoff_of(problem, asked.control, np.array([0]))))
     found = with_memory(problem, found if members else found.lowest())
-    found, at_bounds = off_bounds(problem, found, pieces)
+    found, at_bounds = off_bounds(problem, found)
     found.converged &= enough
-    if pieces is not None:
-        found.converged &= pieces.closed(np.arange(len(found.converged)))
-    return _result(problem, found, at_bounds, same, None if pieces is None else pieces.told())
+    if isinstance(problem, Piecewise):
+        found.converged &= problem.closed(np.array([0]))
+    return _result(problem, found, at_bounds, same)
 
 
 def _check_control(control: Control) -> None:
@@ -293,7 +293,7 @@ def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool)
     return np.asarray(each >= len(unknowns.labels) + sigmas)
 
 
-def _result(problem: Problem, found: Minimum, at_bounds: AtBounds, agreeing: np.ndarray, how: Shot | None) -> Fit:
+def _result(problem: Problem, found: Minimum, at_bounds: AtBounds, agreeing: np.ndarray) -> Fit:
     unknowns, single, asked = problem.unknowns, problem.single, problem.asked
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
     places = unknowns.estimated
@@ -310,7 +310,7 @@ def _result(problem: Problem, found: Minimum, at_bounds: AtBounds, agreeing: np.
         units=unknowns.units,
         cutoff=asked.control.cutoff,
         errors=asked.errors,
-        shooting=how,
+        shooting=problem.told() if isinstance(problem, Piecewise) else None,
         trace=found.trace[0] if single else (),
         asked=asked,
         layout=unknowns.layout,

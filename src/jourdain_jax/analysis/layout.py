@@ -19,7 +19,7 @@ A function is traced when it is handed over, and ties are compared by what they 
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -233,7 +233,7 @@ def tied_by(name: str, function: Callable, scene: Scene) -> Tie:
     return found
 
 
-Kind = Literal["scene", "sensor", "inertia"]
+Kind = Literal["scene", "inertia", "start", "sensor"]  # a parameter, of a body's inertia, an initial value, of a sensor or an actuator
 
 
 @dataclass(frozen=True)
@@ -243,17 +243,12 @@ class Place:
     name: str  # of a sensor's or actuator's: "gyro.gain"
     shape: tuple[int, ...]
     begin: int
-    kind: Kind = "scene"  # a parameter or an initial value; a number of a sensor or an actuator; of a body's inertia
+    kind: Kind
 
     @property
     def end(self) -> int:
         """One past the last."""
         return self.begin + math.prod(self.shape)
-
-    @property
-    def of_sensor(self) -> bool:
-        """Whether it is a number of a sensor or an actuator."""
-        return self.kind == "sensor"
 
     def of(self, vector):
         """Its numbers in a vector (or in many, with leading axes), in their own shape."""
@@ -262,7 +257,10 @@ class Place:
 
 @dataclass(frozen=True)
 class Layout:
-    """Names and shapes of the shared unknowns and of those of each run, and the parameters that follow from them; hashable."""
+    """Names and shapes of the shared unknowns and of those of each run, and the parameters that follow from them; hashable.
+
+    A single run has nothing of its own, unless it is cut into pieces: its unknowns are shared ones.
+    """
 
     shared: tuple[Place, ...]
     local: tuple[Place, ...]
@@ -305,15 +303,19 @@ class Layout:
             found[getattr(names, tie.name)] = function(found)
         return jax.tree.unflatten(treedef, [x if x is own else jnp.asarray(x) for x, own in zip(found, leaves, strict=True)])
 
-    def start(self, start: dict, local: Float[Array | np.ndarray, "*members local"]) -> dict:
-        """The start of a run with these unknowns of its own."""
-        return start | {place.name: place.of(local) for place in self.local if place.name in start}
+    def start(self, start: dict, *vectors: Float[Array | np.ndarray, "*members _"]) -> dict:
+        """The start of a run with these shared unknowns and those of its own."""
+        return start | {name: x for name, x in self._of_kind("start", vectors) if name in start}
 
     @property
     def numbers(self) -> bool:
         """Whether sensors or actuators have any."""
-        return any(place.of_sensor for place in (*self.shared, *self.local))
+        return any(place.kind == "sensor" for place in (*self.shared, *self.local))
 
-    def known(self, shared, local) -> dict[str, Array | np.ndarray]:
+    def known(self, *vectors) -> dict[str, Array | np.ndarray]:
         """Numbers of sensors and actuators by name, of one run."""
-        return {place.name: place.of(vector) for places, vector in ((self.shared, shared), (self.local, local)) for place in places if place.of_sensor}
+        return dict(self._of_kind("sensor", vectors))
+
+    def _of_kind(self, kind: Kind, vectors) -> Iterator:
+        """Names and numbers of the unknowns of a kind, in the vectors of the shared ones and of those of a run."""
+        return ((place.name, place.of(x)) for places, x in zip((self.shared, self.local), vectors, strict=True) for place in places if place.kind == kind)

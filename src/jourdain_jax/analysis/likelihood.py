@@ -28,7 +28,7 @@ from jourdain_jax.analysis.correlated_noise import log_density
 from jourdain_jax.analysis.estimate import Estimate, Range
 from jourdain_jax.analysis.experiment import Data, Experiment, checked
 from jourdain_jax.analysis.information import hidden_combinations
-from jourdain_jax.analysis.layout import Layout, PossibleInertia
+from jourdain_jax.analysis.layout import Layout, Place, PossibleInertia
 from jourdain_jax.analysis.runs import Run, equal_runs, run_of
 from jourdain_jax.analysis.table import table
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
@@ -327,11 +327,15 @@ def _sensitivities(
 
 def _values(scene: Scene, runs: Sequence[Experiment], unknowns: Unknowns) -> Float[Array | np.ndarray, "places"]:
     """All unknowns at the values that the scene and the runs have; those of parameters and starts may be traced."""
-    shared, local = unknowns.split(unknowns.guess)
-    of_bodies = {label: x for body in unknowns.layout.bodies for label, x in zip(body.labels, body.numbers(scene), strict=True)}
-    of_kind = {"scene": lambda place: getattr(scene, place.name), "sensor": lambda place: place.of(shared), "inertia": lambda place: of_bodies[place.name]}
-    rows = [of_kind[place.kind](place) for place in unknowns.layout.shared]
-    for run, own in zip(runs, local, strict=True):
-        rows += [run.start.get(place.name, place.of(own)) for place in unknowns.layout.local]
+    (shared, local), layout = unknowns.split(unknowns.guess), unknowns.layout
+    of_bodies = {label: x for body in layout.bodies for label, x in zip(body.labels, body.numbers(scene), strict=True)}
+
+    def value(place: Place, run: Experiment, numbers):
+        if place.kind == "start":
+            return run.start.get(place.name, place.of(numbers))
+        return {"scene": getattr(scene, place.name, None), "inertia": of_bodies.get(place.name), "sensor": place.of(numbers)}[place.kind]
+
+    rows = [value(place, runs[0], shared) for place in layout.shared]
+    rows += [value(place, run, own) for run, own in zip(runs, local, strict=True) for place in layout.local]
     xp = array_module(rows)
     return xp.concatenate([xp.ravel(x) for x in rows])

@@ -21,7 +21,7 @@ from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.layout import Place
 from jourdain_jax.analysis.levenberg_marquardt import Linearised
 from jourdain_jax.analysis.problem import Asked, Problem, closed
-from jourdain_jax.analysis.runs import Lanes, Some
+from jourdain_jax.analysis.runs import Some
 from jourdain_jax.analysis.shooting import NODE, ends_of_pieces, in_pieces, numbers_of_filters, owned
 from jourdain_jax.analysis.unknowns import Unknowns
 
@@ -48,44 +48,47 @@ class _Standing(ByMember):
     jumps: Float[np.ndarray, "members pieces states"]  # from the piece before
 
 
-class Piecewise(Lanes):
-    """Whole runs that are worked out in pieces, and the problem with nodes as unknowns."""
+class Piecewise(Problem):
+    """The problem of whole runs that are worked out in pieces; `pieces`: that with nodes as unknowns, whose starts have nothing to do with each other."""
 
     def __init__(self, asked: Asked, runs: tuple[Experiment, ...], unknowns: Unknowns):
-        scene, layout, options, shooting = asked.scene, unknowns.layout, asked.options, asked.shooting
+        super().__init__(asked, runs, unknowns)
+        scene, layout, shooting = asked.scene, unknowns.layout, asked.shooting
         assert shooting is not None
-        super().__init__(scene, runs, layout, options)
-        self.asked, self.runs, self.unknowns = asked, runs, unknowns
         of_runs = [len(scene.coordinate_names) + len(scene.speed_names) + numbers_of_filters(run) for run in runs]
         self.states = max(of_runs)  # of a node; zero where a run has fewer low-passes than another
         self.ends_of = [ends_of_pieces(run, shooting, index) for index, run in enumerate(runs)]
-        parts = [in_pieces(run, ends, self.states) for run, ends in zip(runs, self.ends_of, strict=True)]
-        self.parts = tuple(itertools.chain(*parts))
-        if len(self.parts) == len(runs):
+        of_each = [in_pieces(run, ends, self.states) for run, ends in zip(runs, self.ends_of, strict=True)]
+        parts = tuple(itertools.chain(*of_each))
+        if len(parts) == len(runs):
             raise ValueError("`shooting` leaves each run in one piece only; give a shorter `duration`, or leave out `shooting`")
-        self.run_of = np.repeat(np.arange(len(runs)), [len(of_run) for of_run in parts])  # of each piece
+        self.run_of = np.repeat(np.arange(len(runs)), [len(of_run) for of_run in of_each])  # of each piece
         self.follows = np.concatenate([[False], np.diff(self.run_of) == 0])
         self.shared, self.own = layout.sizes
         # numbers of sensors are the same in all pieces: these places of a piece, and its node, are decided by the piece before
-        self._carried = np.array([k for place in layout.local if place.of_sensor for k in range(place.begin, place.end)], int)
+        self._carried = np.array([k for place in layout.local if place.kind == "sensor" for k in range(place.begin, place.end)], int)
         self._decided = np.concatenate([self._carried, self.own + np.arange(self.states)])
-        self.layout = replace(layout, local=(*layout.local, Place(NODE, (self.states,), self.own)))
-        self.lanes = Lanes(scene, self.parts, self.layout, options)
         self._states_of = np.array(of_runs)[self.run_of]
-        self._places = [self._places_of(i) for i in range(len(self.parts))]
+        self._layout = replace(layout, local=(*layout.local, Place(NODE, (self.states,), self.own, "start")))
         self.node_sizes = np.ones(self.states)
-        self.tolerance = float(options.rtol), float(options.atol)
+        self.pieces = Problem(asked, parts, self._unknowns(len(parts)))
+        self._places = [self._places_of(i) for i in range(len(parts))]
+        self.tolerance = float(asked.options.rtol), float(asked.options.atol)
 
     # With nodes as unknowns. ----------------------------------------------------------------------------------------
 
-    def problem(self) -> Problem:
-        """The problem of pieces whose starts have nothing to do with each other."""
+    def _unknowns(self, pieces: int) -> Unknowns:
+        """Those of all pieces with their nodes."""
         whole, free = self.unknowns, unbounded(1.0)
         ranges = self._each(np.array(whole.ranges, object), free, free, np.array([unbounded(float(size)) for size in self.node_sizes], object))
         means, weights = (self._each(x, 0.0, 0.0, 0.0, carried=False) for x in (whole.prior_mean, whole.prior_weight))
         fixed, guess = self._each(whole.fixed, True, True, False), self.spread(whole.guess)
-        unknowns = Unknowns(self.layout, len(self.parts), guess, fixed, tuple(ranges), (), (), means, weights, whole.whitening)
-        return Problem(self.asked, self.parts, unknowns, self.lanes)
+        return Unknowns(self._layout, pieces, guess, fixed, tuple(ranges), (), (), means, weights, whole.whitening)
+
+    def measure(self, node_sizes: Float[np.ndarray, "states"]) -> None:
+        """Takes these as the sizes of the numbers of nodes."""
+        self.node_sizes = node_sizes
+        self.pieces.unknowns = self._unknowns(len(self.follows))
 
     def spread(self, theta: Float[np.ndarray, "*members places"]) -> Float[np.ndarray, "*members all_places"]:
         """Unknowns of whole runs as those of all pieces, with nodes at zero."""
@@ -101,10 +104,11 @@ class Piecewise(Lanes):
         whole = np.concatenate([own, nodes], axis=-1)
         return np.concatenate([shared, whole.reshape(*whole.shape[:-2], -1)], axis=-1)
 
-    def evaluated(self, shared: np.ndarray, local: np.ndarray, members: np.ndarray) -> tuple[list[Some], Float[np.ndarray, "members pieces states width"]]:
-        """What `Lanes.evaluate` yields of all pieces, and [J x] of the states at which they end."""
-        found, ends = [], np.zeros((len(members), len(self.parts), self.states, local.shape[-1] + shared.shape[-1] + 1))
-        for b, j, plain in self.lanes.evaluate(shared, local, members):
+    def with_ends(self, theta: np.ndarray, members: np.ndarray) -> tuple[list[Some], Float[np.ndarray, "members pieces states width"]]:
+        """[J r] of all pieces with these unknowns, and [J x] of the states at which they end."""
+        _, pieces, M = self.pieces.unknowns.split(theta)[1].shape
+        found, ends = [], np.zeros((len(members), pieces, self.states, M + self.shared + 1))
+        for b, j, plain in self.pieces.evaluated(theta, members):
             rows, last = np.split(plain, [-self._states_of[j[0]]], axis=1)
             ends[b, j, : last.shape[1]] = last
             found.append((b, j, rows))
@@ -118,11 +122,10 @@ class Piecewise(Lanes):
         rows[..., -1] -= local[:, piece, self._decided]
         return rows
 
-    def joined(self, problem: Problem, theta: np.ndarray, members: np.ndarray, width: float) -> Linearised:
+    def with_gaps(self, theta: np.ndarray, members: np.ndarray, width: float) -> Linearised:
         """What is minimised with the starts of all pieces as unknowns: their gaps are residuals of this width, in sizes of the states."""
-        shared, local = problem.unknowns.split(theta)
-        some, ends = self.evaluated(shared, local, members)
-        at = problem.assembled(theta, members, some, {})
+        (some, ends), local = self.with_ends(theta, members), self.pieces.unknowns.split(theta)[1]
+        at = self.pieces.assembled(theta, members, some, {})
         count, pieces, M = local.shape
         joins = np.zeros((count, pieces, self._decided.size, 2 * M + self.shared + 1))
         sizes = width * np.concatenate([self.unknowns.least[self.shared + self._carried], self.node_sizes])
@@ -140,7 +143,7 @@ class Piecewise(Lanes):
 
     def put(self, theta: Float[np.ndarray, "members all_places"]) -> ByUnknown:
         """Puts the pieces of all members where they are here; the unknowns of the whole runs."""
-        shared, local = theta[:, : self.shared], theta[:, self.shared :].reshape(len(theta), len(self.parts), -1)
+        shared, local = self.pieces.unknowns.split(theta)
         whole = np.concatenate([shared, local[:, ~self.follows, : self.own].reshape(len(theta), -1)], axis=1)
         slopes, jumps = np.zeros((*local.shape, self.own + self.shared)), np.full((*local.shape[:2], self.states), np.inf)
         self.at = _Standing(local.copy(), whole, np.empty((len(theta), len(self.runs)), object), slopes, np.zeros(local.shape), jumps)
@@ -148,8 +151,9 @@ class Piecewise(Lanes):
 
     def put_nodes(self, theta: ByUnknown, found: Shot) -> None:
         """Puts the pieces where another fit of the same runs ended."""
-        self.node_sizes, whole = found.sizes, self.spread(theta)
-        local = whole[:, self.shared :].reshape(len(theta), len(self.parts), -1)  # a view
+        self.measure(found.sizes)
+        whole = self.spread(theta)
+        local = self.pieces.unknowns.split(whole)[1]  # a view
         local[:, self.follows, self.own :] = np.concatenate(found.nodes)
         self.put(whole)
 
@@ -167,9 +171,9 @@ class Piecewise(Lanes):
         """Keeps this one of all members alone."""
         self.at = self.at.of([member])
 
-    def evaluate(self, shared, local, members) -> Iterator[Some]:
-        """As of `Lanes`, of whole runs; pieces move along with the unknowns, to first order, until they join."""
-        theta, failed = np.concatenate([shared, local.reshape(len(shared), -1)], axis=1), np.zeros(len(members), bool)
+    def evaluated(self, theta: ByUnknown, members: np.ndarray) -> Iterator[Some]:
+        """Yield [J r] of whole runs; pieces move along with the unknowns, to first order, until they join."""
+        failed = np.zeros(len(members), bool)
         for _ in range(8):
             some = np.flatnonzero(~failed & ~((theta == self.at.theta[members]).all(axis=1) & self.closed(members)))
             if not some.size:
@@ -179,7 +183,7 @@ class Piecewise(Lanes):
             yield b, j, closed(rows, self.own + self.shared)
 
     def moved(self, theta: ByUnknown, members: np.ndarray, share: PerMember) -> Iterator[Some]:
-        """As `evaluate`, where a share of the gaps is closed, and rows are [J g r]: r will have changed by g once pieces join."""
+        """As `evaluated`, where a share of the gaps is closed, and rows are [J g r]: r will have changed by g once pieces join."""
         return self._of_runs(members, ~self._move(theta, members, share))
 
     def _of_runs(self, members: np.ndarray, failed: Flags) -> Iterator[Some]:
@@ -192,24 +196,24 @@ class Piecewise(Lanes):
 
     def _shape(self, run: int) -> tuple[int, int]:
         """The shape of [J g r] of a run."""
-        return max(where.stop for where in self.group_of(run).channels.values()), self.own + self.shared + 2
+        return max(where.stop for where in self.group_of[run].channels.values()), self.own + self.shared + 2
 
-    def change(self, problem: Problem, sigma: np.ndarray, d: np.ndarray, members: np.ndarray) -> PerMember:
+    def change(self, sigma: np.ndarray, d: np.ndarray, members: np.ndarray) -> PerMember:
         """Return the change of all residuals by a step that closes the gaps, |J d + g|, in units of sigma."""
         d_shared, d_own = self.unknowns.split(d)
         squares = np.zeros(len(d))
         for (b, member), run in itertools.product(enumerate(members.tolist()), range(len(self.runs))):
             rows = self.at.rows[member, run]
             moved = rows[:, :-2] @ np.concatenate([d_own[b, run], d_shared[b]]) + rows[:, -2]
-            for name, where in self.group_of(run).channels.items():
-                by = sigma[b, problem.estimated.index(name)] if name in problem.estimated else 1.0
+            for name, where in self.group_of[run].channels.items():
+                by = sigma[b, self.estimated.index(name)] if name in self.estimated else 1.0
                 squares[b] += np.sum((moved[where] / by) ** 2)
         return np.sqrt(squares)
 
     def _by_piece(self, theta: ByUnknown) -> Float[np.ndarray, "members pieces own_and_shared"]:
         """The unknowns of the run that each piece belongs to, then the shared ones."""
         shared, own = self.unknowns.split(theta)
-        return np.concatenate([own[:, self.run_of], np.broadcast_to(shared[:, None], (len(theta), len(self.parts), self.shared))], axis=2)
+        return np.concatenate([own[:, self.run_of], np.broadcast_to(shared[:, None], (len(theta), len(self.run_of), self.shared))], axis=2)
 
     def growth(self, members: np.ndarray) -> PerMember:
         """The factor by which small changes of the unknowns grow from the first node to where they are largest, in sizes of states and unknowns."""
@@ -241,13 +245,13 @@ class Piecewise(Lanes):
         before, (shared, own) = self.at.of(members), self.unknowns.split(theta)
         local = before.local + (before.slopes @ self._by_piece(theta - before.theta)[..., None])[..., 0] + share[:, None, None] * before.gaps
         local[:, ~self.follows, :m] = own
-        some, ends = self.evaluated(shared, local, members)
-        rows = np.empty((len(theta), len(self.parts)), object)
+        some, ends = self.with_ends(np.concatenate([shared, local.reshape(len(theta), -1)], axis=1), members)
+        rows = np.empty(local.shape[:2], object)
         for (b, j), one in itertools.chain(*(zip(zip(b, j, strict=True), plain, strict=True) for b, j, plain in some)):
             rows[b, j] = one
         new = _Standing(local, theta, np.empty((len(theta), len(self.runs)), object), 0 * before.slopes, 0 * before.gaps, np.zeros(ends.shape[:-1]))
         with np.errstate(over="ignore", invalid="ignore"):
-            for i in range(len(self.parts)):
+            for i in range(len(self.follows)):
                 if not self.follows[i]:
                     new.slopes[:, i, range(m), range(m)] = 1.0
                     continue
@@ -282,16 +286,10 @@ class Piecewise(Lanes):
         before = piece - int(np.flatnonzero(self.run_of == run)[0])
         first, firsts = self.ends_of[run][before], owned(self.runs[run], self.ends_of[run])
         of_piece, of_run = [], []
-        for name, where in self.lanes.group_of(piece).channels.items():
+        for name, where in self.pieces.group_of[piece].channels.items():
             width = int(np.prod(self.runs[run].values[name].shape[1:]))
             begin, end = firsts[name][before : before + 2]
             samples = np.arange(width * begin, width * end)
             of_piece.append(where.start + samples - width * first)
-            of_run.append(self.group_of(run).channels[name].start + samples)
+            of_run.append(self.group_of[run].channels[name].start + samples)
         return np.concatenate(of_piece), np.concatenate(of_run)
-
-
-def problem_of(asked: Asked, runs: tuple[Experiment, ...], unknowns: Unknowns, members: int | None = None) -> tuple[Problem, Piecewise | None]:
-    """Return the problem of these runs; where multiple shooting is asked for, what works them out in pieces, too."""
-    pieces = None if asked.shooting is None else Piecewise(asked, runs, unknowns)
-    return Problem(asked, runs, unknowns, pieces or Lanes(asked.scene, runs, unknowns.layout, asked.options, members)), pieces

@@ -16,7 +16,7 @@ Source: P. J. Huber and E. M. Ronchetti, Robust Statistics, 2nd ed. (2009), sect
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,7 +26,7 @@ from jourdain_jax.analysis.arrow import Arrow, ByMember, PerMember, arrow, trian
 from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits, half_log_determinant, lowest
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.levenberg_marquardt import Control, Linearised, Minimum, minimise
-from jourdain_jax.analysis.runs import Lanes, Some, Taus
+from jourdain_jax.analysis.runs import Group, Some, Taus, grouped
 from jourdain_jax.analysis.shooting import MultipleShooting
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.calculus.reals import Number, checked_real
@@ -130,28 +130,40 @@ class Span(ByMember):
 
 
 class Problem:
-    """What a fit was asked of its runs: residuals with their derivatives, of any members at any numbers."""
+    """What a fit was asked of its runs: residuals with their derivatives, of any members at any numbers. `repeats` of the experiment; None: it has none."""
 
-    def __init__(self, asked: Asked, runs: tuple[Experiment, ...], unknowns: Unknowns, lanes: Lanes):
-        self.asked, self.runs, self.unknowns, self.lanes = asked, runs, unknowns, lanes
-        self.scene, self.loss, self.single = asked.scene, asked.loss, lanes.single
+    def __init__(self, asked: Asked, runs: tuple[Experiment, ...], unknowns: Unknowns, repeats: int | None = None):
+        self.asked, self.runs, self.unknowns, self.single, self.count = asked, runs, unknowns, repeats is None, repeats or 1
+        self.scene, self.loss = asked.scene, asked.loss
+        self.groups = [Group(asked.scene, runs, indices, unknowns.layout, asked.options, repeats) for indices in grouped(runs)]
+        self.group_of = {run: group for group in self.groups for run in group.runs.tolist()}  # the runs of equal structure that a run belongs to
         self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))  # channels whose sigma is
         largest = [max(float(np.nanmax(np.abs(run.values[name]))) for run in runs if name in run.values) for name in self.estimated]
         self.least_sigma = 1e-10 * np.array([x or 1.0 for x in largest])  # sigma of each of these: of one that is met exactly
         self.with_memory = tuple(sorted({name for run in runs for name in run.unknown_correlation}))  # channels whose correlation time is estimated
-        self.tau = np.zeros((lanes.count, len(self.with_memory)))  # s, of these: at first as if their noise were white
+        self.tau = np.zeros((self.count, len(self.with_memory)))  # s, of these: at first as if their noise were white
         self.failed = False  # whether a motion has
 
     def taus(self, members: np.ndarray) -> dict[str, np.ndarray]:
         """Correlation times of some members, by channel, s."""
-        return dict(zip(self.with_memory, self.tau[members % self.lanes.count].T, strict=True)) if self.with_memory else {}
+        return dict(zip(self.with_memory, self.tau[members % self.count].T, strict=True)) if self.with_memory else {}
+
+    def counted(self, names: Sequence[str], members: np.ndarray) -> Float[np.ndarray, "members names"]:
+        """Samples of each of these channels that are not missing, in all runs."""
+        found = np.zeros((self.count, len(names)))
+        for k, name in enumerate(names):
+            for weights in (group.weights[name] for group in self.groups if name in group.weights):
+                found[:, k] += np.count_nonzero(weights, axis=(0, *range(2, weights.ndim)))
+        return found[members % self.count]
+
+    def evaluated(self, theta: np.ndarray, members: np.ndarray) -> Iterator[Some]:
+        """Yield [J r] of all runs of some members, some lanes at a time."""
+        for group in self.groups:
+            yield from group.evaluate(*self.unknowns.split(theta), members)
 
     def linearised(self, theta: np.ndarray, members: np.ndarray, span: Span | None = None) -> Linearised:
         """Return what is minimised, with its arrow, of some members, over all of the runs or a span of them."""
         return self.assembled(theta, members, self.evaluated(theta, members), self.taus(members), span)
-
-    def evaluated(self, theta: np.ndarray, members: np.ndarray) -> Iterator[Some]:
-        return self.lanes.evaluate(*self.unknowns.split(theta), members)
 
     def minimum(self, theta: np.ndarray, members: np.ndarray, what: str = "", control: Control | None = None, span: Span | None = None) -> Minimum:
         """Return the minimum of some members, from theta. `control`: other than that of the fit."""
@@ -175,9 +187,7 @@ class Problem:
         kept, sigma = np.empty((count, runs), object), np.zeros((count, 0))
         with np.errstate(over="ignore", invalid="ignore"):
             for b, j, plain in evaluated:
-                if runs == 1:  # all unknowns are shared
-                    plain = plain[..., [*range(m, m + p), *range(m), *range(m + p, plain.shape[-1])]]
-                group = self.lanes.group_of(int(j[0]))
+                group = self.group_of[int(j[0])]
                 whole = group.whitened(j, members[b], plain, {name: tau[b] for name, tau in taus.items()})
                 if span is not None:
                     whole = np.where(group.within(j, span.shares[b])[..., None], whole, 0.0)
@@ -198,7 +208,7 @@ class Problem:
                 failed = ~np.isfinite(triangles.sum(axis=(1, 2, 3, 4)) + cost)
                 triangles[failed], cost[failed], self.failed = 0.0, np.inf, True
         if kinds > 1:
-            samples = self.lanes.counted(self.estimated, members)
+            samples = self.counted(self.estimated, members)
             sigma = np.sqrt(np.maximum(squares[:, 1:] / np.maximum(samples, 1), self.least_sigma**2))
             cost = cost + np.sum(samples * np.log(sigma), axis=1)
         whole, of_priors = self.joined(theta, triangles, np.concatenate([np.ones((count, 1)), sigma], axis=1), span)
@@ -211,7 +221,7 @@ class Problem:
         together = triangles[:, :, 0]
         if kinds > 1 or np.any(sigma != 1):
             together = np.linalg.qr((triangles / sigma[:, None, :, None, None]).reshape(count, runs, -1, m + p + 1), mode="r")
-        whole = arrow(together, m if runs > 1 else 0)
+        whole = arrow(together, m)
         unknowns, mean, weight = self.unknowns, self.unknowns.prior_mean, self.unknowns.prior_weight
         if span is not None:
             none = (weight == 0) & ~unknowns.fixed
@@ -226,7 +236,7 @@ class Problem:
         good = np.isfinite(at.cost)
         squares, counted = np.zeros((2, good.sum(), len(shares)))
         for run in range(len(self.runs) if good.any() else 0):
-            group = self.lanes.group_of(run)
+            group = self.group_of[run]
             within = group.within(np.full(len(shares), run), shares)
             r = np.where(within, np.stack(list(at.residuals[good, run]))[:, None], 0.0)
             for name, where in group.channels.items():
@@ -247,7 +257,7 @@ class Problem:
             found, interval = np.exp(lowest(tried, *edges)), low / SHORTEST
             changed = np.maximum(changed, np.abs(np.exp(-interval / found) - np.exp(-interval / taus[name])))
             taus[name] = found
-        self.tau[members % self.lanes.count] = np.stack(list(taus.values()), axis=1)
+        self.tau[members % self.count] = np.stack(list(taus.values()), axis=1)
         return changed
 
     def _limits(self, name: str) -> tuple[float, float]:
@@ -257,7 +267,7 @@ class Problem:
         """What the restricted likelihood is made of, to be as low as possible."""
         at, logs = self.assembled(theta, members, evaluated, taus), np.zeros(len(members))
         for b, j, _ in evaluated:
-            np.add.at(logs, b, self.lanes.group_of(int(j[0])).log_widths(j, members[b], {n: tau[b] for n, tau in taus.items()}))
+            np.add.at(logs, b, self.group_of[int(j[0])].log_widths(j, members[b], {n: tau[b] for n, tau in taus.items()}))
         return at.cost + logs + half_log_determinant(at.arrow, self.unknowns.sizes(theta)), at
 
     def doubt(self, theta: np.ndarray, of: Callable[[Arrow], tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
@@ -272,7 +282,7 @@ class Problem:
         evaluated, taus = list(self.evaluated(theta, members)), self.taus(members)
         for name in self.with_memory:
             low, high = self._limits(name)
-            interval, counted = low / SHORTEST, self.lanes.counted([name], members)[:, 0]
+            interval, counted = low / SHORTEST, self.counted([name], members)[:, 0]
             angle = lambda tau, h=interval: np.arcsin(np.exp(-h / tau))  # noqa: E731
             # in standard deviations of arcsin rho: 1 / sqrt(samples) without unknowns
             nodes = angle(taus[name])[:, None] + np.linspace(-3.2, 3.2, 9) / np.sqrt(counted)[:, None]
@@ -303,7 +313,7 @@ class Problem:
 
         `white`: whitened ones.
         """
-        group = self.lanes.group_of(run)
+        group = self.group_of[run]
         flat = [np.zeros(0) if r is None else r for r in at.residuals[:, run]]
         longest = max(map(len, flat))
         whole = np.stack([np.full(longest, np.nan) if len(r) < longest else r for r in flat])
@@ -321,7 +331,7 @@ class Problem:
         """[J r] of lanes of a run: of channels whose sigma is known, then of each other channel."""
         if not self.estimated:
             return [whole]
-        channels = self.lanes.group_of(run).channels
+        channels = self.group_of[run].channels
         known = [whole[:, where] for name, where in channels.items() if name not in self.estimated]
         return [np.concatenate([whole[:, :0], *known], axis=1), *(whole[:, channels.get(name, slice(0))] for name in self.estimated)]
 

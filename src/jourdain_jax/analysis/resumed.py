@@ -36,7 +36,7 @@ from jourdain_jax.analysis.estimates import Estimates
 from jourdain_jax.analysis.experiment import Data, Experiment
 from jourdain_jax.analysis.information import Information, information, variances
 from jourdain_jax.analysis.likelihood import as_runs
-from jourdain_jax.analysis.piecewise import Piecewise, problem_of
+from jourdain_jax.analysis.piecewise import Piecewise
 from jourdain_jax.analysis.problem import Asked, Problem
 from jourdain_jax.analysis.spread import RISE_95
 from jourdain_jax.analysis.unknowns import unknowns_of
@@ -64,13 +64,13 @@ class TakenUp:
 
 def taken_up(fit: Estimates, data: Data) -> TakenUp:
     """A `Fit` of one experiment where it ended, with residuals and derivatives computed anew. ValueError where `data` are not what it was fitted to."""
-    problem, pieces = for_runs(fit, data, fit.asked)
+    problem = for_runs(fit, data, fit.asked, fit.shooting is not None)
     unknowns, theta = problem.unknowns, problem.unknowns.guess[None].copy()
     if unknowns.labels != fit.labels:
         raise ValueError(f"`data` have the unknowns {', '.join(unknowns.labels)}, expected those of the fit: {', '.join(fit.labels)}")
     theta[0, unknowns.estimated] = fit.values
-    if pieces is not None and fit.shooting is not None:
-        pieces.put_nodes(theta, fit.shooting)
+    if isinstance(problem, Piecewise) and fit.shooting is not None:
+        problem.put_nodes(theta, fit.shooting)
     again = TakenUp(problem, theta)
     sigma = dict(zip(problem.estimated, again.at.sigma[0].tolist(), strict=True))  # as F has it; that of a fit allows for its unknowns
 
@@ -83,14 +83,14 @@ def taken_up(fit: Estimates, data: Data) -> TakenUp:
     return again
 
 
-def for_runs(fit: Estimates, runs: Data, asked: Asked) -> tuple[Problem, Piecewise | None]:
-    """The problem of a `Fit` for these runs, and what works them out in pieces; ValueError where they do not fit the scene."""
+def for_runs(fit: Estimates, runs: Data, asked: Asked, apart: bool) -> Problem:
+    """The problem of a `Fit` for these runs; ValueError where they do not fit the scene. `apart`: what is a run's own is told from what runs share."""
     checked = as_runs(asked.scene, runs)
-    unknowns = unknowns_of(asked.scene, checked, asked.free)
-    problem, pieces = problem_of(asked, checked, unknowns)
+    unknowns = unknowns_of(asked.scene, checked, asked.free, apart)
+    problem = Problem(asked, checked, unknowns) if asked.shooting is None else Piecewise(asked, checked, unknowns)
     if problem.with_memory:
         problem.tau = np.array([[float(fit.correlation_time[name]) for name in problem.with_memory]])
-    return problem, pieces
+    return problem
 
 
 class Prediction(Printed, eqx.Module):
@@ -131,7 +131,7 @@ def of_fitted(fit: Estimates, runs: Sequence[Experiment]) -> tuple[dict[str, Pre
 def of_held_out(fit: Estimates, runs: Data) -> tuple[dict[str, Prediction], ...]:
     """Predictions of other runs; ValueError where they do not fit the scene, or share unknowns that the fit did not estimate."""
     runs = (runs,) if isinstance(runs, Experiment) else tuple(runs)
-    problem, _ = for_runs(fit, runs, replace(fit.asked, shooting=None))
+    problem = for_runs(fit, runs, replace(fit.asked, shooting=None), apart=True)
     unknowns, theta, shared = problem.unknowns, problem.unknowns.guess[None].copy(), problem.unknowns.layout.sizes[0]
     labels = unknowns.labels[:shared]
     for place, label in enumerate(labels):
@@ -207,15 +207,14 @@ def informed(fitted: TakenUp, most: int) -> Informed:
     found: list[dict[str, np.ndarray]] = [{}] * len(problem.runs)
     m, taus = unknowns.layout.sizes[1], problem.taus(np.array([0]))
     for b, j, plain in problem.evaluated(fitted.theta, np.array([0])):
-        group = problem.lanes.group_of(int(j[0]))
+        group = problem.group_of[int(j[0])]
         white = group.whitened(j, b, plain, {name: tau[b] for name, tau in taus.items()})
         for run, r, J in zip(j.tolist(), white[..., -1], white[..., :-1], strict=True):
             rows = np.sqrt(problem.loss.weight(r))[:, None] * J
             for k, name in enumerate(problem.estimated):
                 if name in problem.runs[run].values:
                     rows[group.channels[name]] /= fitted.at.sigma[0, k]
-            # those of a single run count as shared, and come last
-            own, shared = (rows[:, :0], np.roll(rows, -m, axis=1)) if len(problem.runs) == 1 else (rows[:, :m], rows[:, m:])
+            own, shared = rows[:, :m], rows[:, m:]
             a_shared = known.shared @ (shared - own @ known.follow[run]).T  # own unknowns of a run follow the shared ones, x = - G s
             a_own = -np.einsum("kij,js->kis", known.follow, a_shared)
             a_own[run] += known.own[run] @ own.T

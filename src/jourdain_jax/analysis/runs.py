@@ -87,7 +87,7 @@ class Run(NamedTuple):
 
     def at(self, layout: Layout, shared, local) -> "Run":
         """The run with these unknowns."""
-        changed = layout.start(self.start, local)
+        changed = layout.start(self.start, shared, local)
         if not layout.numbers:
             return self._replace(start=changed)
         known = layout.known(shared, local)
@@ -157,11 +157,9 @@ def most_knots(runs: Sequence[Run]) -> list[int]:
     return [max(column) for column in zip(*counts, strict=True)]
 
 
-def filled_up(run: Run, times: int, knots: list[int], axis: int) -> Run:
-    """The run with as many times and knots as these; what is added is close behind its end, and does not count."""
+def filled_up(run: Run, times: int, knots: list[int]) -> Run:
+    """The run, with an axis of members, with as many times and knots as these; what is added is close behind its end, and does not count."""
     more = times - run.ts.shape[0]
-    if not (more or knots):
-        return run
     counts = iter(knots)
 
     def longer(x):
@@ -172,57 +170,35 @@ def filled_up(run: Run, times: int, knots: list[int], axis: int) -> Run:
         ts = np.concatenate([x.ts, max(x.ts[-1], run.ts[-1]) + span * np.arange(1, extra + 1)])
         return eqx.tree_at(lambda s: (s.ts, s.values), x, (ts, np.concatenate([x.values, np.full(extra, x.values[-1])])))
 
-    inputs, drives = jax.tree.map(longer, (run.inputs, run.drives), is_leaf=_is_sampled)
-    run = run._replace(inputs=inputs, drives=drives)
+    if knots:
+        run = run._replace(**dict(zip(("inputs", "drives"), jax.tree.map(longer, (run.inputs, run.drives), is_leaf=_is_sampled), strict=True)))
     if not more:
         return run
-    pad = lambda x: np.concatenate([x, np.zeros((*x.shape[:axis], more, *x.shape[axis + 1 :]))], axis=axis)  # noqa: E731
     ts = np.concatenate([run.ts, run.ts[-1] + 1e-6 * (run.ts[-1] - run.t0) * np.arange(1, more + 1)])
-    return run._replace(ts=ts, values={n: pad(x) for n, x in run.values.items()}, weights={n: pad(x) for n, x in run.weights.items()})
+    return _of_members(run._replace(ts=ts), lambda x: np.pad(x, [(0, 0), (0, more), *[(0, 0)] * (x.ndim - 2)]))
 
 
 Some = tuple[np.ndarray, np.ndarray, np.ndarray]  # members (among those asked for), runs, and [J r] (lanes, samples, unknowns + 1), own unknowns first
 Taus = Mapping[str, np.ndarray]  # correlation times that are estimated, s, of some members, by channel
-
-
-class Lanes:
-    """All lanes of a problem; `evaluate` gives their weighted residuals with derivatives. `members`: repeats of the experiment; None: they have none."""
-
-    def __init__(self, scene: Scene, data: Sequence[Experiment], layout: Layout, options: AllOptions, members: int | None = None):
-        self.single, self.count = members is None, members or 1
-        ready = lambda i: run_of(data[i], repeats=not self.single)  # noqa: E731
-        self.groups = [Group(scene, indices, list(map(ready, indices)), layout, options, members) for indices in grouped(data)]
-        self._of_run = {run: group for group in self.groups for run in group.runs.tolist()}
-
-    def evaluate(self, shared: Float[np.ndarray, "members shared"], local: Float[np.ndarray, "members runs local"], members: np.ndarray) -> Iterator[Some]:
-        """Yield [J r] of all lanes, some at a time."""
-        for group in self.groups:
-            yield from group.evaluate(shared, local, members)
-
-    def group_of(self, run: int) -> "Group":
-        """The runs of equal structure that this one belongs to."""
-        return self._of_run[run]
-
-    def counted(self, names: Sequence[str], members: np.ndarray) -> Float[np.ndarray, "members names"]:
-        """Samples of each of these channels that are not missing, in all runs."""
-        found = np.zeros((self.count, len(names)))
-        for k, name in enumerate(names):
-            for weights in (group.weights[name] for group in self.groups if name in group.weights):
-                found[:, k] += np.count_nonzero(weights, axis=(0, *range(2, weights.ndim)))
-        return found[members % self.count]
+_BY_MEMBER = ("values", "weights")  # of a run, which differ by member
 
 
 class Group:
-    """Runs of equal structure, padded to one length. A lane is a run, by its number in the problem, and a member; runs without repeats have one for all."""
+    """Runs of equal structure, padded to one length. A lane is a run, by its number in the problem, and a member.
 
-    def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, options: AllOptions, members: int | None):
+    `members`: repeats of the experiment, which the values have a leading axis of; None: they have none, and are the same for all members.
+    """
+
+    def __init__(self, scene: Scene, data: Sequence[Experiment], indices: list[int], layout: Layout, options: AllOptions, members: int | None):
+        runs = [run_of(data[i], repeats=members is not None) for i in indices]
+        if members is None:
+            runs = [_of_members(run, lambda x: x[None]) for run in runs]
         self.runs, self._count, self._lengths = np.array(indices), members or 1, [run.ts.shape[0] for run in runs]
         times, knots = max(self._lengths), most_knots(runs)
         equal = runs if runs[0].grid is None or len(runs) == 1 else on_equal_grids(runs)
-        filled = [filled_up(run, times, knots, 0 if members is None else 1) for run in equal]
-        first = filled[0]
-        weights = {name: np.array([run.weights[name] for run in filled]) for name in first.weights}
-        self.weights = {name: x[:, None] if members is None else x for name, x in weights.items()}  # (runs, members, times, *channel)
+        filled = [filled_up(run, times, knots) for run in equal]
+        first = _of_members(filled[0], lambda x: x[0])
+        self.weights = {name: np.array([run.weights[name] for run in filled]) for name in first.weights}  # (runs, members, times, *channel)
         self._t0, self._ts = np.array([run.t0 for run in filled]), np.array([run.ts for run in filled])
         self.channels, end = {}, 0
         for name, weight in sorted(self.weights.items()):
@@ -231,10 +207,9 @@ class Group:
         taus = {name: np.stack([run.correlation_time[name] for run in filled]) for name in first.correlation_time}
         self._chains = Chains.of(self.weights, self._ts, taus, self.channels) if taus else None
         # numbers of a run in one row, since each array that is handed over costs as much as some of the steps of a motion
-        self._common = _row((scene, options), 1)[0]
-        self._rows = np.stack([_row(run, self._count, members is not None) for run in filled])
-        if members is not None:
-            first = first._replace(**{name: {n: x[0] for n, x in getattr(first, name).items()} for name in _BY_MEMBER})
+        self._common = _rows((scene, options), (1, 1))[0]
+        of_members = [self._count if name in _BY_MEMBER else 1 for name in Run._fields]
+        self._rows = np.stack([_rows(run, of_members) for run in filled])
         leaves, treedef = jax.tree.flatten(((scene, options), first))
         shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if is_array(x) else x for x in leaves)
         self._run = _program(Reference.where_free(scene, layout.parameters), treedef, shapes, layout)
@@ -248,7 +223,7 @@ class Group:
         return np.searchsorted(self.runs, runs)
 
     def evaluate(self, shared, local, members) -> Iterator[Some]:
-        """As of `Lanes`."""
+        """Yield [J r] of all lanes, some at a time."""
         first, *chunks = self._chunks(len(members))
 
         def lanes(kept: int, b: np.ndarray, j: np.ndarray) -> Some:
@@ -310,18 +285,15 @@ class Group:
         return found
 
 
-_BY_MEMBER = ("values", "weights")  # of a run, which differ by member where there are any
+def _of_members(run: Run, of: Callable) -> Run:
+    """The run with what differs by member changed."""
+    return run._replace(**{name: {channel: of(x) for channel, x in getattr(run, name).items()} for name in _BY_MEMBER})
 
 
-def _row(tree, count: int, by_member: bool = False) -> Float[np.ndarray, "members numbers"]:
-    """Return all numbers of a tree in the order of `ravel_pytree`; for a run, of each of so many members."""
-    own = {id(x) for name in _BY_MEMBER for x in getattr(tree, name).values()} if by_member else set()
-    parts = [np.asarray(x).reshape(count if id(x) in own else 1, -1) for x in jax.tree.leaves(tree) if is_array(x)]
-    found, end = np.empty((count, sum(part.shape[1] for part in parts))), 0
-    for part in parts:
-        begin, end = end, end + part.shape[1]
-        found[:, begin:end] = part
-    return found
+def _rows(trees: Sequence, members: Sequence[int]) -> Float[np.ndarray, "members numbers"]:
+    """All numbers of some trees in the order of `ravel_pytree`, in a row for each member; of a tree that has no axis of members, the same for all."""
+    parts = [np.asarray(x).reshape(count, -1) for tree, count in zip(trees, members, strict=True) for x in jax.tree.leaves(tree) if is_array(x)]
+    return np.concatenate([np.repeat(part, max(members) // len(part), axis=0) for part in parts], axis=1, dtype=float)
 
 
 @lru_cache(maxsize=16)

@@ -25,7 +25,6 @@ from jaxtyping import Float, Int
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.levenberg_marquardt import Control, Linearised, Minimum, Way, column_scaling, damped_step, minimise
 from jourdain_jax.analysis.piecewise import Piecewise
-from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.analysis.sensors import ideal
 from jourdain_jax.analysis.unknowns import check_starts
 from jourdain_jax.eager.eager import eval_numpy
@@ -111,85 +110,83 @@ def _parabola(ts: Float[np.ndarray, "times"], x: Float[np.ndarray, "times"], t: 
     return float(value), float(slope)
 
 
-def shot(problem: Problem, lanes: Piecewise, theta: Float[np.ndarray, "members places"]) -> Minimum:
-    """The minimum from each `theta`; `problem`: that of whole runs, with these lanes."""
+def shot(problem: Piecewise, theta: Float[np.ndarray, "members places"]) -> Minimum:
+    """The minimum from each `theta`."""
     check_starts(problem.scene, problem.runs, problem.unknowns)
-    (pieces, begin), control = _begun(problem, lanes, theta), problem.asked.control
+    begin, control = _begun(problem, theta), problem.asked.control
     roughly, every = replace(control, tolerance=1.0, most_steps=min(15, control.most_steps)), np.arange(len(theta))
 
     def with_gaps(begin: np.ndarray, width: float) -> Minimum:
         what = f"pieces with gaps of {width:g}"  # in sizes of the states
-        return minimise(lambda x, members: lanes.joined(pieces, x, members, width), begin, pieces.unknowns, roughly, what)
+        return minimise(lambda x, members: problem.with_gaps(x, members, width), begin, problem.pieces.unknowns, roughly, what)
 
     found = with_gaps(begin, 0.1)
     found = with_gaps(found.theta, 0.01).after(found, every)
-    return _closed(problem, lanes, lanes.put(found.theta)).after(found, every)
+    return _closed(problem, problem.put(found.theta)).after(found, every)
 
 
-def _begun(problem: Problem, lanes: Piecewise, theta: np.ndarray) -> tuple[Problem, np.ndarray]:
-    """The problem of pieces with all their starts as unknowns, and first guesses of these."""
-    m, count, coordinates = lanes.own, len(theta), len(problem.scene.coordinate_names)
-    places = np.arange(lanes.states)
+def _begun(problem: Piecewise, theta: np.ndarray) -> np.ndarray:
+    """First guesses of the unknowns of all pieces, nodes included."""
+    count, coordinates = len(theta), len(problem.scene.coordinate_names)
+    places = np.arange(problem.states)
     of_q, of_y = places < coordinates, places >= coordinates + len(problem.scene.speed_names)
-    nodes, starts = np.zeros((count, len(lanes.parts), lanes.states)), np.zeros((len(lanes.parts), lanes.states))
+    nodes, starts = np.zeros((count, len(problem.follows), problem.states)), np.zeros((len(problem.follows), problem.states))
     for run, data in enumerate(problem.runs):
         q, u = _start(problem, data, theta[0], run)
-        starts[lanes.run_of == run, : q.size + u.size] = np.concatenate([q, u])
-        found = first_nodes(problem.scene, data, lanes.ends_of[run], q, u)
-        nodes[:, lanes.run_of == run, : found.shape[1]] = found
-    guess = lanes.spread(theta)
-    local = guess[:, lanes.shared :].reshape(count, len(lanes.parts), -1)  # a view
-    local[:, lanes.follows, m:] = nodes[:, lanes.follows]
-    _put_starts(problem, lanes, local, nodes)
-    _, ends = lanes.evaluated(guess[:, : lanes.shared], local, np.arange(count))
+        starts[problem.run_of == run, : q.size + u.size] = np.concatenate([q, u])
+        found = first_nodes(problem.scene, data, problem.ends_of[run], q, u)
+        nodes[:, problem.run_of == run, : found.shape[1]] = found
+    guess = problem.spread(theta)
+    local = problem.pieces.unknowns.split(guess)[1]  # a view
+    local[:, problem.follows, problem.own :] = nodes[:, problem.follows]
+    _put_starts(problem, local, nodes)
+    _, ends = problem.with_ends(guess, np.arange(count))
     changes = ends[..., -1] - nodes
     failed = ~np.isfinite(changes).all(axis=2)
     changes[failed] = 0.0
     for run in range(len(problem.runs)):
-        here = np.flatnonzero(lanes.run_of == run)
+        here = np.flatnonzero(problem.run_of == run)
         still = (np.ptp(nodes[:, here, :coordinates], axis=(0, 1)) == 0) & goes_on(problem.scene, starts[here[0], :coordinates])
         nodes[:, here[1:, None], np.flatnonzero(still)] += np.cumsum(changes[:, here[:-1, None], np.flatnonzero(still)], axis=1)
     nodes = np.where(failed[..., None] & ~of_y, starts, nodes)  # a piece whose motion fails begins as its run does
-    local[:, lanes.follows, m:] = nodes[:, lanes.follows]
+    local[:, problem.follows, problem.own :] = nodes[:, problem.follows]
     # sizes: how numbers differ from node to node, and change over a piece
     sizes = np.maximum(np.std(nodes, axis=(0, 1)), np.sqrt(np.mean(changes**2, axis=(0, 1))))
     sizes = np.maximum(sizes, 0.01 * np.max(np.abs(nodes), axis=(0, 1)))
     least = np.where(of_y, sizes, np.where(of_q, np.max(sizes[of_q], initial=0.0), np.max(sizes[~of_q & ~of_y], initial=0.0)))
-    lanes.node_sizes = np.where(least > 0, np.maximum(sizes, 1e-4 * least), 1.0)
-    return lanes.problem(), guess
+    problem.measure(np.where(least > 0, np.maximum(sizes, 1e-4 * least), 1.0))
+    return guess
 
 
-def _start(problem: Problem, data: Experiment, theta: np.ndarray, run: int) -> tuple[np.ndarray, np.ndarray]:
+def _start(problem: Piecewise, data: Experiment, theta: np.ndarray, run: int) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates and speeds of the start of a run at the first guess."""
     shared, own = problem.unknowns.split(theta)
     layout = problem.unknowns.layout
-    state = consistent_start(layout.scene(problem.scene, shared), t0=data.t0, inputs=data.inputs, **layout.start(data.start, own[run]))
+    state = consistent_start(layout.scene(problem.scene, shared), t0=data.t0, inputs=data.inputs, **layout.start(data.start, shared, own[run]))
     return np.asarray(state.q), np.asarray(state.u)
 
 
-def _put_starts(problem: Problem, lanes: Piecewise, local: np.ndarray, nodes: np.ndarray) -> None:
+def _put_starts(problem: Piecewise, local: np.ndarray, nodes: np.ndarray) -> None:
     """Unknown start values of runs as they were measured, where that is within their bounds and nothing is known of them beforehand."""
     unknowns, scene = problem.unknowns, problem.scene
-    low, high, p, m = unknowns.low, unknowns.high, lanes.shared, lanes.own
-    for run, first in enumerate(np.flatnonzero(~lanes.follows).tolist()):
+    low, high = unknowns.low, unknowns.high
+    for run, first in enumerate(np.flatnonzero(~problem.follows).tolist()):
         q, u, _ = np.split(nodes[:, first], np.cumsum([len(scene.coordinate_names), len(scene.speed_names)]), axis=-1)
-        for place in unknowns.layout.local:
-            if place.of_sensor:
-                continue
+        for place in (place for place in unknowns.layout.local if place.kind == "start"):
             where = np.arange(place.begin, place.end)
-            at = p + run * m + where
+            at = problem.shared + run * problem.own + where
             names, x = (scene.coordinate_names, q) if place.name in scene.coordinate_names else (scene.speed_names, u)
             value = names.view(x)[place.name].reshape(len(x), -1)
             free = ~unknowns.fixed[at] & (unknowns.prior_weight[at] == 0) & (value > low[at]) & (value < high[at])
             local[:, first, where] = np.where(free, value, local[:, first, where])
 
 
-def _closed(problem: Problem, lanes: Piecewise, theta: np.ndarray) -> Minimum:
+def _closed(problem: Piecewise, theta: np.ndarray) -> Minimum:
     """The minimum with all gaps closed, by sequential quadratic programming from where the pieces are."""
     unknowns, control = problem.unknowns, problem.asked.control
 
     def evaluate(theta: np.ndarray, members: np.ndarray, share: np.ndarray) -> Linearised:
-        return problem.assembled(theta, members, lanes.moved(theta, members, share), problem.taus(members))
+        return problem.assembled(theta, members, problem.moved(theta, members, share), problem.taus(members))
 
     shares = np.ones(len(theta))
     way = Way.begun(theta, evaluate(theta, np.arange(len(theta)), shares))
@@ -199,9 +196,9 @@ def _closed(problem: Problem, lanes: Piecewise, theta: np.ndarray) -> Minimum:
         if not here.size:
             break
         size, undamped = unknowns.sizes(x), np.full(here.size, 1e-24)  # only keeps what is held from being singular
-        d = damped_step(arrow, x, column_scaling(arrow, size), undamped, unknowns, cutoff_of(lanes, control, here))
-        length = lanes.change(problem, way.at.sigma[here], d, here)
-        done = lanes.closed(here) & (length <= control.tolerance) & (np.abs(d) <= control.tolerance * size).all(axis=1)
+        d = damped_step(arrow, x, column_scaling(arrow, size), undamped, unknowns, cutoff_of(problem, control, here))
+        length = problem.change(way.at.sigma[here], d, here)
+        done = problem.closed(here) & (length <= control.tolerance) & (np.abs(d) <= control.tolerance * size).all(axis=1)
         here, d, x, length = way.arrived(here, done), d[~done], x[~done], length[~done]
         if not here.size:
             break
@@ -215,6 +212,6 @@ def _closed(problem: Problem, lanes: Piecewise, theta: np.ndarray) -> Minimum:
     return way.minimum("pieces that join")
 
 
-def cutoff_of(lanes: Piecewise, control: Control, members: np.ndarray) -> float:
+def cutoff_of(problem: Piecewise, control: Control, members: np.ndarray) -> float:
     """The fraction of the largest singular value below which one counts as zero: less, where the largest has grown along the motion and the others have not."""
-    return max(control.cutoff / float(np.max(lanes.growth(members))), 1e-14)  # round-off of singular values
+    return max(control.cutoff / float(np.max(problem.growth(members))), 1e-14)  # round-off of singular values

@@ -207,7 +207,7 @@ def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: C
         return NoiseLevels(at, known, doubt, 0 * doubt, untold[:, 1:])
     by_run = [problem.by_channel(run, at, lambda x: x) for run in range(len(problem.runs))]
     residuals = [r[np.isfinite(r)] for r in np.concatenate([r.reshape(len(theta), -1) for of in by_run for r in of.values()], axis=1)]
-    samples = np.concatenate([[[r.size] for r in residuals], problem.lanes.counted(problem.estimated, members)], axis=1)
+    samples = np.concatenate([[[r.size] for r in residuals], problem.counted(problem.estimated, members)], axis=1)
     (determined, widths), unsure = np.zeros((2, len(theta), count)), problem.loss != LEAST_SQUARES
     fewest = 0.5  # degrees of freedom: with fewer, a channel does not tell its sigma
     for _ in range(50):

@@ -1,6 +1,7 @@
 """The unknowns of a fit: parameters of the scene, which all runs share, initial values of single runs, and numbers of sensors and actuators of both kinds.
 
-theta = (shared, own of run 0, own of run 1, ...), every run with a place for each initial value that is unknown in any; where it is known, it is held.
+theta = (shared, own of run 0, own of run 1, ...), every run with a place for each initial value that is unknown in any; where it is known, it is held. A single
+run has none of its own: there is nothing to tell them from those that runs share.
 
 Whether the runs of a fit start on the constraints, at the first guess and where the unknowns are changed.
 """
@@ -99,24 +100,25 @@ class _Entry:
 
 
 def unknowns_of(
-    scene: Scene, runs: Sequence[Experiment], free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]"
+    scene: Scene, runs: Sequence[Experiment], free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]", apart: bool = False
 ) -> Unknowns:
     """The unknowns that `free`, the runs' `unknown_start` and their sensors and actuators name.
 
-    A parameter for which `free` gives a function of the scene is no unknown: it follows from the others (`ties`).
+    A parameter for which `free` gives a function of the scene is no unknown: it follows from the others (`ties`). Those of a single run count as shared,
+    unless they are to be `apart`.
 
     Raises ValueError for unknown names, for guesses outside their bounds, for a parameter of each run, for an estimate that runs share but state differently,
     and where nothing is free.
     """
     parameters = {name: about for name, _, about in parameters_of(scene)}
-    shared: list[tuple[Kind, _Entry]] = []
+    shared: list[tuple[str, Kind, _Entry]] = []
     bodies: list[BodyInertia] = []
     functions = {}
     for name, given in (free if isinstance(free, Mapping) else dict.fromkeys(as_names(free))).items():
         if isinstance(given, PossibleInertia):
             bodies.append(inertia_of_body(scene, name))
             numbers = zip(bodies[-1].labels, ("kg m^2", ""), (positive(), unbounded(1.0)), bodies[-1].numbers(scene), strict=True)
-            shared += [("inertia", _entry(label, unit, None, default, np.asarray(guess))) for label, unit, default, guess in numbers]
+            shared += [(label, "inertia", _entry(label, unit, None, default, np.asarray(guess))) for label, unit, default, guess in numbers]
             continue
         if name not in parameters:
             raise ValueError(f"`free` names `{name}`, which is no parameter of `{type(scene).__name__}`; {nearest(name, parameters)}")
@@ -128,22 +130,25 @@ def unknowns_of(
         about = parameters[name]
         has_sign = about["positive"] or about["non_negative"]
         entry = _entry(name, about["unit"], given, positive() if has_sign else unbounded(), np.asarray(getattr(scene, name)))
-        shared.append(("scene", _not_negative(entry, about["positive"]) if has_sign else entry))
+        shared.append((name, "scene", _not_negative(entry, about["positive"]) if has_sign else entry))
     of_runs = _of_all_runs(runs)
-    shared += [("sensor", _of_sensor(label, label, estimate)) for label, estimate in of_runs.items() if not estimate.per_run]
+    shared += [(label, "sensor", _of_sensor(label, label, estimate)) for label, estimate in of_runs.items() if not estimate.per_run]
     starts = {name: run.start[name].shape for run in reversed(runs) for name in run.unknown_start}
-    own: list[tuple[str, tuple[int, ...], Kind]] = [(name, starts[name], "scene") for name in dict.fromkeys(name for run in runs for name in run.unknown_start)]
+    own: list[tuple[str, tuple[int, ...], Kind]] = [(name, starts[name], "start") for name in dict.fromkeys(name for run in runs for name in run.unknown_start)]
     own += [(label, np.shape(estimate.guess), "sensor") for label, estimate in of_runs.items() if estimate.per_run]
     local = _placed(own)
-    entries = [entry for _, entry in shared]
-    entries += [_of_run(f"run {index}: {place.name}", place, run) for index, run in enumerate(runs) for place in local]
+    of_each = [_of_run(f"run {index}: {place.name}", place, run) for index, run in enumerate(runs) for place in local]
+    if len(runs) == 1 and not apart:
+        shared += [(place.name, place.kind, entry) for place, entry in zip(local, of_each, strict=True)]
+        local, of_each = (), []
+    entries = [*(entry for *_, entry in shared), *of_each]
     if all(entry.fixed for entry in entries):
         raise ValueError(f"nothing is free; name parameters in `free` ({', '.join(f'`{name}`' for name in parameters)}), or `unknown_start` values of a run")
     free_ones = [entry for entry in entries if not entry.fixed]
     counts = [entry.guess.size for entry in entries]
     each = lambda values: np.array([x for x, count in zip(values, counts, strict=True) for _ in range(count)])  # noqa: E731
     guess = np.concatenate([entry.guess.ravel() for entry in entries], dtype=float)
-    layout = Layout(_placed((entry.label, entry.guess.shape, kind) for kind, entry in shared), local, tuple(bodies))
+    layout = Layout(_placed((name, entry.guess.shape, kind) for name, kind, entry in shared), local, tuple(bodies))
     _check_told_once(layout, functions)
     for name, function in functions.items():
         layout = replace(layout, ties=(*layout.ties, tied_by(name, function, layout.scene(scene, guess[: layout.sizes[0]]))))
@@ -204,7 +209,7 @@ def _of_all_runs(runs: Sequence[Experiment]) -> dict[str, Estimate]:
 
 def _of_run(label: str, place: Place, run: Experiment) -> _Entry:
     """An unknown of one run; where it is known there, or does not exist, it is held."""
-    if place.of_sensor:
+    if place.kind == "sensor":
         estimate = run.estimates.get(place.name)
         return _Entry(label, "", np.zeros(place.shape), unbounded(), fixed=True) if estimate is None else _of_sensor(label, place.name, estimate)
     guess = np.asarray(run.start.get(place.name, np.zeros(place.shape)))
@@ -252,6 +257,6 @@ def check_starts(scene: Scene, runs: Sequence[Experiment], unknowns: Unknowns) -
         for theta, why in ((guess, "is not admissible"), (guess + change, changes)):
             shared, local = unknowns.split(theta)
             try:
-                consistent_start(layout.scene(scene, shared), t0=run.t0, inputs=run.inputs, **layout.start(run.start, local[index]))
+                consistent_start(layout.scene(scene, shared), t0=run.t0, inputs=run.inputs, **layout.start(run.start, shared, local[index]))
             except ValueError as error:
                 raise ValueError(f"the start of run {index} {why}. {error}") from None
