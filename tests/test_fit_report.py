@@ -118,8 +118,8 @@ def test_what_is_drawn_are_the_data_and_a_simulation(fitted, written):
 
 def test_report_loads_nothing_and_is_small(written):
     text = written[0].read_text(encoding="utf-8")
-    # two channels with data and two held out, two autocorrelations, two profiles, widths of intervals, what informs, the way to the minimum
-    assert text.count("<img") == text.count('src="data:image/png;base64,') == 11
+    # two channels with data and two held out, two profiles, widths of intervals
+    assert text.count("<img") == text.count('src="data:image/png;base64,') == 7
     assert not re.search(r"(https?:|src=\"(?!data:)|href=|url\(|@import|<script)", text)
     assert len(text) < 1e6
 
@@ -302,7 +302,7 @@ def test_profiles_answer_wrong_names_and_other_data():
 def shares(fit, runs):
     from jourdain_jax.analysis.resumed import informed, taken_up
 
-    return informed(taken_up(fit, runs), 20)
+    return informed(*taken_up(fit, runs), 20)
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.3], ids=["white", "with a memory"])

@@ -20,12 +20,13 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
 Parts = TypeVar("Parts", bound="ByMember")
 ByUnknown = Float[np.ndarray, "members unknowns"]
 PerMember = Float[np.ndarray, "members"]
 Flags = Bool[np.ndarray, "members"]
+Members = Int[np.ndarray, "members"]  # their numbers
 
 
 class ByMember:

@@ -55,10 +55,12 @@ class Chains:
     before: Int[np.ndarray, "runs members samples"]
     gap: Float[np.ndarray, "runs members samples"]  # s
     known: Float[np.ndarray, "runs samples"]  # tau, s; zero where the noise is white or tau is not known
-    channels: Mapping[str, slice]
+    unknown: list[slice]  # samples of channels whose tau is not known
 
     @staticmethod
-    def of(weights: Mapping[str, np.ndarray], ts: np.ndarray, taus: Mapping[str, np.ndarray], channels: Mapping[str, slice]) -> "Chains":
+    def of(
+        weights: Mapping[str, np.ndarray], ts: np.ndarray, taus: Mapping[str, np.ndarray], channels: Mapping[str, slice], unknown: list[slice]
+    ) -> "Chains":
         """The chains of samples with weights (runs, members, times, *channel), times (runs, times) and correlation times (runs,) of some channels."""
         parts, known, (runs, times) = [], [], ts.shape
         for name, where in channels.items():
@@ -69,14 +71,13 @@ class Chains:
             parts.append([np.moveaxis(x, 1, 2).reshape(runs, -1, times * count) for x in both])
             known.append(np.repeat(np.asarray(taus.get(name, np.zeros(runs)))[:, None], times * count, axis=1))
         before, gap = (np.concatenate(x, axis=-1) for x in zip(*parts, strict=True))
-        return Chains(before, gap, np.concatenate(known, axis=-1), channels)
+        return Chains(before, gap, np.concatenate(known, axis=-1), unknown)
 
-    def at(self, places: np.ndarray, members: np.ndarray, unknown: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Places before, and rho, of lanes: runs at these places, of these members, with correlation times (lanes,) of some channels."""
+    def at(self, places: np.ndarray, members: np.ndarray, taus: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Places before, and rho, of lanes: runs at these places, of these members, with correlation times (lanes, channels) where they are not known."""
         tau = self.known[places].copy()
-        for name, value in unknown.items():
-            if name in self.channels:
-                tau[:, self.channels[name]] = value[:, None]
+        for where, value in zip(self.unknown, taus.T, strict=True):
+            tau[:, where] = value[:, None]
         return self.before[places, members], memory(self.gap[places, members], tau)
 
 

@@ -18,6 +18,7 @@ Unknowns within bounds as vectors x of any real numbers, with the factor by whic
     unbounded  theta = x
     positive   theta = exp x                                  log |d theta / dx| = x
     bounds     theta = low + (high - low) / (1 + exp(-x))     log |d theta / dx| = log(high - low) - log(1 + exp(-x)) - log(1 + exp(x))
+    memory     of a correlation time: so does arcsin rho, rho = exp(-h / theta), h: the shortest interval
 
 Source: B. Carpenter et al., Journal of Statistical Software 76 (2017) 1, section 35 of the Stan reference manual of that year.
 """
@@ -26,7 +27,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,15 +34,18 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Number, checked_known, described
 
+Numbers = Float[Array, "*batch"]
+
 
 @dataclass(frozen=True)
 class Range:
     """Bounds of an unknown (infinite where there is none), and a typical change of it."""
 
-    kind: Literal["bounds", "positive", "unbounded"]
+    kind: Literal["bounds", "positive", "unbounded", "memory"]
     low: float = -np.inf
     high: float = np.inf
     scale: float | None = None
+    interval: float = 0.0  # h, s, of a memory
 
     def least_size(self, guess: float) -> float:
         """What counts as a large change of an unknown that is near zero: the typical change, or a hundredth of the first guess or of the width."""
@@ -61,6 +64,26 @@ class Range:
     def not_below(self, low: float) -> "Range":
         """The part of the range that is not below this number, zero or a little more."""
         return replace(self, kind="positive" if self.kind == "unbounded" else self.kind, low=max(self.low, low))
+
+    def constrain(self, x: Numbers) -> Numbers:
+        """The unknown, in its unit, that a real number stands for."""
+        if self.kind == "memory":
+            return -self.interval / jnp.log(jnp.sin(self.low + (self.high - self.low) * jax.nn.sigmoid(x)))
+        return jnp.exp(x) if self.kind == "positive" else self.low + (self.high - self.low) * jax.nn.sigmoid(x) if self.kind == "bounds" else x
+
+    def log_slope(self, x: Numbers) -> Numbers:
+        """`log |d theta / dx|`; of a correlation time `log |d arcsin rho / dx|`."""
+        if self.kind in ("bounds", "memory"):
+            return np.log(self.high - self.low) + jax.nn.log_sigmoid(x) + jax.nn.log_sigmoid(-x)
+        return x if self.kind == "positive" else jnp.zeros_like(x)
+
+    def unconstrain(self, theta: Numbers) -> Numbers:
+        """The inverse of `constrain`; infinite at a bound, NaN beyond it."""
+        if self.kind not in ("bounds", "memory"):
+            return jnp.log(theta) if self.kind == "positive" else theta
+        inside = jnp.arcsin(jnp.exp(-self.interval / theta)) if self.kind == "memory" else theta
+        share = (inside - self.low) / (self.high - self.low)
+        return jnp.log(share) - jnp.log1p(-share)
 
     def refusal(self, guess: np.ndarray) -> str:
         """Why a first guess cannot be taken; empty where it can."""
@@ -207,39 +230,3 @@ def _check_prior(prior) -> None:
         raise ValueError(f"`prior` of `Estimate` is {described(prior)}, expected `jj.Normal(mean, sigma)`") from None
     if not (np.isfinite(mean) and np.isfinite(sigma) and sigma > 0):
         raise ValueError(f"`prior` of `Estimate` is {prior}, expected a standard deviation above zero; a number that is known needs no estimate")
-
-
-Points = Float[Array, "*batch unknowns"]
-class Transforms(eqx.Module):
-    """One transform for each unknown."""
-
-    kinds: tuple[str, ...] = eqx.field(static=True)
-    low: Float[np.ndarray, "unknowns"]  # zero and one where there are no bounds
-    high: Float[np.ndarray, "unknowns"]
-
-    def __init__(self, ranges: Sequence[Range]):
-        self.kinds = tuple(one.kind for one in ranges)
-        self.low = np.array([one.low if one.kind == "bounds" else 0.0 for one in ranges])
-        self.high = np.array([one.high if one.kind == "bounds" else 1.0 for one in ranges])
-
-    def _are(self, kind: str) -> np.ndarray:
-        return np.array([one == kind for one in self.kinds], bool)
-
-    def constrain(self, x: Points) -> Points:
-        """The unknowns in their units."""
-        positive, between = self._are("positive"), self._are("bounds")
-        share = jax.nn.sigmoid(jnp.where(between, x, 0.0))
-        return jnp.where(positive, jnp.exp(jnp.where(positive, x, 0.0)), jnp.where(between, self.low + (self.high - self.low) * share, x))
-
-    def log_slopes(self, x: Points) -> Points:
-        """`log |d theta / dx|` of each."""
-        positive, between = self._are("positive"), self._are("bounds")
-        inside = jnp.where(between, x, 0.0)
-        logs = jnp.log(self.high - self.low) + jax.nn.log_sigmoid(inside) + jax.nn.log_sigmoid(-inside)
-        return jnp.where(positive, x, jnp.where(between, logs, 0.0))
-
-    def unconstrain(self, theta: Points) -> Points:
-        """The inverse of `constrain`; infinite at a bound, NaN beyond it."""
-        positive, between = self._are("positive"), self._are("bounds")
-        share = jnp.where(between, (theta - self.low) / (self.high - self.low), 0.5)
-        return jnp.where(positive, jnp.log(jnp.where(positive, theta, 1.0)), jnp.where(between, jnp.log(share) - jnp.log1p(-share), theta))

@@ -110,16 +110,16 @@ class Statistics:
 @np.errstate(over="ignore", invalid="ignore")  # of unknowns that no bound kept from growing beyond all measure
 def statistics(problem: Problem, found: Minimum, at_bounds: AtBounds) -> Statistics:
     """Statistics of the minimum of each member; without the axis of members where the problem has none."""
-    unknowns, theta, single = problem.unknowns, found.theta, problem.single
-    one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
+    unknowns, theta, single, one = problem.unknowns, found.theta, problem.single, problem.one
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
     here = lambda x: one(x[:, places])  # noqa: E731
     low, high, bound = unknowns.low[places], unknowns.high[places], unknowns.reached(theta)
     limit = here(at_bounds.limit)
     about = spread(problem, found, bound)
     levels, known, reach = about.levels, about.known.only() if single else about.known, one(about.quantiles * about.known.standard_errors)
-    residuals = tuple(problem.by_channel(run, levels.at, one) for run in range(len(problem.runs)))
-    white = tuple(problem.by_channel(run, levels.at, one, white=True) for run in range(len(problem.runs)))
+    residuals, white = (
+        tuple({name: one(r) for name, r in problem.by_channel(run, levels.at, flag).items()} for run in range(len(problem.runs))) for flag in (False, True)
+    )
     over = lambda r: tuple(range(0 if single else 1, r.ndim))  # noqa: E731
     samples = sum(np.sum(np.isfinite(r), axis=over(r)) for run in residuals for r in run.values())
     determined = np.where(fails, 0.0, _determined(levels.known, unknowns))

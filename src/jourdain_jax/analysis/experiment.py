@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.estimate import Estimate, Range
 from jourdain_jax.analysis.quantities import Instrument, StopEvent, channel, cut
 from jourdain_jax.analysis.sensors import Actuator, Drive, Numbers, Reading, Sensor, Times, ideal, latest, response
-from jourdain_jax.calculus.reals import Number, array_module, checked_unless_traced, described, is_traced
+from jourdain_jax.calculus.reals import Number, array_module, checked_unless_traced, described, holds, is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled, as_inputs
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.scene import Scene, entries_named
@@ -101,7 +101,7 @@ class Experiment(eqx.Module):
             self.ts, self.values, self.sigma = cut(events, self.t0, self.ts, self.values, self.sigma)
 
     def __check_init__(self):
-        if not _holds(lambda t: (t[0] <= t[1]) & (t[0] < t[2]), [self.t0, self.ts[0], self.ts[-1]]):
+        if not holds(lambda t0, ts: (t0 <= ts[0]) & (t0 < ts[-1]), self.t0, self.ts):
             raise ValueError(
                 f"the start at t0 = {self.t0} s comes after the first sample ({self.ts[0]} s), or not before the last ({self.ts[-1]} s); give an earlier `t0`"
             )
@@ -118,15 +118,15 @@ class Experiment(eqx.Module):
             raise ValueError(f"`{self.ended_by}` is an event, whose time has no sensor and no correlation time; leave them out, or rename the channel")
         _check_known(self.unknown_start, "unknown start value `{}` has no first guess; give one in `start`", self.start)
         for name, value in self.values.items():
-            if not _holds(lambda x: ~np.isinf(x), value):
+            if not holds(lambda x: ~np.isinf(x), value):
                 raise ValueError(
                     f"channel `{name}` holds values that are infinite, the first at sample {int(np.argwhere(np.isinf(np.asarray(value)))[0][0])}; "
                     "give NaN for samples that are missing"
                 )
-            if not _holds(lambda x: ~np.all(np.isnan(x)), value):
+            if not holds(lambda x: ~np.all(np.isnan(x)), value):
                 raise ValueError(f"channel `{name}` holds no value at all, only NaN; leave the channel out")
         for name, value in self.sigma.items():
-            if not _holds(lambda x: x > 0, value):
+            if not holds(lambda x: x > 0, value):
                 raise ValueError(f"sigma of channel `{name}` must be above zero (and not NaN); give the standard deviation of its noise")
 
     # Equinox's own costs a microsecond each time, to make methods pytrees; a fit asks for a hundred fields
@@ -147,11 +147,6 @@ class Experiment(eqx.Module):
         aligned = xp.reshape(sigma, sigma.shape + (1,) * (dimensions - sigma.ndim)) if sigma.ndim else sigma
         return xp.broadcast_to(aligned, values.shape)
 Data = Experiment | Sequence[Experiment]
-
-
-def _holds(condition: Callable, x) -> bool:
-    """Whether a condition holds throughout; traced values are not looked at."""
-    return is_traced(x) or bool(np.all(condition(np.asarray(x))))
 
 
 def _array(x) -> Array | np.ndarray:
@@ -175,9 +170,9 @@ def _correlation_times(given: Mapping) -> dict[str, Array | np.ndarray]:
             found[name] = np.zeros((), jnp.result_type(float))
             continue
         time = checked_unless_traced(value, f"correlation time of channel `{name}`", (), advice="give a time in s, or None where it is not known")
-        if not _holds(lambda x: np.isfinite(x) & (x >= 0), time):
+        if not holds(lambda x: np.isfinite(x) & (x >= 0), time):
             raise ValueError(f"the correlation time of channel `{name}` is {float(time):g} s, expected zero or more; None where it is not known")
-        if is_traced(time) or time != 0:
+        if holds(lambda x: x != 0, time):
             found[name] = time
     return found
 
@@ -185,12 +180,13 @@ def _correlation_times(given: Mapping) -> dict[str, Array | np.ndarray]:
 def _check_times(ts) -> None:
     if ts.ndim != 1 or ts.size == 0:
         raise ValueError(f"`ts` has shape {ts.shape}, expected a vector of at least one time in s")
-    if is_traced(ts):
-        return
-    with np.errstate(invalid="ignore"):
-        good = np.isfinite(ts) & (np.diff(ts, prepend=-np.inf) > 0)
-    if not good.all():
-        k = int(np.argmin(good))
+
+    @np.errstate(invalid="ignore")
+    def good(ts):
+        return np.isfinite(ts) & (np.diff(ts, prepend=-np.inf) > 0)
+
+    if not holds(good, ts):
+        k = int(np.argmin(good(ts)))
         after = f" after {ts[k - 1]:.10g} s" if k else ""
         raise ValueError(
             f"`ts` must be finite and strictly increasing, but sample {k} is at {ts[k]:.10g} s{after}; sort the samples by time and merge repeated ones"
@@ -292,7 +288,7 @@ def _inputs(scene: Scene, run: Experiment, where: str, estimates: dict) -> tuple
             if f"{name}.{number}" in estimates:
                 raise ValueError(f"{where} has a channel and an input `{name}`, both with an estimated {number}; give the channel another name")
             estimates[f"{name}.{number}"] = getattr(actuator, number)
-        if drive.has_filter and not is_traced((actuator.command.ts, run.ts)) and actuator.command.ts[-1] < run.ts[-1]:
+        if drive.has_filter and not holds(lambda command, ts: command[-1] >= ts[-1], actuator.command.ts, run.ts):
             raise ValueError(
                 f"the command of input `{name}` of {where} ends at {float(actuator.command.ts[-1]):g} s, before the last sample at {float(run.ts[-1]):g} s, "
                 "and its lag does not go on after it; repeat the last value at a later time"
@@ -305,9 +301,10 @@ def _inputs(scene: Scene, run: Experiment, where: str, estimates: dict) -> tuple
 
 def _check_overlap(run: Experiment, name: str, signal, where: str) -> None:
     """ValueError where all samples of an input that changes lie before the run, or after it."""
-    if not isinstance(signal, Sampled) or is_traced((signal, run.ts, run.t0)) or np.ptp(np.asarray(signal.values)) == 0:
-        return
-    if signal.ts[0] >= run.ts[-1] or signal.ts[-1] <= run.t0:
+    def overlaps(knots, x, ts, t0):
+        return np.ptp(x) == 0 or (knots[0] < ts[-1] and knots[-1] > t0)
+
+    if isinstance(signal, Sampled) and not holds(overlaps, signal.ts, signal.values, run.ts, run.t0):
         first, last, begin, end = (f"{float(t):.10g}" for t in (signal.ts[0], signal.ts[-1], run.t0, run.ts[-1]))
         raise ValueError(
             f"input `{name}` of {where} is sampled from {first} to {last} s, and the run is from {begin} to {end} s, where it would be constant; "

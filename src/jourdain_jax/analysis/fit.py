@@ -53,33 +53,26 @@ def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
     """The minimum from each `theta`; where none is found, or residuals are far beyond their sigmas, the lower one of it and that over growing spans.
 
     Over a short span a motion depends on its unknowns almost linearly, also an unstable one; each fit begins where that over the shorter span ended, and what
-    a short span does not tell stays near the first guess. After a few steps, what is far off gives way to growing spans, and goes on only where these do not
+    a short span does not tell stays near the first guess. What is far off, and comes no nearer, gives way to growing spans, and goes on only where these do not
     lead to small residuals either. Where each theta is a first guess of one problem, spans grow only where none led to a minimum with small residuals.
     """
     samples, control = problem.samples, problem.asked.control
     large = 5.0 * samples  # F: ten times what noise alone leaves, one half for each sample
-    few = replace(control, most_steps=min(8, control.most_steps), patience=3, near=large)
-    rest = replace(control, most_steps=control.most_steps - few.most_steps)
-    in_parts = samples > 0 and not (problem.single and len(theta) > 1)
+    impatient = samples > 0 and not (problem.single and len(theta) > 1)
 
     def of(members: np.ndarray, begin: np.ndarray, how: Control, span: Span | None = None) -> Minimum:
         return problem.minimum(begin, members, "whole runs", how, span)
 
-    def far() -> np.ndarray:
-        return found.at.cost > large
-
-    found = of(np.arange(len(theta)), theta, few if in_parts else control)
-    unfinished = ~found.converged & ~found.stuck & in_parts & (rest.most_steps > 0)
-    if (near := np.flatnonzero(unfinished & ~far())).size:
-        found, unfinished[near] = found.continued(near, of(near, found.theta[near], rest)), False
-    poor = np.flatnonzero(~found.converged | far())
+    found = of(np.arange(len(theta)), theta, replace(control, patience=3, near=large) if impatient else control)
+    left, ended = ~(found.going | found.converged | found.stuck), found.theta.copy()
+    poor = np.flatnonzero(~found.converged | (found.at.cost > large))
     if not poor.size or not samples or (problem.single and np.argmin(found.at.cost) not in poor):
         return found
     spans = np.array([1 / 32, 1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 3 / 4])  # shares of each run
-    ended, place = found.theta.copy(), np.zeros(len(poor), int)
-    way = replace(found.of(poor), theta=theta[poor])
+    way, place = replace(found.of(poor), theta=theta[poor]), np.zeros(len(poor), int)
+    roughly = replace(control, most_steps=min(8, control.most_steps), tolerance=1.0)
     while (some := np.flatnonzero(place < len(spans))).size:
-        grown = of(poor[some], way.theta[some], replace(few, tolerance=1.0, patience=None), Span(spans[place[some]], theta[poor[some]]))
+        grown = of(poor[some], way.theta[some], roughly, Span(spans[place[some]], theta[poor[some]]))
         grown.trace[:] = [((f"the first {spans[k]:.3g} of each run", costs),) for k, ((_, costs),) in zip(place[some], grown.trace, strict=True)]
         way = way.continued(some, grown)
         place[some] += 1
@@ -88,8 +81,8 @@ def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
             place[some] += (place[some] == k) & followed[:, k]  # the next one is followed, and left out
     grown = of(poor, way.theta, control).after(way, np.arange(len(poor)))
     found = found.lowered(poor, replace(grown, grown=np.ones(len(poor), bool)))
-    if (late := np.flatnonzero(unfinished & (~found.converged | far()))).size:
-        more = of(late, ended[late], rest)
+    if (late := np.flatnonzero(left & (~found.converged | (found.at.cost > large)))).size:
+        more = of(late, ended[late], control)
         found = found.lowered(late, replace(more.after(found, late), grown=more.grown))
     return found
 
@@ -294,8 +287,7 @@ def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool)
 
 
 def _result(problem: Problem, found: Minimum, at_bounds: AtBounds, agreeing: np.ndarray) -> Fit:
-    unknowns, single, asked = problem.unknowns, problem.single, problem.asked
-    one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
+    unknowns, asked, one = problem.unknowns, problem.asked, problem.one
     places = unknowns.estimated
     told = Fit(
         values=one(found.theta[:, places]),
@@ -311,7 +303,7 @@ def _result(problem: Problem, found: Minimum, at_bounds: AtBounds, agreeing: np.
         cutoff=asked.control.cutoff,
         errors=asked.errors,
         shooting=problem.told() if isinstance(problem, Piecewise) else None,
-        trace=found.trace[0] if single else (),
+        trace=found.trace[0] if problem.single else (),
         asked=asked,
         layout=unknowns.layout,
         work_out=partial(statistics, problem, found, at_bounds),

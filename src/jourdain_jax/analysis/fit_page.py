@@ -1,15 +1,13 @@
 """A fit as one HTML file for a browser: texts, tables and figures; nothing is loaded from elsewhere.
 
-r_k = sum w_i w_(i+k) / sum w_i^2,  w: whitened residuals
 An interval from noise that is taken as white, but is AR(1) noise of correlation r_1, is too narrow by about sqrt((1 + r_1) / (1 - r_1)) where sensitivities
 change slowly: G. E. P. Box, G. M. Jenkins and G. C. Reinsel, Time Series Analysis, 3rd ed. (1994), section 2.1.5.
 
-The figures of a fit: data beside prediction, residuals, how well each unknown is known, what informs it, its profile, and the way to the minimum.
+Its figures: data beside prediction with errors, how well each unknown is known, and its profile.
 """
 
 import html
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -40,17 +38,6 @@ def data_and_prediction(caption: str, label: str, one: Prediction, component: in
     return figure(draw, _WIDTH, 270, caption)
 
 
-def autocorrelation(name: str, found: np.ndarray, limit: float) -> str:
-    """Draw the correlation of whitened residuals by lag, over the band that white noise hardly leaves."""
-
-    def draw(whole) -> None:
-        axes = whole.add_subplot(xlabel="lag in samples", ylabel=f"correlation of {name}")
-        axes.axhspan(-limit, limit, color="#e6e6e6")
-        axes.stem(np.arange(1, len(found) + 1), found, basefmt=" ")
-
-    return figure(draw, _WIDTH, _HEIGHT)
-
-
 def interval_widths(fit: Estimates) -> str:
     """Draw half the width of the 95 % interval of each unknown, in per cent of the estimate, on an axis of powers of ten."""
     names, narrowest, widest = fit.labels[:40], 1e-4, 100.0  # unknowns in one figure; per cent
@@ -76,24 +63,6 @@ def interval_widths(fit: Estimates) -> str:
     return figure(draw, 700, 20 * len(names) + 60, "; ".join(notes))
 
 
-def information_over_time(shares: Informed, run: int) -> str:
-    """Draw what the samples of a run tell of each unknown per second, by channel; the highest value of each unknown, of all runs, has full height."""
-    spans = [np.gradient(ts) if len(ts) > 1 else np.ones(1) for ts in shares.times]
-    most = np.max([np.max(sum(of.values()) / span, axis=1) for of, span in zip(shares.of_samples, spans, strict=True)], axis=0)
-
-    def draw(whole) -> None:
-        rows = whole.subplots(len(shares.labels), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
-        for i, (axes, name) in enumerate(zip(rows, shares.labels, strict=True)):
-            told = shares.of_samples[run]
-            axes.stackplot(shares.times[run], *(of[i] / spans[run] / most[i] for of in told.values()), labels=list(told), step="mid")
-            axes.set_yticks([0.5], [name if len(name) <= 22 else name[:21] + "…"])
-            axes.text(1.01, 0.3, f"{100 * shares.of_runs[i, run]:.0f} %", transform=axes.transAxes, fontsize=8)
-        rows[0].legend(fontsize=7, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
-        rows[-1].set(xlabel="t in s", ylim=(0.0, 1.05))
-
-    return figure(draw, _WIDTH + 90, 24 * len(shares.labels) + 80, f"run {run}: share of what the data tell of each unknown, along time")
-
-
 def profile(one: Profile, error: float) -> str:
     """Draw the rise along an unknown, its 95 % interval, and the parabola of the standard error."""
     shown = one.rise <= 3 * RISE_95
@@ -114,22 +83,6 @@ def profile(one: Profile, error: float) -> str:
         axes.set(xlim=(low, high), ylim=(bottom, max(top, 1.3 * RISE_95)))
 
     return figure(draw, _WIDTH, _HEIGHT, str(one).replace("`", ""))
-
-
-def way_to_the_minimum(trace: tuple[tuple[str, tuple[float, ...]], ...]) -> str:
-    """Draw F above the lowest of each stretch, after each step tried; a line stands where another function is minimised."""
-
-    def draw(whole) -> None:
-        axes = whole.add_subplot(xlabel="steps tried", ylabel="F above its minimum", yscale="log")
-        begins = np.cumsum([0, *(len(costs) for _, costs in trace)])
-        for (a, b), (_, costs) in zip(pairwise(begins), trace, strict=True):
-            finite = np.where(np.isfinite(costs), costs, np.nan)
-            lowest = np.nanmin(finite) if np.isfinite(finite).any() else np.nan
-            axes.plot(np.arange(a, b), np.maximum(finite - lowest, 1e-3), ".-", color=MODEL, lw=1.2)  # F above its minimum: less is drawn as this
-        for begin in begins[1:-1]:
-            axes.axvline(begin - 0.5, color=QUIET, ls="--", lw=0.8)
-
-    return figure(draw, 2 * _WIDTH if sum(len(costs) for _, costs in trace) > 60 else _WIDTH, _HEIGHT)
 
 
 _PAGE = """<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>
@@ -201,7 +154,7 @@ def _informed(shares: Informed) -> Section:
         rows.append((name, *(f"{100 * share[i]:.1f} %" for share in columns.values()), f"run {run}, {begin:.3g} to {end:.3g} s"))
     more = shares.of_runs.shape[1] - len(shown)
     lines = [*table(rows), *([f"The {len(shown)} runs that tell most are shown; {more} more are not."] if more else [])]
-    return Section("What informs which unknown", about, lines, [information_over_time(shares, int(run)) for run in shown])
+    return Section("What informs which unknown", about, lines)
 
 
 def _correlations(fit: Estimates) -> Section:
@@ -228,7 +181,7 @@ def _predicted(title: str, about: str, runs: Sequence[dict[str, Prediction]], un
 
 def _whiteness(fit: Estimates, fitted: Sequence[dict[str, Prediction]]) -> Section:
     about = "Of residuals from which the memory of the noise was taken out, where that was estimated or stated."
-    rows, figures = [("channel", "correlation of neighbours", "white ones hardly exceed", "white", "correlation time", "intervals too narrow by")], []
+    rows = [("channel", "correlation of neighbours", "white ones hardly exceed", "white", "correlation time", "intervals too narrow by")]
     for name, (rho, limit) in fit.autocorrelation.items():
         white = abs(rho) <= limit
         time = f"{float(fit.correlation_time[name]):.3g} s" if name in fit.correlation_time else "-"
@@ -237,21 +190,16 @@ def _whiteness(fit: Estimates, fitted: Sequence[dict[str, Prediction]]) -> Secti
             time = f"about {-interval / np.log(min(rho, 0.999)):.2g} s"
         narrow = "-" if white or rho < 0 else f"about {np.sqrt((1 + rho) / (1 - min(rho, 0.999))):.2g}"
         rows.append((name, f"{rho:.3f}", f"{limit:.3f}", "yes" if white else "NO", time, narrow))
-        series = [np.asarray(run[name]).reshape(len(run[name]), -1) for run in fit.whitened if name in run]
-        total = sum(np.nansum(r**2) for r in series)
-        lags = range(1, min(20, max(map(len, series)) - 1) + 1)
-        found = np.array([sum(np.nansum(r[lag:] * r[:-lag]) for r in series) / total for lag in lags])
-        figures.append(autocorrelation(name, found, limit))
     if any(row[3] == "NO" for row in rows):
         allowed = "" if fit.errors == "sigmas" else " Those given here come from how much the runs differ, and allow for it."
         about = f"Where residuals are not white, intervals from the sigmas are too narrow, by about the factor in the last column.{allowed} {about}"
-    return Section("Are the residuals white?", about, table(rows), figures)
+    return Section("Are the residuals white?", about, table(rows))
 
 
 def _way(fit: Estimates) -> Section:
     told = fit.agreement if fit.guesses > 1 else "one first guess was tried; `guesses=30` would tell how many lead here"
     rows = [("what is minimised", "steps tried", "F at first", "F at last")]
     rows += [(what, str(len(costs) - 1), f"{costs[0]:.6g}", f"{costs[-1]:.6g}") for what, costs in fit.trace]
-    return Section("The way to the minimum", told, table(rows), [way_to_the_minimum(fit.trace)])
+    return Section("The way to the minimum", told, table(rows))
 
 

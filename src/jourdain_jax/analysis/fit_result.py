@@ -211,7 +211,7 @@ class Fit(Estimates):
         """The profile likelihood of the unknowns in `names` (default: all that are not of one run alone), by name: how far each may be moved, all others
         being fitted anew, before 2 (F - F_min) reaches 3.84, and whether that is "bounded", "one-sided" or "flat". `data`: the runs fitted.
 
-        It takes ten to thirty fits for each name. Where sigmas are estimated, a robust loss was used, or errors="runs", the rise is divided by what variances
+        It takes some ten fits for each name. Where sigmas are estimated, a robust loss was used, or errors="runs", the rise is divided by what variances
         and quantiles are the larger for it. ValueError for a fit of a batch or one that failed, and other data than the fit's; KeyError for names that were
         not estimated.
         """
@@ -219,7 +219,7 @@ class Fit(Estimates):
         of_all = [name for name in self.labels if not name.startswith("run ")] or self.labels
         fitted = taken_up(self, data)
         errors, of_rise = (dict(zip(self.labels, x.tolist(), strict=True)) for x in (self.standard_errors, self.statistics.of_rise))
-        return profiles(fitted, as_names(names) or of_all, errors, of_rise)
+        return profiles(*fitted, as_names(names) or of_all, errors, of_rise)
 
     def predict(self, runs: Data) -> tuple[dict[str, Prediction], ...]:
         """What the fit predicts for `runs` that had no part in it, by channel: `prediction`, `error`, `rms` (in the unit of the channel) and `r_squared`.
@@ -265,7 +265,7 @@ class Fit(Estimates):
         page = fit_page(
             self,
             fitted=of_fitted(self, runs) if runs else (),
-            shares=informed(taken_up(self, runs), 24) if runs else None,  # unknowns of which the report says what informs them
+            shares=informed(*taken_up(self, runs), 24) if runs else None,  # unknowns of which the report says what informs them
             held_out=self.predict(others) if others else (),
             profiles=along,
             units=units or {},

@@ -88,35 +88,20 @@ class RowsOverStates:
 STEP = {"float64": 0.02, "float32": 0.1}  # of the differences, along unit directions
 
 
-@dataclass(frozen=True)
-class RowIntegrability:
-    """Rows that are holonomic one by one, and those that are not; sizes of the violation of Frobenius' criterion."""
-
-    integrable_rows: tuple[str, ...]
-    nonholonomic_rows: tuple[str, ...]
-    violations: dict[str, float]  # relative; infinite for rows nonlinear in the speeds, which are no differential forms
+def integrable_below() -> float:
+    """The violation of Frobenius' criterion below which a row counts as integrable."""
+    return 1e-9 if jnp.result_type(float) == jnp.float64 else 1e-4
 
 
-@dataclass(frozen=True)
-class Growth:
-    """Dimensions of the spaces reached by brackets of admissible velocities; empty for rows nonlinear in the speeds."""
-
-    vector: tuple[int, ...]
-    closed: bool  # brackets to the given depth bring nothing new, or everything is reached
-    depth: int  # the largest number of fields in one bracket
-    tolerance: float  # relative size below which a bracket counts as nothing new
-    holonomic_rows_together: int | None  # all coordinates less the last dimension, at most the rank; None where not closed
-
-
-def row_integrability(scene: Scene) -> RowIntegrability:
+def frobenius_violations(scene: Scene) -> dict[str, float]:
     """Frobenius' criterion for every row by itself, at six random admissible states of the scene's domain.
 
-    The violation is the largest value of the two-form dw on unit velocities that w admits, over all states, divided by the size
-    of w and of its derivatives. Below 1e-9 (1e-4 in single precision) a row counts as integrable.
+    The violation is the largest value of the two-form dw on unit velocities that w admits, over all states, divided by the size of w and of its derivatives;
+    infinite for rows nonlinear in the speeds, which are no differential forms.
     """
     names = structure_of(scene).row_names
     if not names:
-        return RowIntegrability((), (), {})
+        return {}
     t, q, u = (np.asarray(x, float) for x in sample_states(scene, 6))
     rows, x = RowsOverStates(scene), np.concatenate([t[:, None], q], axis=1)
     (here, along), (other, _) = rows(x, u), rows(x, -0.7 * u[:, ::-1])
@@ -124,13 +109,8 @@ def row_integrability(scene: Scene) -> RowIntegrability:
     a, F = _in_speeds(here, 1.0)
     changes = [_in_speeds(along(np.tile(e, (len(x), 1))), 0.0) for e in np.eye(x.shape[1])]
     da, dF = (np.stack(parts, axis=-1) for parts in zip(*changes, strict=True))
-    limit = 1e-9 if jnp.result_type(float) == jnp.float64 else 1e-4
-    violations = {}
-    for s, name in enumerate(names):
-        worst = max(_frobenius_violation(*one) for one in zip(a[:, s], da[:, s], F, dF, strict=True))
-        violations[name] = float("inf") if curved[:, s].any() else worst
-    integrable = tuple(name for name in names if violations[name] <= limit)
-    return RowIntegrability(integrable, tuple(name for name in names if name not in integrable), violations)
+    worst = {name: max(_frobenius_violation(*one) for one in zip(a[:, s], da[:, s], F, dF, strict=True)) for s, name in enumerate(names)}
+    return {name: float("inf") if curved[:, s].any() else worst[name] for s, name in enumerate(names)}
 
 
 def _in_speeds(here: LinearRows, time: float) -> tuple[np.ndarray, np.ndarray]:
@@ -158,26 +138,29 @@ def _frobenius_violation(a: np.ndarray, da: np.ndarray, F: np.ndarray, dF: np.nd
     return float(np.max(np.abs(along - along.T), initial=0.0) / (size + np.max(np.abs(slopes))))
 
 
-def growth_vector(scene: Scene, *, depth: int = 4) -> Growth:
-    """Growth vector of the admissible velocities at generic states, by brackets of at most `depth` fields.
+def growth_vector(scene: Scene, depth: int) -> tuple[tuple[int, ...], bool]:
+    """Growth vector of the admissible velocities at generic states, by brackets of at most `depth` fields; and whether it is closed: longer brackets bring
+    nothing new, or everything is reached. Empty for rows nonlinear in the speeds.
 
-    Of two random states, the one with the largest dimensions is generic. A bracket counts as a new direction where it adds more
-    than `tolerance` (1e-6; 1e-2 in single precision) of the terms that it is made of.
+    Of two random states, the one with the largest dimensions is generic. A bracket counts as a new direction where it adds more than 1e-6 (1e-2 in single
+    precision) of the terms that it is made of.
     """
     structure = structure_of(scene)
-    reachable = len(scene.coordinate_names) - len(scene.coordinates.quaternions)  # unit norms hold by themselves
-    tolerance = 1e-6 if jnp.result_type(float) == jnp.float64 else 1e-2
     if not structure.affine:
-        return Growth((), False, depth, tolerance, None)
+        return (), False
     with_time = structure.timed_kinematics or structure.driven or not structure.homogeneous
     states = zip(*sample_states(scene, 2), strict=True)
-    vector, closed = max(_grow(_Fields(scene, with_time, u), t, q, reachable, depth, tolerance) for t, q, u in states)
-    # relations that the coordinate rates contain by themselves are no rows
-    return Growth(vector, closed, depth, tolerance, min(reachable - vector[-1], structure.rank) if closed else None)
+    return max(_grow(_Fields(scene, with_time, u), t, q, depth) for t, q, u in states)
 
 
-def _grow(fields: "_Fields", t, q, reachable: int, depth: int, tolerance: float) -> tuple[tuple[int, ...], bool]:
+def reachable(scene: Scene) -> int:
+    """The number of coordinates less the unit norms, which hold by themselves."""
+    return len(scene.coordinate_names) - len(scene.coordinates.quaternions)
+
+
+def _grow(fields: "_Fields", t, q, depth: int) -> tuple[tuple[int, ...], bool]:
     """Dimensions at one state, and whether they stopped growing."""
+    tolerance = 1e-6 if jnp.result_type(float) == jnp.float64 else 1e-2
     x = np.concatenate([t[None], q]) if fields.with_time else q
     generators = np.eye(structure_of(fields.scene).degrees_of_freedom + fields.with_time)
     if not len(generators):
@@ -195,7 +178,7 @@ def _grow(fields: "_Fields", t, q, reachable: int, depth: int, tolerance: float)
         if not chosen:
             return tuple(dimensions), True
         dimensions.append(len(spanned) - fields.with_time)
-        if dimensions[-1] == reachable:
+        if dimensions[-1] == reachable(fields.scene):
             return tuple(dimensions), True
         newest = newest[chosen]
     return tuple(dimensions), False

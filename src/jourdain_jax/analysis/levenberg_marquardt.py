@@ -18,9 +18,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
-from jourdain_jax.analysis.arrow import Arrow, ByMember, ByUnknown, Flags, PerMember
+from jourdain_jax.analysis.arrow import Arrow, ByMember, ByUnknown, Flags, Members, PerMember
 from jourdain_jax.analysis.unknowns import Unknowns
 
 LEAST = 1e-9  # damping lambda
@@ -45,21 +45,52 @@ class Control:
     tolerance: float
     most_steps: int
     cutoff: float
-    patience: int | None = None  # steps within which F is to fall to a quarter of what it was; None: any number
+    patience: int = 2**31  # steps within which F is to fall to a quarter of what it was
     near: float = 0.0  # F below which it may fall as slowly as it does
 
 
 @dataclass
 class Minimum(ByMember):
-    """Where the minimisation of each member ended."""
+    """Where the minimisation of each member ended, or is on its way."""
 
     theta: ByUnknown
     at: Linearised
+    going: Flags
     converged: Flags
     stuck: Flags  # no step lowers F, however short, and this is no minimum
-    steps: Int[np.ndarray, "members"]  # tried
+    steps: Members  # tried
     grown: Flags  # whether it was found over growing spans
     trace: np.ndarray  # (members,) of tuples of (what was minimised, F at first and after each step tried)
+
+    @staticmethod
+    def begun(theta: ByUnknown, at: Linearised, what: str) -> "Minimum":
+        """Return the state before the first step; members whose motion fails do not go. `what`: says in the trace what is minimised."""
+        none, trace = np.zeros(len(theta), bool), np.empty(len(theta), object)
+        trace[:] = [((what, (cost,)),) for cost in at.cost.tolist()]
+        return Minimum(theta.copy(), at, np.isfinite(at.cost), none, none.copy(), none.astype(int), none.copy(), trace)
+
+    def here(self) -> tuple[Members, Arrow, ByUnknown]:
+        """Return the members that go, with their linearised problems and unknowns."""
+        here = np.flatnonzero(self.going)
+        return here, self.at.arrow if here.size == self.going.size else self.at.arrow.of(here), self.theta[here]
+
+    def arrived(self, here: Members, done: Flags) -> np.ndarray:
+        """End the members that are done, and return those that try a step."""
+        self.converged[here[done]], self.going[here[done]] = True, False
+        self.steps[here[~done]] += 1
+        return here[~done]
+
+    def go(self, here: Members, end: ByUnknown, trial: Linearised, better: Flags) -> None:
+        """Go to the end of the step where that is better."""
+        self.theta[here[better]] = end[better]
+        self.at = self.at.replaced(here, trial, better)
+        for b in here.tolist():
+            ((what, costs),) = self.trace[b]
+            self.trace[b] = ((what, (*costs, float(self.at.cost[b]))),)
+
+    def give_up(self, members) -> None:
+        """End members for which no step is found."""
+        self.stuck[members], self.going[members] = True, False
 
     def lowest(self) -> "Minimum":
         """That of the member with the lowest value."""
@@ -69,71 +100,24 @@ class Minimum(ByMember):
         """How many members converged to a value at most so far `apart` from the lowest one."""
         return int(np.sum(self.converged & (self.at.cost <= np.min(self.at.cost) + apart)))
 
-    def lowered(self, members: Int[np.ndarray, "some"], other: "Minimum") -> "Minimum":
+    def lowered(self, members: Members, other: "Minimum") -> "Minimum":
         """All members, with those minima of these that were found in another way, where they are lower; and the steps of that one."""
         found = self.replaced(members, other, other.at.cost < self.at.cost[members])
         found.steps[members] = other.steps
         return found
 
-    def continued(self, members: Int[np.ndarray, "some"], new: "Minimum") -> "Minimum":
+    def continued(self, members: Members, new: "Minimum") -> "Minimum":
         """All members, with what was found for these once more; steps add up."""
         return self.replaced(members, new.after(self, members), np.ones(len(members), bool))
 
-    def after(self, before: "Minimum", members: Int[np.ndarray, "some"]) -> "Minimum":
+    def after(self, before: "Minimum", members: Members) -> "Minimum":
         """These members, with steps and trace of what was tried before."""
         return replace(self, steps=before.steps[members] + self.steps, trace=before.trace[members] + self.trace, grown=before.grown[members])
 
 
-@dataclass
-class Way:
-    """Where members are on their way to a minimum."""
-
-    theta: ByUnknown
-    at: Linearised
-    going: Flags
-    converged: Flags
-    stuck: Flags
-    steps: Int[np.ndarray, "members"]
-    costs: list[list[float]]  # F at first and after each step tried
-
-    @staticmethod
-    def begun(theta: ByUnknown, at: Linearised) -> "Way":
-        """Return the state before the first step; members whose motion fails do not go."""
-        none = np.zeros(len(theta), bool)
-        return Way(theta.copy(), at, np.isfinite(at.cost), none, none.copy(), none.astype(int), [[cost] for cost in at.cost.tolist()])
-
-    def here(self) -> tuple[Int[np.ndarray, "some"], Arrow, ByUnknown]:
-        """Return the members that go, with their linearised problems and unknowns."""
-        here = np.flatnonzero(self.going)
-        return here, self.at.arrow if here.size == self.going.size else self.at.arrow.of(here), self.theta[here]
-
-    def arrived(self, here: Int[np.ndarray, "some"], done: Bool[np.ndarray, "some"]) -> Int[np.ndarray, "others"]:
-        """End the members that are done, and return those that try a step."""
-        self.converged[here[done]], self.going[here[done]] = True, False
-        self.steps[here[~done]] += 1
-        return here[~done]
-
-    def go(self, here: Int[np.ndarray, "some"], end: ByUnknown, trial: Linearised, better: Bool[np.ndarray, "some"]) -> None:
-        """Go to the end of the step where that is better."""
-        self.theta[here[better]] = end[better]
-        self.at = self.at.replaced(here, trial, better)
-        for b in here.tolist():
-            self.costs[b].append(float(self.at.cost[b]))
-
-    def give_up(self, members) -> None:
-        """End members for which no step is found."""
-        self.stuck[members], self.going[members] = True, False
-
-    def minimum(self, what: str) -> Minimum:
-        """Return where the members are; `what`: says in the trace what is minimised."""
-        trace = np.empty(len(self.theta), object)
-        trace[:] = [((what, tuple(costs)),) for costs in self.costs]
-        return Minimum(self.theta, self.at, self.converged, self.stuck, self.steps, np.zeros(len(self.theta), bool), trace)
-
-
 def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: ByUnknown, unknowns: Unknowns, control: Control, what: str = "") -> Minimum:
     """Minimise from `theta`. `evaluate(theta, members)`: value and slopes of the members with these numbers; `what`: says in the trace what is minimised."""
-    way = Way.begun(theta, evaluate(theta, np.arange(len(theta))))
+    way = Minimum.begun(theta, evaluate(theta, np.arange(len(theta))), what)
     full = np.ones(len(theta))
     damping, growth, fall = 1e-3 * full, 4.0 * full, 10.0 * full  # factors by which it grows after a step that failed, and falls after a good one
     for _ in range(control.most_steps):
@@ -163,13 +147,13 @@ def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: By
         growth[here] = np.where(better, 4.0, 2 * growth[here])
         way.go(here, x + d, trial, better)
         way.give_up(damping > 1e9)
-        if control.patience is not None:
-            late = [b for b in here.tolist() if len(way.costs[b]) > control.patience]
-            way.going[[b for b in late if way.costs[b][-1] > max(control.near, 0.25 * way.costs[b][-1 - control.patience])]] = False
-    return way.minimum(what)
+        for b in here.tolist():
+            ((_, costs),) = way.trace[b]
+            way.going[b] &= len(costs) <= control.patience or costs[-1] <= max(control.near, 0.25 * costs[-1 - control.patience])
+    return way
 
 
-def fallen(before: Float[np.ndarray, "some"], trial: Linearised, d: ByUnknown, slope, promised, control: Control) -> Float[np.ndarray, "some"]:
+def fallen(before: PerMember, trial: Linearised, d: ByUnknown, slope, promised, control: Control) -> PerMember:
     """Return by how much F falls along a step d.
 
     Near the minimum the simulation's own error decides whether F falls: it jumps where a motion takes one step more. There the slopes of F at both ends of the

@@ -34,7 +34,7 @@ from jourdain_jax.analysis.table import table
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.build.structure import Reference
 from jourdain_jax.calculus.compiled import compiled
-from jourdain_jax.calculus.reals import array_module, described, is_traced
+from jourdain_jax.calculus.reals import array_module, described, holds, is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.simulate import simulate
@@ -52,7 +52,7 @@ def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> tuple[s
     found: list[str] = []
     for index, run in enumerate(runs):
         for name, signal in zip(scene.inputs.entries, run.inputs.channels if isinstance(run.inputs, Inputs) else (), strict=False):
-            if isinstance(signal, Sampled) and not is_traced((signal, run.ts, run.t0)) and np.ptp(np.asarray(signal.values)) > 0:
+            if isinstance(signal, Sampled) and not holds(lambda x, *_: np.ptp(x) == 0, signal.values, signal.ts, run.ts, run.t0):
                 found += _of_input(f"input `{name}` of run {index}", np.asarray(signal.ts), float(run.t0), float(run.ts[-1]))
         for name, values in run.values.items():
             quantity, shown = run.sensors[name].quantity if name in run.sensors else name, values[0] if repeats else values

@@ -2,7 +2,7 @@
 
     log p(z) = log L(theta) + sum log prior(theta) + sum log |d theta / dx| + log |det F|,      theta = constrain(x),   x = centre + F z
 
-L: `log_likelihood`; x: one real number for each unknown (`transforms`); centre, F: zero and the identity, or from a fit (`whitened`).
+L: `log_likelihood`; x: one real number for each unknown (`Range`); centre, F: zero and the identity, or from a fit (`whitened`).
 A correlation time tau stands in theta as arcsin rho, rho = exp(-h / tau), h: the shortest interval, and is even in it (Jeffreys' prior of AR(1) noise).
 Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 1.8 and 12.4.
 """
@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits
-from jourdain_jax.analysis.estimate import Estimate, Points, Range, Transforms, bounds, positive
+from jourdain_jax.analysis.estimate import Estimate, Range, positive
 from jourdain_jax.analysis.experiment import Data
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.layout import Layout, PossibleInertia
@@ -27,7 +27,7 @@ from jourdain_jax.analysis.runs import Run, equal_runs
 from jourdain_jax.analysis.unknowns import check_starts, unknowns_of
 from jourdain_jax.build.structure import Reference
 from jourdain_jax.calculus.compiled import compiled
-from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.calculus.reals import holds, is_traced
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
@@ -38,6 +38,7 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 Point = Float[Array, "unknowns"]
+Points = Float[Array, "*batch unknowns"]
 
 
 class LogDensity(eqx.Module):
@@ -50,7 +51,6 @@ class LogDensity(eqx.Module):
     groups: tuple[Run, ...]  # runs of equal structure, stacked
     options: AllOptions
     fixed: Float[np.ndarray, "places"]  # the first guess, and what is known, of all places of a layout
-    transforms: Transforms
     guess: Float[np.ndarray, "unknowns"]  # in their units
     prior_mean: Float[np.ndarray, "places"]
     prior_rows: Float[np.ndarray, "places places"]  # of priors: see `Unknowns`
@@ -64,7 +64,7 @@ class LogDensity(eqx.Module):
     places: tuple[int, ...] = eqx.field(static=True)  # of those unknowns that are no sigmas
     sigmas: tuple[str, ...] = eqx.field(static=True)  # channels whose sigma is unknown, which come after those
     with_memory: tuple[str, ...] = eqx.field(static=True)  # channels whose correlation time is, last among the unknowns
-    intervals: Float[np.ndarray, "with_memory"]  # s, the shortest of each of these
+    ranges: tuple[Range, ...] = eqx.field(static=True)  # of all unknowns
 
     def __call__(self, z: Point) -> Scalar:
         """The logarithm of the density; -inf where the motion fails."""
@@ -72,10 +72,9 @@ class LogDensity(eqx.Module):
 
     def _at(self, z: Point, reference: Reference) -> Scalar:
         x = self._spread(z)
-        inner = self.transforms.constrain(x)
-        theta = self._told(inner)
+        theta, slopes = self._each(Range.constrain, x), self._each(Range.log_slope, x)
         count, end = len(self.places), len(self.places) + len(self.sigmas)
-        slopes, known = self.transforms.log_slopes(x), self.prior_rows @ (theta[:count] - self.prior_mean)
+        known = self.prior_rows @ (theta[:count] - self.prior_mean)
         # of a sigma: flat in its logarithm, which is x
         logs = jnp.sum(slopes[:count]) + jnp.sum(slopes[end:]) + jnp.sum(jnp.log(jnp.diagonal(self.factor))) + self.prior_height - 0.5 * known @ known
         shared, local = self._split(theta)
@@ -98,7 +97,7 @@ class LogDensity(eqx.Module):
 
     def constrain(self, z: Points) -> Points:
         """The unknowns at z, in their units and in the order of `labels`; of one vector or many."""
-        return self._told(self.transforms.constrain(self._spread(self._checked(z))))
+        return self._each(Range.constrain, self._spread(self._checked(z)))
 
     def named(self, z: Points) -> dict[str, Float[Array, "*batch"]]:
         """The unknowns at z by name, in their units; of one vector or many."""
@@ -114,9 +113,10 @@ class LogDensity(eqx.Module):
             if name not in self.labels:
                 raise ValueError(f"`{name}` is not among the unknowns; {nearest(name, self.labels)}")
         theta = jnp.stack([jnp.asarray(values.get(label, self.guess[i]), jnp.result_type(float)) for i, label in enumerate(self.labels)])
-        x = self.transforms.unconstrain(self._inner(theta))
-        if not is_traced(x) and (off := np.flatnonzero(~np.isfinite(np.asarray(x)))).size:
-            raise ValueError(f"`{self.labels[off[0]]}` is {float(theta[off[0]]):g}, which is at or beyond a bound of it; give a value inside")
+        x = self._each(Range.unconstrain, theta)
+        if not holds(np.isfinite, x):
+            off = int(np.argmin(np.isfinite(x)))
+            raise ValueError(f"`{self.labels[off]}` is {float(theta[off]):g}, which is at or beyond a bound of it; give a value inside")
         return jax.scipy.linalg.solve_triangular(self.factor, x - self.centre, lower=True)
 
     def scene_at(self, z: Point) -> Scene:
@@ -138,20 +138,18 @@ class LogDensity(eqx.Module):
                     f"`{label}` has no standard error in the fit, so that nothing is known of its spread; give it a prior, or leave it out of `free`"
                 )
         noise = [float(fit.sigma[name]) for name in self.sigmas] + [float(fit.correlation_time[name]) for name in self.with_memory]
-        theta = np.array(self._inner(jnp.asarray(np.concatenate([fit.values, noise]))))
-        last = slice(len(theta) - len(self.with_memory), None)
-        low, high = self.transforms.low[last], self.transforms.high[last]
-        theta[last] = np.clip(theta[last], 0.98 * low + 0.02 * high, 0.02 * low + 0.98 * high)  # a correlation time may be at an end
-        x = self.transforms.unconstrain(jnp.asarray(theta))
-        slopes = np.exp(-np.asarray(self.transforms.log_slopes(x)))
+        theta, end = np.concatenate([fit.values, noise]), len(self.labels) - len(self.with_memory)
+        x = np.array(self._each(Range.unconstrain, jnp.asarray(theta)))
+        x[end:] = np.clip(x[end:], -4.0, 4.0)  # a correlation time may be at an end
+        slopes = np.exp(-np.asarray(self._each(Range.log_slope, jnp.asarray(x))))
         covariance = np.zeros((len(theta), len(theta)))
         covariance[: fit.values.size, : fit.values.size] = fit.covariance
         for i, name in enumerate((*self.sigmas, *self.with_memory), fit.values.size):
             samples = np.concatenate([np.ravel(run[name][np.isfinite(run[name])]) for run in fit.whitened if name in run])
             # sum of squares in units of sigma: degrees of freedom
-            covariance[i, i] = theta[i] ** 2 / (2 * max(np.sum(samples**2), 0.5)) if i < last.start else 1 / samples.size
+            covariance[i, i] = theta[i] ** 2 / (2 * max(np.sum(samples**2), 0.5)) if i < end else 1 / samples.size
         factor = np.linalg.cholesky(slopes[:, None] * covariance * slopes)
-        return eqx.tree_at(lambda d: (d.centre, d.factor), self, (np.asarray(x), factor))
+        return eqx.tree_at(lambda d: (d.centre, d.factor), self, (x, factor))
 
     def _checked(self, z) -> Array:
         z = jnp.asarray(z, jnp.result_type(float))
@@ -162,15 +160,9 @@ class LogDensity(eqx.Module):
     def _spread(self, z: Points) -> Points:
         return self.centre + z @ self.factor.T
 
-    def _told(self, inner: Points) -> Points:
-        """The unknowns, from what stands for them between the bounds of their transforms."""
-        end = len(self.labels) - len(self.with_memory)
-        return jnp.concatenate([inner[..., :end], -self.intervals / jnp.log(jnp.sin(inner[..., end:]))], axis=-1)
-
-    def _inner(self, theta: Points) -> Points:
-        """The inverse of `_told`."""
-        end = len(self.labels) - len(self.with_memory)
-        return jnp.concatenate([theta[..., :end], jnp.arcsin(jnp.exp(-self.intervals / theta[..., end:]))], axis=-1)
+    def _each(self, of: Callable, x: Points) -> Points:
+        """What is `of` the range of each unknown, at these numbers."""
+        return jnp.stack([of(one, x[..., i]) for i, one in enumerate(self.ranges)], axis=-1)
 
     def _split(self, theta: Point) -> tuple[Float[Array, "shared"], Float[Array, "runs local"]]:
         shared, local = self.layout.sizes
@@ -217,7 +209,7 @@ def log_density(
     with_memory = in_all_or_none(runs, "the correlation time", lambda run: run.unknown_correlation)
     limits = [correlation_limits([np.asarray(run.ts) for run in runs if name in run.values]) for name in with_memory]
     intervals = np.array([low / SHORTEST for low, _ in limits])
-    angles = [bounds(*(float(np.arcsin(np.exp(-h / tau))) for tau in ends)) for h, ends in zip(intervals, limits, strict=True)]
+    angles = [Range("memory", *(float(np.arcsin(np.exp(-h / tau))) for tau in ends), interval=float(h)) for h, ends in zip(intervals, limits, strict=True)]
     unknowns = unknowns_of(scene, runs, free)
     with reference_parameters(scene):
         if not is_traced((scene, [(run.start, run.t0, run.inputs) for run in runs])):
@@ -232,7 +224,6 @@ def log_density(
         groups=tuple(group for _, group in grouped),
         options=settled,
         fixed=unknowns.guess,
-        transforms=Transforms([*(unknowns.ranges[place] for place in places), *(positive() for _ in sigmas), *angles]),
         guess=np.concatenate([unknowns.guess[places], guesses]),
         prior_mean=unknowns.prior_mean[places],
         prior_rows=unknowns.prior_rows,
@@ -246,7 +237,7 @@ def log_density(
         places=tuple(places.tolist()),
         sigmas=sigmas,
         with_memory=with_memory,
-        intervals=intervals,
+        ranges=(*(unknowns.ranges[place] for place in places), *(positive() for _ in sigmas), *angles),
     )
 
 

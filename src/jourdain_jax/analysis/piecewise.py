@@ -125,7 +125,7 @@ class Piecewise(Problem):
     def with_gaps(self, theta: np.ndarray, members: np.ndarray, width: float) -> Linearised:
         """What is minimised with the starts of all pieces as unknowns: their gaps are residuals of this width, in sizes of the states."""
         (some, ends), local = self.with_ends(theta, members), self.pieces.unknowns.split(theta)[1]
-        at = self.pieces.assembled(theta, members, some, {})
+        at = self.pieces.assembled(theta, members, some, np.zeros((len(theta), len(self.with_memory))))
         count, pieces, M = local.shape
         joins = np.zeros((count, pieces, self._decided.size, 2 * M + self.shared + 1))
         sizes = width * np.concatenate([self.unknowns.least[self.shared + self._carried], self.node_sizes])

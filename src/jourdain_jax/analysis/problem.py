@@ -26,7 +26,7 @@ from jourdain_jax.analysis.arrow import Arrow, ByMember, PerMember, arrow, trian
 from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits, half_log_determinant, lowest
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.levenberg_marquardt import Control, Linearised, Minimum, minimise
-from jourdain_jax.analysis.runs import Group, Some, Taus, grouped
+from jourdain_jax.analysis.runs import Group, Some, grouped
 from jourdain_jax.analysis.shooting import MultipleShooting
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.calculus.reals import Number, checked_real
@@ -144,9 +144,13 @@ class Problem:
         self.tau = np.zeros((self.count, len(self.with_memory)))  # s, of these: at first as if their noise were white
         self.failed = False  # whether a motion has
 
-    def taus(self, members: np.ndarray) -> dict[str, np.ndarray]:
-        """Correlation times of some members, by channel, s."""
-        return dict(zip(self.with_memory, self.tau[members % self.count].T, strict=True)) if self.with_memory else {}
+    def one(self, x: np.ndarray) -> np.ndarray:
+        """What has an axis of members, without it where there are no repeats."""
+        return np.asarray(x[0]) if self.single else x
+
+    def taus(self, members: np.ndarray) -> np.ndarray:
+        """Correlation times of some members, (members, channels with memory), s."""
+        return self.tau[members % self.count]
 
     def counted(self, names: Sequence[str], members: np.ndarray) -> Float[np.ndarray, "members names"]:
         """Samples of each of these channels that are not missing, in all runs."""
@@ -179,8 +183,8 @@ class Problem:
         roughly = replace(control, tolerance=max(control.tolerance, 1e-2))
         return minimise(lambda x, _: self.linearised(x, np.array([member])), begin, replace(unknowns, fixed=fixed), roughly)
 
-    def assembled(self, theta: np.ndarray, members: np.ndarray, evaluated: Iterable[Some], taus: Taus, span: Span | None = None) -> Linearised:
-        """What is minimised, from what was evaluated; `taus`: correlation times by channel."""
+    def assembled(self, theta: np.ndarray, members: np.ndarray, evaluated: Iterable[Some], taus: np.ndarray, span: Span | None = None) -> Linearised:
+        """What is minimised, from what was evaluated, with these correlation times."""
         (p, m), count, runs, kinds = self.unknowns.layout.sizes, len(theta), self.unknowns.runs, 1 + len(self.estimated)
         triangles = np.zeros((count, runs, kinds, m + p + 1, m + p + 1))
         costs, squares = np.zeros((count, runs)), np.zeros((count, kinds))
@@ -188,7 +192,7 @@ class Problem:
         with np.errstate(over="ignore", invalid="ignore"):
             for b, j, plain in evaluated:
                 group = self.group_of[int(j[0])]
-                whole = group.whitened(j, members[b], plain, {name: tau[b] for name, tau in taus.items()})
+                whole = group.whitened(j, members[b], plain, taus[b])
                 if span is not None:
                     whole = np.where(group.within(j, span.shares[b])[..., None], whole, 0.0)
                 for k, rows in enumerate(self.kinds(int(j[0]), whole)):
@@ -248,26 +252,25 @@ class Problem:
 
     def restrict(self, theta: np.ndarray, members: np.ndarray) -> np.ndarray:
         """Puts correlation times that are not known to where the restricted likelihood is largest; by how much rho over one shortest interval changed."""
-        evaluated = list(self.evaluated(theta, members))
-        ends = {name: self._limits(name) for name in self.with_memory}
-        taus, changed = {name: np.maximum(tau, ends[name][0]) for name, tau in self.taus(members).items()}, np.zeros(len(members))
-        for name, (low, high) in ends.items():
+        evaluated, ends = list(self.evaluated(theta, members)), np.array([self._limits(name) for name in self.with_memory])
+        taus, changed = np.maximum(self.taus(members), ends[:, 0]), np.zeros(len(members))
+        for k, (low, high) in enumerate(ends):
             edges = (np.full(len(members), np.log(x)) for x in (low, high))
-            tried = lambda x, name=name: self._restricted(theta, members, evaluated, taus | {name: np.exp(x)})[0]  # noqa: E731
-            found, interval = np.exp(lowest(tried, *edges)), low / SHORTEST
-            changed = np.maximum(changed, np.abs(np.exp(-interval / found) - np.exp(-interval / taus[name])))
-            taus[name] = found
-        self.tau[members % self.count] = np.stack(list(taus.values()), axis=1)
+            found = np.exp(lowest(lambda x, k=k: self._restricted(theta, members, evaluated, _with(taus, k, np.exp(x)))[0], *edges))
+            interval = low / SHORTEST
+            changed = np.maximum(changed, np.abs(np.exp(-interval / found) - np.exp(-interval / taus[:, k])))
+            taus[:, k] = found
+        self.tau[members % self.count] = taus
         return changed
 
     def _limits(self, name: str) -> tuple[float, float]:
         return correlation_limits([np.asarray(run.ts) for run in self.runs if name in run.values])
 
-    def _restricted(self, theta, members: np.ndarray, evaluated: list, taus: Taus) -> tuple[np.ndarray, Linearised]:
+    def _restricted(self, theta, members: np.ndarray, evaluated: list, taus: np.ndarray) -> tuple[np.ndarray, Linearised]:
         """What the restricted likelihood is made of, to be as low as possible."""
         at, logs = self.assembled(theta, members, evaluated, taus), np.zeros(len(members))
         for b, j, _ in evaluated:
-            np.add.at(logs, b, self.group_of[int(j[0])].log_widths(j, members[b], {n: tau[b] for n, tau in taus.items()}))
+            np.add.at(logs, b, self.group_of[int(j[0])].log_widths(j, members[b], taus[b]))
         return at.cost + logs + half_log_determinant(at.arrow, self.unknowns.sizes(theta)), at
 
     def doubt(self, theta: np.ndarray, of: Callable[[Arrow], tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
@@ -280,16 +283,16 @@ class Problem:
         if not self.with_memory:
             return more, spread
         evaluated, taus = list(self.evaluated(theta, members)), self.taus(members)
-        for name in self.with_memory:
+        for k, name in enumerate(self.with_memory):
             low, high = self._limits(name)
             interval, counted = low / SHORTEST, self.counted([name], members)[:, 0]
             angle = lambda tau, h=interval: np.arcsin(np.exp(-h / tau))  # noqa: E731
             # in standard deviations of arcsin rho: 1 / sqrt(samples) without unknowns
-            nodes = angle(taus[name])[:, None] + np.linspace(-3.2, 3.2, 9) / np.sqrt(counted)[:, None]
+            nodes = angle(taus[:, k])[:, None] + np.linspace(-3.2, 3.2, 9) / np.sqrt(counted)[:, None]
             inside = (nodes >= angle(low)) & (nodes <= angle(high))
             found = []
             for node in np.clip(nodes, angle(low), angle(high)).T:
-                value, at = self._restricted(theta, members, evaluated, taus | {name: -interval / np.log(np.sin(node))})
+                value, at = self._restricted(theta, members, evaluated, _with(taus, k, -interval / np.log(np.sin(node))))
                 found.append((value, *of(at.arrow)))
             values, errors, moved = (np.stack(x, axis=1) for x in zip(*found, strict=True))
             weight = np.where(inside, np.exp(np.min(values, axis=1, keepdims=True) - values), 0.0)
@@ -308,10 +311,9 @@ class Problem:
         channels = [(run, name) for i, run in enumerate(self.runs) for name in run.values if name not in self.estimated]
         return sum(math.prod(np.shape(run.values[name])[int(not self.single) :]) for run, name in channels)
 
-    def by_channel(self, run: int, at: Linearised, one: Callable, white: bool = False) -> dict[str, np.ndarray]:
-        """Residuals of a run in units of sigma by channel; NaN where a sample is missing, or they were not worked out since another run had failed.
-
-        `white`: whitened ones.
+    def by_channel(self, run: int, at: Linearised, white: bool = False) -> dict[str, np.ndarray]:
+        """Residuals of a run in units of sigma by channel, (members, *samples); NaN where a sample is missing, or they were not worked out since another run
+        had failed. `white`: whitened ones.
         """
         group = self.group_of[run]
         flat = [np.zeros(0) if r is None else r for r in at.residuals[:, run]]
@@ -320,11 +322,10 @@ class Problem:
         members = np.arange(len(whole))
         if white and longest:
             whole = group.whitened(np.full(len(whole), run), members, whole[..., None], self.taus(members))[..., 0]
-        parts = group.by_channel(run, one(whole))
+        parts = group.by_channel(run, whole)
         for k, name in enumerate(self.estimated):
             if name in parts:
-                sigma = one(at.sigma[:, k])
-                parts[name] = parts[name] / sigma.reshape(sigma.shape + (1,) * (parts[name].ndim - sigma.ndim))
+                parts[name] = parts[name] / at.sigma[:, k].reshape(-1, *[1] * (parts[name].ndim - 1))
         return parts
 
     def kinds(self, run: int, whole: np.ndarray) -> list[np.ndarray]:
@@ -341,3 +342,8 @@ def closed(rows: np.ndarray, unknowns: int) -> np.ndarray:
     if rows.shape[-1] == unknowns + 1:
         return rows
     return np.concatenate([rows[..., :unknowns], rows[..., unknowns:-1] + rows[..., -1:]], axis=-1)
+
+
+def _with(taus: np.ndarray, k: int, values: np.ndarray) -> np.ndarray:
+    """The correlation times with those of one channel changed."""
+    return np.where(np.arange(taus.shape[1]) == k, values[:, None], taus)

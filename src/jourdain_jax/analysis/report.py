@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 
 import jax
 
-from jourdain_jax.analysis.integrability import growth_vector, row_integrability
+from jourdain_jax.analysis.integrability import frobenius_violations, growth_vector, integrable_below, reachable
 from jourdain_jax.build.assembling import COORDINATE_DOMAIN, SPEED_DOMAIN
 from jourdain_jax.build.plausibility import impossible_bodies
 from jourdain_jax.build.structure import structure_of, structure_whatever_its_faults
@@ -179,7 +179,8 @@ def report(scene: Scene | BuiltFor, *, depth: int = 4, start: State | dict | Non
     """
     built = build(scene)
     scene, structure = built.scene, structure_of(built.scene)
-    by_row, growth = row_integrability(scene), growth_vector(scene, depth=depth)
+    violations, (growth, closed) = frobenius_violations(scene), growth_vector(scene, depth)
+    by_itself = {name: size <= integrable_below() for name, size in violations.items()}
     asked = scene.example if start is None and structure.rank_losses and scene.example else start
     rank_at_start = None if asked is None else _rank_at(scene, as_state(scene, asked))
     return Report(
@@ -188,13 +189,14 @@ def report(scene: Scene | BuiltFor, *, depth: int = 4, start: State | dict | Non
         speeds=scene.speed_names.entries,
         rows=structure.row_names,
         **{name: getattr(structure, name) for name in AS_IN_STRUCTURE},
-        integrable_rows=by_row.integrable_rows,
-        nonholonomic_rows=by_row.nonholonomic_rows,
-        frobenius_violations=by_row.violations,
-        growth_vector=growth.vector,
-        closed=growth.closed,
+        integrable_rows=tuple(name for name, is_so in by_itself.items() if is_so),
+        nonholonomic_rows=tuple(name for name, is_so in by_itself.items() if not is_so),
+        frobenius_violations=violations,
+        growth_vector=growth,
+        closed=closed,
         bracket_depth=depth,
-        holonomic_rows_together=growth.holonomic_rows_together,
+        # relations that the coordinate rates contain by themselves are no rows
+        holonomic_rows_together=min(reachable(scene) - growth[-1], structure.rank) if closed else None,
         depends_on_time=structure.timed,
         cyclic_coordinates=cyclic_coordinates(scene),
         ignorable_coordinates=ignorable_coordinates(scene),

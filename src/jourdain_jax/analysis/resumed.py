@@ -26,7 +26,6 @@ one before it ended. Correlation times are held. Source: D. J. Venzon and S. H. 
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -34,35 +33,18 @@ from jaxtyping import Float
 
 from jourdain_jax.analysis.estimates import Estimates
 from jourdain_jax.analysis.experiment import Data, Experiment
-from jourdain_jax.analysis.information import Information, information, variances
+from jourdain_jax.analysis.information import information
+from jourdain_jax.analysis.levenberg_marquardt import Minimum
 from jourdain_jax.analysis.likelihood import as_runs
 from jourdain_jax.analysis.piecewise import Piecewise
 from jourdain_jax.analysis.problem import Asked, Problem
-from jourdain_jax.analysis.spread import RISE_95
+from jourdain_jax.analysis.spread import RISE_95, side
 from jourdain_jax.analysis.unknowns import unknowns_of
 from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.printing import Printed
 
 
-class TakenUp:
-    """A fit taken up again at theta, (1, places), for the runs it was fitted to or for others."""
-
-    def __init__(self, problem: Problem, theta: np.ndarray):
-        self.problem, self.theta = problem, theta
-        self.at = problem.linearised(theta, np.array([0]))
-
-    def residuals(self, run: int) -> dict[str, np.ndarray]:
-        """Residuals of a run by channel, in units of sigma, at theta; NaN where a sample is missing."""
-        return self.problem.by_channel(run, self.at, lambda x: x[0])
-
-    def information(self) -> Information:
-        """What the data tell at theta, from the sigmas alone: no factor for the loss, for sigmas that are estimated, or from how runs differ."""
-        unknowns, theta = self.problem.unknowns, self.theta
-        size, fails = unknowns.sizes(theta), ~np.isfinite(self.at.cost)
-        return information(self.at.arrow, size, unknowns.estimated, unknowns.reached(theta), fails, self.problem.asked.control.cutoff).only()
-
-
-def taken_up(fit: Estimates, data: Data) -> TakenUp:
+def taken_up(fit: Estimates, data: Data) -> tuple[Problem, Minimum]:
     """A `Fit` of one experiment where it ended, with residuals and derivatives computed anew. ValueError where `data` are not what it was fitted to."""
     problem = for_runs(fit, data, fit.asked, fit.shooting is not None)
     unknowns, theta = problem.unknowns, problem.unknowns.guess[None].copy()
@@ -71,16 +53,15 @@ def taken_up(fit: Estimates, data: Data) -> TakenUp:
     theta[0, unknowns.estimated] = fit.values
     if isinstance(problem, Piecewise) and fit.shooting is not None:
         problem.put_nodes(theta, fit.shooting)
-    again = TakenUp(problem, theta)
-    sigma = dict(zip(problem.estimated, again.at.sigma[0].tolist(), strict=True))  # as F has it; that of a fit allows for its unknowns
-
-    def here(run: int, name: str) -> np.ndarray:
-        return np.nan_to_num(again.residuals(run).get(name, np.nan)) * (sigma.get(name, 1.0) / fit.sigma.get(name, 1.0))
-
-    pairs = [(np.nan_to_num(r), here(run, name)) for run, of in enumerate(fit.residuals) for name, r in of.items()]
-    if not all(a.shape == b.shape and np.max(np.abs(a - b), initial=0.0) < 0.01 for a, b in pairs):
-        raise ValueError("`data` are not those of the fit: its residuals are others there; give the runs that it was fitted to")
-    return again
+    at = problem.linearised(theta, np.array([0]))
+    sigma = dict(zip(problem.estimated, at.sigma[0].tolist(), strict=True))  # as F has it; that of a fit allows for its unknowns
+    for run, residuals in enumerate(fit.residuals):
+        again = problem.by_channel(run, at)
+        for name, r in residuals.items():
+            here = np.nan_to_num(again[name][0] if name in again else np.nan) * (sigma.get(name, 1.0) / fit.sigma.get(name, 1.0))
+            if here.shape != r.shape or np.max(np.abs(np.nan_to_num(r) - here), initial=0.0) >= 0.01:
+                raise ValueError("`data` are not those of the fit: its residuals are others there; give the runs that it was fitted to")
+    return problem, Minimum.begun(theta, at, "")
 
 
 def for_runs(fit: Estimates, runs: Data, asked: Asked, apart: bool) -> Problem:
@@ -141,14 +122,14 @@ def of_held_out(fit: Estimates, runs: Data) -> tuple[dict[str, Prediction], ...]
     unknowns.fixed[:shared] = True
     if not np.all(unknowns.fixed):
         theta = problem.minimum(theta, np.array([0])).theta
-    other = TakenUp(problem, theta)
-    if not np.isfinite(other.at.cost[0]):
+    at = problem.linearised(theta, np.array([0]))
+    if not np.isfinite(at.cost[0]):
         raise ValueError("a motion of the runs held out fails at the estimates; look at it with `simulate`")
-    own = dict(zip(problem.estimated, other.at.sigma[0].tolist(), strict=True))
+    own = dict(zip(problem.estimated, at.sigma[0].tolist(), strict=True))
     found = []
     for run, data in enumerate(runs):
         # residuals are in units of sigmas, of which those that are not known were estimated from these very runs
-        residuals = {name: r * own[name] / fit.sigma.get(name, own[name]) if name in own else r for name, r in other.residuals(run).items()}
+        residuals = {name: r[0] * own[name] / fit.sigma.get(name, own[name]) if name in own else r[0] for name, r in problem.by_channel(run, at).items()}
         found.append(_by_channel(fit, data, residuals))
     return tuple(found)
 
@@ -197,30 +178,29 @@ class Informed:
         return run, float(ts[best]), float(ts[last[best] - 1])
 
 
-def informed(fitted: TakenUp, most: int) -> Informed:
-    """Shares for the first `most` unknowns of a fit that have a standard error."""
-    problem, known = fitted.problem, fitted.information()
-    unknowns = problem.unknowns
+def informed(problem: Problem, found: Minimum, most: int) -> Informed:
+    """Shares for the first `most` unknowns of a fit that have a standard error, from the sigmas alone: no factor for the loss or for sigmas that are
+    estimated.
+    """
+    unknowns, (p, m), theta, at = problem.unknowns, problem.unknowns.layout.sizes, found.theta, found.at
+    known = information(at.arrow, unknowns.sizes(theta), unknowns.estimated, unknowns.reached(theta), ~found.going, problem.asked.control.cutoff).only()
     some = np.flatnonzero(known.identifiable)[:most]
-    places, labels = unknowns.estimated[some], tuple(unknowns.labels[i] for i in some)
-    variance = variances(known.shared, known.own, known.follow)[places]
-    found: list[dict[str, np.ndarray]] = [{}] * len(problem.runs)
-    m, taus = unknowns.layout.sizes[1], problem.taus(np.array([0]))
-    for b, j, plain in problem.evaluated(fitted.theta, np.array([0])):
+    C = np.zeros((len(some), unknowns.fixed.size))
+    C[:, unknowns.estimated] = known.whole_covariance[some]
+    variance = C[range(len(some)), unknowns.estimated[some], None]
+    shares: list[dict[str, np.ndarray]] = [{}] * len(problem.runs)
+    for b, j, plain in problem.evaluated(theta, np.array([0])):
         group = problem.group_of[int(j[0])]
-        white = group.whitened(j, b, plain, {name: tau[b] for name, tau in taus.items()})
+        white = group.whitened(j, b, plain, problem.taus(b))
         for run, r, J in zip(j.tolist(), white[..., -1], white[..., :-1], strict=True):
-            rows = np.sqrt(problem.loss.weight(r))[:, None] * J
+            rows, own = np.sqrt(problem.loss.weight(r))[:, None] * J, slice(p + run * m, p + (run + 1) * m)
             for k, name in enumerate(problem.estimated):
-                if name in problem.runs[run].values:
-                    rows[group.channels[name]] /= fitted.at.sigma[0, k]
-            own, shared = rows[:, :m], rows[:, m:]
-            a_shared = known.shared @ (shared - own @ known.follow[run]).T  # own unknowns of a run follow the shared ones, x = - G s
-            a_own = -np.einsum("kij,js->kis", known.follow, a_shared)
-            a_own[run] += known.own[run] @ own.T
-            share = np.concatenate([a_shared, a_own.reshape(-1, len(own))])[places] ** 2 / variance[:, None]
-            found[run] = {name: np.nansum(x, axis=tuple(range(2, x.ndim))) for name, x in group.by_channel(run, share).items()}
-    return Informed(labels, tuple(found), tuple(np.asarray(run.ts) for run in problem.runs))
+                if name in group.channels:
+                    rows[group.channels[name]] /= at.sigma[0, k]
+            # a = C J'
+            share = (np.concatenate([C[:, own], C[:, :p]], axis=1) @ rows.T) ** 2 / variance
+            shares[run] = {name: np.nansum(x, axis=tuple(range(2, x.ndim))) for name, x in group.by_channel(run, share).items()}
+    return Informed(tuple(unknowns.labels[i] for i in some), tuple(shares), tuple(np.asarray(run.ts) for run in problem.runs))
 
 
 class Profile(Printed, eqx.Module):
@@ -243,92 +223,20 @@ class Profile(Printed, eqx.Module):
         return "; ".join((f"`{self.name}` = {self.estimate:.6g}{unit}, profile {self.kind}: {ends}", *self.notes))
 
 
-def profiles(fitted: TakenUp, names: Iterable[str], errors: dict[str, float], inflation: dict[str, float]) -> dict[str, Profile]:
+def profiles(problem: Problem, fitted: Minimum, names: Iterable[str], errors: dict[str, float], inflation: dict[str, float]) -> dict[str, Profile]:
     """Profiles of the unknowns named. `errors`: standard errors by name, for the first step; `inflation`: by what the rise is divided."""
-    unknowns, found = fitted.problem.unknowns, {}
+    unknowns, found = problem.unknowns, {}
     for name in names:
         if name not in unknowns.labels:
             raise UnknownNameError(f"`{name}` was not estimated; {nearest(name, unknowns.labels)}")
-        place = int(unknowns.estimated[unknowns.labels.index(name)])
-        low, high = (_side(fitted, place, errors[name], inflation[name], way) for way in (-1.0, 1.0))
-        points = sorted({(float(fitted.theta[0, place]), 0.0), *low.points, *high.points})
+        k = unknowns.labels.index(name)
+        place, error = int(unknowns.estimated[k]), errors[name]
+        estimate = float(fitted.theta[0, place])
+        first = 0.6 * error if np.isfinite(error) and error > 0 else 0.1 * float(unknowns.sizes(fitted.theta)[0, place])
+        low, high = (side(problem, fitted, 0, place, way, first, RISE_95 / 2 * inflation[name]) for way in (-1.0, 1.0))
+        values, rise = np.array(sorted({(estimate, 0.0), *low.points, *high.points})).T
         closed = low.is_closed, high.is_closed
         kind = ("flat", "one-sided", "bounded")[sum(closed)]
-        notes = tuple(dict.fromkeys(note for note in (low.note, high.note) if note))
-        values, rise = np.array(points).T
-        estimate = float(fitted.theta[0, place])
-        found[name] = Profile(name, unknowns.units[unknowns.labels.index(name)], estimate, values, rise, low.end, high.end, closed, kind, notes)
+        notes = tuple(dict.fromkeys(one.note for one in (low, high) if one.note))
+        found[name] = Profile(name, unknowns.units[k], estimate, values, 2 * rise / inflation[name], low.end, high.end, closed, kind, notes)
     return found
-
-
-class _Side(NamedTuple):
-    """The profile from the estimate to one side."""
-
-    end: float  # of the interval; infinite, or the bound, where there is none
-    points: list[tuple[float, float]]
-    is_closed: bool
-    note: str
-
-
-def _side(fitted: TakenUp, place: int, error: float, inflation: float, way: float) -> _Side:
-    """The profile to one side: `way` is 1 or -1."""
-    theta, origin, note = fitted.theta, float(fitted.theta[0, place]), ""
-    unknowns = fitted.problem.unknowns
-    size, bound = float(unknowns.sizes(theta)[0, place]), float((unknowns.low if way < 0 else unknowns.high)[place])
-    stride = 0.6  # of sqrt(rise), from point to point
-    first = step = stride * error if np.isfinite(error) and error > 0 else 0.1 * size
-    points: list[tuple[float, float]] = []
-
-    def solved(theta: np.ndarray, at: float) -> tuple[float, np.ndarray]:
-        """The rise so far from the estimate, and all others there; infinite where the motion fails."""
-        nonlocal note
-        found = fitted.problem.beside(theta, 0, place, origin + way * at)
-        if np.isfinite(found.at.cost[0]) and not found.converged[0]:
-            note = f"no minimum over the others was found near {origin + way * at:.4g}, so that the interval may be too narrow"
-        rise = 2 * float(found.at.cost[0] - fitted.at.cost[0]) / inflation
-        if np.isfinite(rise):
-            points.append((origin + way * at, rise))
-        return rise, found.theta
-
-    def crossing(theta: np.ndarray, inner: tuple[float, float], outer: tuple[float, float]) -> float:
-        """Where the rise is that of the interval's end, between two points: by halves where it jumps, else by secants of its root, which is nearly straight.
-
-        `theta`: all unknowns at the inner point, from which the others follow; beyond the outer one they may have gone elsewhere.
-        """
-        nonlocal note
-        for _ in range(8):
-            low, end, high = np.sqrt(np.maximum([inner[1], RISE_95, outer[1]], 0.0))
-            middle = inner[0] + (outer[0] - inner[0]) * (0.5 if outer[1] > 3 * RISE_95 else float((end - low) / (high - low)))
-            found, there = solved(theta, middle)
-            if abs(found / RISE_95 - 1) < 0.01:
-                return middle
-            if found < RISE_95:
-                inner, theta = (middle, found), there
-            else:
-                outer = middle, found
-        note = f"the sum of squares jumps near {origin + way * outer[0]:.4g}: beyond it, other unknowns are elsewhere"
-        return outer[0]
-
-    far, rise, slope = 0.0, 0.0, np.zeros(1)
-    room = min(abs(bound - origin), 1e3 * max(size, first))
-    for _ in range(16):
-        if far >= room:
-            break
-        at = min(far + step, room)
-        # others go on as they went from the point before to this one
-        found, there = solved(theta + slope * (at - far), at)
-        if not np.isfinite(found):
-            step = (at - far) / 4
-            if step < 1e-3 * first:
-                break
-            note = f"the motion fails near {origin + way * at:.4g}"
-            continue
-        if found < -0.02 * RISE_95:
-            note = f"a lower minimum than that of the fit lies near {origin + way * at:.6g}: fit again from there"
-        if found >= RISE_95:
-            note = "" if "fails" in note else note
-            return _Side(origin + way * crossing(theta, (far, rise), (at, found)), points, True, note)
-        speed = (np.sqrt(max(found, 0.0)) - np.sqrt(max(rise, 0.0))) / (at - far)
-        step = (at - far) * float(np.clip(stride / max(speed * (at - far), 1e-9), 0.5, 4.0))
-        slope, theta, far, rise = (there - theta) / (at - far), there, at, found
-    return _Side(bound if np.isfinite(bound) else way * np.inf, points, False, note)

@@ -10,9 +10,8 @@ compiled once for runs of equal structure, whatever their number: memory does no
 
 import math
 import os
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import lru_cache, partial
 from typing import NamedTuple
@@ -179,7 +178,6 @@ def filled_up(run: Run, times: int, knots: list[int]) -> Run:
 
 
 Some = tuple[np.ndarray, np.ndarray, np.ndarray]  # members (among those asked for), runs, and [J r] (lanes, samples, unknowns + 1), own unknowns first
-Taus = Mapping[str, np.ndarray]  # correlation times that are estimated, s, of some members, by channel
 _BY_MEMBER = ("values", "weights")  # of a run, which differ by member
 
 
@@ -205,7 +203,8 @@ class Group:
             begin, end = end, end + math.prod(weight.shape[2:])
             self.channels[name] = slice(begin, end)
         taus = {name: np.stack([run.correlation_time[name] for run in filled]) for name in first.correlation_time}
-        self._chains = Chains.of(self.weights, self._ts, taus, self.channels) if taus else None
+        unknown = [self.channels.get(name, slice(0)) for name in sorted({name for run in data for name in run.unknown_correlation})]
+        self._chains = Chains.of(self.weights, self._ts, taus, self.channels, unknown) if taus else None
         # numbers of a run in one row, since each array that is handed over costs as much as some of the steps of a motion
         self._common = _rows((scene, options), (1, 1))[0]
         of_members = [self._count if name in _BY_MEMBER else 1 for name in Run._fields]
@@ -232,18 +231,9 @@ class Group:
             return b[:kept], self.runs[j[:kept]], np.asarray(found)[:kept]
 
         yield lanes(*first)  # compiles, where that is needed
-        if not chunks:
-            return
-        pool, waiting = ThreadPoolExecutor(os.cpu_count() or 1), deque[Future]()
-        try:
-            for chunk in chunks:
-                waiting.append(pool.submit(lanes, *chunk))
-                if len(waiting) == 4:  # are begun before the first is read
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        finally:
-            pool.shutdown(cancel_futures=True)
+        with ThreadPoolExecutor() as pool:
+            for k in range(0, len(chunks), together := os.cpu_count() or 1):
+                yield from pool.map(lanes, *zip(*chunks[k : k + together], strict=True))
 
     def _chunks(self, members: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
         """How many lanes at a time, with positions of their members and runs; these are filled up with copies of the last."""
@@ -252,14 +242,14 @@ class Group:
         lanes = np.minimum(np.arange(-(-count // width) * width), count - 1).reshape(-1, width)
         return [(min(width, count - k * width), *np.divmod(some, len(self.runs))) for k, some in enumerate(lanes)]
 
-    def whitened(self, runs: np.ndarray, members: np.ndarray, rows: Float[np.ndarray, "lanes samples width"], taus: Taus) -> np.ndarray:
-        """Rows of lanes, whitened; `taus`: correlation times (lanes,) that are estimated, s."""
+    def whitened(self, runs: np.ndarray, members: np.ndarray, rows: Float[np.ndarray, "lanes samples width"], taus: np.ndarray) -> np.ndarray:
+        """Rows of lanes, whitened; `taus`: correlation times that are estimated, (lanes, channels), s."""
         if self._chains is None:
             return rows
         before, rho = self._chains.at(self.places(runs), members % self._count, taus)
         return whitened(rows, np.take_along_axis(rows, before[..., None], axis=1), rho[..., None])
 
-    def log_widths(self, runs: np.ndarray, members: np.ndarray, taus: Taus) -> Float[np.ndarray, "lanes"]:
+    def log_widths(self, runs: np.ndarray, members: np.ndarray, taus: np.ndarray) -> Float[np.ndarray, "lanes"]:
         """`sum log sqrt(1 - rho^2)` of lanes."""
         if self._chains is None:
             return np.zeros(len(runs))
@@ -273,15 +263,14 @@ class Group:
         counts = [(where.stop - where.start) // early.shape[1] for where in self.channels.values()]
         return np.concatenate([np.repeat(early, count, axis=1) for count in counts], axis=1)
 
-    def by_channel(self, run: int, flat: Float[np.ndarray, "*members samples"]) -> dict[str, np.ndarray]:
+    def by_channel(self, run: int, flat: Float[np.ndarray, "members samples"]) -> dict[str, np.ndarray]:
         """Weighted residuals of a run by channel, NaN where a sample is missing; all NaN where `flat` is empty, since they were not worked out."""
         place, found = int(np.searchsorted(self.runs, run)), {}
         for name, where in self.channels.items():
             weight = self.weights[name][place]
-            shape = (*flat.shape[:-1], *weight.shape[1:])
-            part = flat[..., where].reshape(shape) if flat.shape[-1] else np.full(shape, np.nan)
-            kept = (..., slice(self._lengths[place]), *(slice(None),) * (weight.ndim - 2))
-            found[name] = np.where((weight if flat.ndim > 1 else weight[0]) > 0, part, np.nan)[kept]
+            shape = (len(flat), *weight.shape[1:])
+            part = flat[:, where].reshape(shape) if flat.shape[1] else np.full(shape, np.nan)
+            found[name] = np.where(weight > 0, part, np.nan)[:, : self._lengths[place]]
         return found
 
 
@@ -293,7 +282,7 @@ def _of_members(run: Run, of: Callable) -> Run:
 def _rows(trees: Sequence, members: Sequence[int]) -> Float[np.ndarray, "members numbers"]:
     """All numbers of some trees in the order of `ravel_pytree`, in a row for each member; of a tree that has no axis of members, the same for all."""
     parts = [np.asarray(x).reshape(count, -1) for tree, count in zip(trees, members, strict=True) for x in jax.tree.leaves(tree) if is_array(x)]
-    return np.concatenate([np.repeat(part, max(members) // len(part), axis=0) for part in parts], axis=1, dtype=float)
+    return np.hstack([np.zeros((max(members), 0)), *(np.repeat(part, max(members) // len(part), axis=0) for part in parts)])
 
 
 @lru_cache(maxsize=16)

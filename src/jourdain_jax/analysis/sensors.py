@@ -31,7 +31,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.estimate import Estimate, positive, unbounded
 from jourdain_jax.analysis.quantities import Channel, Instrument, StopEvent
-from jourdain_jax.calculus.reals import array_module, checked_real, described, is_traced
+from jourdain_jax.calculus.reals import array_module, checked_real, described, holds, is_traced
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.motion_state import Motion
@@ -253,11 +253,9 @@ def _checked_number(where: str, name: str, value, is_one: bool) -> "Float[Array,
         _check_estimate(where, name, value)
         return value
     number = checked_real(value, where, () if name in OF_TIME or is_one else None, advice="give a number, or an `Estimate`").astype(jnp.result_type(float))
-    if is_traced(number):
-        return number
-    if not np.all(np.isfinite(number)):
+    if not holds(np.isfinite, number):
         raise ValueError(f"{where} is {number}, expected a finite number")
-    if name in OF_TIME and number < 0:
+    if name in OF_TIME and not holds(lambda x: x >= 0, number):
         raise ValueError(f"{where} is {float(number):g} s, expected zero or more; where the clock of a channel is ahead, shift its times")
     return number
 
@@ -351,7 +349,7 @@ def response(owner: Sensor | Actuator) -> tuple[dict, tuple[str, ...], tuple[str
     unknown = tuple(name for name, value in given.items() if isinstance(value, Estimate))
     numbers = {name: value.guess if name in unknown else value for name, value in given.items()}
     numbers = {name: array_module(x).asarray(x, jnp.result_type(float)) for name, x in numbers.items()}
-    return numbers, unknown, tuple(n for n, x in numbers.items() if n in unknown or is_traced(x) or not np.all(x == NUMBERS[n]))
+    return numbers, unknown, tuple(n for n, x in numbers.items() if n in unknown or holds(lambda x, n=n: np.any(x != NUMBERS[n]), x))
 
 
 def with_numbers(parts: Mapping[str, "Reading | Drive"], known: Mapping[str, Array | np.ndarray]) -> dict:

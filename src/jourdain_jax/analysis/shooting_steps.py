@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jourdain_jax.analysis.experiment import Experiment
-from jourdain_jax.analysis.levenberg_marquardt import Control, Linearised, Minimum, Way, column_scaling, damped_step, minimise
+from jourdain_jax.analysis.levenberg_marquardt import Control, Linearised, Minimum, column_scaling, damped_step, minimise
 from jourdain_jax.analysis.piecewise import Piecewise
 from jourdain_jax.analysis.sensors import ideal
 from jourdain_jax.analysis.unknowns import check_starts
@@ -189,7 +189,7 @@ def _closed(problem: Piecewise, theta: np.ndarray) -> Minimum:
         return problem.assembled(theta, members, problem.moved(theta, members, share), problem.taus(members))
 
     shares = np.ones(len(theta))
-    way = Way.begun(theta, evaluate(theta, np.arange(len(theta)), shares))
+    way = Minimum.begun(theta, evaluate(theta, np.arange(len(theta)), shares), "pieces that join")
     far = 2.0 * np.sqrt(max(problem.samples, 1))  # a step changes residuals by two sigmas at most, rms
     for _ in range(control.most_steps):
         here, arrow, x = way.here()
@@ -209,7 +209,7 @@ def _closed(problem: Piecewise, theta: np.ndarray) -> Minimum:
         way.go(here, end, trial, good)
         shares[here] = np.where(good, np.minimum(2 * shares[here], 1.0), 0.25 * share)
         way.give_up(shares < 1e-3)
-    return way.minimum("pieces that join")
+    return way
 
 
 def cutoff_of(problem: Piecewise, control: Control, members: np.ndarray) -> float:

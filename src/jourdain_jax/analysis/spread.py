@@ -34,6 +34,7 @@ Biometrics 53 (1997) 983.
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -69,10 +70,54 @@ class AtBounds:
     at_limit: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)  # by member and unknown at a bound: all unknowns with that one at its limit
 
 
-def _rise(problem: Problem, found: Minimum, b: int, place: int, step: float) -> tuple[float, Minimum]:
-    """How much F of member `b` rises when one unknown is moved by a step and held there (infinite where the motion fails), and the minimum there."""
-    at = problem.beside(found.theta[b : b + 1], b, place, found.theta[b, place] + step)
-    return float(at.at.cost[0] - found.at.cost[b]), at
+class Side(NamedTuple):
+    """The profile of one unknown to one side of its estimate."""
+
+    end: float  # where F has risen so much; where it has not, the bound, or infinite
+    is_closed: bool  # whether it has
+    at: Minimum | None  # the minimum there; or one that is lower than that of the fit
+    points: list[tuple[float, float]]  # values of the unknown, and rises of F
+    note: str  # what else was seen
+
+
+def side(problem: Problem, found: Minimum, b: int, place: int, way: float, first: float, end: float) -> Side:
+    """Follow the profile of member `b` along one unknown to one side (`way` is 1 or -1) until F has risen by `end`, from a distance `first` on.
+
+    All others go on from where they were at the point before. The end is found by secants of the root of the rise, which is nearly straight.
+    """
+    close, origin, theta = 0.01, float(found.theta[b, place]), found.theta[b : b + 1]  # close: of the rise at the end
+    bound = float((problem.unknowns.low if way < 0 else problem.unknowns.high)[place])
+    room = min(abs(bound - origin), 1e6 * first)
+    inner, outer, note = (0.0, 0.0), (np.inf, np.inf), ""  # distance and rise on either side
+    delta, points = min(first, room), []
+    for _ in range(20 if room else 0):
+        at = problem.beside(theta, b, place, origin + way * delta)
+        rise, where = float(at.at.cost[0] - found.at.cost[b]), f"near {origin + way * delta:.6g}"
+        if np.isfinite(rise):
+            points.append((origin + way * delta, rise))
+            note = note if at.converged[0] else f"no minimum over the others was found {where}, so that the interval may be too narrow"
+        if rise < -2 * close * end:
+            return Side(bound, False, at, points, f"a lower minimum than that of the fit lies {where}: fit again from there")
+        if abs(rise / end - 1) < close:
+            return Side(origin + way * delta, True, at, points, note)
+        if rise < end:
+            theta, inner = at.theta, (delta, max(rise, 0.0))
+        else:
+            outer = delta, rise
+        if inner[0] >= room:
+            return Side(bound, False, None, points, note)
+        if np.isfinite(outer[1]):
+            low, high = np.sqrt(inner[1] / end), np.sqrt(outer[1] / end)
+            delta = inner[0] + (outer[0] - inner[0]) * float(np.clip((1 - low) / (high - low), 0.1, 0.9))
+        elif np.isfinite(outer[0]):  # the motion fails there
+            if outer[0] - inner[0] < 1e-3 * first:
+                break
+            delta = inner[0] + (outer[0] - inner[0]) / 4
+        else:
+            delta = min(delta * min(np.sqrt(end / inner[1]) * (1 + close) if inner[1] else 4.0, 4.0), room)
+    if not np.isfinite(outer[1]):
+        return Side(bound, False, None, points, f"the motion fails {where}" if np.isfinite(outer[0]) else note)
+    return Side(origin + way * outer[0], True, at, points, f"the sum of squares jumps {where}: beyond it, other unknowns are elsewhere")
 
 
 def limits_at_bounds(problem: Problem, found: Minimum) -> AtBounds:
@@ -96,14 +141,13 @@ def _look_inward(problem: Problem, found: Minimum, told: AtBounds, b: int, place
     if told.beyond[b, place] > FAR_BEYOND:  # the bound decides: the slope alone gives the limit
         told.limit[b, place] = bound + inward * _root(slope, 1 / error**2, end)
         return
-    room = float(limits.high[place] - limits.low[place])
-    first = min(_root(slope, 1 / error**2, end) if np.isfinite(error) else float(limits.sizes(found.theta[b])[place]), room)
-    delta, at = _limit(partial(_rise, problem, found, b, place), inward, first, room, end)
-    if at is not None and np.isfinite(delta):
-        told.at_limit[b, place] = at.theta[0]
-    elif at is not None and (b not in told.lower or at.at.cost[0] < told.lower[b][0]):
-        told.lower[b] = at.at.cost[0], at.theta[0]
-    told.limit[b, place] = np.clip(bound + inward * delta, limits.low[place], limits.high[place])
+    first = _root(slope, 1 / error**2, end) if np.isfinite(error) else float(limits.sizes(found.theta[b])[place])
+    inner = side(problem, found, b, place, inward, first, end)
+    if inner.is_closed and inner.at is not None:
+        told.at_limit[b, place] = inner.at.theta[0]
+    elif inner.at is not None and (b not in told.lower or inner.at.at.cost[0] < told.lower[b][0]):
+        told.lower[b] = inner.at.at.cost[0], inner.at.theta[0]
+    told.limit[b, place] = inner.end
 
 
 def moved_from_bounds(told: AtBounds, theta: np.ndarray, reach: np.ndarray, places: np.ndarray, labels: tuple[str, ...]) -> list[str]:
@@ -122,11 +166,14 @@ def too_narrow_near_bounds(problem: Problem, found: Minimum, told: AtBounds, err
 
     Looked at are bounds that an interval reaches, and where an unknown at its bound may leave it, the ends of the intervals of what runs share.
     """
-    limits, theta, rise = problem.unknowns, found.theta[0], partial(_rise, problem, found, 0)
+    limits, theta = problem.unknowns, found.theta[0]
     places, labels = limits.estimated, limits.labels
 
+    def rise(place: int, step: float) -> float:
+        return float(problem.beside(found.theta, 0, place, theta[place] + step).at.cost[0] - found.at.cost[0])
+
     def named(some: Iterable[int], steps: Callable[[int], list[float]]) -> list[str]:
-        return [f"`{labels[k]}`" for k in some if any(2 * rise(int(places[k]), step)[0] < 0.5 * (step / errors[k]) ** 2 for step in steps(k))]
+        return [f"`{labels[k]}`" for k in some if any(2 * rise(int(places[k]), step) < 0.5 * (step / errors[k]) ** 2 for step in steps(k))]
 
     def to_bounds(k: int) -> list[float]:
         steps = [float((end - theta)[places[k]]) for end in (limits.low, limits.high)]
@@ -149,35 +196,6 @@ def too_narrow_near_bounds(problem: Problem, found: Minimum, told: AtBounds, err
 
 def _too_narrow(names: list[str]) -> str:
     return f"the {'intervals' if len(names) > 1 else 'interval'} of {', '.join(names)} {'are' if len(names) > 1 else 'is'} too narrow"
-
-
-def _limit(profile: Callable[[float], tuple[float, Minimum]], inward: float, delta: float, room: float, end: float) -> tuple[float, Minimum | None]:
-    """How far `inward` (1 or -1) the profile reaches `end`, looked for from `delta` on, and the minimum there; infinite and None where it does not.
-
-    Infinite with a minimum: that one is lower than at the bound.
-    """
-    close = 0.02  # of p at the limit: its error there, and by how much F is to be lower elsewhere to count as lower
-    inner, outer = (0.0, 0.0), (np.inf, np.inf)  # delta and rise on either side
-    for _ in range(16):
-        rise, at = profile(inward * delta)
-        if rise < -close * end:
-            return np.inf, at
-        if abs(rise / end - 1) < close:
-            return delta, at
-        if rise < end:
-            inner = delta, max(rise, 0.0)
-        else:
-            outer = delta, rise
-        if inner[0] >= room:
-            return np.inf, None
-        if np.isfinite(outer[1]):  # the root of p is nearly straight
-            low, high = np.sqrt(inner[1]), np.sqrt(outer[1])
-            delta = inner[0] + (outer[0] - inner[0]) * (np.sqrt(end) - low) / (high - low)
-        elif np.isfinite(outer[0]):  # the motion fails there
-            delta = (inner[0] + outer[0]) / 2
-        else:
-            delta = min(delta * min(np.sqrt(end / inner[1]) * (1 + close) if inner[1] else 4.0, 4.0), room)
-    return (delta, at) if np.isfinite(outer[0]) else (np.inf, None)
 
 
 def _root(slope: float, curvature: float, end: float) -> float:
@@ -205,7 +223,7 @@ def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: C
     doubt, untold = np.zeros((len(theta), len(places))), np.zeros((len(theta), count), bool)
     if count == 1 and problem.loss == LEAST_SQUARES:
         return NoiseLevels(at, known, doubt, 0 * doubt, untold[:, 1:])
-    by_run = [problem.by_channel(run, at, lambda x: x) for run in range(len(problem.runs))]
+    by_run = [problem.by_channel(run, at) for run in range(len(problem.runs))]
     residuals = [r[np.isfinite(r)] for r in np.concatenate([r.reshape(len(theta), -1) for of in by_run for r in of.values()], axis=1)]
     samples = np.concatenate([[[r.size] for r in residuals], problem.counted(problem.estimated, members)], axis=1)
     (determined, widths), unsure = np.zeros((2, len(theta), count)), problem.loss != LEAST_SQUARES

@@ -11,7 +11,6 @@ The result of a verification: comparisons, each with its size, its threshold and
 """
 
 from collections.abc import Callable
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -26,11 +25,11 @@ from jourdain_jax.dynamics.accelerations import reductions
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.instant import constraint_rows
-from jourdain_jax.equations.kinematics import Velocities, coordinate_rates, motion_at, partial_velocities, pose_at
+from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, partial_velocities, pose_at
 from jourdain_jax.equations.reductions import reduce
 from jourdain_jax.equations.rows import position_rows, velocity_rows
 from jourdain_jax.equations.scaling import row_scale
-from jourdain_jax.equations.virtual_power import equations_and_rows
+from jourdain_jax.equations.virtual_power import equations_and_rows, resultants
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.loads import Gravity, Load
 from jourdain_jax.scene.motion_state import Motion
@@ -84,10 +83,21 @@ def check(name: str, values: dict, dtype, note: str = "") -> Check:
     return Check(name, sizes[culprit], threshold, culprit, note)
 
 
-def beside(f: Callable, point, direction, u) -> tuple[list, float]:
-    """Values of f at -2h, -h, h and 2h along a direction, and h; all points through the same program. `u`: the speeds, which h goes with."""
+def along(f: Callable, arguments, point, direction, u) -> tuple:
+    """Value and slope of `f(arguments, point)` along a direction, its values at -2h, -h, h and 2h, and h, which goes with the speeds `u`."""
     h = (2e-2 if u.dtype == jnp.float32 else 1e-3) / (1 + float(np.max(np.abs(u), initial=0.0)))
-    return [f(jax.tree.map(lambda x, d, k=k: x + k * h * d, point, direction)) for k in (-2, -1, 1, 2)], h
+    ends = [_value(f, arguments, jax.tree.map(lambda x, d, k=k: x + k * h * d, point, direction)) for k in (-2, -1, 1, 2)]
+    return *_pushed(f, arguments, point, direction), ends, h
+
+
+@eval_numpy
+def _value(f: Callable, arguments, point):
+    return f(arguments, point)
+
+
+@eval_numpy
+def _pushed(f: Callable, arguments, point, direction):
+    return jax.jvp(lambda point: f(arguments, point), (point,), (direction,))
 
 
 def central_difference(along: list, h: float):
@@ -189,20 +199,18 @@ def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds colum
     weights = jnp.asarray(generator.normal(size=2 * u.shape[0]), u.dtype)
     du = jnp.asarray(generator.normal(size=u.shape), u.dtype)
     dq = coordinate_rates(scene, t, q, Z @ du) - coordinate_rates(scene, t, q, jnp.zeros_like(u))
-    note = ""
-    if not derivative_exists(scene, t, q, u, eqx.combine(relative, fixed), dq, inputs):
-        relative = jax.tree.map(jnp.zeros_like, relative)
-        if not derivative_exists(scene, t, q, u, eqx.combine(relative, fixed), dq, inputs):
-            note = "left out: the rows lose rank at this very state, and accelerations have no derivative there"
-            return [check(name, {}, u.dtype, note) for name in ("jvp against vjp", "differences")]
-        note = "parameters left out: a change of them splits rows that are dependent, and accelerations have no derivative there"
-    arguments = (names, weights, t, inputs, fixed, usual_rows(scene))
-    point, direction = (moving, q, u), (relative, dq, du)
-    forward, size = _forward(arguments, point, direction)
-    reverse = _reverse(arguments, point, direction)
-    difference = central_difference(*beside(partial(_outcome_of_numbers, arguments), point, direction, u))
+    left_out = "parameters left out: a change of them splits rows that are dependent, and accelerations have no derivative there"
+    cases = (relative, ""), (jax.tree.map(jnp.zeros_like, relative), left_out)
+    case = next((case for case in cases if derivative_exists(scene, t, q, u, eqx.combine(case[0], fixed), dq, inputs)), None)
+    if case is None:
+        note = "left out: the rows lose rank at this very state, and accelerations have no derivative there"
+        return [check(name, {}, u.dtype, note) for name in ("jvp against vjp", "differences")]
+    change, note = case
+    arguments, point, direction = (names, weights, t, inputs, fixed, usual_rows(scene)), (moving, q, u), (change, dq, du)
+    value, forward, ends, h = along(_outcome, arguments, point, direction, u)
+    size = np.abs(value) + np.abs(forward) + 1e-3 * np.sum(np.abs(weights))
     found = []
-    for name, other in (("jvp against vjp", reverse), ("differences", difference)):
+    for name, other in (("jvp against vjp", _reverse(arguments, point, direction)), ("differences", central_difference(ends, h))):
         errors = np.abs(forward - other) / size
         found.append(check(name, {f"reduction `{way}`": e for way, e in zip(names, errors, strict=True)}, u.dtype, note))
     return found
@@ -219,18 +227,9 @@ def _outcome(arguments, point) -> Float[Array, "reductions"]:
     return jnp.stack([weights @ jnp.concatenate([a.udot, a.constraint_force]) for a in found])
 
 
-_outcome_of_numbers = eval_numpy(_outcome)
-
-
 def by_reduction(way, scene, t, q, u, equations, rows):
     """One reduction of equations and rows that all share."""
     return way.accelerations(scene, t, q, u, equations, rows) if isinstance(way, GibbsAppell) else reduce(way, equations, rows)
-
-
-@eval_numpy
-def _forward(arguments, point, direction):
-    value, change = jax.jvp(lambda point: _outcome(arguments, point), (point,), (direction,))
-    return change, jnp.abs(value) + jnp.abs(change) + jnp.sum(jnp.abs(arguments[1])) * 1e-3
 
 
 @eval_numpy
@@ -293,26 +292,15 @@ def _potentials(scene: Scene, motion: Motion, Z) -> dict[str, Scalar]:
         return jnp.stack([at[i].potential for i in stated])
 
     dV = jax.jacfwd(V)(q) @ jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(u)
-    partial = partial_velocities(scene, t, q, u)
+    partial, turned = partial_velocities(scene, t, q, u), jnp.stack([body.orientation for body in motion.bodies.values()])
     values = {}
     for i, slope in zip(stated, dV, strict=True):
-        Q = _generalized(loads[i], scene, motion, partial)
+        total = resultants(scene, motion, loads=(loads[i],))
+        # Q = beta' F + gamma' L + Q_direct
+        Q = jnp.einsum("bik,bi->k", partial.linear, total.force) + jnp.einsum("bik,bji,bj->k", partial.angular, turned, total.torque) + total.direct
         size = jnp.max(jnp.abs(Q)) + jnp.max(jnp.abs(slope)) + jnp.finfo(q.dtype).tiny
         values[f"{_name(i, loads[i])}: its potential does not give its force"] = jnp.max(jnp.abs(Z.T @ (Q + slope)), initial=0.0) / size
     return values
-
-
-def _generalized(load: Load, scene: Scene, motion: Motion, partial: Velocities) -> Float[Array, "speeds"]:
-    """`Q = beta' F + gamma' L + Q_direct` of one load."""
-    Q = jnp.zeros_like(motion.u.array)
-    for k, (name, body) in enumerate(motion.bodies.items()):
-        if name in load.forces:
-            Q = Q + partial.linear[k].T @ load.forces[name]
-        if name in load.torques:
-            Q = Q + partial.angular[k].T @ (body.orientation.T @ load.torques[name])
-    for name, force in load.generalized.items():
-        Q = Q.at[scene.speed_names.index(name, "speed")].add(force)
-    return Q
 
 
 def _name(i: int, load: Load) -> str:
@@ -349,11 +337,10 @@ def _derivatives(scene: Scene, t, q, u, inputs, seed: int) -> Check:
     draw = lambda x: jnp.asarray(generator.normal(size=x.shape), x.dtype)  # noqa: E731
     direction = (jax.tree.map(lambda x: draw(x) * jnp.where(x == 0, 1.0, x), moving), jnp.ones_like(t), draw(q), draw(u))
     point = (moving, t, q, u)
-    value, change = _pushed(fixed, inputs, point, direction)
-    along, h = beside(partial(_at_numbers, fixed, inputs), point, direction, u)
+    value, change, around, h = along(_at, (fixed, inputs), point, direction, u)
     values = {}
     for name in value:
-        f, slope, ends = np.asarray(value[name]), np.asarray(change[name]), [np.asarray(x[name]) for x in along]
+        f, slope, ends = np.asarray(value[name]), np.asarray(change[name]), [np.asarray(x[name]) for x in around]
         # 2 s(h) - s(2h) with s(h) = (f(h) - 2 f(0) + f(-h))/h: of third order where f is smooth, the jump of the slope at a kink
         kink = (2 * (ends[1] + ends[2]) - 4 * f) / h - (ends[0] + ends[3] - 2 * f) / (2 * h)
         size = np.max(np.abs(f), initial=0.0) + np.max(np.abs(slope), initial=0.0) + floor
@@ -363,14 +350,6 @@ def _derivatives(scene: Scene, t, q, u, inputs, seed: int) -> Check:
     return check("derivatives", values, q.dtype)
 
 
-def _at(fixed, inputs, point) -> dict[str, Array]:
-    parameters, t, q, u = point
+def _at(arguments, point) -> dict[str, Array]:
+    (fixed, inputs), (parameters, t, q, u) = arguments, point
     return _pieces(eqx.combine(parameters, fixed), t, q, u, inputs)
-
-
-_at_numbers = eval_numpy(_at)
-
-
-@eval_numpy
-def _pushed(fixed, inputs, point, direction) -> tuple[dict[str, Array], dict[str, Array]]:
-    return jax.jvp(lambda point: _at(fixed, inputs, point), (point,), (direction,))

@@ -112,6 +112,11 @@ def checked_whole(value, what: str, low: int, high: int | None = None, *, expect
     return int(value)
 
 
+def holds(condition: Callable, *numbers) -> bool:
+    """Whether a condition holds of all numbers; of those that are traced nothing is known, and it counts as holding."""
+    return is_traced(*numbers) or bool(np.all(condition(*map(np.asarray, numbers))))
+
+
 def has_unit(x) -> bool:
     """Whether it is a quantity, or a list with one in it, whose unit would be lost where it becomes a number: 1,300 g would be 1,300 kg."""
     if isinstance(x, list | tuple):
