@@ -115,14 +115,6 @@ def test_a_scene_is_drawn_at_its_example_start_in_a_notebook(drawn):
     assert ">mass</th>" in broken
 
 
-def test_a_report_shows_how_far_manoeuvres_reach_in_a_notebook(drawn):
-    shown = jj.report(jj.models.VerticalDisc())._repr_html_()
-    assert shown.startswith("<pre>Report on VerticalDisc")
-    (axes,) = drawn[0].axes
-    assert [text.get_text() for text in axes.get_yticklabels()] == ["freedoms", "brackets of 2", "brackets of 3", "coordinates"]
-    assert [bar.get_width() for bar in axes.patches] == [2, 3, 4, 4]
-
-
 def test_a_motion_shows_its_coordinates_as_lines_in_a_notebook(motion, drawn):
     shown = motion._repr_html_()
     assert shown.startswith("<pre>Trajectory of ")

@@ -24,7 +24,7 @@ from jourdain_jax.analysis.arrow import Arrow, PerMember, eliminated
 SHORTEST = 0.1  # tau over the shortest interval: the noise is white
 
 
-def chain(weight: Float[Array | np.ndarray, "times *channel"], ts: Float[Array | np.ndarray, "times"], xp=np) -> tuple[Array | np.ndarray, Array | np.ndarray]:
+def chain(weight: Float[Array | np.ndarray, "times *rest"], ts: Float[Array | np.ndarray, "times"], xp=np) -> tuple[Array | np.ndarray, Array | np.ndarray]:
     """For each sample of a channel, the time index of the last one before it that is not missing (itself where there is none), and the time between, s.
 
     That time is infinite where there is none, and for samples that are missing. `weight` is zero where a sample is missing. Both have its shape.
@@ -34,7 +34,7 @@ def chain(weight: Float[Array | np.ndarray, "times *channel"], ts: Float[Array |
     before = xp.concatenate([xp.full_like(last[:1], -1), last[:-1]])
     linked = (before >= 0) & (weight > 0)
     before = xp.where(linked, before, index)
-    return before, xp.where(linked, xp.broadcast_to(xp.reshape(ts, index.shape), before.shape) - ts[before], xp.inf)
+    return before, xp.where(linked, xp.reshape(ts, index.shape) - ts[before], xp.inf)
 
 
 def memory(gap, tau, xp=np):

@@ -22,7 +22,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.analysis.information import Information, derived, hidden_combinations, standard_errors, variances, weak_combinations
-from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.levenberg_marquardt import Minimum
 from jourdain_jax.analysis.likelihood import oddities
 from jourdain_jax.analysis.piecewise import Shot
@@ -233,15 +232,10 @@ class Estimates(Printed):
     steps: Int[np.ndarray, "*repeats"]  # tried
     grown: Bool[np.ndarray, "*repeats"]  # whether the minimum was found over growing spans, far from where the first guess led to
     agreeing: Int[np.ndarray, "*repeats"]  # first guesses that led to this minimum, of those tried; of a batch, which has one for each repeat, zero
-    guesses: int  # first guesses tried
-    labels: tuple[str, ...]  # names of the unknowns
-    units: tuple[str, ...]
-    cutoff: float
-    errors: str  # whence standard errors come: "sigmas" or "runs"
     shooting: Shot | None  # how it was found by multiple shooting
     trace: tuple[tuple[str, tuple[float, ...]], ...]  # what was minimised, and F at first and after each step tried; none of a batch
-    asked: Asked  # the arguments of `fit`
-    layout: Layout
+    asked: Asked  # the arguments of `fit`; `guesses` and `errors` of these
+    unknowns: Unknowns  # their `labels`, `units` and `layout`
     work_out: Callable[[], Statistics]
 
     @cached_property
@@ -253,9 +247,10 @@ class Estimates(Printed):
         return vars(self) | {"statistics": self.statistics, "work_out": None}  # what was compiled stays in its process
 
     def __getattr__(self, name: str) -> Any:
-        """A part of `statistics`, such as `standard_errors`."""
-        if name in Statistics.__dataclass_fields__:
-            return getattr(self.statistics, name)
+        """A part of `statistics`, such as `standard_errors`, of what was asked, and of the unknowns."""
+        parts = {"statistics": Statistics.__dataclass_fields__, "asked": ("guesses", "errors"), "unknowns": ("labels", "units", "layout")}
+        for part in (part for part, names in parts.items() if name in names):
+            return getattr(getattr(self, part), name)
         raise AttributeError(f"`{name}` has gone: {GONE[name]}" if name in GONE else f"`Fit` has no `{name}`; {nearest(name, dir(self))}")
 
     def __getitem__(self, name: str) -> Estimated:
@@ -354,7 +349,7 @@ class Estimates(Printed):
         shared = self.layout.sizes[0]
         value, slopes = derived(self.asked.scene, self.layout, function, self.values[..., :shared])
         sizes, at_bound, quantiles = (x[..., :shared] for x in (self.sizes, self.at_bound, self.statistics.quantiles))
-        error = standard_errors(self.information, slopes, sizes, at_bound, self.cutoff)
+        error = standard_errors(self.information, slopes, sizes, at_bound, self.asked.control.cutoff)
         of_numbers = quantiles.reshape(*quantiles.shape[:-1], *(1,) * (slopes.ndim - quantiles.ndim), shared)
         reach = error * np.max(np.where(slopes != 0, of_numbers, 0.0), axis=-1, initial=0.0)
         return Estimated(value, error, np.asarray(value - reach), np.asarray(value + reach), unit)

@@ -108,7 +108,12 @@ class _Filter:
         x = self._independent(begin.q, begin.u)
         P = jnp.zeros((x.size, x.size))
         if unknown:
-            J = jax.jacfwd(lambda values: self._independent_at_start(unknown, values))(jnp.stack([run.start[name] for name in unknown]))
+
+            def begun(values: Float[Array, "unknown"]) -> Float[Array, "states"]:
+                state = self._start(run.start | dict(zip(unknown, values, strict=True)))
+                return self._independent(state.q, state.u)
+
+            J = jax.jacfwd(begun)(jnp.stack([run.start[name] for name in unknown]))
             P = (J * sigma**2) @ J.T
         names = sorted(run.weights)
         flat = lambda parts: jnp.concatenate([parts[name].reshape(run.ts.shape[0], -1) for name in names], axis=1)  # noqa: E731
@@ -125,10 +130,6 @@ class _Filter:
 
     def _start(self, values: dict) -> State:
         return consistent_start(self.scene, t0=self.run.t0, inputs=self.run.inputs, **values)
-
-    def _independent_at_start(self, names: tuple[str, ...], values: Float[Array, "unknown"]) -> Float[Array, "states"]:
-        begin = self._start(self.run.start | dict(zip(names, values, strict=True)))
-        return self._independent(begin.q, begin.u)
 
     def _independent(self, q, u) -> Float[Array, "*times states"]:
         return jnp.concatenate([q[..., self.coordinates], u[..., self.speeds]], axis=-1)

@@ -287,8 +287,7 @@ def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool)
 
 
 def _result(problem: Problem, found: Minimum, at_bounds: AtBounds, agreeing: np.ndarray) -> Fit:
-    unknowns, asked, one = problem.unknowns, problem.asked, problem.one
-    places = unknowns.estimated
+    places, one = problem.unknowns.estimated, problem.one
     told = Fit(
         values=one(found.theta[:, places]),
         beyond=one(at_bounds.beyond[:, places]),
@@ -297,15 +296,10 @@ def _result(problem: Problem, found: Minimum, at_bounds: AtBounds, agreeing: np.
         steps=one(found.steps),
         grown=one(found.grown),
         agreeing=agreeing,
-        guesses=asked.guesses,
-        labels=unknowns.labels,
-        units=unknowns.units,
-        cutoff=asked.control.cutoff,
-        errors=asked.errors,
         shooting=problem.told() if isinstance(problem, Piecewise) else None,
         trace=found.trace[0] if problem.single else (),
-        asked=asked,
-        layout=unknowns.layout,
+        asked=problem.asked,
+        unknowns=problem.unknowns,
         work_out=partial(statistics, problem, found, at_bounds),
     )
     if problem.with_memory:  # its motions are needed, in the context that is here

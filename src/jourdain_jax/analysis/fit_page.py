@@ -107,16 +107,13 @@ class Section(NamedTuple):
         return f"{head}{about}<pre>{text}</pre>{''.join(self.figures)}"
 
 
+Predictions = Sequence[dict[str, Prediction]]  # by run and channel
+
+
 def fit_page(
-    fit: Estimates,
-    *,
-    fitted: Sequence[dict[str, Prediction]] = (),
-    shares: Informed | None = None,
-    held_out: Sequence[dict[str, Prediction]] = (),
-    profiles: Mapping[str, Profile] | None = None,
-    units: Mapping[str, str] | None = None,
+    fit: Estimates, fitted: Predictions, shares: Informed | None, held_out: Predictions, profiles: Mapping[str, Profile], units: Mapping[str, str]
 ) -> str:
-    """The page of a `Fit` of one experiment; `fitted` and `held_out`: predictions by run, `units`: of channels."""
+    """The page of a `Fit` of one experiment; `fitted` and `held_out`: predictions, `units`: of channels."""
     sections = [Section("", "", [str(fit)], [interval_widths(fit)])]
     if profiles:
         about = (
@@ -130,13 +127,13 @@ def fit_page(
         sections.append(_informed(shares))
     sections.append(_correlations(fit))
     if fitted:
-        sections.append(_predicted("Data (dots) and prediction (line)", "", fitted, units or {}, "run"))
+        sections.append(_predicted("Data (dots) and prediction (line)", "", fitted, units, "run"))
     if held_out:
         about = (
             "These runs had no part in the fit. What all runs share is held at its estimate; start values that are unknown, and numbers of sensors of each "
             "run, are fitted to the run itself."
         )
-        sections.append(_predicted("Runs held out", about, held_out, units or {}, "held out, run"))
+        sections.append(_predicted("Runs held out", about, held_out, units, "held out, run"))
     sections += [_whiteness(fit, fitted), _way(fit)]
     return _PAGE.format(title=html.escape(f"Fit of {type(fit.scene).__name__}"), sections="".join(map(str, sections)))
 
@@ -165,21 +162,19 @@ def _correlations(fit: Estimates) -> Section:
     return Section("Correlations", about, table(rows))
 
 
-def _predicted(title: str, about: str, runs: Sequence[dict[str, Prediction]], units: Mapping[str, str], what: str) -> Section:
-    lines = [f"`{name}` of {what} {run}, in {units.get(name, 'SI units')}: {one}" for run, channels in enumerate(runs) for name, one in channels.items()]
-    panels = []
-    for run, channels in enumerate(runs):
-        for name, one in channels.items():
-            count = int(np.prod(one.values.shape[1:], dtype=int))
-            for k in range(count):
-                component = f"{name}[{k}]" if count > 1 else name
-                panels.append((f"{what} {run}: {component}", f"{component} in {units.get(name, 'SI units')}", one, k))
+def _predicted(title: str, about: str, runs: Predictions, units: Mapping[str, str], what: str) -> Section:
+    named = [(f"{what} {run}", name, units.get(name, "SI units"), one) for run, channels in enumerate(runs) for name, one in channels.items()]
+    lines, panels = [f"`{name}` of {of}, in {unit}: {one}" for of, name, unit, one in named], []
+    for of, name, unit, one in named:
+        count = int(np.prod(one.values.shape[1:], dtype=int))
+        components = [f"{name}[{k}]" for k in range(count)] if count > 1 else [name]
+        panels += [(f"{of}: {component}", f"{component} in {unit}", one, k) for k, component in enumerate(components)]
     drawn, more = panels[:40], panels[40:]
     lines += [f"{len(more)} more are not drawn."] if more else []
     return Section(title, about, lines, [data_and_prediction(*panel) for panel in drawn])
 
 
-def _whiteness(fit: Estimates, fitted: Sequence[dict[str, Prediction]]) -> Section:
+def _whiteness(fit: Estimates, fitted: Predictions) -> Section:
     about = "Of residuals from which the memory of the noise was taken out, where that was estimated or stated."
     rows = [("channel", "correlation of neighbours", "white ones hardly exceed", "white", "correlation time", "intervals too narrow by")]
     for name, (rho, limit) in fit.autocorrelation.items():

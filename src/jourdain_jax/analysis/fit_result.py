@@ -161,7 +161,7 @@ def text(fit: Estimates) -> str:
     rows += [_row(name, e, " (tied)") for name, e in fit.tied.items() if e.value.ndim == 0]
     lines += table(rows)
     if fit.not_identifiable:
-        lines.append(f"singular values below {fit.cutoff:g} of the largest count as zero:")
+        lines.append(f"singular values below {fit.asked.control.cutoff:g} of the largest count as zero:")
         lines += [f"  {sentence}" for sentence in fit.not_identifiable]
     for sentences, what in ((fit.weak, "combinations"), (fit.correlated, "pairs")):
         lines += [f"  {sentence}" for sentence in sentences[:most]]
@@ -262,14 +262,8 @@ class Fit(Estimates):
         if not runs and profiles and not isinstance(profiles, Mapping):
             raise ValueError("profiles are computed from the runs that were fitted; give them as `data`")
         along = profiles if isinstance(profiles, Mapping) else self.profiles(runs, () if profiles is True else profiles) if profiles else {}
-        page = fit_page(
-            self,
-            fitted=of_fitted(self, runs) if runs else (),
-            shares=informed(*taken_up(self, runs), 24) if runs else None,  # unknowns of which the report says what informs them
-            held_out=self.predict(others) if others else (),
-            profiles=along,
-            units=units or {},
-        )
+        shares = informed(*taken_up(self, runs), 24) if runs else None  # unknowns of which the report says what informs them
+        page = fit_page(self, of_fitted(self, runs) if runs else (), shares, self.predict(others) if others else (), along, units or {})
         with open(path, "w", encoding="utf-8") as file:
             file.write(page)
 

@@ -27,7 +27,6 @@ The size of an unknown is its magnitude; near zero, its typical change (`Range`)
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import jax
 import jax.numpy as jnp
@@ -65,7 +64,7 @@ class Information:
         both = self.identifiable[..., :, None] & self.identifiable[..., None, :]
         return np.where(both, self.whole_covariance, np.nan)
 
-    @cached_property
+    @property
     def whole_covariance(self) -> Float[np.ndarray, "*members unknowns unknowns"]:
         """The covariance of all unknowns, in their units, along the directions that show."""
         runs, m, p = self.follow.shape[-3:]

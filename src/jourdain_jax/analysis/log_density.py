@@ -24,7 +24,7 @@ from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.layout import Layout, PossibleInertia
 from jourdain_jax.analysis.likelihood import as_fit_options, as_runs, in_all_or_none, mapped, of_run
 from jourdain_jax.analysis.runs import Run, equal_runs
-from jourdain_jax.analysis.unknowns import check_starts, unknowns_of
+from jourdain_jax.analysis.unknowns import Places, check_starts, unknowns_of
 from jourdain_jax.build.structure import Reference
 from jourdain_jax.calculus.compiled import compiled
 from jourdain_jax.calculus.reals import holds, is_traced
@@ -50,9 +50,9 @@ class LogDensity(eqx.Module):
     scene: Scene
     groups: tuple[Run, ...]  # runs of equal structure, stacked
     options: AllOptions
-    fixed: Float[np.ndarray, "places"]  # the first guess, and what is known, of all places of a layout
+    fixed: Places  # the first guess, and what is known, of all places of a layout
     guess: Float[np.ndarray, "unknowns"]  # in their units
-    prior_mean: Float[np.ndarray, "places"]
+    prior_mean: Places
     prior_rows: Float[np.ndarray, "places places"]  # of priors: see `Unknowns`
     prior_height: float  # logarithm of what all priors are at most
     centre: Float[np.ndarray, "unknowns"]

@@ -23,7 +23,7 @@ from jourdain_jax.analysis.levenberg_marquardt import Linearised
 from jourdain_jax.analysis.problem import Asked, Problem, closed
 from jourdain_jax.analysis.runs import Some
 from jourdain_jax.analysis.shooting import NODE, ends_of_pieces, in_pieces, numbers_of_filters, owned
-from jourdain_jax.analysis.unknowns import Unknowns
+from jourdain_jax.analysis.unknowns import Places, Unknowns
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ class Piecewise(Problem):
         self.node_sizes = node_sizes
         self.pieces.unknowns = self._unknowns(len(self.follows))
 
-    def spread(self, theta: Float[np.ndarray, "*members places"]) -> Float[np.ndarray, "*members all_places"]:
+    def spread(self, theta: Places) -> np.ndarray:
         """Unknowns of whole runs as those of all pieces, with nodes at zero."""
         return self._each(theta, 0.0, 0.0, 0.0)
 
@@ -141,7 +141,7 @@ class Piecewise(Problem):
 
     # Condensed. -----------------------------------------------------------------------------------------------------
 
-    def put(self, theta: Float[np.ndarray, "members all_places"]) -> ByUnknown:
+    def put(self, theta: np.ndarray) -> ByUnknown:
         """Puts the pieces of all members where they are here; the unknowns of the whole runs."""
         shared, local = self.pieces.unknowns.split(theta)
         whole = np.concatenate([shared, local[:, ~self.follows, : self.own].reshape(len(theta), -1)], axis=1)

@@ -28,7 +28,7 @@ from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.levenberg_marquardt import Control, Linearised, Minimum, minimise
 from jourdain_jax.analysis.runs import Group, Some, grouped
 from jourdain_jax.analysis.shooting import MultipleShooting
-from jourdain_jax.analysis.unknowns import Unknowns
+from jourdain_jax.analysis.unknowns import Places, Unknowns
 from jourdain_jax.calculus.reals import Number, checked_real
 from jourdain_jax.motion.options import AllOptions
 from jourdain_jax.scene.scene import Scene
@@ -126,7 +126,7 @@ class Span(ByMember):
     """The first part of all runs. The first guess is a weak prior, known to its own size: what so few samples do not tell stays there."""
 
     shares: PerMember  # of the span of each run, from its start: samples beyond do not count
-    begun: Float[np.ndarray, "members places"]  # first guesses
+    begun: Places  # first guesses
 
 
 class Problem:
@@ -240,12 +240,10 @@ class Problem:
         good = np.isfinite(at.cost)
         squares, counted = np.zeros((2, good.sum(), len(shares)))
         for run in range(len(self.runs) if good.any() else 0):
-            group = self.group_of[run]
-            within = group.within(np.full(len(shares), run), shares)
-            r = np.where(within, np.stack(list(at.residuals[good, run]))[:, None], 0.0)
-            for name, where in group.channels.items():
-                if name not in self.estimated:
-                    squares, counted = squares + np.sum(r[..., where] ** 2, axis=-1), counted + np.count_nonzero(r[..., where], axis=-1)
+            within = self.group_of[run].within(np.full(len(shares), run), shares)
+            r, early = (self.kinds(run, x)[0] for x in (np.stack(list(at.residuals[good, run])), within))
+            r = np.where(early, r[:, None], 0.0)
+            squares, counted = squares + np.sum(r**2, axis=-1), counted + np.count_nonzero(r, axis=-1)
         found = np.zeros((good.size, len(shares)), bool)
         found[good] = squares <= most * counted
         return found

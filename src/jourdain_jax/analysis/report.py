@@ -17,7 +17,6 @@ from jourdain_jax.analysis.integrability import frobenius_violations, growth_vec
 from jourdain_jax.build.assembling import COORDINATE_DOMAIN, SPEED_DOMAIN
 from jourdain_jax.build.plausibility import impossible_bodies
 from jourdain_jax.build.structure import structure_of, structure_whatever_its_faults
-from jourdain_jax.calculus.figures import MODEL, QUIET, figure
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reduced import cyclic_coordinates, ignorable_coordinates
 from jourdain_jax.lowering.comparison import DIFFERS
@@ -30,7 +29,7 @@ from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.simulate import as_state
 from jourdain_jax.native import nvidia
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers
-from jourdain_jax.scene.printing import Printed, preformatted
+from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
@@ -112,22 +111,6 @@ class Report(Printed):
             first, *more = textwrap.wrap(fact, 94, break_long_words=False, break_on_hyphens=False) or [""]
             lines += [f"  {label:<24}{first}", *(" " * 26 + line for line in more)]
         return "\n".join(lines)
-
-    def _repr_html_(self) -> str:
-        return preformatted(str(self)) + (self._growth_drawn() if self.degrees_of_freedom and self.growth_vector else "")
-
-    def _growth_drawn(self) -> str:
-        """The growth vector as bars, up to the number of coordinates."""
-        names = ["freedoms", *(f"brackets of {k}" for k in range(2, len(self.growth_vector) + 1)), "coordinates"]
-        sizes = [*self.growth_vector, len(self.coordinates)]
-        caption = "Directions of motion: those that are free, and those that are reached by manoeuvres"
-
-        def draw(whole) -> None:
-            axes = whole.add_subplot(frame_on=False, xticks=[])
-            axes.bar_label(axes.barh(names, sizes, color=[*[MODEL] * len(self.growth_vector), QUIET]))
-            axes.invert_yaxis()
-
-        return figure(draw, 400, 18 * len(sizes) + 30, caption)
 
     def _no_redundant_rows(self) -> str:
         if self.rank < len(self.rows):

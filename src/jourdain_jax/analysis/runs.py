@@ -231,6 +231,8 @@ class Group:
             return b[:kept], self.runs[j[:kept]], np.asarray(found)[:kept]
 
         yield lanes(*first)  # compiles, where that is needed
+        if not chunks:
+            return
         with ThreadPoolExecutor() as pool:
             for k in range(0, len(chunks), together := os.cpu_count() or 1):
                 yield from pool.map(lanes, *zip(*chunks[k : k + together], strict=True))

@@ -26,7 +26,7 @@ from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.levenberg_marquardt import Control, Linearised, Minimum, column_scaling, damped_step, minimise
 from jourdain_jax.analysis.piecewise import Piecewise
 from jourdain_jax.analysis.sensors import ideal
-from jourdain_jax.analysis.unknowns import check_starts
+from jourdain_jax.analysis.unknowns import Places, check_starts
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.projection import closure_residual
@@ -110,7 +110,7 @@ def _parabola(ts: Float[np.ndarray, "times"], x: Float[np.ndarray, "times"], t: 
     return float(value), float(slope)
 
 
-def shot(problem: Piecewise, theta: Float[np.ndarray, "members places"]) -> Minimum:
+def shot(problem: Piecewise, theta: Places) -> Minimum:
     """The minimum from each `theta`."""
     check_starts(problem.scene, problem.runs, problem.unknowns)
     begin, control = _begun(problem, theta), problem.asked.control

@@ -22,6 +22,8 @@ from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
+Places = Float[np.ndarray, "*members places"]  # a number for every place
+
 
 @dataclass(eq=False)
 class Unknowns:
@@ -32,18 +34,18 @@ class Unknowns:
 
     layout: Layout
     runs: int
-    guess: Float[np.ndarray, "places"]
+    guess: Places
     fixed: Bool[np.ndarray, "places"]  # known, and there to give all runs one shape
     ranges: tuple[Range, ...]
     labels: tuple[str, ...]  # of those that are not fixed
     units: tuple[str, ...]
-    prior_mean: Float[np.ndarray, "places"]  # zero where nothing is known beforehand
-    prior_weight: Float[np.ndarray, "places"]  # W; zero where nothing is
+    prior_mean: Places  # zero where nothing is known beforehand
+    prior_weight: Places  # W; zero where nothing is
     whitening: Float[np.ndarray, "shared shared"]  # M, of priors of shared ones: see `estimate.whitening`
     estimated: np.ndarray = field(init=False)  # places of those that are not fixed
-    low: Float[np.ndarray, "places"] = field(init=False)
-    high: Float[np.ndarray, "places"] = field(init=False)
-    least: Float[np.ndarray, "places"] = field(init=False)  # the magnitude of each where it is near zero
+    low: Places = field(init=False)
+    high: Places = field(init=False)
+    least: Places = field(init=False)  # the magnitude of each where it is near zero
 
     def __post_init__(self):
         self.estimated = np.flatnonzero(~self.fixed)
@@ -57,11 +59,11 @@ class Unknowns:
         rows[:shared] = self.whitening @ rows[:shared]
         return rows
 
-    def reached(self, theta: Float[np.ndarray, "members places"]) -> Bool[np.ndarray, "members places"]:
+    def reached(self, theta: Places) -> Bool[np.ndarray, "members places"]:
         """Which unknowns lie at a bound."""
         return ((theta <= self.low) | (theta >= self.high)) & ~self.fixed
 
-    def sizes(self, theta: Float[np.ndarray, "*members places"]) -> Float[np.ndarray, "*members places"]:
+    def sizes(self, theta: Places) -> Places:
         """The magnitude against which changes of each are measured: its own; near zero a typical one."""
         return np.asarray(np.maximum(np.abs(theta), self.least))
 
