@@ -8,7 +8,6 @@ the same with other numbers compiles nothing, and a function whose globals have 
 
 from collections.abc import Callable, Hashable, Mapping
 from functools import lru_cache
-from weakref import WeakKeyDictionary
 
 import equinox as eqx
 import jax
@@ -106,53 +105,39 @@ def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
 
     It is traced again where it is another function, or what it reads (`scene/names_read.py`) has changed or has state.
     """
-    if not is_function(function):
-        return _traced_now(function, real)
-    kept = _trace(function)
-    now = (now_read_by(function), real) if kept.again else None
+    try:
+        kept = _trace(function)
+    except TypeError:  # it cannot be hashed
+        kept = _Trace()
+    now = (now_read_by(function), real) if kept.again and is_function(function) else None
     if now is not None and now[0] is not None and kept.now == now:
         return kept.found
-    found = _traced_now(function, real)
-    if kept.again and found[0] is not None and not is_traced(found[0]):
-        kept.now, kept.found = now, found
+    closed, shape = jax.make_jaxpr(lambda t: function(t), return_shape=True)(jax.ShapeDtypeStruct((), real))  # of a new function JAX keeps no trace
+    found = None
+    if getattr(shape, "shape", None) == ():
+        program = TimeProgram(closed, real)
+        if kept.program is None or not kept.program.does_the_same_as(program):
+            kept.program = _one_of_equals(program)
+        found = FunctionOfTime(kept.program, jnp.asarray(program.numbers), tuple(jnp.asarray(x) for x in closed.consts))
+    if kept.again and found is not None and not is_traced(found):
+        kept.now, kept.found = now, (found, shape)
     kept.again = True
-    return found
+    return found, shape
 
 
 class _Trace:
-    """The last trace of a function that is given again, and what it read then; of one that is given once, as most in loops are, nothing is kept."""
+    """The last trace of a function that is given again, and what it read then; of one that is given once, as most in loops are, its program alone is kept."""
 
     def __init__(self) -> None:
         self.again = False
         self.now: Hashable = None
         self.found: tuple[FunctionOfTime | None, object] = (None, None)
+        self.program: TimeProgram | None = None
 
 
 @lru_cache(maxsize=64)
 def _trace(function: Callable) -> _Trace:
     return _Trace()
-
-
-def _traced_now(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
-    closed, shape = jax.make_jaxpr(lambda t: function(t), return_shape=True)(jax.ShapeDtypeStruct((), real))  # of a new function JAX keeps no trace
-    if getattr(shape, "shape", None) != ():
-        return None, shape
-    program = TimeProgram(closed, real)
-    return FunctionOfTime(_known(function, program), jnp.asarray(program.numbers), tuple(jnp.asarray(x) for x in closed.consts)), shape
-
-
-_latest: WeakKeyDictionary = WeakKeyDictionary()  # of each function, while it lives
-
-
-def _known(function: Callable, program: TimeProgram) -> TimeProgram:
-    """An equal program that was met before, or this one."""
-    try:
-        before = _latest.get(function)
-        if before is None or not before.does_the_same_as(program):
-            before = _latest[function] = _one_of_equals(program)
-        return before
-    except TypeError:  # an object that cannot be referred to weakly
-        return _one_of_equals(program)
 
 
 @lru_cache(maxsize=64)
@@ -242,12 +227,6 @@ _NOTHING = object()
 _ZERO = Constant(np.zeros(()))  # made once: a module takes some 20 us
 
 
-@lru_cache(maxsize=64)
-def _at_rest(count: int) -> Inputs:
-    """So many inputs that are zero."""
-    return Inputs((_ZERO,) * count)
-
-
 def _as_channel(f: Callable, where: str) -> Callable:
     """A function of time as a channel, or a ValueError unless `f` of one time is one number; nothing is computed."""
     advice = "give a function of one time that returns one number, such as `lambda t: jnp.sin(t)`"
@@ -275,7 +254,7 @@ def as_inputs(scene: Scene, given) -> Inputs:
     if given is not None and not isinstance(given, Mapping):
         raise ValueError(f"`inputs` is {described(given)}, expected a dictionary: name -> number, function of time, or `jj.Sampled`")
     if not given:
-        return _at_rest(len(scene.inputs))
+        return Inputs((_ZERO,) * len(scene.inputs))
     for name in given:
         if name not in scene.inputs.entries:
             raise ValueError(f"`{type(scene).__name__}` has no input `{name}`; {nearest(name, scene.inputs.entries)}")

@@ -294,18 +294,14 @@ def modelled(scene: Scene | BuiltFor, formulation: Formulation | None = None, ba
     """Return the model of a scene, kept by its class and values; its choices are made when they are first asked for. Of a model, that itself, or with
     another formulation and backend.
     """
+    if isinstance(scene, Model) and (formulation is None or (formulation is scene.formulation and backend == scene.backend)):
+        return scene
     asked = as_formulation(formulation)
     if isinstance(scene, Model):
-        same = scene.formulation is asked and scene.backend == backend
-        return scene if same else Model(scene.scene, asked, backend, scene.decided)
+        return Model(scene.scene, asked, backend, scene.decided)
     if asked.reduction is None and asked.baumgarte is None and isinstance(backend, str):
         return _kept(as_scene(scene), asked.state, asked.stabilisation, backend)
     return Model(as_scene(scene), asked, backend, None)
-
-
-def as_model(given: Scene | BuiltFor) -> Model:
-    """Return a model as it is, or that of a scene by default."""
-    return given if isinstance(given, Model) else modelled(given)
 
 
 def _by_words(scene: Scene, state, stabilisation, backend: str) -> Model:

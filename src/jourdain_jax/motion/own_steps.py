@@ -66,9 +66,11 @@ class OwnSteps(Integrator):
         return native_motion.reason_against(setup.field, setup.scene, setup.inputs, bool(self.event_names), self.order)
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
-        if not setup.reason_against_machine_code:
-            return _on_times(_by_machine_code if self.alongside else with_rules(_by_machine_code, _rules(setup)), setup, begun)
-        return self._in_modes(_by_xla)(setup, begun)
+        if setup.reason_against_machine_code:
+            return self._in_modes(_by_xla)(setup, begun)
+        form = _form(setup)
+        rules = Rules(pushed_by_jax(_by_machine_code), _pulled, lambda *_: reason_against_derivatives(form, 2))
+        return _on_times(_by_machine_code if self.alongside else with_rules(_by_machine_code, rules), setup, begun)
 
     def lanes_solved(self, setups: Setup, begun: Begun) -> Solved:
         serves = not setups.reason_against_machine_code
@@ -126,7 +128,9 @@ def _loop(mode: Mode, setup: Setup, y0, args, ts, knots) -> Solved:
         within=None if knots is None else integrands.within,
     )
     ys, reached, end = erk_loop.integrate(problem, own.solver, y0, jnp.zeros_like(setup.t0), goals, setup.dt0, mode)
-    return _as_solved(goals, ys, reached, end)
+    ys = jax.tree.map(lambda x: x[:-1], ys)
+    counted = (jnp.zeros_like(end.accepted), jnp.full_like(end.t, jnp.inf)) if end.crossings is None else (end.crossings.count, end.crossings.together)
+    return Solved(goals[:-1], ys, reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, end.pivot, *counted)
 
 
 def _by_machine_code(setup: Setup, begun: Begun) -> Solved:
@@ -173,18 +177,9 @@ def _form(setup: Setup) -> Form:
     return native_motion.form_of(setup.field, setup.inputs, bool(setup.integrator.event_names))
 
 
-def _rules(setup: Setup) -> Rules:
-    """Derivatives of `_by_machine_code`."""
-    form = _form(setup)
-
-    def pull(perturbed, arguments, found, g):
-        return _pulled(perturbed, *arguments, found, g)
-
-    return Rules(pushed_by_jax(_by_machine_code), pull, lambda *_: reason_against_derivatives(form, 2))
-
-
-def _pulled(perturbed: tuple, setup: Setup, begun: Begun, found: Solved, g: Solved) -> tuple:
+def _pulled(perturbed: tuple, arguments: tuple[Setup, Begun], found: Solved, g: Solved) -> tuple:
     """Cotangents of what varies, from those of the motion that was found."""
+    setup, begun = arguments
     sampled = [channel for channel in (*perturbed[0].inputs.channels, *perturbed[1].args[2].channels) if isinstance(channel, Sampled)]
     if any(jax.tree.leaves(sampled)):
         raise DifferentiationModeError(OF_SAMPLES)
@@ -198,12 +193,6 @@ def _pulled(perturbed: tuple, setup: Setup, begun: Begun, found: Solved, g: Solv
     inputs = native_motion.with_known(inputs, by_known[len(fixed) :])
     args = field, scene, inputs, tuple(by_known[: len(fixed)]), origin
     return by_setup, eqx.tree_at(lambda b: (b.y0, b.args), none_else[1], (y0, args), is_leaf=lambda x: x is None)
-
-
-def _as_solved(goals, ys: PyTree, reached, end: erk_loop.Progress) -> Solved:
-    ys = jax.tree.map(lambda x: x[:-1], ys)
-    counted = (jnp.zeros_like(end.accepted), jnp.full_like(end.t, jnp.inf)) if end.crossings is None else (end.crossings.count, end.crossings.together)
-    return Solved(goals[:-1], ys, reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, end.pivot, *counted)
 
 
 def watched(field: VectorField, inputs: Inputs, has_events: bool) -> tuple[Callable | None, int]:

@@ -92,18 +92,13 @@ def usual_sizes(scene: Scene, determined: bool, native: bool) -> Usual:
     program = row_program(scene) if native and not ffi.reason_against() else None
     try:
         rows = plain_row_lengths(scene) if determined else usual_rows(scene).lengths
-        within = _found_within(scene, low, high)
-        return Usual(closure_lengths(scene), rows, width, within[0], within[1], rows_are_affine(scene), determined, program)
+        # the domain, and a little more, of the coordinates for which a scene states it and on which rows depend
+        bounded, more = coordinates_on_rows(scene) & [name in scene.domain for name in scene.coordinate_names.entries], NEARLY_INSIDE * (high - low)
+        low, high = np.where(bounded, low - more, -np.inf), np.where(bounded, high + more, np.inf)
+        return Usual(closure_lengths(scene), rows, width, low.astype(width.dtype), high.astype(width.dtype), rows_are_affine(scene), determined, program)
     except ValueError:  # of a scene that is wrong in itself; said where its structure is asked for
         norms, geometric = len(scene.coordinates.quaternions), len(names_of_position_rows(scene))
         return Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), width, -np.inf * width, np.inf * width, False, False, None)
-
-
-def _found_within(scene: Scene, low, high) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of what rows may find: the domain, and a little more, of the coordinates for which a scene states it and on which rows depend."""
-    bounded = coordinates_on_rows(scene) & [name in scene.domain for name in scene.coordinate_names.entries]
-    more = NEARLY_INSIDE * (high - low)
-    return np.where(bounded, low - more, -np.inf).astype(low.dtype), np.where(bounded, high + more, np.inf).astype(low.dtype)
 
 
 def put_positions(scene: Scene, t, q, free, usual: Usual, known: tuple | None = None) -> tuple[Float[Array, "coordinates"], Float[Array, "closures"]]:

@@ -96,7 +96,8 @@ def _next_retry(field: VectorField, motion: Trajectory, t0, options: AllOptions)
     if np.all(np.isin(known_numbers(motion.result), (results.SUCCESS, results.EVENT))):
         return results.AS_ASKED
     tried, solver, backend = int(motion.fallback), options.solver, options.backend
-    lost = _has_another_form(field) and not isinstance(solver, DiscreteGradient) and int(motion.result) in lost_codes(field)
+    another = field.name == "minimal" or field.lowered is not None  # the full state by dense matrices
+    lost = another and not isinstance(solver, DiscreteGradient) and int(motion.result) in lost_codes(field)
     if lost and backend in ("auto", "dense") and not tried & results.FULL_STATE:
         return tried | results.FULL_STATE
     free = solver is None and backend != "native"
@@ -124,28 +125,19 @@ def _marked(motion: Motions, retries: int) -> Motions:
     return eqx.tree_at(lambda m: (m.result, m.fallback), motion, (code, jnp.full_like(motion.fallback, retries)))
 
 
-def _has_another_form(field: VectorField) -> bool:
-    """Return whether a lost motion may run again with the full state and dense matrices."""
-    return field.name == "minimal" or field.lowered is not None
-
-
 def lost_codes(field: VectorField) -> tuple[int, ...]:
     """Result codes after which another form of the state may do better."""
     guarded = field.lowered is not None and (field.lowered.guards or field.lowered.pivots)
-    return (
-        (results.SINGULAR_PARTITION, results.STEP_TOO_SMALL, results.NOT_FINITE, results.UNSOLVED_STEP, results.UNRESOLVED)
-        if guarded
-        else (results.SINGULAR_PARTITION,)
-    )
+    by_guards = results.STEP_TOO_SMALL, results.NOT_FINITE, results.UNSOLVED_STEP, results.UNRESOLVED
+    return results.SINGULAR_PARTITION, *(by_guards if guarded else ())
 
 
 def _is_stiff(field: VectorField, motion: Trajectory, t0) -> bool:
     """Whether stability kept the steps of a `motion` from `t0` short that ran out of them; False where its numbers are not known."""
-    if int(motion.result) not in OUT_OF_STEPS or int(motion.accepted) == 0:
+    known = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, (field, motion, t0))
+    if int(motion.result) not in OUT_OF_STEPS or int(motion.accepted) == 0 or is_traced(known):
         return False
-    field, motion, t0 = (jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, x) for x in (field, motion, t0))
-    if is_traced((field, motion, t0)):
-        return False
+    field, motion, t0 = known
     step = float(motion.last_step)
     step = abs(float(motion.t_end) - float(t0)) / int(motion.accepted) if np.isnan(step) else step
     J = np.asarray(_jacobian(field, motion)) * np.sign(float(motion.t_end) - float(t0))

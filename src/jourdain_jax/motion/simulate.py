@@ -21,7 +21,7 @@ from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, Impl
 from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import nan_is_a_mark
-from jourdain_jax.motion.model import Model, as_model, modelled
+from jourdain_jax.motion.model import Model, modelled
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.own_steps import own_steps
 from jourdain_jax.motion.put_on_rows import State, Usual
@@ -126,7 +126,7 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
             raise ValueError(f"`max_step` does not go with `{solver.name}`, whose steps are at most as long as its `step`: jj.{solver.name}(step=...)")
         max_step = solver.step
     native = options.backend in ("auto", "native")
-    inputs = as_inputs(scene, inputs)
+    inputs = model.once("inputs at rest", lambda: as_inputs(scene, None)) if inputs is None else as_inputs(scene, inputs)
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
     start, usual = _start(model, start, t0, inputs)
     field = model.field(inputs.constant, bool(options.work))
@@ -198,7 +198,7 @@ def as_state(model: Model | Scene, given, *, what: str = "start", t0=0.0, inputs
             f"`{what}` is {described(given)}, expected a State (from `jj.start` or `jj.consistent`), a dictionary of named values, or None for the "
             f"scene's example{'; write `.state` after it' if isinstance(getattr(given, 'state', None), State) else ''}"
         )
-    model = as_model(model)
+    model = modelled(model)
     return named_start(model, model.scene.example if given is None else given, t0, inputs)
 
 

@@ -27,7 +27,7 @@ from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.motion.inputs import as_inputs, inputs_at
-from jourdain_jax.motion.model import Model, as_model, modelled
+from jourdain_jax.motion.model import Model, modelled
 from jourdain_jax.motion.put_on_rows import State, Usual, functions_of_rows, may_contradict, put_positions, put_speeds
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_speeds
@@ -215,7 +215,7 @@ def start(scene: Scene | BuiltFor, given=None, *, near=None, t0: Number = 0.0, i
     ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints or that no state of the
     domain has; where they are not, `residual` is infinite, and a motion from there ends with a code.
     """
-    model = as_model(scene)
+    model = modelled(scene)
     if given is not None and not isinstance(given, Mapping):
         raise ValueError(f"`start` was given {described(given)}, expected named values: `jj.start(scene, lean=0.3)`, or a dictionary of them")
     if near is not None and not isinstance(near, Mapping):
@@ -236,9 +236,10 @@ def named_start(model: Model, values: Mapping, t0, inputs, *, near: Mapping = _N
                 raise ValueError(f"`near` names `{name}`, which is no coordinate; {nearest(name, scene.coordinate_names.entries)}")
     inputs = _as_input_vector(scene, inputs, q.dtype)
     t, free_q = _as_time(t0), _free(scene.coordinate_names.entries, given)
-    for name, value in {**near, **values, "t0": t0}.items():
-        if not np.all(np.isfinite(known_numbers(value))):
-            raise ValueError(f"start value `{name}` is {value}, expected a finite number; check where it was computed")
+    if is_traced(q, u, t) or not (np.isfinite(q).all() and np.isfinite(u).all() and np.isfinite(t)):  # one look where all is known, and right
+        for name, value in {**near, **values, "t0": t0}.items():
+            if not np.all(np.isfinite(known_numbers(value))):
+                raise ValueError(f"start value `{name}` is {value}, expected a finite number; check where it was computed")
     known = structure_of(scene)
     free_u = _free(scene.speed_names.entries, (*given, *_resting(scene, known, given)))
     determined = known.affine and not any(free_u[i] for i in known.independent)  # rows determine the speeds that are free
