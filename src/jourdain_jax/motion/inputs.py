@@ -117,7 +117,7 @@ def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
     if getattr(shape, "shape", None) == ():
         program = TimeProgram(closed, real)
         if kept.program is None or not kept.program.does_the_same_as(program):
-            kept.program = _one_of_equals(program)
+            kept.program = program
         found = FunctionOfTime(kept.program, jnp.asarray(program.numbers), tuple(jnp.asarray(x) for x in closed.consts))
     if kept.again and found is not None and not is_traced(found):
         kept.now, kept.found = now, (found, shape)
@@ -138,11 +138,6 @@ class _Trace:
 @lru_cache(maxsize=64)
 def _trace(function: Callable) -> _Trace:
     return _Trace()
-
-
-@lru_cache(maxsize=64)
-def _one_of_equals(program: TimeProgram) -> TimeProgram:
-    return program
 
 
 def for_programs(f: Callable, options: Callable | None = None) -> Callable[[Hashable], Callable]:

@@ -31,12 +31,13 @@ class Printed:
         raise NotImplementedError(f"`{type(self).__name__}` does not say how it is printed; define `_text(self)`")
 
 
-_pictures: list[Callable] = []  # of a scene: functions of layers above
+_picture: Callable = lambda scene: ""  # noqa: E731
 
 
 def show_scenes_with(picture: Callable) -> None:
-    """Have notebooks show what `picture(scene)`, HTML, draws of a scene, too."""
-    _pictures.append(picture)
+    """Have notebooks show what `picture(scene)` of a layer above, HTML, draws of a scene, too."""
+    global _picture
+    _picture = picture
 
 
 def scene_text(scene) -> str:
@@ -66,7 +67,7 @@ def scene_html(scene) -> str:
     listed = (("coordinates", scene.coordinate_names), ("speeds", scene.speed_names), ("inputs", scene.inputs))
     names = "".join(f"<div>{what}: {html.escape(', '.join(given.entries))}</div>" for what, given in listed if given.entries)
     table = f"<table><thead><tr>{heads}</tr></thead><tbody>{''.join(rows)}</tbody></table>" if rows else ""
-    return f"<div><b>{html.escape(type(scene).__name__)}</b> {html.escape(about)}{table}{names}</div>" + "".join(picture(scene) for picture in _pictures)
+    return f"<div><b>{html.escape(type(scene).__name__)}</b> {html.escape(about)}{table}{names}</div>" + _picture(scene)
 
 
 def _value(value) -> str:
