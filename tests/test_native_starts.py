@@ -13,7 +13,6 @@ import jourdain_jax as jj
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.model import modelled
-from jourdain_jax.motion.start import nearest_state
 from jourdain_jax.native import ffi
 
 pytestmark = pytest.mark.skipif(bool(ffi.reason_against()), reason=ffi.reason_against())
@@ -32,7 +31,7 @@ def _near_rows(scene: jj.Scene, count: int) -> tuple[jax.Array, jax.Array]:
 
 def _put(native: bool, held=()):
     """`(scene, q, u)` -> the nearest state on the rows."""
-    return lambda scene, q, u: nearest_state(modelled(scene, None, BACKENDS[native]), 0.2, q, u, jnp.full(len(scene.inputs), 0.3), held=held)
+    return lambda scene, q, u: jj.consistent(modelled(scene, None, BACKENDS[native]), 0.2, q, u, jnp.full(len(scene.inputs), 0.3), held=held)
 
 
 def _by_both(scene: jj.Scene, q, u, **options):

@@ -28,7 +28,7 @@ from jourdain_jax.motion.put_on_rows import State, Usual
 from jourdain_jax.motion.retries import retried
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
 from jourdain_jax.motion.setup import LONGEST, Setup, times_fit
-from jourdain_jax.motion.start import named_start, nearest_state
+from jourdain_jax.motion.start import consistent, named_start
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_speeds
@@ -163,7 +163,7 @@ def _start(model: Model, given, t0, inputs: Inputs) -> tuple[State, Usual | None
         q, u = as_coordinates(model.scene, given.q), as_speeds(model.scene, given.u)
         as_given = q is given.q and u is given.u
         return given if as_given else eqx.tree_at(lambda s: (s.q, s.u), given, (q, u)), model.usual(False)
-    return nearest_state(model, t0, given.q, given.u, inputs_at(inputs, t0)), None
+    return consistent(model, t0, given.q, given.u, inputs_at(inputs, t0)), None
 
 
 def default_solver(rtol: Number) -> Method:

@@ -3,7 +3,7 @@
 g(t, q) = 0,  phi(t, q, u) = 0
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import NamedTuple
@@ -15,9 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.build.sampling import guesses_of
-from jourdain_jax.build.structure import Structure, structure_of
+from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.calculus.damped import first_root
 from jourdain_jax.calculus.reals import Number, Numbers, at_once, checked_unless_traced, described, is_traced, known_numbers, nothing_is_traced
@@ -30,7 +29,7 @@ from jourdain_jax.motion.inputs import as_inputs, inputs_at
 from jourdain_jax.motion.model import Model, modelled
 from jourdain_jax.motion.put_on_rows import State, Usual, functions_of_rows, may_contradict, put_positions, put_speeds
 from jourdain_jax.program.analyticity import depend_on
-from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_speeds
+from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene, vectors_named
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
@@ -39,7 +38,7 @@ _NOTHING: Mapping = MappingProxyType({})
 _OFF = 1e4  # units of round-off: a residual that is more
 
 
-def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tuple[str, ...] = ()) -> State:
+def consistent(scene: Scene | BuiltFor, t, q: Numbers, u: Numbers, inputs=None, *, held: tuple[str, ...] = ()) -> State:
     """The state on the constraints nearest to (q, u): positions by Gauss-Newton, speeds M-orthogonally; g(t, q) = 0, phi(t, q, u) = 0.
 
     `inputs`: values of the scene's inputs (default: zero). `held`: names of coordinates and speeds that do not move.
@@ -47,12 +46,7 @@ def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tu
     Differentiable in any mode. What cannot be met stays in `residual`, which is infinite where numbers are not finite (no error: this also runs
     inside jit and vmap); the quaternion (0, 0, 0, 0) has no direction and stays as it is, with a residual of 1/2. ValueError for wrong shapes.
     """
-    return nearest_state(modelled(scene), t, q, u, inputs, held=held)
-
-
-def nearest_state(model: Model, t, q, u, inputs, *, held: tuple[str, ...] = ()) -> State:
-    """Project as `consistent` does."""
-    scene = model.scene
+    model, scene = modelled(scene), as_scene(scene)
     coordinates, speeds = scene.coordinate_names.entries, scene.speed_names.entries
     t, q, u = _as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     for name in held:
@@ -85,7 +79,7 @@ class _Guess(NamedTuple):
         return ~self.bounded | ((q >= self.usual.low) & (q <= self.usual.high))
 
 
-def _free(names: tuple[str, ...], held: tuple[str, ...]) -> Bool[np.ndarray, "entries"]:
+def _free(names: tuple[str, ...], held: Sequence[str]) -> Bool[np.ndarray, "entries"]:
     """Which of these entries are not held."""
     return np.array([name not in held for name in names], bool)
 
@@ -235,20 +229,41 @@ def named_start(model: Model, values: Mapping, t0, inputs, *, near: Mapping = _N
             if name not in scene.coordinate_names:
                 raise ValueError(f"`near` names `{name}`, which is no coordinate; {nearest(name, scene.coordinate_names.entries)}")
     inputs = _as_input_vector(scene, inputs, q.dtype)
-    t, free_q = _as_time(t0), _free(scene.coordinate_names.entries, given)
+    t = _as_time(t0)
     if is_traced(q, u, t) or not (np.isfinite(q).all() and np.isfinite(u).all() and np.isfinite(t)):  # one look where all is known, and right
         for name, value in {**near, **values, "t0": t0}.items():
             if not np.all(np.isfinite(known_numbers(value))):
                 raise ValueError(f"start value `{name}` is {value}, expected a finite number; check where it was computed")
-    known = structure_of(scene)
-    free_u = _free(scene.speed_names.entries, (*given, *_resting(scene, known, given)))
-    determined = known.affine and not any(free_u[i] for i in known.independent)  # rows determine the speeds that are free
-    usual = model.usual(determined)
-    bounded = model.once((given, about), lambda: _bounded(usual.program, scene.coordinate_names.entries, given, about))
-    guess = _Guess(q, u, free_q, free_u, bounded, usual)
-    state = _consistent(scene, t, guess, inputs, lambda: guesses_of(scene, known.coordinates[: known.random], q, free_q))
+    held, contradict = model.once((given, about), lambda: _held(model, given, about))
+    guess = _Guess(q, u, *held)
+
+    def guesses() -> Float[Array | np.ndarray, "guesses coordinates"]:
+        known = structure_of(scene)
+        return guesses_of(scene, known.coordinates[: known.random], q, guess.free_q)
+
+    state = _consistent(scene, t, guess, inputs, guesses)
     _check_residual(scene, guess, state, inputs, given)
-    return _moved_if_near(model, state, inputs) if may_contradict(scene, known, free_q, free_u) else state
+    return _moved_if_near(model, state, inputs) if contradict else state
+
+
+def _held(model: Model, given: tuple[str, ...], about: tuple[str, ...]) -> tuple[tuple, bool]:
+    """Return what is left to the rows where values of names are given, or are guesses about which to look, as a `_Guess` has it; and whether given values may
+    contradict each other.
+
+    Privileged speeds that are not given stay at zero, unless a dependent speed is given. Rows may not find coordinates outside of the domain that are neither
+    given nor guessed; but where the rows, affine in them, leave one place.
+    """
+    scene, known = model.scene, structure_of(model.scene)
+    coordinates, speeds = scene.coordinate_names.entries, scene.speed_names.entries
+    privileged = [speeds[i] for i in known.independent]
+    resting = () if any(name in speeds and name not in privileged for name in given) else privileged
+    free_q, free_u = _free(coordinates, given), _free(speeds, (*given, *resting))
+    usual = model.usual(known.affine and not any(free_u[i] for i in known.independent))
+    bounded, program = free_q & _free(coordinates, about), usual.program
+    if program is not None:
+        slopes = [n for (_, k), n in program.G.items() if free_q[k]]
+        bounded = bounded & any(depend_on(program.graph, slopes, np.array(program.q)[free_q].tolist()))
+    return (free_q, free_u, bounded, usual), may_contradict(scene, known, free_q, free_u)
 
 
 def _moved_if_near(model: Model, start: State, inputs) -> State:
@@ -260,29 +275,10 @@ def _moved_if_near(model: Model, start: State, inputs) -> State:
     near = start.residual < _tolerance(start.q.dtype)
     if not np.all(known_numbers(near & _is_off(start))):
         return start
-    state = nearest_state(model, start.t, start.q, start.u, inputs)
+    state = consistent(model, start.t, start.q, start.u, inputs)
     moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
     state = eqx.tree_at(lambda s: (s.moved_q, s.moved_u, s.guess), state, (*moved, start.guess))
     return jax.tree.map(lambda x, y: jnp.where(near, x, y), state, start)
-
-
-def _bounded(program: RowProgram | None, names: tuple[str, ...], given: tuple[str, ...], about: tuple[str, ...]) -> Bool[np.ndarray, "coordinates"]:
-    """Which coordinates rows may not find outside of the domain: those neither given nor guessed; none where the rows, affine in them, leave one place."""
-    free = _free(names, given)
-    if program is not None:
-        slopes = [n for (_, k), n in program.G.items() if free[k]]
-        if not any(depend_on(program.graph, slopes, np.array(program.q)[free].tolist())):
-            return np.zeros(len(names), bool)
-    return free & _free(names, about)
-
-
-def _resting(scene: Scene, known: Structure, given: tuple[str, ...]) -> tuple[str, ...]:
-    """Privileged speeds that stay at zero: those not given, where no dependent speed was."""
-    names = scene.speed_names.entries
-    privileged = [names[i] for i in known.independent]
-    if any(name in names and name not in privileged for name in given):
-        return ()
-    return tuple(name for name in privileged if name not in given)
 
 
 def _check_residual(scene: Scene, start: _Guess, state: State, inputs, given: tuple[str, ...]) -> None:
