@@ -114,7 +114,7 @@ def _function(f: FunctionType, of) -> object:
             return of(y)
         return of(y), tuple((name, read(vars(y)[name], *outer, y)) for name in attributes if name in vars(y))
 
-    named, around = (tuple((name, read(space.get(name))) for name in names) for space, names in spaces(f))
+    named, around = (tuple((name, read(get(name))) for name in names) for get, names in spaces(f))
     if installed:
         return "function", name, around
     return "function", of(f.__code__), of(f.__defaults__), of(f.__kwdefaults__), around, named

@@ -15,7 +15,7 @@ import enum
 import functools
 import re
 import sys
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable
 from dataclasses import fields, is_dataclass
 from decimal import Decimal
 from fractions import Fraction
@@ -145,8 +145,8 @@ class _Watch:
                 content.append((name, _member_key(member)))
                 for f in () if name.startswith("__") and name != "__call__" else functions_in(member):
                     where = f"`{root.__name__}.{name}`" if name else f"the function `{f.__qualname__}`"
-                    for space, names in spaces(f):
-                        found = noted(space.get, names)
+                    for get, names in spaces(f):
+                        found = noted(get, names)
                         content += [(n, told(x, n, where)) for n, x in zip(names, found, strict=True)]
         self._number = self._numbers.setdefault(tuple(content), len(self._numbers))
         self._before, self._sizes = before, sizes  # last: what is refused now is refused at the next call, too
@@ -182,30 +182,19 @@ def _attribute(x, name: str):
         return None
 
 
-class _Cells(Mapping):
-    """Variables of the functions around a function, as a mapping."""
-
-    def __init__(self, f: FunctionType):
-        self._cells = dict(zip(f.__code__.co_freevars, f.__closure__ or (), strict=True))
-
-    def __getitem__(self, name: str):
-        try:
-            return self._cells[name].cell_contents
-        except ValueError:  # not yet set
-            raise KeyError(name) from None
-
-    def __iter__(self):
-        return iter(self._cells)
-
-    def __len__(self) -> int:
-        return len(self._cells)
-
-
-def spaces(f: FunctionType) -> tuple[tuple[Mapping, tuple[str, ...]], ...]:
-    """Where the names that a function loads itself are looked up: its globals, and the variables of the functions around it."""
+def spaces(f: FunctionType) -> tuple[tuple[Callable, tuple[str, ...]], ...]:
+    """How the names that a function loads itself are looked up, `get(name, default)`, and which: its globals, and the variables of the functions around it."""
     written = {"__class__"} | names_in(f.__code__, ("STORE_GLOBAL", "STORE_DEREF"))  # a counter of calls, say
     own, around = names_in(f.__code__, ("LOAD_GLOBAL", "LOAD_NAME")) - written, set(f.__code__.co_freevars) - written
-    return (f.__globals__, tuple(sorted(own))), (_Cells(f), tuple(sorted(around)))
+    cells = dict(zip(f.__code__.co_freevars, f.__closure__ or (), strict=True))
+
+    def variable(name: str, default=None):
+        try:
+            return cells[name].cell_contents
+        except ValueError:  # not yet set
+            return default
+
+    return (f.__globals__.get, tuple(sorted(own))), (variable, tuple(sorted(around)))
 
 
 @functools.lru_cache(maxsize=4096)
