@@ -5,10 +5,9 @@ well at random states are singular; all are projected onto the geometric rows. P
 parameters are traced (numbers near the class's defaults stand in), so that the choice is static.
 """
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from numbers import Real
 
 import jax
 import numpy as np
@@ -20,12 +19,12 @@ from jourdain_jax.build.probed_on_graph import TIMED, Probed, follow_from_others
 from jourdain_jax.build.rank import Scaled, best_privileged, contradictions, named_speeds, pivots_at, ranks_of, redundant_rows, scaled_states, worst_pivot
 from jourdain_jax.build.sampling import drawn_states, no_numbers, symmetric_configurations, usable_states
 from jourdain_jax.build.smoothness import kinks
-from jourdain_jax.calculus.reals import is_traced, real_type
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.rows import UsualRows
 from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.arguments import as_scene
-from jourdain_jax.scene.identity import defaults, once_per_values, reference_parameters, with_reference_parameters
+from jourdain_jax.scene.identity import once_per_values, reference_parameters, with_reference_parameters
 from jourdain_jax.scene.scene import Scene
 
 RANDOM_PROBES = 24
@@ -349,15 +348,6 @@ class Reference:
     arguments, and not by which call was the first. Of parameters that are traced already, the class's defaults stand in.
     """
 
-    @staticmethod
-    def where_free(scene: Scene, free: Collection[str]) -> "Reference":
-        """That of a scene some of whose parameters, `free`, are going to change: the defaults of its class stand in for these, where it has states there."""
-        leaves, treedef = jax.tree.flatten(scene)
-        for place, (name, default) in enumerate(defaults(scene)):
-            if name in free and isinstance(default, Real | np.ndarray | jax.Array) and np.shape(default) == np.shape(leaves[place]):
-                leaves[place] = np.asarray(default, real_type())
-        return _found(jax.tree.unflatten(treedef, leaves)) or Reference(scene)
-
     def __init__(self, scene: Scene):
         self.scene = with_reference_parameters(scene)
         self._key = jax.tree.structure(scene), structure_whatever_its_faults(self.scene).decisions, jax.config.jax_enable_x64
@@ -373,12 +363,3 @@ class Reference:
 
     def __eq__(self, other):
         return isinstance(other, Reference) and self._key == other._key
-
-
-@once_per_values
-def _found(scene: Scene) -> Reference | None:
-    """That of a scene; None where no state of it is found."""
-    try:
-        return Reference(scene)
-    except (TypeError, ValueError):
-        return None

@@ -28,7 +28,7 @@ from jourdain_jax.motion.put_on_rows import State, Usual
 from jourdain_jax.motion.retries import retried
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
 from jourdain_jax.motion.setup import LONGEST, Setup, times_fit
-from jourdain_jax.motion.start import consistent, named_start
+from jourdain_jax.motion.start import consistent, named_start, one_time
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_speeds
@@ -208,9 +208,9 @@ def span_and_times(scene: Scene, start, t0, t1, ts):
     if isinstance(start, State) and start.q.ndim != 1:
         raise ValueError(f"`start` holds a batch of shape {start.q.shape[:-1]}; use `jj.rollout` or `jax.vmap` for many starts")
     ts = None if ts is None else saved_times(ts)
-    t0, t1 = (as_end(name, value) for name, value in (("t0", t0), ("t1", t1)))
+    t0, t1 = (one_time(value, name) for name, value in (("t0", t0), ("t1", t1)))
     if t0 is None:
-        t0 = as_end("t", start.t if isinstance(start, State) else 0.0)
+        t0 = one_time(start.t if isinstance(start, State) else 0.0)
     if t1 is None:
         t1 = t0 + scene.example_span if ts is None else ts[-1]
     ends = known_numbers([t0, t1])
@@ -221,11 +221,6 @@ def span_and_times(scene: Scene, start, t0, t1, ts):
     elif not np.all(known_numbers(times_fit(ts, t0, t1))):
         raise ValueError(f"`ts` runs from {ts[0]} to {ts[-1]} s, outside of the span from t0 = {t0} to t1 = {t1} s or against it; give `t0` and `t1` around it")
     return tuple(as_array(x, real) for x in (t0, ts, t1))
-
-
-def as_end(name: str, value):
-    """One end of the span; None stays. A ValueError where it is no number."""
-    return None if value is None else checked_unless_traced(value, f"`{name}`", (), advice="give one time in s")
 
 
 def saved_times(ts) -> "Float[Array, 'times'] | Float[np.ndarray, 'times']":

@@ -48,7 +48,7 @@ def consistent(scene: Scene | BuiltFor, t, q: Numbers, u: Numbers, inputs=None, 
     """
     model, scene = modelled(scene), as_scene(scene)
     coordinates, speeds = scene.coordinate_names.entries, scene.speed_names.entries
-    t, q, u = _as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
+    t, q, u = one_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     for name in held:
         if name not in coordinates + speeds:
             raise ValueError(f"`held` names `{name}`, which is no coordinate or speed; {nearest(name, coordinates + speeds)}")
@@ -98,9 +98,9 @@ def _consistent(scene: Scene, t, start: _Guess, inputs, guesses: Callable | None
     return state
 
 
-def _as_time(t):
-    """A time on NumPy, unless it is traced."""
-    return checked_unless_traced(t, "`t`", (), advice="give one time in s; use `jax.vmap` for many")
+def one_time(t, name: str = "t"):
+    """A time on NumPy, unless it is traced; None stays. A ValueError that names it where it is no number."""
+    return None if t is None else checked_unless_traced(t, f"`{name}`", (), advice="give one time in s; use `jax.vmap` for many")
 
 
 def _as_input_vector(scene: Scene, inputs, dtype):
@@ -215,7 +215,7 @@ def start(scene: Scene | BuiltFor, given=None, *, near=None, t0: Number = 0.0, i
     if near is not None and not isinstance(near, Mapping):
         raise ValueError(f'`near` is {described(near)}, expected a dictionary of coordinates: near={{"z": -0.4}}')
     with model.standing_in:
-        return named_start(model, {**(given or {}), **values}, t0, inputs_at(as_inputs(model.scene, inputs), _as_time(t0)), near=near or {})
+        return named_start(model, {**(given or {}), **values}, t0, inputs_at(as_inputs(model.scene, inputs), one_time(t0)), near=near or {})
 
 
 def named_start(model: Model, values: Mapping, t0, inputs, *, near: Mapping = _NOTHING) -> State:
@@ -229,7 +229,7 @@ def named_start(model: Model, values: Mapping, t0, inputs, *, near: Mapping = _N
             if name not in scene.coordinate_names:
                 raise ValueError(f"`near` names `{name}`, which is no coordinate; {nearest(name, scene.coordinate_names.entries)}")
     inputs = _as_input_vector(scene, inputs, q.dtype)
-    t = _as_time(t0)
+    t = one_time(t0)
     if is_traced(q, u, t) or not (np.isfinite(q).all() and np.isfinite(u).all() and np.isfinite(t)):  # one look where all is known, and right
         for name, value in {**near, **values, "t0": t0}.items():
             if not np.all(np.isfinite(known_numbers(value))):

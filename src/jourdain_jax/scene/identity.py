@@ -11,7 +11,6 @@ from dataclasses import MISSING, fields
 from functools import lru_cache, wraps
 from operator import is_
 from threading import Lock
-from typing import Any
 
 import jax
 import numpy as np
@@ -103,7 +102,7 @@ def with_reference_parameters(scene: Scene) -> Scene:
     unknown = [is_traced_type(type(x)) for x in leaves]
     if not any(unknown):
         return scene
-    near = [default for _, default in defaults(scene)]
+    near = _defaults(scene)
     known = _STAND_IN.get()
     if known is not None and jax.tree.structure(known) == treedef:
         near = [y if not is_traced_type(type(y)) and np.shape(y) == np.shape(x) else d for x, y, d in zip(leaves, jax.tree.leaves(known), near, strict=True)]
@@ -111,18 +110,16 @@ def with_reference_parameters(scene: Scene) -> Scene:
     return jax.tree.unflatten(treedef, numbers)
 
 
-def defaults(scene: Scene) -> list[tuple[str, Any]]:
-    """For every leaf of a scene the name of its field, and the class's default for it, or None."""
+def _defaults(scene: Scene) -> list:
+    """For every leaf of a scene the class's default for it, or None."""
     found: list = []
     for field in fields(scene):
         if field.metadata.get("static", False):
             continue
-        leaves = jax.tree.leaves(getattr(scene, field.name))
+        count = len(jax.tree.leaves(getattr(scene, field.name)))
         stated = field.default if field.default_factory is MISSING else field.default_factory()
         default = jax.tree.leaves(stated)
-        if len(default) != len(leaves):
-            default = [stated if len(leaves) == 1 else None] * len(leaves)
-        found += [(field.name, x) for x in default]
+        found += default if len(default) == count else [stated if count == 1 else None] * count
     return found
 
 

@@ -25,7 +25,8 @@ from jourdain_jax.motion.options import SPAN, AllOptions, MotionFields, Options,
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.retries import RERUN_FIELDS, lanes_retried
 from jourdain_jax.motion.sensitivity import warn_of_jumps
-from jourdain_jax.motion.simulate import DEFAULT_SAMPLES, as_end, default_solver, saved_times, set_up, span_and_times, warn_float32
+from jourdain_jax.motion.simulate import DEFAULT_SAMPLES, default_solver, saved_times, set_up, span_and_times, warn_float32
+from jourdain_jax.motion.start import one_time
 from jourdain_jax.motion.trajectories import labelled, results
 from jourdain_jax.motion.trajectories.sketch import sketch_of_lanes
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -227,7 +228,7 @@ def _check_times_of_lanes(scene: Scene, starts, span: dict) -> None:
     if t0 is None and isinstance(starts, State):
         if ts is not None:
             saved_times(ts)
-        as_end("t1", t1)
+        one_time(t1, "t1")
         return
     t0, _, t1 = span_and_times(scene, None, t0, t1, ts)
     check_inputs_in_rows(scene, span["inputs"], t0, t1)
