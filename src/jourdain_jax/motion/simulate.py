@@ -18,6 +18,7 @@ from jourdain_jax.calculus.reals import Number, as_array, checked_unless_traced,
 from jourdain_jax.motion.inputs import Inputs, as_inputs, check_inputs_in_rows, inputs_at
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
+from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import nan_is_a_mark
@@ -118,9 +119,7 @@ def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, in
 
 
 def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Setup:
-    scene = model.scene
-    solver, max_step = options.solver, options.max_step
-    order, solver = (solver.order or order_for(options.rtol), None) if isinstance(solver, Taylor) else (None, solver)
+    scene, max_step, (solver, order) = model.scene, options.max_step, solver_of(options)
     if isinstance(solver, FixedStepMethod):
         if max_step is not None:
             raise ValueError(f"`max_step` does not go with `{solver.name}`, whose steps are at most as long as its `step`: jj.{solver.name}(step=...)")
@@ -133,9 +132,6 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     field = solver.fitted(scene, field, model.state) if isinstance(solver, ImplicitMethod) else field
     if not inputs.constant:
         check_inputs_in_rows(scene, inputs, t0, t1)
-    warn_float32(start.q.dtype, options.rtol)
-    if solver is None:
-        solver = default_solver(options.rtol) if order is None else DOPRI8
     static: dict[str, Any] = {"max_steps": options.max_steps, "event_names": field.event_names if options.events else ()}
     static["alongside"] = options.alongside
     own = own_steps(solver, **static, native=native, order=order)
@@ -166,20 +162,22 @@ def _start(model: Model, given, t0, inputs: Inputs) -> tuple[State, Usual | None
     return consistent(model, t0, given.q, given.u, inputs_at(inputs, t0)), None
 
 
-def default_solver(rtol: Number) -> Method:
-    """The method for this tolerance; a ValueError where it is traced."""
-    if is_traced(rtol):
-        raise ValueError("`rtol` is traced, and the default solver is chosen by its value; give a `solver` too, such as diffrax.Dopri8()")
-    return TSIT5 if rtol >= 1e-6 else DOPRI8
+def solver_of(options: AllOptions) -> tuple["diffrax.AbstractSolver | ImplicitMethod | Method", int | None]:
+    """Return the solver, by default the one for the tolerance, and of Taylor series the order. A ValueError where the tolerance is traced and has to decide.
 
-
-def warn_float32(dtype, rtol) -> None:
-    """A warning where the precision does not hold the tolerance."""
-    if dtype == np.float32 and np.any(known_numbers(rtol) < 1e-5):
+    Warns where the precision does not hold the tolerance.
+    """
+    rtol, solver = options.rtol, options.solver
+    if real_type() == np.float32 and np.any(known_numbers(rtol) < 1e-5):
         warnings.warn(
             f"rtol = {rtol} asks for more digits than float32 has; set jax.config.update('jax_enable_x64', True), or loosen rtol and atol to 1e-5",
             stacklevel=users_level(),
         )
+    if isinstance(solver, Taylor):
+        return DOPRI8, solver.order or order_for(rtol)
+    if solver is None and is_traced(rtol):
+        raise ValueError("`rtol` is traced, and the default solver is chosen by its value; give a `solver` too, such as diffrax.Dopri8()")
+    return solver or (TSIT5 if rtol >= 1e-6 else DOPRI8), None
 
 
 DEFAULT_SAMPLES = 201

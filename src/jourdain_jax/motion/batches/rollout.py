@@ -18,14 +18,14 @@ from jourdain_jax.build.structure import Reference
 from jourdain_jax.calculus.reals import checked_real, described, is_traced, known_numbers
 from jourdain_jax.motion.inputs import as_inputs, check_inputs_in_rows, for_programs
 from jourdain_jax.motion.integration import integrate_lanes
-from jourdain_jax.motion.integrators.taylor import Taylor, order_for
+from jourdain_jax.motion.integrators.taylor import Taylor
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.model import modelled
 from jourdain_jax.motion.options import SPAN, AllOptions, MotionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.retries import RERUN_FIELDS, lanes_retried
 from jourdain_jax.motion.sensitivity import warn_of_jumps
-from jourdain_jax.motion.simulate import DEFAULT_SAMPLES, default_solver, saved_times, set_up, span_and_times, warn_float32
+from jourdain_jax.motion.simulate import DEFAULT_SAMPLES, saved_times, set_up, solver_of, span_and_times
 from jourdain_jax.motion.start import one_time
 from jourdain_jax.motion.trajectories import labelled, results
 from jourdain_jax.motion.trajectories.sketch import sketch_of_lanes
@@ -248,15 +248,10 @@ _compiled = for_programs(_lanes_in_lockstep)
 
 def _with_arrays(options: AllOptions) -> AllOptions:
     """Return options with their numbers as arrays, so that another tolerance or first step compiles nothing."""
-    real, solver = jnp.result_type(float), options.solver
-    warn_float32(real, options.rtol)
-    if solver is None:
-        solver = default_solver(options.rtol)
-    elif isinstance(solver, Taylor):
-        solver = Taylor(solver.order or order_for(options.rtol))
+    real, (solver, order) = jnp.result_type(float), solver_of(options)
     numbers = {name: getattr(options, name) for name in ("rtol", "atol", "max_step")}
     arrays = {name: jnp.asarray(value, real) for name, value in numbers.items() if value is not None}
-    return dataclasses.replace(options, solver=solver, **arrays)
+    return dataclasses.replace(options, solver=solver if order is None else Taylor(order), **arrays)
 
 
 def _lanes(scene: Scene, starts, parameters: dict):
