@@ -99,10 +99,10 @@ def test_what_is_bound_anew_is_noticed(kind):
         assert stiffness(scene, "accelerations") == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("way", ["simulate", "rollout", "gradient", "jit"])
+@pytest.mark.parametrize("way", ["simulate", "rollout", "gradient", "jit", "model"])
 def test_every_use_notices_a_number_that_is_bound_anew(way):
     names = cell("k = 1.0", "k")
-    scene = names["Spring"]()
+    scene = (jj.build if way == "model" else jj.Scene.replace)(names["Spring"]())
     assert stiffness(scene, way) == pytest.approx(1.0, abs=1e-6)
     exec("k = 4.0", names)
     assert stiffness(scene, way) == pytest.approx(4.0, abs=1e-6)

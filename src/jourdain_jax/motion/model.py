@@ -3,7 +3,6 @@
 from collections.abc import Callable, Hashable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from dataclasses import field as dataclass_field
 from typing import Any
 
 import equinox as eqx
@@ -95,11 +94,11 @@ class Model(BuiltFor, Printed):
     formulation: Formulation  # of what `build` returns, its state is settled
     backend: str  # the argument of `build`
     decided: Reference | None  # the scene whose numbers decided; None: the model's own, and those of the class's defaults where these are traced
-    made: dict = dataclass_field(default_factory=dict)  # of these numbers: vector fields, sizes of rows, by what tells their cases apart
+    made: Any = None  # found by `modelled`: what is kept for these numbers, vector fields and sizes of rows, by what tells their cases apart
 
     def replace(self, **parameters) -> "Model":
         """Return the model with other values of the parameters named."""
-        return replace(self, scene=self.scene.replace(**parameters), made={})
+        return replace(self, scene=self.scene.replace(**parameters), made=None)
 
     @property
     def reference(self) -> Reference:
@@ -132,6 +131,8 @@ class Model(BuiltFor, Printed):
 
     def once(self, case: Hashable, make: Callable[[], Any]) -> Any:
         """Return what `make` finds for these numbers, made once for each case."""
+        if self.made is None:
+            return modelled(self).once(case, make)
         if case not in self.made:
             with self.standing_in:
                 self.made[case] = make()
@@ -260,7 +261,7 @@ def _flattened(model: Model) -> tuple[tuple, tuple]:
 def _unflattened(static: tuple, children: tuple) -> Model:
     model = object.__new__(Model)  # anything may stand in the place of numbers
     (scene, arrays), (formulation, backend, decided) = children, static
-    vars(model).update(scene=scene, formulation=eqx.combine(arrays, formulation), backend=backend, decided=decided, made={})
+    vars(model).update(scene=scene, formulation=eqx.combine(arrays, formulation), backend=backend, decided=decided, made=None)
     return model
 
 
@@ -286,30 +287,33 @@ def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backe
     structure_of(scene)  # says what is wrong
     model = modelled(scene, formulation, backend)
     model.usual(False), model.usual(True)
-    settled = replace(model.formulation, state="full" if model.field().independent is None else "minimal")
-    return Model(scene, settled, backend, Reference(scene), model.made)
+    settled = Model(scene, replace(model.formulation, state="full" if model.field().independent is None else "minimal"), backend, Reference(scene))
+    modelled(settled).made.update(model.made)
+    return settled
 
 
 def modelled(scene: Scene | BuiltFor, formulation: Formulation | None = None, backend: str = "auto") -> Model:
-    """Return the model of a scene, kept by its class and values; its choices are made when they are first asked for. Of a model, that itself, or with
-    another formulation and backend.
+    """Return a scene, or a model, with this formulation and backend (by default those of the model), and with what is kept for its class and values: choices
+    that are made when they are first asked for.
     """
-    if isinstance(scene, Model) and (formulation is None or (formulation is scene.formulation and backend == scene.backend)):
-        return scene
-    asked = as_formulation(formulation)
+    decided = None
     if isinstance(scene, Model):
-        return Model(scene.scene, asked, backend, scene.decided)
-    if asked.reduction is None and asked.baumgarte is None and isinstance(backend, str):
-        return _kept(as_scene(scene), asked.state, asked.stabilisation, backend)
-    return Model(as_scene(scene), asked, backend, None)
+        if formulation is None:
+            formulation, backend = scene.formulation, scene.backend
+        if scene.made is not None and formulation is scene.formulation and backend == scene.backend:
+            return scene
+        decided, scene = scene.decided, scene.scene
+    asked, scene = as_formulation(formulation), as_scene(scene)
+    in_words = asked.reduction is None and asked.baumgarte is None and isinstance(backend, str)  # these are compared in no time
+    made = _kept(scene, asked.state, asked.stabilisation, backend) if in_words else {}
+    return Model(scene, asked, backend, decided, made)
 
 
-def _by_words(scene: Scene, state, stabilisation, backend: str) -> Model:
-    """Return the model for a formulation that is texts alone: these are compared in no time."""
-    return Model(scene, Formulation(state, None, stabilisation), backend, None)
+def _nothing_yet(scene: Scene, *words) -> dict:
+    return {}
 
 
-_kept = once_per_values(_by_words, of_traced=_by_words)
+_kept = once_per_values(_nothing_yet, of_traced=_nothing_yet)
 
 
 def _vector_field(model: Model, constant: bool, work: bool) -> VectorField:

@@ -95,9 +95,24 @@ _STATIC = ("max_steps", "events", "work", "retry", "backend", "alongside")
 OPTION_NAMES = tuple(OptionFields.__annotations__)
 
 
-for _kind in (Options, AllOptions):
-    _leaves = [field.name for field in fields(_kind) if field.name not in _STATIC]
-    jax.tree_util.register_dataclass(_kind, _leaves, [field.name for field in fields(_kind) if field.name in _STATIC])
+def _register(kind: type[Options]) -> None:
+    """Register a kind of options as a pytree whose leaves may be anything."""
+    names = [field.name for field in fields(kind)]
+    leaves, static = [name for name in names if name not in _STATIC], [name for name in names if name in _STATIC]
+
+    def unflattened(known: tuple, values) -> Options:
+        options = object.__new__(kind)
+        vars(options).update(zip((*leaves, *static), (*values, *known), strict=True))
+        return options
+
+    def flattened(options: Options) -> tuple[list, tuple]:
+        return [getattr(options, name) for name in leaves], tuple(getattr(options, name) for name in static)
+
+    jax.tree_util.register_pytree_node(kind, flattened, unflattened)
+
+
+_register(Options)
+_register(AllOptions)
 _DEFAULT = AllOptions()
 _BY_DIFFRAX = "call `diffrax.diffeqsolve(jj.diffrax_term(scene), ...)` with it"
 GONE = {  # options that there were once -> what serves now
