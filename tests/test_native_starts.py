@@ -50,7 +50,7 @@ def test_all_models_come_onto_the_rows_alike_and_lanes_do_not_see_each_other(nam
     scene = MODELS[name]()
     q, u = _near_rows(scene, 9)
     ours, theirs = (jax.jit(jax.vmap(lambda q, u, native=native: _put(native)(scene, q, u)))(q, u) for native in (True, False))
-    _same((ours.q, ours.u), (theirs.q, theirs.u))
+    _same(ours, theirs)
     for lane in (0, 7):  # by itself, in narrow registers
         alone = jax.jit(lambda q, u: _put(True)(scene, q, u))(q[lane], u[lane])
         assert_array_equal(alone.q, ours.q[lane])
