@@ -29,7 +29,7 @@ from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
 from jourdain_jax.motion.batches.rollout import rollout
 from jourdain_jax.motion.marks import nan_is_a_mark
-from jourdain_jax.motion.trajectories.labelled import FIELDS, OF_LANES
+from jourdain_jax.motion.trajectories.labelled import OF_LANES
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.tracebacks import users_level
 
@@ -87,7 +87,7 @@ class Runner:
         rolled = rollout(task.scene, starts, parameters=parameters or None, chunk=task.block, progress=False, **task.span, options=task.options).lanes
         with nan_is_a_mark():
             outputs = np.array(self._outputs_of(rolled))[:count]
-        columns = {name: np.asarray(getattr(rolled, FIELDS[name]))[:count].astype(dtype) for name, (dtype, _, _) in OF_LANES.items()}
+        columns = {name: np.asarray(getattr(rolled, field))[:count].astype(dtype) for name, (field, dtype, _, _) in OF_LANES.items()}
         if task.save != "statistics":
             columns |= values | dict(zip(task.outputs, outputs.T, strict=True))
         if task.save == "trajectories":

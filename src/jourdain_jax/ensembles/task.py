@@ -92,7 +92,7 @@ class Task:
         for name in self.design.names:
             about = f"start value of {name.removesuffix(AT_START)}" if name.endswith(AT_START) else f"parameter {name}"
             found.append((name, Column("float64", math.nan, {"long_name": about, "role": "varied"} | _unit(units.get(name, "")))))
-        for name, (dtype, fill, attributes) in OF_LANES.items():
+        for name, (_, dtype, fill, attributes) in OF_LANES.items():
             events: dict = {"event_names": list(names_of_events(self.scene))} if name == "event" else {}
             found.append((name, Column(dtype, fill, attributes | events)))
         for name, output in self.outputs.items():

@@ -15,15 +15,14 @@ from jourdain_jax.motion.trajectories.results import CODES
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import parameters_of
 
-OF_LANES: dict[str, tuple[str, float, dict]] = {  # name: type, what stands for nothing, attributes
-    "result": ("int8", -1, {"long_name": "how the motion ended", "flag_values": list(range(len(CODES))), "flag_meanings": " ".join(CODES)}),
-    "event": ("int8", -1, {"long_name": "which stop event ended the motion; -1: none"}),
-    "steps": ("int32", -1, {"long_name": "accepted steps"}),
-    "rejected_steps": ("int32", -1, {"long_name": "rejected steps"}),
-    "retries": ("int8", -1, {"long_name": "how it was run again", "flag_masks": [1, 2], "flag_meanings": "full_state implicit_solver"}),
-    "end_time": ("float64", math.nan, {"long_name": "time at which the motion ended", "units": "s"}),
+OF_LANES: dict[str, tuple[str, str, float, dict]] = {  # name: field of a motion, type, what stands for nothing, attributes
+    "result": ("result", "int8", -1, {"long_name": "how the motion ended", "flag_values": list(range(len(CODES))), "flag_meanings": " ".join(CODES)}),
+    "event": ("event", "int8", -1, {"long_name": "which stop event ended the motion; -1: none"}),
+    "steps": ("accepted", "int32", -1, {"long_name": "accepted steps"}),
+    "rejected_steps": ("rejected", "int32", -1, {"long_name": "rejected steps"}),
+    "retries": ("fallback", "int8", -1, {"long_name": "how it was run again", "flag_masks": [1, 2], "flag_meanings": "full_state implicit_solver"}),
+    "end_time": ("t_end", "float64", math.nan, {"long_name": "time at which the motion ended", "units": "s"}),
 }
-FIELDS = {"result": "result", "event": "event", "steps": "accepted", "rejected_steps": "rejected", "retries": "fallback", "end_time": "t_end"}
 
 
 def dataset(record: Record, units: Mapping[str, str] | None = None):
@@ -49,9 +48,9 @@ def dataset(record: Record, units: Mapping[str, str] | None = None):
 
     for name, values in _columns(record).items():
         add(name, along, values, {"long_name": name} | ({"units": units[name]} if name in units else {}))
-    for name, (dtype, _, about) in OF_LANES.items():
+    for name, (field, dtype, _, about) in OF_LANES.items():
         more = {"event_names": list(record.event_names)} if name == "event" else {}
-        add(name, lanes, np.asarray(getattr(record, FIELDS[name])).astype(dtype), about | more)
+        add(name, lanes, np.asarray(getattr(record, field)).astype(dtype), about | more)
     for name, value, about in parameters_of(record.scene):
         values = np.asarray(value)
         axes = tuple(f"{name}_{k}" for k in range(values.ndim - len(lanes)))
