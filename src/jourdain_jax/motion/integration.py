@@ -34,9 +34,8 @@ from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod
 from jourdain_jax.motion.native import seen
 from jourdain_jax.motion.own_steps import reason_against_watching
-from jourdain_jax.motion.put_on_rows import State
+from jourdain_jax.motion.put_on_rows import State, projected
 from jourdain_jax.motion.setup import Begun, Setup, Solved, times_fit
-from jourdain_jax.motion.start import projected
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.field import ByProgram, Integrated

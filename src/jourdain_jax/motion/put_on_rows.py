@@ -9,22 +9,27 @@ d o_i = sum_j J_ij d x_j     o: any of these numbers, x: parameters, time, coord
 """
 
 from functools import lru_cache, partial
+from typing import NamedTuple
 
 import equinox as eqx
+import equinox.internal as eqxi
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.build.assembling import coordinate_bounds
 from jourdain_jax.build.probed_on_graph import coordinates_on_rows
 from jourdain_jax.build.row_program import RowProgram, row_program
 from jourdain_jax.build.sampling import NEARLY_INSIDE
 from jourdain_jax.build.structure import Structure, closure_lengths, plain_row_lengths, rows_are_affine, usual_rows
+from jourdain_jax.calculus.damped import first_root
 from jourdain_jax.calculus.differentiated_as import differentiated_as
 from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions, project_positions, project_speeds
+from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.motion.native import onto_rows
 from jourdain_jax.motion.native.called import called
 from jourdain_jax.motion.native.onto_rows import Rows, write
@@ -35,6 +40,8 @@ from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.printing import Printed, in_digits
 from jourdain_jax.scene.scene import Scene
+
+OFF = 1e4  # units of round-off: a residual that is more
 
 
 class State(Printed, eqx.Module):
@@ -157,6 +164,108 @@ def _put(rows: Rows, scene: Scene, t, *vectors) -> tuple[Array, Array]:
     real, given = real_type(), (*entries(scene, rows.program.parameters), t[None], *vectors)
     found = _kernel(rows, real)(jnp.concatenate([jnp.asarray(x, real) for x in given]))[0]
     return found[: len(rows.moving)], found[len(rows.moving) :]
+
+
+class Guess(NamedTuple):
+    """Coordinates and speeds that are to be projected, and which of them may move."""
+
+    q: Float[Array | np.ndarray, "coordinates"]
+    u: Float[Array | np.ndarray, "speeds"]
+    free_q: Bool[np.ndarray, "coordinates"]
+    free_u: Bool[np.ndarray, "speeds"]
+    bounded: Bool[np.ndarray, "coordinates"]  # which must end inside the domain that the scene states
+    usual: Usual
+
+    def inside(self, q) -> Bool[Array, "coordinates"]:
+        """Which coordinates are where they may be found."""
+        q = jax.lax.stop_gradient(q)
+        return ~self.bounded | ((q >= self.usual.low) & (q <= self.usual.high))
+
+
+def free_entries(names: tuple[str, ...], held: Sequence[str]) -> Bool[np.ndarray, "entries"]:
+    """Which of these entries are not held."""
+    return np.array([name not in held for name in names], bool)
+
+
+def projected(scene: Scene, t, start: State, inputs, usual: Usual) -> State:
+    """Project a state as `consistent` does, as a part of a larger compiled function."""
+    every_q, every_u = (free_entries(names, ()) for names in (scene.coordinate_names.entries, scene.speed_names.entries))
+    return put_onto_constraints(scene, t, Guess(start.q, start.u, every_q, every_u, ~every_q, usual), inputs, None)[0]
+
+
+def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tuple[State, Bool[Array, ""]]:
+    """The start on the constraints, and whether its coordinates arrived, where they may be found; no search where `guesses` is None.
+
+    The residual is infinite where a number is not finite, or a coordinate was found where it may not be.
+    """
+    given_q, u, free, usual = jnp.asarray(start.q), jnp.asarray(start.u), jnp.asarray(start.free_q), start.usual
+    q = given_q
+    here, at, begin = jax.lax.stop_gradient((scene, t, q))
+    near_q, g = put_positions(here, at, begin, free, usual)
+    arrived, found = _arrived(begin, near_q, g, start), _Put(near_q, g, jnp.zeros((), jnp.int32), begin, jnp.array(True))
+    if guesses is not None and len(usual.closures):
+        other = jax.lax.cond(eqxi.unvmap_any(~arrived), lambda: _searched(here, at, begin, start, jax.lax.stop_gradient(guesses)), lambda: found)
+        better = ~arrived & (left_of(other.g) <= left_of(g))
+        found = jax.tree.map(lambda x, y: jnp.where(better, x, y), other, found)
+        q = jnp.where(better & free, found.begin, q)
+    # derivatives are those of Newton's method from where it began; where the rows cannot be met, they would run away
+    near_q, g = put_positions(scene, t, q, free, usual, (found.q, found.g))
+    near_q, guess = jnp.where(found.met, near_q, q), found.guess
+    near_u, phi = put_speeds(scene, t, near_q, u, jnp.asarray(inputs), jnp.asarray(start.free_u), usual)
+    left = jnp.concatenate([g, phi])
+    right = jnp.all(jnp.isfinite(jnp.concatenate([near_q, near_u, left]))) & jnp.all(start.inside(near_q))
+    moved_q, moved_u, residual = (jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - given_q, near_u - u, left))
+    names = scene.coordinate_names, scene.speed_names
+    state = State(jnp.asarray(t), near_q, near_u, moved_q, moved_u, jnp.where(right, residual, jnp.inf), names, guess.astype(q.dtype))
+    return state, arrived
+
+
+def left_of(g: Float[Array, "closures"]) -> Float[Array, ""]:
+    """Largest residual of the geometric rows that counts: what is no number is infinite, what is round-off is zero."""
+    left = jax.lax.stop_gradient(jnp.max(jnp.abs(g), initial=0.0))
+    return jnp.where(left < contradiction(g.dtype), 0.0, jnp.where(jnp.isfinite(left), left, jnp.inf))
+
+
+def _arrived(q, near_q, g, start: Guess) -> Bool[Array, ""]:
+    """Whether the rows are met, where coordinates may be found and without running far away."""
+    # a coordinate that Newton's method moves by more than ten widths of the domain has run away; never close where it is not a number
+    close = jnp.all(jnp.abs(near_q - q) <= 10.0 * start.usual.width)
+    return jax.lax.stop_gradient(close & (left_of(g) == 0)) & jnp.all(start.inside(near_q))
+
+
+class _Put(NamedTuple):
+    """Coordinates put onto the rows, without derivatives."""
+
+    q: Float[Array, "coordinates"]
+    g: Float[Array, "closures"]
+    guess: Int[Array, ""]
+    begin: Float[Array, "coordinates"]  # where Newton's method began
+    met: Bool[Array, ""]  # whether it was worth while
+
+
+def _searched(scene: Scene, t, q, start: Guess, guesses) -> _Put:
+    """Coordinates from the first guess that leads to the rows, q itself counting as the first."""
+    free, usual = jnp.asarray(start.free_q), start.usual
+    size = jnp.where(free, jnp.asarray(usual.width, q.dtype), 0.0)
+    every = jnp.where(free, jnp.concatenate([q[None], guesses]), q)
+    by = functions_of_rows(usual)
+    given = by.given(scene)
+    G = jax.vmap(lambda q: by.closures(given, t, q)[1])(every)
+    low, high = (jnp.where(start.bounded, x, side * jnp.inf) for x, side in ((usual.low, -1), (usual.high, 1)))
+    every = jnp.clip(jnp.where(jnp.any(G != 0, axis=(0, 1)), every, q), low, high)  # coordinates that no row depends on stay
+    d = row_scale(jnp.max(jnp.abs(G), axis=0) * size, usual.closures * jnp.mean(usual.width))
+    tolerance = 16 * float(jnp.finfo(q.dtype).eps)
+    scaled = lambda q: jax.tree.map(lambda x: (x.T * d).T, by.closures(given, t, q))  # noqa: E731
+    good = float(jnp.finfo(q.dtype).eps) ** 0.5
+    found, guess = first_root(scaled, every, size, tolerance, good, low, high)
+    begin, met = jnp.where(free, found.x, q), found.left <= good
+    near_q = jnp.where(met, put_positions(scene, t, begin, free, usual)[0], begin)
+    return _Put(near_q, by.closures(given, t, near_q)[0], guess, begin, met)
+
+
+def contradiction(dtype) -> float:
+    """The residual (m, rad) from which on given values contradict each other: that of numbers typed with a few digits, or of round-off."""
+    return max(1.5e-5, OFF * float(np.finfo(dtype).eps))  # the first: of numbers typed with a few digits
 
 
 def may_contradict(scene: Scene, known: Structure, free_q: Bool[np.ndarray, "coordinates"], free_u: Bool[np.ndarray, "speeds"]) -> bool:

@@ -26,7 +26,7 @@ import jax
 import numpy as np
 
 from jourdain_jax.calculus.cotangents import tap_cotangents, tap_tangents
-from jourdain_jax.calculus.reals import is_traced, nothing_is_traced
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.own_steps import moving_jumps
 from jourdain_jax.motion.setup import Setup
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -117,7 +117,7 @@ def _judge(amplification: float, rtol: float, steps: int) -> None:
 
 def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
     """`integrate(setup)`; its derivative, taken outside of `jit`, warns where the motion amplifies errors too much."""
-    varies = () if nothing_is_traced() else tuple(name for name, part in setup._asdict().items() if is_traced(part))
+    varies = tuple(name for name, part in setup._asdict().items() if is_traced(part))
     if not varies:
         return integrate(setup)
     start, (rtol, atol) = setup.start, setup.tolerances

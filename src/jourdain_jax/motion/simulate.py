@@ -29,10 +29,10 @@ from jourdain_jax.motion.put_on_rows import State, Usual
 from jourdain_jax.motion.retries import retried
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
 from jourdain_jax.motion.setup import LONGEST, Setup, times_fit
-from jourdain_jax.motion.start import consistent, named_start, one_time
+from jourdain_jax.motion.start import consistent, named_start
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_speeds
+from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_speeds, one_time
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines, users_level
 
@@ -97,7 +97,7 @@ def simulate(
         model = modelled(scene, options.formulation, options.backend)
         with model.standing_in:
             setup = _set_up(model, start, t0, t1, ts, inputs, options)
-            return setup, warn_if_ill_conditioned(setup, _integrated)
+            return setup, _integrated(setup) if nothing_is_traced() else warn_if_ill_conditioned(setup, _integrated)
 
     setup, motion = run(options)
     return retried(run, setup, motion, options) if options.retry else motion

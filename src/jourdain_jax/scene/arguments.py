@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.guards import DifferentiationModeError
-from jourdain_jax.calculus.reals import at_once, checked_real, described, is_traced, real_type
+from jourdain_jax.calculus.reals import at_once, checked_real, checked_unless_traced, described, is_traced, real_type
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
@@ -66,6 +66,11 @@ def of_known_numbers(function: F) -> F:
 def as_time(t) -> Float[Array, ""]:
     """A time in s, as a number of the default floating-point type."""
     return checked_real(t, "`t`", (), advice="give one time in s; use `jax.vmap` for many").astype(real_type())
+
+
+def one_time(t, name: str = "t"):
+    """A time on NumPy, unless it is traced; None stays. A ValueError that names it where it is no number."""
+    return None if t is None else checked_unless_traced(t, f"`{name}`", (), advice="give one time in s; use `jax.vmap` for many")
 
 
 def as_coordinates(scene: Scene, q) -> Float[Array, "coordinates"]:

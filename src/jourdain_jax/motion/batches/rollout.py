@@ -26,12 +26,11 @@ from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.retries import RERUN_FIELDS, lanes_retried
 from jourdain_jax.motion.sensitivity import warn_of_jumps
 from jourdain_jax.motion.simulate import DEFAULT_SAMPLES, saved_times, set_up, solver_of, span_and_times
-from jourdain_jax.motion.start import one_time
 from jourdain_jax.motion.trajectories import labelled, results
 from jourdain_jax.motion.trajectories.sketch import sketch_of_lanes
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.field import VectorField
-from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.arguments import BuiltFor, as_scene, one_time
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
