@@ -8,6 +8,7 @@ g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M(t, q)
 d o_i = sum_j J_ij d x_j     o: any of these numbers, x: parameters, time, coordinates, speeds, inputs;   J: derived on the graph (`values_of_nodes.py`)
 """
 
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from typing import NamedTuple
 
