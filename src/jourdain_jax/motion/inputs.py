@@ -208,7 +208,7 @@ class Inputs(eqx.Module):
 
 def inputs_at(inputs: Inputs, t) -> Float[Array | np.ndarray, "inputs"]:
     """The vector of inputs at time t; on NumPy or compiled where all is known, instead of one operation after another."""
-    if is_traced(inputs, t):
+    if inputs.channels and is_traced(inputs, t):
         return inputs(t)
     if inputs.constant:
         return np.array([np.asarray(value) for value in jax.tree.leaves(inputs)], real_type())

@@ -17,7 +17,7 @@ from jourdain_jax.equations.listed import names_of_events, names_of_invariants, 
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered, NotLowered
-from jourdain_jax.motion.inputs import as_inputs
+from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.put_on_rows import Usual, usual_sizes
 from jourdain_jax.motion.vector_fields.by_matrices import FullByMatrices, MinimalByMatrices, usual_lengths
@@ -128,6 +128,10 @@ class Model(BuiltFor, Printed):
                 return jax.device_put(found)  # handed over in a fifth of the time that arrays of NumPy take
 
         return self.once(determined, sizes)
+
+    def inputs(self, given) -> Inputs:
+        """Return the inputs that are given by name; those at rest are made once."""
+        return self.once("inputs at rest", lambda: as_inputs(self.scene, None)) if given is None else as_inputs(self.scene, given)
 
     def once(self, case: Hashable, make: Callable[[], Any]) -> Any:
         """Return what `make` finds for these numbers, made once for each case."""

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.on_first_use import module_on_first_use
 from jourdain_jax.calculus.reals import Number, as_array, checked_unless_traced, described, is_traced, known_numbers, nothing_is_traced, real_type
-from jourdain_jax.motion.inputs import Inputs, as_inputs, check_inputs_in_rows, inputs_at
+from jourdain_jax.motion.inputs import Inputs, check_inputs_in_rows, inputs_at
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
@@ -125,7 +125,7 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
             raise ValueError(f"`max_step` does not go with `{solver.name}`, whose steps are at most as long as its `step`: jj.{solver.name}(step=...)")
         max_step = solver.step
     native = options.backend in ("auto", "native")
-    inputs = model.once("inputs at rest", lambda: as_inputs(scene, None)) if inputs is None else as_inputs(scene, inputs)
+    inputs = model.inputs(inputs)
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
     start, usual = _start(model, start, t0, inputs)
     field = model.field(inputs.constant, bool(options.work))

@@ -21,7 +21,7 @@ from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.rows import velocity_residual
-from jourdain_jax.motion.inputs import as_inputs, inputs_at
+from jourdain_jax.motion.inputs import inputs_at
 from jourdain_jax.motion.model import Model, modelled
 from jourdain_jax.motion.put_on_rows import OFF, Guess, State, contradiction, free_entries, left_of, may_contradict, put_onto_constraints
 from jourdain_jax.program.analyticity import depend_on
@@ -103,7 +103,7 @@ def start(scene: Scene | BuiltFor, given=None, *, near=None, t0: Number = 0.0, i
     if near is not None and not isinstance(near, Mapping):
         raise ValueError(f'`near` is {described(near)}, expected a dictionary of coordinates: near={{"z": -0.4}}')
     with model.standing_in:
-        return named_start(model, {**(given or {}), **values}, t0, inputs_at(as_inputs(model.scene, inputs), one_time(t0)), near=near or {})
+        return named_start(model, {**(given or {}), **values}, t0, inputs_at(model.inputs(inputs), one_time(t0)), near=near or {})
 
 
 def named_start(model: Model, values: Mapping, t0, inputs, *, near: Mapping = _NOTHING) -> State:
