@@ -13,20 +13,20 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 452_075,
+    "code tokens of src": 440_853,
     "code tokens of docs": 11_441,
     "code tokens of notebooks": 7_444,
-    "caches": 61,
-    "named numbers": 271,
-    "tests for a tracer": 112,
+    "caches": 49,
+    "named numbers": 268,
+    "tests for a tracer": 77,
     "functions with more than 8 parameters": 2,
     "ways: state put onto its constraints": 3,
     "ways: state put back onto its constraints within a step": 1,
     "ways: rows and their slopes for a projection": 2,
     "ways: damped least squares": 2,
-    "code tokens of tests": 310_148,
-    "code tokens of bench": 100_000,
-    "test files that reach private names": 37,
+    "code tokens of tests": 307_730,
+    "code tokens of bench": 99_987,
+    "test files that reach private names": 36,
 }
 
 

@@ -50,7 +50,9 @@ def _of_jax(x) -> Array:
     if has_unit(x):
         raise TypeError(f"real numbers are expected, but this is {described(x)}")
     try:
-        return jnp.asarray(np.asarray(x, real_type()) if type(x) in (int, float) or getattr(x, "dtype", None) == np.longdouble else x)
+        x = np.asarray(x, real_type()) if type(x) in (int, float) or getattr(x, "dtype", None) == np.longdouble else x
+        # without a type, JAX compiles a program for each shape of NumPy's arrays
+        return jnp.asarray(x, jax.dtypes.canonicalize_dtype(x.dtype) if isinstance(x, np.ndarray) and x.dtype.kind == "f" else None)
     except OverflowError:
         raise ValueError("an integer is larger than all floating-point numbers, expected real numbers") from None
 

@@ -75,7 +75,7 @@ def diagnose(trajectory: Record) -> Diagnostics:
     """
     if not hasattr(trajectory, "scene"):
         raise ValueError(f"`diagnose` was given a {type(trajectory).__name__}, expected a `Trajectory`; of a rollout take one lane, as `rollout.lane(0)`")
-    checks = Checks(jax.tree.map(jnp.asarray, usual_rows(trajectory.scene)))
+    checks = Checks(jax.device_put(usual_rows(trajectory.scene)))
     return _diagnosed(trajectory, map_over_times(checks, trajectory, by_inputs=True))
 
 
