@@ -27,12 +27,13 @@ os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # no line number
 # functions are called a million times while scenes are traced: there it takes a tenth of the time of all tests.
 LAYERS = ("equations", "dynamics", "motion", "analysis", "ensembles", "models", "bicycle", "plotting", "cli")
 
-# What takes longest for its number of tests, longest first: started last, one of these would keep one worker busy while the others have nothing to do.
+# What takes longest, longest first: started last, one of these would keep one worker busy while the others have nothing to do.
 LONGEST = """
-malformed_inputs observed_events load_jumps ties storage_faults diffrax simulate noise_levels quality normal_forces events steady report reactions
-result_codes stricter_modes study_faults taylor rows_lost_at_rest identify native_second storage sensors other_systems native_cache native_programs
-traced_parameters sweep_verb two_wheel_axle native_times models_particles_and_discs every_model opaque_calls mutants feasible_starts reduced
-native_mutants crossings particles studies robot_trees names_read power build
+linearize identify result_codes load_jumps events mutants native_mutants native_second sensors native feasible_starts lowering study_faults diffrax
+rank_of_vanishing_rows malformed_inputs crossings every_model inputs names_read extremes simulate discs_and_chains integrability call_costs report
+bench fit_report inertia what_probes_do_not_show bicycle studies power whipple_bicycle derivatives_of_failed plain_numbers build native_functions
+rows_lost_at_rest float32 storage_faults multiple_shooting exported native_starts native_derivatives piecewise_motion readme gpu log_density
+reactions joint_prior observed_events stiff noise_levels labelled native_samples
 """
 
 
