@@ -33,7 +33,6 @@ linearize identify result_codes load_jumps events mutants native_mutants native_
 rank_of_vanishing_rows malformed_inputs crossings every_model inputs names_read extremes simulate discs_and_chains integrability call_costs report
 bench fit_report inertia what_probes_do_not_show bicycle studies power whipple_bicycle derivatives_of_failed plain_numbers build native_functions
 rows_lost_at_rest float32 storage_faults multiple_shooting exported native_starts native_derivatives piecewise_motion readme gpu log_density
-reactions joint_prior observed_events stiff noise_levels labelled native_samples
 """
 
 

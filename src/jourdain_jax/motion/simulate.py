@@ -212,11 +212,11 @@ def span_and_times(scene: Scene, start, t0, t1, ts):
     if t1 is None:
         t1 = t0 + scene.example_span if ts is None else ts[-1]
     ends = known_numbers([t0, t1])
-    if not np.all(np.isfinite(ends)) or np.any(ends[:1] == ends[1:]):
+    if not np.isfinite(ends).all() or (ends[:1] == ends[1:]).any():
         raise ValueError(f"the span from t0 = {t0} to t1 = {t1} s is empty or not finite; give a finite `t1` different from `t0`")
     if ts is None:
         ts = t0 + (t1 - t0) * _EVEN  # of known ends: nothing to compile
-    elif not np.all(known_numbers(times_fit(ts, t0, t1))):
+    elif not known_numbers(times_fit(ts, t0, t1)).all():
         raise ValueError(f"`ts` runs from {ts[0]} to {ts[-1]} s, outside of the span from t0 = {t0} to t1 = {t1} s or against it; give `t0` and `t1` around it")
     return tuple(as_array(x, real) for x in (t0, ts, t1))
 
@@ -227,6 +227,6 @@ def saved_times(ts) -> "Float[Array, 'times'] | Float[np.ndarray, 'times']":
     if ts.ndim != 1 or ts.shape[0] == 0:
         raise ValueError(f"`ts` has shape {ts.shape}, expected a vector of at least one time in s")
     steps = np.diff(known_numbers(ts))
-    if not (np.all(steps > 0) or np.all(steps < 0)) or not np.all(np.isfinite(known_numbers(ts))):
+    if not ((steps > 0).all() or (steps < 0).all()) or not np.isfinite(known_numbers(ts)).all():
         raise ValueError("`ts` must be finite and strictly increasing (or decreasing, for reversed time); sort it and drop repeated times")
     return ts

@@ -5,6 +5,7 @@ g(t, q) = 0,  phi(t, q, u) = 0
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 
 import equinox as eqx
@@ -125,13 +126,16 @@ def named_start(model: Model, values: Mapping, t0, inputs, *, near: Mapping = _N
     held, contradict = model.once((given, about), lambda: _held(model, given, about))
     guess = Guess(q, u, *held)
 
-    def guesses() -> Float[Array | np.ndarray, "guesses coordinates"]:
-        known = structure_of(scene)
-        return guesses_of(scene, known.coordinates[: known.random], q, guess.free_q)
-
+    guesses = partial(_guesses, scene, q, guess.free_q)
     state = _consistent(scene, t, guess, inputs, guesses)
     _check_residual(scene, guess, state, inputs, given)
     return _moved_if_near(model, state, inputs) if contradict else state
+
+
+def _guesses(scene: Scene, q, free) -> Float[Array | np.ndarray, "guesses coordinates"]:
+    """Return coordinates from which the search begins: those of states of the domain, where they are `free`."""
+    known = structure_of(scene)
+    return guesses_of(scene, known.coordinates[: known.random], q, free)
 
 
 def _held(model: Model, given: tuple[str, ...], about: tuple[str, ...]) -> tuple[tuple, bool]:
