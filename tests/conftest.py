@@ -31,8 +31,8 @@ LAYERS = ("equations", "dynamics", "motion", "analysis", "ensembles", "models", 
 LONGEST = """
 linearize identify result_codes load_jumps events mutants native_mutants native_second sensors native feasible_starts lowering study_faults diffrax
 rank_of_vanishing_rows malformed_inputs crossings every_model inputs names_read extremes simulate discs_and_chains integrability call_costs report
-bench fit_report inertia what_probes_do_not_show bicycle studies power whipple_bicycle derivatives_of_failed plain_numbers build native_functions
-rows_lost_at_rest float32 storage_faults multiple_shooting exported native_starts native_derivatives piecewise_motion readme gpu log_density
+bench fit_report inertia what_probes_do_not_show bicycle studies power
+rows_lost_at_rest float32 storage_faults multiple_shooting exported
 """
 
 
