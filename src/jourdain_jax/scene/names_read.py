@@ -44,14 +44,14 @@ class StatefulError(ValueError):
 def clear_caches() -> None:
     """Empty the caches of this package and of JAX, and free their memory.
 
-    Every scene is traced, probed and compiled anew when it is next used: call this after a change of what helpers, modules or classes hold. Machine code
-    stays, since it depends on the text of its program alone and may be running.
+    Every scene is traced, probed and compiled anew at its next use. Call this after a change of values that helpers, modules or classes hold. Machine code
+    stays: it depends on the text of its program alone, and another thread may be running it.
     """
     for name, module in list(sys.modules.items()):
         if name.startswith("jourdain_jax.") and ".native" not in name:
             for value in list(vars(module).values()):
-                if clear := getattr(value, "cache_clear", None):
-                    clear()
+                if callable(value) and hasattr(value, "cache_clear"):  # no module: one that is imported on first use would be
+                    value.cache_clear()
     jax.clear_caches()
 
 
