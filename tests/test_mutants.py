@@ -28,7 +28,7 @@ from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.lowering import appell, kept_rows, lower
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.integrators import crossings, erk_loop, erk_step, event_search, recorded_adjoint, step_adjoint
-from jourdain_jax.motion.integrators.tableaus import method_of
+from jourdain_jax.motion.integrators.explicit_steps import method_of
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 

@@ -150,7 +150,7 @@ class WrongName(Slider):
 
 def lines(error) -> list[str]:
     """The lines of the traceback below the one that called, without those of what wraps public functions (in tests, jaxtyping too)."""
-    wrappers = (str(Path("scene", "tracebacks.py")), str(Path("jaxtyping", "_decorator.py")))
+    wrappers = (str(Path("scene", "arguments.py")), str(Path("jaxtyping", "_decorator.py")))
     return [frame.line for frame in traceback.extract_tb(error.__traceback__)[1:] if not frame.filename.endswith(wrappers)]
 
 

@@ -36,11 +36,10 @@ from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import consistent
 from jourdain_jax.motion.start import start as consistent_start
-from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import Scalar
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 _NODES, _WEIGHTS = gauss_legendre(5)
 

@@ -32,10 +32,9 @@ from jourdain_jax.analysis.unknowns import Unknowns, check_starts, unknowns_of
 from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.options import OptionFields, Options
-from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 
 class FitFields(OptionFields, total=False):

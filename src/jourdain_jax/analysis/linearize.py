@@ -42,11 +42,10 @@ from jourdain_jax.lowering.kinks import bent_load
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import as_state
-from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
+from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, shown_from_users_lines, users_level
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.tracebacks import shown_from_users_lines, users_level
 
 _compiled = partial(compiled, options=RUN_SELDOM)
 

@@ -30,12 +30,11 @@ from jourdain_jax.calculus.compiled import compiled
 from jourdain_jax.calculus.reals import holds, is_traced
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.simulate import simulate
-from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.identity import reference_parameters
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import Scalar
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 Point = Float[Array, "unknowns"]
 Points = Float[Array, "*batch unknowns"]

@@ -23,11 +23,10 @@ from jourdain_jax.calculus.damped import damped_search
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
 from jourdain_jax.calculus.reals import Number, Numbers, described
 from jourdain_jax.motion.put_on_rows import State
-from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
+from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, shown_from_users_lines
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 _FINAL_STEPS = 3
 _SPEEDS = 10.0  # size of a speed, SI units: how far it moves in some steps of the search

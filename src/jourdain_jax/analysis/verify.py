@@ -38,9 +38,8 @@ from jourdain_jax.equations.virtual_power import energies_at, equations_and_rows
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.simulate import as_state
 from jourdain_jax.motion.start import consistent
-from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, of_known_numbers
+from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, of_known_numbers, shown_from_users_lines
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.tracebacks import shown_from_users_lines
 from jourdain_jax.scene.validated import loads_of, potential_of
 
 

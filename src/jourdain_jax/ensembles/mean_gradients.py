@@ -24,10 +24,10 @@ from jourdain_jax.motion.batches.rollout import rollout
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.trajectories import results
+from jourdain_jax.scene.arguments import users_level
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
-from jourdain_jax.scene.tracebacks import users_level
 
 SHIFT = "shift"  # of all values of a column of a table, or of all levels of a grid
 

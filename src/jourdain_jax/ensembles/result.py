@@ -19,9 +19,9 @@ from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.results import CODES
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.scene.arguments import users_level
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.printing import Printed
-from jourdain_jax.scene.tracebacks import users_level
 
 LEVELS = (0.025, 0.5, 0.975)
 

@@ -30,8 +30,8 @@ from jourdain_jax.ensembles.task import Task
 from jourdain_jax.motion.batches.rollout import rollout
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.trajectories.labelled import OF_LANES
+from jourdain_jax.scene.arguments import users_level
 from jourdain_jax.scene.parameters import parameters_of
-from jourdain_jax.scene.tracebacks import users_level
 
 PACKAGES = ("jourdain-jax", "jax", "jaxlib", "diffrax", "numpy", "scipy", "zarr", "llvmlite")
 

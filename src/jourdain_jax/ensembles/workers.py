@@ -20,7 +20,7 @@ from typing import Any
 from jourdain_jax.ensembles.run import Runner
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
-from jourdain_jax.scene.tracebacks import users_level
+from jourdain_jax.scene.arguments import users_level
 
 MOST_DEATHS = 3  # of processes on one chunk, before it is left out
 _NONE_BEGAN = (

@@ -16,8 +16,8 @@ from jaxtyping import Float
 from jourdain_jax.calculus.reading import check_depth, number, parsed, read_bytes, shortened
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.importers.tree import Mass, Matrix, Vector
+from jourdain_jax.scene.arguments import users_level
 from jourdain_jax.scene.names import as_labels, nearest
-from jourdain_jax.scene.tracebacks import users_level
 
 Element = ElementTree.Element
 LARGEST = 100_000_000  # bytes of a file

@@ -8,8 +8,7 @@ from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations
 from jourdain_jax.lowering.comparison import enough, values_at
 from jourdain_jax.lowering.elimination import pivots_ok, usual
-from jourdain_jax.lowering.jacobian import on_its_own
-from jourdain_jax.program.derivative import cotangents
+from jourdain_jax.program.derivative import cotangents, on_its_own
 from jourdain_jax.program.identity_test import SURE, alike, equal
 from jourdain_jax.scene.scene import Scene
 

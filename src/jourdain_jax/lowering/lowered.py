@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Num
 
 from jourdain_jax.build.trace import Variables
 from jourdain_jax.lowering import export
-from jourdain_jax.lowering.jacobian import differentiable
+from jourdain_jax.program.derivative import differentiable
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import ARRAYS, Graph
 from jourdain_jax.scene.scene import Scene

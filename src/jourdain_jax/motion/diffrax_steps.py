@@ -26,9 +26,8 @@ from jourdain_jax.motion.own_steps import reason_against_watching
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.vector_fields.field import Formulation, Integrated, VectorField
-from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines, users_level
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.tracebacks import shown_from_users_lines, users_level
 
 
 class _Rates(eqx.Module):

@@ -22,12 +22,11 @@ from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.put_on_rows import Usual, usual_sizes
 from jourdain_jax.motion.vector_fields.by_matrices import FullByMatrices, MinimalByMatrices, usual_lengths
 from jourdain_jax.motion.vector_fields.field import ByProgram, Formulation, VectorField, as_formulation, reason_for_matrices
-from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.identity import once_per_values
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 _BACKENDS = ("auto", "native", "xla", "dense")
 

@@ -22,9 +22,9 @@ from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.lowering.relations import MOST_WATCHED
 from jourdain_jax.motion.inputs import FunctionOfTime, Inputs, Sampled
 from jourdain_jax.motion.integrators import erk_loop, integrands
+from jourdain_jax.motion.integrators.explicit_steps import Method, method_of
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
 from jourdain_jax.motion.integrators.problem import Problem
-from jourdain_jax.motion.integrators.tableaus import Method, method_of
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.native.flow import OF_SAMPLES, flow
 from jourdain_jax.motion.native.functions import Form

@@ -31,7 +31,7 @@ from jourdain_jax.motion.own_steps import moving_jumps
 from jourdain_jax.motion.setup import Setup
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.field import VectorField
-from jourdain_jax.scene.tracebacks import users_level
+from jourdain_jax.scene.arguments import users_level
 
 
 class SensitivityWarning(UserWarning):

@@ -17,9 +17,9 @@ from jourdain_jax.calculus.on_first_use import module_on_first_use
 from jourdain_jax.calculus.reals import Number, as_array, checked_unless_traced, described, is_traced, known_numbers, nothing_is_traced, real_type
 from jourdain_jax.motion.inputs import Inputs, check_inputs_in_rows, inputs_at
 from jourdain_jax.motion.integration import integrate
+from jourdain_jax.motion.integrators.explicit_steps import DOPRI8, TSIT5, Method
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
-from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.model import Model, modelled
@@ -32,9 +32,8 @@ from jourdain_jax.motion.setup import LONGEST, Setup, times_fit
 from jourdain_jax.motion.start import consistent, named_start
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_speeds, one_time
+from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_speeds, one_time, shown_from_users_lines, users_level
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.tracebacks import shown_from_users_lines, users_level
 
 if TYPE_CHECKING:
     from jourdain_jax.motion import diffrax_steps

@@ -26,10 +26,9 @@ from jourdain_jax.motion.inputs import inputs_at
 from jourdain_jax.motion.model import Model, modelled
 from jourdain_jax.motion.put_on_rows import OFF, Guess, State, contradiction, free_entries, left_of, may_contradict, put_onto_constraints
 from jourdain_jax.program.analyticity import depend_on
-from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds, one_time
+from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds, one_time, shown_from_users_lines
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene, vectors_named
-from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 _NOTHING: Mapping = MappingProxyType({})
 

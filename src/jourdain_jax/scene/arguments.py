@@ -1,10 +1,17 @@
 """What is handed to a public function besides the scene's description: the scene itself, vectors of q and u, inputs. Checked by name.
 
 Kinds and shapes are known while a function is traced: no compiled program contains these checks.
+
+Errors in a user's own methods: the traceback shows their lines, and leaves out those of this package and of JAX between them. As with JAX's own filtering,
+JAX_TRACEBACK_FILTERING=off shows all of them. Errors on whose way no user's method was keep their whole traceback.
 """
 
+import sys
+import sysconfig
 from collections.abc import Callable, Mapping
 from functools import wraps
+from pathlib import Path
+from types import FrameType, TracebackType
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -13,8 +20,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.guards import DifferentiationModeError
+from jourdain_jax.calculus.promotion import with_usual_promotion
 from jourdain_jax.calculus.reals import at_once, checked_real, checked_unless_traced, described, is_traced, real_type
-from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
@@ -75,18 +82,18 @@ def one_time(t, name: str = "t"):
 
 def as_coordinates(scene: Scene, q) -> Float[Array, "coordinates"]:
     """q as a vector of the scene's coordinates."""
-    return _as_vector(scene, "q", q, as_scene(scene).coordinate_names)
+    return _as_vector(scene, "q", q, as_scene(scene).coordinate_names.entries)
 
 
 def as_speeds(scene: Scene, u, what: str = "u") -> Float[Array, "speeds"]:
     """u (or another vector over the speeds, named by `what`) as a vector of the scene's speeds."""
-    return _as_vector(scene, what, u, as_scene(scene).speed_names)
+    return _as_vector(scene, what, u, as_scene(scene).speed_names.entries)
 
 
-def _as_vector(scene: Scene, what: str, x, names: Names) -> Array:
+def _as_vector(scene: Scene, what: str, x, names: tuple[str, ...]) -> Array:
     if isinstance(x, jax.Array) and x.shape == (len(names),) and x.dtype == real_type() and not x.weak_type:
         return x  # as it should be, in a twentieth of the time of what follows
-    listed = ", ".join(names.entries)
+    listed = ", ".join(names)
     if isinstance(x, Mapping):
         raise ValueError(f"`{what}` of `{type(scene).__name__}` is a dictionary, expected a vector of {listed}; `jj.start(scene, **values)` makes one by name")
     advice = f"one number for each of {listed}; use `jax.vmap` or `rollout` for many states"
@@ -119,3 +126,66 @@ def as_input_vector(scene: Scene, inputs, dtype=None) -> Float[Array, "inputs"]:
     advice = "a function of time is for `simulate`; here give its value at this instant"
     values = [checked_real(inputs.get(name, 0.0), f"input `{name}` of `{type(scene).__name__}`", (), advice=advice) for name in names]
     return jnp.stack(values) if values else jnp.zeros(0, dtype)
+
+
+_OURS = str(Path(__file__).parents[1])
+_INSTALLED = tuple(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+_NOTE = "Lines of jourdain_jax between yours are left out of this traceback; JAX_TRACEBACK_FILTERING=off shows them."
+
+
+def shown_from_users_lines(function: F) -> F:
+    """The function, whose errors show users' lines where any of these was on the way: a method of a scene, an input, an event; in usual modes of promotion."""
+
+    @wraps(function)
+    def called(*args, **kwargs):
+        __tracebackhide__ = True  # for IPython and pytest
+        try:
+            usual = jax.config.jax_numpy_dtype_promotion == "standard" and jax.config.jax_numpy_rank_promotion == "allow"
+            return (function if usual else with_usual_promotion(function))(*args, **kwargs)
+        except Exception as error:
+            if not _is_shortened(error):
+                raise
+            raise error.with_traceback(_of_users(error.__traceback__)) from error.__cause__
+
+    return called  # type: ignore[return-value]
+
+
+def users_level() -> int:
+    """The `stacklevel` with which a warning, given where this is called, shows the user's line that led there."""
+    frame, level = sys._getframe(1), 1
+    while frame.f_back is not None and not _is_users(frame):
+        frame, level = frame.f_back, level + 1
+    return level
+
+
+def _is_shortened(error: BaseException) -> bool:
+    """Whether the error comes from a user's line, called from here; then it has the note."""
+    if jax.config.jax_traceback_filtering == "off":
+        return False
+    if not any(_is_users(entry.tb_frame) for entry in _frames(error.__traceback__)):
+        return False
+    if _NOTE not in getattr(error, "__notes__", ()):
+        error.add_note(_NOTE)
+    return True
+
+
+def _frames(traceback: TracebackType | None) -> list[TracebackType]:
+    found = []
+    while traceback is not None:
+        found.append(traceback)
+        traceback = traceback.tb_next
+    return found
+
+
+def _is_users(frame: FrameType) -> bool:
+    """Whether a line stands neither here nor in an installed package or Python's own library."""
+    return not frame.f_code.co_filename.startswith((_OURS, *_INSTALLED, "<frozen"))
+
+
+def _of_users(traceback: TracebackType | None) -> TracebackType | None:
+    """The traceback without lines of this package and of JAX."""
+    kept: TracebackType | None = None
+    for entry in reversed(_frames(traceback)):
+        if _is_users(entry.tb_frame):
+            kept = TracebackType(kept, entry.tb_frame, entry.tb_lasti, entry.tb_lineno)
+    return kept

@@ -28,13 +28,12 @@ from jourdain_jax.analysis.table import complex_numbers, table
 from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.program.derivative import derivatives
-from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers
+from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers, shown_from_users_lines
 from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 FOUND, NOT_FOUND, SINGULAR = range(3)
 MEANINGS = (

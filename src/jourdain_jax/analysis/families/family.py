@@ -18,11 +18,10 @@ from jourdain_jax.analysis.table import complex_numbers, table
 from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.calculus.reals import Numbers
 from jourdain_jax.motion.put_on_rows import State
-from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, of_known_numbers
+from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, of_known_numbers, shown_from_users_lines
 from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
 from jourdain_jax.scene.printing import Printed, in_digits
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 SHOWN = 1e-9  # sizes by which an unknown changes that is printed
 

@@ -30,12 +30,11 @@ from jourdain_jax.motion.trajectories import labelled, results
 from jourdain_jax.motion.trajectories.sketch import sketch_of_lanes
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.field import VectorField
-from jourdain_jax.scene.arguments import BuiltFor, as_scene, one_time
+from jourdain_jax.scene.arguments import BuiltFor, as_scene, one_time, shown_from_users_lines
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 
 class Rollout(Printed, eqx.Module):

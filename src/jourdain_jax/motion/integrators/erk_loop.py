@@ -1,4 +1,4 @@
-"""The loop over steps of one of our own methods, explicit (`tableaus.py`) or implicit (`implicit_steps.py`), with little besides.
+"""The loop over steps of one of our own methods, explicit (`explicit_steps.py`) or implicit (`implicit_steps.py`), with little besides.
 
 A batch of lanes runs in lockstep, from one time asked for to the next (`erk_step`). Every lane carries its own result code, and a lane that has ended
 stands still. A lane whose step ended beyond a stop event goes back to it in further steps of the same loop, so that there is one copy of the rates to
@@ -11,14 +11,13 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jourdain_jax.motion.integrators import recorded_adjoint
-from jourdain_jax.motion.integrators.erk_step import RUNNING, Progress, advanced, begun, running
+from jourdain_jax.motion.integrators.erk_step import Progress, advanced, begun, running
+from jourdain_jax.motion.integrators.explicit_steps import Method, code_at_end
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
 from jourdain_jax.motion.integrators.problem import Problem
-from jourdain_jax.motion.integrators.tableaus import Method
-from jourdain_jax.motion.trajectories import results
 
 
 def integrate(
@@ -33,14 +32,6 @@ def integrate(
     else:
         ys, reached, end = recorded_adjoint.motion(_motion, problem, method, y0, t0, goals, dt0)
     return ys, reached, eqx.tree_at(lambda p: p.code, end, code_at_end(end.code, end.h, end.accepted, end.t - t0))
-
-
-def code_at_end(code, h, accepted, span) -> Int[Array, "*lanes"]:
-    """The code of how a motion ended after a `span`, where no time is left to go to; `h`: of the step that would be next."""
-    # the last steps against the average one
-    # 0.01 of the average step: a singularity is near
-    shrank = (code == results.MAX_STEPS) & (h * accepted < 0.01 * jnp.abs(span))
-    return jnp.where(shrank, results.SHRANK, jnp.where(code == RUNNING, results.SUCCESS, code))
 
 
 def _motion(problem: Problem, method: Method | ImplicitMethod, y0: PyTree, t0, goals, dt0) -> tuple[PyTree, Bool[Array, "times *lanes"], Progress]:

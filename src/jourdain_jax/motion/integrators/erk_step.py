@@ -20,8 +20,7 @@ In single precision the state is summed with compensation (Kahan): what rounding
 increments are smaller than its last digit stands still while time passes, and no error estimate sees it.
 """
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -34,14 +33,13 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.integrators import crossings, event_search
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING, OnArrays
+from jourdain_jax.motion.integrators.explicit_steps import TSIT5, Method, aimed, judged, taken
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod, Solution, even_step
 from jourdain_jax.motion.integrators.problem import Problem, as_in
-from jourdain_jax.motion.integrators.tableaus import TSIT5, Method
 from jourdain_jax.motion.trajectories import results
 
 NOISE = 0.6  # exponent of round-off: its power 0.6 counts as noise anywhere, and no more than its power 0.4
 NEAR_SINE, AMPLIFIED = 0.1, 16.0  # below it rows are about to lose rank; the number of round-offs over its square that count as noise
-SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
 
 
 class Progress(eqx.Module):
@@ -93,45 +91,6 @@ def advanced(problem: Problem, method: Method | ImplicitMethod, p: Progress, goa
     """One step, tried by all lanes that are on their way to `goal`; the others stand still."""
     moving = running(p, goal)
     return jax.tree.map(lambda new, old: jnp.where(moving, new, old), _tried(problem, method, p, goal, last_goal, direction), p)
-
-
-class Aim(NamedTuple):
-    """The step that is tried; of arrays of JAX or values of machine code, as all that `w` (`event_search.OnArrays`, or a `Writer`) works with."""
-
-    t_1: Any  # its end
-    h: Any  # its length, as rounded: the state and the time advance together
-    size: Any  # its magnitude, but of a search for an event
-    locating: Any  # whether it is part of one
-
-
-def aimed(w, p, target, reach, shift=None) -> Aim:
-    """Return the step to the `target`, half of the way there, or as far as `reach`; `shift`: of a search for an event, where there may be one."""
-    locating, rest = w.equal(p["code"], LOCATING), w.magnitude(target - p["t"])
-    lands = ~locating & (reach >= 0.999 * rest)
-    size = w.where(lands, rest, w.where(2.0 * reach > rest, 0.5 * rest, reach))
-    h = p["direction"] * size if shift is None else w.where(locating, shift, p["direction"] * size)
-    t_1 = w.where(lands, target, p["t"] + h)
-    return Aim(t_1, t_1 - p["t"], size, locating)
-
-
-def judged(w, power: Callable, p, aim: Aim, error, order: int) -> tuple:
-    """Return whether a step of this `error` is accepted, and the next step."""
-    accept = aim.locating | (error <= 1.0)
-    factor = SAFETY * power(w.where(error > 0.0, error, 1e-30), -1 / order)
-    factor = w.larger(w.where(error < math.inf, factor, 0.0), LEAST_FACTOR)
-    proposed = w.smaller(aim.size * w.smaller(factor, w.where(accept, LARGEST_FACTOR, 1.0)), p["longest"])
-    return accept, w.where(accept & (aim.size < p["h"]), w.larger(proposed, p["h"]), proposed)
-
-
-def taken(w, p, aim: Aim, accept, next_h) -> dict[str, Any]:
-    """Return time, next step, code and counts after a step."""
-    accepted = p["accepted"] + w.where(accept & ~aim.locating, 1.0, 0.0)
-    rejected = p["rejected"] + w.where(accept, 0.0, 1.0)
-    too_short = (next_h < p["shortest"]) | w.equal(aim.t_1 + p["direction"] * next_h, aim.t_1)  # the second: no time would pass
-    arrived = accept & w.equal(aim.t_1, p["last_goal"])
-    code = w.where((accepted + rejected >= p["max_steps"]) & ~arrived, results.MAX_STEPS, RUNNING)
-    code = w.where(too_short, results.STEP_TOO_SMALL, code)
-    return {"t": w.where(accept, aim.t_1, p["t"]), "h": next_h, "code": code, "accepted": accepted, "rejected": rejected}
 
 
 def _tried(problem: Problem, method: Method | ImplicitMethod, p: Progress, goal, last_goal, direction) -> Progress:

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.motion.integrators.knots import seen_from_within
+from jourdain_jax.motion.inputs import seen_from_within
 from jourdain_jax.motion.vector_fields.field import Integrated
 
 

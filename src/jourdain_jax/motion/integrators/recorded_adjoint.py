@@ -23,11 +23,11 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.calculus.promotion import with_usual_promotion
 from jourdain_jax.motion.integrators import step_adjoint
-from jourdain_jax.motion.integrators.erk_step import LOCATING, Progress, advanced, begun, running, standing
-from jourdain_jax.motion.integrators.event_search import MOST_STEPS, OnArrays, chosen, is_flat
+from jourdain_jax.motion.integrators.erk_step import Progress, advanced, begun, running, standing
+from jourdain_jax.motion.integrators.event_search import LOCATING, MOST_STEPS, OnArrays, chosen, is_flat
+from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
 from jourdain_jax.motion.integrators.problem import Problem
-from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.trajectories import results
 
 STEPS_ALONE, STEPS_TOGETHER = 2048, 512  # of a window: for one motion, for lanes in lockstep

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jourdain_jax.motion.integrators.erk_step import onto_rows, stages, weighted
+from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
 from jourdain_jax.motion.integrators.problem import Problem, as_in
-from jourdain_jax.motion.integrators.tableaus import Method
 
 
 class StepCotangents(eqx.Module):

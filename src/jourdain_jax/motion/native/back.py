@@ -17,8 +17,8 @@ import math
 from collections.abc import Sequence
 from functools import partial
 
-from jourdain_jax.motion.integrators.erk_step import Method
 from jourdain_jax.motion.integrators.event_search import RUNNING, chosen
+from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.native import samples
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.layout import Lanes, copied, each_row

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from jourdain_jax.calculus.differentiated_as import filled, is_zero
 from jourdain_jax.calculus.guards import DifferentiationModeError
-from jourdain_jax.motion.integrators.tableaus import Method
+from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.kernel import Found, Start, kernel
 from jourdain_jax.motion.native.pulled import check_derivatives

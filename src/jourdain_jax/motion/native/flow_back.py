@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.differentiated_as import filled
-from jourdain_jax.motion.integrators.tableaus import Method
+from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.native.flow import with_tangents
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.kernel import Start, kernel_back

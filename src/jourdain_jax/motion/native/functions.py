@@ -11,14 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from jourdain_jax.lowering.jacobian import on_its_own
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.lowering.relations import MOST_WATCHED
 from jourdain_jax.motion.native.layout import Lanes, Layout
 from jourdain_jax.motion.native.samples import looked_up
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.scalar_program import as_real, written, written_in_turn
-from jourdain_jax.program.derivative import directional_derivative
+from jourdain_jax.program.derivative import directional_derivative, on_its_own
 from jourdain_jax.program.graph import Graph
 
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.motion.integrators.event_search import RUNNING
-from jourdain_jax.motion.integrators.tableaus import Method
+from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.native import back, loop, samples
 from jourdain_jax.motion.native.called import called
 from jourdain_jax.motion.native.functions import Form

@@ -8,7 +8,7 @@ progress at the end with the number of times that were reached one after the oth
 import math
 
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
-from jourdain_jax.motion.integrators.tableaus import Method
+from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.native import samples
 from jourdain_jax.motion.native.functions import Form, write_events, write_projection, write_rates, write_relations
 from jourdain_jax.motion.native.layout import Lanes

@@ -13,8 +13,7 @@ from jourdain_jax.calculus.entries import entries_of
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.inputs import Constant, FunctionOfTime, Inputs, Sampled
-from jourdain_jax.motion.integrators.erk_loop import code_at_end
-from jourdain_jax.motion.integrators.tableaus import Method
+from jourdain_jax.motion.integrators.explicit_steps import Method, code_at_end
 from jourdain_jax.motion.native.flow_back import flow_back
 from jourdain_jax.motion.native.functions import Form, event_program
 from jourdain_jax.motion.native.functions_of_time import numbers_of, parts_from, with_functions

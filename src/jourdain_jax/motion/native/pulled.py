@@ -11,11 +11,10 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from jourdain_jax.calculus.guards import DifferentiationModeError
-from jourdain_jax.lowering.jacobian import on_its_own
 from jourdain_jax.motion.native.functions import Form, Outputs, given_values, known_values, outputs_of
 from jourdain_jax.native.ir import Writer
 from jourdain_jax.native.scalar_program import as_real, unsupported, written_in_turn
-from jourdain_jax.program.derivative import cotangents, directional_derivative
+from jourdain_jax.program.derivative import cotangents, directional_derivative, on_its_own
 from jourdain_jax.program.graph import Graph
 
 # Operations of a derivative of the first order, of which reverse mode keeps some on the stack, and of the second.

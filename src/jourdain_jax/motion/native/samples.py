@@ -4,7 +4,7 @@
     df/dt = (f_{k+1} - f_k)/(t_{k+1} - t_k)
 
 Tables have the shape (tables, inputs, 2, samples): times since the start, then values, of every input that is given by samples, padded with infinite
-times. Knots (`integrators/knots.py`) have the shape (rows, knots). Lanes that share them have one of each: of T tables, lane i of N has number i T / N.
+times. Knots (`motion/inputs.py`) have the shape (rows, knots). Lanes that share them have one of each: of T tables, lane i of N has number i T / N.
 """
 
 from jourdain_jax.motion.native.layout import Lanes, Layout

@@ -9,8 +9,9 @@ import numpy as np
 
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.integrators.crossings import reach
-from jourdain_jax.motion.integrators.erk_step import AMPLIFIED, NEAR_SINE, NOISE, Aim, Method, aimed, judged, taken
+from jourdain_jax.motion.integrators.erk_step import AMPLIFIED, NEAR_SINE, NOISE
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING, any_of
+from jourdain_jax.motion.integrators.explicit_steps import Aim, Method, aimed, judged, taken
 from jourdain_jax.motion.native import crossings, search
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.layout import Lanes, Layout, copied, each_row, over_rows

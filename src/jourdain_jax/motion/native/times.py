@@ -15,9 +15,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.differentiated_as import Rules, filled, is_zero, with_rules
-from jourdain_jax.lowering.jacobian import on_its_own
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
+from jourdain_jax.program.derivative import on_its_own
 
 
 def moved(form: Form) -> Callable[[Float[Array, "z"], Float[Array, ""]], Float[Array, "z"]]:

@@ -15,10 +15,9 @@ import numpy as np
 from jaxtyping import Array
 
 from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as, filled, is_zero, with_rules
-from jourdain_jax.lowering.jacobian import on_its_own
 from jourdain_jax.motion.native.called import nodes_called
 from jourdain_jax.native.scalar_program import unsupported
-from jourdain_jax.program.derivative import cotangents, derivatives
+from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import Graph, Unsupported
 

@@ -1,4 +1,4 @@
-"""The explicit Runge-Kutta methods of our own loop: their tableaus.
+"""The explicit Runge-Kutta methods of our own loop: their tableaus, and how long their steps are.
 
     k_i = f(t + c_i h, y + h sum_j a_ij k_j),   y_1 = y + h sum b_i k_i,   e = h sum (b_i - b^_i) k_i
 
@@ -8,14 +8,25 @@ Dopri8: P. J. Prince and J. R. Dormand, J. Comput. Appl. Math. 7 (1981) 67, of o
 
 They bear the names of diffrax's solvers, and have their coefficients to the last bit: so a motion is the same by whichever loop, and the default ones need
 no diffrax. The weights of the solution stand as the last row of A too: the last stage of a step is the first of the next one.
+
+The formulas for the length of steps, those of implicit methods among them, are those of arrays of JAX and of values of machine code: `w` is
+`event_search.OnArrays`, or a `Writer`.
 """
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int
 
+from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
+from jourdain_jax.motion.trajectories import results
+
+SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,3 +134,50 @@ def method_of(solver) -> Method | None:
     """The method of a solver of diffrax; None where our own loop has no such one."""
     method = _ALL.get(type(solver).__name__)
     return method if method is not None and type(solver) is getattr(diffrax, method.name) else None
+
+
+class Aim(NamedTuple):
+    """The step that is tried."""
+
+    t_1: Any  # its end
+    h: Any  # its length, as rounded: the state and the time advance together
+    size: Any  # its magnitude, but of a search for an event
+    locating: Any  # whether it is part of one
+
+
+def aimed(w, p, target, reach, shift=None) -> Aim:
+    """Return the step to the `target`, half of the way there, or as far as `reach`; `shift`: of a search for an event, where there may be one."""
+    locating, rest = w.equal(p["code"], LOCATING), w.magnitude(target - p["t"])
+    lands = ~locating & (reach >= 0.999 * rest)
+    size = w.where(lands, rest, w.where(2.0 * reach > rest, 0.5 * rest, reach))
+    h = p["direction"] * size if shift is None else w.where(locating, shift, p["direction"] * size)
+    t_1 = w.where(lands, target, p["t"] + h)
+    return Aim(t_1, t_1 - p["t"], size, locating)
+
+
+def judged(w, power: Callable, p, aim: Aim, error, order: int) -> tuple:
+    """Return whether a step of this `error` is accepted, and the next step."""
+    accept = aim.locating | (error <= 1.0)
+    factor = SAFETY * power(w.where(error > 0.0, error, 1e-30), -1 / order)
+    factor = w.larger(w.where(error < math.inf, factor, 0.0), LEAST_FACTOR)
+    proposed = w.smaller(aim.size * w.smaller(factor, w.where(accept, LARGEST_FACTOR, 1.0)), p["longest"])
+    return accept, w.where(accept & (aim.size < p["h"]), w.larger(proposed, p["h"]), proposed)
+
+
+def taken(w, p, aim: Aim, accept, next_h) -> dict[str, Any]:
+    """Return time, next step, code and counts after a step."""
+    accepted = p["accepted"] + w.where(accept & ~aim.locating, 1.0, 0.0)
+    rejected = p["rejected"] + w.where(accept, 0.0, 1.0)
+    too_short = (next_h < p["shortest"]) | w.equal(aim.t_1 + p["direction"] * next_h, aim.t_1)  # the second: no time would pass
+    arrived = accept & w.equal(aim.t_1, p["last_goal"])
+    code = w.where((accepted + rejected >= p["max_steps"]) & ~arrived, results.MAX_STEPS, RUNNING)
+    code = w.where(too_short, results.STEP_TOO_SMALL, code)
+    return {"t": w.where(accept, aim.t_1, p["t"]), "h": next_h, "code": code, "accepted": accepted, "rejected": rejected}
+
+
+def code_at_end(code, h, accepted, span) -> Int[Array, "*lanes"]:
+    """The code of how a motion ended after a `span`, where no time is left to go to; `h`: of the step that would be next."""
+    # the last steps against the average one
+    # 0.01 of the average step: a singularity is near
+    shrank = (code == results.MAX_STEPS) & (h * accepted < 0.01 * jnp.abs(span))
+    return jnp.where(shrank, results.SHRANK, jnp.where(code == RUNNING, results.SUCCESS, code))
