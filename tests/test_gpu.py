@@ -12,8 +12,8 @@ from ends_of_models import end_of_model
 
 import jourdain_jax as jj
 from jourdain_jax.native import ffi, gpu, host, nvidia
+from jourdain_jax.native.ffi import write_rows
 from jourdain_jax.native.ir import Writer
-from jourdain_jax.native.threads import write_rows
 from jourdain_jax.scene.parameters import parameters_of
 
 # Kernels of GPUs, checked without one: their twins on the CPU give the bits of machine code in wide registers, and their text is one for NVIDIA's

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import machine_code
 import pytest
 
-from jourdain_jax.native import disk, ffi, host
+from jourdain_jax.native import ffi, host
 
 OTHER = 12345  # the number of another user
 
@@ -20,7 +20,7 @@ OTHER = 12345  # the number of another user
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("JOURDAIN_JAX_CACHE", str(tmp_path / "kept"))
-    disk._warn.cache_clear()
+    host._warn.cache_clear()
     return tmp_path / "kept"
 
 
@@ -30,17 +30,17 @@ def _never():
 
 def _all_kept(*names):
     """The code of each name, made of it where it is not kept."""
-    return [disk.kept(name, "llvm 20", lambda name=name: f"code of {name}".encode()) for name in names]
+    return [host.kept(name, "llvm 20", lambda name=name: f"code of {name}".encode()) for name in names]
 
 
 def test_code_is_made_once_and_again_where_its_file_is_torn(folder):
-    assert disk.kept("a", "llvm 20", lambda: b"code") == b"code"
-    assert disk.kept("a", "llvm 20", _never) == b"code"
+    assert host.kept("a", "llvm 20", lambda: b"code") == b"code"
+    assert host.kept("a", "llvm 20", _never) == b"code"
     file = folder / "a.o"
     whole = file.read_bytes()
     for torn in (whole[:-1], b"", whole[:10], whole[:-1] + b"?"):
         file.write_bytes(torn)
-        assert disk.kept("a", "llvm 20", lambda: b"code") == b"code"
+        assert host.kept("a", "llvm 20", lambda: b"code") == b"code"
         assert file.read_bytes() == whole
     assert [f.name for f in folder.iterdir()] == ["a.o"]
 
@@ -48,10 +48,10 @@ def test_code_is_made_once_and_again_where_its_file_is_torn(folder):
 def test_a_folder_that_cannot_be_used_or_is_switched_off_is_no_error(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("JOURDAIN_JAX_CACHE", str(tmp_path / "file"))
-    assert disk.kept("a", "llvm 20", lambda: b"code") == b"code"
+    assert host.kept("a", "llvm 20", lambda: b"code") == b"code"
     monkeypatch.setenv("JOURDAIN_JAX_CACHE", "0")
-    assert disk.folder() is None
-    assert disk.kept("a", "llvm 20", lambda: b"code") == b"code"
+    assert host.folder() is None
+    assert host.kept("a", "llvm 20", lambda: b"code") == b"code"
 
 
 def test_files_that_are_exchanged_are_made_again(folder):
@@ -63,8 +63,8 @@ def test_files_that_are_exchanged_are_made_again(folder):
         for name, other in zip(names, order, strict=True):
             (folder / f"{name}.o").write_bytes(whole[other])
         assert _all_kept(*names) == right
-    assert disk.kept("a", "llvm 21", lambda: b"newer") == b"newer"
-    assert disk.kept("a", "llvm 20", lambda: b"older") == b"older"
+    assert host.kept("a", "llvm 21", lambda: b"newer") == b"newer"
+    assert host.kept("a", "llvm 20", lambda: b"older") == b"older"
 
 
 def test_every_byte_of_a_file_counts(folder):
@@ -92,7 +92,7 @@ def _unused(folder, words):
     """Code is made each time, nothing of the folder is read or written, and one warning says why."""
     before = {file.name: file.read_bytes() for file in folder.iterdir()}
     with pytest.warns(UserWarning, match=f"{folder}.*{words}") as said:
-        assert [disk.kept(name, "llvm 20", lambda: b"new") for name in "az"] == [b"new", b"new"]
+        assert [host.kept(name, "llvm 20", lambda: b"new") for name in "az"] == [b"new", b"new"]
     assert len(said) == 1
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
 
@@ -103,7 +103,7 @@ def test_a_folder_that_others_may_write_is_not_used(folder, mode):
     folder.chmod(mode)
     _unused(folder, "others may write to it.*chmod go-w.*JOURDAIN_JAX_CACHE")
     folder.chmod(0o755)
-    assert disk.kept("a", "llvm 20", _never) == right[0]
+    assert host.kept("a", "llvm 20", _never) == right[0]
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can hand a folder to another user")
@@ -121,7 +121,7 @@ def test_a_file_that_another_user_put_there_is_made_again(folder):
     assert _all_kept("a") == right
     assert file.stat().st_uid == os.geteuid()
     file.chmod(0o666)
-    assert disk.kept("a", "llvm 20", lambda: b"made again") == b"made again"
+    assert host.kept("a", "llvm 20", lambda: b"made again") == b"made again"
 
 
 def test_a_link_or_a_pipe_in_place_of_a_file_is_not_read(folder, tmp_path):
@@ -129,7 +129,7 @@ def test_a_link_or_a_pipe_in_place_of_a_file_is_not_read(folder, tmp_path):
     file = folder / "a.o"
     file.rename(tmp_path / "moved")
     file.symlink_to(tmp_path / "moved")
-    assert disk.kept("a", "llvm 20", lambda: b"other") == b"other"
+    assert host.kept("a", "llvm 20", lambda: b"other") == b"other"
     file.unlink()
     os.mkfifo(file)
     assert _all_kept("a") == right
@@ -142,12 +142,12 @@ def test_the_owner_is_asked_of_every_folder(tmp_path, monkeypatch, place):
     monkeypatch.delenv("JOURDAIN_JAX_CACHE", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     config = SimpleNamespace(jax_compilation_cache_dir=str(tmp_path) if place == "JAX_COMPILATION_CACHE_DIR" else None)
-    monkeypatch.setattr(disk, "jax", SimpleNamespace(config=config))
-    disk._warn.cache_clear()
+    monkeypatch.setattr(host, "jax", SimpleNamespace(config=config))
+    host._warn.cache_clear()
     (code,) = _all_kept("a")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert disk.kept("a", "llvm 20", _never) == code
+        assert host.kept("a", "llvm 20", _never) == code
     os.chown(tmp_path / "jourdain_jax", OTHER, -1)
     _unused(tmp_path / "jourdain_jax", f"belongs to user {OTHER}")
 
@@ -182,9 +182,9 @@ def test_every_process_writes_the_same_programs(tmp_path, names):
 
 
 def test_the_oldest_go_where_there_is_no_room(folder, monkeypatch):
-    monkeypatch.setattr(disk, "MOST_BYTES", 100)
+    monkeypatch.setattr(host, "MOST_BYTES", 100)
     for name in "abc":
-        disk.kept(name, "llvm 20", lambda: b"x" * 40)
+        host.kept(name, "llvm 20", lambda: b"x" * 40)
     assert not (folder / "a.o").exists()
     assert (folder / "c.o").exists()
 
@@ -202,7 +202,7 @@ def test_code_for_another_program_effort_machine_or_compiler_has_another_name(mo
             ffi.registered(text, effort)
         return str(found.value)
 
-    monkeypatch.setattr(disk, "kept", asked)
+    monkeypatch.setattr(host, "kept", asked)
     usual = name()
     assert name() == usual
     names = [usual, name("another"), name(effort=1)]
@@ -215,7 +215,7 @@ def test_code_for_another_program_effort_machine_or_compiler_has_another_name(mo
 
 
 def _write(name):
-    return disk.kept(name, "llvm 20", lambda: b"y" * 1_000_000)
+    return host.kept(name, "llvm 20", lambda: b"y" * 1_000_000)
 
 
 def test_many_processes_may_write_the_same_code(folder):

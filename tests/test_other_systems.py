@@ -24,7 +24,7 @@ from jourdain_jax.ensembles import files, memory, workers
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.motion.native import called
 from jourdain_jax.motion.simulate import set_up
-from jourdain_jax.native import disk, ffi, host
+from jourdain_jax.native import ffi, host
 from jourdain_jax.program.graph import Graph
 
 SOURCE = Path(jj.__file__).parent
@@ -169,10 +169,10 @@ def test_what_is_kept_has_no_place_where_a_user_has_no_home(monkeypatch):
 
     monkeypatch.delenv("JOURDAIN_JAX_CACHE", raising=False)
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.setattr(disk, "jax", SimpleNamespace(config=SimpleNamespace(jax_compilation_cache_dir=None)))
-    monkeypatch.setattr(disk.Path, "home", nowhere)
-    assert disk.folder() is None
-    assert disk.kept("a", "", lambda: b"code") == b"code"
+    monkeypatch.setattr(host, "jax", SimpleNamespace(config=SimpleNamespace(jax_compilation_cache_dir=None)))
+    monkeypatch.setattr(host.Path, "home", nowhere)
+    assert host.folder() is None
+    assert host.kept("a", "", lambda: b"code") == b"code"
 
 
 def test_a_file_that_another_process_reads_need_not_be_replaced(tmp_path, monkeypatch):
@@ -181,7 +181,7 @@ def test_a_file_that_another_process_reads_need_not_be_replaced(tmp_path, monkey
 
     monkeypatch.setenv("JOURDAIN_JAX_CACHE", str(tmp_path))
     monkeypatch.setattr(os, "replace", refused)
-    assert disk.kept("a", "", lambda: b"code") == b"code"
+    assert host.kept("a", "", lambda: b"code") == b"code"
     assert not list(tmp_path.iterdir())
 
 

@@ -14,9 +14,9 @@ from small_scenes import OnLine
 
 import jourdain_jax as jj
 from jourdain_jax.calculus.scalar_operations import TABLE
+from jourdain_jax.motion.native.taylor import Series
 from jourdain_jax.native import ffi, host
 from jourdain_jax.native.ir import Writer
-from jourdain_jax.native.series import Series
 from jourdain_jax.program.graph import Graph
 
 pytestmark = machine_code.needed

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jax.interpreters import mlir
 
-from jourdain_jax.native import disk, ffi, host, nvidia
+from jourdain_jax.native import ffi, host, nvidia
 from jourdain_jax.native.ir import Value, Writer
 
 _TARGET = "jourdain_jax_on_gpu"
@@ -119,7 +119,7 @@ def registered(text: str, scratch: tuple[int, int]) -> Kernel:
         if number not in _kernels:
             if len(_kernels) == MOST_KERNELS:
                 raise RuntimeError(f"this process has compiled {MOST_KERNELS} kernels for GPUs, the most that it can keep; start a new one")
-            ptx = disk.kept(f"jourdain_jax_{digest.hexdigest()[:24]}", made_by, lambda: nvidia.text_for(text, nvidia.architecture()).encode())
+            ptx = host.kept(f"jourdain_jax_{digest.hexdigest()[:24]}", made_by, lambda: nvidia.text_for(text, nvidia.architecture()).encode())
             found = nvidia.loaded(ptx, ffi.KERNEL)
             place = _WORDS * len(_kernels)
             _table[place + _FUNCTION] = found.function

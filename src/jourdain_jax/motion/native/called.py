@@ -16,9 +16,9 @@ from jaxtyping import Array
 from jourdain_jax.calculus.guards import OtherDeviceError
 from jourdain_jax.calculus.lanes_first import with_lanes_first
 from jourdain_jax.native import ffi, gpu, host, nvidia
+from jourdain_jax.native.ffi import write_rows
 from jourdain_jax.native.ir import Writer
 from jourdain_jax.native.scalar_program import as_real, written_in_turn
-from jourdain_jax.native.threads import write_rows
 from jourdain_jax.program.graph import Graph
 
 

@@ -14,9 +14,8 @@ from jourdain_jax.motion.native.functions import Form, write_events, write_proje
 from jourdain_jax.motion.native.layout import Lanes
 from jourdain_jax.motion.native.step import IDLE, write_step
 from jourdain_jax.motion.native.taylor import TaylorSteps
-from jourdain_jax.native.ffi import Given, last_size, product, write_handler
+from jourdain_jax.native.ffi import Given, last_size, next_lane, product, share, start_counting, write_handler
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.threads import next_lane, share, start_counting
 
 # words of a job, shared by all threads: the number of lanes, of times, and of the next lane, of doubles of a kernel's own memory (`ffi.py`), those of
 # samples, then pointers to the arrays

@@ -14,6 +14,7 @@ from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.inputs import Constant, FunctionOfTime, Inputs, Sampled
 from jourdain_jax.motion.integrators.explicit_steps import Method, code_at_end
+from jourdain_jax.motion.native import taylor
 from jourdain_jax.motion.native.flow_back import flow_back
 from jourdain_jax.motion.native.functions import Form, event_program
 from jourdain_jax.motion.native.functions_of_time import numbers_of, parts_from, with_functions
@@ -23,7 +24,7 @@ from jourdain_jax.motion.native.pulled import check_derivatives
 from jourdain_jax.motion.native.times import moved
 from jourdain_jax.motion.setup import Begun, Setup, Solved
 from jourdain_jax.motion.vector_fields.field import ByProgram, Integrated, VectorField
-from jourdain_jax.native import ffi, series
+from jourdain_jax.native import ffi
 from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.program.graph import Unsupported
 
@@ -74,10 +75,9 @@ def _reason_against_program(form: Form, order: int | None) -> str:
 def _reason_against_series(form: Form, order: int) -> str:
     if form.sampled:
         return "an input is given by samples"
-    graph, rates = form.program.graph, form.rates
-    if reason := series.reason_against(graph, rates):
+    if reason := taylor.reason_against(form.program.graph, form.rates):
         return reason
-    count = series.products(graph, rates, order)
+    count = taylor.products(form, order)
     return f"its series take {count} products, more than {MOST_PRODUCTS}" if count > MOST_PRODUCTS else ""
 
 

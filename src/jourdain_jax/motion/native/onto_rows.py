@@ -15,9 +15,9 @@ from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.fixed_point import QUIET, ROUND_OFF
 from jourdain_jax.equations.projection import MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS
 from jourdain_jax.native.dense import cleared, write_cholesky, write_inverted, write_rotated, write_solved, write_triangular
+from jourdain_jax.native.ffi import write_rows
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.scalar_program import as_real, unsupported, written_in_turn
-from jourdain_jax.native.threads import write_rows
 
 LARGEST_PROGRAM = 60_000  # operations
 _EPS = sys.float_info.epsilon

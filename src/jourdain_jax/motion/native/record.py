@@ -13,9 +13,8 @@ from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.layout import Lanes, copied, each_row, for_rows
 from jourdain_jax.motion.native.loop import COUNT, FIRST_ARRAY, NEXT, OWN, TIMES
-from jourdain_jax.native.ffi import FIRST_OF_SCRATCH
+from jourdain_jax.native.ffi import FIRST_OF_SCRATCH, lanes_taken, next_lane
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.threads import lanes_taken, next_lane
 
 STARTS, TO_STATES, TO_ENDS, GOALS, FOUND = range(FIRST_ARRAY, FIRST_ARRAY + 5)
 FIRST_SLOTS = 64  # for which there is memory at first; then twice as many, and so on

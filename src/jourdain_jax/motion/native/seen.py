@@ -20,10 +20,10 @@ from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.native.called import called, nodes_called
 from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
+from jourdain_jax.native.ffi import write_rows
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.math_functions import FUNCTIONS
 from jourdain_jax.native.scalar_program import as_real, unsupported, written
-from jourdain_jax.native.threads import write_rows
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.scene.scene import Scene
 

@@ -17,8 +17,8 @@ from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.layout import Lanes, Layout, copied, each_row, over_rows
 from jourdain_jax.motion.native.taylor import TaylorSteps, at_time, jet, monitored_at, radius, slope
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.native.exponentials import power
 from jourdain_jax.native.ir import Value, Writer
+from jourdain_jax.native.math_functions import power
 
 IDLE = -9.0  # code of a place that has no lane
 
