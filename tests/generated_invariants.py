@@ -14,7 +14,7 @@ from seen_differently import Seen, other_names, views
 import jourdain_jax as jj
 from jourdain_jax import GibbsAppell, structure_of, velocity_residual
 from jourdain_jax.build.trace import power_of_loads
-from jourdain_jax.calculus.null_space import null_space_qr, null_space_svd, present
+from jourdain_jax.calculus.matrices import null_space_qr, null_space_svd, present
 from jourdain_jax.dynamics.accelerations import diagnosed
 from jourdain_jax.dynamics.power import power
 from jourdain_jax.dynamics.reactions import row_reactions

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
 from jourdain_jax.build.assembling import assemble
-from jourdain_jax.calculus.gauss_newton import shortest
+from jourdain_jax.calculus.roots import shortest
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.lowering import ignorable
 from jourdain_jax.program.evaluate import Probes

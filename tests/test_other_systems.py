@@ -19,7 +19,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jourdain_jax as jj
-from jourdain_jax.calculus import writing
+from jourdain_jax.calculus import files as whole_files
 from jourdain_jax.ensembles import files, memory, workers
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.motion.native import called
@@ -190,7 +190,7 @@ def test_files_of_studies_are_bytes_and_need_no_locks(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "O_BINARY", 0x8000, raising=False)
     monkeypatch.setitem(sys.modules, "fcntl", None)
     monkeypatch.setattr(os, "open", lambda path, flags, *mode, open=os.open: asked.append(flags) or open(path, flags & ~0x8000, *mode))
-    runpy.run_path(writing.__file__)["write_whole"](tmp_path / "a", b"1\n2")
+    runpy.run_path(whole_files.__file__)["write_whole"](tmp_path / "a", b"1\n2")
     assert (tmp_path / "a").read_bytes() == b"1\n2"
     assert all(flags & 0x8000 for flags in asked)
     assert len(asked) == 1
@@ -217,7 +217,7 @@ def _read_as_text(tree: ast.AST) -> Iterator[ast.Call]:
         name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
         of_os = isinstance(call.func, ast.Attribute) and getattr(call.func.value, "id", "") == "os"
         modes = [x.value for x in call.args if isinstance(x, ast.Constant) and isinstance(x.value, str)]
-        own = isinstance(call.func, ast.Name) and name != "open"  # `read_text` of `calculus/reading.py`
+        own = isinstance(call.func, ast.Name) and name != "open"  # `read_text` of `calculus/files.py`
         if (name in ("read_text", "write_text") and not own) or (name == "open" and not of_os and not any("b" in mode for mode in modes)):
             yield call
 

@@ -29,7 +29,7 @@ from test_inputs import OnBelt
 from test_studies import assert_same
 
 import jourdain_jax as jj
-from jourdain_jax.calculus.writing import write_whole
+from jourdain_jax.calculus.files import write_whole
 from jourdain_jax.ensembles import files, store, workers
 from jourdain_jax.ensembles.identity import digest
 from jourdain_jax.ensembles.run import Runner, opened

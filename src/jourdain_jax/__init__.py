@@ -32,7 +32,7 @@ if "xla_backend_extra_options" not in _os.environ.get("XLA_FLAGS", ""):
 from jourdain_jax import models
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import structure_of
-from jourdain_jax.calculus.guards import DifferentiationModeError
+from jourdain_jax.calculus.derivatives import DifferentiationModeError
 from jourdain_jax.calculus.on_first_use import version_of as _version_of
 from jourdain_jax.calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
 from jourdain_jax.dynamics.accelerations import Accelerations, Baumgarte, accelerations, reductions

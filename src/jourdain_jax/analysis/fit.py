@@ -29,7 +29,7 @@ from jourdain_jax.analysis.shooting import MultipleShooting, check_shooting
 from jourdain_jax.analysis.shooting_steps import cutoff_of, shot
 from jourdain_jax.analysis.spread import AtBounds, limits_at_bounds
 from jourdain_jax.analysis.unknowns import Unknowns, check_starts, unknowns_of
-from jourdain_jax.calculus.guards import DifferentiationModeError
+from jourdain_jax.calculus.derivatives import DifferentiationModeError
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.options import OptionFields, Options
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines

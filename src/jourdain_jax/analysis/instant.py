@@ -18,8 +18,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.build.structure import structure_of, usual_rows
-from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
-from jourdain_jax.calculus.reals import Entries, is_traced, real_type
+from jourdain_jax.calculus.reals import RUN_SELDOM, Entries, compiled, is_traced, real_type
 from jourdain_jax.dynamics.reduced import DEPENDS, ignorable_coordinates
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows

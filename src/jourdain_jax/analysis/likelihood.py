@@ -33,8 +33,7 @@ from jourdain_jax.analysis.runs import Run, equal_runs, run_of
 from jourdain_jax.analysis.table import table
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.compiled import compiled
-from jourdain_jax.calculus.reals import array_module, described, holds, is_traced
+from jourdain_jax.calculus.reals import array_module, compiled, described, holds, is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.simulate import simulate
@@ -148,9 +147,7 @@ def check_known(runs: Sequence[Experiment], what: str) -> None:
             raise ValueError(f"`{label}` is to be estimated, but {what} needs its value; give a number, which may be traced, in place of the `Estimate`")
 
 
-def log_likelihood(
-    scene: Scene | BuiltFor, data: Data, *, options: Options | None = None, **by_name: Unpack[OptionFields]
-) -> Scalar:
+def log_likelihood(scene: Scene | BuiltFor, data: Data, *, options: Options | None = None, **by_name: Unpack[OptionFields]) -> Scalar:
     """Logarithm of the probability density of the measurements `data` (one run or several): `- sum r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 
     Differentiable in scene, start values, measured values, sigmas and numbers of sensors and actuators (reverse mode, unless `adjoint` says

@@ -35,8 +35,7 @@ from jourdain_jax.analysis.tangent import (
     privileged_speeds,
 )
 from jourdain_jax.build.structure import WELL_CONDITIONED
-from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
-from jourdain_jax.calculus.reals import Numbers, is_traced
+from jourdain_jax.calculus.reals import RUN_SELDOM, Numbers, compiled, is_traced
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.lowering.kinks import bent_load
 from jourdain_jax.motion.put_on_rows import State
@@ -48,6 +47,7 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 _compiled = partial(compiled, options=RUN_SELDOM)
+
 
 class Modes(eqx.Module):
     """Free small motions `p(t) = shape exp(s t)`, one column per mode; the largest entry of a shape is 1."""

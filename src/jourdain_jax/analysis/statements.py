@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import plain_row_lengths, usual_rows
-from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff
-from jourdain_jax.calculus.reals import as_real, described
+from jourdain_jax.calculus.matrices import pseudo_inverse
+from jourdain_jax.calculus.reals import as_real, described, rank_cutoff
 from jourdain_jax.dynamics.accelerations import reductions
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.gibbs_appell import GibbsAppell

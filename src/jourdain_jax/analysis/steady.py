@@ -18,10 +18,9 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.analysis.instant import ByMatrices, ByProgram, instant_of, on_rows, places_of
 from jourdain_jax.analysis.tangent import privileged_speeds
 from jourdain_jax.build.assembling import coordinate_bounds
-from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
-from jourdain_jax.calculus.damped import damped_search
-from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
-from jourdain_jax.calculus.reals import Number, Numbers, described
+from jourdain_jax.calculus.matrices import pseudo_inverse
+from jourdain_jax.calculus.reals import RUN_SELDOM, Number, Numbers, compiled, described
+from jourdain_jax.calculus.roots import damped_search
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, shown_from_users_lines
 from jourdain_jax.scene.names import as_names, nearest

@@ -14,8 +14,7 @@ from jaxtyping import Float, Int
 from jourdain_jax.build.rank import best_privileged, named_speeds, pivots_at
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import WELL_CONDITIONED, structure_of, usual_rows
-from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
-from jourdain_jax.calculus.reals import Entries, is_traced
+from jourdain_jax.calculus.reals import Entries, is_traced, rank_cutoff
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.rows import position_residual

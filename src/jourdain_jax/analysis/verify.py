@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.statements import Verification, by_reduction, check, gradient_checks, statement_checks
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import plain_row_lengths, structure_of, usual_rows
-from jourdain_jax.calculus.null_space import null_space_svd
+from jourdain_jax.calculus.matrices import null_space_svd
 from jourdain_jax.calculus.reals import Numbers
 from jourdain_jax.dynamics.accelerations import diagnosed, reductions
 from jourdain_jax.dynamics.newton_euler import newton_residual

@@ -25,8 +25,8 @@ from jaxtyping import Array, Float
 from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, shipped_measurements
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, doubts, violations
 from jourdain_jax.bicycle.readings import Readings, read_readings
-from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
-from jourdain_jax.calculus.newton import newton_root
+from jourdain_jax.calculus.reals import RUN_SELDOM, compiled
+from jourdain_jax.calculus.roots import newton_root
 from jourdain_jax.calculus.rotations import rot_y, rot_z
 from jourdain_jax.equations.virtual_power import generalized_forces, mass_matrix_at
 from jourdain_jax.scene.bodies import RigidBody

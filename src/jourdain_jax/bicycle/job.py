@@ -20,7 +20,7 @@ from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
 from jourdain_jax.bicycle.readings import holds_readings
 from jourdain_jax.bicycle.stability import eigenvalues, stability_speeds
 from jourdain_jax.bicycle.uncertainty import interval, sample_parameters
-from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
+from jourdain_jax.calculus.reals import RUN_SELDOM, compiled
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 from jourdain_jax.motion.batches.rollout import Rollout, rollout
 from jourdain_jax.motion.put_on_rows import State

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.linearize import linearize
 from jourdain_jax.bicycle.stability import BicycleMatrices
-from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
+from jourdain_jax.calculus.reals import RUN_SELDOM, compiled
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 from jourdain_jax.motion.put_on_rows import State
 

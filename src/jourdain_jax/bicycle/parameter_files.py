@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.analysis.estimate import Correlated, joint_normal
-from jourdain_jax.calculus import reading
-from jourdain_jax.calculus.reading import read_text, shortened
+from jourdain_jax.calculus import files
+from jourdain_jax.calculus.files import read_text, shortened
 from jourdain_jax.ensembles.distributions import Normal
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 from jourdain_jax.scene.names import nearest
@@ -192,7 +192,7 @@ def with_sigma(text: str, name: str, where: str, what: str) -> tuple[float, floa
     """The finite number in `text` and its sigma (None where not given); `what`: a value or a reading, of the name."""
     parts = text.replace("±", "+/-").split("+/-", 1)
     advice = f"; form: {_FORMAT}. Measure it, or leave this bicycle out."
-    value, *rest = (reading.number(part, f"{where}: {kind} of `{name}`", advice=advice) for part, kind in zip(parts, (what, "sigma"), strict=False))
+    value, *rest = (files.number(part, f"{where}: {kind} of `{name}`", advice=advice) for part, kind in zip(parts, (what, "sigma"), strict=False))
     sigma = rest[0] if rest else None
     if sigma is not None and sigma < 0:
         raise ValueError(f"{where}: sigma of `{name}` is {sigma:g}, expected a standard deviation >= 0. Give its size, or leave `+/-` out if it is not known.")

@@ -28,7 +28,7 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Complex, Float
 
-from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
+from jourdain_jax.calculus.reals import RUN_SELDOM, compiled
 
 Scalar = Float[Array, ""]
 Polynomial = Float[Array, " coefficients"]

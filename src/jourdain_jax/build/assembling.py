@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.calculus.gauss_newton import Look, nearest_root
+from jourdain_jax.calculus.roots import Look, nearest_root
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.scene.scene import Scene
 

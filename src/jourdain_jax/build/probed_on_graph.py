@@ -19,8 +19,8 @@ from jaxtyping import Float
 from jourdain_jax.build.assembling import Assembled, assemble, coordinate_bounds, speed_scales, typical_lengths, without_rows
 from jourdain_jax.build.plausibility import Numbers
 from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
-from jourdain_jax.calculus.gauss_newton import nearest_root, shortest
 from jourdain_jax.calculus.reals import Entries
+from jourdain_jax.calculus.roots import nearest_root, shortest
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.equations.virtual_power import mass_matrix
 from jourdain_jax.program.analyticity import CALLS, NONANALYTIC, decided_by, depend_on, passes

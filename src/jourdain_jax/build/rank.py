@@ -13,8 +13,7 @@ from jaxtyping import Float
 
 from jourdain_jax.build.assembling import speed_scales
 from jourdain_jax.build.probed_on_graph import Probed
-from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
-from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.reals import described, rank_cutoff
 from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.scene import Scene
 

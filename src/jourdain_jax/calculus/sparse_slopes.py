@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jourdain_jax.calculus.gauss_newton import shortest
+from jourdain_jax.calculus.roots import shortest
 
 
 @dataclass(frozen=True, eq=False)

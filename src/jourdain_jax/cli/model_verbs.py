@@ -7,8 +7,7 @@ import numpy as np
 
 from jourdain_jax.analysis.report import report
 from jourdain_jax.analysis.verify import verify
-from jourdain_jax.calculus.reading import number
-from jourdain_jax.calculus.writing import check_place
+from jourdain_jax.calculus.files import check_place, number
 from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.models.registry import MODELS, counts_of, known_model, model
 from jourdain_jax.motion.simulate import simulate

@@ -28,7 +28,7 @@ import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from jourdain_jax.calculus.reading import check_depth, parsed, read_text, whole_number
+from jourdain_jax.calculus.files import check_depth, parsed, read_text, whole_number
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.cli.model_verbs import plain
 from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, Normal, Uniform

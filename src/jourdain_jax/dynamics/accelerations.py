@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.build.structure import structure_of, usual_rows
-from jourdain_jax.calculus.pseudo_inverse import numerical_rank, pseudo_inverse, singular_values
+from jourdain_jax.calculus.matrices import numerical_rank, pseudo_inverse, singular_values
 from jourdain_jax.calculus.reals import checked_real, described
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.gibbs_appell import GibbsAppell

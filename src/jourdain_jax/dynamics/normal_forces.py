@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff
+from jourdain_jax.calculus.matrices import pseudo_inverse
+from jourdain_jax.calculus.reals import rank_cutoff
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.names import nearest
 

@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.structure import plain_row_lengths
-from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff
+from jourdain_jax.calculus.matrices import pseudo_inverse
+from jourdain_jax.calculus.reals import rank_cutoff
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.dynamics.normal_forces import Wrenches, normal_forces

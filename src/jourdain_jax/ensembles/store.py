@@ -27,9 +27,8 @@ from pathlib import Path
 
 import numpy as np
 
+from jourdain_jax.calculus.files import parsed, read_bytes, shortened, write_whole
 from jourdain_jax.calculus.on_first_use import needed
-from jourdain_jax.calculus.reading import parsed, read_bytes, shortened
-from jourdain_jax.calculus.writing import write_whole
 from jourdain_jax.ensembles import optional
 from jourdain_jax.ensembles.design import MOST_SAMPLES
 from jourdain_jax.ensembles.files import locked

@@ -4,7 +4,7 @@
     dx = K (dr - dA x) + K D^-2 K' dA' D^2 (r - A x) + (1 - K A) M^-1 (dA' mu - dM x),   M x = A' mu
 
 C, D: diagonal scales of what moves, and of the rows, which are constants to differentiation; A, M, x: of what is free. The second term counts where rows
-contradict each other. Source: as of `calculus/pseudo_inverse.py`, in the metric M.
+contradict each other. Source: as of `calculus/matrices.py`, in the metric M.
 """
 
 from typing import NamedTuple
@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.calculus.promotion import with_usual_promotion
-from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
+from jourdain_jax.calculus.matrices import pseudo_inverse
+from jourdain_jax.calculus.reals import with_usual_promotion
 from jourdain_jax.equations.reductions import cholesky
 from jourdain_jax.equations.scaling import row_scale, speed_scale
 

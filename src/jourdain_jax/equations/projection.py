@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.calculus.fixed_point import fixed_point
+from jourdain_jax.calculus.roots import fixed_point
 from jourdain_jax.equations.least_change import least_change
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.rows import position_residual, velocity_residual

@@ -21,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.calculus.null_space import null_space_qr, null_space_svd, pivots_qr, present
-from jourdain_jax.calculus.pseudo_inverse import numerical_rank, pseudo_inverse, rank_cutoff, singular_values
+from jourdain_jax.calculus.matrices import null_space_qr, null_space_svd, numerical_rank, pivots_qr, present, pseudo_inverse, singular_values
+from jourdain_jax.calculus.reals import rank_cutoff
 from jourdain_jax.equations.rows import ConstraintRows, UsualRows
 from jourdain_jax.equations.scaling import ScaledProblem, scaled
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.calculus.files import shortened
 from jourdain_jax.calculus.on_first_use import needed
-from jourdain_jax.calculus.reading import shortened
 
 _FUNCTIONS = {
     **{name: name for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sign", "floor")},

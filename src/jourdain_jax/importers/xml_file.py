@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.calculus.reading import check_depth, number, parsed, read_bytes, shortened
+from jourdain_jax.calculus.files import check_depth, number, parsed, read_bytes, shortened
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.importers.tree import Mass, Matrix, Vector
 from jourdain_jax.scene.arguments import users_level

@@ -20,8 +20,8 @@ from jax.extend.core import jaxpr_as_fun
 from jourdain_jax.build.assembling import speed_scales, typical_lengths
 from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import VelocityQuantities, jaxpr_of_scene
-from jourdain_jax.calculus.gauss_newton import shortest
 from jourdain_jax.calculus.jaxprs import needed_only
+from jourdain_jax.calculus.roots import shortest
 from jourdain_jax.eager.lanes import uncompiled_lanes
 from jourdain_jax.equations.virtual_power import mass_matrix
 from jourdain_jax.scene.scene import Scene

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.calculus.pseudo_inverse import undecided
+from jourdain_jax.calculus.reals import undecided
 from jourdain_jax.lowering.elimination import quotient, solve_symmetric
 from jourdain_jax.program.derivative import matrix
 from jourdain_jax.program.evaluate import Probes

@@ -17,8 +17,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, PyTree
 
-from jourdain_jax.calculus.differentiated_as import by_modes
-from jourdain_jax.calculus.guards import SECOND_ORDER_MESSAGE
+from jourdain_jax.calculus.derivatives import SECOND_ORDER_MESSAGE, by_modes
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.integrators import event_search, integrands
 from jourdain_jax.motion.model import modelled

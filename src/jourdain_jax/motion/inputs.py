@@ -30,9 +30,8 @@ from jaxtyping import Array, Bool, Float, PyTree
 from jourdain_jax.build.probed_on_graph import looked_at
 from jourdain_jax.build.smoothness import SPEEDS_WOULD_JUMP
 from jourdain_jax.build.structure import structure_of
-from jourdain_jax.calculus.compiled import compiled
 from jourdain_jax.calculus.jumps import jumps
-from jourdain_jax.calculus.reals import as_real, checked_unless_traced, described, in_default_precision, is_traced, real_type
+from jourdain_jax.calculus.reals import as_real, checked_unless_traced, compiled, described, in_default_precision, is_traced, real_type
 from jourdain_jax.eager.lanes import uncompiled_lanes
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.calls import description

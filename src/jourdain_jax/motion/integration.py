@@ -23,10 +23,8 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.plausibility import faults_at
 from jourdain_jax.build.row_program import row_program
-from jourdain_jax.calculus.compiled import RUN_SELDOM
-from jourdain_jax.calculus.lanes_first import lanes_first
-from jourdain_jax.calculus.nan_where import entered, left
-from jourdain_jax.calculus.reals import in_default_precision
+from jourdain_jax.calculus.markers import entered, lanes_first, left
+from jourdain_jax.calculus.reals import RUN_SELDOM, in_default_precision
 from jourdain_jax.equations.projection import linearised_rows
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.inputs import for_programs
@@ -91,7 +89,7 @@ def integrate_lanes(setups: Setup) -> Trajectory:
 
 def _entered(setup: Setup) -> tuple[Setup, Float[Array, ""]]:
     """The setup, whose derivatives are zero where nothing is asked of its motion, and NaN where what failed is;
-    and the zero by which `_finish` tells (`calculus/nan_where.py`).
+    and the zero by which `_finish` tells (`calculus/markers.py`).
     """
     names = ("scene", "start", "inputs", "t0", "t1", "ts")
     numbers, rest = eqx.partition({name: getattr(setup, name) for name in names}, eqx.is_inexact_array)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jourdain_jax.build.structure import WELL_CONDITIONED, Reference, Structure, structure_of, structure_whatever_its_faults, trust
-from jourdain_jax.calculus.pseudo_inverse import passing_cutoff, undecided
+from jourdain_jax.calculus.reals import passing_cutoff, undecided
 from jourdain_jax.dynamics.accelerations import as_reduction
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.listed import names_of_events, names_of_invariants, names_of_position_rows

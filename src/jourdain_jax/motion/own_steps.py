@@ -14,8 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jourdain_jax.calculus.differentiated_as import Rules, by_modes, pushed_by_jax, with_rules
-from jourdain_jax.calculus.guards import SECOND_ORDER_MESSAGE, DifferentiationModeError
+from jourdain_jax.calculus.derivatives import SECOND_ORDER_MESSAGE, DifferentiationModeError, Rules, by_modes, pushed_by_jax, with_rules
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.lowering.kinks import loads_have_relations, loads_may_jump
 from jourdain_jax.lowering.lowered import Lowered

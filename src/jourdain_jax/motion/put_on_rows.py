@@ -24,10 +24,9 @@ from jourdain_jax.build.probed_on_graph import coordinates_on_rows
 from jourdain_jax.build.row_program import RowProgram, row_program
 from jourdain_jax.build.sampling import NEARLY_INSIDE
 from jourdain_jax.build.structure import Structure, closure_lengths, plain_row_lengths, rows_are_affine, usual_rows
-from jourdain_jax.calculus.damped import first_root
-from jourdain_jax.calculus.differentiated_as import differentiated_as
-from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
-from jourdain_jax.calculus.reals import real_type
+from jourdain_jax.calculus.derivatives import differentiated_as
+from jourdain_jax.calculus.reals import rank_cutoff, real_type
+from jourdain_jax.calculus.roots import first_root
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions, project_positions, project_speeds
 from jourdain_jax.equations.scaling import row_scale

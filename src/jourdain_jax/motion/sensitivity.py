@@ -25,7 +25,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jourdain_jax.calculus.cotangents import tap_cotangents, tap_tangents
+from jourdain_jax.calculus.markers import tap_cotangents, tap_tangents
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.own_steps import moving_jumps
 from jourdain_jax.motion.setup import Setup

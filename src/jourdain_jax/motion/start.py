@@ -16,8 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.sampling import guesses_of
 from jourdain_jax.build.structure import structure_of
-from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
-from jourdain_jax.calculus.reals import Number, Numbers, at_once, described, is_traced, known_numbers, nothing_is_traced
+from jourdain_jax.calculus.reals import RUN_SELDOM, Number, Numbers, at_once, compiled, described, is_traced, known_numbers, nothing_is_traced
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import closure_residual

@@ -20,8 +20,7 @@ from typing import Any
 
 import jax
 
-from jourdain_jax.calculus.reading import whole_number
-from jourdain_jax.calculus.writing import write_whole
+from jourdain_jax.calculus.files import whole_number, write_whole
 from jourdain_jax.native.math_functions import LIBM, PREFIX
 
 llvm: Any = None

@@ -8,8 +8,8 @@ import numpy as np
 
 from jourdain_jax.analysis.families.family import Family
 from jourdain_jax.calculus.figures import pyplot
+from jourdain_jax.calculus.files import check_place
 from jourdain_jax.calculus.reals import described
-from jourdain_jax.calculus.writing import check_place
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from jourdain_jax.calculus.files import check_place
 from jourdain_jax.calculus.reals import described
-from jourdain_jax.calculus.writing import check_place
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.page_data import Display, page_data

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.calculus.differentiated_as import is_zero
+from jourdain_jax.calculus.derivatives import is_zero
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.fused import fused

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.interpreters import ad, batching, mlir
 
-from jourdain_jax.calculus.identities import identity
+from jourdain_jax.calculus.markers import identity
 
 
 def fused(values: tuple) -> tuple:

@@ -18,7 +18,7 @@ from typing import Self
 
 import numpy as np
 
-from jourdain_jax.calculus.gauss_newton import pseudo_inverses
+from jourdain_jax.calculus.roots import pseudo_inverses
 from jourdain_jax.calculus.round_off import EPS, halves, with_bound
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.evaluate import Probes

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jourdain_jax.calculus.gauss_newton import nearest_root
+from jourdain_jax.calculus.roots import nearest_root
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.graph import Graph

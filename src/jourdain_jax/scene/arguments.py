@@ -19,9 +19,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.guards import DifferentiationModeError
-from jourdain_jax.calculus.promotion import with_usual_promotion
-from jourdain_jax.calculus.reals import at_once, checked_real, checked_unless_traced, described, is_traced, real_type
+from jourdain_jax.calculus.derivatives import DifferentiationModeError
+from jourdain_jax.calculus.reals import at_once, checked_real, checked_unless_traced, described, is_traced, real_type, with_usual_promotion
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.newton import newton_root
+from jourdain_jax.calculus.roots import newton_root
 from jourdain_jax.scene.grounds import Cylinder, Ground, Plane, Sphere, normal_at
 
 

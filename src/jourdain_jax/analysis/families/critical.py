@@ -25,7 +25,7 @@ from jourdain_jax.analysis.families.special import SURE
 from jourdain_jax.analysis.families.spectrum import null_space
 from jourdain_jax.analysis.instant import ByProgram, Sloped, differentiable
 from jourdain_jax.analysis.table import complex_numbers, table
-from jourdain_jax.calculus.compiled import RUN_SELDOM, compiled
+from jourdain_jax.calculus.reals import RUN_SELDOM, compiled
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers, shown_from_users_lines

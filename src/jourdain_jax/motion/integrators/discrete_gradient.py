@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import structure_of
-from jourdain_jax.calculus.newton import newton_root
+from jourdain_jax.calculus.roots import newton_root
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.listed import names_of_position_rows

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import Structure, structure_of
-from jourdain_jax.calculus.newton import newton_root
+from jourdain_jax.calculus.roots import newton_root
 from jourdain_jax.equations.kinematics import motion_at, partial_velocities, pose_at
 from jourdain_jax.equations.lagrange import speeds_are_rates
 from jourdain_jax.equations.listed import names_of_position_rows

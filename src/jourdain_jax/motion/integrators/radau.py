@@ -15,7 +15,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
-from jourdain_jax.calculus.newton import newton_root
+from jourdain_jax.calculus.roots import newton_root
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod, Solution
 from jourdain_jax.motion.integrators.problem import Problem
 

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jourdain_jax.calculus.promotion import with_usual_promotion
+from jourdain_jax.calculus.reals import with_usual_promotion
 from jourdain_jax.motion.integrators import step_adjoint
 from jourdain_jax.motion.integrators.erk_step import Progress, advanced, begun, running, standing
 from jourdain_jax.motion.integrators.event_search import LOCATING, MOST_STEPS, OnArrays, chosen, is_flat

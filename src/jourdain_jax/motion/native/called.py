@@ -13,8 +13,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
-from jourdain_jax.calculus.guards import OtherDeviceError
-from jourdain_jax.calculus.lanes_first import with_lanes_first
+from jourdain_jax.calculus.derivatives import OtherDeviceError
+from jourdain_jax.calculus.markers import with_lanes_first
 from jourdain_jax.native import ffi, gpu, host, nvidia
 from jourdain_jax.native.ffi import write_rows
 from jourdain_jax.native.ir import Writer

@@ -11,8 +11,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from jourdain_jax.calculus.differentiated_as import filled, is_zero
-from jourdain_jax.calculus.guards import DifferentiationModeError
+from jourdain_jax.calculus.derivatives import DifferentiationModeError, filled, is_zero
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.kernel import Found, Start, kernel

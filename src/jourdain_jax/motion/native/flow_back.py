@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.differentiated_as import filled
+from jourdain_jax.calculus.derivatives import filled
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.native.flow import with_tangents
 from jourdain_jax.motion.native.functions import Form

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jourdain_jax.calculus.entries import entries_of
+from jourdain_jax.calculus.markers import entries_of
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.inputs import Constant, FunctionOfTime, Inputs, Sampled

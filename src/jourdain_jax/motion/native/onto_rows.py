@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from jourdain_jax.build.row_program import RowProgram
-from jourdain_jax.calculus.fixed_point import QUIET, ROUND_OFF
+from jourdain_jax.calculus.roots import QUIET, ROUND_OFF
 from jourdain_jax.equations.projection import MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS
 from jourdain_jax.native.dense import cleared, write_cholesky, write_inverted, write_rotated, write_solved, write_triangular
 from jourdain_jax.native.ffi import write_rows
@@ -205,7 +205,7 @@ def _write_putting(w: Writer, of: Rows, first: int, state: Value, factors: list[
 
 
 def _write_iteration(w: Writer, of: Rows, first: int, places: tuple[Value, ...]) -> None:
-    """Steps until they change nothing, as those of `calculus/fixed_point.py`."""
+    """Steps until they change nothing, as those of `calculus/roots.py`."""
     state, *factors, x = places
     columns, quiet, changed = len(of.moving), w.room(), w.room()
     w.store(0.0, quiet)

@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
-from jourdain_jax.calculus.guards import DifferentiationModeError
+from jourdain_jax.calculus.derivatives import DifferentiationModeError
 from jourdain_jax.motion.native.functions import Form, Outputs, given_values, known_values, outputs_of
 from jourdain_jax.native.ir import Writer
 from jourdain_jax.native.scalar_program import as_real, unsupported, written_in_turn

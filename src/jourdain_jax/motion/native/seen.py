@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.row_program import RowProgram
-from jourdain_jax.calculus.entries import entries_of
+from jourdain_jax.calculus.markers import entries_of
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.native.called import called, nodes_called

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.differentiated_as import Rules, filled, is_zero, with_rules
+from jourdain_jax.calculus.derivatives import Rules, filled, is_zero, with_rules
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
 from jourdain_jax.program.derivative import on_its_own

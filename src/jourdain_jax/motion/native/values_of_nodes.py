@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as, filled, is_zero, with_rules
+from jourdain_jax.calculus.derivatives import Rules, differentiated_as, filled, is_zero, with_rules
 from jourdain_jax.motion.native.called import nodes_called
 from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own

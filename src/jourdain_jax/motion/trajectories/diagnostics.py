@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.build.structure import structure_of, usual_rows
-from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
+from jourdain_jax.calculus.reals import passing_cutoff
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.dynamics.reactions import ContactForce
 from jourdain_jax.eager.eager import eager_if_concrete

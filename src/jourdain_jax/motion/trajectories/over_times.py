@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.build.structure import structure_of
-from jourdain_jax.calculus.promotion import with_usual_promotion
-from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.calculus.reals import is_traced, with_usual_promotion
 from jourdain_jax.dynamics.accelerations import Accelerations, accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, contact_forces, row_reactions
 from jourdain_jax.eager.eager import eval_numpy

@@ -26,10 +26,9 @@ import numpy as np
 from jaxtyping import Int
 
 from jourdain_jax.build.trace import velocity_quantities
+from jourdain_jax.calculus.files import check_depth, check_place, parsed, write_whole
 from jourdain_jax.calculus.on_first_use import version_of
-from jourdain_jax.calculus.reading import check_depth, parsed
 from jourdain_jax.calculus.reals import described
-from jourdain_jax.calculus.writing import check_place, write_whole
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.inputs import Inputs, Sampled

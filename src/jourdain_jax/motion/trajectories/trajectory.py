@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.plausibility import known_faults_at
 from jourdain_jax.build.structure import usual_rows
-from jourdain_jax.calculus.nan_where import nan_where
+from jourdain_jax.calculus.markers import nan_where
 from jourdain_jax.calculus.reals import checked_real
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions

@@ -1,0 +1,364 @@
+"""Functions whose values are computed in one way and whose derivatives in another: by JAX, of a function that computes the same, or by rules.
+
+Derivatives of f(x) in both modes, to the second order, come from two functions that JAX differentiates forward:
+
+    pushes   w -> f'(x) w                          pulls   g -> g f'(x)
+    turns    v -> f''(x)(v, w)                     bends   v -> g f''(x)(., v)
+
+Pulls transpose pushes. As f'' is symmetric, bends along v transpose bends, and turns, whose w is that v. What f(x) is counts as a number at which these
+are taken, beside x: a derivative along x is the whole one.
+
+Each is a linear map: one function works out its values, another one those of its transpose. JAX meets such a map where a derivative was taken. Forward mode
+evaluates it, reverse mode transposes it, and neither traces what only the other one needs.
+
+A function and its rule of differentiation must agree on which results have lanes and where: JAX takes that from the one that it batches first.
+"""
+
+import operator
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial, reduce
+from typing import NamedTuple, Optional
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from jourdain_jax.calculus.markers import lanes_first, lanes_of, with_lanes_first
+from jourdain_jax.calculus.reals import with_usual_promotion
+
+SECOND_ORDER_MESSAGE = (
+    "`simulate` was differentiated twice with reverse mode in it (jax.hessian, grad of grad), which machine code alone has; where XLA, dense matrices or a "
+    "solver of diffrax integrate, take forward mode of forward mode, `jax.jacfwd(jax.jacfwd(f))`"
+)
+THIRD_ORDER_MESSAGE = (
+    "`simulate` was differentiated three times, and not in forward mode alone; pass backend='xla' and take forward mode of any order, "
+    "`jax.jacfwd(jax.jacfwd(jax.jacfwd(f)))`"
+)
+
+
+class DifferentiationModeError(TypeError):
+    """A motion has no derivative of the mode and order that was asked for; the text says which one it has.
+
+    Raised where the derivative is taken, evaluated or compiled; and by functions that need numbers, such as `fit`, inside `jit`, `vmap` or a derivative.
+    """
+
+
+class OtherDeviceError(RuntimeError):
+    """Raised where machine code would become part of a program for another process, or for a device without machine code."""
+
+    def __init__(self, program: str) -> None:
+        super().__init__(f'machine code of this process cannot be part of a program {program}; give `backend="xla"` to `jj.simulate`, or to `jj.build`')
+
+
+@dataclass(frozen=True, eq=False)
+class LinearMap:
+    """A linear function of arrays that depends on others, `at` which it is taken."""
+
+    apply: Callable[[Sequence, Sequence], list]  # (at, arrays)
+    shapes: Sequence[jax.ShapeDtypeStruct]  # of its values
+    transposed: Callable[[], "LinearMap"] | None = None  # at the same; None: an error says that this is no derivative of the first two orders
+    along: Callable[[list[int]], Optional["LinearMap"]] = lambda _: None  # those of `at` that change -> derivative, also at the arrays; None: JAX's
+
+    def __call__(self, at: Sequence, arrays: Sequence) -> list:
+        """Its values."""
+        return linear_map_p.bind(*at, *arrays, linear=self, count=len(at))
+
+
+def shapes(arrays: Sequence) -> list[jax.ShapeDtypeStruct]:
+    """Shapes of arrays, with their types."""
+    return [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays]
+
+
+def no_further(*_):
+    """Tells that there is no such third derivative."""
+    raise DifferentiationModeError(THIRD_ORDER_MESSAGE)
+
+
+def put(values: Sequence, which: Sequence[int], new: Sequence) -> list:
+    """The values, with new ones at some places."""
+    found = list(values)
+    for i, x in zip(which, new, strict=True):
+        found[i] = x
+    return found
+
+
+def by_jax(own: LinearMap, count: int, which: list[int]) -> LinearMap:
+    """The derivative of a map along those of so many arrays that it is taken at, in forward mode."""
+
+    def pushed(at, arrays):
+        return jax.jvp(lambda *new: own.apply(put(at[:count], which, new), at[count:]), tuple(at[i] for i in which), tuple(arrays))[1]
+
+    return LinearMap(pushed, own.shapes)
+
+
+def _in_lanes(own: LinearMap, axes: list, count: int, size: int) -> LinearMap:
+    """That of lanes side by side, along these axes of what it is taken at, and along the first axis of the arrays, of which there are so many."""
+    transposed = own.transposed
+
+    def along(which: list[int]) -> LinearMap | None:
+        further = own.along(which)
+        return further and _spread(_in_lanes(further, [*axes, *[0] * count], len(which), size), [axes[i] for i in which], size)
+
+    return LinearMap(
+        lambda at, arrays: jax.vmap(own.apply, in_axes=(axes, 0), axis_size=size)(list(at), list(arrays)),
+        [jax.ShapeDtypeStruct((size, *x.shape), x.dtype) for x in own.shapes],
+        transposed and (lambda: _in_lanes(transposed(), axes, len(own.shapes), size)),
+        along,
+    )
+
+
+def _spread(own: LinearMap, axes: list, size: int) -> LinearMap:
+    """A second derivative, of arrays with their lanes along these axes, or the same in all lanes, in place of arrays with their lanes first."""
+    transposed = own.transposed
+
+    def gathered(arrays: Sequence) -> list:
+        return [jnp.sum(x, 0) if axis is None else jnp.moveaxis(x, 0, axis) for x, axis in zip(arrays, axes, strict=True)]
+
+    def back() -> LinearMap:
+        assert transposed is not None
+        inner = transposed()
+        return LinearMap(lambda at, g: gathered(inner.apply(at, g)), jax.eval_shape(gathered, inner.shapes), lambda: forth, inner.along)
+
+    forth = LinearMap(lambda at, arrays: own.apply(at, with_lanes_first(arrays, axes, size)), own.shapes, transposed and back, own.along)
+    return forth
+
+
+def _batched(values, axes, *, linear: LinearMap, count: int):
+    size = lanes_of(values, axes)
+    arrays = with_lanes_first(values[count:], axes[count:], size)
+    found = _in_lanes(linear, list(axes[:count]), len(arrays), size)(values[:count], arrays)
+    return found, [0] * len(found)
+
+
+def _pushed(values, tangents, *, linear: LinearMap, count: int):
+    found, along = linear(values[:count], values[count:]), []
+    which = [i for i, t in enumerate(tangents[:count]) if type(t) is not ad.Zero]
+    if any(type(t) is not ad.Zero for t in tangents[count:]):
+        along.append(linear(values[:count], [ad.instantiate_zeros(t) for t in tangents[count:]]))
+    if which:
+        along.append((linear.along(which) or by_jax(linear, count, which))(values, [tangents[i] for i in which]))
+    return found, [reduce(operator.add, parts) for parts in zip(*along, strict=True)]
+
+
+def _pulled(cotangents, *values, linear: LinearMap, count: int):
+    if linear.transposed is None:
+        no_further()
+    return [None] * count + linear.transposed()(values[:count], [ad.instantiate_zeros(ct) for ct in cotangents])
+
+
+@with_usual_promotion
+def _evaluated(*values, linear: LinearMap, count: int) -> list:
+    return list(linear.apply(values[:count], values[count:]))
+
+
+linear_map_p = Primitive("jourdain_linear_map")
+linear_map_p.multiple_results = True
+linear_map_p.def_impl(_evaluated)
+linear_map_p.def_abstract_eval(lambda *avals, linear, count: [avals[-1].update(shape=x.shape, dtype=x.dtype, weak_type=False) for x in linear.shapes])
+ad.primitive_jvps[linear_map_p] = _pushed
+ad.primitive_transposes[linear_map_p] = _pulled
+batching.primitive_batchers[linear_map_p] = _batched
+mlir.register_lowering(linear_map_p, mlir.lower_fun(_evaluated, multiple_results=True))
+
+
+class BothWays(NamedTuple):
+    """x is a list of arrays like the `leaves`, what is found one like `found`, with numbers at the `places`."""
+
+    rates: Callable[[list[int]], Callable]  # which leaves move -> function of the leaves and of their tangents: tangents of numbers
+    pulled: Callable[[list[int]], Callable]  # which leaves move -> function of the leaves, of what is found, and of cotangents of numbers: those of the leaves
+    reason_against_second: Callable[[list[int]], str]  # which leaves move -> why JAX does not differentiate `pulled`, in words; empty where it does
+    leaves: Sequence[jax.ShapeDtypeStruct]
+    found: Sequence[jax.ShapeDtypeStruct]
+    places: list[int]
+
+    def pushes(self, moving: list[int]) -> LinearMap:
+        """The map of tangents of leaves, at the leaves and what is found."""
+
+        def pushed(at, along):
+            return self.rates(moving)(list(at[: len(self.leaves)]), *along)
+
+        return LinearMap(pushed, [self.found[i] for i in self.places], lambda: self._pulls(moving), lambda others: self._turns(moving, others))
+
+    def _pulls(self, moving: list[int]) -> LinearMap:
+        def pulled(at, g):
+            return self.pulled(moving)(at[: len(self.leaves)], at[len(self.leaves) :], g)
+
+        return LinearMap(pulled, [self.leaves[i] for i in moving], lambda: self.pushes(moving), lambda others: self._bends(moving, others))
+
+    def _turns(self, moving: list[int], others: list[int]) -> LinearMap:
+        """The derivative of pushes along others of the leaves; it is taken at the tangents too."""
+        count = len(self.leaves) + len(self.found)
+
+        def pulled(at, g):
+            return self._bends(others, moving).apply([*at[:count], *g], at[count:])
+
+        own = by_jax(self.pushes(moving), count, others)
+        return replace(own, transposed=lambda: LinearMap(pulled, [self.leaves[i] for i in others], lambda: own, no_further))
+
+    def _bends(self, moving: list[int], others: list[int]) -> LinearMap:
+        """The derivative of pulls along others of the leaves; it is taken at the cotangents too."""
+        count, end = len(self.leaves), len(self.leaves) + len(self.found)
+        if reason := self.reason_against_second([*moving, *others]):
+            raise DifferentiationModeError(reason)
+
+        def bent(at, along):
+            leaves, found, g = list(at[:count]), at[count:end], at[end:]
+
+            def pulled(new, numbers):
+                return self.pulled(moving)(put(leaves, others, new), put(found, self.places, numbers), g)
+
+            rates = self.rates(others)(leaves, *along)
+            return jax.jvp(pulled, ([leaves[i] for i in others], [found[i] for i in self.places]), (list(along), list(rates)))[1]
+
+        return LinearMap(bent, [self.leaves[i] for i in moving], lambda: self._bends(others, moving), no_further)
+
+
+class Rules(NamedTuple):
+    """Derivatives of a function; trees of tangents and cotangents have None where there is none. A rule that does not serve raises an error that says so."""
+
+    push: Callable  # (arguments, tangents): the result and its tangents; JAX differentiates it forward
+    pull: Callable  # (perturbed, arguments, result, cotangents): cotangents of those arguments that vary; JAX differentiates it forward
+    reason_against_second: Callable[..., str] = lambda *_: ""  # (*perturbed): why JAX does not differentiate `pull`, in words; empty where it does
+
+
+class _Leaves(NamedTuple):
+    """The arguments of a function, split into arrays and the rest."""
+
+    treedef: jax.tree_util.PyTreeDef
+    rest: tuple
+
+    def whole(self, leaves: Sequence):
+        """Return the arguments with these arrays."""
+        return eqx.combine(jax.tree.unflatten(self.treedef, leaves), self.rest)
+
+
+def _parted(arguments: tuple) -> tuple[list, _Leaves]:
+    arrays, rest = eqx.partition(arguments, eqx.is_array)
+    leaves, treedef = jax.tree.flatten(arrays)
+    return leaves, _Leaves(treedef, rest)
+
+
+def is_zero(tangent) -> bool:
+    """Return whether nothing changes, as a rule with symbolic zeros is told."""
+    return isinstance(tangent, SymbolicZero)
+
+
+def filled(tangent):
+    """Return the tangent as an array."""
+    return jnp.zeros(tangent.shape, tangent.dtype) if is_zero(tangent) else tangent
+
+
+def _moving(tangents: Sequence) -> list[int]:
+    return [i for i, t in enumerate(tangents) if not is_zero(t)]
+
+
+def differentiated_as(differentiable: Callable, run: Callable) -> Callable:
+    """Return `run` with the derivatives of `differentiable`, which computes the same and which JAX differentiates.
+
+    Both take trees of arrays and of anything else, and return trees of arrays.
+    """
+
+    def called(*arguments):
+        leaves, of = _parted(arguments)
+        own = jax.custom_jvp(lambda *leaves: lanes_first(run(*of.whole(leaves))))
+
+        @with_usual_promotion
+        def rule(leaves, tangents):
+            moving = _moving(tangents)
+            new, along = tuple(leaves[i] for i in moving), tuple(tangents[i] for i in moving)
+            _, rates = jax.jvp(lambda *new: differentiable(*of.whole(put(leaves, moving, new))), new, along)
+            return own(*leaves), lanes_first(rates)
+
+        own.defjvp(rule, symbolic_zeros=True)
+        return own(*leaves)
+
+    return called
+
+
+def pushed_by_jax(run: Callable) -> Callable:
+    """Return the `push` of a function that JAX differentiates forward."""
+
+    def push(arguments: tuple, tangents: tuple):
+        moving, fixed = eqx.partition(arguments, jax.tree.map(lambda d: d is not None, tangents, is_leaf=lambda d: d is None))
+        return jax.jvp(lambda moving: run(*eqx.combine(moving, fixed)), (moving,), (tangents,))
+
+    return push
+
+
+def by_modes(forward: Callable, reverse: Callable, reason_against_second: str) -> Callable:
+    """Return `forward`, which JAX differentiates forward, with the reverse mode of `reverse`, which computes the same.
+
+    `reason_against_second`: why reverse mode takes part in no second derivative, in words.
+    """
+
+    def pull(perturbed: tuple, arguments: tuple, found, g):
+        moving, fixed = eqx.partition(arguments, perturbed)
+        back = jax.vjp(lambda moving: reverse(*eqx.combine(moving, fixed)), moving)[1]
+        return back(jax.tree.map(lambda x, g: np.zeros(x.shape, jax.dtypes.float0) if g is None else g, found, g))[0]
+
+    return with_rules(forward, Rules(pushed_by_jax(forward), pull, lambda *_: reason_against_second))
+
+
+def with_rules(run: Callable, rules: Rules) -> Callable:
+    """Return `run`, which JAX cannot differentiate, with derivatives by rules, in both modes and to the second order.
+
+    It takes trees of arrays and of anything else, and returns trees of arrays.
+    """
+
+    def called(*arguments):
+        leaves, of = _parted(arguments)
+        own = jax.custom_jvp(lambda *leaves: lanes_first(run(*of.whole(leaves))))
+
+        def pushed(moving: list[int], leaves, *along):
+            tangents = jax.tree.unflatten(of.treedef, put([None] * len(leaves), moving, along))
+            found, rates = rules.push(of.whole(leaves), tangents)
+            return found, [x for x in jax.tree.leaves(rates) if x.dtype != jax.dtypes.float0]
+
+        def rates_along(moving: list[int]) -> Callable:
+            return lambda *x: pushed(moving, *x)[1]
+
+        def perturbed(moving: list[int]):
+            varies = jax.tree.unflatten(of.treedef, [i in moving for i in range(len(leaves))])
+            return eqx.combine(varies, jax.tree.map(lambda _: False, of.rest))
+
+        def pulled(structure, places: list[int], moving: list[int]) -> Callable:
+            """Cotangents of the leaves that are moving, as a function of the leaves, of what is found and of cotangents of the numbers of that."""
+            varies = perturbed(moving)
+
+            def cotangents(leaves, found, given):
+                g = jax.tree.unflatten(structure, put([None] * len(found), places, given))
+                by_rules = rules.pull(varies, of.whole(leaves), jax.tree.unflatten(structure, found), g)
+                return jax.tree.leaves(eqx.filter(by_rules, varies))  # rules may give more
+
+            return cotangents
+
+        @with_usual_promotion
+        def rule(leaves, tangents):
+            moving = _moving(tangents)
+            along = [tangents[i] for i in moving]
+            found = own(*leaves)
+            ends = jax.lax.stop_gradient(jax.tree.leaves(found))
+            places = [i for i, x in enumerate(ends) if _is_number(x)]
+            pulls = partial(pulled, jax.tree.structure(found), places)
+            way = BothWays(rates_along, pulls, lambda moving: rules.reason_against_second(*perturbed(moving)), shapes(leaves), shapes(ends), places)
+            return found, _without_gaps(found, way.pushes(moving)([*leaves, *ends], along))
+
+        own.defjvp(rule, symbolic_zeros=True)
+        return own(*leaves)
+
+    return called
+
+
+def _without_gaps(found, rates: list):
+    """The tangents of all that was found, given those of numbers."""
+    left = iter(rates)
+    return jax.tree.map(lambda x: next(left) if _is_number(x) else np.zeros(x.shape, jax.dtypes.float0), found)
+
+
+def _is_number(x) -> bool:
+    return jnp.issubdtype(x.dtype, jnp.inexact)

@@ -1,0 +1,113 @@
+"""The truncated pseudo-inverse, and orthonormal bases of the null space of a wide matrix, with derivatives that are right wherever the rank is constant.
+
+    dA+ = -A+ dA A+  +  A+ A+' dA' (1 - A A+)  +  (1 - A+ A) dA' A+' A+
+    A Z = 0,   dZ = -A+ dA Z
+
+Source of the first: G. H. Golub and V. Pereyra, SIAM J. Numer. Anal. 10 (1973), eq. (4.12). Differentiating the factorisation itself
+divides by differences of singular values, which are equal for the orthonormal rows of rolling and skating.
+
+The second leaves out the rotation of the basis within the null space (its gauge), which LAPACK chooses as it likes; results that do
+not change under Z -> Z R never see it. It is wrong for Z itself: do not let a basis leave the function that uses it.
+To keep shapes static where the rank is not known in advance, a basis has as many columns as `A`; the columns that are not in
+the null space are zero, and `present` says which are.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jourdain_jax.calculus.reals import rank_cutoff, with_usual_promotion
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def pseudo_inverse(A: Float[Array, "rows columns"], cutoff: float | None = None) -> Float[Array, "columns rows"]:
+    """Moore-Penrose inverse of `A`; singular values below `cutoff` times the largest are dropped.
+
+    Differentiable to any order in forward and reverse mode where the rank does not change.
+    """
+    if 0 in A.shape:
+        return jnp.zeros(A.shape[::-1], A.dtype)
+    cutoff = rank_cutoff(A.dtype) if cutoff is None else cutoff
+    left, sigma, right = jnp.linalg.svd(A, full_matrices=False)
+    keep = ~(sigma <= cutoff * sigma[0])  # written so that NaN is kept and shows
+    inverse = jnp.where(keep, 1 / jnp.where(keep, sigma, 1), 0)
+    return (right.T * inverse) @ left.T
+
+
+@pseudo_inverse.defjvp
+@with_usual_promotion
+def _pseudo_inverse_jvp(cutoff, primals, tangents):
+    (A,), (dA,) = primals, tangents
+    P = pseudo_inverse(A, cutoff)
+    rows = dA.T - dA.T @ A @ P  # dA' (1 - A A+)
+    columns = dA.T - P @ (A @ dA.T)  # (1 - A+ A) dA'
+    return P, -P @ dA @ P + P @ (P.T @ rows) + (columns @ P.T) @ P
+
+
+def singular_values(A: Float[Array, "rows columns"]) -> Float[Array, "values"]:
+    """Singular values of `A`, largest first, as a diagnostic: no derivative passes through them."""
+    if 0 in A.shape:
+        return jnp.ones((0,), A.dtype)
+    return jnp.linalg.svd(jax.lax.stop_gradient(A), compute_uv=False)
+
+
+def numerical_rank(sigma: Float[Array, "values"], cutoff: float | None = None) -> Int[Array, ""]:
+    """How many singular values exceed `cutoff` times the largest (default: the cut-off of their dtype)."""
+    if sigma.shape[0] == 0:
+        return jnp.zeros((), jnp.int32)
+    cutoff = rank_cutoff(sigma.dtype) if cutoff is None else cutoff
+    return jnp.sum(sigma > cutoff * sigma[0]).astype(jnp.int32)
+
+
+def null_space_svd(A: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
+    """Null-space basis from the full singular value decomposition; columns of the row space are zero."""
+    return _null_space(A, _svd_basis, None)
+
+
+def null_space_qr(A: Float[Array, "rows columns"], cutoff: float | None = None) -> Float[Array, "columns columns"]:
+    """Null-space basis from the column-pivoted QR decomposition of `A'`; columns of the row space are zero.
+
+    Pivots below `cutoff` times the largest count as zero (default: `rank_cutoff`).
+    """
+    return _null_space(A, _qr_basis, cutoff)
+
+
+def pivots_qr(A: Float[Array, "rows columns"]) -> Float[Array, "values"]:
+    """Magnitudes of the pivots of the column-pivoted QR decomposition of `A'`, largest first, as a diagnostic: no derivative passes through them."""
+    if 0 in A.shape:
+        return jnp.ones((0,), A.dtype)
+    _, R, _ = jax.lax.linalg.qr(jax.lax.stop_gradient(A).T, full_matrices=True, pivoting=True)
+    return jnp.abs(jnp.diagonal(R))
+
+
+def present(Z: Float[Array, "columns columns"]) -> Bool[Array, "columns"]:
+    """Which columns of a basis belong to the null space."""
+    return jnp.any(jax.lax.stop_gradient(Z) != 0, axis=0)
+
+
+def _svd_basis(A, cutoff):
+    _, sigma, right = jnp.linalg.svd(A, full_matrices=True)
+    return right.T, numerical_rank(sigma, cutoff)
+
+
+def _qr_basis(A, cutoff):
+    Q, R, _ = jax.lax.linalg.qr(A.T, full_matrices=True, pivoting=True)
+    return Q, numerical_rank(jnp.abs(jnp.diagonal(R)), cutoff)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1, 2))
+def _null_space(A, decomposed, cutoff):
+    if A.shape[0] == 0:
+        return jnp.eye(A.shape[1], dtype=A.dtype)
+    basis, rank = decomposed(A, cutoff)
+    return jnp.where(jnp.arange(A.shape[1]) >= rank, basis, 0)
+
+
+@_null_space.defjvp
+@with_usual_promotion
+def _null_space_jvp(decomposed, cutoff, primals, tangents):
+    (A,), (dA,) = primals, tangents
+    Z = _null_space(A, decomposed, cutoff)
+    return Z, -pseudo_inverse(A, cutoff) @ (dA @ Z)

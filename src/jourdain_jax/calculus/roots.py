@@ -1,0 +1,273 @@
+"""Roots of rows: by Newton's method, by damped least squares where it runs away, by an iteration to its fixed point, and on NumPy at many states at once.
+
+    F(x, theta) = 0   =>   dx = - (dF/dx)^-1 (dF/dtheta) dtheta                                             `newton_root`
+    min |f(x)|^2:   x <- x - J' (J J' + damping)^-1 f,   J = df/dx                                          `damped_search`
+    x <- step(a, x):   D <- d step/da + d step/dx D,   D = dx/d(a, x_0)                                      `fixed_point`
+    x <- x - G+ g(x),   G = dg/dx                                                                           `nearest_root`
+
+`newton_root` is never differentiated itself, nor unrolled: `jax.lax.custom_root` linearises F once, at the root. Derivatives of any order, in
+either mode, cost one linear solve each. No derivative passes through `damped_search`: take it at the root; it runs under `jit` and `vmap`, where all lanes go
+on until the last has ended (J. Nocedal and S. Wright, Numerical Optimization (2006), section 10.3).
+
+`fixed_point` carries the derivative along with x, for those entries of a and x_0 that vary, so that both modes of differentiation run one loop. Where the
+iteration converges quadratically, each further step doubles the order of derivatives that are right: two steps that change nothing give those up to the
+third. Steps left out cost nothing, under `vmap` neither once all lanes have settled.
+
+In `nearest_root`, rows count as dependent where the triangular factor of the scaled rows says so; then small singular values are left out.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
+
+from jourdain_jax.calculus.reals import with_usual_promotion
+
+
+class Root(eqx.Module):
+    """Where an iteration ended, and whether that is a root."""
+
+    x: Float[Array, "unknowns"]
+    converged: Bool[Array, ""]
+
+
+def newton_root(residual: Callable, guess: Float[Array, "unknowns"], scale: Float[Array, "unknowns"]) -> Root:
+    """x with `residual(x) = 0` near `guess`; `residual` may close over anything, traced numbers included.
+
+    `scale`: the size of each unknown, against which round-off counts; infinite for an unknown that need not be looked at. Iterates until the
+    corrections no longer shrink; what then is still larger than round-off to the power 0.6 has not converged.
+    """
+
+    eps = jnp.finfo(guess.dtype).eps
+
+    def solve(f, x0):
+        def running(carry):
+            _, _, settled, k = carry
+            return ~settled & (k < 20)
+
+        def iterate(carry):
+            x, size, _, k = carry
+            value, derivative = jax.linearize(f, x)
+            dx = jnp.linalg.solve(_matrix(derivative, x), value)
+            new_size = jnp.max(jnp.abs(dx) / scale, initial=0.0)
+            at_round_off = new_size <= 4.0 * eps  # units of round-off
+            # an iteration that no longer shrinks the correction to a tenth has met round-off
+            stalled = (new_size <= eps**0.6) & (new_size > 0.1 * size)
+            return x - dx, new_size, at_round_off | stalled | ~jnp.isfinite(new_size), k + 1
+
+        start = (x0, jnp.asarray(jnp.inf, x0.dtype), jnp.array(False), jnp.array(0, jnp.int32))
+        x, size, _, _ = jax.lax.while_loop(running, iterate, start)
+        return x, (size <= eps**0.6).astype(x0.dtype)
+
+    x, converged = jax.lax.custom_root(residual, jax.lax.stop_gradient(guess), solve, lambda f, y: jnp.linalg.solve(_matrix(f, y), y), has_aux=True)
+    return Root(x, converged > 0)
+
+
+def _matrix(linear: Callable, like) -> Float[Array, "unknowns unknowns"]:
+    """The matrix of a linear function, column by column."""
+    return jax.vmap(linear, in_axes=1, out_axes=1)(jnp.eye(like.shape[0], dtype=like.dtype))
+
+
+class Nearest(eqx.Module):
+    """Where a search ended, and what is left of the rows there."""
+
+    x: Float[Array, "unknowns"]
+    left: Float[Array, ""]  # largest of the rows
+
+
+class Search(eqx.Module):
+    """The best point so far, and the next to try."""
+
+    trial: Float[Array, "unknowns"]
+    best: Float[Array, "unknowns"]
+    f: Float[Array, "rows"]  # at the best, and their slopes
+    J: Float[Array, "rows unknowns"]
+    damping: Float[Array, ""]
+    steps: Int[Array, ""]
+    going: Bool[Array, ""]
+
+    @property
+    def left(self) -> Float[Array, ""]:
+        """The largest of the rows at the best point."""
+        left = jnp.max(jnp.abs(self.f), initial=0.0)
+        return jnp.where(jnp.isfinite(left), left, jnp.inf)
+
+
+def damped_search(
+    rows: Callable, guess: Float[Array, "unknowns"], size: Float[Array, "unknowns"], tolerance: float, low=-np.inf, high=np.inf, most_steps=80
+) -> Search:
+    """Search for x near `guess` from `low` to `high` at which no row exceeds the `tolerance`; it ends where they are smallest. J is per size of an unknown.
+
+    `rows`: x -> f and J. `size`: of each unknown, by which steps are measured; zero for one that is held. Rows should be of order one where unknowns change
+    by their size.
+    """
+
+    def look(x):
+        f, J = rows(x)
+        return f, J * size  # per unit of size
+
+    def once(search: Search) -> Search:
+        f, J = look(search.trial)
+        better = (f @ f < search.f @ search.f) & jnp.all(jnp.isfinite(J))  # never where it is not a number
+        best, f, J = (jnp.where(better, a, b) for a, b in ((search.trial, search.best), (f, search.f), (J, search.J)))
+        damping = jnp.clip(jnp.where(better, search.damping / 6, search.damping * 5), 1e-14, 1e8)
+        step = -J.T @ jnp.linalg.solve(J @ J.T + damping * jnp.eye(f.shape[0], dtype=f.dtype), f)
+        # at most a quarter of the size of the unknowns in one step
+        step = step * jnp.minimum(1.0, 0.25 / jnp.maximum(jnp.max(jnp.abs(step), initial=0.0), jnp.finfo(f.dtype).tiny))
+        # a damping of 1e7: no step makes the rows smaller
+        going = (jnp.max(jnp.abs(f), initial=0.0) > tolerance) & (damping < 1e7) & (search.steps < most_steps) & jnp.all(jnp.isfinite(f))
+        return Search(jnp.clip(best + size * step, low, high), best, f, J, damping, search.steps + 1, going)
+
+    f, J = jax.eval_shape(look, guess)
+    unknown = jnp.full(f.shape, jnp.inf, f.dtype), jnp.zeros(J.shape, J.dtype)
+    start = Search(guess, guess, *unknown, jnp.full((), 6e-2, f.dtype), jnp.zeros((), jnp.int32), jnp.array(True))
+    return jax.lax.while_loop(lambda search: search.going, once, start)
+
+
+def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, tolerance: float, good: float, *bounds) -> tuple[Nearest, Int[Array, ""]]:
+    """The root that is found from the first of the `guesses` that leads to one, and its number; where none does, what comes nearest.
+
+    A root leaves at most `good`; all else, also the `bounds`, is as for `damped_search`.
+    """
+    count = guesses.shape[0]
+    # 50_000 slopes are held at once, for each lane: of 96 trailers those of all guesses and 17 lanes took 57 GB
+    block = max(1, min(count, 50_000 // max(1, jax.eval_shape(rows, guesses[0])[1].size)))
+    blocks = -(-count // block)
+    places = np.minimum(np.arange(blocks * block), count - 1).reshape(blocks, block)  # the last one may stand there several times
+
+    def next_block(carried):
+        k, best, number = carried
+        found = jax.vmap(lambda guess: damped_search(rows, guess, size, tolerance, *bounds))(guesses[jnp.asarray(places)[k]])
+        left = jax.vmap(lambda search: search.left)(found)
+        which = jnp.where(jnp.any(left <= good), jnp.argmax(left <= good), jnp.argmin(left)).astype(jnp.int32)
+        better = (k == 0) | (left[which] < best.left)
+        chosen = (Nearest(found.best[which], left[which]), jnp.asarray(places, jnp.int32)[k, which])
+        return k + 1, *jax.tree.map(lambda new, old: jnp.where(better, new, old), chosen, (best, number))
+
+    nothing = Nearest(guesses[0], jnp.full((), jnp.inf, guesses.dtype)), jnp.zeros((), jnp.int32)
+    return jax.lax.while_loop(lambda carried: (carried[0] < blocks) & ~(carried[1].left <= good), next_block, (jnp.zeros((), jnp.int32), *nothing))[1:]
+
+
+QUIET = 2  # steps in a row
+ROUND_OFF = 1e3  # units of it, relative to 1 + |x|: a change
+
+
+def fixed_point(step: Callable, a: Any, x: Float[Array, "entries"], most: int, prepare: Callable | None = None) -> Float[Array, "entries"]:
+    """x after at most so many steps; what is not a number has settled.
+
+    `prepare`: takes a to what steps are given in its place, a pair whose second has no derivatives.
+    """
+    return _iterated((a, x), step=step, most=most, prepare=prepare)
+
+
+@eqx.filter_custom_jvp
+def _iterated(of: tuple, *, step: Callable, most: int, prepare: Callable | None):
+    a, x = of
+    given = a if prepare is None else prepare(a)
+    return _loop(lambda carry: (step(given, carry[0]),), (x,), most)[0]
+
+
+@_iterated.def_jvp
+@with_usual_promotion
+def _iterated_jvp(primals, tangents, *, step, most, prepare):
+    (of,), (along,) = primals, tangents
+    (moving, _), (fixed, _) = moves, _ = eqx.partition(of, jax.tree.map(lambda d: d is not None, along, is_leaf=lambda d: d is None))
+    flat, restored = ravel_pytree(moves)
+    units, first = jax.vmap(restored)(jnp.eye(flat.size, dtype=flat.dtype))
+    D = jnp.zeros((flat.size, *of[1].shape), of[1].dtype) if first is None else first
+    along_each = partial(jax.vmap, axis_size=flat.size)
+    if prepare is None:
+        at, dat, taken = moving, units, lambda at: eqx.combine(at, fixed)
+    else:
+        of_units = along_each(lambda da: jax.jvp(lambda a: prepare(eqx.combine(a, fixed)), (moving,), (da,), has_aux=True), out_axes=(None, 0, None))
+        at, dat, rest = of_units(units)
+        taken = lambda at: (at, rest)  # noqa: E731
+
+    def both(carry):
+        x, D = carry
+        return along_each(lambda da, dx: jax.jvp(lambda a, x: step(taken(a), x), (at, x), (da, dx)), out_axes=(None, 0))(dat, D)
+
+    x, D = _loop(both, (of[1], D), most)
+    return x, ravel_pytree(along)[0] @ D
+
+
+def _loop(step: Callable, carry: tuple, most: int) -> tuple:
+    """So many steps of a tuple; the first of it tells when it has settled."""
+    if most <= QUIET:
+        return jax.lax.scan(lambda carry, _: (step(carry), None), carry, length=most)[0]
+
+    def once(state, _):
+        carry, quiet = state
+        going = quiet < QUIET
+        new = jax.lax.cond(eqxi.unvmap_any(going), step, lambda carry: carry, carry)
+        old_value, value = jax.lax.stop_gradient((carry[0], new[0]))
+        changed = jnp.any(jnp.abs(value - old_value) > ROUND_OFF * jnp.finfo(value.dtype).eps * (1 + jnp.abs(old_value)))
+        kept = tuple(jnp.where(going, *pair) for pair in zip(new, carry, strict=True))
+        return (kept, jnp.where(going & changed, 0, jnp.minimum(quiet + 1, QUIET))), None
+
+    return jax.lax.scan(once, (carry, jnp.zeros((), jnp.int32)), length=most)[0][0]
+
+
+# x of some states, and their numbers -> g, G in the form that `solve` takes
+Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def nearest_root(
+    look: Look, solve: Callable, x: np.ndarray, *, most: int = 25, longest: np.ndarray | float = np.inf, within: tuple = (-np.inf, np.inf)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return x with g(x) = 0 near the given x, shape (states, unknowns), and the last corrections relative to 1 + |x|, infinite where they are no numbers.
+
+    `solve`: from G and g to the shortest d with G d = g. No step is longer than `longest` in an entry, and none leads out of the bounds `within`.
+    """
+    x, last, moving = np.array(x, float), np.full(len(x), np.inf), np.arange(len(x))
+    for _ in range(most):
+        g, G = look(x[moving], moving)
+        step = solve(G, g)
+        size = np.max(np.abs(step), axis=1, initial=0.0)
+        moves = np.isfinite(size)
+        last[moving[~moves]] = np.inf
+        step, size, moving = step[moves], size[moves], moving[moves]
+        shorter = np.maximum(1.0, np.max(np.abs(step) / longest, axis=1, keepdims=True, initial=0.0))
+        x[moving] = np.clip(x[moving] - step / shorter, *within)
+        last[moving] = size / (1 + np.max(np.abs(x[moving]), axis=1, initial=0.0))
+        moving = moving[last[moving] > 4 * np.finfo(float).eps]
+        if not moving.size:
+            break
+    return x, last
+
+
+def shortest(G: np.ndarray, g: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndarray:
+    """Return the shortest d with G d = g at every state; least squares where the rows are (nearly) dependent, or shorter than they typically are."""
+    return (pseudo_inverses(G, typical) @ g[..., None])[..., 0]
+
+
+def pseudo_inverses(G: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndarray:
+    """Return G+ at every state, with rows scaled to a length of one, or to less where they are shorter than they typically are; NaN where G is no number."""
+    lengths = np.maximum(np.linalg.norm(G, axis=2), typical)
+    d = 1 / np.where(lengths > 0, lengths, 1.0)
+    found, finite = np.full(np.swapaxes(G, 1, 2).shape, np.nan), np.all(np.isfinite(G), axis=(1, 2))
+    scaled = d[..., None] * G
+    places = np.flatnonzero(finite)
+    if G.shape[1] <= G.shape[2]:
+        Q, R = np.linalg.qr(np.swapaxes(scaled[finite], 1, 2))  # D G = R' Q'
+        # where the triangular factor has a smaller diagonal, singular values decide
+        regular = np.min(np.abs(np.diagonal(R, axis1=1, axis2=2)), axis=1, initial=1.0) > 1e-6
+        found[places[regular]] = Q[regular] @ np.swapaxes(np.linalg.inv(R[regular]), 1, 2)
+        places = places[~regular]
+    for k in places:
+        found[k] = _by_singular_values(scaled[k])
+    return found * d[:, None]
+
+
+def _by_singular_values(G: np.ndarray) -> np.ndarray:
+    try:
+        return np.linalg.pinv(G, rcond=1e-9)
+    except np.linalg.LinAlgError:  # numbers too far apart for a decomposition
+        return np.full(G.shape[::-1], np.nan)
