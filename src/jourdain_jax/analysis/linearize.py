@@ -152,6 +152,8 @@ def linearize(
     - `dependent`: names of the coordinates that follow from the geometric rows; `privileged`: names of the independent speeds. The default
       is well conditioned at the state (over the scene's domain, while state or parameters are traced).
 
+    Nothing is integrated and nothing searched for, so that no field of `jj.Options` would mean anything; `jj.build` settles the backend.
+
     **Returns** a `Linearization`. Pure: runs under jit, vmap and differentiation, over scene parameters and the state. Where the privileged speeds do not
     determine the others, all is NaN there and `pivot` is zero, or nearly: name others.
 

@@ -8,6 +8,7 @@ d2y/dt2 along the motion. Levenberg-Marquardt from the guess (`calculus/damped`)
 
 from collections.abc import Mapping
 from functools import partial
+from typing import Unpack
 
 import equinox as eqx
 import jax
@@ -21,6 +22,7 @@ from jourdain_jax.build.assembling import coordinate_bounds
 from jourdain_jax.calculus.matrices import pseudo_inverse
 from jourdain_jax.calculus.reals import RUN_SELDOM, Number, Numbers, compiled, described
 from jourdain_jax.calculus.roots import damped_search
+from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, shown_from_users_lines
 from jourdain_jax.scene.names import as_names, nearest
@@ -28,6 +30,7 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 _FINAL_STEPS = 3
+_REFUSED = dict.fromkeys({*SPAN, *OPTION_NAMES} - {"max_steps"}, "no motion is integrated; `max_steps` bounds the search, and a backend goes to `jj.build`")
 _SPEEDS = 10.0  # size of a speed, SI units: how far it moves in some steps of the search
 
 
@@ -60,7 +63,8 @@ def steady(
     t0: Number = 0.0,
     inputs: Numbers | dict | None = None,
     privileged: str | tuple[str, ...] | None = None,
-    max_steps: int = 60,
+    options: Options | None = None,
+    **by_name: Unpack[OptionFields],
 ) -> SteadyMotion:
     """The steady motion near a guess: `g = 0, phi = 0, dy/dt = 0`, and only coordinates move that do not matter.
 
@@ -73,15 +77,15 @@ def steady(
     - `moving`: names of the coordinates that may keep moving; default: those that the scene's accelerations do not depend on (`ignorable`).
     - `inputs`: values of the scene's inputs (default: zero); `privileged`: names of the speeds that are to be constant (default: the scene's
       own). Choose speeds in which the motion is steady: rates of yaw, lean and spin, say, not velocities along fixed axes.
-    - `max_steps`: of the search, at most.
+    - `options`: a `jj.Options`, whose `max_steps` bounds the steps of the search (default: 60), or `max_steps` by name. The search goes on to round-off and
+      integrates nothing: no other field means anything here.
 
     **Returns** a `SteadyMotion`; look at `converged` and `residual`, nothing is raised where none is found. Differentiable in any mode in the
     scene's parameters and in the held values, where the steady motion is a smooth function of them.
 
-    **Raises** ValueError: an unknown name.
+    **Raises** ValueError: an unknown name. TypeError: another option by name.
     """
-    if not isinstance(max_steps, int | np.integer) or max_steps < 1:
-        raise ValueError(f"`max_steps` is {max_steps!r}, expected a whole number of at least 1")
+    most_steps = as_options(Options(max_steps=60) if options is None else options, by_name, "steady", _REFUSED).max_steps
     built, scene = scene, as_scene(scene)
     t, q, u = guessed(scene, guess, t0)
     f = as_input_vector(scene, inputs, q.dtype).astype(q.dtype)
@@ -98,7 +102,7 @@ def steady(
     # nothing that vanishes changes with them: they keep the guess's value, and no step runs away along them
     idle = ignorable - set(np.array(entries)[on_rows(scene)])
     free = jnp.array([name not in held and name not in idle for name in names], bool)
-    return _solve(_Problem(scene, t, f, instant, y, resting), q, u, free, max_steps)
+    return _solve(_Problem(scene, t, f, instant, y, resting), q, u, free, most_steps)
 
 
 def guessed(scene: Scene, guess, t0) -> tuple[Array, Array, Array]:
@@ -138,8 +142,8 @@ class _Problem(eqx.Module):
 
 
 @partial(compiled, options=RUN_SELDOM)
-def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], max_steps: int) -> SteadyMotion:
-    z = _root(problem, jnp.concatenate([q, u]), free, max_steps)
+def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], most_steps: int) -> SteadyMotion:
+    z = _root(problem, jnp.concatenate([q, u]), free, most_steps)
     left, _, second = problem(z)
     rows = len(left) - len(problem.privileged) - len(problem.resting)
     of_rows, first, second = (jnp.max(jnp.abs(x), initial=0.0) for x in (left[:rows], left[rows : rows + len(problem.privileged)], second))
@@ -150,13 +154,13 @@ def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], max_steps: in
     return SteadyMotion(state, first, residual, residual < _round_off_root(z.dtype))
 
 
-def _root(problem: _Problem, z: Float[Array, "unknowns"], free: Bool[Array, "unknowns"], max_steps: int) -> Float[Array, "unknowns"]:
+def _root(problem: _Problem, z: Float[Array, "unknowns"], free: Bool[Array, "unknowns"], most_steps: int) -> Float[Array, "unknowns"]:
     """The root near z: a search without derivative, then steps `z <- z - J+ R(z)` with the J found, which carry one order of derivative each."""
     still, guess, movable = jax.lax.stop_gradient((problem, z, free))
     low, high = coordinate_bounds(problem.scene)
     sizes = np.concatenate([np.where(high > low, high - low, 1.0), np.full(z.shape[0] - low.size, _SPEEDS)])
     size = jnp.where(movable, jnp.asarray(sizes, z.dtype), 0.0)
-    found = damped_search(lambda z: still(z)[:2], guess, size, float(np.finfo(z.dtype).eps), most_steps=max_steps)
+    found = damped_search(lambda z: still(z)[:2], guess, size, float(np.finfo(z.dtype).eps), most_steps=most_steps)
     found = jax.lax.stop_gradient(found)
     inverse = size[:, None] * pseudo_inverse(found.J, _round_off_root(z.dtype))
     return jax.lax.scan(lambda z, _: (z - inverse @ problem(z)[0], None), jnp.where(free, found.best, z), length=_FINAL_STEPS)[0]
