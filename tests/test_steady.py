@@ -25,8 +25,8 @@ def _circle(lean, yaw_rate, **disc):
 @pytest.mark.parametrize(("lean", "yaw_rate"), [(0.3, 2.0), (-0.6, 3.0), (1.0, 1.0)])
 def test_a_disc_rolls_in_the_circle_of_the_closed_form(lean, yaw_rate):
     found = steady(TiltingDisc(**DISC), {**GUESS, "lean": lean, "yaw_rate": yaw_rate}, held=HELD)
-    assert bool(found.converged)
-    assert float(found.residual) < 1e-11  # rad/s^2, with spins up to 20 rad/s
+    assert found.converged
+    assert found.residual < 1e-11  # rad/s^2, with spins up to 20 rad/s
     assert float(found["lean"]) == lean
     assert float(found["yaw_rate"]) == yaw_rate
     assert float(found["lean_rate"]) == pytest.approx(0.0, abs=1e-12)
@@ -37,8 +37,8 @@ def test_a_disc_rolls_in_the_circle_of_the_closed_form(lean, yaw_rate):
 def test_a_disc_keeps_to_the_circle_it_was_put_on():
     disc = TiltingDisc(**DISC)
     ride = jj.simulate(disc, steady(disc, GUESS, held=HELD).state, t1=5.0, rtol=1e-10, atol=1e-10)
-    assert float(jnp.max(jnp.abs(ride["lean"] - 0.3))) < 1e-8
-    assert float(jnp.max(jnp.abs(ride["yaw_rate"] - 2.0))) < 1e-8
+    assert jnp.max(jnp.abs(ride["lean"] - 0.3)) < 1e-8
+    assert jnp.max(jnp.abs(ride["yaw_rate"] - 2.0)) < 1e-8
 
 
 def _spin(radius, lean):
@@ -66,7 +66,7 @@ def test_steady_motions_are_found_in_batches():
     leans = jnp.array([0.2, 0.5, 0.8])
     found = jax.jit(jax.vmap(lambda lean: steady(TiltingDisc(**DISC), {**GUESS, "lean": lean}, held=HELD)))(leans)
     assert_allclose(found["spin_rate"], [_circle(float(lean), 2.0) for lean in leans], rtol=1e-11)
-    assert bool(jnp.all(found.converged))
+    assert jnp.all(found.converged)
 
 
 def test_a_pendulum_comes_to_rest_at_an_equilibrium():
@@ -79,14 +79,14 @@ def test_a_pendulum_comes_to_rest_at_an_equilibrium():
 
 def test_a_free_body_spins_steadily_about_the_nearest_axis():
     found = steady(FreeRigidBody(), {"attitude_omega_z": 2.0, "attitude_omega_x": 0.1}, held=("attitude_omega_z",))
-    assert bool(found.converged)
+    assert found.converged
     assert_allclose(found["attitude_omega"], [0.0, 0.0, 2.0], atol=1e-10)
 
 
 def test_where_there_is_no_steady_motion_the_residual_says_so():
     """A disc that leans and neither yaws nor spins falls."""
     found = steady(TiltingDisc(**DISC), {"lean": 0.3}, held=("lean", "yaw_rate", "spin_rate", "lean_rate"))
-    assert not bool(found.converged)
+    assert not found.converged
     assert float(found.acceleration) == pytest.approx(9.81 * 0.5 * np.sin(0.3) / (0.25 / 4 + 0.25), rel=1e-9)
     assert "no steady motion found" in str(found)
 
@@ -109,28 +109,26 @@ class Sprung(OnLine):
 def test_an_equilibrium_is_that_of_the_inputs_and_of_the_time():
     # the load that depends on time is -1 N at pi s, and does not change there: 4 x + x^3 = 2.125
     found = steady(Sprung(), {"x": 0.1}, t0=np.pi, inputs={"push": 3.125})
-    assert bool(found.converged)
+    assert found.converged
     assert float(found["x"]) == pytest.approx(0.5, rel=1e-12)
     moving = steady(Sprung(), {"x": 0.1}, t0=1.0, inputs={"push": 3.125})
-    assert not bool(moving.converged)
+    assert not moving.converged
     assert float(moving.residual) == pytest.approx(np.sin(1.0), rel=1e-6)  # |d2y/dt2|
 
 
 def test_what_is_steady_depends_on_the_speeds_that_are_to_be_constant():
     circle = {"heading_rate": 0.5, "roll_rate": 3.0}
     rolled = lambda *speeds: steady(VerticalDisc(), circle, held=tuple(circle), privileged=speeds)  # noqa: E731
-    assert bool(rolled("roll_rate", "heading_rate").converged)
+    assert rolled("roll_rate", "heading_rate").converged
     found = rolled("x_rate", "heading_rate")  # the velocity along x turns with the heading
-    assert not bool(found.converged)
+    assert not found.converged
     assert float(found.residual) == pytest.approx(0.5**2 * abs(float(found["x_rate"])), rel=1e-6)  # |d2y/dt2|, where x_rate has its largest value
 
 
 def test_a_search_of_one_step_says_that_it_did_not_arrive():
-    found = steady(Sprung(), {"x": 10.0}, max_steps=1)
-    assert not bool(found.converged)
-    assert float(found.residual) > 1e-4
-    again = steady(Sprung(), {"x": 10.0}, options=jj.Options(max_steps=1))
-    assert float(again.residual) == float(found.residual)
+    found = steady(Sprung(), {"x": 10.0}, options=jj.Options(max_steps=1))
+    assert not found.converged
+    assert found.residual > 1e-4
 
 
 # Minutes of compilation, and not yet run together with the rest: kept out of the short run until it has been.

@@ -22,8 +22,6 @@ from jourdain_jax.analysis.families.spectrum import mode_names
 from jourdain_jax.analysis.instant import ByMatrices, instant_of, places_of
 from jourdain_jax.analysis.table import linearization_text
 from jourdain_jax.analysis.tangent import (
-    block_diagonal,
-    carried_along,
     dependent_coordinates,
     eliminated,
     inverse,
@@ -33,6 +31,7 @@ from jourdain_jax.analysis.tangent import (
     perturbed_names,
     privileged_at,
     privileged_speeds,
+    smallest_pivot,
 )
 from jourdain_jax.build.structure import WELL_CONDITIONED
 from jourdain_jax.calculus.reals import RUN_SELDOM, Numbers, compiled, is_traced
@@ -214,25 +213,24 @@ def _matrices(scene: Scene, q, v, D, mass, independent: tuple[str, ...], y: tupl
     """What `Linearization` holds."""
     at, names, xp, chosen = places_of(scene), perturbed_names(scene), numeric((q, D)), np.array(y, int)
     kept, (count, m) = np.array([names.index(name) for name in independent], int), (len(names), len(at.u))
-    (E, back), constant = perturbations(scene, q), at.udot[chosen]
+    (S, turned), constant = perturbations(scene), at.udot[chosen]
     change = D[constant] @ xp.concatenate([np.ones(1), v[at.qdot], v[at.udot], np.zeros(len(at.f))])
 
-    # slopes along every perturbation (ds, du, df); all perturbations from the independent ones: first ds, then du
-    along = xp.concatenate([D[:, at.q] @ E, D[:, at.u], D[:, at.f]], axis=1)
-    T, pivot_s = eliminated(along[at.geometric, :count], others(kept, count))
-    T = block_diagonal([T, np.eye(m + len(at.f))])
-    U, pivot_u = eliminated(along[at.phi] @ T, len(kept) + others(chosen, m))
-    T = T @ U
+    # slopes along every perturbation (ds, du, df), and all of these from the independent ones
+    along = xp.concatenate([D[:, at.q] @ (S + turned @ q), D[:, at.u], D[:, at.f]], axis=1)
+    T = eliminated(along[np.concatenate([at.geometric, at.phi])], np.concatenate([kept, count + chosen, count + m + np.arange(len(at.f))]))
+    pivots = smallest_pivot(along[at.geometric], others(kept, count)), smallest_pivot(along[at.phi], count + others(chosen, m))
 
-    # rows of A and B: rates of the independent ds in axes that go with the motion, and of the privileged speeds
-    drag = carried_along(scene, q, v[at.qdot]) @ E @ T[:count]
-    rates = xp.concatenate([back[kept] @ (along[at.qdot] @ T - drag), along[constant] @ T])
+    # rows of A and B: rates of the independent ds in axes that turn with the unperturbed motion, and of the privileged speeds
+    # a turn ds after q is d(q0' q)/dt = q0' (qdot - q0dot q0' q), and q0dot q0' dq = (B q0dot) ds
+    rates = (S + 4 * turned @ q).T[kept] @ (along[at.qdot] @ T - turned @ v[at.qdot] @ T[:count])
+    rates = xp.concatenate([rates, along[constant] @ T])
     n = len(kept) + len(y)
     A, B, Z = rates[:, :n], rates[:, n:], T[count : count + m, len(kept) : n]
     found = dict(zip(("M", "C", "K", "F", "coupling"), _second_order(scene, A, B, Z.T @ mass @ Z, independent, y, coordinates), strict=True))
     acceleration = xp.max(xp.abs(v[constant]), initial=0.0)
     residual = xp.maximum(acceleration, xp.max(xp.abs(change), initial=0.0))
-    found |= {"A": A, "B": B, "acceleration": acceleration, "residual": residual, "pivot": xp.minimum(pivot_s, pivot_u)}
+    found |= {"A": A, "B": B, "acceleration": acceleration, "residual": residual, "pivot": xp.minimum(*pivots)}
     return {name: jnp.asarray(x, q.dtype) for name, x in found.items()}
 
 

@@ -35,41 +35,22 @@ def perturbed_names(scene: Scene) -> tuple[str, ...]:
     return tuple(names)
 
 
-def perturbations(scene: Scene, q: Float[Entries, "coordinates"]) -> tuple[Float[Entries, "coordinates perturbed"], Float[Entries, "perturbed coordinates"]]:
-    """E and D of `dq = E ds`, `ds = D dq`; of a unit quaternion q the inverse of `x -> q x` is the transpose."""
-    return (
-        _by_blocks(scene, q, np.eye, lambda first: left_product(q[first : first + 4])[:, 1:] / 2),
-        _by_blocks(scene, q, np.eye, lambda first: 2 * left_product(q[first : first + 4]).T[1:]),
-    )
+def perturbations(scene: Scene) -> tuple[Float[np.ndarray, "coordinates perturbed"], Float[np.ndarray, "coordinates perturbed coordinates"]]:
+    """S and B of `dq = E ds`, `E = S + B q`: plain coordinates as they are, quaternions by half the product with a turn.
 
-
-def carried_along(scene: Scene, q: Float[Entries, "coordinates"], qdot: Float[Entries, "coordinates"]) -> Float[Entries, "coordinates coordinates"]:
-    """W of `d(ds)/dt = D (d qdot - W dq)`: perturbing turns are measured in axes that turn with the unperturbed motion.
-
-    Zero for plain coordinates. For a quaternion `d(q0^-1 q)/dt = q0^-1 (qdot - q0dot q0^-1 q)`, hence `W dq = q0dot q0^-1 dq`.
+    Of a unit quaternion the inverse of `x -> q x` is the transpose: `ds = (S + 4 B q)' dq`.
     """
-    return _by_blocks(scene, q, lambda n: np.zeros((n, n)), lambda first: left_product(qdot[first : first + 4]) @ left_product(q[first : first + 4]).T)
+    names, entries = perturbed_names(scene), scene.coordinate_names.entries
+    S = np.array([[float(entry == name) for name in names] for entry in entries])
+    B = np.zeros((*S.shape, len(entries)))
+    for k, (first, _) in enumerate(scene.coordinates.quaternions):
+        own = slice(first, first + 4)
+        B[own, first - k : first - k + 3, own] = _HALF_A_TURN
+    return S, B
 
 
-def _by_blocks(scene: Scene, q, plain, turned):
-    blocks, begin = [], 0
-    for first, _ in scene.coordinates.quaternions:
-        blocks += [plain(first - begin), turned(first)]
-        begin = first + 4
-    return block_diagonal([*blocks, plain(q.shape[-1] - begin)])
-
-
-def left_product(p: Float[Entries, "4"]) -> Float[Entries, "4 4"]:
-    """The matrix of `x -> p x` of quaternions."""
-    w, x, y, z = p
-    return numeric(p).stack([numeric(p).stack(row) for row in ([w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w])])
-
-
-def block_diagonal(blocks: list) -> Float[Entries, "rows columns"]:
-    """Matrices along the diagonal of one that is zero elsewhere."""
-    xp, widths = numeric(blocks), np.cumsum([0, *(block.shape[1] for block in blocks)])
-    sides = [(np.zeros((len(x), first)), x, np.zeros((len(x), widths[-1] - last))) for x, first, last in zip(blocks, widths, widths[1:], strict=False)]
-    return xp.concatenate([xp.concatenate(row, axis=1) for row in sides])
+# q (0, ds)/2 = H q ds, by parts w, x, y, z of the product and by the axes of the turn
+_HALF_A_TURN = np.eye(4)[[[1, 2, 3], [0, 3, 2], [3, 0, 1], [2, 1, 0]]] * np.array([[-1, -1, -1], [1, -1, 1], [1, 1, -1], [-1, 1, 1]])[..., None] / 2
 
 
 def numeric(x):
@@ -77,12 +58,12 @@ def numeric(x):
     return jnp if is_traced(x) else np
 
 
-def inverse(x: Float[Entries, "rows rows"]) -> Float[Entries, "rows rows"]:
-    """The inverse; NaN where there is none."""
+def inverse(x: Float[Entries, "rows columns"]) -> Float[Entries, "columns rows"]:
+    """The inverse, or the pseudo-inverse of what is not square; NaN where there is none."""
     try:
-        return numeric(x).linalg.inv(x)
+        return numeric(x).linalg.inv(x) if len(x) == x.shape[1] else numeric(x).linalg.pinv(x, rtol=rank_cutoff(x.dtype))
     except np.linalg.LinAlgError:
-        return np.full(x.shape, np.nan)
+        return np.full(x.T.shape, np.nan)
 
 
 def others(some, count: int) -> Int[np.ndarray, "rest"]:
@@ -90,22 +71,28 @@ def others(some, count: int) -> Int[np.ndarray, "rest"]:
     return np.setdiff1d(np.arange(count), np.asarray(some, int))
 
 
-def eliminated(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]) -> tuple[Float[Entries, "all independent"], Float[Entries, ""]]:
-    """All perturbations from the independent ones so that `rows @ perturbation = 0`; and the smallest singular value of the scaled block."""
-    xp, independent = numeric(rows), others(dependent, rows.shape[1])
-    if dependent.size == 0:
-        return np.eye(rows.shape[1]), np.ones(())
-    if xp is np and not np.all(np.isfinite(rows)):
-        return np.full((rows.shape[1], len(independent)), np.nan), np.asarray(np.nan)
-    block = rows[:, dependent]
-    fixed = jax.lax.stop_gradient(block) if xp is jnp else block
-    length = xp.sqrt(xp.sum(fixed**2, axis=1, keepdims=True))
-    d = 1 / xp.where(length > 0, length, 1.0)
-    block, right, sigma = d * block, d * rows[:, independent], xp.linalg.svd(d * fixed, compute_uv=False)
-    below = -(inverse(block) if block.shape[0] == block.shape[1] else xp.linalg.pinv(block, rtol=rank_cutoff(block.dtype))) @ right
-    pivot = sigma[-1] if block.shape[0] >= block.shape[1] else 0.0
-    order = np.argsort(np.concatenate([independent, dependent]))
-    return xp.concatenate([np.eye(len(independent)), below])[order], xp.asarray(pivot)
+def eliminated(rows: Float[Entries, "rows all"], independent: Int[np.ndarray, "independent"]) -> Float[Entries, "all independent"]:
+    """All perturbations from the independent ones so that `rows @ perturbation = 0`."""
+    dependent = others(independent, rows.shape[1])
+    rows = _of_unit_length(rows, dependent)
+    followed = -inverse(rows[:, dependent]) @ rows[:, independent]
+    return numeric(rows).concatenate([np.eye(len(independent)), followed])[np.argsort(np.concatenate([independent, dependent]))]
+
+
+def smallest_pivot(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]) -> Float[Entries, ""]:
+    """The smallest singular value of the dependent part of rows, each of unit length; no derivative."""
+    xp, block = numeric(rows), _of_unit_length(rows, dependent)[:, dependent]
+    if xp is np and not np.all(np.isfinite(block)):
+        return np.asarray(np.nan)
+    sizes = xp.linalg.svd(jax.lax.stop_gradient(block) if xp is jnp else block, compute_uv=False)
+    return xp.asarray(xp.min(sizes, initial=1.0) if len(block) >= len(dependent) else 0.0)
+
+
+def _of_unit_length(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]) -> Float[Entries, "rows all"]:
+    """Rows over the lengths of their dependent parts."""
+    xp, block = numeric(rows), rows[:, dependent]
+    length = xp.linalg.norm(jax.lax.stop_gradient(block) if xp is jnp else block, axis=1, keepdims=True)
+    return rows / xp.where(length > 0, length, 1.0)
 
 
 def privileged_speeds(scene: Scene, names: str | tuple[str, ...] | None = None) -> tuple[int, ...]:
@@ -153,7 +140,8 @@ def dependent_coordinates(
         scene = with_reference_parameters(scene)
         t, q, _ = sample_states(scene, 16)
     G = _geometric_rows(scene, t, q) if G is None else G[None]
-    return _pivots(G @ np.stack([perturbations(scene, x)[0] for x in np.asarray(q)]), [names.index(name) for name in named], type(scene).__name__)
+    S, B = perturbations(scene)
+    return _pivots(G @ np.stack([S + B @ x for x in np.asarray(q)]), [names.index(name) for name in named], type(scene).__name__)
 
 
 @eval_numpy
