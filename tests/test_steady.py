@@ -66,7 +66,7 @@ def test_steady_motions_are_found_in_batches():
     leans = jnp.array([0.2, 0.5, 0.8])
     found = jax.jit(jax.vmap(lambda lean: steady(TiltingDisc(**DISC), {**GUESS, "lean": lean}, held=HELD)))(leans)
     assert_allclose(found["spin_rate"], [_circle(float(lean), 2.0) for lean in leans], rtol=1e-11)
-    assert jnp.all(found.converged)
+    assert found.converged.all()
 
 
 def test_a_pendulum_comes_to_rest_at_an_equilibrium():

@@ -77,8 +77,8 @@ def steady(
     - `moving`: names of the coordinates that may keep moving; default: those that the scene's accelerations do not depend on (`ignorable`).
     - `inputs`: values of the scene's inputs (default: zero); `privileged`: names of the speeds that are to be constant (default: the scene's
       own). Choose speeds in which the motion is steady: rates of yaw, lean and spin, say, not velocities along fixed axes.
-    - `options`: a `jj.Options`, whose `max_steps` bounds the steps of the search (default: 60); `by_name`: `max_steps` alone. The search goes on to round-off and
-      integrates nothing: no other field means anything here.
+    - `options`: a `jj.Options`, whose `max_steps` bounds the steps of the search (default: 60); `by_name`: `max_steps` alone.
+      The search goes on to round-off and integrates nothing: no other field means anything here.
 
     **Returns** a `SteadyMotion`; look at `converged` and `residual`, nothing is raised where none is found. Differentiable in any mode in the
     scene's parameters and in the held values, where the steady motion is a smooth function of them.
