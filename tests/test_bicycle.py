@@ -28,7 +28,6 @@ from jourdain_jax.bicycle import (
     table,
     write_results,
 )
-from jourdain_jax.bicycle.from_measurements import SwungPart, TwistedPart, period
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, PARAMETERS
 from jourdain_jax.bicycle.readings import read_readings
 from jourdain_jax.cli import main
@@ -256,15 +255,6 @@ def off(name, of=None):
     found, published = benchmark_from_measurements(name), measured_bicycle(name)
     sigma = published.sigmas
     return {n: ((found.values[n] - published.values[n]) / sigma[n], found.sigmas[n] / sigma[n]) for n in (of or PARAMETER_NAMES)}
-
-
-def test_periods_of_the_scenes_are_those_of_the_formulas():
-    found = jax.jit(period)(SwungPart(mass=2.0, inertia=0.3, length=0.4, gravity=9.8))
-    assert_allclose(found, 2 * np.pi * np.sqrt((0.3 + 2.0 * 0.4**2) / (2.0 * 9.8 * 0.4)), rtol=1e-13)
-    tilt, n = 0.7, np.array([-np.sin(0.7), np.cos(0.7)])
-    along = n @ np.array([[0.3, 0.1], [0.1, 0.5]]) @ n
-    found = jax.jit(period)(TwistedPart(Ixx=0.3, Izz=0.5, Ixz=0.1, tilt=tilt, stiffness=4.0))
-    assert_allclose(found, 2 * np.pi * np.sqrt(along / 4.0), rtol=1e-13)
 
 
 @pytest.mark.parametrize("name", DELFT)

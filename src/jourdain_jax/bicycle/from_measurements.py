@@ -1,16 +1,14 @@
 """The parameters of a bicycle from what was read off its parts, with their covariance.
 
-    y: readings with standard deviations s;   theta(y): parameters, defined by conditions F(theta, y) = 0
-    covariance of theta = J diag(s^2) J',     J = d theta / d y = - F_theta^-1 F_y      (implicit function theorem)
-
-F says that the scenes at the end of this file have the periods that were timed, and that the mass centre of a hung part lies below the rod. Of more than
-three hangings, and of three upright lines through one point, the sum of squares is smallest. Readings are independent; parameters that come of the same
-readings are not: all inertias share the stiffness of the rod, and the place of a mass centre its moment of inertia about y.
+    y: readings with standard deviations s;   theta(y): parameters
+    covariance of theta = J diag(s^2) J',     J = d theta / d y
 
     swung on a level axle       (I + m l^2) angle'' + m g l sin angle = 0        T = 2 pi sqrt((I + m l^2) / (m g l))
     twisted on an upright rod   (n . I n) twist'' + k twist = 0                  T = 2 pi sqrt((n . I n) / k)
 
-n is the direction of the rod in axes of the part. Periods come from the scenes, not from these formulas, which the tests compare them with.
+n is the direction of the rod in axes of the part; the mass centre of a hung part lies below the rod. Of more than three hangings, and of three upright lines
+through one point, the sum of squares is smallest. Readings are independent; parameters that come of the same readings are not: all inertias share the
+stiffness of the rod, and the place of a mass centre its moment of inertia about y.
 Source: J. D. G. Kooijman, M.Sc. thesis, Delft (2006), chapter 3; J. K. Moore, Human control of a bicycle, Ph.D. thesis, Davis (2012), chapter 4.
 """
 
@@ -26,15 +24,8 @@ from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, shipped_measur
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, doubts, violations
 from jourdain_jax.bicycle.readings import Readings, read_readings
 from jourdain_jax.calculus.reals import RUN_SELDOM, compiled
-from jourdain_jax.calculus.roots import newton_root
-from jourdain_jax.calculus.rotations import rot_y, rot_z
-from jourdain_jax.equations.virtual_power import generalized_forces, mass_matrix_at
-from jourdain_jax.scene.bodies import RigidBody
-from jourdain_jax.scene.coordinates import coordinates
-from jourdain_jax.scene.loads import generalized_force, gravity
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.parameters import Scalar, parameter
-from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.parameters import Scalar
 
 Values = dict[str, Scalar]
 
@@ -137,7 +128,8 @@ def _column(what: str, part: str, numbers: tuple[int, ...], y: Values) -> Float[
 def _geometry(y: Values, known: Values, by_table: bool) -> Values:
     """Wheelbase, trail and tilt of the steer axis: with lengths of the rear frame a, of the fork b, across, and along the steer axis d between the wheels,
 
-    w = (a + b) cos lam + d sin lam,    rR - rF = d cos lam - (a + b) sin lam,    trail = (rF sin lam - b) / cos lam
+    w = (a + b) cos lam + d sin lam,    rR - rF = d cos lam - (a + b) sin lam = sqrt(d^2 + (a + b)^2) cos(lam + atan((a + b) / d)),
+    trail = (rF sin lam - b) / cos lam
     """
     if not by_table:
         w, lam, b = y["w"], jnp.deg2rad(90 - y["gamma"]), y["f"]
@@ -145,11 +137,7 @@ def _geometry(y: Values, known: Values, by_table: bool) -> Values:
         a = y["h1"] + y["h2"] - y["h3"] + (y["d1"] - y["d2"]) / 2
         b = y["h4"] - y["h5"] + (y["d4"] - y["d3"]) / 2
         d = jnp.sqrt((y["d"] + (y["d2"] + y["d3"]) / 2) ** 2 - (a - b) ** 2)
-
-        def wheels_on_the_ground(x):
-            return d * jnp.cos(x) - (a + b) * jnp.sin(x) - (known["rR"] - known["rF"])
-
-        lam = newton_root(wheels_on_the_ground, jnp.full(1, 0.3), jnp.ones(1)).x[0]
+        lam = jnp.arccos((known["rR"] - known["rF"]) / jnp.hypot(d, a + b)) - jnp.arctan2(a + b, d)
         w = (a + b) * jnp.cos(lam) + d * jnp.sin(lam)
     return {"w": w, "lam": lam, "c": (known["rF"] * jnp.sin(lam) - b) / jnp.cos(lam)}
 
@@ -167,47 +155,32 @@ def _mass_centre(tilts: Float[Array, "hangings"], beside: Float[Array, "hangings
     cos(tilt) x + sin(tilt) z = a: the rod, whose line is upright, is a beside the point that the part hangs by.
     """
     across = jnp.stack([jnp.cos(tilts), jnp.sin(tilts)], axis=1)
-    misses = lambda r: across @ r - beside  # noqa: E731
-    r = newton_root(lambda r: across.T @ misses(r), jnp.zeros(2), jnp.ones(2)).x
-    return r, misses(r)
+    r = _least_squares(across, beside)
+    return r, across @ r - beside
+
+
+def _least_squares(rows: Float[Array, "rows columns"], values: Float[Array, "rows"]) -> Float[Array, "columns"]:
+    return jnp.linalg.solve(rows.T @ rows, rows.T @ values)
 
 
 def _moments_about_y(y: Values, lengths: Values) -> Values:
-    """Iyy of the parts with these distances of the mass centre from the axle, kg m^2: the swung scenes have the periods that were timed."""
-    mass, length, timed = (jnp.stack(of) for of in zip(*((y[f"m{p}"], lengths[p], y[f"Tc{p}1"]) for p in lengths), strict=True))
-
-    def wrong(moments):
-        swung = lambda m, moment, l: period(SwungPart(mass=m, inertia=moment, length=l, gravity=y["g"])) ** 2  # noqa: E731
-        return jax.vmap(swung)(mass, moments, length) - timed**2
-
-    moments = newton_root(wrong, jnp.full(len(lengths), 0.3), jnp.ones(len(lengths))).x
-    return {f"I{part}yy": moment for part, moment in zip(lengths, moments, strict=True)}
+    """Iyy of the parts with these distances of the mass centre from the axle, kg m^2, from the periods of their swings."""
+    return {f"I{p}yy": y[f"m{p}"] * l * (y["g"] * (y[f"Tc{p}1"] / (2 * jnp.pi)) ** 2 - l) for p, l in lengths.items()}
 
 
 def _moments_in_plane(y: Values, hangings: dict[str, tuple[int, ...]], tilts: dict[str, Float[Array, "_"]]) -> Values:
-    """Ixx, Izz, Ixz of the parts and Ixx of the wheels, kg m^2: the twisted scenes have the periods that were timed, of more than three as nearly as may be."""
-    names = [f"I{wheel}xx" for wheel in "RF"] + [f"I{part}{axes}" for part in hangings for axes in ("xx", "zz", "xz")]
-    # a bar of known inertia gauges the rod. Then the wheels, on the rod by their rims: Izz = Ixx, Ixz = 0. The sixth is a zero, the seventh the bar
+    """Ixx, Izz, Ixz of the parts and Ixx of the wheels, kg m^2, from the periods of their twists; those of more than three are met as nearly as may be.
+
+    A bar of known inertia gauges the rod. The wheels are on the rod by their rims, the parts with n = (-sin tilt, 0, cos tilt).
+    """
     bar = y["mP"] * (3 * (y["dP"] / 2) ** 2 + y["lP"] ** 2) / 12
-    zero, gauge = len(names), len(names) + 1
-    places = [(gauge, gauge, zero), (0, 0, zero), (1, 1, zero)]
-    places += [tuple(names.index(f"I{part}{axes}") for axes in ("xx", "zz", "xz")) for part, numbers in hangings.items() for _ in numbers]
-    tilt = jnp.concatenate([jnp.zeros(3), *tilts.values()])
-    timed = jnp.stack([y["TtP1"], y["TtR1"], y["TtF1"], *(y[f"Tt{part}{k}"] for part, numbers in hangings.items() for k in numbers)])
-
-    def squared_ratios(moments):
-        """Squares of the periods over that of the bar, on which the stiffness of the rod has no influence."""
-        entries = jnp.concatenate([moments, jnp.stack([jnp.zeros(()), bar])])[np.array(places)]
-        twisted = lambda entry, angle: period(TwistedPart(Ixx=entry[0], Izz=entry[1], Ixz=entry[2], tilt=angle)) ** 2  # noqa: E731
-        squares = jax.vmap(twisted)(entries, tilt)
-        return squares[1:] / squares[0]
-
-    def condition(moments):
-        wrong, back = jax.vjp(lambda m: squared_ratios(m) - (timed[1:] / timed[0]) ** 2, moments)
-        return back(wrong)[0]
-
-    guess = jnp.array([0.0 if name.endswith("xz") else 0.3 for name in names])
-    return dict(zip(names, newton_root(condition, guess, jnp.ones(len(names))).x, strict=True))
+    along = lambda timed: bar * (timed / y["TtP1"]) ** 2  # noqa: E731, n . I n
+    found = {f"I{wheel}xx": along(y[f"Tt{wheel}1"]) for wheel in "RF"}
+    for part, numbers in hangings.items():
+        s, c = jnp.sin(tilts[part]), jnp.cos(tilts[part])
+        moments = _least_squares(jnp.stack([s**2, c**2, -2 * s * c], axis=1), along(_column("Tt", part, numbers, y)))
+        found |= {f"I{part}{axes}": moment for axes, moment in zip(("xx", "zz", "xz"), moments, strict=True)}
+    return found
 
 
 def _of_whole_bicycle(found: Values) -> Values:
@@ -220,51 +193,3 @@ def _of_whole_bicycle(found: Values) -> Values:
         apart = {"xx": m * dz**2, "yy": m * (dx**2 + dz**2), "zz": m * dx**2, "xz": -m * dx * dz}
         moments = {axes: moments[axes] + found[f"I{part}{axes}"] + apart[axes] for axes in moments}
     return {"mH": mass, "xH": x, "zH": z} | {f"IH{axes}": moment for axes, moment in moments.items()}
-
-
-class SwungPart(Scene):
-    """A part hung on a level axle, `length` away from its mass centre: a compound pendulum."""
-
-    mass: Scalar = parameter(5.0, unit="kg", positive=True)
-    inertia: Scalar = parameter(0.5, unit="kg m^2", positive=True)  # about an axis along the axle, through the mass centre
-    length: Scalar = parameter(0.3, unit="m", positive=True)
-    gravity: Scalar = parameter(9.81, unit="m/s^2")
-
-    coordinates = coordinates("angle")
-    conventions = "x horizontal, z up; the axle lies along y through the origin; angle from hanging straight down."
-
-    def bodies(self, t, q):
-        centre = self.length * jnp.stack([jnp.sin(q.angle), jnp.zeros_like(q.angle), -jnp.cos(q.angle)])
-        return {"part": RigidBody(self.mass, jnp.full(3, self.inertia), centre, rot_y(-q.angle))}
-
-    def loads(self, motion):
-        return (gravity(motion, self.gravity),)
-
-
-class TwistedPart(Scene):
-    """A part clamped to an upright rod that twists, its mass centre below the rod: a torsional pendulum."""
-
-    Ixx: Scalar = parameter(0.5, unit="kg m^2")
-    Izz: Scalar = parameter(0.5, unit="kg m^2")
-    Ixz: Scalar = parameter(0.0, unit="kg m^2")
-    tilt: Scalar = parameter(0.0, unit="rad")  # of the part about its y axis, from where its z axis lies along the rod
-    stiffness: Scalar = parameter(5.0, unit="N m/rad", positive=True)
-
-    coordinates = coordinates("twist")
-    conventions = "The rod lies along z; x and z of the part are in the plane of symmetry of the bicycle that it belongs to."
-
-    def bodies(self, t, q):
-        zero = jnp.zeros(())
-        # Iyy does not matter to turns about a direction in the plane of x and z; nor does the mass
-        inertia = jnp.stack([jnp.stack([self.Ixx, zero, self.Ixz]), jnp.array([0.0, 1.0, 0.0]), jnp.stack([self.Ixz, zero, self.Izz])])
-        return {"part": RigidBody(1.0, inertia, jnp.zeros(3), rot_z(q.twist) @ rot_y(self.tilt))}
-
-    def loads(self, motion):
-        return (generalized_force(motion, twist_rate=-self.stiffness * motion.q.twist),)
-
-
-def period(pendulum: SwungPart | TwistedPart) -> Scalar:
-    """Period of small motions about rest, s: 2 pi sqrt(M / K), M the mass in the scene's equation, K by how much its force falls with the coordinate."""
-    zero, rest = jnp.zeros(()), jnp.zeros(1)
-    force = lambda q: generalized_forces(pendulum, zero, q, rest)[0]  # noqa: E731
-    return 2 * jnp.pi * jnp.sqrt(mass_matrix_at(pendulum, zero, rest)[0, 0] / -jax.jvp(force, (rest,), (jnp.ones(1),))[1])
