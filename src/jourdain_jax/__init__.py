@@ -92,7 +92,7 @@ if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.analysis.log_density import LogDensity, log_density
     from jourdain_jax.analysis.problem import huber, student_t
     from jourdain_jax.analysis.quantities import Accelerometer, LoadCell
-    from jourdain_jax.analysis.report import Checked, Report, check, report
+    from jourdain_jax.analysis.report import Report, report
     from jourdain_jax.analysis.sensors import Actuator, Sensor
     from jourdain_jax.analysis.shooting import MultipleShooting
     from jourdain_jax.analysis.statements import Verification, derivative_exists
@@ -112,6 +112,7 @@ if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.importers.sympy_scene import from_sympy
     from jourdain_jax.importers.urdf import from_urdf
     from jourdain_jax.motion.batches.rollout import Rollout, rollout
+    from jourdain_jax.motion.check import Checked, check
     from jourdain_jax.motion.diffrax_steps import diffrax_term
     from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
     from jourdain_jax.motion.integrators.discrete_lagrange_dalembert import DiscreteLagrangeDAlembert
@@ -137,7 +138,7 @@ _ON_FIRST_USE = {
     "analysis.log_density": "LogDensity log_density",
     "analysis.problem": "huber student_t",
     "analysis.quantities": "Accelerometer LoadCell",
-    "analysis.report": "Checked Report check report",
+    "analysis.report": "Report report",
     "analysis.sensors": "Actuator Sensor",
     "analysis.shooting": "MultipleShooting",
     "analysis.statements": "Verification derivative_exists",
@@ -157,6 +158,7 @@ _ON_FIRST_USE = {
     "importers.sympy_scene": "from_sympy",
     "importers.urdf": "from_urdf",
     "motion.batches.rollout": "Rollout rollout",
+    "motion.check": "Checked check",
     "motion.diffrax_steps": "diffrax_term",
     "motion.integrators.discrete_gradient": "DiscreteGradient",
     "motion.integrators.discrete_lagrange_dalembert": "DiscreteLagrangeDAlembert",

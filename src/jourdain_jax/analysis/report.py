@@ -1,12 +1,4 @@
-"""What kind of system a scene is, in one table: freedoms, rows, rank, integrability, growth, cyclic and ignorable coordinates.
-
-Likely mistakes of a scene in one table: it can be computed, but is hardly meant.
-
-smoothness        poses, rows and rates of coordinates that jump, or whose velocities do, on lines through states of the domain
-grounds           what the ground of a contact does, and what is stated of it
-bodies            0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2, and all that is refused where a motion starts
-scalar program    its rates and slopes against JAX's
-"""
+"""What kind of system a scene is, in one table: freedoms, rows, rank, integrability, growth, cyclic and ignorable coordinates."""
 
 import textwrap
 from dataclasses import asdict, dataclass
@@ -15,13 +7,9 @@ import jax
 
 from jourdain_jax.analysis.integrability import frobenius_violations, growth_vector, integrable_below, reachable
 from jourdain_jax.build.assembling import COORDINATE_DOMAIN, SPEED_DOMAIN
-from jourdain_jax.build.plausibility import impossible_bodies
-from jourdain_jax.build.structure import structure_of, structure_whatever_its_faults
+from jourdain_jax.build.structure import structure_of
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reduced import cyclic_coordinates, ignorable_coordinates
-from jourdain_jax.lowering.comparison import DIFFERS
-from jourdain_jax.lowering.lower import lowered
-from jourdain_jax.lowering.lowered import NotLowered
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.model import Model, build, modelled
 from jourdain_jax.motion.native import native_motion
@@ -214,43 +202,3 @@ def _lowering(built: Model) -> str:
     if not reason and jax.default_backend() == "gpu":
         where += f" of the CPU and of NVIDIA GPUs ({nvidia.architecture()})"
     return f"a scalar program of {found.operations} operations{calls}; {where}"
-
-
-@dataclass(frozen=True, repr=False)
-class Checked(Printed):
-    """Findings of `check`: subject -> sentences on what looks wrong, none where all is plausible. Printed as a table."""
-
-    scene: str
-    found: dict[str, tuple[str, ...]]
-
-    @property
-    def passed(self) -> bool:
-        """True where nothing looks wrong."""
-        return not any(self.found.values())
-
-    def _text(self) -> str:
-        rows = [f"  {what:<16} {'; '.join(sentences) or 'ok'}" for what, sentences in self.found.items()]
-        return "\n".join([f"Check of {self.scene}: {'nothing looks wrong' if self.passed else 'LOOK AT THIS'}", *rows])
-
-
-@shown_from_users_lines
-@of_known_numbers
-def check(scene: Scene | BuiltFor) -> Checked:
-    """Look for likely mistakes of a scene: kinks and jumps, grounds that other bodies carry, impossible bodies, a program that differs from JAX.
-
-        print(jj.check(scene))
-
-    Looks at some states of the domain; a narrow feature between them is not seen. When the scene is built or moves, the first finding is raised as an error,
-    except a program that differs (dense matrices serve) and a moment of inertia above the sum of the others.
-    ValueError where no admissible state is found, or a motion that the rows leave free has no inertia.
-    """
-    scene = as_scene(scene)
-    known = structure_whatever_its_faults(scene)
-    program = "" if known.kinks or known.odd_grounds or known.faults else lowered(scene)
-    found = {
-        "smoothness": known.kinks,
-        "grounds": known.odd_grounds,
-        "bodies": known.faults or impossible_bodies(scene, known.coordinates[0]),
-        "scalar program": (str(program),) if isinstance(program, NotLowered) and DIFFERS in str(program) else (),
-    }
-    return Checked(type(scene).__name__, found)

@@ -111,6 +111,7 @@ class Verification(Printed, eqx.Module):
     scene: str = eqx.field(static=True)
     checks: tuple[Check, ...]
     not_applicable: tuple[str, ...] = eqx.field(static=True)  # reductions that do not apply at this state
+    mistakes: str = eqx.field(static=True, default="")  # the table of `jj.check`
 
     @property
     def certifies(self) -> bool:
@@ -149,7 +150,7 @@ class Verification(Printed, eqx.Module):
             lines.append("  single precision: gross errors show, but passing certifies nothing; verify in double precision (JAX_ENABLE_X64=1)")
         if self.not_applicable:
             lines.append("  not applicable at this state: " + ", ".join(self.not_applicable))
-        return "\n".join(lines)
+        return "\n".join([*lines, self.mistakes]).rstrip()
 
 
 def derivative_exists(scene: Scene, t, q, u, direction: Scene, dq, inputs=None) -> bool:

@@ -35,6 +35,7 @@ from jourdain_jax.equations.lagrange import lagrange_equations, speeds_are_rates
 from jourdain_jax.equations.listed import names_of_rows
 from jourdain_jax.equations.scaling import row_scale, speed_scale
 from jourdain_jax.equations.virtual_power import energies_at, equations_and_rows
+from jourdain_jax.motion.check import check as look_for_mistakes
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.simulate import as_state
 from jourdain_jax.motion.start import consistent
@@ -62,7 +63,7 @@ def verify(scene: Scene | BuiltFor, state: State | dict | None = None, inputs: N
       speeds, relative in the parameters; the Gibbs-Appell reduction is left out of them. Parameters that split rows which are dependent have no
       derivative there and are left out, with a note (`derivative_exists`).
 
-    **Returns** a `Verification`. Nothing is raised for a failed check; a DifferentiationModeError where numbers are traced.
+    **Returns** a `Verification`, printed with the table of `jj.check`. Nothing is raised for a failed check; a DifferentiationModeError where numbers are traced.
     """
     if not isinstance(seed, int | np.integer) or seed < 0:
         raise ValueError(f"`seed` is {seed!r}, expected a whole number that is not negative")
@@ -79,7 +80,7 @@ def verify(scene: Scene | BuiltFor, state: State | dict | None = None, inputs: N
     checks = statement_checks(scene, t, q, u, inputs, Z, seed)
     checks += [check(name, values, found["M"].dtype) for name, values in _comparisons(scene, found, applicable).items()]
     checks += gradient_checks(scene, t, q, u, inputs, Z, tuple(applicable), seed)
-    return Verification(type(scene).__name__, tuple(checks), tuple(name for name in found["applicable"] if name not in applicable))
+    return Verification(type(scene).__name__, tuple(checks), tuple(name for name in found["applicable"] if name not in applicable), str(look_for_mistakes(scene)))
 
 
 @eval_numpy

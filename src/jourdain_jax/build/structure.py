@@ -54,6 +54,7 @@ class Structure:
     rows_of_inputs: bool  # rows depend on inputs, so that the accelerations depend on their rates
     chosen_by_user: bool
     kinks: tuple[str, ...]  # what is not smooth, as sentences
+    odd_bodies: tuple[str, ...]  # bodies with moments of inertia that no distribution of mass has
     odd_grounds: tuple[str, ...]  # grounds of contacts that move in another way than is stated
     faults: tuple[str, ...]  # numbers of bodies and planes that cannot be, and rows that contradict each other, as sentences
     row_lengths: np.ndarray = field(compare=False, repr=False)  # typical ones, in scaled speeds: what the length of a row is judged by
@@ -223,7 +224,7 @@ def _probed_structure(scene: Scene) -> Structure:
             break
     on_rows = usable_states(scene, found, generic)
     numbers = jax.tree.map(lambda x: x[on_rows], found.numbers)
-    rough, grounds, faults = kinks(scene, found.q[on_rows & generic], u), sentences(scene, numbers, "grounds"), sentences(scene, numbers, "faults")
+    rough, (grounds, bodies, faults) = kinks(scene, found.q[on_rows & generic], u), (sentences(scene, numbers, of) for of in ("grounds", "moments", "faults"))
     A = found.A * speed_scales(found.M)[:, None]
     usable = np.all(np.isfinite(A), axis=(1, 2)) & on_rows
     if not faults and not usable.any():
@@ -279,6 +280,7 @@ def _probed_structure(scene: Scene) -> Structure:
         rows_of_inputs=rows_of_inputs,
         chosen_by_user=by_user is not None,
         kinks=rough,
+        odd_bodies=bodies,
         odd_grounds=grounds,
         faults=faults,
         row_lengths=typical,

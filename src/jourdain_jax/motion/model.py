@@ -17,6 +17,7 @@ from jourdain_jax.equations.listed import names_of_events, names_of_invariants, 
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered, NotLowered
+from jourdain_jax.motion.check import warn_of_mistakes
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.put_on_rows import Usual, usual_sizes
@@ -283,6 +284,7 @@ def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backe
 
     `formulation`, `backend`: as of `simulate`. All functions of a scene build on first use and keep what they found. `start`, `simulate`, `rollout`, `fit`,
     `fit_batch`, `linearize`, `steady`, `report`, `verify` and `lower` take what this returns in the place of `scene`; all others take its `.scene`.
+    The first call for a class warns with the table of `check` where something looks wrong.
     ValueError as of `structure_of` (no admissible state, no inertia along a free motion, numbers of bodies that cannot be), and where the formulation or
     the backend does not serve the scene.
     """
@@ -292,6 +294,8 @@ def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backe
     model.usual(False), model.usual(True)
     settled = Model(scene, replace(model.formulation, state="full" if model.field().independent is None else "minimal"), backend, Reference(scene))
     modelled(settled).made.update(model.made)
+    if backend != "dense":  # which asks for no program to compare
+        warn_of_mistakes(settled.reference.scene)
     return settled
 
 

@@ -1,0 +1,67 @@
+"""Likely mistakes of a scene in one table: it can be computed, but is hardly meant.
+
+smoothness        poses, rows and rates of coordinates that jump, or whose velocities do, on lines through states of the domain
+grounds           what the ground of a contact does, and what is stated of it
+bodies            0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2, and all that is refused where a motion starts
+scalar program    its rates and slopes against JAX's
+"""
+
+import warnings
+from dataclasses import dataclass
+
+from jourdain_jax.build.structure import structure_whatever_its_faults
+from jourdain_jax.lowering.comparison import DIFFERS
+from jourdain_jax.lowering.lower import lowered
+from jourdain_jax.lowering.lowered import NotLowered
+from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers, shown_from_users_lines, users_level
+from jourdain_jax.scene.identity import once_per_class
+from jourdain_jax.scene.printing import Printed
+from jourdain_jax.scene.scene import Scene
+
+
+@dataclass(frozen=True, repr=False)
+class Checked(Printed):
+    """Findings of `check`: subject -> sentences on what looks wrong, none where all is plausible. Printed as a table."""
+
+    scene: str
+    found: dict[str, tuple[str, ...]]
+
+    @property
+    def passed(self) -> bool:
+        """True where nothing looks wrong."""
+        return not any(self.found.values())
+
+    def _text(self) -> str:
+        rows = [f"  {what:<16} {'; '.join(sentences) or 'ok'}" for what, sentences in self.found.items()]
+        return "\n".join([f"Check of {self.scene}: {'nothing looks wrong' if self.passed else 'LOOK AT THIS'}", *rows])
+
+
+@shown_from_users_lines
+@of_known_numbers
+def check(scene: Scene | BuiltFor) -> Checked:
+    """Look for likely mistakes of a scene: kinks and jumps, grounds that other bodies carry, impossible bodies, a program that differs from JAX.
+
+        print(jj.check(scene))
+
+    Looks at some states of the domain; a narrow feature between them is not seen. `verify` prints the table, and the first `build` of a class warns with it
+    where something looks wrong. When the scene is built or moves, the first finding is raised as an error, except a program that differs (dense matrices
+    serve) and a moment of inertia above the sum of the others.
+    ValueError where no admissible state is found, or a motion that the rows leave free has no inertia.
+    """
+    scene = as_scene(scene)
+    known = structure_whatever_its_faults(scene)
+    program = "" if known.kinks or known.odd_grounds or known.faults else lowered(scene)
+    found = {
+        "smoothness": known.kinks,
+        "grounds": known.odd_grounds,
+        "bodies": known.faults or known.odd_bodies,
+        "scalar program": (str(program),) if isinstance(program, NotLowered) and DIFFERS in str(program) else (),
+    }
+    return Checked(type(scene).__name__, found)
+
+
+@once_per_class
+def warn_of_mistakes(scene: Scene) -> None:
+    """Warn with the table where something looks wrong, once for each class."""
+    if not (found := check(scene)).passed:
+        warnings.warn(str(found), stacklevel=users_level())
