@@ -16,7 +16,7 @@ from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.simulate import as_state
 from jourdain_jax.native import nvidia
-from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers, shown_from_users_lines
+from jourdain_jax.scene.arguments import BuiltFor, of_known_numbers, shown_from_users_lines
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 

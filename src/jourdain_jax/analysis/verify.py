@@ -63,7 +63,8 @@ def verify(scene: Scene | BuiltFor, state: State | dict | None = None, inputs: N
       speeds, relative in the parameters; the Gibbs-Appell reduction is left out of them. Parameters that split rows which are dependent have no
       derivative there and are left out, with a note (`derivative_exists`).
 
-    **Returns** a `Verification`, printed with the table of `jj.check`. Nothing is raised for a failed check; a DifferentiationModeError where numbers are traced.
+    **Returns** a `Verification`, printed with the table of `jj.check`. Nothing is raised for a failed check; a
+    DifferentiationModeError where numbers are traced.
     """
     if not isinstance(seed, int | np.integer) or seed < 0:
         raise ValueError(f"`seed` is {seed!r}, expected a whole number that is not negative")
@@ -80,7 +81,8 @@ def verify(scene: Scene | BuiltFor, state: State | dict | None = None, inputs: N
     checks = statement_checks(scene, t, q, u, inputs, Z, seed)
     checks += [check(name, values, found["M"].dtype) for name, values in _comparisons(scene, found, applicable).items()]
     checks += gradient_checks(scene, t, q, u, inputs, Z, tuple(applicable), seed)
-    return Verification(type(scene).__name__, tuple(checks), tuple(name for name in found["applicable"] if name not in applicable), str(look_for_mistakes(scene)))
+    left_out = tuple(name for name in found["applicable"] if name not in applicable)
+    return Verification(type(scene).__name__, tuple(checks), left_out, str(look_for_mistakes(scene)))
 
 
 @eval_numpy
