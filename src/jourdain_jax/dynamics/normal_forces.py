@@ -25,22 +25,15 @@ class Wrenches(eqx.Module):
     torque: Float[Array, "*rows bodies 3"]  # N m
 
 
-class NormalForce(eqx.Module):
-    """What a contact presses with."""
-
-    normal: Float[Array, ""]  # N
-    determined: Bool[Array, ""]
-
-
 def normal_forces(contacts: dict[str, Contact], bodies: tuple[str, ...], positions: Float[Array, "bodies 3"], hidden: Wrenches, spare: Wrenches, size):
-    """The normal force of every contact of `height="coordinates"`, by name.
+    """The normal force (N) of every contact of `height="coordinates"`, by name, and whether it is determined.
 
     - `bodies`, `positions`: names and mass centres (m) of all bodies. `hidden`: what no load and no row exerts on them.
     - `spare`: what the rows exert for multipliers that change no motion, with a leading axis; zero where the rows are independent.
     - `size`: of the forces at hand, N.
     """
     carried = {name: _carried(contact, name, bodies) for name, contact in contacts.items() if contact.height == "coordinates"}
-    found: dict[str, NormalForce] = {}
+    found: dict[str, tuple] = {}
     for names in _supports(carried):
         found |= _of_support(names, contacts, carried, bodies, positions, hidden, spare, size)
     return found
@@ -55,7 +48,7 @@ def _supports(carried: dict[str, tuple[int, ...]]) -> list[list[str]]:
     return groups
 
 
-def _of_support(names: list[str], contacts, carried, bodies, positions, hidden: Wrenches, spare: Wrenches, size) -> dict[str, NormalForce]:
+def _of_support(names: list[str], contacts, carried, bodies, positions, hidden: Wrenches, spare: Wrenches, size) -> dict[str, tuple]:
     sets = tuple(dict.fromkeys(carried[name] for name in names))  # of bodies, whose equations these contacts share
     points = jnp.stack([contacts[name].point for name in names])
     normals = jnp.stack([contacts[name].plane.normal for name in names])
@@ -65,7 +58,7 @@ def _of_support(names: list[str], contacts, carried, bodies, positions, hidden: 
     tolerance = jnp.sqrt(jnp.finfo(forces.dtype).eps)
     if len(names) == 1:
         normal = normals[0] @ forces
-        return {names[0]: NormalForce(normal, _unmoved(wrenches[1][0] @ normals.T, spare, tolerance)[0])}
+        return {names[0]: (normal, _unmoved(wrenches[1][0] @ normals.T, spare, tolerance)[0])}
 
     touches = [[bodies.index(contacts[name].body) in own or carried[name] == own for name in names] for own in sets]
     by_set = jnp.asarray(touches, normals.dtype)[:, None, :]
@@ -90,7 +83,7 @@ def _of_support(names: list[str], contacts, carried, bodies, positions, hidden: 
     met = (missed[0] <= tolerance * size) & (missed[1] <= tolerance * (size + jnp.max(jnp.abs(hidden.torque)) / length))
     by_forces_alone, by_both = jnp.abs(jnp.diagonal(left)) <= tolerance, jnp.abs(jnp.diagonal(open_still)) <= tolerance
     determined = jax.lax.stop_gradient((by_forces_alone | (by_both & met)) & _unmoved(jax.vmap(solved)(*wrenches[1]), spare, tolerance))
-    return {name: NormalForce(N[i], determined[i]) for i, name in enumerate(names)}
+    return {name: (N[i], determined[i]) for i, name in enumerate(names)}
 
 
 def _resultant(wrench: Wrenches, positions, sets: tuple[tuple[int, ...], ...], here):

@@ -160,7 +160,7 @@ def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=N
             height = rows.row_names.index(f"{name} height")
             normal, known = rows.multipliers[height], rows.determined[height]
         else:
-            normal, known = built_in[name].normal, built_in[name].determined
+            normal, known = built_in[name]
         forces[name] = _contact_force(normal, tangential, determined & known, known, margin)
     return forces
 

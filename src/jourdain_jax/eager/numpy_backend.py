@@ -25,10 +25,8 @@ def applied(equation, inputs) -> list[np.ndarray]:
     inner = called(name, params)
     if inner is not None:
         return evaluated(inner, inputs, applied)
-    if name in _LOOPS:
-        return _LOOPS[name](equation, inputs)
     if name in _CONTROL:
-        return _CONTROL[name](params, inputs)
+        return _CONTROL[name](equation, inputs)
     if name in _ENTRYWISE:
         with_type = _ENTRYWISE[name](*inputs)
         return [np.asarray(with_type, equation.outvars[0].aval.dtype)]
@@ -94,22 +92,23 @@ def _where(equation) -> str:
     return "a function of the scene"
 
 
-def _linear_solve(params, inputs) -> list[np.ndarray]:
-    lengths = params["const_lengths"]
+def _linear_solve(equation, inputs) -> list[np.ndarray]:
+    params, lengths = equation.params, equation.params["const_lengths"]
     of_solve = inputs[lengths.matvec + lengths.vecmat :][: lengths.solve]
     return evaluated(params["jaxprs"].solve, [*of_solve, *inputs[sum(lengths) :]], applied)
 
 
-def _linear_map(params, inputs) -> list[np.ndarray]:
-    closed = jax.make_jaxpr(params["linear"].apply)(inputs[: params["count"]], inputs[params["count"] :])
-    return evaluated(closed, inputs, applied)
+def _linear_map(equation, inputs) -> list[np.ndarray]:
+    count = equation.params["count"]
+    return evaluated(jax.make_jaxpr(equation.params["linear"].apply)(inputs[:count], inputs[count:]), inputs, applied)
 
 
-_LOOPS: dict[str, Callable] = {"scan": _scan, "while": _while}
 _CONTROL: dict[str, Callable] = {
-    "cond": lambda params, inputs: evaluated(params["branches"][int(inputs[0])], inputs[1:], applied),
+    "scan": _scan,
+    "while": _while,
+    "cond": lambda equation, inputs: evaluated(equation.params["branches"][int(inputs[0])], inputs[1:], applied),
     "jourdain_linear_map": _linear_map,
-    "custom_lin": lambda params, inputs: inputs,
+    "custom_lin": lambda equation, inputs: inputs,
     "custom_linear_solve": _linear_solve,
 }
 
@@ -149,11 +148,6 @@ def as_matrices(equation, a, b) -> tuple[np.ndarray, np.ndarray]:
     left = np.transpose(a, (*batch_a, *free_a, *over_a)).reshape(*batch, int(np.prod([a.shape[i] for i in free_a])), contracted)
     right = np.transpose(b, (*batch_b, *over_b, *free_b)).reshape(*batch, contracted, int(np.prod([b.shape[i] for i in free_b])))
     return left, right
-
-
-def _dot_general(equation, a, b):
-    left, right = as_matrices(equation, a, b)
-    return _reshaped(equation, left @ right)
 
 
 def _broadcast_in_dim(equation, x, *dynamic):
@@ -266,7 +260,7 @@ def _reshaped(equation, x, *dynamic):
 
 RULES: dict[str, Callable] = {
     **dict.fromkeys(("reshape", "squeeze", "expand_dims"), _reshaped),
-    "dot_general": _dot_general,
+    "dot_general": lambda e, a, b: _reshaped(e, np.matmul(*as_matrices(e, a, b))),
     "broadcast_in_dim": _broadcast_in_dim,
     "transpose": lambda e, x: np.transpose(x, e.params["permutation"]),
     "rev": lambda e, x: np.flip(x, e.params["dimensions"]),

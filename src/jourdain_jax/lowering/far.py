@@ -36,13 +36,8 @@ def _at_full_turns(probes: Probes, traced: TracedScene) -> Probes:
     graph = probes.graph
     for name in sorted({str(graph.value[graph.args[n][0]]) for n in range(len(graph.op)) if turns(graph, n)}):
         inputs[name] = inputs[name] + generator.uniform(-np.pi, np.pi, count)
-    return _on_rows(probes.with_inputs(inputs), traced.closures, coordinates)
-
-
-def _on_rows(probes: Probes, rows: list[int], coordinates: list[int]) -> Probes:
-    """Return the probes with coordinates on rows = 0; NaN where Gauss-Newton does not converge."""
-    found = onto_rows(probes, rows, {f"q_{i}": n for i, n in enumerate(coordinates)}, most=12)
-    off = ~(np.max(np.abs(found.probes(rows)), axis=0, initial=0.0) <= 1e-9)
+    found = onto_rows(probes.with_inputs(inputs), traced.closures, {f"q_{i}": n for i, n in enumerate(coordinates)}, most=12)
+    off = ~(np.max(np.abs(found.probes(traced.closures)), axis=0, initial=0.0) <= 1e-9)  # also where Gauss-Newton does not converge
     return found.probes.with_inputs({name: np.where(off, np.nan, found.probes.inputs[name]) for name in found.moved})
 
 

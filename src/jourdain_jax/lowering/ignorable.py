@@ -44,7 +44,7 @@ def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expect
     used, here, regular = set(builder.graph.reachable(equations.ydot)), generic(equations.ydot), pivots_ok(equations.pivots, generic)
 
     def unchanged(group) -> bool:
-        elsewhere = generic.exchanged([f"q_{i}" for i in group])
+        elsewhere = generic.exchanged([[f"q_{i}" for i in group]], np.arange(generic.count))
         return bool(np.all(equal(elsewhere(equations.ydot), here, regular & pivots_ok(equations.pivots, elsewhere))))
 
     def surely_changed(groups) -> np.ndarray:
@@ -52,7 +52,7 @@ def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expect
         at = np.flatnonzero(regular)[:FEW]
         if len(groups) < FEW or not at.size or builder.graph.calls(equations.ydot):
             return np.zeros(len(groups), bool)
-        elsewhere = generic.exchanged_in_turn([[f"q_{i}" for i in group] for group in groups], at)
+        elsewhere = generic.exchanged([[f"q_{i}" for i in group] for group in groups], at)
         then, lanes = elsewhere(equations.ydot), np.tile(at, len(groups))
         before = here[:, lanes]
         before.error = here.error[:, lanes]

@@ -53,7 +53,7 @@ def accelerations_by_multipliers(
     right = [graph.neg(graph.add(d, graph.dot(row, free))) for d, row in zip(drift, A, strict=True)]
     solved = solve_symmetric(graph, S, [right] if affine else [right, *map(list, zip(*A, strict=True))])
     multipliers = solved.solution[0]
-    udot = [graph.add(w, graph.total(graph.mul(x[k], m) for x, m in zip(impulses, multipliers, strict=True))) for k, w in enumerate(free)]
+    udot = [graph.add(w, graph.dot(column, multipliers)) for w, *column in zip(free, *impulses, strict=True)]
     left = [(r, pivot) for r, pivot in enumerate(solved.pivots) if graph.varies[pivot]]
     sines = [graph.call("sqrt", graph.call("max", graph.zero, graph.div(pivot, S[r][r]))) for r, pivot in left]
     # sine, or length of a row beside its usual one: below it round-off decides how a motion goes on, and the program does not serve
@@ -89,14 +89,19 @@ def projected_coordinates(graph: Graph, q: list[int], closure: list[int]) -> lis
     """One step of Gauss-Newton towards `closure = 0`."""
     G = matrix(graph, closure, q)
     correction = solve_symmetric(graph, _products(graph, G, G, NormalForms(graph, 0)), [closure]).solution[0]
-    return [graph.sub(n, graph.total(graph.mul(row[k], c) for row, c in zip(G, correction, strict=True))) for k, n in enumerate(q)]
+    return _less(graph, q, G, correction)
 
 
 def projected_speeds(graph: Graph, M: Columns, A: Columns, u: list[int], phi: list[int], forms: NormalForms) -> list[int]:
     """The speeds on `phi = 0`, nearest in the metric of M."""
     impulses = solve_symmetric(graph, M, A).solution
     multipliers = solve_symmetric(graph, _products(graph, A, impulses, forms), [phi]).solution[0]
-    return [graph.sub(n, graph.total(graph.mul(x[k], m) for x, m in zip(impulses, multipliers, strict=True))) for k, n in enumerate(u)]
+    return _less(graph, u, impulses, multipliers)
+
+
+def _less(graph: Graph, x: list[int], rows: Columns, factors: list[int]) -> list[int]:
+    """`x - rows' factors`"""
+    return [graph.sub(n, graph.dot(column, factors)) for n, *column in zip(x, *rows, strict=True)]
 
 
 def _products(graph: Graph, A: Columns, X: Columns, forms: NormalForms) -> Columns:

@@ -106,13 +106,9 @@ def jumps(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: 
     """Return the numbers at whose zeros, between probes, an output jumps."""
     size = np.nanmax(np.abs(probes(outputs)), axis=1, initial=0.0)
 
-    def change(pair: tuple[Probes, Probes]) -> np.ndarray:
-        before, behind = (here(outputs)[:, 0] for here in pair)
-        return np.abs(behind - before)
-
     def jumps_at(number: int) -> bool:
-        near = [(change(place(1e-9)), change(place(ASIDE))) for place in _places(number, probes)]
-        return any(np.any((closer > AGREE * size) & (closer > 0.5 * wide)) for closer, wide in near)
+        changes = ([np.abs(behind(outputs) - before(outputs))[:, 0] for before, behind in map(place, (1e-9, ASIDE))] for place in _places(number, probes))
+        return any(np.any((closer > AGREE * size) & (closer > 0.5 * wide)) for closer, wide in changes)
 
     return tuple(n for n in numbers if jumps_at(n))
 

@@ -19,7 +19,7 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.build.plausibility import faults_at
 from jourdain_jax.build.row_program import row_program
@@ -49,25 +49,23 @@ def integrate(setup: Setup) -> Trajectory:
 def _one_motion(setup: Setup) -> Trajectory:
     given = _with_machine_code(_prepared(setup))
     setup, asked = _entered(given)
-    if setup.usual is not None:
-        setup = setup._replace(start=projected(setup.scene, setup.t0, setup.start, setup.inputs(setup.t0), setup.usual))
     begun, fitting = _begin(setup), setup.fitting()
     return _finish(given, fitting, asked, begun, setup.integrator.solved(fitting, begun))
 
 
-def _compiler_options(setup: Setup) -> dict | None:
-    """Those that save most for what is compiled; the arrays of the setup are not looked at."""
-    # The steps by machine code are no part of it: a first motion of a disc takes 0.9 s of processor time in place of 1.8, of a bicycle 1.1 in place of 1.8; a
-    # motion with 201 saved times takes 0.34 ms instead of 0.27, and 2.10 instead of 2.05.
-    return None if setup.reason_against_machine_code else RUN_SELDOM
+# The options save most for what is compiled, of which the steps by machine code are no part: a first motion of a disc takes 0.9 s of processor time in place
+# of 1.8, of a bicycle 1.1 in place of 1.8; a motion with 201 saved times takes 0.34 ms instead of 0.27, and 2.10 instead of 2.05.
+_compiled = for_programs(_one_motion, lambda setup: None if setup.reason_against_machine_code else RUN_SELDOM)
 
 
-_compiled = for_programs(_one_motion, _compiler_options)
+def _numbers(setup: Setup) -> dict:
+    """What a motion is differentiated with respect to."""
+    return {name: getattr(setup, name) for name in ("scene", "start", "inputs", "t0", "t1", "ts")}
 
 
 def _prepared(setup: Setup) -> Setup:
     """The setup with all numbers in the default precision (derivatives keep the type of what is differentiated)."""
-    return setup._replace(**in_default_precision({name: getattr(setup, name) for name in ("scene", "start", "inputs", "t0", "t1", "ts")}))
+    return setup._replace(**in_default_precision(_numbers(setup)))
 
 
 def _with_machine_code(setup: Setup) -> Setup:
@@ -91,19 +89,19 @@ def _entered(setup: Setup) -> tuple[Setup, Float[Array, ""]]:
     """The setup, whose derivatives are zero where nothing is asked of its motion, and NaN where what failed is;
     and the zero by which `_finish` tells (`calculus/markers.py`).
     """
-    names = ("scene", "start", "inputs", "t0", "t1", "ts")
-    numbers, rest = eqx.partition({name: getattr(setup, name) for name in names}, eqx.is_inexact_array)
+    numbers, rest = eqx.partition(_numbers(setup), eqx.is_inexact_array)
     leaves, treedef = jax.tree.flatten(numbers)
     each, asked = zip(*map(entered, lanes_first(leaves)), strict=True)  # also of what all motions share
     return setup._replace(**eqx.combine(jax.tree.unflatten(treedef, each), rest)), sum(asked)
 
 
 def _begin(setup: Setup) -> Begun:
-    timely = times_fit(setup.ts, setup.t0, setup.t1)
-    right, start = _without_faults(setup)
-    field, scene = setup.field, setup.scene
+    field, scene, start = setup.field, setup.scene, setup.start
+    if setup.usual is not None:
+        start = projected(scene, setup.t0, start, setup.inputs(setup.t0), setup.usual)
+    right, start = _without_faults(setup, start)
     args = field, scene, setup.inputs, field.fixed(scene), setup.t0
-    return Begun(right, timely, start, args, field.pack(start.q, start.u))
+    return Begun(right, times_fit(setup.ts, setup.t0, setup.t1), start, args, field.pack(start.q, start.u))
 
 
 def _finish(given: Setup, setup: Setup, asked: Float[Array, ""], begun: Begun, solved: Solved) -> Trajectory:
@@ -137,21 +135,14 @@ def _finish(given: Setup, setup: Setup, asked: Float[Array, ""], begun: Begun, s
     lost = energy_lost(energies_near(setup, args, *states), solved.accepted) if conserves(setup) else False
     violated = rows_violated(setup, states[0], *found[:2]) if field.rows_may_contradict else False
     drifted = jnp.nanmax(moved_by) > MOST_STEP_ERRORS * (1 + solved.accepted) if puts_back else False
-    code = jnp.where(results.is_success(solved.code) & drifted, results.OFF_CONSTRAINTS, solved.code)
-    code = jnp.where(results.is_success(code) & lost, results.ENERGY_LOST, code)
-    code = jnp.where(results.is_success(code) & violated, results.CONTRADICTORY_ROWS, code)
+    code = solved.code
+    for found_out, cause in ((drifted, results.OFF_CONSTRAINTS), (lost, results.ENERGY_LOST), (violated, results.CONTRADICTORY_ROWS)):
+        code = jnp.where((code <= results.EVENT) & found_out, cause, code)
     unwatched = reason_against_watching(setup)
-    result = results.with_causes(
-        _result(code, solved.y_end, start, pivot if field.needs_pivot else jnp.inf),
-        parameters=begun.right,
-        times=begun.timely,
-        start=jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)),
-        moved=solved.accepted > 0,
-        resolved=jnp.asarray(setup.tolerances[0] >= jnp.finfo(start.q.dtype).eps),
-    )
-    failed = ~results.is_success(result)
+    result = _result(setup, begun, solved, code, pivot if field.needs_pivot else jnp.inf)
+    failed = result > results.EVENT
     # what the steps did not notice happened at a time that is not known
-    passed = (result == results.SINGULAR_PARTITION) & (pivot > 0) & ~results.is_success(solved.code)
+    passed = (result == results.SINGULAR_PARTITION) & (pivot > 0) & (solved.code > results.EVENT)
     noticed = passed | (result == solved.code) | (result == results.NOT_FINITE)
     beyond = failed & ~(noticed & jnp.append(valid, False))  # of the saved states, and of the end
 
@@ -197,9 +188,9 @@ def _step_errors(setup: Setup, free: Integrated, y: Integrated) -> Float[Array, 
     return jnp.max(jnp.stack([jnp.max(jnp.abs(a - b) / (atol + rtol * jnp.abs(b)), initial=0.0) for a, b in parts]))
 
 
-def _without_faults(setup: Setup):
+def _without_faults(setup: Setup, start: State) -> tuple[Bool[Array, ""], State]:
     """Return whether parameters, bodies and contacts are right, and the start: NaN where they are not, so that such a lane ends at once."""
-    scene, t0, start, field = setup.scene, setup.t0, setup.start, setup.field
+    scene, t0, field = setup.scene, setup.t0, setup.field
     program = row_program(scene) if isinstance(field, ByProgram) and field.native else None
     if program is None or unsupported(program.graph, [program.right]):
         right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *faults_at(scene, t0, start.q, start.u, setup.inputs(t0)).values()]))
@@ -208,14 +199,20 @@ def _without_faults(setup: Setup):
     return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u)))
 
 
-def _result(code, y_end: Integrated, start: State, pivot):
-    """The result code, with what the end state says."""
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(part)) for part in jax.tree.leaves((y_end.q, y_end.v))]))
-    code = jnp.where(finite, code, results.NOT_FINITE)
+def _result(setup: Setup, begun: Begun, solved: Solved, code, pivot) -> Int[Array, ""]:
+    """Return the result code, with the cause where one is known; what comes later counts more."""
+    start, end = begun.start, solved.y_end
+    eps, finite = jnp.finfo(start.q.dtype).eps, lambda *parts: jnp.all(jnp.isfinite(jnp.concatenate(parts)))
+    code = jnp.where(finite(end.q, end.v), code, results.NOT_FINITE)
     # a change of sign, or so small, means that the partition into privileged and dependent speeds was lost
     code = jnp.where(pivot < SMALLEST_PIVOT, results.SINGULAR_PARTITION, code)
-    tolerance = 1e3 * jnp.sqrt(jnp.finfo(start.q.dtype).eps)
-    return jnp.where(start.residual <= tolerance, code, results.INCONSISTENT_START).astype(jnp.int32)
+    code = jnp.where(start.residual <= 1e3 * jnp.sqrt(eps), code, results.INCONSISTENT_START)
+    code = jnp.where((code == results.STEP_TOO_SMALL) & ~(setup.tolerances[0] >= eps), results.UNRESOLVED, code)
+    # no step, however short: the accelerations themselves are at fault
+    code = jnp.where((code == results.STEP_TOO_SMALL) & (solved.accepted == 0), results.NOT_FINITE, code)
+    code = jnp.where(finite(start.q, start.u), code, results.BAD_START)
+    code = jnp.where(begun.timely, code, results.BAD_TIMES)
+    return jnp.where(begun.right, code, results.BAD_PARAMETER).astype(jnp.int32)
 
 
 MOST_STEP_ERRORS = 10  # times what N steps at their tolerance change

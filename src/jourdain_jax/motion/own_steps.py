@@ -66,22 +66,78 @@ class OwnSteps(Integrator):
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
         if setup.reason_against_machine_code:
-            return self._in_modes(_by_xla)(setup, begun)
-        form = _form(setup)
-        rules = Rules(pushed_by_jax(_by_machine_code), _pulled, lambda *_: reason_against_derivatives(form, 2))
-        return _on_times(_by_machine_code if self.alongside else with_rules(_by_machine_code, rules), setup, begun)
+            return self._in_modes(lambda mode, setup, begun: self._by_xla(mode, setup, begun.y0, begun.args, setup.ts, setup.knots))(setup, begun)
+        run, form = self._by_machine_code, self._form(setup)
+        rules = Rules(pushed_by_jax(run), self._pulled, lambda *_: reason_against_derivatives(form, 2))
+        return _on_times(run if self.alongside else with_rules(run, rules), form, setup, begun)
 
     def lanes_solved(self, setups: Setup, begun: Begun) -> Solved:
         serves = not setups.reason_against_machine_code
         if (program := setups.field.lowered) is None or serves or not isinstance(self.solver, Method):
             return super().lanes_solved(setups, begun)
-        return self._in_modes(lambda mode, *lanes: in_blocks(partial(_lanes_by_xla, mode), width(program), *lanes))(setups, begun)
+        return self._in_modes(lambda mode, *lanes: in_blocks(partial(self._lanes_by_xla, mode), width(program), *lanes))(setups, begun)
 
     def _in_modes(self, by_xla: Callable) -> Callable:
         """Return a function of a mode, a setup and its beginning as a function of these two that serves both modes."""
         forward = partial(by_xla, "forward")
         return forward if self.alongside else by_modes(forward, partial(by_xla, "reverse"), SECOND_ORDER_MESSAGE)
 
+    def _lanes_by_xla(self, mode: Mode, setups: Setup, begun: Begun) -> Solved:
+        """Lanes in lockstep: their axis comes first outside and last inside."""
+        y0, ts, knots = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), (begun.y0, setups.ts, eqx.filter_vmap(lambda s: s.knots)(setups)))
+        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), self._by_xla(mode, setups, y0, begun.args, ts, knots))
+
+    def _by_xla(self, mode: Mode, setup: Setup, y0, args, ts, knots) -> Solved:
+        field, goals = setup.field, setup.goals(ts)
+        args = args if knots is None else integrands.within(jnp.full_like(setup.t0, jnp.inf), args)
+        relations, relation_count = watched(field, setup.inputs, bool(self.event_names))
+        rtol, atol, longest = (jnp.broadcast_to(x, setup.t0.shape) for x in (*setup.tolerances, setup.longest))
+        problem = Problem(
+            rates=integrands.rates,
+            args=args,
+            project=integrands.project if field.projects else None,
+            events=integrands.events if self.event_names else None,
+            norm=integrands.state_norm,
+            rtol=rtol,
+            atol=atol,
+            shortest=setup.shortest,
+            longest=longest,
+            max_steps=setup.most_steps(knots),
+            knots=knots,
+            rates_and_pivots=integrands.rates_and_pivots if field.has_pivots else None,
+            near_rank_loss=field.near_rank_loss,
+            relations=relations,
+            relation_count=relation_count,
+            span=jnp.abs(goals[-1]),
+            within=None if knots is None else integrands.within,
+        )
+        ys, reached, end = erk_loop.integrate(problem, self.solver, y0, jnp.zeros_like(setup.t0), goals, setup.dt0, mode)
+        ys = jax.tree.map(lambda x: x[:-1], ys)
+        counted = (jnp.zeros_like(end.accepted), jnp.full_like(end.t, jnp.inf)) if end.crossings is None else (end.crossings.count, end.crossings.together)
+        return Solved(goals[:-1], ys, reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, end.pivot, *counted)
+
+    def _form(self, setup: Setup) -> Form:
+        return native_motion.form_of(setup.field, setup.inputs, bool(self.event_names))
+
+    def _by_machine_code(self, setup: Setup, begun: Begun) -> Solved:
+        form, start = self._form(setup), native_motion.start_of(setup, begun)
+        assert isinstance(self.solver, Method)
+        return native_motion.solved(form.layout, start.goals, flow(form, self.solver, self.order)(start))
+
+    def _pulled(self, perturbed: tuple, arguments: tuple[Setup, Begun], found: Solved, g: Solved) -> tuple:
+        """Cotangents of what varies, from those of the motion that was found."""
+        setup, begun = arguments
+        sampled = [channel for channel in (*perturbed[0].inputs.channels, *perturbed[1].args[2].channels) if isinstance(channel, Sampled)]
+        if any(jax.tree.leaves(sampled)):
+            raise DifferentiationModeError(OF_SAMPLES)
+        asked = [bool(varies) for varies in native_motion.known_of(perturbed[1].args)]
+        assert isinstance(self.solver, Method)
+        by_start, by_known = native_motion.cotangents(self._form(setup), self.solver, native_motion.start_of(setup, begun), asked, g)
+        by_setup, by_begun = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, (setup, begun))
+        field, scene, inputs, fixed, origin = by_begun.args
+        y0 = jax.tree.map(lambda varies, by: by if varies else None, perturbed[1].y0, by_start)
+        args = field, scene, native_motion.with_known(inputs, by_known[len(fixed) :]), tuple(by_known[: len(fixed)]), origin
+        return by_setup, eqx.tree_at(lambda b: (b.y0, b.args), by_begun, (y0, args), is_leaf=lambda x: x is None)
 
 def own_steps(solver, **static) -> OwnSteps | None:
     """Return our own loop where it has the solver; None for solvers of diffrax."""
@@ -92,60 +148,14 @@ def own_steps(solver, **static) -> OwnSteps | None:
     return OwnSteps(method, **static)
 
 
-def _by_xla(mode: Mode, setup: Setup, begun: Begun) -> Solved:
-    return _loop(mode, setup, begun.y0, begun.args, setup.ts, setup.knots)
-
-
-def _lanes_by_xla(mode: Mode, setups: Setup, begun: Begun) -> Solved:
-    """Lanes in lockstep: their axis comes first outside and last inside."""
-    y0, ts, knots = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), (begun.y0, setups.ts, eqx.filter_vmap(lambda s: s.knots)(setups)))
-    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), _loop(mode, setups, y0, begun.args, ts, knots))
-
-
-def _loop(mode: Mode, setup: Setup, y0, args, ts, knots) -> Solved:
-    field, own = setup.field, _own(setup)
-    goals = setup.goals(ts)
-    args = args if knots is None else integrands.within(jnp.full_like(setup.t0, jnp.inf), args)
-    relations, relation_count = watched(field, setup.inputs, bool(own.event_names))
-    problem = Problem(
-        rates=integrands.rates,
-        args=args,
-        project=integrands.project if field.projects else None,
-        events=integrands.events if own.event_names else None,
-        norm=integrands.state_norm,
-        rtol=jnp.broadcast_to(setup.tolerances[0], setup.t0.shape),
-        atol=jnp.broadcast_to(setup.tolerances[1], setup.t0.shape),
-        shortest=setup.shortest,
-        longest=jnp.broadcast_to(setup.longest, setup.t0.shape),
-        max_steps=setup.most_steps(knots),
-        knots=knots,
-        rates_and_pivots=integrands.rates_and_pivots if field.has_pivots else None,
-        near_rank_loss=field.near_rank_loss,
-        relations=relations,
-        relation_count=relation_count,
-        span=jnp.abs(goals[-1]),
-        within=None if knots is None else integrands.within,
-    )
-    ys, reached, end = erk_loop.integrate(problem, own.solver, y0, jnp.zeros_like(setup.t0), goals, setup.dt0, mode)
-    ys = jax.tree.map(lambda x: x[:-1], ys)
-    counted = (jnp.zeros_like(end.accepted), jnp.full_like(end.t, jnp.inf)) if end.crossings is None else (end.crossings.count, end.crossings.together)
-    return Solved(goals[:-1], ys, reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, end.pivot, *counted)
-
-
-def _by_machine_code(setup: Setup, begun: Begun) -> Solved:
-    own, form, start = _own(setup), _form(setup), native_motion.start_of(setup, begun)
-    assert isinstance(own.solver, Method)
-    return native_motion.solved(form.layout, start.goals, flow(form, own.solver, own.order)(start))
-
-
-def _on_times(run: Callable[[Setup, Begun], Solved], setup: Setup, begun: Begun) -> Solved:
+def _on_times(run: Callable[[Setup, Begun], Solved], form: Form, setup: Setup, begun: Begun) -> Solved:
     """The motion that `run` finds from a number to others, its start and states moved to the times of the setup.
 
     A time is the goal where that was reached, is found by the loop itself where a stop event ended the motion before, and lies at a number after the start
     otherwise.
     """
     numbers, (field, scene, inputs, fixed, start) = jax.lax.stop_gradient, begun.args
-    moved = native_motion.mover(begun.args, _form(setup))
+    moved = native_motion.mover(begun.args, form)
     goals, later = setup.goals(setup.ts), start - numbers(start)
     y0 = moved(begun.y0, start, -later)
     setup = setup._replace(**{name: numbers(getattr(setup, name)) for name in ("ts", "t0", "t1")})
@@ -165,33 +175,6 @@ def _on_times(run: Callable[[Setup, Begun], Solved], setup: Setup, begun: Begun)
             found.t_end + jnp.where(event, -later, jnp.where(by_goal[-1], goals[-1] - number[-1], 0.0)),
         ),
     )
-
-
-def _own(setup: Setup) -> OwnSteps:
-    assert isinstance(setup.integrator, OwnSteps)
-    return setup.integrator
-
-
-def _form(setup: Setup) -> Form:
-    return native_motion.form_of(setup.field, setup.inputs, bool(setup.integrator.event_names))
-
-
-def _pulled(perturbed: tuple, arguments: tuple[Setup, Begun], found: Solved, g: Solved) -> tuple:
-    """Cotangents of what varies, from those of the motion that was found."""
-    setup, begun = arguments
-    sampled = [channel for channel in (*perturbed[0].inputs.channels, *perturbed[1].args[2].channels) if isinstance(channel, Sampled)]
-    if any(jax.tree.leaves(sampled)):
-        raise DifferentiationModeError(OF_SAMPLES)
-    asked = [bool(varies) for varies in native_motion.known_of(perturbed[1].args)]
-    method = _own(setup).solver
-    assert isinstance(method, Method)
-    by_start, by_known = native_motion.cotangents(_form(setup), method, native_motion.start_of(setup, begun), asked, g)
-    none_else = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, (setup, begun))
-    by_setup, (field, scene, inputs, fixed, origin) = none_else[0], none_else[1].args
-    y0 = jax.tree.map(lambda varies, by: by if varies else None, perturbed[1].y0, by_start)
-    inputs = native_motion.with_known(inputs, by_known[len(fixed) :])
-    args = field, scene, inputs, tuple(by_known[: len(fixed)]), origin
-    return by_setup, eqx.tree_at(lambda b: (b.y0, b.args), none_else[1], (y0, args), is_leaf=lambda x: x is None)
 
 
 def watched(field: VectorField, inputs: Inputs, has_events: bool) -> tuple[Callable | None, int]:

@@ -11,7 +11,6 @@ little of the mode is left. A motion that ran out of steps with h r near that nu
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -34,7 +33,6 @@ from jourdain_jax.motion.vector_fields.field import VectorField, as_formulation
 OUT_OF_STEPS = (results.MAX_STEPS, results.SHRANK)
 
 RERUN_FIELDS = ("state_form", "reduction", "solver", "projected", "unwatched")  # of a trajectory, static: they say how a lane was run again
-Motions = TypeVar("Motions", bound=Trajectory)
 
 
 def retried(run: Callable[[AllOptions], tuple[Setup, Trajectory]], setup: Setup, motion: Trajectory, options: AllOptions) -> Trajectory:
@@ -57,7 +55,8 @@ def lanes_retried(
         for way in np.unique(again[again > 0]).tolist():
             chosen, changed = np.flatnonzero(again == way), _with_retries(way, options)
             for first in range(0, len(chosen), chunk):
-                index = chosen[np.minimum(np.arange(first, first + min(chunk, _round_up(len(chosen)))), len(chosen) - 1)]
+                size = min(chunk, max(8, 1 << (len(chosen) - 1).bit_length()))  # a power of two, so that few programs are compiled
+                index = chosen[np.minimum(np.arange(first, first + size), len(chosen) - 1)]
                 new = run(changed, index)
                 lanes, reruns[way] = _replaced(lanes, _marked(new, way), index), tuple(getattr(new, name) for name in RERUN_FIELDS)
     return lanes, tuple(sorted(reruns.items()))
@@ -74,11 +73,6 @@ def _next_retries(form: Callable[[AllOptions], VectorField], lanes: Trajectory, 
     return found
 
 
-def _round_up(count: int) -> int:
-    """Round up to a power of two, at least 8, so that few programs are compiled."""
-    return max(8, 1 << (count - 1).bit_length())
-
-
 def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajectory:
     """Replace the lanes at `index` by those of another run."""
     leaves, treedef = jax.tree.flatten(lanes)
@@ -93,7 +87,7 @@ def _next_retry(field: VectorField, motion: Trajectory, t0, options: AllOptions)
 
     `field`: how it was integrated; `options`: those that were given.
     """
-    if np.all(np.isin(known_numbers(motion.result), (results.SUCCESS, results.EVENT))):
+    if np.all(known_numbers(motion.result) <= results.EVENT):
         return results.AS_ASKED
     tried, solver, backend = int(motion.fallback), options.solver, options.backend
     another = field.name == "minimal" or field.lowered is not None  # the full state by dense matrices
@@ -117,7 +111,7 @@ def _with_retries(retries: int, options: AllOptions) -> AllOptions:
     return options
 
 
-def _marked(motion: Motions, retries: int) -> Motions:
+def _marked(motion: Trajectory, retries: int) -> Trajectory:
     """A motion, or several, marked as run again by these retries; where it is out of steps once more, it is called stiff."""
     code = motion.result
     if retries & results.IMPLICIT:

@@ -5,7 +5,6 @@ Rates, projection and events are given tau, and the scene and its inputs t0 + ta
 """
 
 import abc
-from operator import attrgetter
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -97,9 +96,12 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     reference: Reference | None = None  # of a model: what is compiled for one serves those that decide alike
 
     def fitting(self) -> "Setup":
-        """The setup with times that serve any loop, also where its own do not go together."""
-        of = attrgetter("ts", "t0", "t1", "dt0", "longest")
-        return eqx.tree_at(of, self, fitting_times(*of(self)))
+        """The setup with times that serve any loop: none beyond an end by round-off, and those of a short span where its own do not go together."""
+        ts, t0, t1 = self.ts, self.t0, self.t1
+        fits, direction = times_fit(ts, t0, t1), jnp.sign(t1 - t0)
+        inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
+        shares = {"ts": jnp.linspace(0.0, 1.0, len(ts), dtype=ts.dtype), "t0": 0.0, "t1": 1.0, "dt0": 0.1, "longest": 1.0}
+        return self._replace(**{name: jnp.where(fits, inside if name == "ts" else getattr(self, name), _SHORT * x) for name, x in shares.items()})
 
     @property
     def reason_against_machine_code(self) -> str:
@@ -143,12 +145,3 @@ def times_fit(ts, t0, t1) -> "Bool[Array, ''] | np.bool_":
     slack = 4 * np.finfo(ts.dtype).eps * xp.maximum(xp.abs(t0), xp.abs(t1))
     from_start, to_end = (ts[0] - t0) * direction, (t1 - ts[-1]) * direction
     return (direction != 0) & xp.isfinite(t1 - t0) & xp.all((ts[1:] - ts[:-1]) * direction > 0) & (from_start >= -slack) & (to_end >= -slack)
-
-
-def fitting_times(ts, t0, t1, dt0, longest):
-    """`ts`, `t0`, `t1`, the first step and the longest one where they go together, none beyond an end by round-off; otherwise those of a short span."""
-    fits, direction = times_fit(ts, t0, t1), jnp.sign(t1 - t0)
-    inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
-    short = _SHORT * jnp.linspace(0.0, 1.0, ts.shape[-1], dtype=ts.dtype), jnp.zeros_like(t0)
-    short += tuple(share * _SHORT * jnp.ones_like(x) for share, x in ((1.0, t1), (0.1, dt0), (1.0, longest)))
-    return tuple(jnp.where(fits, own, other) for own, other in zip((inside, t0, t1, dt0, longest), short, strict=True))

@@ -29,7 +29,7 @@ from jourdain_jax.motion.put_on_rows import State, Usual
 from jourdain_jax.motion.retries import retried
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
 from jourdain_jax.motion.setup import LONGEST, Setup, times_fit
-from jourdain_jax.motion.start import consistent, named_start
+from jourdain_jax.motion.start import named_start
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_speeds, one_time, shown_from_users_lines, users_level
@@ -108,7 +108,7 @@ def _integrated(setup: Setup) -> Trajectory:
         return integrate(setup)
     with nan_is_a_mark():
         motion = integrate(setup)
-    return motion if np.all(np.isin(known_numbers(motion.result), (results.SUCCESS, results.EVENT))) else integrate(setup)
+    return motion if np.all(known_numbers(motion.result) <= results.EVENT) else integrate(setup)
 
 
 def set_up(scene: Scene | BuiltFor, start=None, *, t0=None, t1=None, ts=None, inputs=None, options: Options | None = None, **by_name) -> Setup:
@@ -154,11 +154,9 @@ def _start(model: Model, given, t0, inputs: Inputs) -> tuple[State, Usual | None
     """Return the start on its constraints; or a `State` as it is, and the sizes by which the program that integrates projects it."""
     if not (model.formulation.projects and isinstance(given, State)):
         return as_state(model, given, t0=t0, inputs=inputs_at(inputs, t0)), None
-    if nothing_is_traced():
-        q, u = as_coordinates(model.scene, given.q), as_speeds(model.scene, given.u)
-        as_given = q is given.q and u is given.u
-        return given if as_given else eqx.tree_at(lambda s: (s.q, s.u), given, (q, u)), model.usual(False)
-    return consistent(model, t0, given.q, given.u, inputs_at(inputs, t0)), None
+    q, u = as_coordinates(model.scene, given.q), as_speeds(model.scene, given.u)
+    as_given = q is given.q and u is given.u
+    return given if as_given else eqx.tree_at(lambda s: (s.q, s.u), given, (q, u)), model.usual(False)
 
 
 def solver_of(options: AllOptions) -> tuple["diffrax.AbstractSolver | ImplicitMethod | Method", int | None]:

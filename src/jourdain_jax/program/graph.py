@@ -9,6 +9,7 @@ import math
 import threading
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from functools import reduce
 
 import numpy as np
 
@@ -123,10 +124,7 @@ class Graph:
         (s, i), (c, j) = (*more.items(), *less.items())
         if i != 2 or j != 2 or {self.op[s], self.op[c]} != {"sin", "cos"} or self.args[s] != self.args[c]:
             return None
-        product = self.one
-        for factor in (left & right).elements():
-            product = self.mul(product, factor)
-        return product
+        return self.product((left & right).elements())
 
     def _factors(self, node: int) -> list[int]:
         """Factors of a product of few; the node itself where it is none."""
@@ -290,10 +288,11 @@ class Graph:
 
     def total(self, terms: Iterable[int]) -> int:
         """The sum of nodes."""
-        result = self.zero
-        for term in terms:
-            result = self.add(result, term)
-        return result
+        return reduce(self.add, terms, self.zero)
+
+    def product(self, factors: Iterable[int]) -> int:
+        """The product of nodes."""
+        return reduce(self.mul, factors, self.one)
 
     def dot(self, a: Iterable[int], b: Iterable[int]) -> int:
         """sum a_i b_i"""
@@ -341,10 +340,7 @@ class Graph:
     def with_quotients(self, outputs: Iterable[int]) -> list[int]:
         """The outputs with `a (1/b)` as one division, where `1/b` serves only once."""
         outputs = list(outputs)
-        uses: dict[int, int] = {}
-        for node in self.reachable(outputs):
-            for a in self.args[node]:
-                uses[a] = uses.get(a, 0) + 1
+        uses = Counter(a for node in self.reachable(outputs) for a in self.args[node])
         new: dict[int, int] = {}
         for node in self.reachable(outputs):
             args = self.args[node]

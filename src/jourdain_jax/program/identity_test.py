@@ -21,6 +21,7 @@ import numpy as np
 from jourdain_jax.calculus.roots import pseudo_inverses
 from jourdain_jax.calculus.round_off import EPS, halves, with_bound
 from jourdain_jax.calculus.scalar_operations import TABLE
+from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.onto_rows import onto_rows
@@ -77,12 +78,8 @@ class IdentityProbes:
         """Whether no operation that the nodes need is replaced by another function."""
         return all(graph.op[n] in _KNOWN for n in graph.reachable(nodes))
 
-    def exchanged(self, names: Collection[str]) -> Self:
-        """Probes at each of which the named inputs have the value that they had at another probe; all others are kept."""
-        return self.exchanged_in_turn([names], np.arange(self.count))
-
-    def exchanged_in_turn(self, groups: Sequence[Collection[str]], at: np.ndarray) -> Self:
-        """The probes numbered `at` as `exchanged` makes them, group of names after group."""
+    def exchanged(self, groups: Sequence[Collection[str]], at: np.ndarray) -> Self:
+        """The probes numbered `at`, for each group of names in turn with the values that these inputs had at another probe; all others are kept."""
 
         def in_turn(name, x):
             x = np.broadcast_to(x, self.count)
@@ -110,35 +107,15 @@ def alike(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarr
 def unaffected(probes: IdentityProbes, nodes: list[int], replacement: Mapping[int, int]) -> dict[int, int]:
     """The replacements, each of one node by another, that by themselves change none of the `nodes`; `probes`: generic ones."""
     graph, here = probes.graph, probes(nodes)
-    users = _users(graph, nodes, list(replacement))
 
     def unchanged(old, new):
-        those = users[old]
+        those = [k for k, needs in enumerate(depend_on(graph, nodes, [old])) if needs]
         then = probes(graph.substituted([nodes[k] for k in those], {old: new}))
         before = here[those]
         before.error = here.error[those]
         return np.all(equal(then, before))
 
     return {old: new for old, new in replacement.items() if unchanged(old, new)}
-
-
-def _users(graph: Graph, outputs: Sequence[int], nodes: Sequence[int]) -> dict[int, list[int]]:
-    """Which of the outputs, by number, need each of the nodes."""
-    bit = {n: 1 << k for k, n in enumerate(nodes)}
-    needs: dict[int, int] = {}  # one bit for each of the nodes
-    for node in graph.reachable(outputs):
-        found = bit.get(node, 0)
-        for a in graph.args[node]:
-            found |= needs[a]
-        needs[node] = found
-    users: dict[int, list[int]] = {n: [] for n in nodes}
-    for k, output in enumerate(outputs):
-        left = needs[output]
-        while left:
-            lowest = left & -left
-            users[nodes[lowest.bit_length() - 1]].append(k)
-            left ^= lowest
-    return users
 
 
 def is_combination(a: np.ndarray, error: np.ndarray, rows: np.ndarray, errors: np.ndarray) -> bool:

@@ -217,21 +217,21 @@ def _select(graph: Graph, params, which, *cases):
     return graph.call("select", which, *cases)
 
 
-def _power(graph: Graph, x: int, y: int) -> int:
+def _power(graph: Graph, params, x: int, y: int) -> int:
     whole = graph.is_const(y) and graph.value[y].is_integer()
     return graph.power(x, int(graph.value[y])) if whole else graph.call("pow", x, y)
 
 
-def _round(graph: Graph, method, x: int) -> int:
-    if method != jax.lax.RoundingMethod.TO_NEAREST_EVEN:
+def _round(graph: Graph, params, x: int) -> int:
+    if params["rounding_method"] != jax.lax.RoundingMethod.TO_NEAREST_EVEN:
         raise Unsupported("rounding half away from zero")
     return graph.call("round", x)
 
 
 _ELEMENTWISE: dict[str, Callable] = {
     **{name: _call(name) for name in TABLE},
-    "pow": lambda graph, params, x, y: _power(graph, x, y),
-    "round": lambda graph, params, x: _round(graph, params["rounding_method"], x),
+    "pow": _power,
+    "round": _round,
     "add_any": _call("add"),
     "square": lambda graph, params, x: graph.mul(x, x),
     "rsqrt": lambda graph, params, x: graph.div(graph.one, graph.call("sqrt", x)),

@@ -7,6 +7,8 @@ factors are taken out greedily (Horner's scheme in several variables).
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from functools import reduce
+from operator import and_
 
 from jourdain_jax.program.graph import ARRAYS, Graph
 
@@ -116,27 +118,26 @@ class NormalForms:
             atom = self.graph.call("sqrt", self.rebuilt(p))
             return self._atom(atom) if self.graph.op[atom] == "sqrt" else self.expanded(atom)
         outside, inside = rooted
-        result = self._root(inside) if inside != {(): 1.0} else inside
-        for atom in outside:
-            result = self.product(result, self._magnitude(atom))
-        return result
+        return self._times(self._root(inside) if inside != {(): 1.0} else inside, self._magnitude, outside)
+
+    def _times(self, p: Polynomial, function: Callable[[int], Polynomial], atoms: Iterable[int]) -> Polynomial:
+        """p f(x) f(y) ... of some atoms."""
+        for atom in atoms:
+            p = self.product(p, function(atom))
+        return p
 
     def _rooted(self, p: Polynomial) -> tuple[list[int], Polynomial] | None:
         """Atoms to take out of the root, and what stays inside; None where nothing comes out."""
         if len(p) == 1:
             ((monomial, c),) = p.items()
-            inside, outside = list(monomial), []
-            for atom in set(monomial):
-                pairs = monomial.count(atom) // 2
-                outside += [atom] * pairs
-                for _ in range(2 * pairs):
-                    inside.remove(atom)
+            counts = Counter(monomial)
+            outside, inside = ([atom for atom, k in counts.items() for _ in range(share(k))] for share in (lambda k: k // 2, lambda k: k % 2))
             return (outside, {tuple(inside): c}) if outside else None
         if len(p) == 2:
             (small, c), (large, d) = sorted(p.items(), key=lambda item: len(item[0]))
-            extra = _rest(large, small)
-            if c == -d and len(extra) == 2 and extra[0] == extra[1] and self.graph.op[extra[0]] == "cos":
-                return [self.graph.call("sin", self.graph.args[extra[0]][0])], {small: c}
+            extra = Counter(large) - Counter(small)
+            if c == -d and len(large) == len(small) + 2 and [*extra.values()] == [2] and self.graph.op[min(extra)] == "cos":
+                return [self.graph.call("sin", self.graph.args[min(extra)][0])], {small: c}
         return None
 
     def _absolute(self, p: Polynomial) -> Polynomial:
@@ -144,10 +145,7 @@ class NormalForms:
         if len(p) != 1:
             return self._magnitude(self.rebuilt(p))
         ((monomial, c),) = p.items()
-        result: Polynomial = {(): abs(c)}
-        for atom in monomial:
-            result = self.product(result, self._magnitude(atom))
-        return result
+        return self._times({(): abs(c)}, self._magnitude, monomial)
 
     def _magnitude(self, node: int) -> Polynomial:
         sign = self._sign(node) if self.graph.varies[node] or self.graph.is_const(node) else 0  # parameters may have either sign
@@ -160,28 +158,22 @@ class NormalForms:
     def _reciprocal(self, p: Polynomial) -> Polynomial:
         if len(p) == 1:
             ((monomial, c),) = p.items()
-            result: Polynomial = {(): 1 / c}
-            for atom in monomial:
-                result = self.product(result, self._inverse_atom(atom))
-            return result
+            return self._times({(): 1 / c}, self._inverse_atom, monomial)
         return {(self.graph.div(self.graph.one, self.rebuilt(p)),): 1.0}
 
     def _inverse_atom(self, atom: int) -> Polynomial:
-        graph = self.graph
-        if graph.op[atom] == "div" and graph.args[atom][0] == graph.one:
-            return self.expanded(graph.args[atom][1])
-        return {(graph.div(graph.one, atom),): 1.0}
+        x = self._reciprocal_of(atom)
+        return {(self.graph.div(self.graph.one, atom),): 1.0} if x is None else self.expanded(x)
 
     def _atom(self, atom: int) -> Polynomial:
         graph, op = self.graph, self.graph.op[atom]
-        if op == "sin" and atom not in self._squares:
-            other = graph.call("cos", graph.args[atom][0])
-            self._squares[atom] = {(): 1.0, (other, other): -1.0}
-        elif op == "sqrt" and atom not in self._squares:
-            self._squares[atom] = self.expanded(graph.args[atom][0])
-        elif op == "abs" and atom not in self._squares:
-            x = self.expanded(graph.args[atom][0])
-            self._squares[atom] = self.product(x, x)
+        if atom not in self._squares and op in ("sin", "sqrt", "abs"):
+            if op == "sin":
+                other = graph.call("cos", graph.args[atom][0])
+                self._squares[atom] = {(): 1.0, (other, other): -1.0}
+            else:
+                x = self.expanded(graph.args[atom][0])
+                self._squares[atom] = x if op == "sqrt" else self.product(x, x)
         return {(atom,): 1.0}
 
     def product(self, p: Polynomial, q: Polynomial) -> Polynomial:
@@ -232,9 +224,8 @@ class NormalForms:
 
     def _cancelled(self, monomial: Monomial) -> Monomial:
         """Without pairs x, 1/x."""
-        known = self._reciprocals
         for atom in monomial:
-            x = known[atom] if atom in known else self._reciprocal_of(atom)
+            x = self._reciprocal_of(atom)
             if x is not None and x in monomial:
                 return self._cancelled(_without(_without(monomial, atom), x))
         return monomial
@@ -242,7 +233,8 @@ class NormalForms:
     def _reciprocal_of(self, atom: int) -> int | None:
         """x of an atom 1/x; None of any other."""
         graph = self.graph
-        self._reciprocals[atom] = graph.args[atom][1] if graph.op[atom] == "div" and graph.args[atom][0] == graph.one else None
+        if atom not in self._reciprocals:
+            self._reciprocals[atom] = graph.args[atom][1] if graph.op[atom] == "div" and graph.args[atom][0] == graph.one else None
         return self._reciprocals[atom]
 
     # and back
@@ -272,16 +264,10 @@ class NormalForms:
         graph = self.graph
         if not p:
             return graph.zero
-        common = list(sorted(q, key=len)[0])
-        for monomial in q:
-            common = [x for k, x in enumerate(common) if common[: k + 1].count(x) <= monomial.count(x)]
+        common = reduce(and_, map(Counter, q))
         scale = next(iter(q.values()))
-        rest = {m: c / scale for m, c in q.items()}
-        p = {m: c / scale for m, c in p.items()}
-        for atom in common:
-            p = self.product(p, self._inverse_atom(atom))
-            rest = {_without(m, atom): c for m, c in rest.items()}
-        divisor = self.rebuilt(rest)
+        p = self._times({m: c / scale for m, c in p.items()}, self._inverse_atom, common.elements())
+        divisor = self.rebuilt({tuple((Counter(m) - common).elements()): c / scale for m, c in q.items()})
         return graph.div(self.rebuilt(p), divisor) if graph.varies[divisor] else self.rebuilt(p, None if divisor == graph.one else divisor)
 
     def cramer(self, M: list[list[int]], f: list[int]) -> list[int]:
@@ -305,54 +291,18 @@ class NormalForms:
 
     def _coefficient(self, p: Polynomial) -> int:
         """A polynomial in parameters alone: how many operations it takes does not matter."""
-        graph = self.graph
-        total = graph.zero
-        for monomial, c in sorted(p.items()):
-            product = graph.one
-            for atom in monomial:
-                product = graph.mul(product, atom)
-            total = graph.add(total, graph.mul(graph.const(c), product))
-        return total
+        return self.graph.total(self.graph.mul(self.graph.const(c), self.graph.product(monomial)) for monomial, c in sorted(p.items()))
 
     def _horner(self, terms: list[tuple[Monomial, bool]]) -> int:
         graph = self.graph
-        if not terms:
-            return graph.zero
-        if len(terms) == 1:
-            factors, positive = terms[0]
-            return self._signed(self._product(factors), positive)
-        counts: Counter[int] = Counter()
-        for factors, _ in terms:
-            counts.update(set(factors))
+        counts = Counter(factor for factors, _ in terms for factor in set(factors))
         factor, count = max(counts.items(), key=lambda item: (item[1], graph.varies[item[0]], item[0]), default=(graph.one, 0))
         if count < 2:
-            total = graph.zero
-            for factors, positive in sorted(terms):
-                total = graph.add(total, self._signed(self._product(factors), positive))
-            return total
+            products = ((graph.product(sorted(factors, key=graph.varies.__getitem__)), positive) for factors, positive in sorted(terms))  # parameters first
+            return graph.total(product if positive else graph.neg(product) for product, positive in products)
         inside = [(_without(f, factor), s) for f, s in terms if factor in f]
         outside = [(f, s) for f, s in terms if factor not in f]
         return graph.add(graph.mul(factor, self._horner(inside)), self._horner(outside))
-
-    def _product(self, factors: Monomial) -> int:
-        graph = self.graph
-        fixed = [f for f in factors if not graph.varies[f]]
-        product = graph.one
-        for factor in [*fixed, *(f for f in factors if graph.varies[f])]:
-            product = graph.mul(product, factor)
-        return product
-
-    def _signed(self, node: int, positive: bool) -> int:
-        return node if positive else self.graph.neg(node)
-
-
-def _rest(large: Monomial, small: Monomial) -> Monomial:
-    """What is left of `large` without the factors of `small`; nothing where it does not hold them."""
-    for factor in small:
-        if factor not in large:
-            return ()
-        large = _without(large, factor)
-    return large
 
 
 def _without(factors: Monomial, factor: int) -> Monomial:
@@ -361,13 +311,9 @@ def _without(factors: Monomial, factor: int) -> Monomial:
 
 
 def _put(p: Polynomial, monomial: Monomial, c: float) -> None:
-    old = p.get(monomial)
-    if old is None:
-        p[monomial] = c
-        return
-    new = old + c
+    new = p.get(monomial, 0.0) + c
     if abs(new) <= 1e-13 * abs(c):  # cancelled, up to the round-off of the numbers in the scene
-        del p[monomial]
+        p.pop(monomial, None)
     else:
         p[monomial] = new
 

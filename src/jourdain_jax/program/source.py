@@ -1,5 +1,6 @@
 """A graph as text: readable Python, C, or SymPy expressions. What is used more than once gets a name of its own."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -33,12 +34,7 @@ C = Language("c", "", "    const double {name} = {value};")
 def statements(graph: Graph, outputs: Sequence[int], names: Mapping[int, str], language: Language, prefix: str = "s") -> tuple[list[str], list[str]]:
     """Lines that name what is used more than once, and the expressions of the outputs. `names`: of inputs and of nodes known already."""
     nodes = _needed(graph, outputs, names)
-    uses: dict[int, int] = {}
-    for node in nodes:
-        for a in graph.args[node]:
-            uses[a] = uses.get(a, 0) + 1
-    for node in outputs:
-        uses[node] = uses.get(node, 0) + 1
+    uses = Counter([*outputs, *(a for node in nodes for a in graph.args[node])])
     written: dict[int, tuple[str, int]] = {n: (name, 9) for n, name in names.items()}  # text and how tightly it binds
     lines: list[str] = []
     for node in nodes:

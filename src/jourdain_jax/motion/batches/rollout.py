@@ -71,7 +71,7 @@ class Rollout(Printed, eqx.Module):
     @property
     def failed(self) -> np.ndarray:
         """Numbers of the lanes that reached neither their end nor an event."""
-        return np.flatnonzero((self.result != results.SUCCESS) & (self.result != results.EVENT))
+        return np.flatnonzero(self.result > results.EVENT)
 
     @property
     def continued(self) -> np.ndarray:
@@ -123,7 +123,7 @@ class Rollout(Printed, eqx.Module):
                 events = np.asarray(self.lanes.event)[lanes]
                 named = " " + ", ".join(f"`{self.lanes.event_names[i]}` {int(np.sum(events == i))}" for i in np.unique(events))
             elif code != results.SUCCESS:
-                named = self._wrong_parameters(lanes[:10]) if code == results.BAD_PARAMETER else ""
+                named = f" ({', '.join(dict.fromkeys(name for i in lanes[:10] for name in self.lane(int(i)).faults))})" if code == results.BAD_PARAMETER else ""
                 named += ": lanes " + ", ".join(map(str, lanes[:10])) + (" ..." if lanes.size > 10 else "")
             lines.append(f"  {lanes.size} {message}{named}")
         if self.continued.size:
@@ -136,9 +136,6 @@ class Rollout(Printed, eqx.Module):
         steps = np.asarray(self.lanes.accepted)
         lines.append(f"  steps accepted: {steps.min()} to {steps.max()}, median {int(np.median(steps))}")
         return "\n".join(lines)
-
-    def _wrong_parameters(self, lanes: np.ndarray) -> str:
-        return f" ({', '.join(dict.fromkeys(name for i in lanes for name in self.lane(int(i)).faults))})"
 
 
 @shown_from_users_lines

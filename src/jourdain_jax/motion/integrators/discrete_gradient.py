@@ -22,7 +22,7 @@ from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.virtual_power import energies_at
-from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, Solution
+from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, Solution, sizes
 from jourdain_jax.motion.integrators.problem import Problem
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
@@ -64,9 +64,7 @@ def _solved(args, t, h, y: Integrated) -> Solution:
     n, z0 = y.q.shape[0], jnp.concatenate([y.q, y.v])
     H0 = _energy(args, t, z0, n)
     guess = h * jnp.concatenate(_rates(args, t, y.q, y.v))
-    size = jnp.max(jnp.abs(z0)) + jnp.max(jnp.abs(guess))
-    scale = jnp.broadcast_to(jnp.where(size == 0, 1.0, size), z0.shape)
-    found = newton_root(lambda d: _residual(args, t, h, n, z0, H0, d), guess, jax.lax.stop_gradient(scale))
+    found = newton_root(lambda d: _residual(args, t, h, n, z0, H0, d), guess, sizes(len(z0), z0, guess))
     change = jnp.where(found.converged, found.x, 0.0)
     return Solution(Integrated(change[:n], change[n:], jax.tree.map(jnp.zeros_like, y.work)), None, found.converged)
 

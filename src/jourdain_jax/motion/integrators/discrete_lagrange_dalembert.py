@@ -29,7 +29,7 @@ from jourdain_jax.equations.lagrange import speeds_are_rates
 from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.rows import position_residual, velocity_residual
 from jourdain_jax.equations.virtual_power import energies_at, resultants
-from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, Solution
+from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, Solution, sizes
 from jourdain_jax.motion.integrators.problem import Problem
 from jourdain_jax.motion.vector_fields.by_matrices import full_without_projection
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
@@ -161,10 +161,9 @@ def _solved(args, over: Interval, y: Integrated) -> Solution:
     A0 = jax.jacfwd(lambda u: _kept(scene, velocity_residual(scene, over.t0, q0, u, inputs(over.t0))))(u0)
     p0 = momentum(scene, over.t0, q0, u0, inputs(over.t0))
     guess = jnp.concatenate([h * u0, jnp.zeros(A0.shape[0], q0.dtype)])
-    size = jnp.max(jnp.abs(q0)) + jnp.max(jnp.abs(h * u0))
     # impulses follow from coordinates: they are right when those are
-    scale = jnp.where(jnp.arange(guess.shape[0]) < n, jnp.where(size == 0, 1.0, size), jnp.inf)
-    found = newton_root(lambda x: _residual(args, over, q0, p0, A0, x), guess, jax.lax.stop_gradient(scale))
+    scale = jnp.where(jnp.arange(len(guess)) < n, sizes(len(guess), q0, h * u0), jnp.inf)
+    found = newton_root(lambda x: _residual(args, over, q0, p0, A0, x), guess, scale)
     q1 = q0 + found.x[:n]
     u1 = _projected(args, over, q0, q1)
     solved = found.converged & jnp.all(jnp.isfinite(u1))

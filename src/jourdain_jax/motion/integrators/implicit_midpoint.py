@@ -1,12 +1,11 @@
 """The implicit midpoint rule, on whatever form of the state is integrated."""
 
-import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
 from jourdain_jax.calculus.roots import newton_root
-from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, Solution
+from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, Solution, sizes
 from jourdain_jax.motion.integrators.problem import Problem
 
 
@@ -34,6 +33,5 @@ class ImplicitMidpoint(FixedStepMethod):
 
         # the unknown is the difference, which has more digits than the state
         guess = h * f(t, y0)
-        scale = jnp.broadcast_to(jnp.max(jnp.abs(y0)) + jnp.max(jnp.abs(guess)), y0.shape)
-        found = newton_root(lambda d: d - h * f(middle, y0 + d / 2), guess, jax.lax.stop_gradient(jnp.where(scale == 0, 1.0, scale)))
+        found = newton_root(lambda d: d - h * f(middle, y0 + d / 2), guess, sizes(len(y0), y0, guess))
         return Solution(unravel(jnp.where(found.converged, found.x, 0.0)), None, found.converged)

@@ -9,6 +9,7 @@ import abc
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
@@ -65,6 +66,12 @@ class FixedStepMethod(ImplicitMethod):
     def without_step(self) -> "FixedStepMethod":
         """The method alone: another step is no other program."""
         return eqx.tree_at(lambda method: method.step, self, None)
+
+
+def sizes(unknowns: int, x: Float[Array, "numbers"], change: Float[Array, "numbers"]) -> Float[Array, "unknowns"]:
+    """The size of each unknown, against which round-off counts: that of the state x and of its change; 1 where both are zero."""
+    size = jnp.max(jnp.abs(x)) + jnp.max(jnp.abs(change))
+    return jax.lax.stop_gradient(jnp.full(unknowns, jnp.where(size == 0, 1.0, size)))
 
 
 def even_step(longest: Float[Array, ""], rest: Float[Array, ""]) -> Float[Array, ""]:

@@ -16,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
 from jourdain_jax.calculus.roots import newton_root
-from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod, Solution
+from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod, Solution, sizes
 from jourdain_jax.motion.integrators.problem import Problem
 
 _NODES = np.array([(4 - np.sqrt(6)) / 10, (4 + np.sqrt(6)) / 10, 1.0])
@@ -56,9 +56,7 @@ class RadauIIA(ImplicitMethod):
             return (z - h * A @ rates).reshape(-1)
 
         slope, along = jax.linearize(lambda x: f(t, x), x0)
-        size = jnp.max(jnp.abs(x0)) + jnp.max(jnp.abs(h * slope))
-        scale = jnp.broadcast_to(jnp.where(size == 0, 1.0, size), (3 * n,))
-        found = newton_root(equations, jnp.zeros(3 * n, x0.dtype), jax.lax.stop_gradient(scale))
+        found = newton_root(equations, jnp.zeros(3 * n, x0.dtype), sizes(3 * n, x0, h * slope))
         z = found.x.reshape(3, n)
         one = jnp.eye(n, dtype=x0.dtype)
         error = jnp.linalg.solve(one - h * _REAL * jax.vmap(along, 1, 1)(one), _REAL * h * slope + estimate @ z)

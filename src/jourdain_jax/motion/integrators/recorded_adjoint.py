@@ -90,16 +90,18 @@ def motion(forward: Callable, problem: Problem, method: Method | ImplicitMethod,
     """`forward` of the other arguments; in reverse mode it has derivatives with respect to `y0`, `t0`, `goals` and all that the functions of `problem` read."""
     like = (t0, y0, problem.args)
     rates, project, events = (f if f is None else eqx.filter_closure_convert(f, *like) for f in (problem.rates, problem.project, problem.events))
-    control = problem.norm, *jax.lax.stop_gradient((problem.rtol, problem.atol, problem.shortest, problem.longest)), problem.max_steps
-    control += (problem.rates_and_pivots, problem.relations, problem.relation_count, jax.lax.stop_gradient(problem.span))
-    control += (problem.near_rank_loss, problem.within)
-    return _motion(((rates, project, problem.args), events, problem.knots, y0, t0, goals), (control, jax.lax.stop_gradient(jnp.asarray(dt0))), forward, method)
+    moving = (rates, project, problem.args), events, problem.knots, y0, t0, goals
+    fixed = eqx.tree_at(_moving, problem, [None] * 5, is_leaf=lambda x: x is None), jnp.asarray(dt0)
+    return _motion(moving, jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, fixed), forward, method)
+
+
+def _moving(problem: Problem) -> list:
+    return [problem.rates, problem.project, problem.args, problem.events, problem.knots]
 
 
 def _problem(moving, control) -> Problem:
-    (rates, project, args), events, knots, *_ = moving
-    norm, rtol, atol, shortest, longest, max_steps, *monitored = control[0]
-    return Problem(rates, args, project, events, norm, rtol, atol, shortest, longest, max_steps, knots, *monitored)
+    functions, events, knots, *_ = moving
+    return eqx.tree_at(_moving, control[0], [*functions, events, knots], is_leaf=lambda x: x is None)
 
 
 @eqx.filter_custom_vjp
@@ -160,7 +162,7 @@ def _vjp(residuals, cotangents, perturbed, moving, control, forward, method):
     shared, events, knots, y0, t0, goals = moving
     problem, direction = _problem(moving, control), jnp.sign(goals[-1] - t0)
     g_ys, _, g_end = cotangents
-    g_ys, g_t, g_y = (_filled(g, x) for g, x in ((g_ys, _stacked(y0, len(goals))), (g_end.t, end.t), (g_end.y, end.y)))
+    g_ys, g_t, g_y = (_filled(g, x) for g, x in ((g_ys, _room(len(goals), y0)), (g_end.t, end.t), (g_end.y, end.y)))
     differentiable, fixed = eqx.partition(shared, perturbed[0])
     by_events, fixed_events = eqx.partition(events, perturbed[1])
     g_events = jax.tree.map(jnp.zeros_like, by_events)
@@ -279,14 +281,11 @@ def _empty(start: Progress, max_steps: int) -> _Record:
     windows = -(-(max_steps + MOST_STEPS) // (length - length // SPARE)) + 1
     windows = min(windows, max(_FEWEST[1], _MEMORY[1] // state_bytes))
 
-    def room(count: int, tree):
-        return jax.tree.map(lambda x: jnp.zeros((count, *jnp.shape(x)), jnp.result_type(x)), tree)
-
     zero = jnp.zeros((), jnp.int32)
-    t, y, goal = room(length, (start.t, start.y, zero))
+    t, y, goal = _room(length, (start.t, start.y, zero))
     window = _Window(t, y, goal, zero).added(start, zero, restart=True)
     beginning = _Beginnings(start.t, start.y, start.h, zero)
-    return _Record(window, _put(room(windows + 1, beginning), 0, beginning), zero)
+    return _Record(window, _put(_room(windows + 1, beginning), 0, beginning), zero)
 
 
 def _at(tree, i):
@@ -306,8 +305,9 @@ def _where(chosen, a, b):
     return jax.tree.map(lambda a, b: jnp.where(chosen, a, b), a, b)
 
 
-def _stacked(tree, count: int):
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape), x.dtype), tree)
+def _room(count: int, tree):
+    """Zeros for so many of these."""
+    return jax.tree.map(lambda x: jnp.zeros((count, *jnp.shape(x)), jnp.result_type(x)), tree)
 
 
 def _filled(cotangents, like):

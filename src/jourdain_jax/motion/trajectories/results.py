@@ -1,7 +1,7 @@
-"""How a motion ended: a code per lane, never an exception inside."""
+"""How a motion ended: a code per lane, never an exception inside.
 
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+Codes up to `EVENT` are those of motions that reached the end of their span, or an event; all others failed.
+"""
 
 SUCCESS, EVENT, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, INCONSISTENT_START, SINGULAR_PARTITION, BAD_PARAMETER, BAD_START, UNSOLVED_STEP = range(10)
 SHRANK, STIFF, OFF_CONSTRAINTS, BAD_TIMES, ENERGY_LOST, PROCESS_DIED, CONTRADICTORY_ROWS, UNRESOLVED = 10, 11, 12, 13, 14, 15, 16, 17
@@ -47,23 +47,6 @@ FALLBACKS = {
     FULL_STATE | IMPLICIT: "run again with the full state, dense matrices and an implicit solver: the motion is stiff, and the privileged speeds, or the "
     "scalar program, do not serve all along it",
 }
-
-
-def is_success(code: Int[Array, "*lanes"]) -> Bool[Array, "*lanes"]:
-    """Whether a motion reached the end of its span, or an event."""
-    return (jnp.asarray(code) == SUCCESS) | (jnp.asarray(code) == EVENT)
-
-
-def with_causes(code, *, parameters: Bool[Array, ""], times: Bool[Array, ""], start: Bool[Array, ""], moved: Bool[Array, ""], resolved) -> Int[Array, ""]:
-    """The code with the cause where one is known: whether the `parameters` are right, the `times` go together, the `start` is finite, any step was
-    accepted (`moved`), and the precision holds the tolerance (`resolved`).
-    """
-    code = jnp.where((code == STEP_TOO_SMALL) & ~resolved, UNRESOLVED, code)
-    # no step, however short: the accelerations themselves are at fault
-    code = jnp.where((code == STEP_TOO_SMALL) & ~moved, NOT_FINITE, code)
-    code = jnp.where(start, code, BAD_START)
-    code = jnp.where(times, code, BAD_TIMES)
-    return jnp.where(parameters, code, BAD_PARAMETER).astype(jnp.int32)
 
 
 class SimulationError(RuntimeError):

@@ -328,7 +328,7 @@ def _check_codes(path, header: dict, arrays: dict) -> None:
 
 def _check_finite(path, arrays: dict) -> None:
     """Motions that reached their end, or an event, are finite as far as they went; failed ones may hold anything."""
-    whole = np.isin(arrays["result"], (SUCCESS, EVENT))
+    whole = np.asarray(arrays["result"] <= EVENT)
     for name in ("t_end", "q_end", "u_end", "moved_q", "moved_u"):
         good = np.isfinite(arrays[name])
         if not np.all(good.reshape(*whole.shape, -1)[whole]):

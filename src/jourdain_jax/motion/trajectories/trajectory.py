@@ -60,7 +60,7 @@ class Trajectory(Record, Printed):
     @property
     def succeeded(self) -> Bool[Array, "*lanes"]:
         """Whether the motion reached the end of its span, or an event; also under jit and vmap."""
-        return results.is_success(self.result)
+        return jnp.asarray(self.result) <= results.EVENT
 
     @property
     def valid(self) -> Bool[Array, "*lanes times"]:
@@ -152,7 +152,7 @@ class Trajectory(Record, Printed):
         reduction that do not determine the others in this precision; contacts that would have to pull.
         Computed where it is asked for; needs numbers: not under jit or vmap.
         """
-        failure = () if int(self.result) in (results.SUCCESS, results.EVENT) else (self.message,)
+        failure = () if int(self.result) <= results.EVENT else (self.message,)
         return (*failure, *warnings_of(diagnose(self), self))
 
     @property
@@ -176,9 +176,9 @@ class Trajectory(Record, Printed):
         Their derivatives are NaN, too. Lanes that are left out of a loss by `jnp.where(motion.succeeded, ..., 0.0)` do not disturb its derivatives with respect
         to what all lanes share.
         """
-        parts = [x for x in (self.q, self.u, self.q_end, self.u_end, self.work) if x is not None]
-        marked = [nan_where(jnp.broadcast_to(jnp.expand_dims(~self.succeeded, tuple(range(jnp.ndim(self.result), x.ndim))), x.shape), x) for x in parts]
-        return eqx.tree_at(lambda m: [x for x in (m.q, m.u, m.q_end, m.u_end, m.work) if x is not None], self, marked)
+        states = lambda m: [x for x in (m.q, m.u, m.q_end, m.u_end, m.work) if x is not None]  # noqa: E731
+        failed = lambda x: jnp.broadcast_to(jnp.expand_dims(~self.succeeded, tuple(range(jnp.ndim(self.result), x.ndim))), x.shape)  # noqa: E731
+        return eqx.tree_at(states, self, [nan_where(failed(x), x) for x in states(self)])
 
     @of_known_numbers
     def raise_if_failed(self) -> "Trajectory":
@@ -186,6 +186,6 @@ class Trajectory(Record, Printed):
 
         A DifferentiationModeError under `jit` and `vmap`, where numbers are not known; `nan_if_failed` serves there.
         """
-        if int(self.result) not in (results.SUCCESS, results.EVENT):
+        if int(self.result) > results.EVENT:
             raise results.SimulationError(f"`{type(self.scene).__name__}` at t = {float(self.t_end):.6g} s: {self.message}")
         return self
