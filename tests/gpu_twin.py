@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jax.interpreters import mlir
 
-from jourdain_jax.motion.native import called
+from jourdain_jax.motion.native import values
 from jourdain_jax.native import ffi, gpu, host, nvidia
 
 THREADS = 4
@@ -117,13 +117,13 @@ def by_twins(order: str = "in order", slots: int = 64):
         results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in ctx.avals_out]
         return mlir.lower_fun(lambda *values: jax.pure_callback(run, results, *values))(ctx, *values)
 
-    register = partial(mlir.register_lowering, called._call_p, platform="cpu")
+    register = partial(mlir.register_lowering, values._call_p, platform="cpu")
     jax.clear_caches()
     register(lowered)
     try:
         yield texts
     finally:
-        register(called.on_cpu)
+        register(values.on_cpu)
         jax.clear_caches()
 
 

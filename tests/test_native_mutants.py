@@ -19,7 +19,7 @@ from test_mutants import Mutant
 import jourdain_jax as jj
 from jourdain_jax.motion import integration, put_on_rows
 from jourdain_jax.motion.integrators import event_search
-from jourdain_jax.motion.native import back, crossings, functions, kernel, loop, native_motion, onto_rows, pulled, search, step
+from jourdain_jax.motion.native import back, functions, loop, native_motion, projection, step
 from jourdain_jax.motion.simulate import set_up
 
 pytestmark = machine_code.needed
@@ -315,20 +315,20 @@ MUTANTS = [
     Mutant("no bound of series", step, "_tried_by_series", 'rows), p["longest"])', "rows), math.inf)", SERIES_LONGEST, "the longest step"),
     Mutant("no start at an event", event_search, "at_start", "rises = (rate > 0.0)", "rises = (rate > 1e9)", LEAVES, "leaves"),
     Mutant("every start at an event", event_search, "at_start", "& (w.magnitude(a) <= reach_of_noise(w, span) * rate)", "", LEAVES_BELOW, "below"),
-    Mutant("no step refused", crossings, "watched_by", "(fits & (count > 0.0) & (", "(fits & (count < 0.0) & (", STRIP, "strip"),
+    Mutant("no step refused", step, "watched_by", "(fits & (count > 0.0) & (", "(fits & (count < 0.0) & (", STRIP, "strip"),
     Mutant("steps as long as the way that is left", step, "reach", "w.larger(0.5 * (", "w.larger(1.0 * (", STRIP, "too many|crossings"),
-    Mutant("signs of the first state", crossings, "noted", "w.where(counts, new, old)", "w.where(counts, old, old)", STRIP, "crossings"),
-    Mutant("a change that is never behind", crossings, "noted", "passed = counts & (", "passed = counts & ~counts & (", STRIP, "too many|crossings|strip"),
-    Mutant("only the ends of a step", crossings, "watched_by", "2.0, 0.0)", "0.0, 0.0)", NAMED, "not named"),
-    Mutant("no event between the ends of a step", crossings, "watched_by", "hidden[relations:]) > 0.0", "hidden[relations:]) > 9.0", WINDOW, "passed over"),
+    Mutant("signs of the first state", step, "noted", "w.where(counts, new, old)", "w.where(counts, old, old)", STRIP, "crossings"),
+    Mutant("a change that is never behind", step, "noted", "passed = counts & (", "passed = counts & ~counts & (", STRIP, "too many|crossings|strip"),
+    Mutant("only the ends of a step", step, "watched_by", "2.0, 0.0)", "0.0, 0.0)", NAMED, "not named"),
+    Mutant("no event between the ends of a step", step, "watched_by", "hidden[relations:]) > 0.0", "hidden[relations:]) > 9.0", WINDOW, "passed over"),
     Mutant("no projection", step, "_project", 'w.run("project", p.pointer, t1, y1)', "None", CIRCLE, "circle"),
-    Mutant("no events", search, "decided", "~no_event(c_1)", "~no_event(c_0)", EVENT, "event"),
-    Mutant("no dips", search, "decided", "((share < 1.0) | again)", "again", DIP, "passed over"),
-    Mutant("a bracket with the wrong end", search, "advanced", "w.where(same, old.t[1], old.t[0])", "old.t[0]", EVENT, "event"),
-    Mutant("rows by half", onto_rows, "_write_moved", "- w.where(moves, change, 0.0)", "- 0.5 * w.where(moves, change, 0.0)", ROWS, "coordinates|speeds"),
+    Mutant("no events", step, "decided", "~no_event(c_1)", "~no_event(c_0)", EVENT, "event"),
+    Mutant("no dips", step, "decided", "((share < 1.0) | again)", "again", DIP, "passed over"),
+    Mutant("a bracket with the wrong end", step, "advanced", "w.where(same, old.t[1], old.t[0])", "old.t[0]", EVENT, "event"),
+    Mutant("rows by half", projection, "_write_moved", "- w.where(moves, change, 0.0)", "- 0.5 * w.where(moves, change, 0.0)", ROWS, "coordinates|speeds"),
     Mutant(
         "rows that are not scaled",
-        onto_rows,
+        projection,
         "_write_factored",
         "w.load(row, k) * scale, row",
         "w.load(row, k), row",
@@ -353,9 +353,9 @@ MUTANTS = [
     Mutant("an event at a number for a time", back, "_write_event_back", "-total / rate", "total / rate", EVENT_BACK, WRONG),
     Mutant("the level of an event forgotten", back, "_write_event_back", "w.where(usable, w.load(out, i), 0.0)", "w.number(0.0)", EVENT_BACK, WRONG),
     Mutant("tangents of states alone", functions, "outputs_of", "| {len(y) + i: n for i, n in known[k].items()}", "", ALONG, WRONG),
-    Mutant("the time of an event fixed", search, "_put_tangents", "-dc / slope", "0.0 * dc", EVENT_ALONG, WRONG),
-    Mutant("the wrong way from an event", search, "_move_rows", "w.fma(w.load(k, i + rates), dt, before)", "before", EVENT_ALONG, WRONG),
-    Mutant("tangents of an event by rates of before it moved", search, "_put_tangents", "if part > 1:", "if part > 9:", EVENT_TWICE, WRONG),
+    Mutant("the time of an event fixed", step, "_put_tangents", "-dc / slope", "0.0 * dc", EVENT_ALONG, WRONG),
+    Mutant("the wrong way from an event", step, "_move_rows", "w.fma(w.load(k, i + rates), dt, before)", "before", EVENT_ALONG, WRONG),
+    Mutant("tangents of an event by rates of before it moved", step, "_put_tangents", "if part > 1:", "if part > 9:", EVENT_TWICE, WRONG),
     Mutant("the tangent at the time of an event", back, "_write_event_back", "dt * w.load(f, i)", "0.0 * dt", BENT, WRONG),
     Mutant("the tangent of an event forgotten", back, "_moved_back", "w.where(usable, w.load(out, i), 0.0)", "w.number(0.0)", BENT, WRONG),
     Mutant("an event that stays while its tangent moves", back, "_moved_back", "w.load(added, asked)", "0.0 * g_dt", BENT, WRONG),
@@ -372,7 +372,7 @@ MUTANTS = [
     Mutant("goals that do not move states", native_motion, "moved", "jnp.sum(scaled(rates(z), g))", "0 * jnp.sum(g)", TIME, WRONG),
 ]
 CHECKS = list(dict.fromkeys(mutant.check for mutant in MUTANTS))
-KEPT = (kernel.kernel, kernel.kernel_back, put_on_rows._kernel, pulled.reason_against_derivatives)
+KEPT = (loop.kernel, back.kernel_back, put_on_rows._kernel, functions.reason_against_derivatives)
 
 
 @pytest.fixture(autouse=True)

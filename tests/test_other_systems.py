@@ -22,7 +22,7 @@ import jourdain_jax as jj
 from jourdain_jax.calculus import files as whole_files
 from jourdain_jax.ensembles import files, memory, workers
 from jourdain_jax.ensembles.store import Store
-from jourdain_jax.motion.native import called
+from jourdain_jax.motion.native import values
 from jourdain_jax.motion.simulate import set_up
 from jourdain_jax.native import ffi, host
 from jourdain_jax.program.graph import Graph
@@ -105,10 +105,10 @@ def test_a_batch_is_shared_among_threads_also_where_registers_hold_two_numbers(m
     monkeypatch.setattr(host, "lanes", lambda: 2)
     monkeypatch.setattr(host, "threads", lambda: 3)
     asked = []
-    monkeypatch.setattr(called, "write_rows", lambda *given, write=called.write_rows: asked.append(given[0].threads) or write(*given))
+    monkeypatch.setattr(values, "write_rows", lambda *given, write=values.write_rows: asked.append(given[0].threads) or write(*given))
     graph = Graph()
     x = graph.input("x", True)
-    sine = called.nodes_called(graph, [graph.call("sin", x)], [x])
+    sine = values.nodes_called(graph, [graph.call("sin", x)], [x])
     angles = np.linspace(0.0, 3.0, 301)[:, None]  # enough for three threads
     assert_allclose(jax.vmap(sine)(jnp.asarray(angles)), np.sin(angles), rtol=1e-15, atol=1e-16)
     assert_allclose(sine(jnp.asarray(angles[7])), np.sin(angles[7]), rtol=1e-15)

@@ -28,8 +28,7 @@ from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.lowering.lower import lower
 from jourdain_jax.lowering.lowered import Lowered, NotLowered
-from jourdain_jax.motion.native.called import nodes_called
-from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
+from jourdain_jax.motion.native.values import nodes_called, values_of_nodes
 from jourdain_jax.native import ffi
 from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.program.derivative import derivatives, jacobian

@@ -30,7 +30,7 @@ from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.inputs import for_programs
 from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod
-from jourdain_jax.motion.native import seen
+from jourdain_jax.motion.native import values
 from jourdain_jax.motion.own_steps import reason_against_watching
 from jourdain_jax.motion.put_on_rows import State, projected
 from jourdain_jax.motion.setup import Begun, Setup, Solved, times_fit
@@ -71,7 +71,7 @@ def _prepared(setup: Setup) -> Setup:
 def _with_machine_code(setup: Setup) -> Setup:
     """The setup, where machine code integrates it also with machine code for what is seen of it, if that can be made."""
     field = setup.field
-    if setup.reason_against_machine_code or not isinstance(field, ByProgram) or seen.beside(field.program) is None:
+    if setup.reason_against_machine_code or not isinstance(field, ByProgram) or values.beside(field.program) is None:
         return setup
     return setup._replace(field=replace(field, native=True))
 
@@ -195,7 +195,7 @@ def _without_faults(setup: Setup, start: State) -> tuple[Bool[Array, ""], State]
     if program is None or unsupported(program.graph, [program.right]):
         right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *faults_at(scene, t0, start.q, start.u, setup.inputs(t0)).values()]))
     else:
-        right = seen.is_right(program, scene, t0, start.q)
+        right = values.is_right(program, scene, t0, start.q)
     return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u)))
 
 

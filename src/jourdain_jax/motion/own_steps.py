@@ -25,11 +25,9 @@ from jourdain_jax.motion.integrators.explicit_steps import Method, method_of
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
 from jourdain_jax.motion.integrators.problem import Problem
 from jourdain_jax.motion.native import native_motion
-from jourdain_jax.motion.native.flow import OF_SAMPLES, flow
-from jourdain_jax.motion.native.functions import Form
-from jourdain_jax.motion.native.functions_of_time import numbers_of
-from jourdain_jax.motion.native.native_motion import driven
-from jourdain_jax.motion.native.pulled import reason_against_derivatives
+from jourdain_jax.motion.native.functions import Form, reason_against_derivatives
+from jourdain_jax.motion.native.loop import OF_SAMPLES, flow
+from jourdain_jax.motion.native.native_motion import driven, numbers_of
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.vector_fields.field import VectorField

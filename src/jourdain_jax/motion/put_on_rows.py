@@ -5,7 +5,7 @@ g(t, q) = 0,  phi(t, q, u) = 0
 By machine code, the rows and the mass matrix are functions that JAX can differentiate: a derivative has two calls in it, in place of the scene itself.
 
 g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M(t, q)
-d o_i = sum_j J_ij d x_j     o: any of these numbers, x: parameters, time, coordinates, speeds, inputs;   J: derived on the graph (`values_of_nodes.py`)
+d o_i = sum_j J_ij d x_j     o: any of these numbers, x: parameters, time, coordinates, speeds, inputs;   J: derived on the graph (`motion/native/values.py`)
 """
 
 from collections.abc import Sequence
@@ -30,11 +30,9 @@ from jourdain_jax.calculus.roots import first_root
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions, project_positions, project_speeds
 from jourdain_jax.equations.scaling import row_scale
-from jourdain_jax.motion.native import onto_rows
-from jourdain_jax.motion.native.called import called
-from jourdain_jax.motion.native.onto_rows import Rows, write
-from jourdain_jax.motion.native.seen import entries
-from jourdain_jax.motion.native.values_of_nodes import values_of_nodes
+from jourdain_jax.motion.native import projection
+from jourdain_jax.motion.native.projection import Rows, write
+from jourdain_jax.motion.native.values import called, entries, values_of_nodes
 from jourdain_jax.native import ffi
 from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.scene.coordinates import Names
@@ -290,7 +288,7 @@ def _loses_rank(matrices, free) -> bool:
 def row_functions(program: RowProgram) -> RowFunctions:
     """g and G, phi and A, and M, by the program; of what is no machine code, by autodiff."""
     nodes = [*program.g, *program.G.values(), *program.phi, *program.A.values(), *(program.M or {}).values()]
-    if unsupported(program.graph, nodes) or program.graph.operations(nodes) > onto_rows.LARGEST_PROGRAM:
+    if unsupported(program.graph, nodes) or program.graph.operations(nodes) > projection.LARGEST_PROGRAM:
         return BY_AUTODIFF
     rows, speeds = len(program.phi), len(program.u)
     closures, coordinates = len(program.g), len(program.q)

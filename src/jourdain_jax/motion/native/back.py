@@ -10,29 +10,36 @@ and where a motion ended at a stop event, at its time t_e = t - c(t, y)/cdot and
 
     s = -(g_t + g_y . f)/cdot,   g_y += s dc/dy,   g_p += s dc/dp
 
-As `motion/integrators/recorded_adjoint.py` and `step_adjoint.py` have it.
+As `motion/integrators/recorded_adjoint.py` and `step_adjoint.py` have it. JAX differentiates this once more, by cotangents of the motion with a tangent.
+Let S be the sum of all states, each times its cotangent g, and g' what S' changes by along a tangent. What is asked for is dS/dx, x the start's state and the
+numbers known. It changes by d(dS)/dx, where dS is the sum of the states times g' and of their tangents times g: cotangents are g' of the states and g of
+their tangents.
 """
 
 import math
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
 
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.derivatives import filled
 from jourdain_jax.motion.integrators.event_search import RUNNING, chosen
 from jourdain_jax.motion.integrators.explicit_steps import Method
-from jourdain_jax.motion.native import samples
-from jourdain_jax.motion.native.functions import Form
-from jourdain_jax.motion.native.layout import Lanes, copied, each_row
-from jourdain_jax.motion.native.loop import COUNT, FIRST_OF_SAMPLES, TIMES, write_functions, write_job
-from jourdain_jax.motion.native.pulled import write_pulled
+from jourdain_jax.motion.native.functions import Form, write_pulled
+from jourdain_jax.motion.native.layout import Lanes, arguments_of_samples, begin_samples, copied, each_row, nearer_knot, pass_knot
+from jourdain_jax.motion.native.loop import COUNT, FIRST_OF_SAMPLES, MOST_KERNELS, TIMES, Start, with_tangents, write_functions, write_job
 from jourdain_jax.motion.native.record import GOALS, STARTS, TO_ENDS, TO_STATES, Slot, prepare, write_record
-from jourdain_jax.motion.native.search import slope_is_flat
-from jourdain_jax.motion.native.step import IDLE, near_rank_loss, put_near_rows, squares_of, weighted
+from jourdain_jax.motion.native.step import IDLE, near_rank_loss, put_near_rows, slope_is_flat, squares_of, weighted
+from jourdain_jax.motion.native.values import called
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native.ffi import write_handler
 from jourdain_jax.native.ir import Value, Writer
 
 
-def write(w: Writer, form: Form, method: Method, asked: Sequence[int]) -> None:
+def write_back(w: Writer, form: Form, method: Method, asked: Sequence[int]) -> None:
     """The module; `asked`: of which of the numbers that the rates are given cotangents are asked."""
     write_functions(w, form, method)
     write_pulled(w, form, asked)
@@ -46,7 +53,7 @@ def write(w: Writer, form: Form, method: Method, asked: Sequence[int]) -> None:
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
         write_record(w, form, method, len(asked), job)
         w.give(Value(w, "ptr", "null"))
-    write_handler(w, 4 + samples.arguments(form.layout), 1, lambda arguments, results: write_job(w, form, arguments, results))
+    write_handler(w, 4 + arguments_of_samples(form.layout), 1, lambda arguments, results: write_job(w, form, arguments, results))
 
 
 def _write_begin(w: Writer, form: Form) -> None:
@@ -64,8 +71,8 @@ def _write_begin(w: Writer, form: Form) -> None:
             lanes.set("code", lane, IDLE)
         if form.sampled:  # places without a lane are worked out too
             words = w.at(job, FIRST_OF_SAMPLES, "i64")
-            samples.begin(w, form.layout, words, w.load(job, COUNT, "i64"), lanes, lane, w.where(there, number, 0))
-            lanes.set("goal", lane, samples.nearer(w, lanes, lane, lanes.of("goal", lane)))
+            begin_samples(w, form.layout, words, w.load(job, COUNT, "i64"), lanes, lane, w.where(there, number, 0))
+            lanes.set("goal", lane, nearer_knot(w, lanes, lane, lanes.of("goal", lane)))
         lanes.set("taken", lane, 0.0)
         if form.has_events:
             lanes.set("search_left", lane, 0.0)
@@ -83,7 +90,7 @@ def _write_note(w: Writer, form: Form) -> None:
                 if form.sampled:
                     at_knot = lanes.of("t", lane).differs(w.load(goals, number * times + before, "double"))
                     with w.when(at_knot):
-                        samples.pass_knot(w, lanes, lane)
+                        pass_knot(w, lanes, lane)
                     reached = before + w.where(at_knot, w.literal(0, "i64"), 1)
                 else:
                     reached = before + 1
@@ -92,7 +99,7 @@ def _write_note(w: Writer, form: Form) -> None:
                     lanes.set("code", lane, results.SUCCESS)
                 with w.when(reached < times):
                     goal = w.load(goals, number * times + reached, "double")
-                    lanes.set("goal", lane, samples.nearer(w, lanes, lane, goal) if form.sampled else goal)
+                    lanes.set("goal", lane, nearer_knot(w, lanes, lane, goal) if form.sampled else goal)
 
 
 def _write_added(w: Writer, form: Form) -> None:
@@ -242,3 +249,43 @@ def _moved_back(w: Writer, form: Form, lanes: Lanes, usable: Value, cotangents: 
     w.run("pull_moved", lanes.pointer, lanes["t"], lanes.pointer, given, out, added)
     each_row(w, count, g, lambda i: w.load(given, i) + w.where(usable, w.load(out, i), 0.0))
     return w.load(added, asked)
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def kernel_back(form: Form, method: Method, asked: tuple[int, ...]) -> Callable:
+    """A function of samples, the rows of a start, cotangents of the states at the goals and of the end (with its time last), and the goals.
+
+    It returns cotangents of the state at the start, and of the numbers `asked` for of those that the rates are given. A state has its tangent after it.
+    """
+    count = form.layout.integrated + len(asked)
+    run_rows = called(lambda w: write_back(w, form, method, asked), lambda *_: ((count,),), arguments_of_samples(form.layout))
+    return lambda *arguments: run_rows(*arguments)[0]
+
+
+def flow_back(form: Form, method: Method, asked: tuple[int, ...]) -> Callable[..., Float[Array, "found"]]:
+    """Cotangents of the start's state, and of the numbers `asked` for of those known, as a function of the start, and of cotangents of the states at the
+    goals, and of the end and its time.
+    """
+    n = form.layout.y
+
+    @jax.custom_jvp
+    def own(start: Start, g: Float[Array, "times y"], ends: Float[Array, "ends"]):
+        return _pulled(form, method, asked, start, g, ends)
+
+    @partial(own.defjvp, symbolic_zeros=True)
+    def rule(primals, tangents):
+        (start, g, ends), (along, dg, dends) = primals, tangents
+        dg, dends = filled(dg), filled(dends)
+        raised, more = with_tangents(form, start, along)
+        # of the state and its tangent, at the goals, at the end, and of the time of that
+        both = jnp.concatenate([dg, g], axis=1), jnp.concatenate([dends[:n], ends[:n], dends[n:], ends[n:]])
+        raised = replace(raised, time_moves=form.has_events and bool(form.sampled))  # an event needs to know how fast samples change
+        d = _pulled(raised, method, asked, more, *both)
+        return own(*primals), jnp.concatenate([d[:n], d[2 * n :]])
+
+    return own
+
+
+def _pulled(form: Form, method: Method, asked: tuple[int, ...], start: Start, g, ends) -> Float[Array, "found"]:
+    rows = start.rows([jnp.zeros(())] * len(form.moving))
+    return kernel_back(form, method, asked)(*start.of_samples, rows, g, ends, start.goals)

@@ -1,30 +1,53 @@
-"""The loop over steps as machine code: lanes of a batch side by side, each replaced by the next one when it has ended, in several threads.
+"""The loop over steps as machine code, and as a function of JAX: from rows of starts and times to save at, to states, and rows of ends.
 
-A call is given two arrays with one row per lane: the rows of `Layout.given`, and the times to save at. It returns the states there, and the rows of the
-progress at the end with the number of times that were reached one after the other. Where inputs are given by samples, their tables and knots come first
-(`samples.py`).
+Lanes of a batch run side by side in several threads, in the widest registers, each replaced by the next one when it has ended. One motion by itself runs in
+narrow registers, in which an instruction takes less time. What a lane computes does not depend on the width. A call is given two arrays with one row per
+lane: the rows of `Layout.given`, and the times to save at. It returns the states there, and the rows of the progress at the end with the number of times that
+were reached one after the other. Where inputs are given by samples, their tables and knots come first (`layout.py`).
+
+The derivative of a motion is a motion, of states with their tangents. A time of an event has a tangent, which the loop itself finds; all other times are
+numbers (`native_motion.py`). Tolerances and the first step change nothing, and what samples say is a number at each time.
 """
 
 import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
+from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.derivatives import DifferentiationModeError, filled, is_zero
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
 from jourdain_jax.motion.integrators.explicit_steps import Method
-from jourdain_jax.motion.native import samples
-from jourdain_jax.motion.native.functions import Form, write_events, write_projection, write_rates, write_relations
-from jourdain_jax.motion.native.layout import Lanes
+from jourdain_jax.motion.native.functions import Form, check_derivatives, write_events, write_projection, write_rates, write_relations
+from jourdain_jax.motion.native.layout import (
+    WORDS_OF_SAMPLES,
+    Lanes,
+    Layout,
+    arguments_of_samples,
+    begin_samples,
+    nearer_knot,
+    pass_knot,
+    store_samples,
+    write_sampled_inputs,
+)
 from jourdain_jax.motion.native.step import IDLE, write_step
-from jourdain_jax.motion.native.taylor import TaylorSteps
+from jourdain_jax.motion.native.taylor import TaylorSteps, products
+from jourdain_jax.motion.native.values import called
 from jourdain_jax.native.ffi import Given, last_size, next_lane, product, share, start_counting, write_handler
 from jourdain_jax.native.ir import Value, Writer
 
 # words of a job, shared by all threads: the number of lanes, of times, and of the next lane, of doubles of a kernel's own memory (`ffi.py`), those of
 # samples, then pointers to the arrays
 COUNT, TIMES, NEXT, OWN, FIRST_OF_SAMPLES = range(5)
-FIRST_ARRAY = FIRST_OF_SAMPLES + samples.WORDS
+FIRST_ARRAY = FIRST_OF_SAMPLES + WORDS_OF_SAMPLES
 _STARTS, _GOALS, _STATES, _ENDS = range(FIRST_ARRAY, FIRST_ARRAY + 4)
 
 
-def write(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
+def write_loop(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
     """The module."""
     write_functions(w, form, method)
     _write_begin(w, form)
@@ -32,13 +55,13 @@ def write(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
     if isinstance(method, TaylorSteps):
         _write_save_within(w, form, method)
     _write_loop(w, form, method)
-    write_handler(w, 2 + samples.arguments(form.layout), 2, lambda arguments, results: write_job(w, form, arguments, results))
+    write_handler(w, 2 + arguments_of_samples(form.layout), 2, lambda arguments, results: write_job(w, form, arguments, results))
 
 
 def write_functions(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
     """`step`, and what it calls."""
     if form.sampled:
-        samples.write_inputs(w, form.layout, form.time_moves)
+        write_sampled_inputs(w, form.layout, form.time_moves)
     write_rates(w, form)
     if form.projects:
         write_projection(w, form)
@@ -51,7 +74,7 @@ def write_functions(w: Writer, form: Form, method: Method | TaylorSteps) -> None
 
 def write_job(w: Writer, form: Form, arguments: list[Given], results: list[Value]) -> None:
     """All lanes, by this thread and by others that it starts and waits for; the last of the arguments is an array of lanes and times."""
-    of_samples, arguments, times = arguments[: samples.arguments(form.layout)], arguments[samples.arguments(form.layout) :], arguments[-1]
+    of_samples, arguments, times = arguments[: arguments_of_samples(form.layout)], arguments[arguments_of_samples(form.layout) :], arguments[-1]
     arrays = [*(x.data for x in arguments), *results]
     job = w.room(FIRST_ARRAY + len(arrays), "i64")
     for word, pointer in enumerate(arrays):
@@ -64,7 +87,7 @@ def write_job(w: Writer, form: Form, arguments: list[Given], results: list[Value
     if w.device:
         w.store(w.own[1], job, OWN)
     if form.sampled:
-        samples.store_words(w, w.at(job, FIRST_OF_SAMPLES, "i64"), of_samples)
+        store_samples(w, w.at(job, FIRST_OF_SAMPLES, "i64"), of_samples)
     share(w, job, w.load(count, type="i64"))
 
 
@@ -110,8 +133,8 @@ def _write_begin(w: Writer, form: Form) -> None:
                 w.store(w.load(starts, number * given + row, "double"), lanes.place(row, lane))
             goal = w.load(w.load(job, _GOALS, "ptr"), number * w.load(job, TIMES, "i64"), "double")
             if form.sampled:
-                samples.begin(w, form.layout, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load(job, COUNT, "i64"), lanes, lane, number)
-                goal = samples.nearer(w, lanes, lane, goal)
+                begin_samples(w, form.layout, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load(job, COUNT, "i64"), lanes, lane, number)
+                goal = nearer_knot(w, lanes, lane, goal)
             lanes.set("goal", lane, goal)
             lanes.set("bound", lane, math.inf)
             if form.has_events:
@@ -120,7 +143,7 @@ def _write_begin(w: Writer, form: Form) -> None:
             lanes.set("code", lane, IDLE)
             w.store(w.load(who, 2 * w.lanes, "i64") - 1, who, 2 * w.lanes)
             if form.sampled:  # rates are worked out there too
-                samples.begin(w, form.layout, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load(job, COUNT, "i64"), lanes, lane, w.literal(0, "i64"))
+                begin_samples(w, form.layout, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load(job, COUNT, "i64"), lanes, lane, w.literal(0, "i64"))
 
 
 def _write_serve(w: Writer, form: Form) -> None:
@@ -136,8 +159,8 @@ def _write_serve(w: Writer, form: Form) -> None:
                 next_time = w.load(w.load(job, _GOALS, "ptr"), place, "double")
                 at_knot = runs & t.differs(next_time)
                 with w.when(at_knot):
-                    samples.pass_knot(w, lanes, lane)
-                    lanes.set("goal", lane, samples.nearer(w, lanes, lane, next_time))
+                    pass_knot(w, lanes, lane)
+                    lanes.set("goal", lane, nearer_knot(w, lanes, lane, next_time))
                 with w.when(~at_knot):
                     _save(w, form, job, who, lanes, lane, runs)
             else:
@@ -185,7 +208,7 @@ def _save(w: Writer, form: Form, job: Value, who: Value, lanes: Lanes, lane: Val
     w.store(last, who, lane + w.lanes)
     with w.when(last < times):
         goal = w.load(goals, number * times + last, "double")
-        lanes.set("goal", lane, samples.nearer(w, lanes, lane, goal) if form.sampled else goal)
+        lanes.set("goal", lane, nearer_knot(w, lanes, lane, goal) if form.sampled else goal)
     with w.when(last >= times):
         each = layout.returned + 1
         with w.counted(0, layout.returned) as row:
@@ -193,3 +216,125 @@ def _save(w: Writer, form: Form, job: Value, who: Value, lanes: Lanes, lane: Val
         reached = w.where(runs, times, saved)
         w.store(w.converted("sitofp", reached, "double"), ends, number * each + layout.returned)
         w.run("begin", job, lanes.pointer, who, lane)
+
+
+MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the process
+
+
+class Start(NamedTuple):
+    """A motion as a kernel is given it; the state and what is known are followed by their tangents (`Layout`)."""
+
+    of_samples: tuple[Array, ...]  # as `layout.py` has them
+    control: tuple[Float[Array, ""], ...]  # rtol, atol, shortest, longest and first step, most steps
+    goals: Float[Array, "times"]  # since the start
+    origin: Float[Array, ""]  # the time of the start
+    y: tuple[Float[Array, "y"], ...]
+    known: tuple[tuple[Float[Array, ""], ...], ...]
+
+    def rows(self, dt: Sequence) -> Float[Array, "given"]:
+        """The rows of a lane at the start, whose time has tangents."""
+        rtol, atol, shortest, longest, first, most = self.control
+        zero, one = jnp.zeros(()), jnp.ones(())
+        progress = [zero, jnp.minimum(jnp.abs(first), longest), RUNNING * one, zero, zero, -one, jnp.inf * one, zero, jnp.inf * one, *dt]
+        limits = [jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, longest, most, self.origin]
+        known = [jnp.stack(part) for part in self.known if part]  # each tangent by itself: values may have no lanes where tangents have
+        return jnp.concatenate([*self.y, jnp.stack(progress), jnp.stack(limits), *known])
+
+
+class Found(NamedTuple):
+    """A motion as a kernel returns it; each with its tangents."""
+
+    y: tuple[Float[Array, "times y"], ...]  # at the goals
+    end: tuple[Float[Array, "y"], ...]
+    t: tuple[Float[Array, ""], ...]  # of the end, since the start
+    rest: Float[Array, "rest"]  # rows of the progress after its time, and the number of goals that were reached one after the other
+
+
+class Kernel(NamedTuple):
+    """The loop over steps of a form."""
+
+    form: Form
+    run: Callable  # (*samples, rows of starts, goals): states at the goals, and rows of the end
+    motion: Callable[[Start], Found]
+
+    @property
+    def layout(self) -> Layout:
+        """The rows of a lane."""
+        return self.form.layout
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def kernel(form: Form, method: Method, order: int | None = None) -> Kernel:
+    """The kernel for what is integrated, by a tableau, or by Taylor series up to an order."""
+    steps, layout = method if order is None else TaylorSteps(order), form.layout
+
+    def shapes(*arguments):
+        return (arguments[-1].shape[-1], layout.integrated), (layout.returned + 1,)
+
+    def run(*arguments: Float[Array, "..."]) -> tuple[Float[Array, "times y"], Float[Array, "ends"]]:
+        return tuple(run_rows(*arguments))
+
+    run_rows = called(lambda w: write_loop(w, form, steps), shapes, arguments_of_samples(layout))
+    return Kernel(form, run, _motion(layout, run))
+
+
+def _motion(layout: Layout, run: Callable) -> Callable[[Start], Found]:
+    """`run` in words; a tangent has lanes where anything has that it depends on: all directions share the values of one motion."""
+    n, parts = layout.y, 1 + len(layout.moving)
+
+    @jax.custom_batching.custom_vmap
+    def motion(start: Start) -> Found:
+        states, end = run(*start.of_samples, start.rows([jnp.zeros(())] * (parts - 1)), start.goals)
+        progress, dt, count = end[n * parts : -parts], end[-parts:-1], end[-1:]
+        every = [slice(k * n, (k + 1) * n) for k in range(parts)]
+        return Found(
+            tuple(states[:, part] for part in every),
+            tuple(end[part] for part in every),
+            (progress[0], *dt),
+            jnp.concatenate([progress[1:], count]),
+        )
+
+    @motion.def_vmap
+    def motions(count, batched: Sequence, start: Start):
+        (given,) = batched
+        found = jax.vmap(motion.fun, [jax.tree.map(lambda has_axis: 0 if has_axis else None, given)], axis_size=count)(start)
+        base = any(jax.tree.leaves(given._replace(y=(), known=())))
+        own = [any(jax.tree.leaves((given.y[k], given.known[k]))) for k in range(parts)]
+        lanes = tuple(base or any(own[other] for other in range(k + 1) if other & k == other) for k in range(parts))
+        lanes = Found(lanes, lanes, lanes, lanes[0])
+        return jax.tree.map(lambda x, has_lanes: x if has_lanes else x[0], found, lanes), lanes
+
+    return motion
+
+
+OF_SAMPLES = 'machine code does not differentiate with respect to samples of an input; `jj.simulate(..., backend="xla")` does'
+
+
+def flow(form: Form, method: Method, order: int | None) -> Callable[[Start], Found]:
+    """The motion by a kernel; `order`: of Taylor series, in the place of the tableau."""
+    # 36_000 of coefficients in a step by Taylor series of second derivatives; where there are more, steps are those of the tableau
+    order = None if order is not None and len(form.moving) > 1 and products(form, order) > 36_000 else order
+    own = jax.custom_jvp(kernel(form, method, order).motion)
+
+    @partial(own.defjvp, symbolic_zeros=True)
+    def rule(primals, tangents):
+        (start,), (along,) = primals, tangents
+        if not all(map(is_zero, along.of_samples[:1])):
+            raise DifferentiationModeError(OF_SAMPLES)
+        check_derivatives(replace(form, moving=(), time_moves=False), (len(form.moving) + 1).bit_length())
+        raised, more = with_tangents(form, start, along)
+        both = flow(replace(raised, time_moves=form.has_events and len(start.y) > 1), method, order)(more)
+        found, d = (Found(*(part[half] for part in both[:3]), both.rest) for half in (slice(len(start.y)), slice(len(start.y), None)))
+        return found, d._replace(rest=jnp.zeros_like(found.rest))
+
+    return own
+
+
+def with_tangents(form: Form, start: Start, along: Start) -> tuple[Form, Start]:
+    """The form and the start that have these tangents too."""
+    every = (tuple(range(len(start.known[0]))), *form.moving)
+    moves = [[not is_zero(dx) for dx in part] for part in along.known]
+    moving = tuple(tuple(i for i, does in zip(of, part, strict=True) if does) for of, part in zip(every, moves, strict=True))
+    known = tuple(tuple(dx for dx in part if not is_zero(dx)) for part in along.known)
+    more = start._replace(y=(*start.y, *map(filled, along.y)), known=(*start.known, *known))
+    return replace(form, moving=(*form.moving, *moving)), more

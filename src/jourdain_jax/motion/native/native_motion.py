@@ -1,32 +1,192 @@
-"""One motion by machine code, and when: what a kernel is given of it, and what is found from what the kernel returns."""
+"""One motion by machine code, and when: what a kernel is given of it, and what is found from what the kernel returns.
 
-from collections.abc import Callable, Sequence
-from functools import lru_cache
+Inputs that are functions of time become part of the scalar program: time and their numbers take the place of their values.
+
+    u_i = f_i(t, c_i),   y' = F(t, y, u) = F(t, y, f(t, c))         c_i: the numbers in f_i and those that it closes over
+
+Times may vary. Machine code goes from one number to others, and states are moved to the times that these stand for, along their own rates. z: all that the
+rates of a state are given, beside that state; G: how fast each of these numbers changes. Where z is moved by a time d that is zero,
+
+    dz_1 = (1 + G' d)(dz + G dd),   G' = dG/dz,   to the second order
+
+A start is moved by less than its time, t_0 = number - d, what is found by more.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
+from itertools import islice
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from jourdain_jax.build.trace import Variables
+from jourdain_jax.calculus.derivatives import Rules, filled, is_zero, with_rules
 from jourdain_jax.calculus.markers import entries_of
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.motion.inputs import Constant, FunctionOfTime, Inputs, Sampled
+from jourdain_jax.lowering.relations import jumps, switches
+from jourdain_jax.motion.inputs import Constant, FunctionOfTime, Inputs, Sampled, TimeProgram
 from jourdain_jax.motion.integrators.explicit_steps import Method, code_at_end
 from jourdain_jax.motion.native import taylor
-from jourdain_jax.motion.native.flow_back import flow_back
-from jourdain_jax.motion.native.functions import Form, event_program
-from jourdain_jax.motion.native.functions_of_time import numbers_of, parts_from, with_functions
-from jourdain_jax.motion.native.kernel import Found, Start
+from jourdain_jax.motion.native.back import flow_back
+from jourdain_jax.motion.native.functions import Form, check_derivatives, event_program
 from jourdain_jax.motion.native.layout import Layout
-from jourdain_jax.motion.native.pulled import check_derivatives
-from jourdain_jax.motion.native.times import moved
+from jourdain_jax.motion.native.loop import Found, Start
+from jourdain_jax.motion.native.values import values_of_nodes
 from jourdain_jax.motion.setup import Begun, Setup, Solved
 from jourdain_jax.motion.vector_fields.field import ByProgram, Integrated, VectorField
 from jourdain_jax.native import ffi
 from jourdain_jax.native.scalar_program import unsupported
-from jourdain_jax.program.graph import Unsupported
+from jourdain_jax.program.derivative import on_its_own
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.graph import ARRAYS, Graph, Unsupported
+from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
+
+# Parts of a program that are nodes; `power` is another one.
+_NODES = (
+    *("qdot", "ydot", "pivots", "sizes", "directions", "squares", "guards", "events"),
+    *("projected_q", "projected_u", "relations", "event_relations", "jumps"),
+)
+MOST_NUMBERS = 200  # in a function of time; of a long table each is a row of a lane, and `jj.Sampled` looks up in it
+
+
+@lru_cache(maxsize=64)
+def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) -> Lowered | str:
+    """The program with these functions in the place of inputs, or why there is none, in words; their numbers come last among what is `fixed`."""
+    numbers = sum(math.prod(shape) for function in functions if function is not None for shape in function.shapes)
+    if numbers > MOST_NUMBERS:
+        return f"inputs are functions of time with {numbers} numbers, more than {MOST_NUMBERS}"
+    if any(program.graph.op[n] in ARRAYS for n in program.fixed):
+        return "the scene keeps parts as calls, and an input is a function of time"
+    graph = Graph(keeps_rules=True)
+    new = {n: graph.input(str(k), True) for k, n in enumerate(program.variables)}
+    t, known = new[program.traced.t], []
+    try:
+        for node, function in zip(program.traced.inputs.tolist(), functions, strict=True):
+            if function is not None:
+                given = [[graph.input(f"{node} {k} {i}", True) for i in range(math.prod(shape))] for k, shape in enumerate(function.shapes)]
+                known += [n for part in given for n in part]
+                arguments = [Nodes(np.reshape(part, shape)) for part, shape in zip(given, function.shapes, strict=True)]
+                new[node] = int(as_nodes(graph, interpret(graph, function.closed, [*arguments, Nodes(t)])[0]))
+    except (Unsupported, ValueError) as error:
+        return f"an input is a function of time without scalar form ({error})"
+    nodes = {name: getattr(program, name) for name in _NODES}
+    of_functions = [new[n] for n in program.traced.inputs.tolist() if n in new]
+    by_functions = switches(graph, of_functions)
+    jumping = jumps(graph, by_functions, of_functions, _random(graph, [*by_functions, *of_functions]))
+    new = graph.copied([program.power, *(n for part in nodes.values() for n in part)], program.graph, new)
+    on_it: dict[str, Any] = {name: tuple(new[n] for n in part) for name, part in nodes.items()}
+    on_it["relations"] = tuple(dict.fromkeys([*on_it["relations"], *by_functions]))
+    on_it["jumps"] += tuple(jumping)
+    stays = [i for i, function in enumerate(functions) if function is None]
+    u = [new.get(n, t) for n in program.traced.u.tolist()]  # dependent speeds are no variables
+    q, inputs = (np.array([new[n] for n in part.tolist()], np.int64) for part in (program.traced.q, program.traced.inputs[stays]))
+    return replace(
+        program,
+        traced=Variables(graph, t, q, np.array(u, np.int64), inputs, []),
+        inputs=tuple(program.inputs[i] for i in stays),
+        fixed=(*(new[n] for n in program.fixed), *known),
+        power=new[program.power],
+        **on_it,
+        z=(),  # what is seen of a motion is evaluated with the values of inputs
+        energies=(),
+        usual={},
+        states={},
+    )
+
+
+def _random(graph: Graph, nodes: Iterable[int]) -> Probes:
+    """Return random times and numbers for functions."""
+    generator = np.random.default_rng(11)
+    # states at which it is seen whether functions jump
+    return Probes(graph, {str(graph.value[n]): generator.uniform(-1.0, 3.0, 64) for n in graph.reachable(nodes) if graph.op[n] == "input"})
+
+
+def numbers_of(channel: FunctionOfTime) -> list:
+    """Each number of a function of time; of a tree of flags or of tangents in its place, what stands for each (None: nothing does)."""
+    return [x for part, shape in zip((channel.numbers, *channel.held), _shapes(channel), strict=True) for x in _each(part, shape)]
+
+
+def parts_from(channel: FunctionOfTime, numbers: Iterator) -> list:
+    """`channel.numbers`, and all that is `channel.held`, from the next of what stands for each number; None where nothing does."""
+    found = [(list(islice(numbers, math.prod(shape))), shape) for shape in _shapes(channel)]
+    return [None if any(x is None for x in each) else jnp.stack(each).reshape(shape) if each else jnp.zeros(shape) for each, shape in found]
+
+
+def _shapes(channel: FunctionOfTime) -> list[tuple[int, ...]]:
+    shapes = channel.program.shapes
+    count = len(shapes) - len(channel.held)
+    return [(count,), *shapes[count:]]
+
+
+def _each(part, shape: tuple[int, ...]) -> list:
+    return list(jnp.reshape(part, -1)) if hasattr(part, "shape") else [part] * math.prod(shape)
+
+
+def moved(form: Form) -> Callable[[Float[Array, "z"], Float[Array, ""]], Float[Array, "z"]]:
+    """Return z itself as a function of z and of the time by which it is moved, which is zero.
+
+    z: the state, time, the numbers known, and how fast those of them change that samples give.
+    """
+    rates = _rates(form)
+
+    def moving_with_time(slope: Callable) -> Callable:
+        @jax.custom_jvp
+        def same(z, d, v):
+            return v
+
+        @partial(same.defjvp, symbolic_zeros=True)
+        def rule(at, tangents):
+            (z, _, v), (_, dd, dv) = at, tangents
+            return same(*at), filled(dv) if is_zero(dd) else filled(dv) + scaled(slope(z, v), dd)
+
+        return same
+
+    along = moving_with_time(lambda z, v: jax.jvp(rates, (z,), (v,))[1])
+    back = moving_with_time(lambda z, g: jax.vjp(rates, z)[1](g)[0])
+
+    def push(arguments, tangents):
+        (z, d), (dz, dd) = arguments, tangents
+        dz = jnp.zeros_like(z) if dz is None else dz
+        return z, along(z, d, dz if dd is None else dz + scaled(rates(z), dd))
+
+    def pull(perturbed, arguments, found, g):
+        (z, d), (_, varies) = arguments, perturbed
+        g = back(z, d, g)
+        return g, jnp.sum(scaled(rates(z), g)) if varies else None
+
+    return with_rules(lambda z, d: z, Rules(push, pull))
+
+
+def _rates(form: Form) -> Callable[[Float[Array, "z"]], Float[Array, "z"]]:
+    """G(z), which is zero but for the state, time and what samples give."""
+    program, layout = form.program, form.layout
+    graph, rates, variables = on_its_own(program.graph, form.rates, program.variables)
+    first, count = len(program.fixed), layout.coordinates + layout.speeds
+    work = [graph.input("work", True)] if layout.with_work else []
+    slopes = [graph.input(f"slope of input {i}", True) for i in form.sampled]
+    z = [*variables[first + 1 : first + 1 + count], *work, variables[first], *variables[:first], *variables[first + 1 + count :], *slopes]
+    of_inputs = dict(zip(form.sampled, slopes, strict=True))
+    known = [graph.zero] * first + [of_inputs.get(i, graph.zero) for i in range(len(program.inputs))]
+    return values_of_nodes(graph, [*rates, graph.one, *known, *[graph.zero] * len(slopes)], z)
+
+
+@jax.custom_jvp
+def scaled(slope: Float[Array, "y"], by: Float[Array, "..."]) -> Float[Array, "y"]:
+    """Their product; zero, whatever the slope, where it is multiplied by zero."""
+    return jnp.where(by == 0.0, 0.0, slope * by)
+
+
+@scaled.defjvp
+def _scaled_jvp(primals, tangents):
+    return scaled(*primals), scaled(tangents[0], primals[1]) + scaled(primals[0], tangents[1])
+
 
 # Operations of all that is evaluated. Measured: they are compiled in a time that grows with them, 15,000 of a chain of 128 trailers in 2.8 s (XLA: 40 s),
 # 18,000 of a chain of 23 joint angles in 1.2 s.
@@ -109,7 +269,7 @@ def cotangents(form: Form, method: Method, start: Start, asked: Sequence[bool], 
 
 
 def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integrated]:
-    """The state at a time t, as a function of it, of t, and of a time d that is zero, by which it is moved along its rates (`times.py`)."""
+    """The state at a time t, as a function of it, of t, and of a time d that is zero, by which it is moved along its rates."""
     others, fixed, along_rates = _others(args[2]), len(form.program.fixed), moved(form)
 
     def moved_by(y, t, d):

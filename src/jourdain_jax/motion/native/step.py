@@ -1,4 +1,6 @@
-"""One step of lanes side by side, as in `motion/integrators/erk_step.py`, which says what it does and why."""
+"""One step of lanes side by side, as in `motion/integrators/erk_step.py`, which says what it does and why; relations whose signs are watched
+(`motion/integrators/crossings.py`), stop events and the search for one (`motion/integrators/event_search.py`) by the formulas there.
+"""
 
 import math
 import operator
@@ -8,17 +10,160 @@ from typing import NamedTuple
 import numpy as np
 
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
-from jourdain_jax.motion.integrators.crossings import reach
+from jourdain_jax.motion.integrators.crossings import Crossings, Watched, noted, reach, unless_zero
+from jourdain_jax.motion.integrators.crossings import watched as watched_by
 from jourdain_jax.motion.integrators.erk_step import AMPLIFIED, NEAR_SINE, NOISE
-from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING, any_of
+from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING, Search, advanced, any_of, chosen, decided, is_flat
 from jourdain_jax.motion.integrators.explicit_steps import Aim, Method, aimed, judged, taken
-from jourdain_jax.motion.native import crossings, search
 from jourdain_jax.motion.native.functions import Form
-from jourdain_jax.motion.native.layout import Lanes, Layout, copied, each_row, over_rows
+from jourdain_jax.motion.native.layout import Lanes, Layout, copied, each_row, for_rows, over_rows
 from jourdain_jax.motion.native.taylor import TaylorSteps, at_time, jet, monitored_at, radius, slope
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.math_functions import power
+
+
+def _crossings_of(p: Lanes) -> Crossings:
+    """The signs so far."""
+    return Crossings(tuple(p.every("last")), p["crossing_by"], p["crossings"], p["together"])
+
+
+def _write_first_signs(w: Writer, form: Form, p: Lanes) -> None:
+    """The signs at the start of a motion, in lanes that have tried no step."""
+    fresh = (p["accepted"] + p["rejected"]).equals(0.0)
+    with w.when(w.any(fresh)):
+        now = unless_zero(w, _relations(w, form, p, p["t"], p.pointer), [w.number(0.0)] * len(form.watched))
+        p.put("last", [w.where(fresh, new, old) for new, old in zip(now, p.every("last"), strict=True)])
+        p["crossing_by"] = w.where(fresh, p["direction"] * math.inf, p["crossing_by"])
+
+
+def _relations(w: Writer, form: Form, p: Lanes, t: Value, y: Value) -> list[Value]:
+    values = w.room(len(form.watched))
+    w.run("relations", p.pointer, t, y, values)
+    return [w.load(values, i) for i in range(len(form.watched))]
+
+
+def _watched(w: Writer, form: Form, p: Lanes, t1: Value, step: Value, y1: Value, fits: Value) -> Watched:
+    """What a step to the state `y1` crosses; `fits`: it would be accepted."""
+    layout = form.layout
+
+    def between(once: Value, share: Value, now: tuple[Value, ...]) -> list[Value]:
+        found = w.room(len(now))
+        for i, x in enumerate(now):
+            w.store(x, found, i)
+        with w.when(w.any(once)):
+            y, part = w.room(layout.integrated), w.where(once, share, 0.0)
+            for i in range(layout.coordinates + layout.speeds):
+                start = w.load(p.pointer, i)
+                w.store(w.fma(part, w.load(y1, i) - start, start), y, i)
+            for i, x in enumerate(unless_zero(w, _relations(w, form, p, w.fma(part, step, p["t"]), y), now)):
+                w.store(x, found, i)
+        return [w.load(found, i) for i in range(len(now))]
+
+    return watched_by(w, _crossings_of(p), _relations(w, form, p, t1, y1), len(form.relations), between, fits, step, p["last_goal"])
+
+
+def _note_signs(w: Writer, p: Lanes, step: Watched, t1: Value, moving: Value, counts: Value) -> None:
+    """The signs after a step to `t1`, in lanes that are `moving`, and in which it `counts` or not."""
+    old, new = _crossings_of(p), noted(w, _crossings_of(p), step, t1, p["direction"], counts)
+    p.put("last", [w.where(moving, *pair) for pair in zip(new.last, old.last, strict=True)])
+    for name, *pair in (("crossing_by", new.by, old.by), ("crossings", new.count, old.count), ("together", new.together, old.together)):
+        p[name] = w.where(moving, *pair)
+
+
+def _search_of(p: Lanes, count: int) -> Search:
+    """The search in the rows of lanes, for one of so many events."""
+    values = p.every("search_c")
+    c = tuple(tuple(values[i * count : (i + 1) * count]) for i in range(3))
+    step, left, shift = (p[f"search_{name}"] for name in ("step", "left", "shift"))
+    return Search(tuple(p.every("search_t")), c, step, left, shift, tuple(p.every("search_slope")))
+
+
+def _monitored(w: Writer, form: Form, p: Lanes, k: tuple[Value, Value], y1: Value, new: dict[str, Value], h: Value, accept: Value) -> dict[str, Value]:
+    """The step in which an event may have happened or is being located, or before which one has; changes the state `y1` after it.
+
+    `k`: slopes at its ends; `accept`: it is a step of the motion.
+    """
+    layout, count, y, t = form.layout, form.layout.events, p.pointer, p["t"]
+
+    def events(t: Value, y: Value, slope: Value) -> list[list[Value]]:
+        values, rates = w.room(count), w.room(count)
+        w.run("events", p.pointer, t, y, slope, values, rates)
+        return [[w.load(place, i) for i in range(count)] for place in (values, rates)]
+
+    c_0, rate_0 = events(t, y, k[0])
+    c_1, rate_1 = events(new["t"], y1, k[1])
+
+    def advance(begins: Value, changes: Value) -> tuple[Search, Value]:
+        first = w.room()
+        w.store(p["event"], first)
+        with w.when(w.any(changes)):
+            old = _search_of(p, count)
+            found, event = advanced(w, old, begins, (t, c_0, rate_0), (new["t"], c_1))
+            newton = w.where(event.usable & ~event.beyond, -chosen(w, event.first, c_1) / chosen(w, event.first, rate_0), 0.0)
+            rows = {"t": found.t, "c": [x for part in found.c for x in part], "step": [found.step], "left": [found.left], "slope": found.slope}
+            rows["shift"] = [w.where(event.trying, found.shift, newton)]
+            for name, values in rows.items():
+                p.put(f"search_{name}", [w.where(changes, a, b) for a, b in zip(values, p.every(f"search_{name}"), strict=True)])
+            w.store(w.literal(event.first, w.real), first)
+        return _search_of(p, count), w.load(first)
+
+    # a motion that starts beyond an event has no motion at all
+    sound = over_rows(w, range(layout.y), 0.0, lambda total, i: total + 0.0 * w.load(y, i)).equals(0.0)
+    found = decided(w, p, new, h, (c_0, rate_0, c_1, rate_1), accept, sound, (_search_of(p, count), advance))
+
+    def state(i: int | Value) -> Value:
+        after = w.load(y1, i)
+        return w.where(found.stays, w.load(y, i), w.where(found.found, w.fma(found.search.shift, w.load(k[0], i), after), after))
+
+    each_row(w, layout.integrated, y1, state)
+    if form.moving:
+        _put_tangents(w, form, p, k[0], found.found, new["t"], rate_0, y1)
+    return new | found.new | {"taken": w.where(found.stays, 0.0, new["taken"])}
+
+
+def slope_is_flat(w: Writer, p: Lanes, rate: Value) -> Value:
+    """Whether the value of a lane's event has no slope where it falls through zero."""
+    return is_flat(w, rate, chosen(w, p["event"], p.every("search_slope")))
+
+
+def _put_tangents(w: Writer, form: Form, p: Lanes, k: Value, found: Value, t: Value, rate: list[Value], y1: Value) -> None:
+    """Where an event is found at the time t in the state `y1`, the tangents of that time, and those of the state there; `k`: the rates.
+
+    Each tangent of time is found in turn, the state being moved by it, with e the directions taken together in it,
+
+        dt = -(dc/dt dt + dc/dy dy + dc/dp dp)/cdot,   y <- y + e dt f(t, y),   t <- t + e dt,   e^2 = 0
+
+    where values, tangents and rates are those before; dt is NaN where c has no slope there.
+    """
+    layout, count, times = form.layout, form.layout.events, form.layout.rows["dt"]
+    with w.when(w.any(found)):
+        values, pivots = w.room(count * len(times)), w.room(max(len(form.monitored), 1))
+        slope = chosen(w, p["event"], rate)
+        usable = found & slope.differs(0.0) & (w.magnitude(slope) < math.inf)
+        flat = found & slope_is_flat(w, p, slope)
+        for part, row in enumerate(times, 1):
+            if part > 1:  # what is known of the rates is of the state as it was
+                k = w.room(layout.integrated)
+                w.run("rates", p.pointer, t, y1, k, pivots)
+            w.run("event_tangents", p.pointer, t, y1, values)
+            dc = chosen(w, p["event"], [w.load(values, (part - 1) * count + i) for i in range(count)])
+            dt = w.where(flat, math.nan, w.where(usable, -dc / slope, 0.0))
+            w.store(w.where(found, dt, w.load(p.pointer, row)), p.pointer, row)
+            for other in range(len(times) + 1):
+                if not other & part:
+                    _move_rows(w, layout, y1, k, (other | part) * layout.y, other * layout.y, dt, usable | flat)
+
+
+def _move_rows(w: Writer, layout: Layout, y: Value, k: Value, rows: int, rates: int, dt: Value, moves: Value) -> None:
+    """Adds the rates that begin with row `rates` of `k`, times `dt`, to those that begin with row `rows` of `y`."""
+
+    def moved(i: int | Value) -> Value:
+        before = w.load(y, i + rows)
+        return w.where(moves, w.fma(w.load(k, i + rates), dt, before), before)
+
+    for_rows(w, range(layout.y), lambda i: w.store(moved(i), y, i + rows))
+
 
 IDLE = -9.0  # code of a place that has no lane
 
@@ -38,7 +183,7 @@ def write_step(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
     with w.procedure("step", "state:noalias k:noalias") as (state, k):
         lanes = Lanes(w, form.layout, state)
         if form.relations:
-            crossings.write_begin(w, form, lanes)
+            _write_first_signs(w, form, lanes)
         if isinstance(method, TaylorSteps):
             _take(w, form, method, lanes, w.at(k, form.layout.integrated), _tried_by_series(w, form, method, lanes, k))
         else:
@@ -65,7 +210,7 @@ def _tried_by_stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value) 
 
 def _reach(w: Writer, form: Form, p: Lanes, h: Value) -> Value:
     """The step `h`, or as far as relations let one go."""
-    return w.smaller(h, reach(w, crossings.of_lanes(p), p["t"], p["direction"], p["last_goal"])) if form.relations else h
+    return w.smaller(h, reach(w, _crossings_of(p), p["t"], p["direction"], p["last_goal"])) if form.relations else h
 
 
 def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Value) -> Trial:
@@ -115,7 +260,7 @@ def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Valu
     layout, y, count = form.layout, p.pointer, form.layout.integrated
     aim, y1, accept, next_h, smallest = trial
     t1, locating = aim.t_1, aim.locating
-    watched = crossings.watched(w, form, p, t1, aim.h, y1, accept & ~locating) if form.relations else None
+    watched = _watched(w, form, p, t1, aim.h, y1, accept & ~locating) if form.relations else None
     if watched is not None:
         accept, next_h = accept & ~watched.refused, w.where(watched.refused, w.where(watched.falls, watched.to_event, p["h"]), next_h)
     new = taken(w, p, aim, accept, next_h)
@@ -123,7 +268,7 @@ def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Valu
     each_row(w, count, y1, lambda i: w.where(accept, w.load(y1, i), w.load(y, i)))
     if form.has_events:
         ends = k, w.at(k, method.at_the_end * layout.integrated)
-        new = search.monitored(w, form, p, ends, y1, new, aim.h, accept & ~locating & new["code"].equals(RUNNING))
+        new = _monitored(w, form, p, ends, y1, new, aim.h, accept & ~locating & new["code"].equals(RUNNING))
     counts = accept & ~locating & new["code"].equals(RUNNING) & new["t"].equals(t1)
     stays = counts | (locating & new["code"].equals(results.EVENT))
     if smallest is not None:
@@ -131,7 +276,7 @@ def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Valu
         new |= {"pivot": pivot, "code": w.where(counts & (pivot < SMALLEST_PIVOT), results.SINGULAR_PARTITION, new["code"])}
     moving = locating | p["code"].equals(RUNNING)
     if watched is not None:
-        crossings.note(w, p, watched, t1, moving, stays)
+        _note_signs(w, p, watched, t1, moving, stays)
     copied(w, count, y1, y, moving)
     for name, value in new.items():
         p[name] = w.where(moving, value, w.number(0.0) if name == "taken" else p[name])

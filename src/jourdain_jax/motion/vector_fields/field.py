@@ -23,7 +23,7 @@ from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.reductions import Reduction
 from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.motion.native import seen
+from jourdain_jax.motion.native import values
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
@@ -257,7 +257,7 @@ class ByProgram(VectorField):
 
     def fixed(self, scene: Scene) -> tuple:
         """What depends on parameters alone."""
-        return seen.fixed_values(self.program, scene) if self.native else self.program.fixed_values(scene)
+        return values.fixed_values(self.program, scene) if self.native else self.program.fixed_values(scene)
 
     def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "speeds"]:
         return self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[0]
@@ -265,12 +265,12 @@ class ByProgram(VectorField):
     def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
         """All speeds, and the smallest pivot of the elimination relative to its usual size."""
         if self.native:
-            return seen.speeds_and_pivot(self.program, fixed, t, y.q, y.v, inputs)
+            return values.speeds_and_pivot(self.program, fixed, t, y.q, y.v, inputs)
         return self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)
 
     def energies(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "2"]:
         if self.native:
-            return seen.energies(self.program, fixed, t, y.q, y.v, inputs)
+            return values.energies(self.program, fixed, t, y.q, y.v, inputs)
         return self.program.energy_values(fixed, t, tuple(y.q), tuple(y.v), inputs)
 
     def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:

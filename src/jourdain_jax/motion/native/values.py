@@ -1,0 +1,346 @@
+"""Modules of LLVM IR as functions of JAX, and by them values of nodes of a graph, and numbers beside the steps of a motion.
+
+Arrays without lanes go in, and under `vmap` all lanes go to one call. Many lanes run side by side in the widest registers; one by itself runs in narrow ones,
+in which an instruction takes less time. What a lane computes does not depend on the width.
+
+    o = f(x),    f'(x) v,    g f'(x),    f''(x) w v,    g f''(x) v         o: values of the nodes, x: of the variables
+
+Each is machine code of its own, made when it is asked for: derivatives are taken on the graph. For programs that are too large these are JAX's derivatives of
+the program as XLA runs it.
+
+Beside the steps stand numbers that depend on parameters alone, and all speeds, pivots and energies at saved states: functions of JAX on one state or scene,
+for which rows of the numbers that are needed are put together. Speeds of few operations are XLA's (`lowering/lowered.py`).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cache, lru_cache, partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
+from jaxtyping import Array, Bool, Float
+
+from jourdain_jax.build.row_program import RowProgram
+from jourdain_jax.calculus.derivatives import OtherDeviceError, Rules, differentiated_as, filled, is_zero, with_rules
+from jourdain_jax.calculus.markers import entries_of, with_lanes_first
+from jourdain_jax.calculus.reals import real_type
+from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.native import ffi, gpu, host, nvidia
+from jourdain_jax.native.ffi import write_rows
+from jourdain_jax.native.ir import Value, Writer
+from jourdain_jax.native.math_functions import FUNCTIONS
+from jourdain_jax.native.scalar_program import as_real, unsupported, written, written_in_turn
+from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
+from jourdain_jax.program.emit import run
+from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.scene.scene import Scene
+
+
+def called(write: Callable[[Writer], None], shapes: Callable, of_samples: int = 0, effort: int = 2) -> Callable:
+    """A module of LLVM IR as a function of arrays without lanes; `shapes`: of its results, given the arguments.
+
+    The first arguments are samples, which lanes may share; `effort`: as of `host.object_code`.
+    """
+
+    @cache
+    def handler(lanes: int, threads: int) -> str:
+        w = Writer(lanes, host.fuses(), threads)
+        write(w)
+        return ffi.registered(w.text, effort)
+
+    @cache
+    def kernel() -> gpu.Kernel:
+        w = Writer(1, True, device=True)
+        write(w)
+        return gpu.registered(w.text, w.scratch)
+
+    def call(lanes: int, threads: int, *arguments):
+        return tuple(_call_p.bind(*arguments, handler=handler, kernel=kernel, lanes=lanes, threads=threads, shapes=shapes))
+
+    @jax.custom_batching.custom_vmap
+    def run(*arguments):
+        # 2 places for the lanes of one motion; measured: 64 us with 2, 66 with 1 or 4, 99 with 8 (10 s of a disc at 1e-8)
+        return call(2, 1, *arguments)
+
+    @run.def_vmap
+    def run_many(count, batched: list[bool], *arguments):
+        stays = [has_axis or k < of_samples for k, has_axis in enumerate(batched)]
+        every = [x if stay else jnp.broadcast_to(x, (count, *x.shape)) for x, stay in zip(arguments, stays, strict=True)]
+        found = call(host.lanes(), host.threads(), *every)
+        return found, (True,) * len(found)
+
+    return run
+
+
+def _results(*arguments, shapes: Callable, **_) -> list:
+    return [arguments[-1].update(shape=(*arguments[-1].shape[:-1], *shape), weak_type=False) for shape in shapes(*arguments)]
+
+
+def on_cpu(ctx: mlir.LoweringRuleContext, *arguments, handler: Callable, lanes: int, threads: int, **_):
+    """The call in a program for the CPU."""
+    _check_here(ctx)
+    return ffi.in_doubles(ctx, arguments, jax.ffi.ffi_lowering(handler(lanes, threads)))
+
+
+def _on_nvidia(ctx: mlir.LoweringRuleContext, *arguments, kernel: Callable, **_):
+    """The call in a program for an NVIDIA GPU."""
+    _check_here(ctx)
+    if reason := nvidia.reason_against():
+        raise OtherDeviceError(f"for JAX's platform cuda, and {reason}")
+    return gpu.lowered(ctx, arguments, kernel())
+
+
+def _nowhere(ctx: mlir.LoweringRuleContext, *_, **__):
+    """The error of a program for any other device."""
+    raise OtherDeviceError(f"for JAX's platforms {', '.join(ctx.module_context.platforms)}")
+
+
+def _check_here(ctx: mlir.LoweringRuleContext) -> None:
+    """Raise an error for a program that may run in another process."""
+    if ctx.module_context.lowering_parameters.for_export:
+        raise OtherDeviceError("to be exported")
+    if len(ctx.module_context.platforms) > 1:
+        _nowhere(ctx)
+
+
+# The call itself: machine code is made where a program is lowered that holds it, not for what is only traced.
+_call_p = Primitive("jourdain_machine_code")
+_call_p.multiple_results = True
+_HOW = "handler", "kernel", "lanes", "threads", "shapes"
+_call_p.def_impl(jax.jit(lambda *arguments, **how: _call_p.bind(*arguments, **how), static_argnames=_HOW))
+_call_p.def_abstract_eval(_results)
+mlir.register_lowering(_call_p, _nowhere)
+mlir.register_lowering(_call_p, on_cpu, platform="cpu")
+mlir.register_lowering(_call_p, _on_nvidia, platform="cuda")
+batching.primitive_batchers[_call_p] = lambda values, axes, **how: (found := _call_p.bind(*with_lanes_first(values, axes), **how), [0] * len(found))
+
+
+def nodes_called(graph: Graph, nodes: Sequence[int], variables: Sequence[int], effort: int = 1) -> Callable[[Array], Array]:
+    """Values of nodes of a graph as a function of the values of the variables."""
+
+    def write(w: Writer) -> None:
+        with w.procedure("row", "state found") as (state, found):
+            known = {n: w.load(state, k) for k, n in enumerate(variables)}
+            for k, value in written_in_turn(w, graph, nodes, known):
+                w.store(as_real(w, value), found, k)
+        write_rows(w, len(variables), len(nodes))
+
+    kernel = called(write, lambda *_: ((len(nodes),),), effort=effort)
+    return lambda x: kernel(x)[0]
+
+
+def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[Array], Array]:
+    """Values of nodes, of which zeros cost nothing, as a function of the values of the variables."""
+    graph, nodes, variables = on_its_own(graph, nodes, variables)
+    by_xla, by_machine_code = _both(graph, nodes, variables)
+    there = np.flatnonzero([n != graph.zero for n in nodes])
+
+    @cache
+    def derivative(back: bool, order: int) -> Callable[[Array], Array] | None:
+        """The derivative as a function of x, v or g, and w in a row; None where it is too large, or no machine code."""
+        weights = [graph.input(f"v {i}", True) for i in range(len(there if back else variables))]
+        w = [graph.input(f"w {i}", True) for i in range(len(variables))]
+
+        def along(nodes, direction: list[int]) -> list[int]:
+            return derivatives(graph, nodes, dict(zip(variables, direction, strict=True)))
+
+        try:
+            first = along(nodes, w) if order == 2 else nodes
+            found = cotangents(graph, [first[i] for i in there], weights, variables) if back else along(first, weights)
+        except Unsupported:
+            return None
+        # operations of a derivative; machine code of so many takes 1.4 MB of the stack, and 0.3 s to make
+        if unsupported(graph, found) or graph.operations(found) > 40_000:
+            return None
+        return differentiated_as(*_both(graph, found, [*variables, *weights, *(w if order == 2 else ())]))
+
+    def linear(back: bool) -> Callable[[Array, Array], Array]:
+        """A function of x and v, or (`back`) g; its derivative along x is machine code where that serves."""
+
+        def taken(v):
+            return v[there] if back else v
+
+        @jax.custom_jvp
+        def first(x, v):
+            if (by_graph := derivative(back, 1)) is not None:
+                return by_graph(jnp.concatenate([x, taken(v)]))
+            return jax.vjp(by_xla, x)[1](v)[0] if back else jax.jvp(by_xla, (x,), (v,))[1]
+
+        @partial(first.defjvp, symbolic_zeros=True)
+        def rule(at, tangents):
+            (x, v), (dx, dv) = at, tangents
+            found, second = first(x, v), None if is_zero(dx) else derivative(back, 2)
+            if not is_zero(dx) and second is None:
+                return jax.jvp(first.fun, at, (dx, filled(dv)))
+            rates = [] if is_zero(dv) else [first(x, dv)]
+            rates += [second(jnp.concatenate([x, taken(v), dx]))] if second else []
+            return found, sum(rates[1:], rates[0]) if rates else jnp.zeros_like(found)
+
+        return first
+
+    along, back = linear(False), linear(True)
+
+    def push(arguments, tangents):
+        return values(*arguments), along(*arguments, *tangents)
+
+    def pull(perturbed, arguments, found, g):
+        return (back(*arguments, g),)
+
+    values = with_rules(by_machine_code, Rules(push, pull))
+    return values
+
+
+def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple[Callable, Callable]:
+    """Values of nodes as a function of the values of the variables: by XLA, and by machine code.
+
+    Machine code returns the numbers that are not zero: a whole matrix of 32 trailers lay beyond the end of its stack.
+    """
+    number = {n: k for k, n in enumerate(dict.fromkeys(n for n in nodes if n != graph.zero))}
+    which = np.array([number.get(n, len(number)) for n in nodes], int)
+    in_order = bool(number) and np.array_equal(which, np.arange(len(number)))
+    kernel = nodes_called(graph, list(number), variables, effort=0)
+
+    def placed(found, x):
+        return found if in_order else jnp.append(found, jnp.zeros((), x.dtype))[which]
+
+    def by_xla(x):
+        found = [jnp.asarray(value, x.dtype) for value in run(graph, list(number), dict(zip(variables, x, strict=True)))]
+        return placed(jnp.stack(found) if found else x[:0], x)
+
+    return by_xla, lambda x: placed(kernel(x), x)
+
+
+_TRUTHS = frozenset(("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite"))
+
+
+class Beside(NamedTuple):
+    """Machine code of what stands beside the steps of a program."""
+
+    needed: tuple[tuple[int, ...], ...]  # nodes of those entries of the scene's parameters on which something that is fixed depends, -1 for others
+    fixed: Callable[[Array], Array]  # of those entries and of what is usual
+    usual: Callable[[Array], Array] | None  # of those entries; JAX does not differentiate it
+    at_states: "AtStates | None"  # None where XLA is quicker
+
+
+class AtStates(NamedTuple):
+    """Functions of what is fixed, of time, coordinates, privileged speeds and inputs."""
+
+    speeds: Callable[..., Array]  # all of them
+    numbers: Callable[..., Array]  # pivots, then energies, which JAX does not differentiate
+
+
+@lru_cache(maxsize=64)
+def beside(program: Lowered) -> Beside | None:
+    """All this; None where it cannot be machine code."""
+    graph, nodes = program.graph, [*program.z, *program.pivots, *program.energies, *program.fixed, *program.usual.values()]
+    truths = any(_is_truth(graph, n) for n in program.fixed)  # which XLA hands on as such
+    # 60_000 operations
+    if truths or graph.operations(nodes) > 60_000 or unsupported(graph, nodes):
+        return None
+    used = set(graph.reachable([*program.fixed, *program.usual.values()]))
+    needed = tuple(tuple(n if n in used else -1 for n in np.ravel(leaf).tolist()) for leaf in program.traced.parameters)
+    given = [n for leaf in needed for n in leaf if n >= 0]
+    usual = called(partial(_write_usual, program, given), lambda *_: ((len(program.usual),),), effort=1) if program.usual else None
+    return Beside(needed, values_of_nodes(graph, program.fixed, [*given, *program.usual]), usual, _at_states(program))
+
+
+def _at_states(program: Lowered) -> AtStates | None:
+    # Operations from which on speeds, pivots and energies are machine code. Measured, ms by XLA and here: one motion of 8 trailers (228 operations) 0.69 and
+    # 0.54, of 16 (436) 2.6 and 1.8, derivatives of which compile in 13 and 6 s; 256 bicycles (460) 25 and 15, their gradient 85 and 72; 1,024 chains of
+    # 4 trailers (124) 44 and 39, their gradient 111 and 108; gradients of 256 rattlebacks (70) 29 and 42.
+    if program.graph.operations(program.z) < 100:
+        return None
+    every = [*(int(program.traced.u[k]) for k in program.independent), *program.z]
+    speeds = [every[i] for i in np.argsort([*program.independent, *program.dependent])]
+    numbers = _at_state(program, [*program.pivots, *program.energies], nodes_called)
+    return AtStates(_at_state(program, speeds, values_of_nodes), lambda *state: numbers(*jax.lax.stop_gradient(state)))
+
+
+def _at_state(program: Lowered, nodes: Sequence[int], function: Callable) -> Callable[..., Array]:
+    """Machine code of nodes, which is given those numbers alone that it needs of what is fixed."""
+    used = set(program.graph.reachable(nodes))
+    which = [k for k, n in enumerate(program.fixed) if n in used]
+    run = function(program.graph, nodes, [*(program.fixed[k] for k in which), *program.variables[len(program.fixed) :]])
+
+    def values(fixed, t, q, y, inputs) -> Float[Array, "nodes"]:
+        known = jnp.stack([*(fixed[k] for k in which), t])
+        return run(jnp.concatenate([jnp.asarray(x, real_type()) for x in (known, q, y, inputs)]))
+
+    return values
+
+
+def _is_truth(graph: Graph, node: int) -> bool:
+    return graph.op[node] in _TRUTHS or (graph.op[node] == "select" and _is_truth(graph, graph.args[node][1]))
+
+
+def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:
+    """Those entries of a scene's parameters that have a node; `nodes`: of each leaf, entry by entry, -1 for none."""
+    found = []
+    for leaf, of_leaf in zip(jax.tree.leaves(scene), nodes, strict=True):
+        needed = np.flatnonzero(np.ravel(np.asarray(of_leaf, int)) >= 0)
+        if needed.size:
+            flat = jnp.reshape(jnp.asarray(leaf, real_type()), (-1,))
+            found.append(flat if needed.size == flat.shape[0] else flat[needed])
+    return found
+
+
+def fixed_values(program: Lowered, scene: Scene) -> tuple[Float[Array, ""], ...]:
+    """As `Lowered.fixed_values`."""
+    own = beside(program)
+    parameters = [] if own is None else entries(scene, own.needed)
+    if own is None or not program.fixed or not parameters:  # nothing to hand over, or nothing asked for
+        return program.fixed_values(scene)
+    x = jnp.concatenate(parameters)
+    usual = [] if own.usual is None else own.usual(jax.lax.stop_gradient(x))
+    return entries_of(own.fixed(jnp.concatenate([x, *usual])))
+
+
+def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
+    """As `Lowered.speeds_and_pivot`."""
+    if (own := beside(program)) is None or own.at_states is None:
+        return program.speeds_and_pivot(fixed, t, tuple(q), tuple(y), inputs)
+    pivots = own.at_states.numbers(fixed, t, q, y, inputs)[:-2]
+    return own.at_states.speeds(fixed, t, q, y, inputs), program.smallest_pivot(fixed, pivots)
+
+
+def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
+    """As `Lowered.energy_values`."""
+    if (own := beside(program)) is None or own.at_states is None:
+        return program.energy_values(fixed, t, tuple(q), tuple(y), inputs)
+    return own.at_states.numbers(fixed, t, q, y, inputs)[-2:]
+
+
+def is_right(program: RowProgram, scene: Scene, t, q) -> Bool[Array, ""]:
+    """Whether parameters are right, and the masses and inertias that they make; as `parameter_faults` and `body_faults`."""
+    parts = [*entries(scene, program.parameters), jnp.asarray(t)[None], q]
+    run = nodes_called(program.graph, [program.right], [*(n for leaf in program.parameters for n in leaf if n >= 0), program.t, *program.q])
+    return run(jax.lax.stop_gradient(jnp.concatenate([jnp.asarray(x, real_type()) for x in parts])))[0] > 0
+
+
+def _write_usual(program: Lowered, given: Sequence[int], w: Writer) -> None:
+    """`row(state, found)`: as `Lowered.usual_values`, of the magnitudes at the probed states."""
+    nodes, states = list(program.usual.values()), list(program.states)
+    probes = len(next(iter(program.states.values()), (None,)))
+    table = w.constants("probed", (x[p] for p in range(probes) for x in program.states.values())) if states else Value(w, "ptr", "null")
+    log, exp = FUNCTIONS["log"], FUNCTIONS["exp"]
+    with w.procedure("row", "state found") as (state, found):
+        totals = w.room(2 * len(nodes))  # of logarithms, and of how many these are
+        for k in range(2 * len(nodes)):
+            w.store(0.0, totals, k)
+        known = {n: w.load(state, k) for k, n in enumerate(given)}
+        with w.counted(0, probes) as p:
+            at = {n: w.spread(w.load(table, p * len(states) + k, "double")) for k, n in enumerate(states)}
+            for k, value in enumerate(written(w, program.graph, nodes, known | at)):
+                size = w.magnitude(as_real(w, value))
+                counts = (size > 0.0) & (size < math.inf)
+                more = log(w, w.where(counts, size, w.number(1.0))), w.where(counts, 1.0, 0.0)
+                for place, x in zip((2 * k, 2 * k + 1), more, strict=True):
+                    w.store(w.load(totals, place) + x, totals, place)
+        for k in range(len(nodes)):
+            count = w.larger(w.load(totals, 2 * k + 1), w.number(1.0))
+            w.store(exp(w, w.load(totals, 2 * k) / count), found, k)
+    write_rows(w, len(given), len(nodes))
