@@ -107,7 +107,7 @@ class Windows(jj.Scene):
     def geometric_constraints(self, pose):
         q, rows, left, right = pose.q, {}, jnp.zeros(3), jnp.array([2.0, 0.0, 0.0])
         for i in range(self.count):
-            p, r = (jnp.stack([q[f"{x}{i}"], 0.0 * q.x0, q[f"{z}{i}"]]) for x, z in ("xz", "uw"))
+            p, r = (jnp.stack([q[f"{x}{i}"], 0.0, q[f"{z}{i}"]]) for x, z in ("xz", "uw"))
             rows |= {f"left {i}": jj.rod(left, p, 1.0), f"coupler {i}": jj.rod(p, r, 2.0), f"right {i}": jj.rod(right, r, 1.0)}
             left, right = p, r
         return rows

@@ -57,7 +57,7 @@ class LightKnee(jj.Scene):
 
     def bodies(self, t, q):
         o = 0 * q.x
-        return {"knee": jj.Particle(self.knee, jnp.stack([q.x, o, q.z])), "bob": jj.Particle(1.0, jnp.stack([q.x_end, o, q.z_end]))}
+        return {"knee": jj.Particle(self.knee, [q.x, o, q.z]), "bob": jj.Particle(1.0, [q.x_end, o, q.z_end])}
 
     def geometric_constraints(self, pose):
         q = pose.q
@@ -94,7 +94,7 @@ SERVED = {
 def test_motions_are_served_by_one_program_in_both_forms_of_the_state(case, state):
     scene, start, traced = SERVED[case]
     motion, reference = motion_and_reference(scene, start, 3.0, traced=traced, formulation=jj.Formulation(state))
-    assert int(motion.result) == results.SUCCESS
+    assert motion.result == results.SUCCESS
     assert "lowered" in motion.reduction
     assert_allclose(motion.q_end, reference.q_end, atol=1e-8)
     assert motion.smallest_pivot > 0.1 or "turns" not in case
@@ -175,7 +175,7 @@ def test_a_motion_through_a_loss_of_rank_is_right():
     start = jj.start(board, steer=0.3, steer_rate=0.5, heading_rate=0.2)
     beyond = jj.simulate(board, start, rtol=1e-9, atol=1e-9, **options)
     dense = jj.simulate(board, start, rtol=1e-11, atol=1e-11, backend="dense", **options)
-    assert int(beyond.result) == int(dense.result) == results.SUCCESS
+    assert beyond.result == int(dense.result) == results.SUCCESS
     assert_allclose(beyond.u_end, dense.u_end, atol=1e-6)
 
 

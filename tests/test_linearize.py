@@ -97,7 +97,7 @@ def test_a_bicycle_that_leans_is_not_steady_and_says_so():
     small = linearize(bicycle, leant, ("lean", "steer"), dependent=("pitch",))
     udot = jj.accelerations(bicycle, 0.0, leant.q, leant.u).udot
     y = [bicycle.speed_names.index(name, "speed") for name in bicycle.privileged]
-    assert float(small.acceleration) == pytest.approx(float(jnp.max(jnp.abs(udot[np.array(y)]))), rel=1e-12)
+    assert small.acceleration == pytest.approx(float(jnp.max(jnp.abs(udot[np.array(y)]))), rel=1e-12)
     assert small.acceleration > 1.0
 
 
@@ -139,7 +139,7 @@ def test_what_couples_the_named_coordinate_to_the_rest_is_reported():
     alone = linearize(disc, {"spin_rate": 4.0}, ("lean",))
     together = linearize(disc, {"spin_rate": 4.0})
     assert together.coordinates == ("yaw", "lean", "spin")
-    assert float(alone.coupling) == pytest.approx(1.5, rel=1e-12)  # (C + m a^2) spin = 1.5 N m s, where nothing else is in C
+    assert alone.coupling == pytest.approx(1.5, rel=1e-12)  # (C + m a^2) spin = 1.5 N m s, where nothing else is in C
     assert together.coupling == 0.0
 
 

@@ -26,7 +26,7 @@ class Top(jj.Scene):
     def bodies(self, t, q):
         inertia = jnp.diag(self.moments) + self.product * (jnp.ones((3, 3)) - jnp.eye(3)) + self.lopsided * jnp.eye(3, k=1)
         turned = jj.rot_z(q.turn) @ jnp.diag(jnp.stack([self.mirror, self.stretch, self.stretch]))
-        return {"top": jj.RigidBody(self.mass, inertia, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]), turned)}
+        return {"top": jj.RigidBody(self.mass, inertia, [q.x, 0.0, 0.0], turned)}
 
 
 def test_a_rod_and_a_massless_frame_can_be():
@@ -52,7 +52,7 @@ class BallOnPlate(jj.Scene):
     domain = {"x": (-1.0, 1.0), "y": (-1.0, 1.0), "z": (0.0, 1.0)}
 
     def bodies(self, t, q):
-        return {"ball": jj.RigidBody.ball(1.0, 0.1, position=jnp.stack([q.x, q.y, q.z]), orientation=jj.quaternion_to_matrix(q.attitude))}
+        return {"ball": jj.RigidBody.ball(1.0, 0.1, position=[q.x, q.y, q.z], orientation=jj.quaternion_to_matrix(q.attitude))}
 
     def contacts(self, pose):
         o = 0.0 * pose.t
@@ -75,9 +75,9 @@ class OnSledge(jj.Scene):
     def bodies(self, t, q):
         o = 0.0 * q.x
         return {
-            "sledge": jj.RigidBody.box(2.0, (1.0, 0.3, 0.1), position=jnp.stack([q.sledge, o, o]), orientation=jnp.eye(3)),
+            "sledge": jj.RigidBody.box(2.0, (1.0, 0.3, 0.1), position=[q.sledge, o, o], orientation=jnp.eye(3)),
             "post": jj.Particle(1.0, jnp.zeros(3)),
-            "ball": jj.RigidBody.ball(1.0, 0.1, position=jnp.stack([q.x, o, o + 0.15]), orientation=jj.rot_y(q.roll)),
+            "ball": jj.RigidBody.ball(1.0, 0.1, position=[q.x, o, o + 0.15], orientation=jj.rot_y(q.roll)),
         }
 
     def contacts(self, pose):
@@ -105,13 +105,13 @@ class OnLift(OnSledge):
 
     def bodies(self, t, q):
         made = super().bodies(t, q)
-        up = jnp.stack([0.0 * q.rise, 0.0 * q.rise, q.rise])
+        up = jnp.stack([0.0, 0.0, q.rise])
         ball = self.ground(q, up).plane_at(up)
         at = ball.origin + q.x * ball.axes[:, 0] + 0.1 * ball.normal
         return made | {"ball": jj.RigidBody.ball(1.0, 0.1, position=at, orientation=jj.rot_y(q.roll))}
 
     def contacts(self, pose):
-        return {"back": jj.ball_contact(pose["ball"], 0.1, ground=self.ground(pose.q, jnp.stack([0.0 * pose.q.rise, 0.0 * pose.q.rise, pose.q.rise])))}
+        return {"back": jj.ball_contact(pose["ball"], 0.1, ground=self.ground(pose.q, jnp.stack([0.0, 0.0, pose.q.rise])))}
 
 
 def test_a_check_names_grounds_and_bodies_and_passes_all_models():

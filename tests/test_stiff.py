@@ -63,7 +63,7 @@ def damped():
 
 
 def test_a_stiff_motion_is_run_again_by_an_implicit_solver_and_says_so(damped):
-    assert int(damped.raise_if_failed().fallback) == results.IMPLICIT
+    assert damped.raise_if_failed().fallback == results.IMPLICIT
     assert damped.solver == "RadauIIA"
     assert "with an implicit solver: the motion is stiff" in str(damped)
     assert_allclose(damped["x"], np.sin(TS), rtol=0, atol=1e-8)  # as asked
@@ -72,16 +72,16 @@ def test_a_stiff_motion_is_run_again_by_an_implicit_solver_and_says_so(damped):
 
 def test_a_solver_that_was_chosen_is_kept_and_a_motion_that_is_not_stiff_has_no_other_solver():
     chosen = jj.simulate(Damped(), {"x_rate": 1.0}, ts=TS, solver=diffrax.Dopri8(), max_steps=2000, retry=True)
-    assert int(chosen.result) == results.MAX_STEPS
-    assert int(chosen.fallback) == results.AS_ASKED
+    assert chosen.result == results.MAX_STEPS
+    assert chosen.fallback == results.AS_ASKED
     slow = jj.simulate(Ridge(strength=0.0), {"x": 1.0, "x_rate": 1.0}, ts=TS, max_steps=2, retry=True)
     assert int(slow.result) in (results.MAX_STEPS, results.SHRANK)
-    assert int(slow.fallback) == results.AS_ASKED
+    assert slow.fallback == results.AS_ASKED
 
 
 def test_a_motion_too_stiff_for_its_number_of_steps_is_called_stiff():
     motion = jj.simulate(Damped(), {"x_rate": 0.0}, ts=TS, max_steps=30, retry=True)  # 3 for the implicit solver
-    assert int(motion.result) == results.STIFF
+    assert motion.result == results.STIFF
     assert motion.message.startswith("stiff: ran out of steps")
     assert motion.warnings[0] == motion.message
 
@@ -111,10 +111,10 @@ TURNED = {"heading": 0.0, "heading_rate": 1.3}
 def test_a_motion_that_left_its_domain_is_run_again_where_that_is_asked_for_and_its_code_says_how():
     ts = np.array([2.0])
     told = jj.simulate(TurnedSkate(), TURNED, ts=ts)
-    assert int(told.result) == results.SINGULAR_PARTITION
+    assert told.result == results.SINGULAR_PARTITION
     assert "retry=True" in told.message
     again = jj.simulate(TurnedSkate(), TURNED, ts=ts, retry=True)
-    assert int(again.raise_if_failed().fallback) == results.FULL_STATE
+    assert again.raise_if_failed().fallback == results.FULL_STATE
     inside = jax.jit(lambda rate: jj.simulate(TurnedSkate(), TURNED | {"heading_rate": rate}, ts=ts, retry=True))(1.3)
     assert (int(inside.result), int(inside.fallback)) == (results.SINGULAR_PARTITION, results.AS_ASKED)
 
@@ -128,7 +128,7 @@ def test_a_lane_that_is_stiff_and_leaves_its_domain_is_run_with_the_full_state_a
     assert batch.continued.tolist() == [0, 1]
     assert [(batch.lane(i).solver, batch.lane(i).state_form) for i in range(2)] == [("Dopri8", "full"), ("RadauIIA", "full")]
     alone = jj.simulate(scene.replace(damping=1e6), TURNED, ts=ts, retry=True)
-    assert int(alone.raise_if_failed().fallback) == both
+    assert alone.raise_if_failed().fallback == both
     expected = skate.motion(ts, slope=0.3, gravity=9.81, u0=0.0, th0=0.0, th_rate=1.3)["x"]
     for motion in (alone, batch.lane(0), batch.lane(1)):
         assert_allclose(motion["x"], expected, rtol=0, atol=1e-7)
@@ -136,7 +136,7 @@ def test_a_lane_that_is_stiff_and_leaves_its_domain_is_run_with_the_full_state_a
 
 def test_steps_that_shrink_towards_a_singularity_are_named():
     motion = jj.simulate(Centre(), {"x": 1.0}, ts=TS, max_steps=70)
-    assert int(motion.result) == results.SHRANK
+    assert motion.result == results.SHRANK
     assert "shrunk" in motion.message
     assert 0 < float(motion.last_step) < 1e-3
     assert_allclose(motion.t_end, np.pi / np.sqrt(8), rtol=1e-3)
@@ -217,7 +217,7 @@ def test_a_stiff_motion_is_right_at_its_event_and_so_is_its_derivative(options):
     """It is located by steps of the solver that followed the motion."""
     for height, x in ((7.3, 0.85), (0.4, -1.0)):
         motion = jj.simulate(Following(), {"y": height, "x": x}, ts=[6.0], max_steps=20_000, **options)
-        assert int(motion.result) == results.EVENT
+        assert motion.result == results.EVENT
         assert_allclose(motion.t_end, np.sqrt(2 * height), rtol=1e-10)
         expected = followed(height, x)
         assert_allclose(motion.q_end, [expected, 0.0], rtol=0, atol=5e-6)
@@ -231,7 +231,7 @@ def test_zero_is_no_attitude():
     top = jj.models.FreeRigidBody()
     none = jj.consistent(top, 0.0, jnp.zeros(7), jnp.zeros(6))
     assert float(none.residual) == 0.5
-    assert int(jj.simulate(top, none, t1=1.0).result) == results.INCONSISTENT_START
+    assert jj.simulate(top, none, t1=1.0).result == results.INCONSISTENT_START
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -239,7 +239,7 @@ def test_a_start_that_is_not_finite_is_not_called_consistent(value):
     skate = jj.models.Skate()
     state = jj.consistent(skate, 0.0, jnp.array([0.0, value, 0.0]), jnp.zeros(3))
     assert float(state.residual) == np.inf
-    assert int(jj.simulate(skate, state, t1=1.0).result) == results.BAD_START
+    assert jj.simulate(skate, state, t1=1.0).result == results.BAD_START
 
 
 def test_the_discrete_lagrange_dalembert_equations_are_named_as_such():

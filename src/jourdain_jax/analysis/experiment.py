@@ -15,6 +15,7 @@ from jourdain_jax.analysis.quantities import Instrument, StopEvent, channel, cut
 from jourdain_jax.analysis.sensors import Actuator, Drive, Numbers, Reading, Sensor, Times, ideal, latest, response
 from jourdain_jax.calculus.reals import Number, array_module, checked_unless_traced, described, holds, is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled, as_inputs
+from jourdain_jax.scene.arguments import one_time, vector_of_times
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.scene import Scene, entries_named
 
@@ -78,7 +79,7 @@ class Experiment(eqx.Module):
         correlation_time: "Mapping | Number | None" = 0.0,
         events: Mapping | None = None,
     ):
-        self.ts = checked_unless_traced(ts, "`ts`", advice="give times in s")
+        self.ts = vector_of_times(ts)
         _check_times(self.ts)
         for what, part in (("values", values), ("start", start), ("sensors", sensors or {}), ("events", events or {})):
             if not isinstance(part, Mapping):
@@ -95,7 +96,7 @@ class Experiment(eqx.Module):
         self.inputs = inputs
         self.sensors = {name: one if isinstance(one, Sensor) else Sensor(one) for name, one in (sensors or {}).items()}
         self.readings, self.drives, self.estimates = {}, {}, {}
-        self.t0 = _array(self.ts[0] if t0 is None else checked_unless_traced(t0, "`t0`", (), advice="give a time in s"))
+        self.t0 = _array(self.ts[0] if t0 is None else one_time(t0, "t0"))
         self.ended_by = next(iter(events or {}), "")
         if events:
             self.ts, self.values, self.sigma = cut(events, self.t0, self.ts, self.values, self.sigma)
@@ -153,8 +154,8 @@ def _array(x) -> Array | np.ndarray:
     return array_module(x).asarray(x, jnp.result_type(float))
 
 
-def _reals(what: str, given: Mapping, advice: str = "check how it is put together") -> dict[str, Array | np.ndarray]:
-    return {name: checked_unless_traced(value, f"{what} `{name}`", advice=advice) for name, value in given.items()}
+def _reals(what: str, given: Mapping, advice: str = "check how it is put together", shape: tuple[()] | None = None) -> dict[str, Array | np.ndarray]:
+    return {name: checked_unless_traced(value, f"{what} `{name}`", shape, advice=advice) for name, value in given.items()}
 
 
 def _unmasked(value):
@@ -164,23 +165,15 @@ def _unmasked(value):
 
 def _correlation_times(given: Mapping) -> dict[str, Array | np.ndarray]:
     """Those that are not zero; zero where it is not known."""
-    found = {}
-    for name, value in given.items():
-        if value is None:
-            found[name] = np.zeros((), jnp.result_type(float))
-            continue
-        time = checked_unless_traced(value, f"correlation time of channel `{name}`", (), advice="give a time in s, or None where it is not known")
+    numbers = {name: 0.0 if value is None else value for name, value in given.items()}
+    found = _reals("correlation time of channel", numbers, "give a time in s, or None where it is not known", ())
+    for name, time in found.items():
         if not holds(lambda x: np.isfinite(x) & (x >= 0), time):
             raise ValueError(f"the correlation time of channel `{name}` is {float(time):g} s, expected zero or more; None where it is not known")
-        if holds(lambda x: x != 0, time):
-            found[name] = time
-    return found
+    return {name: time for name, time in found.items() if given[name] is None or holds(lambda x: x != 0, time)}
 
 
 def _check_times(ts) -> None:
-    if ts.ndim != 1 or ts.size == 0:
-        raise ValueError(f"`ts` has shape {ts.shape}, expected a vector of at least one time in s")
-
     @np.errstate(invalid="ignore")
     def good(ts):
         return np.isfinite(ts) & (np.diff(ts, prepend=-np.inf) > 0)

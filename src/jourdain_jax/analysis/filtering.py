@@ -28,7 +28,7 @@ from jourdain_jax.analysis.quantities import Channel, Instrument, StopEvent
 from jourdain_jax.analysis.runs import Run, equal_runs
 from jourdain_jax.analysis.sensors import Reading, gauss_legendre, ideal
 from jourdain_jax.analysis.tangent import dependent_coordinates, others, privileged_speeds
-from jourdain_jax.calculus.reals import checked_unless_traced, holds
+from jourdain_jax.calculus.reals import checked_real, holds
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.inputs import Inputs, inputs_at
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
@@ -221,10 +221,10 @@ def _intensities(scene: Scene, speeds: tuple[int, ...], given: Mapping) -> Float
                 f"`process_noise` names `{name}`, which is no independent speed of `{type(scene).__name__}`; {nearest(name, names)} "
                 "Others can be made so by `privileged` of the scene."
             )
-        number = checked_unless_traced(value, f"process noise of `{name}`", (), advice="give one number")
+        number = checked_real(value, f"process noise of `{name}`", (), advice="give one number")
         if not holds(lambda x: np.isfinite(x) & (x >= 0), number):
             raise ValueError(f"process noise of `{name}` is {float(number):g}, expected zero or more")
-        found[name] = jnp.asarray(number, jnp.result_type(float))
+        found[name] = number.astype(jnp.result_type(float))
     return jnp.stack(list(found.values())) if found else jnp.zeros(0)
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.build.structure import structure_of, usual_rows
-from jourdain_jax.calculus.reals import RUN_SELDOM, Entries, compiled, is_traced, real_type
+from jourdain_jax.calculus.reals import RUN_SELDOM, Entries, array_module, compiled, real_type
 from jourdain_jax.dynamics.reduced import DEPENDS, ignorable_coordinates
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
@@ -92,7 +92,7 @@ class Sloped:
 
     def __call__(self, numbers: Float[Entries, "numbers"]) -> Slopes:
         """v, D and the other matrix; NaN where a guard is not positive."""
-        xp = jnp if is_traced(numbers) else np
+        xp = array_module(numbers)
         found = (self._traced if xp is jnp else self._known)(numbers)
         found = xp.where(xp.all(found[self.guards] > 0), found, xp.nan)
         found = xp.concatenate([found, xp.zeros(1, found.dtype)])
@@ -139,7 +139,7 @@ class ByProgram:
 
 def numbers_of(scene: Scene, t, q, u, f) -> Float[Entries, "numbers"]:
     """All numbers in a row: parameters, t, q, u, inputs."""
-    xp = jnp if is_traced((scene, t, q, u, f)) else np
+    xp = array_module((scene, t, q, u, f))
     parts = [*jax.tree.leaves(scene), t, q, u, f]
     return xp.concatenate([xp.ravel(xp.asarray(x, real_type())) for x in parts])
 

@@ -25,7 +25,6 @@ from jourdain_jax.analysis.tangent import (
     dependent_coordinates,
     eliminated,
     inverse,
-    numeric,
     others,
     perturbations,
     perturbed_names,
@@ -34,7 +33,7 @@ from jourdain_jax.analysis.tangent import (
     smallest_pivot,
 )
 from jourdain_jax.build.structure import WELL_CONDITIONED
-from jourdain_jax.calculus.reals import RUN_SELDOM, Numbers, compiled, is_traced
+from jourdain_jax.calculus.reals import RUN_SELDOM, Numbers, array_module, compiled, holds, is_traced
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.lowering.kinks import bent_load
 from jourdain_jax.motion.put_on_rows import State
@@ -169,7 +168,7 @@ def linearize(
     dependent = None if dependent is None else as_names(dependent)
     y = privileged_speeds(scene, privileged)
     found = _about(instant_of(built, y, masses=True), scene, state, f, y, dependent, coordinates)
-    if is_traced(found) or not found.pivot < WELL_CONDITIONED:
+    if holds(lambda pivot: ~(pivot < WELL_CONDITIONED), found.pivot):
         return found
     if privileged is None and scene.privileged is None:
         chosen = privileged_at(scene, state, f, y)
@@ -211,7 +210,7 @@ def _about(instant, scene: Scene, state: State, f, y: tuple[int, ...], dependent
 
 def _matrices(scene: Scene, q, v, D, mass, independent: tuple[str, ...], y: tuple[int, ...], coordinates: tuple[str, ...]) -> dict:
     """What `Linearization` holds."""
-    at, names, xp, chosen = places_of(scene), perturbed_names(scene), numeric((q, D)), np.array(y, int)
+    at, names, xp, chosen = places_of(scene), perturbed_names(scene), array_module((q, D)), np.array(y, int)
     kept, (count, m) = np.array([names.index(name) for name in independent], int), (len(names), len(at.u))
     (S, turned), constant = perturbations(scene), at.udot[chosen]
     change = D[constant] @ xp.concatenate([np.ones(1), v[at.qdot], v[at.udot], np.zeros(len(at.f))])
@@ -236,7 +235,7 @@ def _matrices(scene: Scene, q, v, D, mass, independent: tuple[str, ...], y: tupl
 
 def _second_order(scene: Scene, A, B, mass, independent: tuple[str, ...], y, coordinates: tuple[str, ...]):
     """M, C, K, F of the named coordinates and what couples them to the rest; `mass` is that of the privileged speeds."""
-    count, k, xp = len(independent), len(coordinates), numeric(A)
+    count, k, xp = len(independent), len(coordinates), array_module(A)
     p = np.array([independent.index(name) for name in coordinates], int)
     # (ds, pdot, other privileged speeds) = change x
     kept = count + _speeds_beside(scene, y, coordinates)
@@ -252,7 +251,7 @@ def _second_order(scene: Scene, A, B, mass, independent: tuple[str, ...], y, coo
 
 def _relative(neglected, kept):
     """Largest neglected entry over the largest kept one; the entry itself where nothing is kept."""
-    xp = numeric(kept)
+    xp = array_module(kept)
     size = xp.max(xp.abs(kept), initial=0.0)
     return xp.max(xp.abs(neglected), initial=0.0) / xp.where(size > 0, size, 1.0)
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from jourdain_jax.build.rank import best_privileged, named_speeds, pivots_at
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import WELL_CONDITIONED, structure_of, usual_rows
-from jourdain_jax.calculus.reals import Entries, is_traced, rank_cutoff
+from jourdain_jax.calculus.reals import Entries, array_module, is_traced, rank_cutoff
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.rows import position_residual
@@ -53,15 +53,10 @@ def perturbations(scene: Scene) -> tuple[Float[np.ndarray, "coordinates perturbe
 _HALF_A_TURN = np.eye(4)[[[1, 2, 3], [0, 3, 2], [3, 0, 1], [2, 1, 0]]] * np.array([[-1, -1, -1], [1, -1, 1], [1, 1, -1], [-1, 1, 1]])[..., None] / 2
 
 
-def numeric(x):
-    """`jax.numpy` where anything is traced, otherwise NumPy."""
-    return jnp if is_traced(x) else np
-
-
 def inverse(x: Float[Entries, "rows columns"]) -> Float[Entries, "columns rows"]:
     """The inverse, or the pseudo-inverse of what is not square; NaN where there is none."""
     try:
-        return numeric(x).linalg.inv(x) if len(x) == x.shape[1] else numeric(x).linalg.pinv(x, rtol=rank_cutoff(x.dtype))
+        return array_module(x).linalg.inv(x) if len(x) == x.shape[1] else array_module(x).linalg.pinv(x, rtol=rank_cutoff(x.dtype))
     except np.linalg.LinAlgError:
         return np.full(x.T.shape, np.nan)
 
@@ -76,12 +71,12 @@ def eliminated(rows: Float[Entries, "rows all"], independent: Int[np.ndarray, "i
     dependent = others(independent, rows.shape[1])
     rows = _of_unit_length(rows, dependent)
     followed = -inverse(rows[:, dependent]) @ rows[:, independent]
-    return numeric(rows).concatenate([np.eye(len(independent)), followed])[np.argsort(np.concatenate([independent, dependent]))]
+    return array_module(rows).concatenate([np.eye(len(independent)), followed])[np.argsort(np.concatenate([independent, dependent]))]
 
 
 def smallest_pivot(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]) -> Float[Entries, ""]:
     """The smallest singular value of the dependent part of rows, each of unit length; no derivative."""
-    xp, block = numeric(rows), _of_unit_length(rows, dependent)[:, dependent]
+    xp, block = array_module(rows), _of_unit_length(rows, dependent)[:, dependent]
     if xp is np and not np.all(np.isfinite(block)):
         return np.asarray(np.nan)
     sizes = xp.linalg.svd(jax.lax.stop_gradient(block) if xp is jnp else block, compute_uv=False)
@@ -90,7 +85,7 @@ def smallest_pivot(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, 
 
 def _of_unit_length(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray, "dependent"]) -> Float[Entries, "rows all"]:
     """Rows over the lengths of their dependent parts."""
-    xp, block = numeric(rows), rows[:, dependent]
+    xp, block = array_module(rows), rows[:, dependent]
     length = xp.linalg.norm(jax.lax.stop_gradient(block) if xp is jnp else block, axis=1, keepdims=True)
     return rows / xp.where(length > 0, length, 1.0)
 

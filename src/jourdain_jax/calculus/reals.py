@@ -155,7 +155,7 @@ def has_unit(x) -> bool:
 
 def as_array(x, dtype):
     """An array of this type: on NumPy where its numbers are known, of JAX where they are traced."""
-    return (jnp if is_traced_type(type(x)) else np).asarray(x, dtype)
+    return array_module(x).asarray(x, dtype)
 
 
 def in_default_precision(tree):

@@ -9,12 +9,11 @@ to the right, and one of `rot_y` pitches the nose down and rolls a wheel ahead.
 
 from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Real
 
-from jourdain_jax.calculus.reals import Number, Vector, checked_real
+from jourdain_jax.calculus.reals import Number, Vector, checked_real, holds
 
 
 def _angle(angle: Number) -> Float[Array, ""]:
@@ -72,7 +71,7 @@ def quaternion_to_matrix(quaternion: Real[Array | np.ndarray, "4"] | Sequence[Nu
     ValueError where it is known to be zero; NaN where a traced one is.
     """
     quaternion = checked_real(quaternion, "quaternion", (4,), advice="give (w, x, y, z)")
-    if not isinstance(quaternion, jax.core.Tracer) and not np.any(np.asarray(quaternion)):
+    if not holds(np.any, quaternion):
         raise ValueError("quaternion is (0, 0, 0, 0), which is no attitude; give (w, x, y, z) of any other length, such as (1, 0, 0, 0) for none turned")
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     # R = 1 + 2 (w [v]x + [v]x^2) / (w^2 + v.v): unchanged by the norm, so that a drifting norm never scales an inertia.

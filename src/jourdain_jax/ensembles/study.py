@@ -8,7 +8,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from jourdain_jax.calculus.reals import checked_unless_traced, checked_whole, described, has_unit
+from jourdain_jax.calculus.reals import checked_real, checked_whole, described, has_unit
 from jourdain_jax.ensembles.cluster import on_cluster
 from jourdain_jax.ensembles.design import Design
 from jourdain_jax.ensembles.distributions import Distribution, Levels
@@ -103,7 +103,7 @@ class Study(Printed):
             if name not in q and name not in u:
                 raise ValueError(f"`{type(self.scene).__name__}` has no coordinate or speed `{name}` to start with; {nearest(name, (*q, *u, *groups))}")
             if not isinstance(how, Distribution | Levels) and (np.ndim(how) == 0 or name in groups):
-                constants[name] = checked_unless_traced(how, f"start `{name}`", advice="give its value") if has_unit(how) else how
+                constants[name] = checked_real(how, f"start `{name}`", advice="give its value") if has_unit(how) else how
             elif name in groups:
                 raise ValueError(f"start `{name}` is a vector; what varies must be one number: vary its entries")
             else:

@@ -17,8 +17,8 @@ def may_be_massless(scene: Scene, structure: Structure) -> bool:
     These are parameters declared `non_negative` and those whose default is zero; where privileged speeds serve, so that it costs nothing, all that are not
     declared `positive`.
     """
-    if structure.massless or not is_traced(scene):
-        return structure.massless
+    if structure.massless:
+        return True
     without = _with_zeros(scene, every=structure.well_conditioned)
     if without is None:
         return False

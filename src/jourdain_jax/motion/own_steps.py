@@ -202,8 +202,9 @@ def moving_jumps(field: VectorField, scene: Scene, inputs: Inputs, scene_varies:
     if not program.jumps:
         return False
     lowered = [isinstance(channel, FunctionOfTime) and program is not field.lowered for channel in inputs.channels]
-    numbers = [varies for channel in compress(inputs.channels, lowered) for varies in numbers_of(jax.tree.map(is_traced, channel))]
-    others = [is_traced(channel) for channel, is_lowered in zip(inputs.channels, lowered, strict=True) if not is_lowered]
+    traced = [jax.tree.map(is_traced, channel) for channel in inputs.channels]
+    numbers = [varies for channel in compress(traced, lowered) for varies in numbers_of(channel)]
+    others = [any(jax.tree.leaves(channel)) for channel, is_lowered in zip(traced, lowered, strict=True) if not is_lowered]
     count = len(program.traced.q) + len(program.independent)
     varies = [*[scene_varies] * len(field.lowered.fixed), *numbers, False, *[True] * count, *others]
     return any(depend_on(program.graph, program.jumps, compress(program.variables, varies)))

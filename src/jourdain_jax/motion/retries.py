@@ -19,12 +19,13 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from jourdain_jax.calculus.reals import is_traced, known_numbers
+from jourdain_jax.calculus.reals import known_numbers
 from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
 from jourdain_jax.motion.integrators.explicit_steps import DOPRI8
 from jourdain_jax.motion.integrators.radau import RadauIIA
 from jourdain_jax.motion.integrators.taylor import Taylor
 from jourdain_jax.motion.options import AllOptions
+from jourdain_jax.motion.sensitivity import numbers_where_known
 from jourdain_jax.motion.setup import Setup
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -128,8 +129,8 @@ def lost_codes(field: VectorField) -> tuple[int, ...]:
 
 def _is_stiff(field: VectorField, motion: Trajectory, t0) -> bool:
     """Whether stability kept the steps of a `motion` from `t0` short that ran out of them; False where its numbers are not known."""
-    known = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, (field, motion, t0))
-    if int(motion.result) not in OUT_OF_STEPS or int(motion.accepted) == 0 or is_traced(known):
+    known = numbers_where_known((field, motion, t0))
+    if int(motion.result) not in OUT_OF_STEPS or int(motion.accepted) == 0 or known is None:
         return False
     field, motion, t0 = known
     step = float(motion.last_step)

@@ -121,7 +121,7 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
     if not varies:
         return integrate(setup)
     start, (rtol, atol) = setup.start, setup.tolerances
-    known = _known((start.q, start.u, rtol, atol))
+    known = numbers_where_known((start.q, start.u, rtol, atol))
     if known is None:
         return integrate(setup)
     tolerances = float(known[2]), float(known[3])
@@ -132,7 +132,7 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
         at_start = shown(at_start, size.start(known[:2]))
     motion = integrate(eqx.tree_at(lambda s: (s.start.q, s.start.u), setup, at_start))
     parts = (motion.q, motion.u, motion.q_end, motion.u_end)
-    seen = _known((*parts, motion.accepted))
+    seen = numbers_where_known((*parts, motion.accepted))
     if seen is None:
         return motion
     if {"scene", "start", "inputs", "t0"}.intersection(varies):
@@ -144,7 +144,7 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
 
 def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -> None:
     """Warn where one of the differentiated `motions` crossed relations at which rates jump; do nothing where that is not known."""
-    crossings = _known(motions.crossings)
+    crossings = numbers_where_known(motions.crossings)
     if crossings is None or not np.any(crossings):
         return
     names = jax.tree.map(lambda x: x[0], motions.scene) if motions.q.ndim > 2 else motions.scene
@@ -158,7 +158,7 @@ def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -
         warnings.warn(text, SensitivityWarning, stacklevel=users_level())
 
 
-def _known(values):
-    """The numbers of values that are being differentiated outside of `jit`; None where they have none."""
+def numbers_where_known(values):
+    """Return the values with numbers where they are being differentiated outside of `jit`; None where they have none."""
     bare = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, values)
-    return None if is_traced(bare) else jax.tree.map(np.asarray, bare)
+    return None if is_traced(bare) else jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, bare)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.on_first_use import module_on_first_use
-from jourdain_jax.calculus.reals import Number, as_array, checked_unless_traced, described, is_traced, known_numbers, nothing_is_traced, real_type
+from jourdain_jax.calculus.reals import Number, as_array, described, is_traced, known_numbers, nothing_is_traced, real_type
 from jourdain_jax.motion.inputs import Inputs, check_inputs_in_rows, inputs_at
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.explicit_steps import DOPRI8, TSIT5, Method
@@ -32,7 +32,7 @@ from jourdain_jax.motion.setup import LONGEST, Setup, times_fit
 from jourdain_jax.motion.start import named_start
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_speeds, one_time, shown_from_users_lines, users_level
+from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_speeds, one_time, shown_from_users_lines, users_level, vector_of_times
 from jourdain_jax.scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -220,9 +220,7 @@ def span_and_times(scene: Scene, start, t0, t1, ts):
 
 def saved_times(ts) -> "Float[Array, 'times'] | Float[np.ndarray, 'times']":
     """Times to save at, on NumPy where they are known; a ValueError where they are no monotonic vector of finite numbers."""
-    ts = checked_unless_traced(ts, "`ts`", advice="give a vector of times in s")
-    if ts.ndim != 1 or ts.shape[0] == 0:
-        raise ValueError(f"`ts` has shape {ts.shape}, expected a vector of at least one time in s")
+    ts = vector_of_times(ts)
     steps = np.diff(known_numbers(ts))
     if not ((steps > 0).all() or (steps < 0).all()) or not np.isfinite(known_numbers(ts)).all():
         raise ValueError("`ts` must be finite and strictly increasing (or decreasing, for reversed time); sort it and drop repeated times")

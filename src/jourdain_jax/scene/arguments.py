@@ -20,7 +20,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.derivatives import DifferentiationModeError
-from jourdain_jax.calculus.reals import at_once, checked_real, checked_unless_traced, described, is_traced, real_type, with_usual_promotion
+from jourdain_jax.calculus.reals import (
+    Entries,
+    at_once,
+    checked_real,
+    checked_unless_traced,
+    described,
+    is_traced,
+    real_type,
+    with_usual_promotion,
+)
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
@@ -77,6 +86,14 @@ def as_time(t) -> Float[Array, ""]:
 def one_time(t, name: str = "t"):
     """A time on NumPy, unless it is traced; None stays. A ValueError that names it where it is no number."""
     return None if t is None else checked_unless_traced(t, f"`{name}`", (), advice="give one time in s; use `jax.vmap` for many")
+
+
+def vector_of_times(ts) -> Float[Entries, "times"]:
+    """Times in s, on NumPy unless they are traced. A ValueError where they are no vector of at least one number."""
+    ts = checked_unless_traced(ts, "`ts`", advice="give a vector of times in s")
+    if ts.ndim != 1 or ts.size == 0:
+        raise ValueError(f"`ts` has shape {ts.shape}, expected a vector of at least one time in s")
+    return ts
 
 
 def as_coordinates(scene: Scene, q) -> Float[Array, "coordinates"]:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.on_first_use import needed
-from jourdain_jax.calculus.reals import Vector, checked_positive, checked_real, described, is_traced
+from jourdain_jax.calculus.reals import Vector, checked_known, checked_positive, checked_real, described
 from jourdain_jax.scene.bodies import _axis_index, _stack
 from jourdain_jax.scene.grounds import tangents_of
 
@@ -125,9 +125,8 @@ class Visual(eqx.Module):
         `vertices` (points, 3) in m and `faces`, one row of numbers of vertices for each, anticlockwise seen from outside, are known numbers; `scale`, one
         factor or three, may depend on parameters. `look` as for all shapes.
         """
-        if is_traced(vertices, faces):
-            raise ValueError("the vertices of a mesh depend on parameters or coordinates, expected known numbers; use `scale`, `at` and `turn`")
-        corners = np.asarray(vertices, float)
+        advice = "where they depend on parameters or coordinates, use `scale`, `at` and `turn`"
+        corners = checked_known(vertices, "`vertices` of a mesh", advice=advice)
         if corners.ndim != 2 or corners.shape[1] != 3 or not np.all(np.isfinite(corners)):
             raise ValueError(f"vertices of a mesh have shape {corners.shape}, expected (points, 3), finite, m")
         polygons = tuple(tuple(int(i) for i in face) for face in faces)

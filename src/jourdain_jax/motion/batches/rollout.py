@@ -103,11 +103,11 @@ class Rollout(Printed, eqx.Module):
 
         `units`: name of a coordinate or speed -> its unit, as in `Trajectory.to_xarray`. ImportError without xarray.
         """
-        return labelled.dataset(self.lanes, units)
+        return labelled.to_xarray(self.lanes, units)
 
     def to_pandas(self):
         """Coordinates and speeds as a `pandas.DataFrame`, one row for each lane and time (s). ImportError without pandas."""
-        return labelled.frame(self.lanes)
+        return labelled.to_pandas(self.lanes)
 
     def _picture(self) -> str:
         return sketch_of_lanes(self.lanes)

@@ -14,7 +14,7 @@ from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.motion.inputs import Constant, Sampled
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.trajectories.over_times import Checked, Checks, Record, map_over_times
-from jourdain_jax.motion.trajectories.results import FALLBACKS
+from jourdain_jax.motion.trajectories.results import FALLBACKS, SINGULAR_PARTITION
 from jourdain_jax.motion.vector_fields.field import reason_for_matrices
 
 
@@ -180,12 +180,13 @@ def summary(trajectory: Record, message: str) -> str:
     pivot = "" if trajectory.state_form == "full" else f"; pivot of the privileged speeds at least {float(trajectory.smallest_pivot):.1e}"
     dense = reason_for_matrices(structure_of(trajectory.scene), trajectory.inputs.constant)
     low, high = (int(r) for r in found.rank)
-    moved = float(trajectory.moved_q), float(trajectory.moved_u)
+    moved, left = (float(trajectory.moved_q), float(trajectory.moved_u)), _left_domain(trajectory)
+    lost = left if int(trajectory.result) == SINGULAR_PARTITION else ""
     inputs = [f"{name} {_channel_text(channel)}" for name, channel in zip(trajectory.scene.inputs, trajectory.inputs.channels, strict=True)]
     rows = [
-        ("motion", f"t {float(ts[0]):.6g} to {float(trajectory.t_end):.6g} s, {saved}; {message}"),
+        ("motion", f"t {float(ts[0]):.6g} to {float(trajectory.t_end):.6g} s, {saved}; {message}{lost}"),
         ("solver", f"{trajectory.solver}, {int(trajectory.accepted)} steps accepted, {int(trajectory.rejected)} rejected"),
-        *([("run again", FALLBACKS[int(trajectory.fallback)].removeprefix("run again ") + _left_domain(trajectory))] if int(trajectory.fallback) else []),
+        *([("run again", FALLBACKS[int(trajectory.fallback)].removeprefix("run again ") + left)] if int(trajectory.fallback) else []),
         ("state", f"{trajectory.state_form}, reduction: {trajectory.reduction}" + (", projected after each step" if trajectory.projected else "") + pivot),
         *([("dense", dense)] if dense else []),
         *([("relations", f"{int(trajectory.crossings)} crossings")] if int(trajectory.crossings) > 0 else []),

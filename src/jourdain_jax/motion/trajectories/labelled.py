@@ -9,9 +9,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from jourdain_jax.calculus.on_first_use import needed
-from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.trajectories.over_times import Record
 from jourdain_jax.motion.trajectories.results import CODES
+from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import parameters_of
 
@@ -25,7 +25,8 @@ OF_LANES: dict[str, tuple[str, str, float, dict]] = {  # name: field of a motion
 }
 
 
-def dataset(record: Record, units: Mapping[str, str] | None = None):
+@of_known_numbers
+def to_xarray(record: Record, units: Mapping[str, str] | None = None):
     """The motion, or with a leading axis the lanes, as an `xarray.Dataset`; `units`: name of a coordinate or speed -> its unit."""
     xarray = needed("xarray", "a motion as labelled arrays")
     lanes = _lanes(record)
@@ -60,7 +61,8 @@ def dataset(record: Record, units: Mapping[str, str] | None = None):
     return held.assign_attrs(scene=type(record.scene).__name__, conventions=record.scene.conventions, solver=record.solver)
 
 
-def frame(record: Record):
+@of_known_numbers
+def to_pandas(record: Record):
     """Coordinates and speeds as a `pandas.DataFrame`: one row for each time, or for each lane and time."""
     pandas = needed("pandas", "a table of a motion")
     lanes, ts = _lanes(record), np.asarray(record.ts)
@@ -72,8 +74,6 @@ def frame(record: Record):
 
 
 def _lanes(record: Record) -> tuple[str, ...]:
-    if is_traced(record.q, record.ts):
-        raise ValueError("a motion is being traced and has no numbers yet; make labelled arrays of it outside of `jax.jit`, `jax.vmap` and derivatives")
     return ("lane",) * (record.q.ndim - 2)
 
 

@@ -117,11 +117,11 @@ class Trajectory(Record, Printed):
 
         `units`: name of a coordinate or speed -> its unit, kept as `attrs["units"]`: a scene states those of its parameters only. ImportError without xarray.
         """
-        return labelled.dataset(self, units)
+        return labelled.to_xarray(self, units)
 
     def to_pandas(self):
         """Coordinates and speeds as a `pandas.DataFrame`, one row for each time (s). ImportError without pandas."""
-        return labelled.frame(self)
+        return labelled.to_pandas(self)
 
     def _text(self) -> str:
         with nan_is_a_mark():
