@@ -44,15 +44,11 @@ WIDTH = 8  # lanes of a vector
 OUTPUTS = {"final lean": jj.End("lean", "rad"), "final yaw": jj.End("yaw", "rad"), "fell": jj.Happened("fallen"), "fall time": jj.EventTime("fallen")}
 
 
-def discs(lanes: int) -> jj.Study:
-    """Discs with random starts."""
+def run(lanes: int, path, memory=None, **options) -> jj.StudyResult:
+    """A study of so many discs with random starts in a folder."""
     start = {"lean": jj.Uniform(-0.6, 0.6), "yaw_rate": jj.Normal(0.0, 0.5), "lean_rate": jj.Normal(0.0, 0.3), "spin_rate": jj.Uniform(-9.0, 0.0)}
-    return jj.Study(jj.models.TiltingDisc(), start=start, samples=lanes, seed=1)
-
-
-def run(lanes: int, path, **options) -> jj.StudyResult:
-    """A study of so many discs in a folder."""
-    return discs(lanes).run(path, t1=SPAN, rtol=TOLERANCE, atol=TOLERANCE, outputs=OUTPUTS, progress=False, **options)
+    study = jj.Study(jj.build(jj.models.TiltingDisc(), memory=memory), start=start, samples=lanes, seed=1)
+    return study.run(path, t1=SPAN, rtol=TOLERANCE, atol=TOLERANCE, outputs=OUTPUTS, progress=False, **options)
 
 
 def timed(lanes: int, folder: Path, **options) -> dict:
@@ -100,13 +96,12 @@ def call(name: str, lanes: int, folder: Path, **options) -> list[str]:
 
 def in_fresh_process(lanes: int, folder: Path, on_one_core: bool = False, **options) -> dict:
     """`timed` in a process of its own, on all cores or on one."""
-    environment = os.environ | ({"JOURDAIN_JAX_THREADS": "1"} if on_one_core else {})
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     cores = os.sched_getaffinity(0)
     begin = lambda: os.sched_setaffinity(0, {min(cores)} if on_one_core else cores)  # noqa: E731
-    command = call("timed", lanes, folder, **options)
-    done = subprocess.run(command, cwd=HERE, env=environment, check=True, stdout=subprocess.PIPE, text=True, preexec_fn=begin)
+    environment = os.environ | ({"JOURDAIN_JAX_THREADS": "1"} if on_one_core else {})
+    done = subprocess.run(call("timed", lanes, folder, **options), cwd=HERE, env=environment, check=True, stdout=subprocess.PIPE, text=True, preexec_fn=begin)
     return json.loads(done.stdout.splitlines()[-1])
 
 
@@ -139,10 +134,9 @@ def memory(lanes: int, folder: Path) -> Figures:
     """Resident memory."""
     few, many = (in_fresh_process(count, folder / "memory")["peak"] for count in (lanes, 10 * lanes))
     yield figure(f"growth of resident memory from {lanes} to {10 * lanes} lanes, MB", MODEL, many - few, 300)
-    bound = 1000  # MB
-    kept = {"save": "trajectories", "ts": np.linspace(0.0, SPAN, 201).tolist(), "memory": f"{bound}MB"}
-    peak = in_fresh_process(lanes, folder / "memory", **kept)["peak"] * 2**20 / 1e6
-    yield figure("largest resident memory, MB, of a study that keeps trajectories under memory='1000MB'", MODEL, peak, bound)
+    ts = np.linspace(0.0, SPAN, 201).tolist()
+    peak = in_fresh_process(lanes, folder / "memory", save="trajectories", ts=ts, memory="1000MB")["peak"] * 1.048576
+    yield figure("largest resident memory, MB, of a study that keeps trajectories under memory='1000MB'", MODEL, peak, 1000)
 
 
 def processes(lanes: int, folder: Path) -> Figures:

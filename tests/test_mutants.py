@@ -446,7 +446,7 @@ def test_a_mutant_is_caught(mutant, monkeypatch):
 
 
 def test_a_derivative_is_no_number_where_memory_does_not_hold_the_motion(monkeypatch):
-    monkeypatch.setattr(recorded_adjoint, "_MEMORY", (2**27, 0))
+    monkeypatch.setattr(recorded_adjoint, "_SHARES", (32, 2**62))
     for windows, held in ((1, False), (40, True)):
         monkeypatch.setattr(recorded_adjoint, "_FEWEST", (16, windows))
         found, _ = jax.jit(jax.grad(weighed("reverse", "saved times"), has_aux=True))(arguments("saved times"))

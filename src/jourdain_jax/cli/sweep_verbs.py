@@ -37,6 +37,7 @@ from jourdain_jax.ensembles.outputs import End, EventTime, Happened, Integral, L
 from jourdain_jax.ensembles.result import LEVELS, StudyResult, load_study, merge_studies
 from jourdain_jax.ensembles.study import REFUSED, Study
 from jourdain_jax.models.registry import model
+from jourdain_jax.motion.model import build
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN
 from jourdain_jax.scene.names import nearest
 
@@ -87,9 +88,9 @@ def _sweep(options) -> bool:
 def _run(text: str, source: str, out: str, options) -> bool:
     asked = parsed(tomllib.loads, text, source, "TOML")
     check_depth(asked, lambda x: x.values() if isinstance(x, dict) else x if isinstance(x, list) else (), source)
-    study, how = described_study(asked)
+    study, how = described_study(asked, options.memory)
     try:
-        asked_here = {"processes": options.workers, "memory": options.memory, "shard": _shard(options.shard), "progress": not options.quiet}
+        asked_here = {"processes": options.workers, "shard": _shard(options.shard), "progress": not options.quiet}
         found = study.run(out, command=text, **asked_here, **how)
     except KeyboardInterrupt as stopped:
         print(f"jourdain-jax: {stopped or 'interrupted'}; or: jourdain-jax sweep resume {out}", file=sys.stderr)
@@ -104,8 +105,8 @@ def _run(text: str, source: str, out: str, options) -> bool:
     return not found.failed.size and not {*range(first - 1, found.store.chunks, every)}.difference(found.store.receipts())
 
 
-def described_study(asked: Mapping) -> tuple[Study, dict]:
-    """The study that a file describes, and how it is to be run."""
+def described_study(asked: Mapping, memory: str | None = None) -> tuple[Study, dict]:
+    """The study that a file describes, whose processes may hold so much memory, and how it is to be run."""
     for key in asked:
         if key not in KEYS:
             raise ValueError(f"the file has an entry `{key}`; {nearest(key, KEYS)}")
@@ -124,6 +125,7 @@ def described_study(asked: Mapping) -> tuple[Study, dict]:
     known = {name: asked[name] for name in ("sampler", "samples", "seed") if name in asked}
     outputs = {name: _output(name, how) for name, how in asked["outputs"].items()} if "outputs" in asked else None
     how = {name: asked[name] for name in ("t1", "save", "every", "chunk") if name in asked} | asked.get("options", {})
+    scene = scene if memory is None else build(scene, memory=memory)
     return Study(scene, vary=vary, start=start, correlation=correlation or None, **known), how | {"outputs": outputs}
 
 

@@ -10,25 +10,13 @@ studies that keep trajectories.
 """
 
 import ctypes
-import math
 import os
-import re
 from typing import Any
-
-from jourdain_jax.calculus.reals import described
 
 COMPILED = 500e6  # bytes for compilers and what they compile; the disc takes 220 MB, the bicycle 400 MB
 BLOCKS = 4.0  # copies of a block's states that are there at once; seen: 3.7
 CHUNKS = 2.0  # the arrays of a chunk's blocks, and these put together
 _NOT_HERE = "`memory` is held on Linux with glibc only; leave it out here"
-
-
-def bytes_of(memory: Any) -> int:
-    """Bytes that `memory` says: a number of bytes, or a text such as "2GB" (10^9 bytes) or "500 MiB" (2^20); ValueError otherwise."""
-    found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+(?:e[0-9]+)?)\s*(?:(?:([kmgt])(i?))?b)?\s*", str(memory).lower())
-    if isinstance(memory, bool) or not found or not math.isfinite(float(found[1])):
-        raise ValueError(f"`memory` is {described(memory)}, expected a number of bytes, or a text such as '2GB' or '500MB'")
-    return int(float(found[1]) * (1024 if found[3] else 1000) ** " kmgt".index(found[2] or " "))
 
 
 def resident() -> int:
@@ -48,9 +36,9 @@ def give_back_at_once() -> None:
         raise ValueError(_NOT_HERE)
 
 
-def of_each(memory: Any, processes: int) -> int:
+def of_each(memory: int, processes: int) -> int:
     """Bytes for each process that computes, of `memory` for all of them and, if they are several, this one."""
-    return bytes_of(memory) if processes == 1 else max(0, (bytes_of(memory) - resident()) // processes)
+    return memory if processes == 1 else max(0, (memory - resident()) // processes)
 
 
 def room(allowed: int, *, here: bool) -> float:

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Unpack
 
@@ -19,13 +19,13 @@ from jourdain_jax.ensembles.result import StudyResult
 from jourdain_jax.ensembles.run import bounded, in_this_process, run
 from jourdain_jax.ensembles.task import AT_START, SAVES, Task
 from jourdain_jax.ensembles.workers import in_processes
+from jourdain_jax.motion.model import Model, build
 from jourdain_jax.motion.options import MotionFields, Options, as_options
 from jourdain_jax.motion.simulate import span_and_times
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
-from jourdain_jax.scene.scene import Scene
 
 _STATED = "times to save at are `ts`, and what is kept is said by `outputs` and `save`"
 REFUSED = dict.fromkeys(("progress", "parameters", "starts", "scene", "start"), _STATED)
@@ -60,7 +60,7 @@ class Study(Printed):
     Raises ValueError for unknown names and for what cannot vary. Needs the extra `ensembles`.
     """
 
-    scene: Scene
+    scene: Any  # a scene, or a model, of which the scene is kept
     vary: Any = None  # a dictionary by name, as is `start`, and by pairs of names `correlation`
     start: Any = None
     sampler: str = "random"
@@ -118,7 +118,9 @@ class Study(Printed):
             raise ValueError(f"`save` is {save!r}; {nearest(str(save), SAVES)}")
         about = "of at least 1; it says of which lanes save='trajectories' keeps the trajectory"
         every = checked_whole(every, "`every`", 1, None if save == "trajectories" else 1, expected=about)
-        options = as_options(options, by_name, "Study.run", REFUSED, self._given)
+        options = replace(as_options(options, by_name, "Study.run", REFUSED, self._given), memory=None)
+        if isinstance(self._given, Model) and self._given.formulation == build(self.scene, backend=options.backend).formulation:
+            options = replace(options, formulation=None)  # as for the scene by itself: a study may go on with other memory
         known = as_outputs(self.scene, outputs)
         first, times, last = span_and_times(self.scene, None, t0, t1, ts)
         if ts is None and save != "trajectories" and not any(output.over_times for output in known.values()):
@@ -137,7 +139,6 @@ class Study(Printed):
         progress: bool = True,
         processes: int = 1,
         client=None,
-        memory: int | str | None = None,
         shard: tuple[int, int] = (1, 1),
         command: str = "",
         **what: Unpack[TaskFields],
@@ -157,14 +158,15 @@ class Study(Printed):
         - `processes`: how many compute, each on its share of the cores; more than one need a script whose top level is guarded by
           `if __name__ == "__main__":`, and outputs that are no functions within functions.
         - `client`: a `dask.distributed.Client`, whose workers compute; all of them must reach the folder. One chunk at a time is computed in each worker.
-        - `memory`: bytes, or a text such as "2GB": what the processes of this machine that compute may hold together, the present one with all that is in
-          it included; with `client`, what each worker may hold. Blocks and chunks are made small enough. It is held on Linux. Means and covariances of
-          studies with other blocks differ in their last digits.
         - `shard`: (k, n): only the k-th of n shares of the chunks, for a folder of its own on one of n machines; `jj.merge_studies` puts them together.
         - `progress`: a bar; `command`: text that is kept with the study.
         - `options`: a `jj.Options`, or its fields by name; `inputs`: as in `rollout`. These, and `t0` to `save` above, are the `what` of the signature.
 
-        Raises ValueError where the folder holds another study or `memory` is too little, MemoryError where it turned out to be, `InUseError` where another
+        Where the scene is a model, `jj.build(scene, memory="2GB")`, that is what the processes of this machine that compute may hold together, the present
+        one with all that is in it included; with `client`, what each worker may hold. Blocks and chunks are made small enough. It is held on Linux. Means
+        and covariances of studies with other blocks differ in their last digits.
+
+        Raises ValueError where the folder holds another study or the memory is too little, MemoryError where it turned out to be, `InUseError` where another
         process runs it, OSError where it cannot be written.
         Ctrl-C: the chunk under way ends, all is kept, and KeyboardInterrupt says so.
         """
@@ -176,6 +178,7 @@ class Study(Printed):
         if client is not None and processes != 1:
             raise ValueError("`client` and `processes` are both given; the workers of a cluster compute, or processes of this machine")
         here = client is None and processes == 1
+        memory = self._given.memory if isinstance(self._given, Model) else None
         task, chunk = bounded(task, path, chunk, None if memory is None else of_each(memory, processes), here=here)
         compute = partial(in_this_process, task) if here else on_cluster(task, client) if client is not None else in_processes(task, processes)
         store = run(task, path, chunk=chunk, progress=progress, shard=shards, command=command, workers=compute)

@@ -92,7 +92,8 @@ def whatever_dies(store: Store, numbers, interrupted, compute: Callable, attempt
 
 
 _ADVICE = (
-    "Is there enough memory? Take fewer processes, `memory=`, or a smaller `chunk`; or simulate these lanes one by one, in a process of their own, to see why"
+    "Is there enough memory? Take fewer processes, `jj.build(scene, memory=...)`, or a smaller `chunk`; or simulate these lanes one by one, in a process of "
+    "their own, to see why"
 )
 
 

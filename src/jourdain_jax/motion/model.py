@@ -20,6 +20,7 @@ from jourdain_jax.lowering.lowered import Lowered, NotLowered
 from jourdain_jax.motion.check import warn_of_mistakes
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.native import native_motion
+from jourdain_jax.motion.options import bytes_of
 from jourdain_jax.motion.put_on_rows import Usual, usual_sizes
 from jourdain_jax.motion.vector_fields.by_matrices import FullByMatrices, MinimalByMatrices, usual_lengths
 from jourdain_jax.motion.vector_fields.field import ByProgram, Formulation, VectorField, as_formulation, reason_for_matrices
@@ -63,11 +64,9 @@ class Freedoms:
 
 @dataclass(frozen=True)
 class Dependence:
-    """What depends on time by itself, on inputs, and what changes along the motion."""
+    """What depends on time by itself, and what changes along the motion."""
 
     on_time: tuple[str, ...]  # rows, poses, inertias, coordinate rates, loads, potential
-    rows_on_inputs: bool
-    potentials_on_inputs: tuple[int, ...]  # numbers of the loads
     driven: bool  # bodies move while all speeds are zero
     varying_inertia: bool
     massless: bool  # nothing has inertia along some motion that the rows hold
@@ -94,6 +93,7 @@ class Model(BuiltFor, Printed):
     formulation: Formulation  # of what `build` returns, its state is settled
     backend: str  # the argument of `build`
     decided: Reference | None  # the scene whose numbers decided; None: the model's own, and those of the class's defaults where these are traced
+    memory: int | None = None  # bytes that batches of its motions, and what reverse mode keeps of them, may take, if stated
     made: Any = None  # found by `modelled`: what is kept for these numbers, vector fields and sizes of rows, by what tells their cases apart
 
     def replace(self, **parameters) -> "Model":
@@ -162,9 +162,9 @@ class Model(BuiltFor, Printed):
 
     @property
     def dependence(self) -> Dependence:
-        """What depends on time, inputs and the motion."""
+        """What depends on time and on the motion."""
         known = self.structure
-        return Dependence(known.timed, known.rows_of_inputs, known.potentials_of_inputs, known.driven, known.varying_inertia, known.massless)
+        return Dependence(known.timed, known.driven, known.varying_inertia, known.massless)
 
     @property
     def conserved(self) -> Conserved:
@@ -220,7 +220,7 @@ class Model(BuiltFor, Printed):
         return tuple(said)
 
     def __reduce__(self):
-        return build, (self.scene, self.formulation, self.backend)
+        return build, (self.scene, self.formulation, self.backend, self.memory)
 
     def _text(self) -> str:
         listed = lambda names: ", ".join(names) or "none"  # noqa: E731
@@ -259,13 +259,13 @@ def _decisions_where_traced(scene: Scene) -> tuple:
 
 def _flattened(model: Model) -> tuple[tuple, tuple]:
     arrays, rest = eqx.partition(model.formulation, eqx.is_array)
-    return (model.scene, arrays), (rest, model.backend, model.decided)
+    return (model.scene, arrays), (rest, model.backend, model.decided, model.memory)
 
 
 def _unflattened(static: tuple, children: tuple) -> Model:
     model = object.__new__(Model)  # anything may stand in the place of numbers
-    (scene, arrays), (formulation, backend, decided) = children, static
-    vars(model).update(scene=scene, formulation=eqx.combine(arrays, formulation), backend=backend, decided=decided, made=None)
+    (scene, arrays), (formulation, backend, decided, memory) = children, static
+    vars(model).update(scene=scene, formulation=eqx.combine(arrays, formulation), backend=backend, decided=decided, memory=memory, made=None)
     return model
 
 
@@ -273,7 +273,7 @@ jax.tree_util.register_pytree_node(Model, _flattened, _unflattened)
 
 
 @shown_from_users_lines
-def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backend: str = "auto") -> Model:
+def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backend: str = "auto", memory: int | float | str | None = None) -> Model:
     """Settle once how motions of a scene are integrated: rank, redundant rows, privileged speeds, what depends on time, what is conserved, the state,
     the scalar program, the backend.
 
@@ -282,8 +282,10 @@ def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backe
         motion = jj.simulate(model, {"lean": 0.3}, t1=5.0)
         slope = jax.grad(lambda r: jj.simulate(model.replace(radius=r), {"lean": 0.3}, t1=5.0).q_end[0])(0.5)
 
-    `formulation`, `backend`: as of `simulate`. All functions of a scene build on first use and keep what they found. `start`, `simulate`, `rollout`, `fit`,
-    `fit_batch`, `linearize`, `steady`, `report`, `verify` and `lower` take what this returns in the place of `scene`; all others take its `.scene`.
+    `formulation`, `backend`: as of `simulate`. `memory`: bytes, or a text such as "2GB", that chunks of a `rollout` and what reverse mode of XLA keeps of a
+    motion may take (default: 4 GiB), and, where it is stated, the processes of a `Study`. All functions of a scene build on first use and keep what they
+    found. `start`, `simulate`, `rollout`, `fit`, `fit_batch`, `linearize`, `steady`, `report`, `verify`, `lower` and `Study` take what this returns in the
+    place of `scene`; all others take its `.scene`.
     The first call for a class warns with the table of `check` where something looks wrong.
     ValueError as of `structure_of` (no admissible state, no inertia along a free motion, numbers of bodies that cannot be), and where the formulation or
     the backend does not serve the scene.
@@ -292,7 +294,8 @@ def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backe
     structure_of(scene)  # says what is wrong
     model = modelled(scene, formulation, backend)
     model.usual(False), model.usual(True)
-    settled = Model(scene, replace(model.formulation, state="full" if model.field().independent is None else "minimal"), backend, Reference(scene))
+    formulation = replace(model.formulation, state="full" if model.field().independent is None else "minimal")
+    settled = Model(scene, formulation, backend, Reference(scene), None if memory is None else bytes_of(memory))
     modelled(settled).made.update(model.made)
     if backend != "dense":  # which asks for no program to compare
         warn_of_mistakes(settled.reference.scene)
@@ -300,20 +303,18 @@ def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backe
 
 
 def modelled(scene: Scene | BuiltFor, formulation: Formulation | None = None, backend: str = "auto") -> Model:
-    """Return a scene, or a model, with this formulation and backend (by default those of the model), and with what is kept for its class and values: choices
-    that are made when they are first asked for.
-    """
-    decided = None
+    """Return a scene, or a model, with this formulation and backend (by default those of the model), and with the choices that are kept for its values."""
+    decided = memory = None
     if isinstance(scene, Model):
         if formulation is None:
             formulation, backend = scene.formulation, scene.backend
         if scene.made is not None and formulation is scene.formulation and backend == scene.backend:
             return scene
-        decided, scene = scene.decided, scene.scene
+        decided, memory, scene = scene.decided, scene.memory, scene.scene
     asked, scene = as_formulation(formulation), as_scene(scene)
     in_words = asked.reduction is None and asked.baumgarte is None and isinstance(backend, str)  # these are compared in no time
     made = _kept(scene, asked.state, asked.stabilisation, backend) if in_words else {}
-    return Model(scene, asked, backend, decided, made)
+    return Model(scene, asked, backend, decided, memory, made)
 
 
 def _nothing_yet(scene: Scene, *words) -> dict:

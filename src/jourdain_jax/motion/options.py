@@ -1,6 +1,8 @@
 """Options of a simulation: one object that `simulate`, `rollout`, `fit`, `Study` and their kin take, as it is or by the names of its fields."""
 
 import difflib
+import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, TypedDict
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from jourdain_jax.motion.vector_fields.field import Formulation
 
 TOLERANCE, MOST_STEPS = 1e-8, 100_000
+MEMORY = 2**32  # bytes, where no model states others
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,7 @@ class AllOptions(Options):
     solver: "diffrax.AbstractSolver | ImplicitMethod | Taylor | Method | None" = None
     formulation: "Formulation | None" = None
     backend: str = "auto"
+    memory: int | None = None  # of a model: bytes that batches and reverse mode may take; None: `MEMORY`
     alongside: bool = False  # whether one run gives values and tangents: for derivatives by `jvp` and `jacfwd` alone
 
 
@@ -91,7 +95,7 @@ class MotionFields(OptionFields, total=False):
 
 
 SPAN = ("t0", "t1", "ts", "inputs")  # arguments of a motion by name besides its options
-_STATIC = ("max_steps", "events", "work", "retry", "backend", "alongside")
+_STATIC = ("max_steps", "events", "work", "retry", "backend", "memory", "alongside")
 OPTION_NAMES = tuple(OptionFields.__annotations__)
 
 
@@ -118,6 +122,7 @@ _BY_DIFFRAX = "call `diffrax.diffeqsolve(jj.diffrax_term(scene), ...)` with it"
 GONE = {  # options that there were once -> what serves now
     "adjoint": f"all motions have derivatives in forward and in reverse mode; for an adjoint of diffrax {_BY_DIFFRAX}",
     "dt0": "the first step is 1e-4 of the span; structure-preserving solvers carry theirs, as in solver=jj.ImplicitMidpoint(step=0.01)",
+    "memory": "a model has its own; give it to `jj.build`",
     "saveat": f"give times to save at as `ts`; for values between steps, or at each step, {_BY_DIFFRAX}",
     "stepsize_controller": f"give `rtol`, `atol` and `max_step`, or solver=jj.ImplicitMidpoint(step=0.01); for another control {_BY_DIFFRAX}",
 }
@@ -128,10 +133,10 @@ def as_options(
 ) -> AllOptions:
     """Return the options of a call of `function`: the fields of the object, replaced by options by name.
 
-    `refused`: names that have no meaning for this function, and why; `scene`: a model brings its formulation and backend. Raises TypeError for these and for
-    unknown names, ValueError for wrong values.
+    `refused`: names that have no meaning for this function, and why; `scene`: a model brings its formulation, backend and memory. Raises TypeError for these
+    and for unknown names, ValueError for wrong values.
     """
-    of_model = {"formulation": scene.formulation, "backend": scene.backend} if isinstance(scene, BuiltFor) else {}
+    of_model = {name: getattr(scene, name) for name in ("formulation", "backend", "memory")} if isinstance(scene, BuiltFor) else {}
     if not (by_name or of_model) and (options is None or type(options) is AllOptions):
         return _DEFAULT if options is None else options
     if options is not None and not isinstance(options, Options):
@@ -148,6 +153,14 @@ def as_options(
     found = AllOptions(**({} if options is None else vars(options)) | of_model | dict(by_name))
     _check(found)
     return found
+
+
+def bytes_of(memory: Any) -> int:
+    """Bytes that `memory` says: a number of bytes, or a text such as "2GB" (10^9 bytes) or "500 MiB" (2^20); ValueError otherwise."""
+    found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+(?:e[0-9]+)?)\s*(?:(?:([kmgt])(i?))?b)?\s*", str(memory).lower())
+    if isinstance(memory, bool) or not found or not math.isfinite(float(found[1])):
+        raise ValueError(f"`memory` is {described(memory)}, expected a number of bytes, or a text such as '2GB' or '500MB'")
+    return int(float(found[1]) * (1024 if found[3] else 1000) ** " kmgt".index(found[2] or " "))
 
 
 def alongside(options: AllOptions) -> AllOptions:

@@ -48,6 +48,7 @@ class OwnSteps(Integrator):
     event_names: tuple[str, ...]
     native: bool  # whether machine code may integrate
     order: int | None  # of Taylor series, by which machine code steps in place of the solver's tableau
+    memory: int  # bytes that the record of reverse mode may take
     projects_saved: ClassVar[bool] = True
     watches: ClassVar[bool] = True
 
@@ -108,6 +109,7 @@ class OwnSteps(Integrator):
             relation_count=relation_count,
             span=jnp.abs(goals[-1]),
             within=None if knots is None else integrands.within,
+            memory=self.memory,
         )
         ys, reached, end = erk_loop.integrate(problem, self.solver, y0, jnp.zeros_like(setup.t0), goals, setup.dt0, mode)
         ys = jax.tree.map(lambda x: x[:-1], ys)

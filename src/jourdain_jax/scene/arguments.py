@@ -42,6 +42,7 @@ class BuiltFor:
     scene: Scene
     formulation: Any
     backend: str
+    memory: int | None
     reference: Any
 
     def __getattr__(self, name: str):

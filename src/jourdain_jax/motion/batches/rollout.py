@@ -21,7 +21,7 @@ from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.integrators.taylor import Taylor
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.model import modelled
-from jourdain_jax.motion.options import SPAN, AllOptions, MotionFields, Options, as_options
+from jourdain_jax.motion.options import MEMORY, SPAN, AllOptions, MotionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.retries import RERUN_FIELDS, lanes_retried
 from jourdain_jax.motion.sensitivity import warn_of_jumps
@@ -154,7 +154,8 @@ def rollout(
 
     - `starts`: name -> number or array of shape (lanes,) (as in `jj.start`; the rest is solved for), or a `State` with a leading axis of lanes.
     - `parameters`: parameter name -> array with a leading axis of lanes, where lanes differ in parameters.
-    - `chunk`: lanes that run together (default: 512, less where saved states would pass 1 GiB); `progress`: a bar (default: with several chunks).
+    - `chunk`: lanes that run together (default: 512), fewer where they would pass the `memory` that `jj.build` was given (default: 4 GiB);
+      `progress`: a bar (default: with several chunks).
     - `options`: a `jj.Options`; `by_name`: its fields, and `t0`, `t1`, `ts`, `inputs`, as in `simulate`. All lanes have the same inputs; where they are to
       differ, use `jax.vmap` of `simulate`.
 
@@ -180,7 +181,7 @@ def rollout(
     advice = "give an array with one entry per lane; a field that is a module varies by `equinox.filter_vmap` of `simulate`"
     parameters = {name: checked_real(value, f"parameter `{name}`", advice=advice) for name, value in (parameters or {}).items()}
     fixed, varied, count = _lanes(scene, starts, parameters)
-    chunk = _chunk(scene, count, chunk, span["ts"])
+    chunk = _chunk(scene, count, chunk, span["ts"], options.memory or MEMORY)
     span["inputs"] = as_inputs(scene, span["inputs"])
     _check_times_of_lanes(scene, starts, span)
     times = {name: None if span[name] is None else checked_real(span[name], f"`{name}`").astype(jnp.result_type(float)) for name in ("t0", "t1", "ts")}
@@ -281,10 +282,10 @@ def _common_length(lengths: dict) -> int:
     return counts.pop()
 
 
-def _chunk(scene: Scene, count: int, chunk: int | None, ts) -> int:
+def _chunk(scene: Scene, count: int, chunk: int | None, ts, memory: int) -> int:
     if chunk is not None and (not isinstance(chunk, int | np.integer) or chunk < 1):
         raise ValueError(f"`chunk` is {chunk!r}, expected a whole number, at least one lane")
     times = DEFAULT_SAMPLES if ts is None else np.shape(ts)[0]
     per_lane = 8 * times * (len(scene.coordinate_names) + len(scene.speed_names) + 2)
-    # the stages of 512 lanes fit the cache of a core; saved states of a chunk take 1 GiB at most
-    return max(1, min(count, 512 if chunk is None else chunk, max(1, 2**30 // per_lane)))
+    # the stages of 512 lanes fit the cache of a core; of the saved states of a chunk four copies are there at once
+    return max(1, min(count, 512 if chunk is None else chunk, memory // (4 * per_lane)))

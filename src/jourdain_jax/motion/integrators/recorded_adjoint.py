@@ -32,7 +32,7 @@ from jourdain_jax.motion.trajectories import results
 
 STEPS_ALONE, STEPS_TOGETHER = 2048, 512  # of a window: for one motion, for lanes in lockstep
 SPARE = 4  # this part of a window is left free, for the steps that it takes when it is integrated again
-_MEMORY = 2**27, 2**30  # bytes of a window and of the beginnings of all, at most where lanes are many,
+_SHARES = 32, 4  # these parts of the memory take a window and the beginnings of all, at most where lanes are many,
 _FEWEST = 16, 256  # but so many steps and windows
 
 
@@ -118,7 +118,7 @@ def _recorded(perturbed, moving, control, forward, method):
     problem = _problem(moving, control)
     direction = jnp.sign(goals[-1] - t0)
     start = begun(problem, y0, t0, control[1], direction)
-    empty = _empty(start, problem.max_steps)
+    empty = _empty(start, problem.max_steps, problem.memory)
     full = len(empty.window.t) - 1 - len(empty.window.t) // SPARE
     places = len(empty.beginnings.t)
 
@@ -274,12 +274,13 @@ def _back_from_event(end: Progress, located, slope, g: _Cotangents, differentiab
     return replace(g, t=jnp.where(located, 0, g.t), y=y, shared=jax.tree.map(jnp.add, g.shared, by_shared)), by_events
 
 
-def _empty(start: Progress, max_steps: int) -> _Record:
+def _empty(start: Progress, max_steps: int, memory: int) -> _Record:
     """A record with the start as its only state."""
     state_bytes = sum(jnp.size(x) * jnp.result_type(x).itemsize for x in jax.tree.leaves((start.t, start.y)))
-    length = max(_FEWEST[0], min(STEPS_TOGETHER if start.t.ndim else STEPS_ALONE, _MEMORY[0] // state_bytes, max_steps + MOST_STEPS + 2))
+    fitting = [memory // (share * state_bytes) for share in _SHARES]
+    length = max(_FEWEST[0], min(STEPS_TOGETHER if start.t.ndim else STEPS_ALONE, fitting[0], max_steps + MOST_STEPS + 2))
     windows = -(-(max_steps + MOST_STEPS) // (length - length // SPARE)) + 1
-    windows = min(windows, max(_FEWEST[1], _MEMORY[1] // state_bytes))
+    windows = min(windows, max(_FEWEST[1], fitting[1]))
 
     zero = jnp.zeros((), jnp.int32)
     t, y, goal = _room(length, (start.t, start.y, zero))
