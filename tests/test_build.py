@@ -150,3 +150,29 @@ def test_what_a_motion_a_batch_or_a_fit_runs_is_not_decided_by_the_call_before_i
         found.append(of)
     assert found[0] == found[1]
     assert len({privileged for privileged, *_ in found[0].values()}) == 2
+
+
+@pytest.mark.parametrize("kind", [jj.models.TiltingDisc, jj.models.DoublePendulumRods, jj.models.FreeRigidBody])
+def test_a_model_comes_back_from_its_file_without_tracing_the_scene(kind, tmp_path, monkeypatch):
+    scene, path = kind(), tmp_path / "one.model"
+    model = jj.build(scene, memory="1GB")
+    model.save(path)
+    ended, said = jj.simulate(model, t1=0.1).q_end, str(model)
+    jj.clear_caches()
+    monkeypatch.setattr(jax, "make_jaxpr", None)
+    loaded = jj.load_model(path, scene)
+    monkeypatch.undo()
+    assert (str(loaded), loaded.memory) == (said, 10**9)
+    assert_array_equal(jj.simulate(loaded, t1=0.1).q_end, ended)
+
+
+def test_a_file_of_something_else_is_no_model(tmp_path):
+    disc, path = jj.models.TiltingDisc(), tmp_path / "disc.model"
+    jj.build(disc).save(path)
+    with pytest.raises(ValueError, match="no model of this `TiltingDisc`: what differs is scene; build and save it anew"):
+        jj.load_model(path, disc.replace(mass=2.0))
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(ValueError, match="what differs is sha256"):
+        jj.load_model(path, disc)
+    with pytest.raises(ValueError, match="a reduction or a stabilisation of its own has no file"):
+        jj.build(disc, jj.Formulation("full", reduction="kkt")).save(path)

@@ -31,9 +31,9 @@ from test_studies import assert_same
 import jourdain_jax as jj
 from jourdain_jax.calculus.files import write_whole
 from jourdain_jax.ensembles import files, store, workers
-from jourdain_jax.ensembles.identity import digest
 from jourdain_jax.ensembles.run import Runner, opened
 from jourdain_jax.ensembles.store import Store
+from jourdain_jax.scene.digests import digest
 
 COUNT = 90  # lanes, in three chunks
 pytestmark = pytest.mark.usefixtures("small_blocks")

@@ -52,7 +52,7 @@ from jourdain_jax.lowering.lower import lower
 from jourdain_jax.lowering.lowered import Lowered, NotLowered
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators.taylor import Taylor
-from jourdain_jax.motion.model import Model, build
+from jourdain_jax.motion.model import Model, build, load_model
 from jourdain_jax.motion.options import Options
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.sensitivity import SensitivityWarning
@@ -294,6 +294,7 @@ __all__ = [
     "knife_edge",
     "lagrange_equations",
     "linearize",
+    "load_model",
     "load_rollout",
     "load_study",
     "load_trajectory",

@@ -112,6 +112,7 @@ def looked_at(scene: Scene) -> LookedAt:
     )
 
 
+@once_per_class
 def coordinates_on_rows(scene: Scene) -> np.ndarray:
     """Which coordinates geometric rows or unit norms depend on, (coordinates,)."""
     nodes = looked_at(scene)

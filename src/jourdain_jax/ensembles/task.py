@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.ensembles.design import Design
-from jourdain_jax.ensembles.identity import digest
 from jourdain_jax.ensembles.outputs import Output
 from jourdain_jax.ensembles.store import Column
 from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.motion.options import AllOptions, stated
 from jourdain_jax.motion.trajectories.labelled import OF_LANES
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.scene.digests import digest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 

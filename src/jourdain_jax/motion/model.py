@@ -1,5 +1,6 @@
 """Models: scenes with the choices that `build` made for their motions. `simulate` and its kin take a model in place of a scene."""
 
+import os
 from collections.abc import Callable, Hashable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
@@ -9,6 +10,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from jourdain_jax.build.probed_on_graph import coordinates_on_rows
+from jourdain_jax.build.row_program import row_program
 from jourdain_jax.build.structure import WELL_CONDITIONED, Reference, Structure, structure_of, structure_whatever_its_faults, trust
 from jourdain_jax.calculus.reals import passing_cutoff, undecided
 from jourdain_jax.dynamics.accelerations import as_reduction
@@ -17,7 +20,9 @@ from jourdain_jax.equations.listed import names_of_events, names_of_invariants, 
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered, NotLowered
+from jourdain_jax.motion import model_file
 from jourdain_jax.motion.check import warn_of_mistakes
+from jourdain_jax.motion.facts import Conserved, Dependence, Freedoms, Rows
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.options import bytes_of
@@ -25,60 +30,12 @@ from jourdain_jax.motion.put_on_rows import Usual, usual_sizes
 from jourdain_jax.motion.vector_fields.by_matrices import FullByMatrices, MinimalByMatrices, usual_lengths
 from jourdain_jax.motion.vector_fields.field import ByProgram, Formulation, VectorField, as_formulation, reason_for_matrices
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
-from jourdain_jax.scene.identity import once_per_values
+from jourdain_jax.scene.identity import found_before, once_per_values
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 _BACKENDS = ("auto", "native", "xla", "dense")
-
-
-@dataclass(frozen=True)
-class Rows:
-    """Which rows hold the scene, and how far they are independent."""
-
-    names: tuple[str, ...]
-    rank: int  # at generic states
-    redundant: tuple[str, ...]  # may be left out together: the others keep the rank at every probed state
-    may_set_in: tuple[str, ...]  # redundant at every probed state, but by no identity
-    rank_losses: tuple[str, ...]  # probed configurations with fewer independent rows
-    affine: bool  # linear or affine in the speeds
-    homogeneous: bool  # they hold at rest
-
-
-@dataclass(frozen=True)
-class Freedoms:
-    """Which speeds are independent, and how well they determine the others."""
-
-    privileged: tuple[str, ...]
-    dependent: tuple[str, ...]
-    chosen_by_user: bool
-    worst_pivot: float  # smallest singular value of the scaled A_z over all probes; 1 is best
-    typical_pivot: float
-
-    @property
-    def count(self) -> int:
-        """Degrees of freedom."""
-        return len(self.privileged)
-
-
-@dataclass(frozen=True)
-class Dependence:
-    """What depends on time by itself, and what changes along the motion."""
-
-    on_time: tuple[str, ...]  # rows, poses, inertias, coordinate rates, loads, potential
-    driven: bool  # bodies move while all speeds are zero
-    varying_inertia: bool
-    massless: bool  # nothing has inertia along some motion that the rows hold
-
-
-@dataclass(frozen=True)
-class Conserved:
-    """What stays as it is along a motion."""
-
-    energy: bool  # kinetic and potential energy together, without integrated work
-    ignorable: tuple[str, ...]  # coordinates that no acceleration depends on; empty where there is no scalar program
-    invariants: tuple[str, ...]  # as the scene states them
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -219,6 +176,19 @@ class Model(BuiltFor, Printed):
             )
         return tuple(said)
 
+    def save(self, path: str | os.PathLike) -> None:
+        """Write what `build` found for the numbers of the scene to a file, for `jj.load_model`.
+
+        ValueError for a model with a reduction or a stabilisation of its own, and where the scene has parts that are kept as calls of JAX.
+        """
+        scene, formulation = self.reference.scene, self.formulation
+        if formulation.reduction is not None or formulation.baumgarte is not None:
+            raise ValueError("a model with a reduction or a stabilisation of its own has no file; build it anew")
+        how = {"state": formulation.state, "projects": formulation.projects, "backend": self.backend, "memory": self.memory}
+        found = {("_structure",): self.structure, ("coordinates_on_rows",): coordinates_on_rows(scene), ("row_program",): row_program(scene)}
+        found |= {("_lowered", every or not self.structure.row_names): lowered(scene, every) for every in (self.state == "full", not self.structure.has_minimal_state)}
+        model_file.write(path, scene, how, {what: x for what, x in found.items() if not isinstance(x, NotLowered)})
+
     def __reduce__(self):
         return build, (self.scene, self.formulation, self.backend, self.memory)
 
@@ -300,6 +270,21 @@ def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backe
     if backend != "dense":  # which asks for no program to compare
         warn_of_mistakes(settled.reference.scene)
     return settled
+
+
+def load_model(path: str | os.PathLike, scene: Scene) -> Model:
+    """Build the model of a scene from the file that `Model.save` wrote for it: in a fresh process nothing is traced, probed or lowered.
+
+        jj.build(bicycle).save("bicycle.model")
+        model = jj.load_model("bicycle.model", bicycle)
+
+    `path`: of the file; `scene`: of the same class, methods and values. Nothing of a file is run, but it decides what is integrated: take files of your own.
+    ValueError where the file is damaged, or is that of another scene, version or precision.
+    """
+    found, how = model_file.read(path, as_scene(scene))
+    formulation = Formulation(how["state"], stabilisation="projection" if how["projects"] else None)
+    with found_before(found):
+        return build(scene, formulation, how["backend"], how["memory"])
 
 
 def modelled(scene: Scene | BuiltFor, formulation: Formulation | None = None, backend: str = "auto") -> Model:

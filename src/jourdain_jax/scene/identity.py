@@ -4,13 +4,15 @@ What holds of a scene at every state, such as the rank of its rows and which spe
 by evaluating the scene at a few states, which takes numbers for its parameters.
 """
 
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import MISSING, fields
 from functools import lru_cache, wraps
 from operator import is_
 from threading import Lock
+from types import MappingProxyType
+from typing import Any
 
 import jax
 import numpy as np
@@ -26,7 +28,7 @@ def once_per_values(probe, of_traced: Callable | None = None):
 
     `of_traced`: what is run, every time, on scenes whose parameters are traced, in place of the function on numbers that stand in for them.
     """
-    cached = lru_cache(maxsize=512)(lambda wrapped, *case: probe(wrapped.scene, *case))
+    cached = lru_cache(maxsize=512)(lambda wrapped, *case: _described(probe, wrapped.scene, case))
 
     @wraps(probe)
     def of(scene: Scene, *case: Hashable):
@@ -192,7 +194,22 @@ def once_per_class(describe: Callable, most: int = 1024) -> Callable:
     return of
 
 
+_BEFORE: ContextVar[Mapping[Hashable, Any]] = ContextVar("before", default=MappingProxyType({}))
+
+
+@contextmanager
+def found_before(found: Mapping[Hashable, Any]) -> Iterator[None]:
+    """Inside, what these functions would find, by their name and the first part of the case, is not worked out."""
+    token = _BEFORE.set(found)
+    try:
+        yield
+    finally:
+        _BEFORE.reset(token)
+
+
 def _described(describe: Callable, scene: Scene, case: tuple):
+    if (key := (describe.__name__, *case[:1])) in (before := _BEFORE.get()):
+        return before[key]
     try:
         return describe(scene, *case)
     except (TypeError, ValueError) as error:

@@ -1,0 +1,51 @@
+"""What `build` finds about a scene, in words: its rows, freedoms, what depends on time, and what is conserved."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Which rows hold the scene, and how far they are independent."""
+
+    names: tuple[str, ...]
+    rank: int  # at generic states
+    redundant: tuple[str, ...]  # may be left out together: the others keep the rank at every probed state
+    may_set_in: tuple[str, ...]  # redundant at every probed state, but by no identity
+    rank_losses: tuple[str, ...]  # probed configurations with fewer independent rows
+    affine: bool  # linear or affine in the speeds
+    homogeneous: bool  # they hold at rest
+
+
+@dataclass(frozen=True)
+class Freedoms:
+    """Which speeds are independent, and how well they determine the others."""
+
+    privileged: tuple[str, ...]
+    dependent: tuple[str, ...]
+    chosen_by_user: bool
+    worst_pivot: float  # smallest singular value of the scaled A_z over all probes; 1 is best
+    typical_pivot: float
+
+    @property
+    def count(self) -> int:
+        """Degrees of freedom."""
+        return len(self.privileged)
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """What depends on time by itself, and what changes along the motion."""
+
+    on_time: tuple[str, ...]  # rows, poses, inertias, coordinate rates, loads, potential
+    driven: bool  # bodies move while all speeds are zero
+    varying_inertia: bool
+    massless: bool  # nothing has inertia along some motion that the rows hold
+
+
+@dataclass(frozen=True)
+class Conserved:
+    """What stays as it is along a motion."""
+
+    energy: bool  # kinetic and potential energy together, without integrated work
+    ignorable: tuple[str, ...]  # coordinates that no acceleration depends on; empty where there is no scalar program
+    invariants: tuple[str, ...]  # as the scene states them

@@ -1,0 +1,82 @@
+"""Files of models: what `build` found about a scene, as JSON behind a line that says what it is of.
+
+    {"format", "version", "jax", "precision", "scene", "sha256"}      digests of the class, its methods and values, and of what follows
+    [how, {what: finding}]                                            what: the function that finds it, and which case
+
+A dataclass of `KINDS` or a graph is {its name: its fields}, an array {"array": [type, entries]}, a tuple {"tuple": [...]}, a dictionary {"dict": pairs}.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Hashable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from jourdain_jax.build.row_program import RowProgram
+from jourdain_jax.build.structure import Structure
+from jourdain_jax.build.trace import Variables
+from jourdain_jax.calculus.files import parsed, read_bytes, write_whole
+from jourdain_jax.calculus.on_first_use import version_of
+from jourdain_jax.lowering.lowered import Lowered, Stage
+from jourdain_jax.program.graph import Graph
+from jourdain_jax.scene.digests import digest
+from jourdain_jax.scene.scene import Scene
+
+KINDS = {kind.__name__: kind for kind in (Structure, Lowered, Stage, RowProgram, Variables, Graph)}
+LARGEST = 2**30  # bytes
+
+
+def write(path: str | os.PathLike, scene: Scene, how: dict, found: Mapping[Hashable, Any]) -> None:
+    """Write what was found about a scene, by the functions that find it and the first part of their case, and `how` it was asked to be built."""
+    try:
+        content = json.dumps(_encoded([how, dict(found)])).encode()
+    except TypeError as error:
+        raise ValueError(f"`{type(scene).__name__}` has parts that are kept as calls of JAX, and its model has no file ({error})") from None
+    write_whole(path, json.dumps(_about(scene, content)).encode() + b"\n" + content)
+
+
+def read(path: str | os.PathLike, scene: Scene) -> tuple[dict[Hashable, Any], dict]:
+    """Return what was found about a scene, and how it is built; a ValueError where the file is damaged or of something else."""
+    head, _, content = read_bytes(path, LARGEST, "a model").partition(b"\n")
+    stated, expected = parsed(json.loads, head, f"`{path}`", "a model"), _about(scene, content)
+    if stated != expected:
+        other = ", ".join(name for name, value in expected.items() if not isinstance(stated, dict) or stated.get(name) != value)
+        raise ValueError(f"`{path}` is no model of this `{type(scene).__name__}`: what differs is {other}; build and save it anew")
+    how, found = _decoded(json.loads(content))
+    return found, how
+
+
+def _about(scene: Scene, content: bytes) -> dict:
+    versions = {"format": 1, "version": version_of("jourdain-jax"), "jax": jax.__version__, "precision": bool(jax.config.jax_enable_x64)}
+    return versions | {"scene": digest((type(scene), scene)), "sha256": hashlib.sha256(content).hexdigest()}
+
+
+def _encoded(x: Any) -> Any:
+    if isinstance(x, list):
+        return [_encoded(y) for y in x]
+    if isinstance(x, tuple):
+        return {"tuple": [_encoded(y) for y in x]}
+    if isinstance(x, dict):
+        return {"dict": [[_encoded(key), _encoded(y)] for key, y in x.items()]}
+    if isinstance(x, np.ndarray):
+        return {"array": [x.dtype.str, list(x.shape), x.ravel().tolist()]}
+    return {type(x).__name__: _encoded(vars(x))} if type(x) in KINDS.values() else x
+
+
+def _decoded(x: Any) -> Any:
+    if isinstance(x, list):
+        return [_decoded(y) for y in x]
+    if not isinstance(x, dict):
+        return x
+    ((kind, value),) = x.items()
+    if kind == "array":
+        return np.array(value[2], value[0]).reshape(value[1])
+    parts = [_decoded(y) for y in value] if kind in ("tuple", "dict") else _decoded(value)
+    if kind in ("tuple", "dict"):
+        return {"tuple": tuple, "dict": dict}[kind](parts)
+    made = object.__new__(KINDS[kind])
+    vars(made).update(parts)
+    return made
