@@ -491,6 +491,7 @@ ANALYSIS: dict[str, Case] = {
     "jj.steady(sleigh, {}, held='headin')": "`ChaplyginSleigh` has no `headin` to hold or to move; did you mean `heading`?",
     "jj.steady(b, {}, moving=('z',))": "`Bead` has no `z` to hold or to move; Valid names: `x`, `y`.",
     "jj.steady(b, {}, max_steps=0)": "`max_steps` is 0, expected a whole number of at least 1",
+    "jj.build(b, jj.Formulation('full', reduction='kkt')).save('b')": "a model with a reduction or a stabilisation of its own has no file",
     "jj.steady(b, {}, options={})": "`options` is a dict, expected `jj.Options(...)`",
     "jj.steady(b, {}, rtol=1e-3)": ("TypeError", "steady() takes no `rtol`: no motion is integrated; `max_steps` bounds the search"),
 }

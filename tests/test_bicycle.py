@@ -160,17 +160,17 @@ def test_samples_have_the_measured_mean_and_sigma():
     samples = sample_parameters(bicycle, jax.random.key(0), 4000)
     values = np.array([bicycle.values[name] for name in samples.names])
     sigmas = np.array([bicycle.sigmas[name] for name in samples.names])
-    standard = (np.asarray(samples.values) - values) / sigmas
+    standard = (samples.values - values) / sigmas
     assert np.abs(standard.mean(0)).max() < 5 / np.sqrt(4000)
     assert np.abs(standard.std(0) - 1).max() < 5 / np.sqrt(2 * 4000)
     assert np.abs(np.corrcoef(standard.T) - np.eye(len(values))).max() < 5 / np.sqrt(4000)
-    assert bool(samples.physical.all())
+    assert samples.physical.all()
     assert samples.refused == {}
 
 
 def test_a_parameter_without_sigma_does_not_vary():
     samples = sample_parameters(shipped("Benchmark"), jax.random.key(0), 5)
-    assert np.ptp(np.asarray(samples.values), axis=0).max() == 0
+    assert np.ptp(samples.values, axis=0).max() == 0
 
 
 def test_unphysical_samples_are_counted_and_named(tmp_path):
@@ -500,7 +500,7 @@ def test_the_benchmark_speeds_are_the_published_ones():
     assert_allclose(found.double_root_eigenvalue, oracle.DOUBLE_ROOT, **close)
     assert_allclose(found.stable_from, found.weave_speed, **close)
     assert_allclose(found.stable_to, found.capsize_speed, **close)
-    assert bool(found.stable_range_exists)
+    assert found.stable_range_exists
 
 
 @pytest.mark.parametrize("name", RIDEABLE)
@@ -529,7 +529,7 @@ def test_the_eigenvalues_cross_where_the_speeds_say(name):
     assert (above.imag != 0).all()
     assert_allclose([below.real, above.real], found.double_root_eigenvalue, rtol=1e-2)
 
-    assert bool(found.stable_range_exists)
+    assert found.stable_range_exists
     middle = 0.5 * (found.stable_from + found.stable_to)
     assert (_growth_rates(matrices, middle).real < 0).all()
 
@@ -548,13 +548,13 @@ def test_a_bicycle_that_speed_does_not_change_has_no_stable_range():
     found = speeds_of(M, np.zeros((2, 2)), K0, np.zeros((2, 2)), g)
     assert np.isnan([found.weave_speed, found.capsize_speed, found.double_root_speed]).all()
     assert np.isnan([found.weave_frequency, found.stable_from, found.stable_to]).all()
-    assert not bool(found.stable_range_exists)
+    assert not found.stable_range_exists
 
     def weave_and_double_root(M):
         found = stability_speeds(M, np.zeros((2, 2)), K0, np.zeros((2, 2)), g)
         return jnp.stack([found.weave_speed, found.weave_frequency, found.double_root_speed, found.capsize_speed])
 
-    assert (np.asarray(jax.jit(jax.jacrev(weave_and_double_root))(M)) == 0).all()
+    assert (jax.jit(jax.jacrev(weave_and_double_root))(M) == 0).all()
 
 
 def test_speeds_beyond_the_largest_are_not_reported():

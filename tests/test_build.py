@@ -124,7 +124,7 @@ def test_a_model_whose_numbers_decide_otherwise_than_the_defaults_of_its_class_s
 
 
 def batch(scene, ts, start) -> list:
-    return np.asarray(jj.rollout(scene, {**start, "x": jnp.array([0.1, 0.2])}, ts=ts, progress=False)["y"]).tolist()
+    return jj.rollout(scene, {**start, "x": jnp.array([0.1, 0.2])}, ts=ts, progress=False)["y"].tolist()
 
 
 def alone(scene, ts, start) -> list:
@@ -134,7 +134,7 @@ def alone(scene, ts, start) -> list:
 
 def fitted(scene, ts, start) -> list:
     data = jj.Experiment(ts, {"x": 0.1 + ts, "z": 0.02 * ts}, 0.01, start=start)
-    return np.asarray(jj.fit(scene, data, free={"arm": None}, max_iterations=2).values).tolist()
+    return jj.fit(scene, data, free={"arm": None}, max_iterations=2).values.tolist()
 
 
 @pytest.mark.parametrize("run", [alone, batch, fitted])
@@ -152,27 +152,17 @@ def test_what_a_motion_a_batch_or_a_fit_runs_is_not_decided_by_the_call_before_i
     assert len({privileged for privileged, *_ in found[0].values()}) == 2
 
 
-@pytest.mark.parametrize("kind", [jj.models.TiltingDisc, jj.models.DoublePendulumRods, jj.models.FreeRigidBody])
+@pytest.mark.parametrize("kind", [TiltingDisc, DoublePendulumRods, jj.models.FreeRigidBody])
 def test_a_model_comes_back_from_its_file_without_tracing_the_scene(kind, tmp_path, monkeypatch):
-    scene, path = kind(), tmp_path / "one.model"
-    model = jj.build(scene, memory="1GB")
+    model, path = jj.build(kind()), tmp_path / "file"
     model.save(path)
-    ended, said = jj.simulate(model, t1=0.1).q_end, str(model)
+    ended = jj.simulate(model, t1=0.1).q_end
     jj.clear_caches()
     monkeypatch.setattr(jax, "make_jaxpr", None)
-    loaded = jj.load_model(path, scene)
+    loaded = jj.load_model(path, model.scene)
     monkeypatch.undo()
-    assert (str(loaded), loaded.memory) == (said, 10**9)
+    assert str(loaded) == str(model)
     assert_array_equal(jj.simulate(loaded, t1=0.1).q_end, ended)
-
-
-def test_a_file_of_something_else_is_no_model(tmp_path):
-    disc, path = jj.models.TiltingDisc(), tmp_path / "disc.model"
-    jj.build(disc).save(path)
-    with pytest.raises(ValueError, match="no model of this `TiltingDisc`: what differs is scene; build and save it anew"):
-        jj.load_model(path, disc.replace(mass=2.0))
     path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(ValueError, match="what differs is sha256"):
-        jj.load_model(path, disc)
-    with pytest.raises(ValueError, match="a reduction or a stabilisation of its own has no file"):
-        jj.build(disc, jj.Formulation("full", reduction="kkt")).save(path)
+    with pytest.raises(ValueError, match="what differs is scene, sha256; build and save it anew"):
+        jj.load_model(path, ChaplyginSleigh())

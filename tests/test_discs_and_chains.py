@@ -279,7 +279,7 @@ def test_heavy_trailers_slow_the_car_as_energy_demands():
     # T = v^2 (m0 + m1 cos^2(gamma) + I1 sin^2(gamma)/L^2)/2
     carried = scene.car_mass + scene.trailer_mass * jnp.cos(hitch) ** 2 + scene.trailer_inertia * (jnp.sin(hitch) / LENGTH) ** 2
     assert relative_error(carried * speed**2, jnp.full(7, carried[0] * SPEED**2)) <= tolerance("closed_form")
-    assert float(speed[0] - speed[-1]) > 0.05
+    assert speed[0] - speed[-1] > 0.05
     assert jnp.max(jnp.abs(motion["turn0"])) <= tolerance("round_off")
 
 

@@ -138,7 +138,7 @@ def test_samples_in_single_precision_are_those_in_double():
     times, pushes = [0.0, 1.0, 2.0], [0.0, 1.0, -2.0]
     single = jj.Sampled(np.array(times, np.float32), jnp.array(pushes, jnp.float32))
     ends = [jj.simulate(Slider(), t1=3.0, inputs={"push": samples}).q_end for samples in (single, jj.Sampled(times, pushes))]
-    assert bool(jnp.all(ends[0] == ends[1]))
+    assert jnp.all(ends[0] == ends[1])
 
 
 @pytest.mark.parametrize("backend", ["native", "xla", "dense"])
@@ -147,7 +147,7 @@ def test_a_state_in_single_precision_moves_in_double(backend):
     q, u = jnp.zeros(2, jnp.float32), jnp.array([1.0, 2.0], jnp.float32)
     motion = jj.simulate(scene, jj.consistent(scene, 0.0, q, u), **options)
     assert motion.q.dtype == jnp.float64
-    assert bool(jnp.all(motion.q_end == jj.simulate(scene, {"x_rate": 1.0, "angle_rate": 2.0}, **options).q_end))
+    assert jnp.all(motion.q_end == jj.simulate(scene, {"x_rate": 1.0, "angle_rate": 2.0}, **options).q_end)
 
 
 @pytest.mark.parametrize(("precision", "backend"), [(jnp.float32, "xla"), (jnp.bfloat16, "auto")])

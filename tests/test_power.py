@@ -134,7 +134,7 @@ def test_the_work_along_driven_poses_is_part_of_the_scalar_program(backend):
 
 def test_work_that_is_left_out_is_no_fault():
     driven = jj.simulate(small.BeadOnTurningWire(), {"r": 0.5}, t1=1.0, work=False)
-    assert float(jj.diagnose(driven).energy_drift) > 0.1
+    assert jj.diagnose(driven).energy_drift > 0.1
     assert driven.warnings == ()
     assert "T + V, which the work changes that was left out" in str(driven)
 

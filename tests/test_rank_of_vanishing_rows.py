@@ -35,7 +35,7 @@ def _near(name: str, distance: float, unit: float = 1.0):
 def test_rank_is_lost_where_a_row_is_round_off(name, unit):
     scene, _, found = _near(name, 0.0, unit)
     assert (structure_of(scene).rank, int(found.rank)) == (2, 1)
-    assert float(found.smallest_singular_value) < 1e-12
+    assert found.smallest_singular_value < 1e-12
 
 
 @pytest.mark.parametrize("unit", UNITS)

@@ -38,12 +38,12 @@ def test_bad_lanes_are_counted_and_named_and_harm_no_other(sleighs):
     assert lanes.failed.tolist() == [2, 5]
     good = np.setdiff1d(np.arange(7), lanes.failed)
     assert np.all(lanes.result[good] == results.SUCCESS)
-    assert np.all(np.isfinite(np.asarray(lanes["x"])[good]))
+    assert np.isfinite(lanes["x"][good]).all()
     assert lanes.result[[2, 5]].tolist() == [results.BAD_START, results.BAD_PARAMETER]
     assert "1 the start is not finite; check where its values were computed: lanes 2" in str(lanes)
     assert "1 a parameter is not finite or has the wrong sign (`offset`): lanes 5" in str(lanes)
     assert lanes.quantiles("heading", (0.5,)).shape == (1, 5)
-    assert_allclose(lanes.quantiles("heading", (0.5,))[0], np.median(np.asarray(lanes["heading"])[good], axis=0))
+    assert_allclose(lanes.quantiles("heading", (0.5,))[0], np.median(lanes["heading"][good], axis=0))
 
 
 def test_lanes_with_times_of_their_own_have_no_quantiles_in_common():
@@ -60,8 +60,8 @@ def test_lanes_with_parameters_of_the_wrong_sign_end_at_once_and_say_which():
     assert lanes.result.tolist() == [results.SUCCESS, *[results.BAD_PARAMETER] * 3]
     assert "wrong sign (`mass`): lanes 1, 2, 3" in str(lanes)
     assert lanes.lane(1).message.endswith("(`mass`); check where it was computed")
-    assert np.all(np.isnan(np.asarray(lanes["x"])[1:]))
-    assert np.all(np.asarray(lanes.lanes.t_end)[1:] == 0.0)
+    assert np.isnan(lanes["x"][1:]).all()
+    assert np.all(lanes.lanes.t_end[1:] == 0.0)
     assert_allclose(lanes.lane(0).q, jj.simulate(ChaplyginSleigh(mass=1.0), **OPTIONS).q, atol=1e-9)
 
 

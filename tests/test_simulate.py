@@ -65,8 +65,8 @@ def test_work_without_potential_is_taken_off_the_energy_and_the_result_says_so()
     motion = jj.simulate(Falling(drag=0.3), t1=1.0, inputs={"force": lambda t: jnp.sin(3 * t)}, **options)
     energy = motion.energies()
     assert energy.kind == "T + V less the work done"
-    assert float(jnp.ptp(energy.kinetic + energy.potential)) > 1.0
-    assert float(jnp.ptp(energy.balance)) < 1e-10
+    assert jnp.ptp(energy.kinetic + energy.potential) > 1.0
+    assert jnp.ptp(energy.balance) < 1e-10
 
 
 def test_a_conservative_scene_tracks_no_work():
@@ -187,7 +187,7 @@ def test_a_reduction_by_privileged_speeds_too_light_for_the_precision_is_warned_
     # one digit is left of the wheel's acceleration: what its turning would be off by, the projection of its rate does not show
     assert int(pulled(1e-30, "qr").result) == results.MAX_STEPS
     lost = pulled(1e-30, by_wheel)  # the scaled row of the wheel hardly holds x: A_z is singular in 64-bit floats
-    assert float(lost.q_end[0]) < 1e-3
+    assert lost.q_end[0] < 1e-3
     assert any("hardly determine the others, pivot 1.0e-15" in text for text in lost.warnings)
 
 

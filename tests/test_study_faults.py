@@ -39,13 +39,15 @@ COUNT = 90  # lanes, in three chunks
 pytestmark = pytest.mark.usefixtures("small_blocks")
 
 
-def study(seed=3, **more):
+def study(seed=3, memory=None, **more):
+    scene = jj.models.TiltingDisc()
     lean = jj.Uniform(-0.5, 0.5)
-    return jj.Study(jj.models.TiltingDisc(), start={"lean": lean, "spin_rate": jj.Uniform(-4.0, 0.0)}, samples=COUNT, seed=seed, **more)
+    scene = scene if memory is None else jj.build(scene, memory=memory)
+    return jj.Study(scene, start={"lean": lean, "spin_rate": jj.Uniform(-4.0, 0.0)}, samples=COUNT, seed=seed, **more)
 
 
-def run(path, seed=3, **options):
-    return study(seed).run(path, t1=1.0, rtol=1e-6, atol=1e-6, progress=False, **options)
+def run(path, seed=3, memory=None, **options):
+    return study(seed, memory).run(path, t1=1.0, rtol=1e-6, atol=1e-6, progress=False, **options)
 
 
 @pytest.fixture(scope="module")

@@ -186,7 +186,8 @@ class Model(BuiltFor, Printed):
             raise ValueError("a model with a reduction or a stabilisation of its own has no file; build it anew")
         how = {"state": formulation.state, "projects": formulation.projects, "backend": self.backend, "memory": self.memory}
         found = {("_structure",): self.structure, ("coordinates_on_rows",): coordinates_on_rows(scene), ("row_program",): row_program(scene)}
-        found |= {("_lowered", every or not self.structure.row_names): lowered(scene, every) for every in (self.state == "full", not self.structure.has_minimal_state)}
+        known = self.structure
+        found |= {("_lowered", every or not known.row_names): lowered(scene, every) for every in (self.state == "full", not known.has_minimal_state)}
         model_file.write(path, scene, how, {what: x for what, x in found.items() if not isinstance(x, NotLowered)})
 
     def __reduce__(self):
