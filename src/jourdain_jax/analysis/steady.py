@@ -29,7 +29,6 @@ from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
-_FINAL_STEPS = 3
 _REFUSED = dict.fromkeys({*SPAN, *OPTION_NAMES} - {"max_steps"}, "no motion is integrated; `max_steps` bounds the search, and a backend goes to `jj.build`")
 _SPEEDS = 10.0  # size of a speed, SI units: how far it moves in some steps of the search
 
@@ -163,7 +162,7 @@ def _root(problem: _Problem, z: Float[Array, "unknowns"], free: Bool[Array, "unk
     found = damped_search(lambda z: still(z)[:2], guess, size, float(np.finfo(z.dtype).eps), most_steps=most_steps)
     found = jax.lax.stop_gradient(found)
     inverse = size[:, None] * pseudo_inverse(found.J, _round_off_root(z.dtype))
-    return jax.lax.scan(lambda z, _: (z - inverse @ problem(z)[0], None), jnp.where(free, found.best, z), length=_FINAL_STEPS)[0]
+    return jax.lax.scan(lambda z, _: (z - inverse @ problem(z)[0], None), jnp.where(free, found.best, z), length=3)[0]
 
 
 def _round_off_root(dtype) -> float:

@@ -177,7 +177,7 @@ class Model(BuiltFor, Printed):
         return tuple(said)
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write what `build` found for the numbers of the scene to a file, for `jj.load_model`.
+        """Write what `build` found for the numbers of the scene to the file `path`, for `jj.load_model`.
 
         ValueError for a model with a reduction or a stabilisation of its own, and where the scene has parts that are kept as calls of JAX.
         """

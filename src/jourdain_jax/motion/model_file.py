@@ -26,7 +26,6 @@ from jourdain_jax.scene.digests import digest
 from jourdain_jax.scene.scene import Scene
 
 KINDS = {kind.__name__: kind for kind in (Structure, Lowered, Stage, RowProgram, Variables, Graph)}
-LARGEST = 2**30  # bytes
 
 
 def write(path: str | os.PathLike, scene: Scene, how: dict, found: Mapping[Hashable, Any]) -> None:
@@ -40,7 +39,7 @@ def write(path: str | os.PathLike, scene: Scene, how: dict, found: Mapping[Hasha
 
 def read(path: str | os.PathLike, scene: Scene) -> tuple[dict[Hashable, Any], dict]:
     """Return what was found about a scene, and how it is built; a ValueError where the file is damaged or of something else."""
-    head, _, content = read_bytes(path, LARGEST, "a model").partition(b"\n")
+    head, _, content = read_bytes(path, 2**30, "a model").partition(b"\n")
     stated, expected = parsed(json.loads, head, f"`{path}`", "a model"), _about(scene, content)
     if stated != expected:
         other = ", ".join(name for name, value in expected.items() if not isinstance(stated, dict) or stated.get(name) != value)

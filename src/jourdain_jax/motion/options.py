@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from jourdain_jax.motion.vector_fields.field import Formulation
 
 TOLERANCE, MOST_STEPS = 1e-8, 100_000
-MEMORY = 2**32  # bytes, where no model states others
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ class AllOptions(Options):
     solver: "diffrax.AbstractSolver | ImplicitMethod | Taylor | Method | None" = None
     formulation: "Formulation | None" = None
     backend: str = "auto"
-    memory: int | None = None  # of a model: bytes that batches and reverse mode may take; None: `MEMORY`
+    memory: int | None = None  # of a model: bytes that batches and reverse mode may take; None: those of `integrators.problem`
     alongside: bool = False  # whether one run gives values and tangents: for derivatives by `jvp` and `jacfwd` alone
 
 

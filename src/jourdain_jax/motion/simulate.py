@@ -20,10 +20,11 @@ from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.explicit_steps import DOPRI8, TSIT5, Method
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
+from jourdain_jax.motion.integrators.problem import MEMORY
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.model import Model, modelled
-from jourdain_jax.motion.options import MEMORY, AllOptions, OptionFields, Options, as_options
+from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.own_steps import own_steps
 from jourdain_jax.motion.put_on_rows import State, Usual
 from jourdain_jax.motion.retries import retried

@@ -7,6 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
+MEMORY = 2**32  # bytes, where no model states others
+
 
 class Problem(eqx.Module):
     """What is integrated and how well."""
@@ -29,7 +31,7 @@ class Problem(eqx.Module):
     span: Float[Array, "*lanes"] | None = None  # of the motion, s
     near_rank_loss: bool = eqx.field(static=True, default=False)  # `rates_and_pivots` has a sine: of rows that may lose rank
     within: Callable | None = None  # (t, args) -> args for the stages of a step with the middle t; None: the same in all steps
-    memory: int = eqx.field(static=True, default=2**32)  # bytes that the record of reverse mode may take
+    memory: int = eqx.field(static=True, default=MEMORY)  # bytes that the record of reverse mode may take
 
     def in_step(self, t, h) -> "Problem":
         """The problem for the stages of a step."""
