@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.analysis.arrow import Arrow, PerMember, eliminated
+from jourdain_jax.analysis.experiment import Experiment
 
 SHORTEST = 0.1  # tau over the shortest interval: the noise is white
 
@@ -106,13 +107,13 @@ def lowest(f: Callable[[np.ndarray], np.ndarray], a: np.ndarray, b: np.ndarray) 
     return np.asarray((a + b) / 2)
 
 
-def correlation_limits(ts: Sequence[np.ndarray]) -> tuple[float, float]:
+def correlation_limits(runs: Sequence[Experiment], channel: str) -> tuple[float, float]:
     """Shortest and longest correlation time that is looked for, s. ValueError where no run has two samples."""
-    intervals = [float(np.min(np.diff(t))) for t in ts if len(t) > 1]
-    if not intervals:
+    ts = [np.asarray(run.ts) for run in runs if channel in run.values and len(run.ts) > 1]
+    if not ts:
         raise ValueError("a correlation time is None, but each run has one sample, and neighbours in a run tell it; give a number in s, or 0 for white noise")
     # beyond ten spans hardly to be told from a bias
-    return SHORTEST * min(intervals), 10.0 * max(float(t[-1] - t[0]) for t in ts)
+    return SHORTEST * min(float(np.min(np.diff(t))) for t in ts), 10.0 * max(float(t[-1] - t[0]) for t in ts)
 
 
 def log_density(r, weight, ts, tau) -> Float[Array, ""]:

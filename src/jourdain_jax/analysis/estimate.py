@@ -67,9 +67,10 @@ class Range:
 
     def constrain(self, x: Numbers) -> Numbers:
         """The unknown, in its unit, that a real number stands for."""
-        if self.kind == "memory":
-            return -self.interval / jnp.log(jnp.sin(self.low + (self.high - self.low) * jax.nn.sigmoid(x)))
-        return jnp.exp(x) if self.kind == "positive" else self.low + (self.high - self.low) * jax.nn.sigmoid(x) if self.kind == "bounds" else x
+        if self.kind in ("positive", "unbounded"):
+            return jnp.exp(x) if self.kind == "positive" else x
+        inside = self.low + (self.high - self.low) * jax.nn.sigmoid(x)
+        return -self.interval / jnp.log(jnp.sin(inside)) if self.kind == "memory" else inside
 
     def log_slope(self, x: Numbers) -> Numbers:
         """`log |d theta / dx|`; of a correlation time `log |d arcsin rho / dx|`."""
@@ -87,7 +88,7 @@ class Range:
 
     def refusal(self, guess: np.ndarray) -> str:
         """Why a first guess cannot be taken; empty where it can."""
-        if self.low < float(guess) < self.high if guess.ndim == 0 else ((guess > self.low) & (guess < self.high)).all():
+        if np.all((self.low < guess) & (guess < self.high)):
             return ""
         if self.kind == "positive":
             return "expected a first guess above zero; or leave it free to change sign with `unbounded()`"
@@ -117,11 +118,12 @@ def unbounded(scale: Number | None = None) -> Range:
 
     Raises ValueError unless the scale is positive and finite.
     """
-    if scale is not None:
-        checked_known(scale, "`scale` of `unbounded`", ())
-    if scale is not None and not (np.isfinite(scale) and scale > 0):
+    if scale is None:
+        return Range("unbounded")
+    number = float(checked_known(scale, "`scale` of `unbounded`", ()))
+    if not (np.isfinite(number) and number > 0):
         raise ValueError(f"unbounded({scale}): expected a positive scale, a typical change in the unit of the unknown")
-    return Range("unbounded", scale=None if scale is None else float(scale))
+    return Range("unbounded", scale=number)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,13 +157,12 @@ def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]
     C = checked_known(covariance, "`covariance` of `joint_normal`", (n, n), advice=f"one row and one column for each of {', '.join(names)}")
     if not (np.all(np.isfinite(C)) and np.all(np.isfinite(means))):
         raise ValueError("mean and covariance of `joint_normal` must be finite; leave out what is not known")
-    variances = np.diag(C)
-    if np.any(variances <= 0):
-        first = names[int(np.argmax(variances <= 0))]
-        raise ValueError(f"the variance of `{first}` is {variances[names.index(first)]:g}, expected one above zero; a number that is known needs no estimate")
+    for name, variance in zip(names, variances := np.diag(C), strict=True):
+        if variance <= 0:
+            raise ValueError(f"the variance of `{name}` is {variance:g}, expected one above zero; a number that is known needs no estimate")
     sigma, round_off = np.sqrt(variances), 1e-9  # of correlations
     correlations = C / np.outer(sigma, sigma)
-    if np.max(np.abs(correlations - correlations.T)) > round_off:
+    if np.abs(correlations - correlations.T).max() > round_off:
         raise ValueError("`covariance` of `joint_normal` is not symmetric; give cov(a, b) = cov(b, a)")
     if (least := np.linalg.eigvalsh(correlations)[0]) < -n * round_off:
         raise ValueError(f"`covariance` of `joint_normal` is no covariance: its correlations have the eigenvalue {least:.3g}, expected none below zero")
@@ -216,11 +217,6 @@ class Estimate:
             raise ValueError(f"`per_run` of `Estimate` is {described(self.per_run)}, expected True or False")
         if self.prior is not None:
             _check_prior(self.prior)
-
-    @property
-    def known_before(self) -> tuple[float, float] | None:
-        """Mean and standard deviation of the prior."""
-        return None if self.prior is None else (float(self.prior.mean), float(self.prior.sigma))
 
 
 def _check_prior(prior) -> None:

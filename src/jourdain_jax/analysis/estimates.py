@@ -36,7 +36,7 @@ from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.model import modelled
 from jourdain_jax.motion.own_steps import moving_jumps
 from jourdain_jax.motion.simulate import simulate
-from jourdain_jax.scene.names import UnknownNameError, nearest
+from jourdain_jax.scene.names import UnknownNameError, check_name, nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
@@ -254,8 +254,7 @@ class Estimates(Printed):
         raise AttributeError(f"`{name}` has gone: {GONE[name]}" if name in GONE else f"`Fit` has no `{name}`; {nearest(name, dir(self))}")
 
     def __getitem__(self, name: str) -> Estimated:
-        if name not in self.labels:
-            raise UnknownNameError(f"`{name}` was not estimated; {nearest(name, self.labels)}")
+        check_name(name, self.labels, f"`{name}` was not estimated", UnknownNameError)
         i = self.labels.index(name)
         return Estimated(self.values[..., i], self.standard_errors[..., i], self.low[..., i], self.high[..., i], self.units[i])
 

@@ -6,7 +6,6 @@ value_k = reading of the channel's sensor at t_k + sigma_k e_k,   e_k independen
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -16,7 +15,7 @@ from jourdain_jax.analysis.sensors import Actuator, Drive, Numbers, Reading, Sen
 from jourdain_jax.calculus.reals import Number, array_module, checked_unless_traced, described, holds, is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled, as_inputs
 from jourdain_jax.scene.arguments import one_time, vector_of_times
-from jourdain_jax.scene.names import as_names, nearest
+from jourdain_jax.scene.names import as_names, check_name, nearest
 from jourdain_jax.scene.scene import Scene, entries_named
 
 _NO_INPUTS = Inputs(())
@@ -84,7 +83,9 @@ class Experiment(eqx.Module):
         for what, part in (("values", values), ("start", start), ("sensors", sensors or {}), ("events", events or {})):
             if not isinstance(part, Mapping):
                 raise ValueError(f'`{what}` of `Experiment` is {described(part)}, expected a dictionary by name, such as {{"x": ...}}')
-        self.values = _reals("values of channel", {name: _unmasked(value) for name, value in values.items()}, "give numbers, NaN where a sample is missing")
+        masked = {name for name, x in values.items() if isinstance(x, np.ma.MaskedArray) and x.dtype.kind in "iuf"}
+        filled = {name: np.ma.filled(x.astype(float), np.nan) if name in masked else x for name, x in values.items()}
+        self.values = _reals("values of channel", filled, "give numbers, NaN where a sample is missing")
         given = sigma if isinstance(sigma, Mapping) else dict.fromkeys(self.values, sigma)
         self.unknown_sigma = tuple(sorted(name for name, value in given.items() if value is None))
         self.sigma = _reals("sigma of channel", {name: 1.0 if value is None else value for name, value in given.items()})
@@ -96,7 +97,7 @@ class Experiment(eqx.Module):
         self.inputs = inputs
         self.sensors = {name: one if isinstance(one, Sensor) else Sensor(one) for name, one in (sensors or {}).items()}
         self.readings, self.drives, self.estimates = {}, {}, {}
-        self.t0 = _array(self.ts[0] if t0 is None else one_time(t0, "t0"))
+        self.t0 = self.ts[:1].reshape(()) if t0 is None else one_time(t0, "t0")
         self.ended_by = next(iter(events or {}), "")
         if events:
             self.ts, self.values, self.sigma = cut(events, self.t0, self.ts, self.values, self.sigma)
@@ -108,16 +109,19 @@ class Experiment(eqx.Module):
             )
         if not self.values:
             raise ValueError("`values` is empty; give at least one channel: name -> measured values; or the time of an event, in `events`")
-        strange = "names channel `{}`, which has no values"
-        for names, what in ((self.sigma, f"`sigma` {strange}"), (self.correlation_time, f"`correlation_time` {strange}")):
-            _check_known(names, what, self.values)
-        _check_known(self.sensors, "sensor `{}` has no measured values", self.values)
+        for names, what, known in (
+            (self.sigma, "`sigma` names channel `{}`, which has no values", self.values),
+            (self.correlation_time, "`correlation_time` names channel `{}`, which has no values", self.values),
+            (self.sensors, "sensor `{}` has no measured values", self.values),
+            (self.unknown_start, "unknown start value `{}` has no first guess; give one in `start`", self.start),
+        ):
+            for name in names:
+                check_name(name, known, what.format(name))
         for name in self.values:
             if name not in self.sigma:
                 raise ValueError(f"channel `{name}` has no sigma; give `sigma` a number for it, or one number for all channels")
         if self.ended_by in (*self.sensors, *self.correlation_time):
             raise ValueError(f"`{self.ended_by}` is an event, whose time has no sensor and no correlation time; leave them out, or rename the channel")
-        _check_known(self.unknown_start, "unknown start value `{}` has no first guess; give one in `start`", self.start)
         for name, value in self.values.items():
             if not holds(lambda x: ~np.isinf(x), value):
                 raise ValueError(
@@ -150,17 +154,8 @@ class Experiment(eqx.Module):
 Data = Experiment | Sequence[Experiment]
 
 
-def _array(x) -> Array | np.ndarray:
-    return array_module(x).asarray(x, jnp.result_type(float))
-
-
 def _reals(what: str, given: Mapping, advice: str = "check how it is put together", shape: tuple[()] | None = None) -> dict[str, Array | np.ndarray]:
     return {name: checked_unless_traced(value, f"{what} `{name}`", shape, advice=advice) for name, value in given.items()}
-
-
-def _unmasked(value):
-    """The values, with NaN where samples are masked."""
-    return np.ma.filled(value.astype(float), np.nan) if isinstance(value, np.ma.MaskedArray) and value.dtype.kind in "iuf" else value
 
 
 def _correlation_times(given: Mapping) -> dict[str, Array | np.ndarray]:
@@ -184,12 +179,6 @@ def _check_times(ts) -> None:
         raise ValueError(
             f"`ts` must be finite and strictly increasing, but sample {k} is at {ts[k]:.10g} s{after}; sort the samples by time and merge repeated ones"
         )
-
-
-def _check_known(names: Iterable[str], what: str, known: Mapping) -> None:
-    for name in names:
-        if name not in known:
-            raise ValueError(f"{what.format(name)}; {nearest(name, known)}")
 
 
 def checked(scene: Scene, run: Experiment, index: int, repeats: bool) -> Experiment:
@@ -286,7 +275,7 @@ def _inputs(scene: Scene, run: Experiment, where: str, estimates: dict) -> tuple
                 f"the command of input `{name}` of {where} ends at {float(actuator.command.ts[-1]):g} s, before the last sample at {float(run.ts[-1]):g} s, "
                 "and its lag does not go on after it; repeat the last value at a later time"
             )
-        inputs = eqx.tree_at(lambda i, k=drive.index: i.channels[k], inputs, drive.signal())
+        inputs = drive.put_into(inputs)
         if drive.unknown:
             drives[name] = drive
     return inputs, drives
@@ -307,12 +296,11 @@ def _check_overlap(run: Experiment, name: str, signal, where: str) -> None:
 
 def _named_shape(scene: Scene, name: str, channel_name: str, where: str) -> tuple[int, ...]:
     """The shape of a coordinate or speed: of a quaternion (4,), of its rates (3,)."""
-    both = scene.coordinate_names, scene.speed_names
-    entries = both[0].entries + both[1].entries
-    if name in entries:
-        return ()
-    groups = {group: length for names in both for group, _, length in names.groups}
-    if name not in groups:
-        unknown = f"unknown channel `{name}`" if name == channel_name else f"channel `{channel_name}`, whose sensor measures an unknown quantity `{name}`"
-        raise ValueError(f"{where} has {unknown}; {nearest(name, (*groups, *entries))} For other quantities give a function of the motion in `sensors`.")
-    return (groups[name],)
+    valid: list[str] = []
+    for names in (scene.coordinate_names, scene.speed_names):
+        named = names.view(np.zeros(len(names)))
+        if name in named:
+            return named[name].shape
+        valid += named.keys()
+    unknown = f"unknown channel `{name}`" if name == channel_name else f"channel `{channel_name}`, whose sensor measures an unknown quantity `{name}`"
+    raise ValueError(f"{where} has {unknown}; {nearest(name, valid)} For other quantities give a function of the motion in `sensors`.")

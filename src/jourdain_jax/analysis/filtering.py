@@ -14,7 +14,7 @@ G. J. Bierman, Factorization Methods for Discrete Sequential Estimation (1977), 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Unpack
+from typing import Any, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -26,11 +26,11 @@ from jourdain_jax.analysis.experiment import Data, Experiment
 from jourdain_jax.analysis.likelihood import as_fit_options, as_runs, check_known, mapped
 from jourdain_jax.analysis.quantities import Channel, Instrument, StopEvent
 from jourdain_jax.analysis.runs import Run, equal_runs
-from jourdain_jax.analysis.sensors import Reading, gauss_legendre, ideal
-from jourdain_jax.analysis.tangent import dependent_coordinates, others, privileged_speeds
+from jourdain_jax.analysis.sensors import gauss_legendre, ideal
+from jourdain_jax.analysis.tangent import dependent_coordinates, others, privileged_at, privileged_speeds
 from jourdain_jax.calculus.reals import checked_real, holds
 from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.motion.inputs import Inputs, inputs_at
+from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.simulate import simulate
@@ -74,16 +74,16 @@ def filtered_log_likelihood(
     scene = as_scene(scene)
     runs = as_runs(scene, data)
     _check_supported(scene, runs)
-    speeds = privileged_speeds(scene)
-    intensities = _intensities(scene, speeds, process_noise)
     total = jnp.zeros(())
     for numbers, alike in equal_runs(runs):
+        speeds = _independent_speeds(scene, runs[numbers[0]])
+        intensities = _intensities(scene, speeds, process_noise)
         names = tuple(dict.fromkeys(name for i in numbers for name in runs[i].unknown_start))
 
-        def one(run: Run, begun: Float[Array, "2 unknown"], names=names) -> Scalar:
+        def one(run: Run, begun: Float[Array, "2 unknown"], names=names, known=(speeds, intensities)) -> Scalar:
             mean, sigma = begun
             run = run._replace(start=run.start | dict(zip(names, mean, strict=True)))
-            return _Filter(scene, run, settled, speeds, intensities).log_likelihood(names, sigma)
+            return _Filter(scene, run, settled, *known).log_likelihood(names, sigma)
 
         total = total + jnp.sum(mapped(one, alike, jnp.stack([_begun(runs[i], names) for i in numbers])))
     return jnp.where(jnp.isfinite(total), total, -jnp.inf)
@@ -97,7 +97,7 @@ class _Filter:
         self.scene, self.run, self.inputs, self.options = scene, run, run.inputs, options
         self.speeds, self.intensities = np.array(speeds, int), intensities
         self.begin = self._start(run.start)
-        count = len(scene.coordinate_names.entries)
+        count = len(scene.coordinate_names)
         self.coordinates = others(dependent_coordinates(scene, self.begin, (), None), count)
         self.held = (*(scene.coordinate_names.entries[i] for i in self.coordinates), *(scene.speed_names.entries[i] for i in speeds))
 
@@ -137,7 +137,7 @@ class _Filter:
         """The state with these independent coordinates and speeds; the others follow, the coordinates near q."""
         count = len(self.coordinates)
         q = jax.lax.stop_gradient(q).at[self.coordinates].set(x[:count])
-        u = jnp.zeros(len(self.scene.speed_names.entries)).at[self.speeds].set(x[count:])
+        u = jnp.zeros(len(self.scene.speed_names)).at[self.speeds].set(x[count:])
         return consistent(self.scene, t, q, u, inputs_at(self.inputs, t), held=self.held)
 
     def _propagated(self, t, t1, q, x, P):
@@ -193,21 +193,30 @@ def _check_supported(scene: Scene, runs: Sequence[Experiment]) -> None:
         for name in (*run.correlation_time, *run.unknown_correlation):
             raise ValueError(f"the noise of channel `{name}` has a correlation time, but a filter takes it as white; leave it out")
         for name, reading in run.readings.items():
-            _check_reading(name, reading, index)
+            if isinstance(reading.operation, StopEvent):
+                raise ValueError(f"run {index} gives the time of its event `{name}`, which a filter does not use; leave it out, and samples after it")
+            which = f"sensor `{name}` of run {index}"
+            if reading.is_late:
+                raise ValueError(f"{which} has a delay or a lag, which a filter does not know; shift its times by the delay, or use `fit`")
+            if isinstance(reading.operation, Instrument):
+                raise ValueError(f"{which} shows accelerations, and so the white disturbance itself; leave it out, or use `fit`")
         for name, given in run.unknown_start.items():
-            if not isinstance(given, Estimate) or given.known_before is None or isinstance(given.prior, Correlated):
+            if not isinstance(given, Estimate) or given.prior is None or isinstance(given.prior, Correlated):
                 raise ValueError(
                     f"start value `{name}` of run {index} is unknown, but nothing says how far off it may be; give `jj.Estimate(prior=jj.Normal(mean, sigma))`"
                 )
 
 
-def _check_reading(name: str, reading: Reading, index: int) -> None:
-    if isinstance(reading.operation, StopEvent):
-        raise ValueError(f"run {index} gives the time of its event `{name}`, which a filter does not use; leave it out, and samples after it")
-    if reading.is_late:
-        raise ValueError(f"sensor `{name}` of run {index} has a delay or a lag, which a filter does not know; shift its times by the delay, or use `fit`")
-    if isinstance(reading.operation, Instrument):
-        raise ValueError(f"sensor `{name}` of run {index} shows accelerations, and so the white disturbance itself; leave it out, or use `fit`")
+def _independent_speeds(scene: Scene, run: Experiment) -> tuple[int, ...]:
+    """Return those of the scene, or of a scene that names none others where they do not determine the rest at a known start."""
+    usual, inputs = privileged_speeds(scene), as_inputs(scene, run.inputs)
+    begin = consistent_start(scene, t0=run.t0, inputs=inputs, **run.start)
+
+    def at_start() -> tuple[int, ...]:
+        return privileged_at(scene, begin, inputs_at(inputs, run.t0), usual)
+
+    determined = scene.privileged is not None or holds(lambda *_: at_start() == usual, *jax.tree.leaves((scene, begin)))
+    return usual if determined else at_start()
 
 
 def _intensities(scene: Scene, speeds: tuple[int, ...], given: Mapping) -> Float[Array, "speeds"]:
@@ -230,9 +239,6 @@ def _intensities(scene: Scene, speeds: tuple[int, ...], given: Mapping) -> Float
 
 def _begun(run: Experiment, names: tuple[str, ...]) -> Float[Array, "2 unknown"]:
     """Means and standard deviations of these start values."""
-    known = []
-    for name in names:
-        given = run.unknown_start.get(name)
-        before = given.known_before if isinstance(given, Estimate) else None
-        known.append((run.start[name], 0.0) if before is None else before)
-    return jnp.array(known, jnp.result_type(float)).T if known else jnp.zeros((2, 0))
+    given: dict[str, Any] = dict(run.unknown_start)  # estimates with priors
+    known = [(given[name].prior.mean, given[name].prior.sigma) if name in given else (run.start[name], 0.0) for name in names]
+    return jnp.array(known, jnp.result_type(float)).reshape(-1, 2).T

@@ -30,7 +30,7 @@ from jourdain_jax.analysis.shooting_steps import cutoff_of, shot
 from jourdain_jax.analysis.spread import AtBounds, limits_at_bounds
 from jourdain_jax.analysis.unknowns import Unknowns, check_starts, unknowns_of
 from jourdain_jax.calculus.derivatives import DifferentiationModeError
-from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.calculus.reals import checked_whole, is_traced
 from jourdain_jax.motion.options import OptionFields, Options
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.names import as_names
@@ -176,10 +176,9 @@ def fit(
         print(found)                                              # estimates with 95 % intervals, and what the data cannot tell
         found["offset"].value, found.scene.offset                 # near 0.25 m
     """
-    if isinstance(guesses, bool) or not isinstance(guesses, int | np.integer) or guesses < 1:
-        raise ValueError(f"`guesses` is {guesses!r}, expected a whole number of at least 1: how many first guesses to begin from")
+    guesses = checked_whole(guesses, "`guesses`", 1, expected="of at least 1: how many first guesses to begin from")
     check_shooting(shooting)
-    return _fit(replace(_asked(scene, free, by_name, "fit"), guesses=int(guesses), shooting=shooting), data)
+    return _fit(replace(_asked(scene, free, by_name, "fit"), guesses=guesses, shooting=shooting), data)
 
 
 def fit_batch(
@@ -223,7 +222,13 @@ def _fit(asked: Asked, data: Data, repeats: bool = False) -> Fit:
     runs = as_runs(scene, data, repeats=repeats)
     _check_noise(runs, asked)
     unknowns = unknowns_of(scene, runs, asked.free, apart=asked.shooting is not None)
-    members = _repeats(runs) if repeats else None
+    members = None
+    if repeats:
+        counts = {values.shape[0] for run in runs for values in run.values.values()}
+        if len(counts) != 1 or 0 in counts:
+            said = "give every channel of every run the same leading axis, of one or more"
+            raise ValueError(f"the channels hold {sorted(counts)} repeats; {said}")
+        members = counts.pop()
     enough = _check_enough(runs, unknowns, repeats)
     theta = unknowns.first_guesses(asked.guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
     problem = Problem(asked, runs, unknowns, members) if asked.shooting is None else Piecewise(asked, runs, unknowns)
@@ -247,8 +252,7 @@ def _check_control(control: Control) -> None:
         raise ValueError(f"`cutoff` is {control.cutoff!r}, expected a number between 0 and 1: the share of the largest singular value that counts as zero")
     if not control.tolerance > 0:
         raise ValueError(f"`tolerance` is {control.tolerance!r}, expected a number above zero: the step in sigmas that ends the fit")
-    if isinstance(control.most_steps, bool) or not isinstance(control.most_steps, int | np.integer) or control.most_steps < 0:
-        raise ValueError(f"`max_iterations` is {control.most_steps!r}, expected a whole number of steps")
+    checked_whole(control.most_steps, "`max_iterations`", 0, expected="of steps")
 
 
 def _check_noise(runs: Sequence[Experiment], asked: Asked) -> None:
@@ -261,13 +265,6 @@ def _check_noise(runs: Sequence[Experiment], asked: Asked) -> None:
     if coloured and robust:
         raise ValueError(f"the noise of channel `{coloured[0]}` has a correlation time, but a robust loss takes samples as independent; leave out either")
     in_all_or_none(runs, "the correlation time", lambda run: run.unknown_correlation)
-
-
-def _repeats(runs: Sequence[Experiment]) -> int:
-    counts = {values.shape[0] for run in runs for values in run.values.values()}
-    if len(counts) != 1 or 0 in counts:
-        raise ValueError(f"the channels hold {sorted(counts)} repeats; give every channel of every run the same leading axis, of one or more")
-    return counts.pop()
 
 
 def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool) -> np.ndarray:

@@ -73,13 +73,11 @@ def profile(one: Profile, error: float) -> str:
         axes.plot(values, rise, ".-", color=MODEL, lw=1.2)
         axes.axhline(RISE_95, color=DATA, ls="--", lw=0.8)
         axes.axvline(one.estimate, color=QUIET, lw=0.8)
-        for end, closed in zip((one.low, one.high), one.is_closed, strict=True):
-            if closed:
-                axes.axvline(end, color=DATA, ls="--", lw=0.8)
+        for end in np.compress(one.is_closed, (one.low, one.high)):
+            axes.axvline(end, color=DATA, ls="--", lw=0.8)
         (low, high), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-        if np.isfinite(error) and error > 0:
-            x = np.linspace(low, high, 60)
-            axes.plot(x, ((x - one.estimate) / error) ** 2, "--", color=QUIET, lw=0.8)
+        x = np.linspace(low, high, 60)
+        axes.plot(x, ((x - one.estimate) / error) ** 2, "--", color=QUIET, lw=0.8)
         axes.set(xlim=(low, high), ylim=(bottom, max(top, 1.3 * RISE_95)))
 
     return figure(draw, _WIDTH, _HEIGHT, str(one).replace("`", ""))
@@ -120,9 +118,8 @@ def fit_page(
             "By how much the sum of squares rises where one unknown is held and all others are fitted anew. The interval ends where it passes 3.84 (red, "
             "dashed). Grey: the parabola of the standard error; where both differ, trust the profile."
         )
-        errors = {name: float(e.standard_error) for name, e in fit.estimates.items()}
-        figures = [profile(one, errors.get(one.name, np.nan)) for one in profiles.values()]
-        sections.append(Section("Profile likelihood", about, [str(one) for one in profiles.values()], figures))
+        figures = [profile(one, float(fit[one.name].standard_error)) for one in profiles.values()]
+        sections.append(Section("Profile likelihood", about, list(map(str, profiles.values())), figures))
     if shares is not None and shares.labels:
         sections.append(_informed(shares))
     sections.append(_correlations(fit))
@@ -150,8 +147,8 @@ def _informed(shares: Informed) -> Section:
         run, begin, end = shares.half(i)
         rows.append((name, *(f"{100 * share[i]:.1f} %" for share in columns.values()), f"run {run}, {begin:.3g} to {end:.3g} s"))
     more = shares.of_runs.shape[1] - len(shown)
-    lines = [*table(rows), *([f"The {len(shown)} runs that tell most are shown; {more} more are not."] if more else [])]
-    return Section("What informs which unknown", about, lines)
+    note = [f"The {len(shown)} runs that tell most are shown; {more} more are not."] if more else []
+    return Section("What informs which unknown", about, table(rows) + note)
 
 
 def _correlations(fit: Estimates) -> Section:
@@ -169,9 +166,8 @@ def _predicted(title: str, about: str, runs: Predictions, units: Mapping[str, st
         count = int(np.prod(one.values.shape[1:], dtype=int))
         components = [f"{name}[{k}]" for k in range(count)] if count > 1 else [name]
         panels += [(f"{of}: {component}", f"{component} in {unit}", one, k) for k, component in enumerate(components)]
-    drawn, more = panels[:40], panels[40:]
-    lines += [f"{len(more)} more are not drawn."] if more else []
-    return Section(title, about, lines, [data_and_prediction(*panel) for panel in drawn])
+    lines += [f"{len(panels) - 40} more are not drawn."] if len(panels) > 40 else []
+    return Section(title, about, lines, [data_and_prediction(*panel) for panel in panels[:40]])
 
 
 def _whiteness(fit: Estimates, fitted: Predictions) -> Section:

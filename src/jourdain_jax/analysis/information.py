@@ -24,7 +24,6 @@ C_rel = C_ij / (size_i size_j),      C_rel v = s^2 v:      the unknowns may chan
 The size of an unknown is its magnitude; near zero, its typical change (`Range`). Source: R. N. Gutenkunst et al., PLoS Computational Biology 3 (2007) e189.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -32,15 +31,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.special import stdtrit
 
 from jourdain_jax.analysis.arrow import Arrow
 from jourdain_jax.analysis.layout import Layout
-from jourdain_jax.analysis.sensors import gauss_legendre
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.scene.scene import Scene
-
-_NODES, _WEIGHTS = gauss_legendre(40)
-_ARRAYS = ("singular_values", "least_part", "rank", "identifiable", "standard_errors", "shared", "own", "follow")
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +52,7 @@ class Information:
     shared: Float[np.ndarray, "*members shared shared"]
     own: Float[np.ndarray, "*members runs own own"]  # covariance where the shared unknowns are known
     follow: Float[np.ndarray, "*members runs own shared"]  # G
-    estimated: tuple[int, ...]  # places of the unknowns among those of all runs
+    estimated: Int[np.ndarray, "unknowns"]  # their places among those of all runs
 
     @property
     def covariance(self) -> Float[np.ndarray, "*members unknowns unknowns"]:
@@ -73,12 +69,11 @@ class Information:
         for i in range(runs):
             block = slice(p + i * m, p + (i + 1) * m)
             whole[..., block, block] += self.own[..., i, :, :]
-        places = np.array(self.estimated, int)
-        return whole[..., places[:, None], places]
+        return whole[..., self.estimated[:, None], self.estimated]
 
     def only(self) -> "Information":
         """That of the only member, without the axis of members."""
-        return replace(self, **{name: np.asarray(getattr(self, name)[0]) for name in _ARRAYS})
+        return replace(self, **{name: np.asarray(x[0]) for name, x in vars(self).items() if name not in ("hidden", "estimated")})
 
     def between_runs(self, scores: Float[np.ndarray, "*members runs shared"]) -> "Information":
         """Takes the covariance of the shared unknowns from how much runs differ: C (sum g g') C n / (n - 1), g: scores of n runs, C: the covariance so far.
@@ -87,7 +82,7 @@ class Information:
         """
         runs = scores.shape[-2]
         shared = self.shared @ (np.swapaxes(scores, -1, -2) @ scores) @ self.shared * runs / (runs - 1)
-        variance = variances(shared, self.own, self.follow)[..., np.array(self.estimated, int)]
+        variance = variances(shared, self.own, self.follow)[..., self.estimated]
         return replace(self, standard_errors=np.where(self.identifiable, np.sqrt(variance), np.nan), shared=shared)
 
 
@@ -98,13 +93,8 @@ def variances(shared: np.ndarray, own: np.ndarray, follow: np.ndarray) -> Float[
 
 
 def students_t_95(degrees):
-    """97.5 % quantile q of Student's t with one degree of freedom or more: q = sqrt(n) tan a,   2 c integral_0^a cos^(n - 1) = 0.95."""
-    n = np.clip(np.asarray(degrees, float), 1.0, 1e7)  # degrees of freedom, beyond which Student's t is normal
-    c, a = np.vectorize(lambda x: np.exp(math.lgamma((x + 1) / 2) - math.lgamma(x / 2)) / np.sqrt(np.pi))(n), np.zeros(n.shape)
-    for _ in range(12):  # Newton's method, from below: what is integrated falls
-        area = a * (np.cos(a[..., None] * _NODES) ** (n[..., None] - 1) @ _WEIGHTS)
-        a = a + (0.475 / c - area) / np.cos(a) ** (n - 1)
-    return np.asarray(np.sqrt(n) * np.tan(a))
+    """97.5 % quantile of Student's t with one degree of freedom or more; beyond 1e7 it is normal."""
+    return stdtrit(np.clip(degrees, 1.0, 1e7), 0.975)
 
 
 def information(arrow: Arrow, size: Float[np.ndarray, "members places"], estimated: np.ndarray, bound, fails, cutoff: float) -> Information:
@@ -113,47 +103,40 @@ def information(arrow: Arrow, size: Float[np.ndarray, "members places"], estimat
     `size`: magnitude of each unknown, in its unit; `estimated`: places of unknowns; `bound`: (members, places), which lie at a bound, and are held there;
     `fails`: (members,), of which nothing is known; `cutoff`: singular values below this fraction of the largest count as zero.
     """
-    found = [_information(arrow.of([b]), size[b], estimated, bound[b], not fails[b], cutoff) for b in range(len(size))]
-    stacked = {name: np.stack([getattr(one, name) for one in found]) for name in _ARRAYS}
-    return Information(**stacked, hidden=tuple(one.hidden[0] for one in found), estimated=tuple(estimated.tolist()))
-
-
-def _information(arrow: Arrow, size: Float[np.ndarray, "places"], estimated: np.ndarray, bound, usable, cutoff: float) -> Information:
-    runs, m, p = arrow.counts
-    held = np.ones(len(size), bool)
-    held[estimated] = bound[estimated]
-    scaled = arrow.scaled(np.where(held, 0.0, size)[None])
-    local, shared = scaled.local[0], scaled.shared[0]
-    U, S, Vt = np.linalg.svd(local[..., :m])  # (runs, m, m)
-    shows = np.max(S, axis=1, keepdims=True, initial=0.0) * cutoff < S
-    inverse = np.where(shows, 1 / np.where(shows, S, 1.0), 0.0)
-    turned = np.swapaxes(U, 1, 2) @ local[..., m:-1]
-    follow = np.swapaxes(Vt, 1, 2) @ (inverse[..., None] * turned)  # G: x = - G s
-    own = np.swapaxes(Vt, 1, 2) @ (inverse[..., None] ** 2 * Vt)
-    # what the run's own unknowns cannot take up
-    left = np.concatenate([np.where(shows[..., None], 0.0, turned).reshape(runs * m, p), shared[:, :-1]])
-    _, S_s, Vt_s = np.linalg.svd(left, full_matrices=left.shape[0] < p)
-    S_s = np.concatenate([S_s, np.zeros(p - S_s.size)])
-    largest = max(np.max(S_s, initial=0.0), np.max(S, initial=0.0) if not p else 0.0)
-    shows_s = cutoff * largest < S_s
-    covariance = Vt_s.T @ (np.where(shows_s, 1 / np.where(shows_s, S_s, 1.0) ** 2, 0.0)[:, None] * Vt_s)
-    hidden = _hidden_directions(Vt[~shows], np.nonzero(~shows)[0], Vt_s[~shows_s], follow, held)
+    (runs, m, p), held = arrow.counts, np.ones(size.shape, bool)
+    held[:, estimated] = bound[:, estimated]
+    scaled = arrow.scaled(np.where(held, 0.0, size))
+    U, S, Vt = np.linalg.svd(scaled.local[..., :m])  # (members, runs, m, m)
+    shows, V = np.max(S, axis=2, keepdims=True, initial=0.0) * cutoff < S, np.swapaxes(Vt, 2, 3)
+    inverse = np.where(shows, 1 / np.where(shows, S, 1.0), 0.0)[..., None]
+    turned = np.swapaxes(U, 2, 3) @ scaled.local[..., m:-1]
+    follow, own = V @ (inverse * turned), V @ (inverse**2 * Vt)  # G: x = - G s
+    # what the runs' own unknowns cannot take up
+    left = np.where(shows[..., None], 0.0, turned).reshape(len(size), runs * m, p)
+    left = np.concatenate([left, scaled.shared[..., :-1]], axis=1)
+    _, S_s, Vt_s = np.linalg.svd(left, full_matrices=left.shape[1] < p)
+    S_s = np.pad(S_s, ((0, 0), (0, p - S_s.shape[1])))
+    largest = np.max(S_s if p else S.reshape(len(size), -1), axis=1, initial=0.0)
+    shows_s = cutoff * largest[:, None] < S_s
+    squares = np.where(shows_s, 1 / np.where(shows_s, S_s, 1.0) ** 2, 0.0)
+    covariance = np.swapaxes(Vt_s, 1, 2) @ (squares[..., None] * Vt_s)
+    hidden = [_hidden_directions(Vt[b], shows[b], Vt_s[b, ~shows_s[b]], follow[b], held[b]) for b in range(len(size))]
     variance = variances(covariance, own, follow)
-    least_part = np.minimum(np.sqrt(cutoff), np.sqrt(variance) * least_move(cutoff, largest))
-    has_part = np.linalg.norm(hidden, axis=0) > least_part
-    identifiable = ~has_part[estimated] & ~bound[estimated] & usable
-    size_s, size_l = size[:p], size[p:].reshape(runs, m)
+    least_part = np.minimum(np.sqrt(cutoff), np.sqrt(variance) * least_move(cutoff, largest)[:, None])
+    has_part = np.stack([np.linalg.norm(rows, axis=0) for rows in hidden]) > least_part
+    identifiable = (~has_part & ~bound & ~fails[:, None])[:, estimated]
+    size_s, size_l = size[:, :p], size[:, p:].reshape(len(size), runs, m, 1)
     return Information(
         singular_values=S_s,
-        hidden=(hidden[:, estimated],),
-        least_part=least_part[estimated],
-        rank=np.asarray(int(np.sum(~held)) - len(hidden) if usable else 0),
+        hidden=tuple(rows[:, estimated] for rows in hidden),
+        least_part=least_part[:, estimated],
+        rank=np.where(fails, 0, np.sum(~held, axis=1) - [len(rows) for rows in hidden]),
         identifiable=identifiable,
-        standard_errors=np.where(identifiable, (np.sqrt(variance) * size)[estimated], np.nan),
-        shared=covariance * size_s[:, None] * size_s,
-        own=own * size_l[:, :, None] * size_l[:, None, :],
-        follow=follow * size_l[:, :, None] / size_s,
-        estimated=tuple(estimated.tolist()),
+        standard_errors=np.where(identifiable, (np.sqrt(variance) * size)[:, estimated], np.nan),
+        shared=covariance * size_s[..., None] * size_s[:, None],
+        own=own * size_l * np.swapaxes(size_l, 2, 3),
+        follow=follow * size_l / size_s[:, None, None],
+        estimated=estimated,
     )
 
 
@@ -165,19 +148,14 @@ def least_move(cutoff: float, largest):
     return np.maximum(0.1, cutoff * largest)  # standard errors: an unknown that moves so far along a direction that does not show has a part in it
 
 
-def _hidden_directions(own: np.ndarray, runs: np.ndarray, shared: np.ndarray, follow: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Orthonormal directions of all places that do not show and move no place that is held."""
-    count, m, p = follow.shape
-    rows = np.zeros((len(own) + len(shared), p + count * m))
-    for row, (run, direction) in enumerate(zip(runs, own, strict=True)):
-        rows[row, p + run * m : p + (run + 1) * m] = direction
-    if len(shared):
-        rows[len(own) :, :p] = shared
-        rows[len(own) :, p:] = -np.einsum("kij,nj->nki", follow, shared).reshape(len(shared), -1)
-    rows = np.where(held, 0.0, rows)
-    if not len(rows):
-        return rows
-    _, S, Vt = np.linalg.svd(rows, full_matrices=False)
+def _hidden_directions(own: np.ndarray, shows: np.ndarray, shared: np.ndarray, follow: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Orthonormal directions of all places that do not show and move no place that is held; `own`: V' of each run, of which some directions show."""
+    (count, m, p), (runs, places) = follow.shape, np.nonzero(~shows)
+    apart = np.zeros((len(runs), count, m))
+    apart[range(len(runs)), runs] = own[runs, places]
+    of_own = np.pad(apart.reshape(len(runs), count * m), ((0, 0), (p, 0)))
+    of_shared = np.concatenate([shared, -np.einsum("kij,nj->nki", follow, shared).reshape(len(shared), count * m)], axis=1)
+    _, S, Vt = np.linalg.svd(np.where(held, 0.0, np.concatenate([of_own, of_shared])), full_matrices=False)
     return Vt[S > 1e-6]  # directions of held places alone are none
 
 
@@ -202,7 +180,7 @@ def _in_words(row: np.ndarray, relative: np.ndarray, power: np.ndarray, values: 
     names = " and ".join(f"`{labels[i]}`" for i in involved)
     changes = " : ".join(f"d {labels[i]}/{labels[i]}" if relative[i] else f"d {labels[i]}" for i in involved)
     text = f"{names} do not show separately: no channel changes along {changes} = {' : '.join(f'{row[i]:.3g}' for i in involved)}"
-    own, others = involved[0], involved[1:]
+    own, *others = involved
     exponents = -row[others] / row[own]
     if power[involved].all() and np.all(np.abs(exponents - np.round(2 * exponents) / 2) < close):
         of_own = ["" if abs(e - 1) < close else f"^{e:.3g}" for e in exponents]
@@ -282,10 +260,8 @@ def weak_combinations(
     some = np.flatnonzero(np.isfinite(np.diagonal(covariance)))[:400]  # unknowns that are looked at
     shared = [i for i in some if not labels[i].startswith("run ")]
     some = np.array(shared) if shared else some
-    if not some.size:
-        return ()
-    is_relative = np.abs(values[some]) > 1e-3 * np.abs(sizes[some])
     scale = np.abs(sizes[some])
+    is_relative = np.abs(values[some]) > 1e-3 * scale
     squares, directions = np.linalg.eigh(covariance[np.ix_(some, some)] / (scale * scale[:, None]))
     found = []
     for k in range(some.size)[::-1]:
@@ -296,15 +272,15 @@ def weak_combinations(
         # of the largest entry of a direction: what is less is left out
         parts = np.flatnonzero(np.abs(directions[:, k]) > 0.1 * np.max(np.abs(directions[:, k])))
         parts = parts[np.argsort(-np.abs(directions[parts, k]))]
-        told = [_by(labels[some[i]], change[i] * np.sign(change[parts[0]]), bool(is_relative[i])) for i in parts]
-        if len(told) == 1:
-            found.append(f"{told[0]} is one standard error: the data tell it poorly")
+        *others, last = [_by(labels[some[i]], change[i] * np.sign(change[parts[0]]), bool(is_relative[i])) for i in parts]
+        if others:
+            said = "together are one standard error: the data tell this combination poorly"
+            found.append(f"{', '.join(others)} and {last} {said}")
         else:
-            found.append(f"{', '.join(told[:-1])} and {told[-1]} together are one standard error: the data tell this combination poorly")
+            found.append(f"{last} is one standard error: the data tell it poorly")
     return tuple(found)
 
 
 def _by(name: str, change: float, is_relative: bool) -> str:
-    if not is_relative:
-        return f"a change of `{name}` by {change:.2g}"
-    return f"a change of `{name}` by {100 * change:.2g} %" if abs(change) < 0.995 else f"a change of `{name}` by {change:.2g} times its value"
+    how = f"{100 * change:.2g} %" if is_relative and abs(change) < 0.995 else f"{change:.2g}{' times its value' if is_relative else ''}"
+    return f"a change of `{name}` by {how}"

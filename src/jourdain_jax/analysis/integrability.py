@@ -19,7 +19,6 @@ From the scene's scalar graph, on which derivatives are sparse: nothing is compi
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
@@ -31,15 +30,7 @@ from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.scene.scene import Scene
 
-
-@dataclass(frozen=True)
-class LinearRows:
-    """Rows and coordinate rates at many points; or the derivatives of these along one direction for each point."""
-
-    A: np.ndarray  # (points, rows, speeds)
-    d: np.ndarray  # (points, rows)
-    N: np.ndarray  # (points, coordinates, speeds)
-    nu: np.ndarray  # (points, coordinates)
+Both = tuple[np.ndarray, np.ndarray]
 
 
 class RowsOverStates:
@@ -57,7 +48,7 @@ class RowsOverStates:
         changes = jacobian(g, self.values, variables)
         self.changes = [(i, variables.index(n), node) for i, row in enumerate(changes) for n, node in row.items()]
 
-    def __call__(self, x: np.ndarray, u: np.ndarray) -> tuple[LinearRows, Callable[[np.ndarray], LinearRows]]:
+    def __call__(self, x: np.ndarray, u: np.ndarray) -> tuple[Both, Callable[[np.ndarray], Both]]:
         """Values at the points, taken at the speeds u (which matter where rows are nonlinear in them), and derivatives as a function of directions.
 
         `x`, `u` and what that function takes have a leading axis of points.
@@ -67,22 +58,24 @@ class RowsOverStates:
         value, change = found[: len(self.values)], found[len(self.values) :]
         place, variable = (np.array([c[k] for c in self.changes], int) for k in (0, 1))
 
-        def along(direction: np.ndarray) -> LinearRows:
+        def along(direction: np.ndarray) -> Both:
             rate = np.zeros_like(value)
             np.add.at(rate, place, change * direction.T[variable])
-            return self._arranged(rate, u)
+            return self._arranged(rate, u, 0.0)
 
-        return self._arranged(value, u), along
+        return self._arranged(value, u, 1.0), along
 
-    def _arranged(self, flat: np.ndarray, u: np.ndarray) -> LinearRows:
-        """The rows and coordinate rates in values with a last axis of points."""
+    def _arranged(self, flat: np.ndarray, u: np.ndarray, time: float) -> Both:
+        """The rows and the frame in values with a last axis of points; `time`: its rate."""
         count, rows = self.shape[0], len(self.traced.at.phi)
         slopes = np.zeros((flat.shape[-1], *self.shape))
         if self.places:
             i, j = zip(*self.places, strict=True)
             slopes[:, i, j] = flat[count + len(self.traced.q) :].T
-        A, N = slopes[:, :rows], slopes[:, rows:]
-        return LinearRows(A, flat[:rows].T - np.einsum("pij,pj->pi", A, u), N, flat[count : count + len(self.traced.q)].T)
+        A, F = slopes[:, :rows], np.pad(slopes[:, rows:], ((0, 0), (1, 0), (1, 0)))
+        F[:, 0, 0], F[:, 1:, 0] = time, flat[count : count + len(self.traced.q)].T
+        d = flat[:rows].T - np.einsum("pij,pj->pi", A, u)
+        return np.concatenate([d[..., None], A], axis=-1), F
 
 
 STEP = {"float64": 0.02, "float32": 0.1}  # of the differences, along unit directions
@@ -104,20 +97,13 @@ def frobenius_violations(scene: Scene) -> dict[str, float]:
         return {}
     t, q, u = (np.asarray(x, float) for x in sample_states(scene, 6))
     rows, x = RowsOverStates(scene), np.concatenate([t[:, None], q], axis=1)
-    (here, along), (other, _) = rows(x, u), rows(x, -0.7 * u[:, ::-1])
-    curved = np.max(np.abs(here.A - other.A), axis=2, initial=0.0) > 1.5e-8 * (1 + np.max(np.abs(here.A), axis=2, initial=0.0))
-    a, F = _in_speeds(here, 1.0)
-    changes = [_in_speeds(along(np.tile(e, (len(x), 1))), 0.0) for e in np.eye(x.shape[1])]
+    ((a, F), along), ((other, _), _) = rows(x, u), rows(x, -0.7 * u[:, ::-1])
+    A, other = a[..., 1:], other[..., 1:]
+    curved = np.max(np.abs(A - other), axis=2, initial=0.0) > 1.5e-8 * (1 + np.max(np.abs(A), axis=2, initial=0.0))
+    changes = [along(np.tile(e, (len(x), 1))) for e in np.eye(x.shape[1])]
     da, dF = (np.stack(parts, axis=-1) for parts in zip(*changes, strict=True))
     worst = {name: max(_frobenius_violation(*one) for one in zip(a[:, s], da[:, s], F, dF, strict=True)) for s, name in enumerate(names)}
     return {name: float("inf") if curved[:, s].any() else worst[name] for s, name in enumerate(names)}
-
-
-def _in_speeds(here: LinearRows, time: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows a over (1, u), and the frame F of the possible velocities of (t, q), which is F (1, u)."""
-    F = np.zeros((len(here.N), 1 + here.N.shape[1], 1 + here.N.shape[2]))
-    F[:, 0, 0], F[:, 1:, 0], F[:, 1:, 1:] = time, here.nu, here.N
-    return np.concatenate([here.d[..., None], here.A], axis=-1), F
 
 
 def _frobenius_violation(a: np.ndarray, da: np.ndarray, F: np.ndarray, dF: np.ndarray) -> float:
@@ -250,9 +236,8 @@ class _Fields:
         """Values at many points, and derivatives as a function of one direction for each."""
         first = 1 - self.with_time
         padded = lambda a: np.pad(a, ((0, 0), (first, 0)))  # noqa: E731
-        here, change_along = self.rows(padded(x), np.tile(self.u, (len(x), 1)))
-        a, F = _in_speeds(here, 1.0)
-        length = np.linalg.norm(here.A, axis=2, keepdims=True)
+        (a, F), change_along = self.rows(padded(x), np.tile(self.u, (len(x), 1)))
+        length = np.linalg.norm(a[..., 1:], axis=2, keepdims=True)
         scale = 1 / np.where(length > 0, length, 1.0)
         # X = F C,  a C = 0,  a dC = -da C, in the dependent speeds only
         C = np.zeros((len(x), a.shape[2], len(self.free)))
@@ -260,7 +245,7 @@ class _Fields:
         C[:, self.dependent] = self._solved(scale * a, scale * a @ C)
 
         def along(direction: np.ndarray) -> np.ndarray:
-            (da, dF), dC = _in_speeds(change_along(padded(direction)), 0.0), np.zeros_like(C)
+            (da, dF), dC = change_along(padded(direction)), np.zeros_like(C)
             dC[:, self.dependent] = self._solved(scale * a, scale * da @ C)
             return (dF @ C + F @ dC)[:, first:, first:]
 

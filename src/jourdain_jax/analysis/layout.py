@@ -33,7 +33,7 @@ from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import pose_at
 from jourdain_jax.program.calls import Call
 from jourdain_jax.scene.bodies import RigidBody
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
@@ -153,8 +153,8 @@ def inertia_of_body(scene: Scene, name: str) -> BodyInertia:
 def _found(scene: Scene, name: str) -> tuple[list[Entry], list[Entry | None]]:
     """Entries of the diagonal, and of the products 12, 23, 13."""
     known = {of: placed.body for of, placed in pose_at(scene, 0.0, scene.named()[0]).bodies.items()}
-    if name not in known:
-        raise ValueError(f"`free` asks for a possible inertia of `{name}`, which is no body of `{type(scene).__name__}`; {nearest(name, known)}")
+    what = f"`free` asks for a possible inertia of `{name}`, which is no body of `{type(scene).__name__}`"
+    check_name(name, known, what)
     if not isinstance(known[name], RigidBody):
         raise ValueError(f"`free` asks for a possible inertia of `{name}`, but that is a particle, which has none; name a rigid body")
     names = [of for of, value, _ in parameters_of(scene) if np.issubdtype(np.asarray(value).dtype, np.floating)]

@@ -39,7 +39,7 @@ from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_op
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines, users_level
 from jourdain_jax.scene.identity import with_reference_parameters
-from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
+from jourdain_jax.scene.names import UnknownNameError, as_names, check_name
 from jourdain_jax.scene.parameters import Scalar
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
@@ -49,7 +49,7 @@ def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> tuple[s
     """One sentence for each, of runs that were `checked`; traced numbers are not looked at. `repeats`: values have a leading axis, and the first one counts."""
     found: list[str] = []
     for index, run in enumerate(runs):
-        for name, signal in zip(scene.inputs.entries, run.inputs.channels if isinstance(run.inputs, Inputs) else (), strict=False):
+        for name, signal in zip(scene.inputs, run.inputs.channels if isinstance(run.inputs, Inputs) else (), strict=False):
             if isinstance(signal, Sampled) and not holds(lambda x, *_: np.ptp(x) == 0, signal.values, signal.ts, run.ts, run.t0):
                 found += _of_input(f"input `{name}` of run {index}", np.asarray(signal.ts), float(run.t0), float(run.ts[-1]))
         for name, values in run.values.items():
@@ -188,20 +188,21 @@ def mapped(f: Callable, runs: Run, *more: Array) -> Array:
     return f(*jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, (runs, *more)))[None]
 
 
+Matrix = Float[Array, "unknowns unknowns"]
 _CUTOFF = 1e-6  # of the largest singular value of the scaled sensitivities: what is less does not show
 
 
 class PlannedInformation(Printed, eqx.Module):
     """What planned runs will tell of each unknown. `print` shows the standard errors that they lead to."""
 
-    matrix: Float[Array, "unknowns unknowns"]  # F, in the units of the unknowns
+    matrix: Matrix  # F, in the units of the unknowns
     values: Float[Array | np.ndarray, "unknowns"]  # at which it is taken
     sensitivities: tuple[dict[str, Float[Array, "*samples unknowns"]], ...]  # of each run and channel: (d y / d theta) / sigma, zero where there is no sample
     labels: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
 
     @property
-    def covariance(self) -> Float[Array, "unknowns unknowns"]:
+    def covariance(self) -> Matrix:
         """F^-1. Entries grow beyond all bounds where a combination of unknowns does not show."""
         return _inverse(self.matrix)
 
@@ -217,8 +218,7 @@ class PlannedInformation(Printed, eqx.Module):
         """
         asked = as_names(names) or self.labels
         for name in asked:
-            if name not in self.labels:
-                raise UnknownNameError(f"`{name}` is not among the unknowns; {nearest(name, self.labels)}")
+            check_name(name, self.labels, f"`{name}` is not among the unknowns", UnknownNameError)
         return -_log_det(self.matrix, tuple(self.labels.index(name) for name in asked))
 
     @property
@@ -244,13 +244,13 @@ class PlannedInformation(Printed, eqx.Module):
 
 
 @compiled
-def _inverse(F: Float[Array, "unknowns unknowns"]) -> Float[Array, "unknowns unknowns"]:
+def _inverse(F: Matrix) -> Matrix:
     scale = 1 / jnp.sqrt(jnp.where(jnp.diagonal(F) > 0, jnp.diagonal(F), 1.0))
     return scale[:, None] * jnp.linalg.inv(scale[:, None] * F * scale) * scale
 
 
 @compiled
-def _log_det(F: Float[Array, "unknowns unknowns"], places: tuple[int, ...]) -> Scalar:
+def _log_det(F: Matrix, places: tuple[int, ...]) -> Scalar:
     """The logarithm of the determinant of this block of the inverse."""
     some = np.array(places, int)
     return jnp.linalg.slogdet(_inverse(F)[some[:, None], some])[1]

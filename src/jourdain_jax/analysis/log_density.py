@@ -31,7 +31,7 @@ from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.identity import reference_parameters
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.parameters import Scalar
 from jourdain_jax.scene.scene import Scene
 
@@ -108,8 +108,7 @@ class LogDensity(eqx.Module):
         Raises ValueError for names that are not unknown, and for values at or beyond a bound.
         """
         for name in values:
-            if name not in self.labels:
-                raise ValueError(f"`{name}` is not among the unknowns; {nearest(name, self.labels)}")
+            check_name(name, self.labels, f"`{name}` is not among the unknowns")
         theta = jnp.stack([jnp.asarray(values.get(label, self.guess[i]), jnp.result_type(float)) for i, label in enumerate(self.labels)])
         x = self._each(Range.unconstrain, theta)
         if not holds(np.isfinite, x):
@@ -205,7 +204,7 @@ def log_density(
     runs = as_runs(scene, data)
     sigmas = in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma)
     with_memory = in_all_or_none(runs, "the correlation time", lambda run: run.unknown_correlation)
-    limits = [correlation_limits([np.asarray(run.ts) for run in runs if name in run.values]) for name in with_memory]
+    limits = [correlation_limits(runs, name) for name in with_memory]
     intervals = np.array([low / SHORTEST for low, _ in limits])
     angles = [Range("memory", *(float(np.arcsin(np.exp(-h / tau))) for tau in ends), interval=float(h)) for h, ends in zip(intervals, limits, strict=True)]
     unknowns = unknowns_of(scene, runs, free)

@@ -46,16 +46,14 @@ class Loss:
         k = self.parameter
         if math.isinf(k):
             return 0.5 * np.einsum("...i,...i->...", r, r)
-        size = abs(r)
         if self.kind == "student-t":
             return np.sum((k + 1) / 2 * np.log1p(r**2 / k), axis=-1)
-        return np.sum(np.where(size <= k, 0.5 * r**2, k * np.minimum(size, np.finfo(float).max / max(k, 1.0)) - 0.5 * k**2), axis=-1)
+        inside = np.minimum(abs(r), k)
+        return np.sum(inside * (np.minimum(abs(r), np.finfo(float).max / max(k, 1.0)) - 0.5 * inside), axis=-1)
 
     def weight(self, r: Float[np.ndarray, "*samples"]) -> Float[np.ndarray, "*samples"]:
         """w(r)."""
         k = self.parameter
-        if not np.isfinite(k):
-            return np.ones_like(r)
         return (k + 1) / (k + r**2) if self.kind == "student-t" else np.minimum(1.0, k / np.maximum(abs(r), np.finfo(float).tiny))
 
     def weighted(self, rows: Float[np.ndarray, "*samples width"], r: Float[np.ndarray, "*samples"]):
@@ -250,7 +248,7 @@ class Problem:
 
     def restrict(self, theta: np.ndarray, members: np.ndarray) -> np.ndarray:
         """Puts correlation times that are not known to where the restricted likelihood is largest; by how much rho over one shortest interval changed."""
-        evaluated, ends = list(self.evaluated(theta, members)), np.array([self._limits(name) for name in self.with_memory])
+        evaluated, ends = list(self.evaluated(theta, members)), np.array([correlation_limits(self.runs, name) for name in self.with_memory])
         taus, changed = np.maximum(self.taus(members), ends[:, 0]), np.zeros(len(members))
         for k, (low, high) in enumerate(ends):
             edges = (np.full(len(members), np.log(x)) for x in (low, high))
@@ -260,9 +258,6 @@ class Problem:
             taus[:, k] = found
         self.tau[members % self.count] = taus
         return changed
-
-    def _limits(self, name: str) -> tuple[float, float]:
-        return correlation_limits([np.asarray(run.ts) for run in self.runs if name in run.values])
 
     def _restricted(self, theta, members: np.ndarray, evaluated: list, taus: np.ndarray) -> tuple[np.ndarray, Linearised]:
         """What the restricted likelihood is made of, to be as low as possible."""
@@ -282,7 +277,7 @@ class Problem:
             return more, spread
         evaluated, taus = list(self.evaluated(theta, members)), self.taus(members)
         for k, name in enumerate(self.with_memory):
-            low, high = self._limits(name)
+            low, high = correlation_limits(self.runs, name)
             interval, counted = low / SHORTEST, self.counted([name], members)[:, 0]
             angle = lambda tau, h=interval: np.arcsin(np.exp(-h / tau))  # noqa: E731
             # in standard deviations of arcsin rho: 1 / sqrt(samples) without unknowns

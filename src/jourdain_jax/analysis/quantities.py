@@ -38,7 +38,7 @@ from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.program.calls import Call
 from jourdain_jax.scene.identity import once_per_values
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_name, nearest
 from jourdain_jax.scene.names_read import is_function, now_read_by
 from jourdain_jax.scene.scene import Scene
 
@@ -100,7 +100,7 @@ def _kind(scene: Scene):
 @lru_cache(maxsize=64)
 def _motion_shape(treedef, shapes) -> Motion:
     scene = jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes])
-    q, u = (jax.ShapeDtypeStruct((len(names.entries),), jnp.result_type(float)) for names in (scene.coordinate_names, scene.speed_names))
+    q, u = (jax.ShapeDtypeStruct((len(names),), jnp.result_type(float)) for names in (scene.coordinate_names, scene.speed_names))
     return jax.eval_shape(lambda scene, q, u: motion_at(scene, 0.0, q, u), scene, q, u)
 
 
@@ -144,8 +144,7 @@ class Accelerometer(Instrument):
     def check(self, scene: Scene, channel: str, where: str) -> None:
         """ValueError, which names the `channel` and the run, where the scene has no such body."""
         bodies = motion_shape(scene).bodies
-        if self.body not in bodies:
-            raise ValueError(f"the accelerometer `{channel}` of {where} sits on body `{self.body}`, which is not there; {nearest(self.body, bodies)}")
+        check_name(self.body, bodies, f"the accelerometer `{channel}` of {where} sits on body `{self.body}`, which is not there")
 
     def over_times(self, motion: Trajectory) -> Float[Array, "times 3"]:
         """What it feels at all times of one motion."""
@@ -183,8 +182,7 @@ class LoadCell(Instrument):
     def check(self, scene: Scene, channel: str, where: str) -> None:
         """ValueError, which names the `channel` and the run, where the scene has no such contact, or does not determine its force."""
         determined = _determined(scene)
-        if self.contact not in determined:
-            raise ValueError(f"the load cell `{channel}` of {where} is under contact `{self.contact}`, which is not there; {nearest(self.contact, determined)}")
+        check_name(self.contact, determined, f"the load cell `{channel}` of {where} is under contact `{self.contact}`, which is not there")
         if not determined[self.contact]:
             raise ValueError(
                 f"the load cell `{channel}` of {where} is under contact `{self.contact}`, whose force is not determined: others share it; leave the channel out"

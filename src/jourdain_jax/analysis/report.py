@@ -152,7 +152,11 @@ def report(scene: Scene | BuiltFor, *, depth: int = 4, start: State | dict | Non
     violations, (growth, closed) = frobenius_violations(scene), growth_vector(scene, depth)
     by_itself = {name: size <= integrable_below() for name, size in violations.items()}
     asked = scene.example if start is None and structure.rank_losses and scene.example else start
-    rank_at_start = None if asked is None else _rank_at(scene, as_state(scene, asked))
+    if asked is None:
+        rank_at_start = None
+    else:
+        state = as_state(scene, asked)
+        rank_at_start = int(accelerations(scene, state.t, state.q, state.u, reduction="svd").rank)
     return Report(
         scene=type(scene).__name__,
         coordinates=scene.coordinate_names.entries,
@@ -178,10 +182,6 @@ def report(scene: Scene | BuiltFor, *, depth: int = 4, start: State | dict | Non
         domain={name: (float(low), float(high)) for name, (low, high) in scene.domain.items()},
         conventions=scene.conventions,
     )
-
-
-def _rank_at(scene: Scene, state: State) -> int:
-    return int(accelerations(scene, state.t, state.q, state.u, reduction="svd").rank)
 
 
 def _span(bounds: tuple[float, float]) -> str:

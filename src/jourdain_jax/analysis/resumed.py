@@ -27,7 +27,6 @@ one before it ended. Correlation times are held. Source: D. J. Venzon and S. H. 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -40,7 +39,7 @@ from jourdain_jax.analysis.piecewise import Piecewise
 from jourdain_jax.analysis.problem import Asked, Problem
 from jourdain_jax.analysis.spread import RISE_95, side
 from jourdain_jax.analysis.unknowns import unknowns_of
-from jourdain_jax.scene.names import UnknownNameError, nearest
+from jourdain_jax.scene.names import UnknownNameError, check_name
 from jourdain_jax.scene.printing import Printed
 
 
@@ -74,16 +73,20 @@ def for_runs(fit: Estimates, runs: Data, asked: Asked, apart: bool) -> Problem:
     return problem
 
 
-class Prediction(Printed, eqx.Module):
+Samples = Float[np.ndarray, "times *channel"]
+
+
+@dataclass(frozen=True, repr=False)
+class Prediction(Printed):
     """A channel of a run as a fit predicts it, in the unit of the channel."""
 
     ts: Float[np.ndarray, "times"]  # s
-    values: Float[np.ndarray, "times *channel"]  # measured; NaN where missing
-    prediction: Float[np.ndarray, "times *channel"]  # NaN where missing
-    sigma: Float[np.ndarray, "times *channel"]
+    values: Samples  # measured; NaN where missing
+    prediction: Samples  # NaN where missing
+    sigma: Samples
 
     @property
-    def error(self) -> Float[np.ndarray, "times *channel"]:
+    def error(self) -> Samples:
         """Prediction less value, in the unit of the channel."""
         return self.prediction - self.values
 
@@ -114,10 +117,8 @@ def of_held_out(fit: Estimates, runs: Data) -> tuple[dict[str, Prediction], ...]
     runs = (runs,) if isinstance(runs, Experiment) else tuple(runs)
     problem = for_runs(fit, runs, replace(fit.asked, shooting=None), apart=True)
     unknowns, theta, shared = problem.unknowns, problem.unknowns.guess[None].copy(), problem.unknowns.layout.sizes[0]
-    labels = unknowns.labels[:shared]
-    for place, label in enumerate(labels):
-        if label not in fit.labels:
-            raise ValueError(f"the runs held out share `{label}`, which was not estimated; {nearest(label, fit.labels)}")
+    for place, label in enumerate(unknowns.labels[:shared]):
+        check_name(label, fit.labels, f"the runs held out share `{label}`, which was not estimated")
         theta[0, place] = fit[label].value
     unknowns.fixed[:shared] = True
     if not np.all(unknowns.fixed):
@@ -126,12 +127,10 @@ def of_held_out(fit: Estimates, runs: Data) -> tuple[dict[str, Prediction], ...]
     if not np.isfinite(at.cost[0]):
         raise ValueError("a motion of the runs held out fails at the estimates; look at it with `simulate`")
     own = dict(zip(problem.estimated, at.sigma[0].tolist(), strict=True))
-    found = []
-    for run, data in enumerate(runs):
-        # residuals are in units of sigmas, of which those that are not known were estimated from these very runs
-        residuals = {name: r[0] * own[name] / fit.sigma.get(name, own[name]) if name in own else r[0] for name, r in problem.by_channel(run, at).items()}
-        found.append(_by_channel(fit, data, residuals))
-    return tuple(found)
+    # residuals are in units of sigmas, of which those that are not known were estimated from these very runs
+    ratio = {name: sigma / fit.sigma.get(name, sigma) for name, sigma in own.items()}
+    residuals = [{name: r[0] * ratio.get(name, 1.0) for name, r in problem.by_channel(k, at).items()} for k in range(len(runs))]
+    return tuple(_by_channel(fit, run, r) for run, r in zip(runs, residuals, strict=True))
 
 
 def _by_channel(fit: Estimates, data: Experiment, residuals: dict[str, np.ndarray]) -> dict[str, Prediction]:
@@ -203,19 +202,20 @@ def informed(problem: Problem, found: Minimum, most: int) -> Informed:
     return Informed(tuple(unknowns.labels[i] for i in some), tuple(shares), tuple(np.asarray(run.ts) for run in problem.runs))
 
 
-class Profile(Printed, eqx.Module):
+@dataclass(frozen=True, repr=False)
+class Profile(Printed):
     """The rise of the sum of squares along one unknown, and the 95 % interval that follows from it."""
 
-    name: str = eqx.field(static=True)
-    unit: str = eqx.field(static=True)
+    name: str
+    unit: str
     estimate: float
     values: Float[np.ndarray, "points"]  # increasing, the estimate among them
     rise: Float[np.ndarray, "points"]  # zero at the estimate
     low: float  # ends of the interval; where the data set none, the bound, or infinite
     high: float
-    is_closed: tuple[bool, bool] = eqx.field(static=True)  # whether the data set them
-    kind: str = eqx.field(static=True)  # "bounded", "one-sided" or "flat"
-    notes: tuple[str, ...] = eqx.field(static=True)  # what else was seen
+    is_closed: tuple[bool, bool]  # whether the data set them
+    kind: str  # "bounded", "one-sided" or "flat"
+    notes: tuple[str, ...]  # what else was seen
 
     def _text(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
@@ -227,8 +227,7 @@ def profiles(problem: Problem, fitted: Minimum, names: Iterable[str], errors: di
     """Profiles of the unknowns named. `errors`: standard errors by name, for the first step; `inflation`: by what the rise is divided."""
     unknowns, found = problem.unknowns, {}
     for name in names:
-        if name not in unknowns.labels:
-            raise UnknownNameError(f"`{name}` was not estimated; {nearest(name, unknowns.labels)}")
+        check_name(name, unknowns.labels, f"`{name}` was not estimated", UnknownNameError)
         k = unknowns.labels.index(name)
         place, error = int(unknowns.estimated[k]), errors[name]
         estimate = float(fitted.theta[0, place])

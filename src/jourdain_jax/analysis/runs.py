@@ -55,7 +55,7 @@ class Run(NamedTuple):
         """The motion at these times."""
         inputs = self.inputs
         for drive in self.drives.values():
-            inputs = eqx.tree_at(lambda i, k=drive.index: i.channels[k], inputs, drive.signal())
+            inputs = drive.put_into(inputs)
         if options.backend == "auto" and any(drive.unknown for drive in self.drives.values()):
             options = replace(options, backend="xla")  # which differentiates with respect to samples
         return simulate(scene, begin(scene, self.start, self.t0), t0=self.t0, ts=ts, inputs=inputs, options=options)
@@ -133,7 +133,8 @@ def grouped(data: Sequence[Experiment]) -> list[list[int]]:
     groups: dict[tuple, list[int]] = {}
     for index, run in enumerate(data):
         parts = run.start, run.readings, run.inputs, run.drives, run.correlation_time
-        arrays, rest = eqx.partition((*parts[:2], _without_knots(parts[2:4])), is_array)
+        signals = jax.tree.map(lambda x: None if _is_sampled(x) else x, parts[2:4], is_leaf=_is_sampled)  # without knots
+        arrays, rest = eqx.partition((*parts[:2], signals), is_array)
         kind = (jax.tree.structure((*parts, dict.fromkeys(run.values, 0))), tuple(jax.tree.leaves(rest)))
         groups.setdefault((*kind, tuple(x.shape for x in jax.tree.leaves(arrays))), []).append(index)
     return list(groups.values())
@@ -145,10 +146,6 @@ def is_array(x) -> bool:
 
 def _is_sampled(x) -> bool:
     return isinstance(x, Sampled)
-
-
-def _without_knots(inputs):
-    return jax.tree.map(lambda x: None if _is_sampled(x) else x, inputs, is_leaf=_is_sampled)
 
 
 def most_knots(runs: Sequence[Run]) -> list[int]:

@@ -32,7 +32,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.estimate import Estimate, positive, unbounded
 from jourdain_jax.analysis.quantities import Channel, Instrument, StopEvent
 from jourdain_jax.calculus.reals import array_module, checked_real, described, holds, is_traced
-from jourdain_jax.motion.inputs import Sampled
+from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.parameters import Scalar
@@ -40,9 +40,10 @@ from jourdain_jax.scene.parameters import Scalar
 FEWEST_INTERVALS = 64  # up to the end of a run, or to the next node of a piece
 Numbers = Float[Array | np.ndarray, "..."]
 Times = Float[Array | np.ndarray, "times"]
+Knots = Float[Array, "knots"]
 
 
-def intervals(t0, ts: Times, node=None) -> int:
+def intervals(t0, ts: Times, node) -> int:
     """How many there are from the start to the last sample: those of the samples where these are equal, too; else none longer than their median.
 
     Of traced times only their number is known: there are two intervals for each of theirs, as if the first sample were at the start. Of a piece of a run the
@@ -68,7 +69,7 @@ def grid(t0, ts: Times, count: int, node=None) -> Float[Array | np.ndarray, "gri
 
 POINTS = 6  # of the grid, that a polynomial goes through
 _MIDDLE = (POINTS - 1) / 2
-_COEFFICIENTS = np.linalg.inv(np.vander(np.arange(POINTS) - _MIDDLE, increasing=True))  # of powers of the distance from the middle, from values
+_COEFFICIENTS = np.linalg.inv(np.vander(np.arange(POINTS) - _MIDDLE))  # of powers of the distance from the middle, the highest first, from values
 _LEAST = 1e-3  # of rho, in exp(-s / rho)
 
 
@@ -103,9 +104,9 @@ def read(
     some = flat[first[:, None] + np.arange(POINTS)]
     polynomials = jnp.einsum("ij,kjc->kic", coefficients, some)  # (intervals, powers, channel)
     left = jnp.asarray(begins - first - _MIDDLE, flat.dtype)  # place of the interval's begin
-    since = (x - interval)[:, None]
+    since = x - interval
     if lag is None:
-        found, y = _value(polynomials[interval], left[interval][:, None] + since), flat
+        found, y = jax.vmap(jnp.polyval)(polynomials[interval], left[interval] + since), flat
     else:
         rho = lag / step
 
@@ -114,16 +115,9 @@ def read(
             return _relaxed(y, polynomial, begin, jnp.ones((), flat.dtype), rho), y
 
         end, at_begins = jax.lax.scan(next_one, flat[0] if begin is None else begin, (polynomials, left))
-        found = jax.vmap(_relaxed, (0, 0, 0, 0, None))(at_begins[interval], polynomials[interval], left[interval], since[:, 0], rho)
+        found = jax.vmap(_relaxed, (0, 0, 0, 0, None))(at_begins[interval], polynomials[interval], left[interval], since, rho)
         y = jnp.concatenate([at_begins, end[None]])
     return found.reshape(ts.shape[0], *values.shape[1:]), y
-
-
-def _value(polynomial: Float[Array, "*batch powers channel"], at) -> Float[Array, "*batch channel"]:
-    found = polynomial[..., -1, :]
-    for power in range(POINTS - 2, -1, -1):
-        found = found * at + polynomial[..., power, :]
-    return found
 
 
 def _relaxed(y: Float[Array, "channel"], polynomial: Float[Array, "powers channel"], begin, since, rho) -> Float[Array, "channel"]:
@@ -133,25 +127,25 @@ def _relaxed(y: Float[Array, "channel"], polynomial: Float[Array, "powers channe
     # P = p - rho p' + rho^2 p'' - ...
     particular, derivative = polynomial, polynomial
     for order in range(1, POINTS):
-        powers = jnp.arange(1, POINTS, dtype=polynomial.dtype)[:, None]
-        derivative = jnp.concatenate([powers * derivative[1:], jnp.zeros_like(derivative[:1])])
+        powers = np.arange(POINTS - 1, 0, -1, polynomial.dtype)[:, None]
+        derivative = jnp.concatenate([jnp.zeros_like(derivative[:1]), powers * derivative[:-1]])
         particular = particular + (-quick) ** order * derivative
     decay = jnp.exp(-since / jnp.maximum(quick, _LEAST))
-    by_formula = _value(particular, begin + since) + (y - _value(particular, begin)) * decay
+    by_formula = jnp.polyval(particular, begin + since) + (y - jnp.polyval(particular, begin)) * decay
     weights = since / slow * jnp.asarray(_WEIGHTS, polynomial.dtype) * jnp.exp(-since * (1 - _NODES.astype(polynomial.dtype)) / slow)
-    inside = jax.vmap(lambda node: _value(polynomial, begin + since * node))(jnp.asarray(_NODES, polynomial.dtype))
+    inside = jax.vmap(lambda node: jnp.polyval(polynomial, begin + since * node))(jnp.asarray(_NODES, polynomial.dtype))
     by_quadrature = y * jnp.exp(-since / slow) + weights @ inside
     return jnp.where(small, by_formula, by_quadrature)
 
 
-def held(ts: Float[Array, "knots"], values: Float[Array, "knots"]) -> tuple[Float[Array, "more_knots"], Float[Array, "more_knots"]]:
+def held(ts: Knots, values: Knots) -> tuple[Float[Array, "more_knots"], Float[Array, "more_knots"]]:
     """Knots of a command that keeps each value until the next one: it passes over in a thousandth of the shortest interval, half of it before the time."""
     half = 0.5e-3 * jnp.min(jnp.diff(ts))
     late = jnp.stack([ts[1:] - half, ts[1:] + half], axis=1).reshape(-1)
     return jnp.concatenate([ts[:1], late]), jnp.concatenate([values[:1], jnp.stack([values[:-1], values[1:]], axis=1).reshape(-1)])
 
 
-def filtered(ts: Float[Array, "knots"], values: Float[Array, "knots"], lag, hold: bool = False) -> Float[Array, "knots"]:
+def filtered(ts: Knots, values: Knots, lag, hold: bool = False) -> Knots:
     """What the filter gives at the knots of a command that is linear in between, or is held until the next knot: exactly there.
 
     y_k+1 = x_k+1 - lag m + (y_k - x_k + lag m) exp(-h / lag),     m = (x_k+1 - x_k) / h;      held: y_k+1 = x_k + (y_k - x_k) exp(-h / lag)
@@ -341,6 +335,10 @@ class Drive(Response):
         elif self.hold and ts.shape[0] > 1:
             ts, values = held(ts, values)
         return eqx.tree_at(lambda s: (s.ts, s.values), self.command, (ts + self.numbers["delay"], self.scaled(values)))
+
+    def put_into(self, inputs) -> Inputs:
+        """The inputs with its signal."""
+        return eqx.tree_at(lambda i: i.channels[self.index], inputs, self.signal())
 
 
 def response(owner: Sensor | Actuator) -> tuple[dict, tuple[str, ...], tuple[str, ...]]:

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int
 
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.sensors import FEWEST_INTERVALS, latest
-from jourdain_jax.calculus.reals import Number, checked_real
+from jourdain_jax.calculus.reals import Number, checked_real, checked_whole
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -73,9 +73,9 @@ class MultipleShooting:
     def __post_init__(self):
         if (self.pieces is None) == (self.duration is None):
             raise ValueError("`MultipleShooting` expects one of `pieces` (how many each run has) and `duration` (of a piece, in s), such as `duration=0.5`")
-        if self.pieces is not None and (isinstance(self.pieces, bool) or not isinstance(self.pieces, int | np.integer) or self.pieces < 2):
-            raise ValueError(f"`pieces` of `MultipleShooting` is {self.pieces!r}, expected a whole number of two or more; for one piece leave out `shooting`")
-        if self.duration is not None:
+        if self.pieces is not None:
+            checked_whole(self.pieces, "`pieces` of `MultipleShooting`", 2, expected="of two or more; for one piece leave out `shooting`")
+        else:
             number: Number = checked_real(self.duration, "`duration` of `MultipleShooting`", (), advice="give a time in s")
             if not (np.isfinite(number) and number > 0):
                 raise ValueError(f"`duration` of `MultipleShooting` is {self.duration} s, expected a finite time above zero")
@@ -121,11 +121,11 @@ def in_pieces(run: Experiment, ends: Int[np.ndarray, "ends"], states: int) -> li
     found, firsts = [], owned(run, ends)
     for k, (first, end) in enumerate(pairwise(ends)):
         last = max(end, *(own[k + 1] - 1 for own in firsts.values()))
-        here = slice(first, last + 1)
+        here, of_piece = slice(first, last + 1), np.arange(first, last + 1)
         values = {}
         for name, x in run.values.items():
-            of_piece = np.arange(first, last + 1)
-            counts = (of_piece >= firsts[name][k]) & (of_piece < firsts[name][k + 1])
+            begin, after = firsts[name][k : k + 2]
+            counts = (of_piece >= begin) & (of_piece < after)
             part = np.asarray(x[here], float)
             values[name] = np.where(counts.reshape(-1, *[1] * (part.ndim - 1)), part, np.nan)
         begins = first == ends[0]

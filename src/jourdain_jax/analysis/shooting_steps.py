@@ -31,7 +31,6 @@ from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.motion.start import start as consistent_start
-from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.scene import Scene
 
 
@@ -46,19 +45,16 @@ def first_nodes(
     for name, values in run.values.items():
         reading = run.readings.get(name, ideal(name))
         gain, bias, delay, lag = (np.asarray(reading.numbers[number]) for number in ("gain", "bias", "delay", "lag"))
-        of_state = reading.operation is None and not np.any(gain == 0)
-        if not (of_state or reading.has_filter):
-            continue
         y = ((np.asarray(values, float) - bias) / np.where(gain == 0, 1.0, gain)).reshape(len(ts), -1)
         found = np.array([[_parabola(ts - delay, column, t) for column in y.T] for t in at])  # (nodes, entries, 2)
         if reading.has_filter:
             filters.append(np.nan_to_num(found[..., 0]))
-        if not of_state:
+        if reading.operation is not None or np.any(gain == 0):
             continue
         found[..., 0] += lag * found[..., 1]
         for names, state, of_speeds in ((scene.coordinate_names, qs, False), (scene.speed_names, us, True)):
             if reading.name in names:
-                where = _entries(names, reading.name)
+                where = np.atleast_1d(names.view(np.arange(len(names)))[reading.name])
                 state[:, where] = np.where(np.isfinite(found[..., 0]), found[..., 0], state[:, where])
                 if of_speeds:
                     speeds[where] = True
@@ -91,13 +87,6 @@ def _rates(scene: Scene, t, q, u):
         return coordinate_rates(scene, t, q, u), jax.jacfwd(coordinate_rates, 3)(scene, t, q, u)
 
     return jax.vmap(one)(t, q, u)
-
-
-def _entries(names: Names, name: str) -> np.ndarray:
-    for group, first, length in names.groups:
-        if group == name:
-            return np.arange(first, first + length)
-    return np.array([names.entries.index(name)])
 
 
 def _parabola(ts: Float[np.ndarray, "times"], x: Float[np.ndarray, "times"], t: float) -> tuple[float, float]:

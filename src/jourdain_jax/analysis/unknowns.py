@@ -18,7 +18,7 @@ from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.layout import BodyInertia, Kind, Layout, Place, PossibleInertia, inertia_of_body, tied_by
 from jourdain_jax.analysis.sensors import UNITS, default_range
 from jourdain_jax.motion.start import start as consistent_start
-from jourdain_jax.scene.names import as_names, nearest
+from jourdain_jax.scene.names import as_names, check_name
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
@@ -122,8 +122,9 @@ def unknowns_of(
             numbers = zip(bodies[-1].labels, ("kg m^2", ""), (positive(), unbounded(1.0)), bodies[-1].numbers(scene), strict=True)
             shared += [(label, "inertia", _entry(label, unit, None, default, np.asarray(guess))) for label, unit, default, guess in numbers]
             continue
-        if name not in parameters:
-            raise ValueError(f"`free` names `{name}`, which is no parameter of `{type(scene).__name__}`; {nearest(name, parameters)}")
+        check_name(
+            name, parameters, f"`free` names `{name}`, which is no parameter of `{type(scene).__name__}`"
+        )
         if isinstance(given, Estimate) and given.per_run:
             raise ValueError(f"`free` asks for a `{name}` of each run, but all runs share the scene; leave out `per_run`, or fit the runs one by one")
         if callable(given):
@@ -146,9 +147,7 @@ def unknowns_of(
     entries = [*(entry for *_, entry in shared), *of_each]
     if all(entry.fixed for entry in entries):
         raise ValueError(f"nothing is free; name parameters in `free` ({', '.join(f'`{name}`' for name in parameters)}), or `unknown_start` values of a run")
-    free_ones = [entry for entry in entries if not entry.fixed]
-    counts = [entry.guess.size for entry in entries]
-    each = lambda values: np.array([x for x, count in zip(values, counts, strict=True) for _ in range(count)])  # noqa: E731
+    each = [entry for entry in entries for _ in range(entry.guess.size)]  # of each number
     guess = np.concatenate([entry.guess.ravel() for entry in entries], dtype=float)
     layout = Layout(_placed((name, entry.guess.shape, kind) for name, kind, entry in shared), local, tuple(bodies))
     _check_told_once(layout, functions)
@@ -158,13 +157,13 @@ def unknowns_of(
         layout=layout,
         runs=len(runs),
         guess=guess,
-        fixed=each([entry.fixed for entry in entries]),
-        ranges=tuple(entry.range for entry in entries for _ in range(entry.guess.size)),
-        labels=tuple(label for entry in free_ones for label in entry.labels),
-        units=tuple(entry.unit for entry in free_ones for _ in range(entry.guess.size)),
-        prior_mean=each([0.0 if entry.prior is None else float(entry.prior.mean) for entry in entries]),
-        prior_weight=each([0.0 if entry.prior is None else 1 / float(entry.prior.sigma) for entry in entries]),
-        whitening=whitening([entry.prior for entry in entries for _ in range(entry.guess.size)][: layout.sizes[0]]),
+        fixed=np.array([entry.fixed for entry in each]),
+        ranges=tuple(entry.range for entry in each),
+        labels=tuple(label for entry in entries if not entry.fixed for label in entry.labels),
+        units=tuple(entry.unit for entry in each if not entry.fixed),
+        prior_mean=np.array([0.0 if entry.prior is None else float(entry.prior.mean) for entry in each]),
+        prior_weight=np.array([0.0 if entry.prior is None else 1 / float(entry.prior.sigma) for entry in each]),
+        whitening=whitening([entry.prior for entry in each[: layout.sizes[0]]]),
     )
 
 

@@ -24,7 +24,7 @@ from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, shipped_measur
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, doubts, violations
 from jourdain_jax.bicycle.readings import Readings, read_readings
 from jourdain_jax.calculus.reals import RUN_SELDOM, compiled
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.parameters import Scalar
 
 Values = dict[str, Scalar]
@@ -46,8 +46,7 @@ def benchmark_from_measurements(path: str | Path) -> MeasuredBicycle:
     """
     if isinstance(path, str) and not Path(path).exists() and not Path(path).suffix:
         known = shipped_measurements()
-        if path not in known:
-            raise ValueError(f"there are no measurements of a bicycle `{path}`, and no such file; {nearest(path, known)}")
+        check_name(path, known, f"there are no measurements of a bicycle `{path}`, and no such file")
         path = known[path]
     readings = read_readings(path)
     means = {name: jnp.asarray(value, jnp.result_type(float)) for name, value in readings.means.items()}

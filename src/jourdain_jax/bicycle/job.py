@@ -6,6 +6,7 @@ measured standard deviations by Monte Carlo to 2.5 and 97.5 % limits, and ride i
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import equinox as eqx
@@ -35,29 +36,32 @@ CAVEAT = (
 )
 
 
-class Refused(eqx.Module):
+@dataclass(frozen=True)
+class Refused:
     """A file that describes no bicycle, and why."""
 
-    path: str = eqx.field(static=True)
-    error: str = eqx.field(static=True)
+    path: str
+    error: str
 
     def as_dict(self) -> dict:
         """One object of `result.json`."""
         return {"file": self.path, "bicycle": None, "error": self.error} | dict.fromkeys(SPEEDS)
 
 
-class Rides(eqx.Module):
+@dataclass(frozen=True)
+class Rides:
     """Three rides, by label."""
 
-    labels: tuple[str, ...] = eqx.field(static=True)
+    labels: tuple[str, ...]
     speeds: np.ndarray  # m/s
     lanes: Rollout
 
 
-class Study(eqx.Module):
+@dataclass(frozen=True)
+class Study:
     """What was found out about one bicycle."""
 
-    path: str = eqx.field(static=True)
+    path: str
     bicycle: MeasuredBicycle
     speeds: dict[str, dict | None]  # name -> value, low, high, fraction
     stable_fraction: float  # of the samples, those that have a stable range

@@ -5,14 +5,13 @@ Its sets in YAML, `name: value`, with or without a section `values`, are read as
 files carry no covariance: sigmas are those of independent errors.
 """
 
-import dataclasses
 import difflib
 import re
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -21,7 +20,7 @@ from jourdain_jax.calculus import files
 from jourdain_jax.calculus.files import read_text, shortened
 from jourdain_jax.ensembles.distributions import Normal
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_name
 
 from .parameters import PARAMETER_NAMES, doubts, violations
 
@@ -30,22 +29,23 @@ _REPEATED = {"IRzz": "IRxx", "IFzz": "IFxx"}  # a wheel is symmetric
 _OUT_OF_PLANE = ("yB", "yH")  # a Whipple bicycle is symmetric: zero
 
 
-class MeasuredBicycle(eqx.Module):
+@dataclass(frozen=True)
+class MeasuredBicycle:
     """One bicycle's measured parameters: `values` and standard deviations `sigmas`, by name, in SI units."""
 
-    name: str = eqx.field(static=True)
+    name: str
     values: dict[str, float]  # every name of PARAMETER_NAMES, in that order
     sigmas: dict[str, float]  # the same names; zero where the file gives none
-    path: str = eqx.field(static=True)
-    without_sigma: tuple[str, ...] = eqx.field(static=True)  # names whose sigma the file does not give
-    ignored: tuple[str, ...] = eqx.field(static=True)  # names in the file that the Whipple bicycle does not use
-    warnings: tuple[str, ...] = eqx.field(static=True)  # sentences: odd values, taken as they are
+    path: str
+    without_sigma: tuple[str, ...]  # names whose sigma the file does not give
+    ignored: tuple[str, ...]  # names in the file that the Whipple bicycle does not use
+    warnings: tuple[str, ...]  # sentences: odd values, taken as they are
     covariance: Float[np.ndarray, "parameters parameters"] | None = None  # in the order of `values`; None: not known, and sigmas count as independent
 
     @property
     def with_independent_errors(self) -> "MeasuredBicycle":
         """The bicycle as if its parameters had nothing to do with each other: without covariance."""
-        return dataclasses.replace(self, covariance=None)
+        return replace(self, covariance=None)
 
     @property
     def scene(self) -> WhippleBicycle:
@@ -72,8 +72,7 @@ def measured_bicycle(name: str) -> MeasuredBicycle:
     **Raises** ValueError: an unknown name, with the nearest known ones; and as `read_bicycle`.
     """
     known = shipped_bicycles()
-    if name not in known:
-        raise ValueError(f"there is no measured bicycle `{name}`; {nearest(name, known)}")
+    check_name(name, known, f"there is no measured bicycle `{name}`")
     return read_bicycle(known[name])
 
 

@@ -18,9 +18,8 @@ deviation is sqrt(sum sigma^2) / readings. Part and number follow the name of wh
 
 import math
 import re
+from dataclasses import dataclass
 from pathlib import Path
-
-import equinox as eqx
 
 from jourdain_jax.bicycle.parameter_files import entries, listed, read_lines, text_lines, with_sigma
 
@@ -31,15 +30,16 @@ _ALWAYS = ("g", "dR", "nR", "dF", "nF", "mR", "mF", "mB", "lR", "lF", "TcR1", "T
 _FEWEST = 3  # hangings, for three numbers in the plane of symmetry
 
 
-class Readings(eqx.Module):
+@dataclass(frozen=True)
+class Readings:
     """What was read off one bicycle, as means and their standard deviations; `hangings`: numbers of the hangings of each part, such as B: (1, 2, 3)."""
 
-    path: str = eqx.field(static=True)
+    path: str
     means: dict[str, float]
     sigmas: dict[str, float]
-    hangings: dict[str, tuple[int, ...]] = eqx.field(static=True)
-    without_sigma: tuple[str, ...] = eqx.field(static=True)
-    unused: tuple[str, ...] = eqx.field(static=True)
+    hangings: dict[str, tuple[int, ...]]
+    without_sigma: tuple[str, ...]
+    unused: tuple[str, ...]
 
     @property
     def by_table(self) -> bool:

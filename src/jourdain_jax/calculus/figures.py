@@ -16,8 +16,8 @@ DATA, MODEL, QUIET = "#d1495b", "#1b4f72", "#888888"
 def figure(draw: Callable[[Any], None], width: float, height: float, caption: str = "") -> str:
     """Return HTML of the matplotlib figure that `draw` fills, `width` by `height` pixels; a sentence where matplotlib is not installed."""
     try:
-        # 110 dots per inch; a pixel of width and height is 1/96 inch
-        drawn = needed("matplotlib.figure", "a figure", "plot").Figure((width / 96, height / 96), dpi=110, layout="constrained")
+        # a pixel of a page is 1/96 inch
+        drawn = needed("matplotlib.figure", "a figure", "plot").Figure((width / 96, height / 96), dpi=96, layout="constrained")
     except ImportError as missing:
         return f"<p>{html.escape(str(missing))}</p>"
     draw(drawn)

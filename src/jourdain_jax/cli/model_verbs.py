@@ -160,7 +160,7 @@ def _simulate(options) -> bool:
     if options.out:
         save(trajectory, options.out)
     if options.plot:
-        plot(trajectory, *scene.coordinate_names.entries, path=options.plot)
+        plot(trajectory, *scene.coordinate_names, path=options.plot)
     if options.animate:
         animate(trajectory, options.animate)
     print(json.dumps(_motion_row(options.model, trajectory), indent=2) if options.json else trajectory)
@@ -172,17 +172,14 @@ def _simulate(options) -> bool:
 
 def _check_files(options) -> None:
     """Before a long run, not after it: the files can be written."""
-    for path in filter(None, (options.out, options.plot, options.animate)):
-        check_place(path)
-    if options.plot:
-        check_format(options.plot)
-    if options.animate:
-        check_suffix(options.animate)
+    for check, path in ((check_place, options.out), (check_format, options.plot), (check_suffix, options.animate)):
+        if path:
+            check(path)
 
 
 def _motion_row(name: str, trajectory: Trajectory) -> dict:
     found, scene = diagnose(trajectory), trajectory.scene
-    names = (*scene.coordinate_names.entries, *scene.speed_names.entries)
+    names = (*scene.coordinate_names, *scene.speed_names)
     of_contact = ("lowest_normal", "highest_normal", "friction_needed", "pulls", "determined")  # friction_needed: none where it is infinite
     contacts = {key: {what: getattr(contact, what) for what in of_contact} for key, contact in found.contacts.items()}
     row = {

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.scene.parameters import Scalar
 
 FOR_EXTREMES, FOR_INTEGRALS = 5, 4  # values that a polynomial goes through
 
@@ -43,7 +44,7 @@ def sampled(motion: Trajectory, quantity: str | Callable) -> tuple[Float[Array, 
     return times, values, jnp.where(beyond > 0, place + 1, jnp.maximum(reached, 1))
 
 
-def largest(times: Float[Array, "times"], values: Float[Array, "times"], count: Int[Array, ""]) -> Float[Array, ""]:
+def largest(times: Float[Array, "times"], values: Float[Array, "times"], count: Int[Array, ""]) -> Scalar:
     """The largest of the first `count` of `values`, and between them. Its derivative is that of the quantity at the time of the largest value."""
     k = jnp.argmax(jnp.where(jnp.arange(times.shape[0]) < count, values, -jnp.inf))
     if times.shape[0] < FOR_EXTREMES:
@@ -59,7 +60,7 @@ def largest(times: Float[Array, "times"], values: Float[Array, "times"], count: 
     return jnp.where(count >= FOR_EXTREMES, jnp.maximum(values[k], _polynomial(s, y, jax.lax.stop_gradient(at))), values[k])
 
 
-def integral(times: Float[Array, "times"], values: Float[Array, "times"], count: Int[Array, ""]) -> Float[Array, ""]:
+def integral(times: Float[Array, "times"], values: Float[Array, "times"], count: Int[Array, ""]) -> Scalar:
     """The integral over time of the first `count` of `values`."""
 
     def over(i):
@@ -87,7 +88,7 @@ def _window(times, values, count, first, zero, points: int):
     return first, since / (since[-1] - since[0]), jnp.where(enough, values[some], 0.0)
 
 
-def _polynomial(s: Float[Array, "points"], y: Float[Array, "points"], place: Float[Array, ""]) -> Float[Array, ""]:
+def _polynomial(s: Float[Array, "points"], y: Float[Array, "points"], place: Scalar) -> Scalar:
     """The value at `place` of the polynomial through (s, y), by Lagrange's formula."""
     total = jnp.zeros_like(place)
     for i in range(s.shape[0]):

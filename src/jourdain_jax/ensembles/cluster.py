@@ -6,8 +6,8 @@ Dask starts a chunk again where its worker died. A chunk on which workers died a
 import os
 from collections.abc import Callable, Iterator
 
+from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.calculus.reals import described
-from jourdain_jax.ensembles import optional
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
 from jourdain_jax.ensembles.workers import chunk, computed, keep_to_share, sent_to_others, whatever_dies
@@ -15,7 +15,7 @@ from jourdain_jax.ensembles.workers import chunk, computed, keep_to_share, sent_
 
 def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
     """What `run` takes as its workers; ValueError where `client` is no client of Dask, or the task cannot be sent to another process."""
-    distributed = optional.distributed()
+    distributed = needed("distributed", "a cluster", "cluster")
     if not isinstance(client, distributed.Client):
         raise ValueError(f"`client` is {described(client)}, expected a `dask.distributed.Client`")
     sent = sent_to_others(task)
@@ -48,7 +48,9 @@ def _places(distributed, client) -> dict[object, int] | None:
 def _chunk(number: int, sent: bytes, path: str, asking: int, places: dict | None) -> tuple[int, int]:
     """Compute and keep a chunk in this worker; `asking`: the process that asks; `places`: as `_places` says."""
     if os.getpid() != asking and "JOURDAIN_JAX_THREADS" not in os.environ:  # a worker that is a process of its own keeps to its share of the cores
-        worker = optional.distributed().get_worker()
+        from distributed import get_worker
+
+        worker = get_worker()
         os.environ["JOURDAIN_JAX_THREADS"] = str(worker.state.nthreads)
         if places and worker.name in places:
             keep_to_share(places[worker.name], len(places))

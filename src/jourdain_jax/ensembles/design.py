@@ -12,10 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from jourdain_jax.calculus.reals import checked_known, checked_whole, described, has_unit
-from jourdain_jax.ensembles.distributions import Distribution, Levels
-from jourdain_jax.ensembles.optional import special_functions
+from jourdain_jax.ensembles.distributions import Distribution, Levels, special
 from jourdain_jax.ensembles.samplers import MOST_SOBOL, SAMPLERS
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_name, nearest
 from jourdain_jax.scene.printing import Printed
 
 GRID, TABLE = "grid", "table"
@@ -118,8 +117,7 @@ class Design(Printed):
                 raise ValueError(f"`correlation` has the entry {pair!r}, expected pairs of names, such as ({names[0]!r}, {names[-1]!r}): 0.5")
             value = float(checked_known(value, f"the correlation of {pair}", (), advice="give a number between -1 and 1"))
             for name in pair:
-                if name not in names:
-                    raise ValueError(f"`correlation` names `{name}`, which does not vary; {nearest(name, names)}")
+                check_name(name, names, f"`correlation` names `{name}`, which does not vary")
             if len(set(pair)) != 2 or not -1 < value < 1:
                 raise ValueError(f"the correlation of {pair} is {value}, expected two names and a number between -1 and 1")
             if (back := self.correlation.get(pair[::-1], value)) != value:
@@ -160,7 +158,6 @@ class Design(Printed):
         u = SAMPLERS[self.sampler](int(self.seed), first, last, len(self.variables), len(self))
         if self._factor is None:
             return u
-        special = special_functions()
         # row by row: a product of matrices may round differently with the number of rows
         return special.ndtr(np.einsum("ij,kj->ki", self._factor, special.ndtri(u)))
 

@@ -11,8 +11,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from jourdain_jax.calculus.on_first_use import module_on_first_use
 from jourdain_jax.calculus.reals import checked_known
-from jourdain_jax.ensembles.optional import special_functions
+
+special = module_on_first_use("scipy.special")
 
 
 class Distribution:
@@ -59,7 +61,7 @@ class Normal(Distribution):
 
     @staticmethod
     def _inverse(u, mean, sigma):
-        return mean + sigma * special_functions().ndtri(u)
+        return mean + sigma * special.ndtri(u)
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ class LogNormal(Distribution):
 
     @staticmethod
     def _inverse(u, median, sigma):
-        return median * np.exp(sigma * special_functions().ndtri(u))
+        return median * np.exp(sigma * special.ndtri(u))
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.scene.arguments import users_level
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_name, nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 
@@ -55,8 +55,7 @@ class MeanGradients(Printed):
     def of(self, output: str, name: str) -> float:
         """The derivative of the mean of `output` with respect to `name`; ValueError for unknown names."""
         for given, known in ((output, self.outputs), (name, self.names)):
-            if given not in known:
-                raise ValueError(f"there is no `{given}`; {nearest(given, known)}")
+            check_name(given, known, f"there is no `{given}`")
         return float(self.gradient[self.outputs.index(output), self.names.index(name)])
 
     def _text(self) -> str:

@@ -8,14 +8,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.ensembles.along import integral, largest, sampled
 from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.motion.trajectories.results import EVENT
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_name, nearest
+from jourdain_jax.scene.parameters import Scalar
 from jourdain_jax.scene.scene import Scene
 
 
@@ -26,7 +26,7 @@ class Output:
     over_times: bool = True
 
     @abstractmethod
-    def of(self, motion: Trajectory) -> Float[Array, ""]:
+    def of(self, motion: Trajectory) -> Scalar:
         """The number, of one `motion`; by operations of JAX."""
 
     def check(self, scene: Scene) -> None:
@@ -34,9 +34,8 @@ class Output:
 
 
 def _check_name(output: Output, name, scene: Scene) -> None:
-    valid = (*scene.coordinate_names.entries, *scene.speed_names.entries)
-    if name not in valid:
-        raise ValueError(f"{type(output).__name__}({name!r}): `{type(scene).__name__}` has no such coordinate or speed; {nearest(str(name), valid)}")
+    valid = (*scene.coordinate_names, *scene.speed_names)
+    check_name(name, valid, f"{type(output).__name__}({name!r}): `{type(scene).__name__}` has no such coordinate or speed")
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class End(Output):
     def check(self, scene: Scene) -> None:
         _check_name(self, self.name, scene)
 
-    def of(self, motion: Trajectory) -> Float[Array, ""]:
+    def of(self, motion: Trajectory) -> Scalar:
         names = motion.scene.coordinate_names
         if self.name in names.entries:
             return motion.q_end[names.entries.index(self.name)]
@@ -71,6 +70,14 @@ class _Along(Output):
         if not callable(self.quantity):
             _check_name(self, self.quantity, scene)
 
+    def of(self, motion: Trajectory) -> Scalar:
+        return self._number(*sampled(motion, self.quantity))
+
+    @staticmethod
+    @abstractmethod
+    def _number(times, values, count) -> Scalar:
+        """The number, of the first `count` values of the quantity at these times."""
+
 
 @dataclass(frozen=True)
 class Largest(_Along):
@@ -79,16 +86,15 @@ class Largest(_Along):
     `quantity`: the name of a coordinate or speed, or a function of a trajectory that gives its values at all times.
     """
 
-    def of(self, motion: Trajectory) -> Float[Array, ""]:
-        return largest(*sampled(motion, self.quantity))
+    _number = staticmethod(largest)
 
 
 @dataclass(frozen=True)
 class Smallest(_Along):
     """The smallest value of a `quantity`, found as `Largest` finds the largest. `unit`: text that is kept with it."""
 
-    def of(self, motion: Trajectory) -> Float[Array, ""]:
-        times, values, count = sampled(motion, self.quantity)
+    @staticmethod
+    def _number(times, values, count):
         return -largest(times, -values, count)
 
 
@@ -96,8 +102,8 @@ class Smallest(_Along):
 class LargestMagnitude(_Along):
     """The largest magnitude of a `quantity`, found as `Largest` finds the largest. `unit`: text that is kept with it."""
 
-    def of(self, motion: Trajectory) -> Float[Array, ""]:
-        times, values, count = sampled(motion, self.quantity)
+    @staticmethod
+    def _number(times, values, count):
         return jnp.maximum(largest(times, values, count), largest(times, -values, count))
 
 
@@ -108,8 +114,7 @@ class Integral(_Along):
     `quantity`: as of `Largest`.
     """
 
-    def of(self, motion: Trajectory) -> Float[Array, ""]:
-        return integral(*sampled(motion, self.quantity))
+    _number = staticmethod(integral)
 
 
 @dataclass(frozen=True)
@@ -137,7 +142,7 @@ class EventTime(OfEvent):
 
     unit = "s"
 
-    def of(self, motion: Trajectory) -> Float[Array, ""]:
+    def of(self, motion: Trajectory) -> Scalar:
         return jnp.where(self._happened(motion), motion.t_end, jnp.nan)
 
 
@@ -145,7 +150,7 @@ class EventTime(OfEvent):
 class Happened(OfEvent):
     """1 where the stop event `event` ended the motion (default: any event), otherwise 0: its mean is the fraction of lanes."""
 
-    def of(self, motion: Trajectory) -> Float[Array, ""]:
+    def of(self, motion: Trajectory) -> Scalar:
         return jnp.where(self._happened(motion), 1.0, 0.0)
 
 
@@ -159,7 +164,7 @@ class Quantity(Output):
     function: Callable
     unit: str = ""
 
-    def of(self, motion: Trajectory) -> Float[Array, ""]:
+    def of(self, motion: Trajectory) -> Scalar:
         found = self.function(motion)
         shape = getattr(found, "shape", None if not isinstance(found, int | float) else ())
         if shape != () or jnp.iscomplexobj(found):
@@ -170,7 +175,7 @@ class Quantity(Output):
 def as_outputs(scene: Scene, outputs: Mapping | None) -> dict[str, Output]:
     """Outputs by name, checked; functions become a `Quantity`; None: the end values of all coordinates and speeds."""
     if outputs is None:
-        outputs = {f"{name} at the end": End(name) for name in (*scene.coordinate_names.entries, *scene.speed_names.entries)}
+        outputs = {f"{name} at the end": End(name) for name in (*scene.coordinate_names, *scene.speed_names)}
     if not isinstance(outputs, Mapping) or not outputs:
         raise ValueError(f'`outputs` is {described(outputs)}, expected a dictionary by name, such as {{"final lean": jj.End("lean", "rad")}}')
     found = {}

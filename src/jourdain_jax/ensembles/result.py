@@ -20,7 +20,7 @@ from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.results import CODES
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.arguments import users_level
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.printing import Printed
 
 LEVELS = (0.025, 0.5, 0.975)
@@ -162,8 +162,7 @@ class StudyResult(Printed):
         return sobol_indices(self.to_xarray()[output].values, self.varied, confidence=confidence)
 
     def _place(self, output: str) -> int:
-        if output not in self.outputs:
-            raise ValueError(f"the study has no output `{output}`; {nearest(output, self.outputs)}")
+        check_name(output, self.outputs, f"the study has no output `{output}`")
         return self.outputs.index(output)
 
     def to_xarray(self):
@@ -207,20 +206,17 @@ class StudyResult(Printed):
                 axis.stairs(np.where(beyond, counts, 0), edges, fill=True, color="#1f5fa8", alpha=0.25, label="anywhere in here")
                 axis.legend(fontsize="small")
             axis.axvline(self.mean(name), color="#b3470f", lw=1.2)
-            unit = self._unit(name)
+            column = self.store.columns.get(name)
+            unit = column.attributes.get("units") if column else ""
             axis.set_xlabel(f"{name} ({unit})" if unit else name)
             axis.spines[["top", "right"]].set_visible(False)
         whole.axes[0].set_ylabel("lanes")
 
     def _repr_html_(self) -> str:
         drawn = [name for name in self.outputs if self._done and self._bars(name, 40)[0].sum() > 0]
-        # outputs in a notebook
-        shown = drawn[:12]
+        shown = drawn[:12]  # in a notebook
         more = f"and {len(drawn) - len(shown)} more" if len(drawn) > len(shown) else ""
         return super()._repr_html_() + (figure(lambda whole: self._draw(whole, shown, 40), 240 * len(shown), 200, more) if shown else "")
-
-    def _unit(self, output: str) -> str:
-        return self.store.columns[output].attributes.get("units", "") if output in self.store.columns else ""
 
     def _in_short(self, output: str, level: float) -> str:
         """A quantile as one number, the middle of its cell; of one beyond the grid the side on which it is."""

@@ -93,7 +93,7 @@ class Runner:
         if task.save == "trajectories":
             kept = slice(-first % task.every, count, task.every)
             for names, array in ((task.scene.coordinate_names, rolled.q), (task.scene.speed_names, rolled.u)):
-                columns |= dict(zip(names.entries, np.moveaxis(np.asarray(array)[kept], -1, 0), strict=True))
+                columns |= dict(zip(names, np.moveaxis(np.asarray(array)[kept], -1, 0), strict=True))
         if task.memory:
             memory.check(task.memory)
         return Lanes(columns, outputs)

@@ -9,12 +9,12 @@ saltelli         for Sobol' indices of d variables: points (A_j, B_j) of that se
 """
 
 import warnings
-from collections.abc import Callable
 
 import numpy as np
 
-from jourdain_jax.calculus.on_first_use import needed
+from jourdain_jax.calculus.on_first_use import module_on_first_use
 
+qmc = module_on_first_use("scipy.stats.qmc")
 MOST_SOBOL = 2**30  # points of the sequence, of 30 bits
 _M1, _M2, _GOLDEN = (np.uint64(x) for x in (0xBF58476D1CE4E5B9, 0x94D049BB133111EB, 0x9E3779B97F4A7C15))
 
@@ -62,7 +62,7 @@ def latin_hypercube(seed: int, first: int, last: int, variables: int, samples: i
 
 def sobol(seed: int, first: int, last: int, variables: int, samples: int) -> np.ndarray:
     """Points first to last - 1 of a scrambled Sobol sequence, shape (last - first, variables)."""
-    engine = needed("scipy.stats.qmc", "a Sobol sequence", "ensembles").Sobol(variables, scramble=True, rng=np.random.default_rng(seed))
+    engine = qmc.Sobol(variables, scramble=True, rng=np.random.default_rng(seed))
     with warnings.catch_warnings():  # pieces of a sequence need not be powers of two
         warnings.simplefilter("ignore", UserWarning)
         if first:
@@ -82,9 +82,4 @@ def saltelli(seed: int, first: int, last: int, variables: int, samples: int) -> 
     return mixed.reshape(-1, variables)[first - begin * group : last - begin * group]
 
 
-SAMPLERS: dict[str, Callable[[int, int, int, int, int], np.ndarray]] = {
-    "random": random,
-    "latin-hypercube": latin_hypercube,
-    "sobol": sobol,
-    "saltelli": saltelli,
-}
+SAMPLERS = {"random": random, "latin-hypercube": latin_hypercube, "sobol": sobol, "saltelli": saltelli}

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jourdain_jax.ensembles.optional import special_functions
+from jourdain_jax.ensembles.distributions import special
 from jourdain_jax.scene.printing import Printed
 
 
@@ -64,7 +64,7 @@ def sobol_indices(values, names: Sequence[str], *, confidence: float = 0.95) -> 
         raise ValueError("fewer than two groups of samples have values, or all values are equal; Sobol' indices need a quantity that varies")
     generator = np.random.default_rng(0)
     drawn = np.stack([_indices(groups[generator.integers(0, len(groups), len(groups))]) for _ in range(200)])
-    half = special_functions().ndtri(0.5 + confidence / 2) * drawn.std(axis=0, ddof=1)
+    half = special.ndtri(0.5 + confidence / 2) * drawn.std(axis=0, ddof=1)
     first, total = _indices(groups)
     return SobolIndices(names, first, half[0], total, half[1], confidence, len(groups), int(np.sum(~sound)))
 

@@ -79,9 +79,8 @@ class Tally:
         codes, finite = columns["result"], np.isfinite(values)
         x = np.ascontiguousarray(np.where(finite, values - grid.centre, 0.0).T)
         m = np.ascontiguousarray(finite.T, float)
-        counts = np.zeros((values.shape[1], CELLS + 2), np.int64)
-        for i, column in enumerate(values.T):
-            counts[i] = np.bincount(np.searchsorted(grid.edges(i), column[finite[:, i]], side="right"), minlength=CELLS + 2)
+        places = [np.searchsorted(grid.edges(i), column[finite[:, i]], side="right") for i, column in enumerate(values.T)]
+        counts = np.array([np.bincount(place, minlength=CELLS + 2) for place in places], np.int64)
         return cls(
             np.bincount(codes, minlength=len(CODES)),
             np.array([np.sum(columns["retries"] > 0)]),
@@ -148,12 +147,10 @@ class Statistics:
     def histogram(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Lanes per cell of the output `name`, and the edges of the cells; lanes beyond the grid are in cells that reach to the extremes."""
         i = self.names.index(name)
-        counts, edges = self.counts[i], self.grid.edges(i)
-        if counts[0]:
-            edges = np.concatenate([[self.extremes[0, i]], edges])
-        if counts[-1]:
-            edges = np.append(edges, self.extremes[1, i])
-        return counts[0 if counts[0] else 1 : None if counts[-1] else -1], edges
+        counts, (least, largest) = self.counts[i], self.extremes[:, i]
+        first, last = int(not counts[0]), len(counts) - int(not counts[-1])
+        edges = np.concatenate([[least], self.grid.edges(i), [largest]])
+        return counts[first:last], edges[first : last + 1]
 
     def quantile(self, name: str, level: float) -> tuple[float, float]:
         """Two numbers between which the quantile `level` (0 to 1) of the output `name` lies: of the n values, the one with number ceil(level n)."""

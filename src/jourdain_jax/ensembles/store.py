@@ -29,7 +29,6 @@ import numpy as np
 
 from jourdain_jax.calculus.files import parsed, read_bytes, shortened, write_whole
 from jourdain_jax.calculus.on_first_use import needed
-from jourdain_jax.ensembles import optional
 from jourdain_jax.ensembles.design import MOST_SAMPLES
 from jourdain_jax.ensembles.files import locked
 from jourdain_jax.ensembles.statistics import Tally
@@ -101,15 +100,13 @@ class Store:
         self.columns = {name: Column(**entry | {"more": tuple(map(tuple, entry["more"]))}) for name, entry in self.study["columns"].items()}
         self.outputs = tuple(self.study.get("outputs", ()))
         decides = [self.study.get(name) for name in ("identity", "samples", "chunk", "block", "outputs")]  # the same in all shares
-        self.identity = hashlib.sha256(json.dumps(decides).encode()).hexdigest()
+        self.identity = _digest(json.dumps(decides).encode())
 
     @staticmethod
     def make(path: str | os.PathLike, study: Mapping, columns: Mapping[str, Column], constants: Mapping[str, tuple], attributes: Mapping) -> "Store":
         """A new folder, whole or absent; an existing one is not touched. `constants`: name -> axis, values, attributes."""
         zarr = needed("zarr", "storing a study", "ensembles")
         path = Path(path)
-        if path.is_file():
-            raise ValueError(f"`{path}` is a file, expected a folder for the study; give another name")
         if fault := _beyond(study):
             raise ValueError(f"the study is too large: {fault}; take fewer samples, or a larger `chunk`")
         beside = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
@@ -294,7 +291,7 @@ class Store:
             except OSError:
                 return name
             known = receipt and receipt.checksums[name]
-            if (int.from_bytes(stated, "little"), len(stated)) != (known, 4) or (whole and optional.crc32c().value(content) != known):
+            if (int.from_bytes(stated, "little"), len(stated)) != (known, 4) or (whole and _crc32c(content) != known):
                 return name
         return "receipt" if receipt is None else None
 
@@ -364,4 +361,8 @@ def _write_manifest(path: Path, digests: Mapping[str, str]) -> None:
 
 def _ended(content: bytes) -> bytes:
     """Content, and its CRC-32C as Zarr's codec writes it."""
-    return content + optional.crc32c().value(content).to_bytes(4, "little")
+    return content + _crc32c(content).to_bytes(4, "little")
+
+
+def _crc32c(content) -> int:
+    return needed("google_crc32c", "storing a study", "ensembles").value(content)  # comes with zarr

@@ -23,7 +23,7 @@ from jourdain_jax.motion.model import Model, build
 from jourdain_jax.motion.options import MotionFields, Options, as_options
 from jourdain_jax.motion.simulate import span_and_times
 from jourdain_jax.scene.arguments import as_scene
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_name, nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 
@@ -89,8 +89,7 @@ class Study(Printed):
         known = {name: np.ndim(value) for name, value, _ in parameters_of(self.scene)}
         varying = {}
         for name, how in (self.vary or {}).items():
-            if name not in known:
-                raise ValueError(f"scene `{type(self.scene).__name__}` has no parameter `{name}`; {nearest(name, known)}")
+            check_name(name, known, f"scene `{type(self.scene).__name__}` has no parameter `{name}`")
             if known[name]:
                 raise ValueError(f"parameter `{name}` is an array; what varies must be one number: vary a parameter from which the scene makes that array")
             if np.ndim(how) == 0 and not isinstance(how, Distribution | Levels):
@@ -114,8 +113,7 @@ class Study(Printed):
         self, *, t1=None, ts=None, t0=None, outputs: Mapping | None = None, save: str = "outputs", every: int = 1, inputs=None, options=None, **by_name
     ) -> Task:
         """All that decides the numbers of a run; arguments as in `run`: `t1`, `ts`, `t0` in s, `outputs`, `save`, `every`, `inputs`, `options`, `by_name`."""
-        if save not in SAVES:
-            raise ValueError(f"`save` is {save!r}; {nearest(str(save), SAVES)}")
+        check_name(save, SAVES, f"`save` is {save!r}")
         about = "of at least 1; it says of which lanes save='trajectories' keeps the trajectory"
         every = checked_whole(every, "`every`", 1, None if save == "trajectories" else 1, expected=about)
         options = replace(as_options(options, by_name, "Study.run", REFUSED, self._given), memory=None)
@@ -171,8 +169,7 @@ class Study(Printed):
         Ctrl-C: the chunk under way ends, all is kept, and KeyboardInterrupt says so.
         """
         task = self.task(**what)
-        shards = tuple(shard)
-        if len(shards) != 2 or not all(isinstance(x, int) for x in shards) or not 1 <= shards[0] <= shards[1]:
+        if [type(x) for x in shard] != [int, int] or not 1 <= shard[0] <= shard[1]:
             raise ValueError(f"`shard` is {shard}, expected (k, n) with 1 <= k <= n")
         checked_whole(processes, "`processes`", 1, expected="of at least 1")
         if client is not None and processes != 1:
@@ -181,7 +178,7 @@ class Study(Printed):
         memory = self._given.memory if isinstance(self._given, Model) else None
         task, chunk = bounded(task, path, chunk, None if memory is None else of_each(memory, processes), here=here)
         compute = partial(in_this_process, task) if here else on_cluster(task, client) if client is not None else in_processes(task, processes)
-        store = run(task, path, chunk=chunk, progress=progress, shard=shards, command=command, workers=compute)
+        store = run(task, path, chunk=chunk, progress=progress, shard=shard, command=command, workers=compute)
         return StudyResult(store, task)
 
     def mean_gradients(self, *, parameters: Sequence[str] = (), **what: Unpack[TaskFields]) -> MeanGradients:

@@ -89,15 +89,19 @@ class Task:
         """The arrays of the store. ValueError where two have one name, or that of an axis or of another file in the store."""
         units = {name: about["unit"] for name, _, about in parameters_of(self.scene)}
         found = []
+
+        def number(name: str, about: str, unit: str, **role: str) -> None:
+            found.append((name, Column("float64", math.nan, {"long_name": about} | role | ({"units": unit} if unit else {}))))
+
         for name in self.design.names:
             about = f"start value of {name.removesuffix(AT_START)}" if name.endswith(AT_START) else f"parameter {name}"
-            found.append((name, Column("float64", math.nan, {"long_name": about, "role": "varied"} | _unit(units.get(name, "")))))
+            number(name, about, units.get(name, ""), role="varied")
         for name, (_, dtype, fill, attributes) in OF_LANES.items():
             events: dict = {"event_names": list(names_of_events(self.scene))} if name == "event" else {}
             found.append((name, Column(dtype, fill, attributes | events)))
         for name, output in self.outputs.items():
-            found.append((name, Column("float64", math.nan, {"long_name": name, "role": "output"} | _unit(output.unit))))
-        along = (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries) if self.save == "trajectories" else ()
+            number(name, name, output.unit, role="output")
+        along = (*self.scene.coordinate_names, *self.scene.speed_names) if self.save == "trajectories" else ()
         for name in along:
             found.append((name, Column("float64", math.nan, {"long_name": f"{name} along the motion"}, (("time", len(self.ts)),), self.every)))
         names = [*(name for name, _ in found), *(("time",) if along else ()), *RESERVED]
@@ -117,7 +121,3 @@ class Task:
             "precision": digest(str(jnp.result_type(float))),
             "backend": jax.default_backend(),
         }
-
-
-def _unit(unit: str) -> dict[str, str]:
-    return {"units": unit} if unit else {}

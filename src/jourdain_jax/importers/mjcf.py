@@ -6,13 +6,14 @@ Source: the XML reference of MuJoCo's documentation, version 3.
 import math
 import os
 from collections.abc import Iterable
+from pathlib import Path
 
 import numpy as np
 
 from jourdain_jax.calculus.rotations import matrices_to_quaternions
-from jourdain_jax.importers.identifiers import identifier
 from jourdain_jax.importers.mjcf_elements import TABLE, Defaults, all_of
 from jourdain_jax.importers.placing import about, by_euler_angles, by_quaternion, combined, onto_axis
+from jourdain_jax.importers.scene_class import identifier
 from jourdain_jax.importers.solids import SIZES, moments, volume
 from jourdain_jax.importers.tree import Closure, Follower, Joint, Link, Look, Mass, Matrix, Motor, Push, Tree, Vector
 from jourdain_jax.importers.tree_scene import tree_scene
@@ -71,7 +72,7 @@ class _Reader:
         self.unit = 1.0 if self.settings["angle"] == "radian" else math.pi / 180
         if len(self.settings["eulerseq"]) != 3 or set(self.settings["eulerseq"].lower()) - set("xyz"):
             raise self.compiler.fault("`eulerseq`", f"`{self.settings['eulerseq']}`, expected three letters out of x, y, z, X, Y, Z")
-        self.meshes = {mesh.get("name") or (mesh.get("file") or "").rpartition("/")[2].partition(".")[0]: mesh for mesh in file.root.findall("asset/mesh")}
+        self.meshes = {mesh.get("name") or Path(mesh.get("file", "")).stem: mesh for mesh in file.root.findall("asset/mesh")}
         self.links: list[Link] = []
         self.sites: dict[str, tuple[str | None, Vector, Matrix]] = {}  # the body that each is on, and its place there
         self.moving: set[str | None] = set()  # names of links
@@ -99,8 +100,7 @@ class _Reader:
             one, other = (element.get(f"{'joint' if follows else 'body'}{end}") for end in (1, 2))
             known = joints if follows else [link.name for link in self.links]
             for end in (one, other or one):
-                if end not in known:
-                    raise self.file.fault(f"{tie.what} names `{end}`, which is no {'hinge or slide' if follows else 'body'}; {nearest(str(end), known)}")
+                self.file.check_name(str(end), known, f"{tie.what} names `{end}`, which is no {'hinge or slide' if follows else 'body'}")
             if element.get("active") == "false":
                 continue
             if follows:
@@ -150,8 +150,7 @@ class _Reader:
         what = f"joint `{name}`"
         given = Part(self.file, what, element) if element.tag == "freejoint" else self.defaults.of(element, childclass, what)
         kind = "free" if element.tag == "freejoint" else given.given.get("type", "hinge")
-        if kind not in _TYPES:
-            raise self.file.fault(f"{what} is of the type `{kind}`; {nearest(kind, _TYPES)}")
+        self.file.check_name(kind, _TYPES, f"{what} is of the type `{kind}`")
         unit = self.unit if kind in ("hinge", "ball") else 1.0
         damping, stiffness, rest, reference = (given.number(word, 0.0) for word in ("damping", "stiffness", "springref", "ref"))
         if stiffness and kind not in ("hinge", "slide"):
@@ -274,8 +273,9 @@ class _Reader:
             name, gear, push = element.get("name") or f"{site or joint}_motor", motor.numbers("gear", None, [1.0]), None
             motor.what = f"motor `{name}`"
             if site is not None:
-                if site not in self.sites:
-                    raise self.file.fault(f"{motor.what} pushes the site `{site}`, which is none; {nearest(site, self.sites)}")
+                self.file.check_name(
+                    site, self.sites, f"{motor.what} pushes the site `{site}`, which is none"
+                )
                 link, position, turn = self.sites[site]
                 if link not in heavy:
                     raise self.file.fault(f"{motor.what} pushes the site `{site}` of {f'body `{link}`' if link else 'the world'}, which has no mass that moves")

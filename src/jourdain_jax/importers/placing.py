@@ -17,11 +17,6 @@ def cross_matrix(v: Vector) -> Matrix:
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
-def by_roll_pitch_yaw(angles: Vector) -> Matrix:
-    """URDF's `rpy`: about the fixed x, y, z axes in turn (rad)."""
-    return Rotation.from_euler("xyz", angles).as_matrix()
-
-
 def by_euler_angles(angles: Vector, sequence: str) -> Matrix:
     """MJCF's `euler`: about axes in turn (rad), those of the turned frame in lower case, fixed ones in upper case."""
     turn = np.eye(3)

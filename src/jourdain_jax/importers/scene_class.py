@@ -1,12 +1,47 @@
-"""A class of scenes made from a description: its parameters become fields with defaults, like those that a user writes."""
+"""A class of scenes made from a description: its parameters become fields with defaults, like those that a user writes.
 
+Names of other tools become names of Python, for fields, coordinates, speeds and inputs.
+"""
+
+import keyword
+import re
+from collections.abc import Iterable
 from typing import Any
 
 from jourdain_jax.scene.scene import Scene
 
+_TAKEN = ("t", "array", "slots", "keys")  # by the time and by the container of named values
+
+
+def identifier(name: str) -> str:
+    """The name as one of Python: what is no letter, digit or underscore becomes an underscore, `left-wheel` is `left_wheel`."""
+    plain = re.sub(r"\W+", "_", name).strip("_") or "unnamed"
+    plain = f"_{plain}" if plain[0].isdigit() else plain
+    return f"{plain}_" if keyword.iskeyword(plain) or plain in _TAKEN else plain
+
+
+def identifiers(names: Iterable[str], kind: str, taken: Iterable[str] = ()) -> dict[str, str]:
+    """Name -> its identifier, with an underscore at its end where that is among the `taken` ones; ValueError where two are equal, or become so."""
+    found: dict[str, str] = {}
+    taken = set(taken)
+    for name in names:
+        new = identifier(name)
+        new = f"{new}_" if new in taken else new
+        twin = next((other for other, known in found.items() if known == new), None)
+        if twin == name:
+            raise ValueError(f"two {kind}s are called `{name}`; give each a name of its own")
+        if twin is not None:
+            raise ValueError(f"{kind}s `{twin}` and `{name}` would both be called `{new}`; rename one of them")
+        found[name] = new
+    return found
+
 
 def scene_class(base: type[Scene], name: str, about: str, fields: dict[str, Any], attributes: dict[str, Any]) -> type[Scene]:
-    """A subclass of `base` called `name`, whose docstring is `about`, with `fields`, made by `parameter`, and further class `attributes`."""
+    """A subclass of `base` called `name`, of which `my-robot` becomes `MyRobot`, whose docstring is `about`, with `fields`, made by `parameter`, and further
+    class `attributes`.
+    """
+    words = [word for word in re.split(r"[\W_]+", name) if word]
+    name = identifier("".join(word[0].upper() + word[1:] for word in words) or "Scene")
     annotations = dict.fromkeys(fields, object)
     namespace = {"__module__": base.__module__, "__qualname__": name, "__doc__": about, "__annotations__": annotations, **fields, **attributes}
     return type(base)(name, (base,), namespace)

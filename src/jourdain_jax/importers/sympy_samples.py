@@ -38,8 +38,8 @@ def sampled(system: MechanicalSystem, lists: Mapping[str, Iterable[Any]], rows: 
 
     Constants have their numbers where these are given. ValueError, which names a list, where there are too few such states.
     """
-    rates = [system.rates[q.diff(system.time)] for q in system.coordinates]
-    named: dict[Any, list] = {name: list(expressions) for name, expressions in lists.items()} | {"": rates}
+    named: dict[Any, list] = {name: list(expressions) for name, expressions in lists.items()}
+    named[""] = [system.rates[q.diff(system.time)] for q in system.coordinates]
     kept = [system.resolved(row) for row in rows]
     expressions = [*kept, *(e for several in named.values() for e in several)]
     symbols = sorted(symbols_in(expressions) | {*system.coordinates, *system.speeds, system.time}, key=str)
@@ -61,12 +61,13 @@ def sampled(system: MechanicalSystem, lists: Mapping[str, Iterable[Any]], rows: 
             )
             for step in (_STEP, -_STEP)
         )
-        found.append(Sample(leaves, values, {name: (ahead[name] - behind[name]) / (2 * _STEP) for name in values}))
-        infinite = [name for name in values if not (np.isfinite(values[name]).all() and np.isfinite(found[-1].rates[name]).all())]
+        rates = {name: (ahead[name] - behind[name]) / (2 * _STEP) for name in values}
+        infinite = [name for name in values if not np.isfinite([values[name], rates[name]]).all()]
         if infinite:
-            found.pop()
             worst = infinite[0] or "rate of a coordinate"
-        elif len(found) == _STATES:
+            continue
+        found.append(Sample(leaves, values, rates))
+        if len(found) == _STATES:
             return found
     raise ValueError(
         f"the {worst} has no finite value at {_TRIES - _STATES + 1} of {_TRIES} random states; check its expressions and the values of its constants"

@@ -1,19 +1,18 @@
 """Scenes from SymPy's mechanics: poses, loads and rows are SymPy's expressions, evaluated on JAX; the equations of motion are those of this engine."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import checked_real, described
 from jourdain_jax.importers.formulas import Formulas, sympy_package
-from jourdain_jax.importers.identifiers import class_name, identifiers
-from jourdain_jax.importers.scene_class import scene_class
-from jourdain_jax.importers.sympy_forces import forces_of, velocity_rows
+from jourdain_jax.importers.scene_class import identifiers, scene_class
 from jourdain_jax.importers.sympy_kinematics import Pose, poses_of
-from jourdain_jax.importers.sympy_samples import symbols_in
+from jourdain_jax.importers.sympy_samples import affine, sampled, symbols_in
 from jourdain_jax.importers.sympy_system import MechanicalSystem, mechanical_system
 from jourdain_jax.scene.bodies import Particle, RigidBody
 from jourdain_jax.scene.coordinates import coordinates, inputs, speeds
@@ -169,7 +168,48 @@ def _scene_class(system: MechanicalSystem, poses: list[Pose], name: str) -> type
         "_expressions": expressions,
     }
     parameters = {fields[str(x)]: parameter(system.given[str(x)], about=f"{x} of SymPy", positive=bool(x.is_positive)) for x in constants}
-    return scene_class(SympyScene, class_name(name), f"A scene from SymPy: {', '.join(pose.name for pose in poses)}.", parameters, attributes)
+    return scene_class(SympyScene, name, f"A scene from SymPy: {', '.join(pose.name for pose in poses)}.", parameters, attributes)
+
+
+def forces_of(system: MechanicalSystem, poses: Sequence[Pose]) -> dict[tuple[str, Any], Any]:
+    """The loads by kind and place, inertial frame: "weight" (constant, so that it has a potential), "force" and "torque" of a body, "generalized" of a speed.
+
+    A force on a point that is no mass centre, and a torque on a frame that is no body's, count by the power that they have by SymPy's velocity of that
+    point or frame: Q_k = F . dv/du_k.
+    """
+    sympy = sympy_package()
+    found: dict[tuple[str, Any], Any] = {}
+    for where, vector in system.loads:
+        value = system.resolved(vector.to_matrix(system.frame))
+        is_point = isinstance(where, sympy.physics.mechanics.Point)
+        body = next((pose.name for pose in poses if (pose.centre if is_point else pose.frame) == where), None)
+        if body is not None:
+            kind = "torque" if not is_point else "weight" if system.is_constant(value) else "force"
+            parts = {(kind, body): value}
+        else:
+            velocity = where.vel(system.frame) if is_point else where.ang_vel_in(system.frame)
+            partial = system.resolved(velocity.to_matrix(system.frame)).jacobian(sympy.Matrix(system.speeds))
+            powers = zip(system.speeds, system.resolved(partial.T * value), strict=True)
+            parts = {("generalized", speed): sympy.Matrix([power]) for speed, power in powers if power != 0}
+        found |= {key: found[key] + part if key in found else part for key, part in parts.items()}
+    return found
+
+
+def velocity_rows(system: MechanicalSystem) -> list[Any]:
+    """The velocity rows that are not the rates of the geometric ones: SymPy wants both."""
+    rows = [system.resolved(row) for row in system.velocity]
+    if not rows or not system.configuration:
+        return rows
+    both = {"own": rows, "rates": [system.resolved(row) for row in system.rates_of_configuration()]}
+    kept = np.zeros(len(rows), bool)
+    samples = sampled(system, {f"{name} of rows": several for name, several in both.items()})
+    formulas = Formulas(both, list(samples[0].leaves))
+    for sample in samples:
+        given, implied = (affine(lambda at, name=name: formulas.numbers(at)[name], sample.leaves, system.speeds) for name in both)  # type: ignore[misc]
+        left = given - given @ np.linalg.pinv(implied) @ implied
+        # of a row: what of it the geometric rows leave, relative
+        kept |= np.max(np.abs(left), axis=1) > 1e-9 * np.max(np.abs(given), axis=1)
+    return [row for row, keep in zip(rows, kept, strict=True) if keep]
 
 
 def _check_input(system: MechanicalSystem, x, of_poses: set[Any]) -> None:

@@ -8,14 +8,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import quaternion_to_matrix
-from jourdain_jax.importers.identifiers import class_name, identifiers
 from jourdain_jax.importers.placing import combined, cross_matrix, onto_axis
-from jourdain_jax.importers.scene_class import scene_class
+from jourdain_jax.importers.scene_class import identifiers, scene_class
 from jourdain_jax.importers.tree import Follower, Joint, Link, Look, Mass, Push, Tree
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.coordinates import Quaternion, coordinates, inputs, quaternion
 from jourdain_jax.scene.loads import Load, generalized_force, gravity, point_force, torque
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
@@ -180,8 +179,8 @@ def _visual(look: Look, at, turn) -> Visual:
     if look.kind == "mesh":
         mesh = _mesh(look.path)
         return Visual.mesh(mesh.faces.corners, mesh.faces.polygons, scale=np.array(look.size), **options)
-    make: Any = {"ball": Visual.ball, "box": Visual.box, "cylinder": Visual.cylinder, "capsule": Visual.capsule, "ellipsoid": Visual.ellipsoid}[look.kind]
-    return make(np.array(look.size), **options) if look.kind in ("box", "ellipsoid") else make(*look.size, **options)
+    size = (np.array(look.size),) if look.kind in ("box", "ellipsoid") else look.size
+    return getattr(Visual, look.kind)(*size, **options)
 
 
 @lru_cache(maxsize=256)
@@ -189,7 +188,7 @@ def _mesh(path: str) -> Any:
     return Visual.from_file(path)
 
 
-def tree_scene(tree: Tree, source: str, ignore: tuple[str, ...] = ()) -> type[Scene]:
+def tree_scene(tree: Tree, source: str, ignore: tuple[str, ...]) -> type[Scene]:
     """The class of scenes of a mechanism. ValueError, which names the `source`, where nothing moves, what moves weighs nothing, or moments are impossible.
 
     `ignore`: with "inertia" in it, such moments are taken as they are.
@@ -200,8 +199,7 @@ def tree_scene(tree: Tree, source: str, ignore: tuple[str, ...] = ()) -> type[Sc
     _check_masses(tree, source, ignore)
     known = [link.name for link in tree.links]
     for name in tree.free:
-        if name not in known:
-            raise ValueError(f"`free` names `{name}`, which is no link; {nearest(name, known)}")
+        check_name(name, known, f"`free` names `{name}`, which is no link")
     joints = [joint for link in tree.links for joint in link.joints]
     link_names = identifiers([link.name for link in tree.links], "link")
     of_base = () if all(joint.name for joint in joints) else ("x", "y", "z", "heading", "attitude")
@@ -232,7 +230,7 @@ def tree_scene(tree: Tree, source: str, ignore: tuple[str, ...] = ()) -> type[Sc
         "_names": names,
     }
     about = f"{tree.name}, from {source}: {', '.join(link.name for link in tree.links if link.name in moving and link.mass is not None)}."
-    return scene_class(TreeScene, class_name(tree.name), about, parameters, attributes)
+    return scene_class(TreeScene, tree.name, about, parameters, attributes)
 
 
 def _mass_parameters(link: Link, name: str) -> dict[str, Any]:

@@ -8,13 +8,14 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from jourdain_jax.calculus.reals import checked_known
-from jourdain_jax.importers.placing import about, by_roll_pitch_yaw
+from jourdain_jax.importers.placing import about
 from jourdain_jax.importers.tree import Follower, Joint, Link, Look, Mass, Matrix, Motor, Tree, Vector
 from jourdain_jax.importers.tree_scene import tree_scene
 from jourdain_jax.importers.xml_file import Holds, Part, XmlFile
-from jourdain_jax.scene.names import as_labels, nearest
+from jourdain_jax.scene.names import as_labels, check_name, nearest
 from jourdain_jax.scene.scene import Scene
 
 _KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free", "planar": "planar", "fixed": ""}
@@ -133,8 +134,7 @@ class _Reader:
         joints = [joint for link in links for joint in link.joints]
         names = [joint.name for joint in joints if joint.kind in ("hinge", "slide")]
         for name in motors:
-            if name not in names:
-                raise ValueError(f"`motors` names `{name}`, which is no joint of one coordinate; {nearest(name, names)}")
+            check_name(name, names, f"`motors` names `{name}`, which is no joint of one coordinate")
         mimics = {joint.name: self.joints[joint.name].child("mimic") for joint in joints if joint.name}
         followers = tuple(self._follower(name, mimic, names) for name, mimic in mimics.items() if mimic.element is not None)
         pushed = tuple(Motor(f"{name}_motor", name) for name in motors)
@@ -144,15 +144,13 @@ class _Reader:
         link = joint.child(which).given.get("link")
         if link is None:
             raise self.file.fault(f"{joint.what} has no `{which}`; name a link")
-        if link not in self.links:
-            raise self.file.fault(f"{joint.what} has the {which} `{link}`, which is no link; {nearest(link, self.links)}")
+        self.file.check_name(link, self.links, f"{joint.what} has the {which} `{link}`, which is no link")
         return link
 
     def _link(self, name: str, label: str, parent: str) -> Link:
         joint = self.joints[label]
-        kind = joint.given.get("type")
-        if kind not in _KINDS:
-            raise self.file.fault(f"{joint.what} is of the type `{kind}`; {nearest(str(kind), _KINDS)}")
+        kind = joint.given.get("type", "")
+        self.file.check_name(kind, _KINDS, f"{joint.what} is of the type `{kind}`")
         joints, (position, turn) = (self._joint(joint, label, kind),) if _KINDS[kind] else (), _origin(joint)
         if label in self.locked:
             axis, value, joints = joints[0].axis, self.locked[label], ()
@@ -173,8 +171,7 @@ class _Reader:
     def _follower(self, name: str, mimic: Part, names: list[str]) -> Follower:
         leader = mimic.given.get("joint") or ""
         for end in (name, leader):
-            if end not in names:
-                raise self.file.fault(f"{mimic.what}: `{end}` is no joint of one coordinate; {nearest(end, names)}")
+            self.file.check_name(end, names, f"{mimic.what}: `{end}` is no joint of one coordinate")
         if leader == name:
             raise self.file.fault(f"joint `{name}` mimics itself; expected another joint")
         return Follower(name, leader, (mimic.number("offset", 0.0), mimic.number("multiplier", 1.0)))
@@ -234,4 +231,5 @@ class _Reader:
 
 def _origin(part: Part) -> tuple[Vector, Matrix]:
     origin = part.child("origin")
-    return origin.numbers("xyz", 3, np.zeros(3)), by_roll_pitch_yaw(origin.numbers("rpy", 3, np.zeros(3)))
+    turn = Rotation.from_euler("xyz", origin.numbers("rpy", 3, np.zeros(3)))  # about the fixed axes in turn
+    return origin.numbers("xyz", 3, np.zeros(3)), turn.as_matrix()

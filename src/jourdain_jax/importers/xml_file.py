@@ -17,7 +17,7 @@ from jourdain_jax.calculus.files import check_depth, number, parsed, read_bytes,
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.importers.tree import Mass, Matrix, Vector
 from jourdain_jax.scene.arguments import users_level
-from jourdain_jax.scene.names import as_labels, nearest
+from jourdain_jax.scene.names import as_labels, check_name, nearest
 
 Element = ElementTree.Element
 LARGEST = 100_000_000  # bytes of a file
@@ -48,8 +48,7 @@ class XmlFile:
         self.source = f"the {format_name} text" if text is not None else str(path)
         content = read_bytes(path, LARGEST, f"a {format_name} file") if text is None else text
         self.folder = Path.cwd() if text is not None else Path(path).resolve().parent
-        self.root: Element = parsed(ElementTree.fromstring, content, self.source, "XML")
-        check_depth(self.root, list, self.source)
+        self.root = _parsed(content, self.source)
         root_tag = next(iter(table))
         if self.root.tag != root_tag:
             raise self.fault(f"its root is `{self.root.tag}`, expected `{root_tag}` of a {format_name} file")
@@ -71,8 +70,7 @@ class XmlFile:
             if path in known:
                 raise self.fault(f"`{path.name}` is included twice; expected once")
             known.add(path)
-            inner: Element = parsed(ElementTree.fromstring, read_bytes(path, LARGEST, "an included file"), str(path), "XML")
-            check_depth(inner, list, str(path))
+            inner = _parsed(read_bytes(path, LARGEST, "an included file"), str(path))
             self._include(inner, known)
             holder[k : k + 1] = list(inner)
 
@@ -130,6 +128,10 @@ class XmlFile:
         """The error of this file."""
         return ValueError(f"{self.source}: {what}")
 
+    def check_name(self, name: str, valid: Iterable[str], what: str) -> None:
+        """The error of this file, which says `what` is wrong, unless the name is among the valid ones."""
+        check_name(name, valid, f"{self.source}: {what}")
+
     def named(self, kind: str) -> "dict[str, Part]":
         """The elements of a kind in the root, by their names; ValueError where one has none, or two have the same."""
         found: dict[str, Part] = {}
@@ -141,6 +143,12 @@ class XmlFile:
                 raise self.fault(f"two {kind}s are called `{name}`; give each a name of its own")
             found[name] = Part(self, f"{kind} `{name}`", element)
         return found
+
+
+def _parsed(content: str | bytes, source: str) -> Element:
+    root = parsed(ElementTree.fromstring, content, source, "XML")
+    check_depth(root, list, source)
+    return root
 
 
 class Part:

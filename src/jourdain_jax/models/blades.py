@@ -105,12 +105,12 @@ def _level(mass, inertia, x, y, orientation) -> RigidBody:
     return RigidBody(mass, inertia * jnp.ones(3), jnp.stack([x, y, jnp.zeros_like(x)]), orientation)
 
 
-def _edge(body, point=None) -> Float[Array, ""]:
+def _edge(body, point=None) -> Scalar:
     """The row of a blade along body x, at a point of the body (default: its mass centre)."""
     return knife_edge(body, body.position if point is None else body.place(point), body.orientation[:, 1])
 
 
-def _forward(motion) -> Float[Array, ""]:
+def _forward(motion) -> Scalar:
     """Speed of the mass centre along the blade, m/s."""
     return motion.u.x_rate * jnp.cos(motion.q.heading) + motion.u.y_rate * jnp.sin(motion.q.heading)
 

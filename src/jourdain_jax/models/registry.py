@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from importlib import import_module
 
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_name, nearest
 from jourdain_jax.scene.scene import Scene
 
 PLACES = {  # models by the module of this package that holds their classes, which is imported on first use
@@ -43,8 +43,7 @@ def model(name: str, **parameters) -> Scene:
     kind = known_model(name)
     valid = [field.name for field in fields(kind) if field.init]
     for given in parameters:
-        if given not in valid:
-            raise ValueError(f"model `{name}` has no parameter `{given}`; {nearest(given, valid)}")
+        check_name(given, valid, f"model `{name}` has no parameter `{given}`")
     return kind(**parameters)
 
 

@@ -22,7 +22,7 @@ from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contacts import disc_contact
 from jourdain_jax.scene.coordinates import coordinates, inputs
 from jourdain_jax.scene.loads import generalized_force, gravity
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.parameters import Scalar, parameter, parameters_of
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
@@ -82,8 +82,7 @@ class WhippleBicycle(Scene):
         """
         names = [name for name, _, _ in parameters_of(cls())]
         for name in values:
-            if name not in names:
-                raise ValueError(f"unknown bicycle parameter `{name}`; {nearest(name, names)}")
+            check_name(name, names, f"unknown bicycle parameter `{name}`")
         missing = [name for name in names if name not in values]
         if missing:
             raise ValueError(f"bicycle parameters missing: {', '.join(f'`{name}`' for name in missing)}; give all {len(names)}")

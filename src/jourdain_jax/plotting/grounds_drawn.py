@@ -8,7 +8,7 @@ from jourdain_jax.equations.kinematics import pose_at
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.guesses import across
 from jourdain_jax.plotting.looks import Curved, Drawn
-from jourdain_jax.plotting.solids import quads, revolved
+from jourdain_jax.plotting.solids import arc, quads, revolved
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere
 from jourdain_jax.scene.validated import contacts_of
@@ -31,8 +31,7 @@ def grounds_of(trajectory: Trajectory, drawn: Drawn, low: np.ndarray, high: np.n
 def _ground(trajectory: Trajectory, drawn: Drawn, name: str, contact: Contact, low, high) -> dict:
     ground = contact.ground
     if isinstance(ground, Sphere):  # of one that bodies are in, the lower half
-        angle = np.linspace(0.0, np.pi / 2 if ground.side == "inside" else np.pi, _CELLS // 2 + 1)
-        profile = float(ground.radius[0]) * np.stack([np.sin(angle), -np.cos(angle)], axis=1)
+        profile = float(ground.radius[0]) * arc(np.pi / 2 if ground.side == "inside" else np.pi, _CELLS // 2 + 1)
         return _mesh(revolved(profile, _CELLS) + np.asarray(ground.origin)[0])
     if isinstance(ground, Cylinder):
         axis, origin = np.asarray(ground.axis)[0], np.asarray(ground.origin)[0]

@@ -90,13 +90,13 @@ def _drawn(ts: np.ndarray, reached: np.ndarray, seen) -> Drawn:
         if name not in stated:
             shapes = [_at(contact.shape, 0) for contact in contacts.values() if contact.body == name and contact.shape is not None]
             stated[name] = [_same_at_all(look, len(reached)) for look in guessed(body, shapes, dot)]
-    drawn = {}
+    drawn, upright = {}, np.broadcast_to(np.eye(3), (len(reached), 3, 3))
     for k, (name, body) in enumerate(bodies.items()):
-        turned = np.asarray(body.orientation) if isinstance(body, RigidBody) else np.broadcast_to(np.eye(3), (len(reached), 3, 3))
+        turned = np.asarray(body.orientation) if isinstance(body, RigidBody) else upright
         drawn[name] = DrawnBody(name, PALETTE[k % len(PALETTE)], np.asarray(body.position), turned, velocities[name], stated[name])
     if stated.get(""):
         still = np.zeros((len(reached), 3))
-        drawn[""] = DrawnBody("", PLAIN, still, np.broadcast_to(np.eye(3), (len(reached), 3, 3)), still, stated[""])
+        drawn[""] = DrawnBody("", PLAIN, still, upright, still, stated[""])
     return Drawn(ts, reached, drawn, contacts, sized)
 
 

@@ -50,7 +50,8 @@ def page_data(motions: list[Trajectory], display: Display) -> tuple[dict, Number
     """The description of the page, and its numbers."""
     drawn = [looks_of(motion, "show", 1000) for motion in motions]
     numbers, first = Numbers(), drawn[0]
-    near, far = (np.stack([x.min(axis=0), x.max(axis=0)]) for x in (_around_the_middle(drawn), _everywhere(drawn)))
+    everywhere = np.concatenate([body.extents().reshape(-1, 3) for one in drawn for body in one.bodies.values()])
+    near, far = (np.stack([x.min(axis=0), x.max(axis=0)]) for x in (_around_the_middle(drawn), everywhere))
     size, reach = (float(np.ptp(box, axis=0).max()) for box in (near, far))
     colours = {name: body.colour for one in drawn for name, body in one.bodies.items() if name}
     # by itself, where the whole motion is five times as long as its bodies
@@ -162,17 +163,6 @@ def _at_rest(drawn: Drawn) -> bool:
 
 def _moves(body: DrawnBody) -> bool:
     return len(_still(body.positions)) > 1
-
-
-def _far(drawn: list[Drawn]) -> np.ndarray:
-    """The lowest and the highest corner (2, 3), m, of the box that holds all bodies at all times."""
-    points = np.concatenate([body.extents().reshape(-1, 3) for one in drawn for body in one.bodies.values()])
-    return np.stack([points.min(axis=0), points.max(axis=0)])
-
-
-def _everywhere(drawn: list[Drawn]) -> np.ndarray:
-    """Points (points, 3), m, whose box holds all bodies at all times."""
-    return np.concatenate([body.extents().reshape(-1, 3) for one in drawn for body in one.bodies.values()])
 
 
 def _around_the_middle(drawn: list[Drawn]) -> np.ndarray:

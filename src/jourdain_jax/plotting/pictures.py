@@ -7,6 +7,7 @@ import numpy as np
 
 from jourdain_jax.calculus.figures import figure as figure_in_html
 from jourdain_jax.calculus.figures import pyplot
+from jourdain_jax.calculus.files import check_place
 from jourdain_jax.calculus.reals import checked_whole, described
 from jourdain_jax.motion.start import start
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -19,6 +20,7 @@ VIEWS = {"above": (90.0, -90.0), "side": (0.0, -90.0), "space": (28.0, -60.0)}  
 
 def check_suffix(path: str | os.PathLike) -> None:
     """ValueError where an animation cannot be written to a file of this name."""
+    check_place(path)
     if not str(path).lower().endswith(".gif"):
         raise ValueError(f"cannot write `{path}`: an animation is a .gif file")
 
@@ -81,14 +83,12 @@ def draw_still(
     at: int | Sequence = 3,
     paths: Sequence[tuple[str, Sequence]] | None = None,
     view: str | tuple = "space",
-    size: tuple[int, int] = (640, 420),
 ) -> None:
     """Draw a motion as one picture: its bodies, solid, at a few times, earlier ones paler, and the paths of points.
 
     - `at`: times in s (the nearest saved ones are drawn), or how many, evenly spaced from the start to the end.
     - `paths`: (body, body-frame point in m) pairs to trace; default: the mass centre of the first body.
     - `view`: "above", "side" or "space", or elevation and azimuth in degrees.
-    - `size`: width and height in pixels.
 
     ValueError for a rollout, an unknown view or body, or a motion that reached none of its times; ImportError without matplotlib.
     """
@@ -99,9 +99,9 @@ def draw_still(
     wanted = np.asarray(at, float) if not isinstance(at, int) else np.linspace(drawn.ts[0], drawn.ts[-1], at) if at > 1 else drawn.ts[-1:]
     chosen = np.unique(np.argmin(np.abs(drawn.ts - wanted[:, None]), axis=1)).tolist()
     traces = _traces(trajectory, drawn, [(next(name for name in drawn.bodies if name), np.zeros(3))] if paths is None else paths)
-    strengths = np.linspace(0.35, 1.0, len(chosen)) if len(chosen) > 1 else [1.0]
-    faces, colours = zip(*(painted(drawn, k, strength) for k, strength in zip(chosen, strengths, strict=True)), strict=True)
-    figure = plt.figure(figsize=(size[0] / 100, size[1] / 100), dpi=100)
+    strengths = np.linspace(1.0, 0.35, len(chosen))[::-1]
+    faces, colours = zip(*map(painted, [drawn] * len(chosen), chosen, strengths), strict=True)
+    figure = plt.figure(figsize=(6.4, 4.2), dpi=100)
     axes = axes_in_space(figure, VIEWS[view] if isinstance(view, str) else view, (0.05, 0.07, 0.88, 0.83))
     draw(axes, (np.concatenate(faces), np.concatenate(colours)), traces, box_of([*faces, *traces]))
     legend(figure, drawn, len(traces))

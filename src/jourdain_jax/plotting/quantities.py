@@ -14,7 +14,7 @@ from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.arguments import of_known_numbers
-from jourdain_jax.scene.names import UnknownNameError, nearest
+from jourdain_jax.scene.names import UnknownNameError, check_name
 
 ENERGIES = ("energy", "kinetic energy", "potential energy")
 UNITS = {  # by what is measured in them, in those of SI
@@ -146,11 +146,9 @@ def _checked_units(units, scenes: Sequence) -> dict[str, tuple[str, float]]:
     kinds |= dict.fromkeys(ENERGIES, "energy") | {"t": "time"}
     found = {"t": ("s", 1.0)}
     for name, unit in (units or {}).items():
-        if name not in kinds:
-            raise UnknownNameError(f"`units` names `{name}`, which is nothing to plot; {nearest(str(name), tuple(kinds))}")
+        check_name(name, kinds, f"`units` names `{name}`, which is nothing to plot", UnknownNameError)
         known = UNITS[kinds[name]]
-        if unit not in known:
-            raise ValueError(f"`{unit}` is no unit of the {kinds[name]} `{name}` that is known here; {nearest(str(unit), tuple(known))}")
+        check_name(unit, known, f"`{unit}` is no unit of the {kinds[name]} `{name}` that is known here")
         found[name] = unit, known[unit]
     return found
 
@@ -191,22 +189,22 @@ def _scene(motion: Trajectory | Rollout):
 
 def _draw(axis, motion, y: np.ndarray, second: float, bands: Sequence[float], colour: str, label: str) -> None:
     """A line; of a rollout the bands, widest and palest first, and the median, `y` as `_values` gives them."""
-    if not isinstance(motion, Rollout):
-        axis.plot(np.asarray(motion.ts) / second, y, color=colour, lw=1.5, label=label)
-        return
-    ts, named = np.asarray(motion.lanes.ts[0]) / second, f"{label}, " if label else ""
-    for k, part in reversed(list(enumerate(bands))):
-        low, high = y[2 * k], y[2 * k + 1]
-        axis.fill_between(ts, low, high, color=colour, alpha=0.2 if k else 0.4, lw=0, label=f"{named}{100 * part:.3g} % of lanes")
-    axis.plot(ts, y[-1], color=colour, lw=1.5, label=f"{named}median")
+    many = isinstance(motion, Rollout)
+    ts = np.asarray(motion.lanes.ts[0] if many else motion.ts) / second
+    if many:
+        named = f"{label}, " if label else ""
+        for k, part in reversed(list(enumerate(bands))):
+            band = f"{named}{100 * part:.3g} % of lanes"
+            axis.fill_between(ts, y[2 * k], y[2 * k + 1], color=colour, alpha=0.2 if k else 0.4, lw=0, label=band)
+        y, label = y[-1], f"{named}median"
+    axis.plot(ts, y, color=colour, lw=1.5, label=label)
 
 
 def _values(motion: Trajectory | Rollout, name: str, bands: Sequence[float]) -> np.ndarray:
     """Values at all times; of a rollout the lower and the upper end of each band in turn, and the median last."""
     many, scene = isinstance(motion, Rollout), _scene(motion)
-    valid = (*scene.coordinate_names.entries, *scene.speed_names.entries, *(() if many else ENERGIES))
-    if name not in valid:
-        raise UnknownNameError(f"nothing named `{name}` to plot; {nearest(name, valid)}")
+    valid = (*scene.coordinate_names, *scene.speed_names, *(() if many else ENERGIES))
+    check_name(name, valid, f"nothing named `{name}` to plot", UnknownNameError)
     if isinstance(motion, Rollout):
         return motion.quantiles(name, [level for part in bands for level in ((1 - part) / 2, (1 + part) / 2)] + [0.5])
     if name in ENERGIES:

@@ -16,19 +16,19 @@ def faces_of(visual: Visual, k: int, thin: float) -> tuple[Quads, Float[np.ndarr
 
     `thin`: radius of a line that has none, m.
     """
-    size, dark = np.asarray(visual.size)[0], None
+    size, dark = np.asarray(visual.size)[0], np.zeros(())
     if visual.kind == "line":
         points, radius = np.asarray(visual.size)[k], radius_of(visual) or thin
         found = np.concatenate([_bar(a, b, radius) for a, b in pairwise(points) if np.any(a != b)] or [np.zeros((0, 4, 3))])
     elif visual.kind == "ellipsoid":  # its octants are painted in turn, so that one sees it roll
-        found = size * quads(revolved(_arc(np.pi, 13), 24))
+        found = size * quads(revolved(arc(np.pi, 13), 24))
         dark = np.kron(0.35 * np.eye(2)[[0, 1, 0, 1]].T, np.ones((6, 6))).ravel()
     elif visual.kind == "mesh":
         found = size * triangles_of(visual)
     elif visual.kind == "box":
         found = size * _box()
     elif visual.kind == "capsule":
-        bow = _arc(np.pi / 2, 5) * size[0]
+        bow = arc(np.pi / 2, 5) * size[0]
         found = quads(revolved(np.concatenate([bow - [0, size[1] / 2], [1, -1] * bow[::-1] + [0, size[1] / 2]]), 24))
     else:
         around = 40 if visual.kind == "wheel" else 24
@@ -36,7 +36,7 @@ def faces_of(visual: Visual, k: int, thin: float) -> tuple[Quads, Float[np.ndarr
         if visual.kind == "wheel":  # a dark tread, and quarters of its sides in turn
             quarters = np.repeat([0.0, 0.35, 0.0, 0.35], around // 4)
             dark = np.concatenate([quarters, np.full(around, 0.5), quarters])
-    return found, np.zeros(len(found)) if dark is None else dark
+    return found, np.broadcast_to(dark, len(found))
 
 
 def radius_of(line: Visual) -> float:
@@ -62,7 +62,7 @@ def triangles_of(mesh: Visual) -> Quads:
     return mesh.faces.corners[[(p[0], p[k], p[k + 1], p[k + 1]) for p in mesh.faces.polygons for k in range(1, len(p) - 1)]]
 
 
-def _arc(last: float, count: int) -> Float[np.ndarray, "rows 2"]:
+def arc(last: float, count: int) -> Float[np.ndarray, "rows 2"]:
     """Radius and z on the unit circle, by angles from its lowest point."""
     angle = np.linspace(0.0, last, count)
     return np.stack([np.sin(angle), -np.cos(angle)], axis=1)

@@ -22,6 +22,12 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     return f"{hint}Valid names: {', '.join(f'`{v}`' for v in valid) or 'none'}."
 
 
+def check_name(name: str, valid: Iterable[str], what: str, error: type[Exception] = ValueError) -> None:
+    """Raise an error that says `what` is wrong, and the nearest valid name, unless the name is valid."""
+    if name not in valid:
+        raise error(f"{what}; {nearest(name, valid)}")
+
+
 def as_names(names: "str | Iterable[str]") -> tuple[str, ...]:
     """Names as a tuple; those in a text are parted by blanks, as in `jj.coordinates`."""
     if not isinstance(names, str | Iterable):
