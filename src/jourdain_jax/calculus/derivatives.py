@@ -253,8 +253,22 @@ def filled(tangent):
     return jnp.zeros(tangent.shape, tangent.dtype) if is_zero(tangent) else tangent
 
 
-def _moving(tangents: Sequence) -> list[int]:
-    return [i for i, t in enumerate(tangents) if not is_zero(t)]
+def _with_rates(run: Callable, rates: Callable) -> Callable:
+    """Return `run` with a derivative; `rates`: (arguments as leaves, leaves, which of them move, how, what is found) -> tangents of that."""
+
+    def called(*arguments):
+        leaves, of = _parted(arguments)
+        own = jax.custom_jvp(lambda *leaves: lanes_first(run(*of.whole(leaves))))
+
+        @with_usual_promotion
+        def rule(leaves, tangents):
+            moving, found = [i for i, t in enumerate(tangents) if not is_zero(t)], own(*leaves)
+            return found, rates(of, leaves, moving, [tangents[i] for i in moving], found)
+
+        own.defjvp(rule, symbolic_zeros=True)
+        return own(*leaves)
+
+    return called
 
 
 def differentiated_as(differentiable: Callable, run: Callable) -> Callable:
@@ -263,21 +277,10 @@ def differentiated_as(differentiable: Callable, run: Callable) -> Callable:
     Both take trees of arrays and of anything else, and return trees of arrays.
     """
 
-    def called(*arguments):
-        leaves, of = _parted(arguments)
-        own = jax.custom_jvp(lambda *leaves: lanes_first(run(*of.whole(leaves))))
+    def rates(of: _Leaves, leaves: Sequence, moving: list[int], along: list, found):
+        return lanes_first(jax.jvp(lambda *new: differentiable(*of.whole(put(leaves, moving, new))), [leaves[i] for i in moving], along)[1])
 
-        @with_usual_promotion
-        def rule(leaves, tangents):
-            moving = _moving(tangents)
-            new, along = tuple(leaves[i] for i in moving), tuple(tangents[i] for i in moving)
-            _, rates = jax.jvp(lambda *new: differentiable(*of.whole(put(leaves, moving, new))), new, along)
-            return own(*leaves), lanes_first(rates)
-
-        own.defjvp(rule, symbolic_zeros=True)
-        return own(*leaves)
-
-    return called
+    return _with_rates(run, rates)
 
 
 def pushed_by_jax(run: Callable) -> Callable:
@@ -310,48 +313,33 @@ def with_rules(run: Callable, rules: Rules) -> Callable:
     It takes trees of arrays and of anything else, and returns trees of arrays.
     """
 
-    def called(*arguments):
-        leaves, of = _parted(arguments)
-        own = jax.custom_jvp(lambda *leaves: lanes_first(run(*of.whole(leaves))))
-
+    def rates(of: _Leaves, leaves: Sequence, moving: list[int], along: list, found):
         def pushed(moving: list[int], leaves, *along):
             tangents = jax.tree.unflatten(of.treedef, put([None] * len(leaves), moving, along))
-            found, rates = rules.push(of.whole(leaves), tangents)
-            return found, [x for x in jax.tree.leaves(rates) if x.dtype != jax.dtypes.float0]
-
-        def rates_along(moving: list[int]) -> Callable:
-            return lambda *x: pushed(moving, *x)[1]
+            return [x for x in jax.tree.leaves(rules.push(of.whole(leaves), tangents)[1]) if x.dtype != jax.dtypes.float0]
 
         def perturbed(moving: list[int]):
             varies = jax.tree.unflatten(of.treedef, [i in moving for i in range(len(leaves))])
             return eqx.combine(varies, jax.tree.map(lambda _: False, of.rest))
 
-        def pulled(structure, places: list[int], moving: list[int]) -> Callable:
+        def pulled(moving: list[int]) -> Callable:
             """Cotangents of the leaves that are moving, as a function of the leaves, of what is found and of cotangents of the numbers of that."""
             varies = perturbed(moving)
 
-            def cotangents(leaves, found, given):
-                g = jax.tree.unflatten(structure, put([None] * len(found), places, given))
-                by_rules = rules.pull(varies, of.whole(leaves), jax.tree.unflatten(structure, found), g)
+            def cotangents(leaves, ends, given):
+                g = jax.tree.unflatten(structure, put([None] * len(ends), places, given))
+                by_rules = rules.pull(varies, of.whole(leaves), jax.tree.unflatten(structure, ends), g)
                 return jax.tree.leaves(eqx.filter(by_rules, varies))  # rules may give more
 
             return cotangents
 
-        @with_usual_promotion
-        def rule(leaves, tangents):
-            moving = _moving(tangents)
-            along = [tangents[i] for i in moving]
-            found = own(*leaves)
-            ends = jax.lax.stop_gradient(jax.tree.leaves(found))
-            places = [i for i, x in enumerate(ends) if _is_number(x)]
-            pulls = partial(pulled, jax.tree.structure(found), places)
-            way = BothWays(rates_along, pulls, lambda moving: rules.reason_against_second(*perturbed(moving)), shapes(leaves), shapes(ends), places)
-            return found, _without_gaps(found, way.pushes(moving)([*leaves, *ends], along))
+        ends, structure = jax.tree.flatten(jax.lax.stop_gradient(found))
+        places = [i for i, x in enumerate(ends) if _is_number(x)]
+        reason = lambda moving: rules.reason_against_second(*perturbed(moving))  # noqa: E731
+        way = BothWays(lambda moving: partial(pushed, moving), pulled, reason, shapes(leaves), shapes(ends), places)
+        return _without_gaps(found, way.pushes(moving)([*leaves, *ends], along))
 
-        own.defjvp(rule, symbolic_zeros=True)
-        return own(*leaves)
-
-    return called
+    return _with_rates(run, rates)
 
 
 def _without_gaps(found, rates: list):

@@ -264,7 +264,7 @@ def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backe
     scene = as_scene(scene)
     structure_of(scene)  # says what is wrong
     model = modelled(scene, formulation, backend)
-    model.usual(False), model.usual(True)
+    model.usual(False), model.usual(True), model.way
     formulation = replace(model.formulation, state="full" if model.field().independent is None else "minimal")
     settled = Model(scene, formulation, backend, Reference(scene), None if memory is None else bytes_of(memory))
     modelled(settled).made.update(model.made)

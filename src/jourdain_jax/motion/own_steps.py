@@ -25,7 +25,8 @@ from jourdain_jax.motion.integrators.explicit_steps import Method, method_of
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
 from jourdain_jax.motion.integrators.problem import Problem
 from jourdain_jax.motion.native import native_motion
-from jourdain_jax.motion.native.functions import Form, reason_against_derivatives
+from jourdain_jax.motion.native.functions import reason_against_derivatives
+from jourdain_jax.motion.native.layout import Form
 from jourdain_jax.motion.native.loop import OF_SAMPLES, flow
 from jourdain_jax.motion.native.native_motion import driven, numbers_of
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
@@ -122,7 +123,7 @@ class OwnSteps(Integrator):
     def _by_machine_code(self, setup: Setup, begun: Begun) -> Solved:
         form, start = self._form(setup), native_motion.start_of(setup, begun)
         assert isinstance(self.solver, Method)
-        return native_motion.solved(form.layout, start.goals, flow(form, self.solver, self.order)(start))
+        return native_motion.solved(form, start.goals, flow(form, self.solver, self.order)(start))
 
     def _pulled(self, perturbed: tuple, arguments: tuple[Setup, Begun], found: Solved, g: Solved) -> tuple:
         """Cotangents of what varies, from those of the motion that was found."""

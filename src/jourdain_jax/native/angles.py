@@ -203,27 +203,27 @@ def _reduced_far(w: Writer, x: Value) -> tuple[Value, Value, Value]:
 def _write_far_angle(w: Writer, x: Value, r: Value, over: Value, quadrant: Value) -> None:
     bits = w.load(x, type="i64")
     m = w.converted("zext", (bits & (2**52 - 1)) | 2**52, "i128")
-    start = (w.bitwise("lshr", bits, 52) & 2047) - (1077 - 64)  # of the bits of 2/pi, after a word of zeros
-    word, shift = w.bitwise("ashr", start, 6), start & 63
+    start = (w.binary("lshr", bits, 52) & 2047) - (1077 - 64)  # of the bits of 2/pi, after a word of zeros
+    word, shift = w.binary("ashr", start, 6), start & 63
 
     def digits(k: int) -> Value:
         """64 bits of 2/pi."""
         table = Value(w, "ptr", "@two_over_pi")
-        both = w.bitwise("shl", w.converted("zext", w.load(table, word + k, "i64"), "i128"), 64) | w.converted(
+        both = w.binary("shl", w.converted("zext", w.load(table, word + k, "i64"), "i128"), 64) | w.converted(
             "zext", w.load(table, word + (k + 1), "i64"), "i128"
         )
-        return w.bitwise("lshr", w.bitwise("shl", both, w.converted("zext", shift, "i128")), 64)
+        return w.binary("lshr", w.binary("shl", both, w.converted("zext", shift, "i128")), 64)
 
     # in units of 2^-126 quarter turns, without whole turns
-    product = w.bitwise("shl", m * digits(0), 64) + m * digits(1) + w.bitwise("lshr", m * digits(2), 64)
-    turns = w.bitwise("lshr", product + 2**125, 126)
-    left = product - w.bitwise("shl", turns, 126)
+    product = w.binary("shl", m * digits(0), 64) + m * digits(1) + w.binary("lshr", m * digits(2), 64)
+    turns = w.binary("lshr", product + 2**125, 126)
+    left = product - w.binary("shl", turns, 126)
     # three parts of 43 bits, each exact
     parts = []
     for low in (86, 43, 0):
-        part = w.bitwise("ashr", left, low)
+        part = w.binary("ashr", left, low)
         parts.append(w.converted("sitofp", w.converted("trunc", part, "i64"), "double") * 2.0 ** (low - 126))
-        left = left - w.bitwise("shl", part, low)
+        left = left - w.binary("shl", part, low)
     head, rest = two_sum(parts[0], parts[1])
     head, more = two_sum(head, parts[2] + rest)
     angle = head * _HALF_PI[0]
@@ -240,8 +240,8 @@ def _write_far_angle(w: Writer, x: Value, r: Value, over: Value, quadrant: Value
 
 def _turned(w: Writer, x: Value, quadrant: Value) -> Value:
     """x, with the other sign in the third and fourth quadrant, which have the numbers 2 and 3."""
-    sign = w.bitwise("shl", quadrant & 2, 62)
-    return w.converted("bitcast", w.bitwise("xor", w.converted("bitcast", x, w.whole), sign), w.real)
+    sign = w.binary("shl", quadrant & 2, 62)
+    return w.converted("bitcast", w.binary("xor", w.converted("bitcast", x, w.whole), sign), w.real)
 
 
 def arctangent(w: Writer, x: Value) -> Value:
@@ -289,7 +289,7 @@ def _direction(w: Writer, across: Value, x: Value) -> Value:
     n = w.where(middle, 1.0, 0.0)
     n = w.where(steep, 2.0 - n, n)
     n = w.where(back, 4.0 - n, n)
-    way = w.where(w.bitwise("xor", steep, back), -1.0, w.number(1.0))
+    way = w.where(w.binary("xor", steep, back), -1.0, w.number(1.0))
     return _arc(w, 0.25 * n, way, q, rest)
 
 

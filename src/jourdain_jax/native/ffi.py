@@ -116,18 +116,13 @@ def answer_metadata(w: Writer, frame: Value) -> None:
     known = version()
     assert known is not None
     extension = w.load(frame, 1, "ptr")
-    asked, called = w.label(), w.label()
-    is_asked = w.label()
-    none = w.compared("eq", w.converted("ptrtoint", extension, "i64"), 0)
-    w.go(called, none, is_asked)
-    w.place(is_asked)
-    w.go(asked, w.load(extension, 2, "i32").equals(1), called)  # the kind of an extension, in its second word
-    w.place(asked)
-    metadata = w.load(extension, 3, "ptr")
-    for place, number in enumerate((*known, 0), 6):  # major and minor version in the fourth word, then flags
-        w.store(w.literal(number, "i32"), metadata, place)
-    w.give(Value(w, "ptr", "null"))
-    w.place(called)
+    with w.when(w.converted("ptrtoint", extension, "i64").differs(0)):
+        asked = w.load(extension, 2, "i32").equals(1)  # the kind of an extension, in its second word
+        with w.when(asked):
+            metadata = w.load(extension, 3, "ptr")
+            for place, number in enumerate((*known, 0), 6):  # major and minor version in the fourth word, then flags
+                w.store(w.literal(number, "i32"), metadata, place)
+        w.give_where(asked, Value(w, "ptr", "null"))
 
 
 def _write_kernel(w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Value]], None]) -> None:
@@ -224,6 +219,18 @@ def share(w: Writer, job: Value, count: Value) -> None:
             w.external("pthread_join", "i32", w.load(others, number, "i64"), nothing)
 
 
+def taken_in(w: Writer, count: int, numbers: Value, rows: Value, lane: Value) -> None:
+    """A lane takes so many numbers, one after the other in memory, as its rows."""
+    with w.counted(0, count) as row:
+        w.store(w.load(numbers, row, "double"), rows, row * w.lanes + lane)
+
+
+def handed_out(w: Writer, count: int, rows: Value, lane: Value, numbers: Value) -> None:
+    """So many rows of a lane, put one after the other into memory."""
+    with w.counted(0, count) as row:
+        w.store(w.load(rows, row * w.lanes + lane, "double"), numbers, row)
+
+
 def write_rows(w: Writer, given: int, returned: int) -> None:
     """A handler that takes rows of `given` numbers to rows of `returned` ones, lanes side by side, by the module's `row(given, returned)`.
 
@@ -241,14 +248,12 @@ def write_rows(w: Writer, given: int, returned: int) -> None:
             with w.counted(0, w.lanes) as lane:
                 number = next_lane(w, job, NEXT)
                 w.store(number, who, lane)
-                last = w.where(number < count, number, count - 1)
-                with w.counted(0, given) as row:
-                    w.store(w.load(rows, last * given + row, "double"), state, row * w.lanes + lane)
+                taken_in(w, given, w.at(rows, w.where(number < count, number, count - 1) * given, "double"), state, lane)
             w.run("row", state, found)
             with w.counted(0, w.lanes) as lane:
                 number = w.load(who, lane, "i64")
-                with w.when(number < count), w.counted(0, returned) as row:
-                    w.store(w.load(found, row * w.lanes + lane, "double"), results, number * returned + row)
+                with w.when(number < count):
+                    handed_out(w, returned, found, lane, w.at(results, number * returned, "double"))
         w.give(Value(w, "ptr", "null"))
 
     def body(arguments: list[Given], results: list[Value]) -> None:

@@ -6,7 +6,6 @@ of the call's own: a counter of the lanes, and what threads need beyond their ow
 """
 
 import ctypes
-import functools
 import hashlib
 import threading
 from collections.abc import Sequence
@@ -66,10 +65,8 @@ def handler_text() -> str:
         api, asked = w.load(frame, 2, "ptr"), w.room(4, "i64")
         for word, value in enumerate((w.literal(32, "i64"), w.literal(0, "i64"), w.load(frame, 3, "i64"), w.literal(0, "i64"))):
             w.store(value, asked, word)
-        failed = w.through(w.load(api, 10, "ptr"), "ptr", asked)  # `XLA_FFI_Stream_Get`
-        with w.when(w.converted("ptrtoint", failed, "i64").differs(0)):
-            w.give(failed)
-            w.place(w.label())
+        failed = w.call(w.load(api, 10, "ptr"), "ptr", asked)  # `XLA_FFI_Stream_Get`
+        w.give_where(w.converted("ptrtoint", failed, "i64").differs(0), failed)
         stream, code, parameters = w.load(asked, 3, "ptr"), w.room(type="i32"), w.room(type="ptr")
         w.store(words, parameters)
         w.store(w.external("cuMemsetD32Async", "i32", scratch, w.literal(0, "i32"), w.literal(2, "i64"), stream), code)
@@ -84,7 +81,7 @@ def handler_text() -> str:
             kind = w.where(w.load(code, type="i32").equals(2), w.literal(8, "i64"), 13)
             for word, value in enumerate((w.literal(28, "i64"), w.literal(0, "i64"), w.load(message, type="i64"), kind)):
                 w.store(value, error, word)
-            w.give(w.through(w.load(api, 6, "ptr"), "ptr", error))  # `XLA_FFI_Error_Create`
+            w.give(w.call(w.load(api, 6, "ptr"), "ptr", error))  # `XLA_FFI_Error_Create`
             w.place(w.label())
         w.give(nothing)
     return w.text
@@ -100,7 +97,6 @@ def _write_described(w: Writer) -> None:
         w.give()
 
 
-@functools.cache
 def _handler() -> str:
     """The name under which JAX calls kernels."""
     for name in ("cuMemsetD32Async", "cuLaunchKernel", "cuGetErrorString"):

@@ -29,8 +29,7 @@ class Value:
     def __add__(self, other) -> "Value":
         return self.writer.binary("add", self, other)
 
-    def __radd__(self, other) -> "Value":
-        return self.writer.binary("add", self, other)
+    __radd__ = __add__
 
     def __sub__(self, other) -> "Value":
         return self.writer.binary("sub", self, other)
@@ -41,8 +40,7 @@ class Value:
     def __mul__(self, other) -> "Value":
         return self.writer.binary("mul", self, other)
 
-    def __rmul__(self, other) -> "Value":
-        return self.writer.binary("mul", self, other)
+    __rmul__ = __mul__
 
     def __truediv__(self, other) -> "Value":
         return self.writer.binary("div", self, other)
@@ -74,16 +72,16 @@ class Value:
         return self.writer.compared("ne", self, other)
 
     def __and__(self, other) -> "Value":
-        return self.writer.bitwise("and", self, other)
+        return self.writer.binary("and", self, other)
 
     def __or__(self, other) -> "Value":
-        return self.writer.bitwise("or", self, other)
+        return self.writer.binary("or", self, other)
 
     def __xor__(self, other) -> "Value":
-        return self.writer.bitwise("xor", self, other)
+        return self.writer.binary("xor", self, other)
 
     def __invert__(self) -> "Value":
-        return self.writer.bitwise("xor", self, -1)
+        return self.writer.binary("xor", self, -1)
 
 
 class Writer:
@@ -132,6 +130,12 @@ class Writer:
     def give(self, value: Value | None = None) -> None:
         """Returns from the function."""
         self._lines.append("  ret void" if value is None else f"  ret {value.type} {value.name}")
+
+    def give_where(self, condition: Value, value: Value | None = None) -> None:
+        """Returns from the function where the condition holds."""
+        with self.when(condition):
+            self.give(value)
+            self.place(self.label())
 
     def label(self) -> str:
         """A new name of a place."""
@@ -204,14 +208,9 @@ class Writer:
         return self.literal(value, self.real)
 
     def binary(self, op: str, a: Value, b) -> Value:
-        """A sum, difference, product or quotient."""
+        """A sum, difference, product or quotient; an operation on truth values or whole numbers, bit by bit."""
         b, prefix = self.literal(b, a.type), "f" if "double" in a.type else ""
         return self.instruction(a.type, f"{prefix}{op} {a.type} {a.name}, {b.name}")
-
-    def bitwise(self, op: str, a: Value, b) -> Value:
-        """An operation on truth values or whole numbers, bit by bit."""
-        b = self.literal(b, a.type)
-        return self.instruction(a.type, f"{op} {a.type} {a.name}, {b.name}")
 
     def compared(self, op: str, a: Value, b) -> Value:
         """A comparison; with NaN only `ne` holds."""
@@ -229,9 +228,10 @@ class Writer:
         a, b = self.literal(a, like.type), self.literal(b, like.type)
         return self.instruction(a.type, f"select {condition.type} {condition.name}, {a.type} {a.name}, {b.type} {b.name}")
 
-    def call(self, function: str, result: str, *arguments: Value) -> Value:
-        """The result of a function."""
-        return self.instruction(result, f"call {result} @{function}({', '.join(f'{a.type} {a.name}' for a in arguments)})")
+    def call(self, function: str | Value, result: str, *arguments: Value) -> Value:
+        """The result of a function, of this name, or to which this points."""
+        name = function.name if isinstance(function, Value) else f"@{function}"
+        return self.instruction(result, f"call {result} {name}({', '.join(f'{a.type} {a.name}' for a in arguments)})")
 
     def run(self, function: str, *arguments: Value) -> None:
         """Calls a function that returns nothing."""
@@ -248,10 +248,6 @@ class Writer:
     def declare(self, name: str, text: str) -> None:
         """A declaration at the end of the module."""
         self._declared[name] = text
-
-    def through(self, pointer: Value, result: str, *arguments: Value) -> Value:
-        """The result of a function that a pointer points to."""
-        return self.instruction(result, f"call {result} {pointer.name}({', '.join(f'{a.type} {a.name}' for a in arguments)})")
 
     def shared(self, name: str, body: Callable[..., Value], *arguments: Value) -> Value:
         """The result of a function of vectors that stands in the module once, so that each use takes one call to compile; `body(w, *arguments)` writes it."""

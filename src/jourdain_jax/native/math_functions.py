@@ -51,12 +51,12 @@ def _bits(x: float) -> int:
 
 
 def _power_of_two(w: Writer, k: Value) -> Value:
-    return w.converted("bitcast", w.bitwise("shl", k + 1023, 52), w.real)
+    return w.converted("bitcast", w.binary("shl", k + 1023, 52), w.real)
 
 
 def _scaled(w: Writer, x: Value, k: Value) -> Value:
     """2^k x, in two factors, neither of which overflows."""
-    half = w.bitwise("ashr", k, 1)
+    half = w.binary("ashr", k, 1)
     return x * _power_of_two(w, half) * _power_of_two(w, k - half)
 
 
@@ -93,8 +93,8 @@ def _mantissa(w: Writer, x: Value) -> tuple[Value, Value]:
     """k and m of x = 2^k m with m from sqrt(1/2) to sqrt(2), for an x that is positive and finite."""
     small = x < 2.0**-1022
     bits = w.converted("bitcast", w.where(small, x * 2.0**54, x), w.whole)
-    biased = w.bitwise("lshr", bits + (_bits(1.0) - _bits(math.sqrt(0.5))), 52)  # k + 1023
-    m = w.converted("bitcast", bits - w.bitwise("shl", biased, 52) + _bits(1.0), w.real)
+    biased = w.binary("lshr", bits + (_bits(1.0) - _bits(math.sqrt(0.5))), 52)  # k + 1023
+    m = w.converted("bitcast", bits - w.binary("shl", biased, 52) + _bits(1.0), w.real)
     k = w.converted("bitcast", biased | _bits(2.0**52), w.real) - w.where(small, 2.0**52 + 1077, w.number(2.0**52 + 1023))
     return k, m
 

@@ -88,22 +88,22 @@ def _devices() -> range:
     return range(count.value)  # their handles are their numbers
 
 
-def _of_device(attribute: int) -> int:
-    """The least of any device's."""
-    found, each = ctypes.c_int(), []
+def _least(function: str, found, *what: int) -> int:
+    """The least of what the driver says of a device, of all devices."""
+    each = []
     for device in _devices():
-        _checked(driver().cuDeviceGetAttribute(ctypes.byref(found), attribute, device))
+        _checked(getattr(driver(), function)(ctypes.byref(found), *what, device))
         each.append(found.value)
     return min(each)
+
+
+def _of_device(attribute: int) -> int:
+    return _least("cuDeviceGetAttribute", ctypes.c_int(), attribute)
 
 
 def memory() -> int:
     """Bytes of the smallest device."""
-    found, each = ctypes.c_size_t(), []
-    for device in _devices():
-        _checked(driver().cuDeviceTotalMem_v2(ctypes.byref(found), device))
-        each.append(found.value)
-    return min(each)
+    return _least("cuDeviceTotalMem_v2", ctypes.c_size_t())
 
 
 def architecture() -> str:

@@ -158,7 +158,7 @@ def as_truth(w: Writer, a: Value) -> Value:
 
 def _operation(w: Writer, op: str, args: list[Value]) -> Value:
     if op in _TRUTHS:
-        return w.bitwise(_TRUTHS[op], as_truth(w, args[0]), as_truth(w, args[1]))
+        return w.binary(_TRUTHS[op], as_truth(w, args[0]), as_truth(w, args[1]))
     if op == "not":
         return ~as_truth(w, args[0])
     if op == "select":

@@ -28,11 +28,11 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.derivatives import filled
 from jourdain_jax.motion.integrators.event_search import RUNNING, chosen
 from jourdain_jax.motion.integrators.explicit_steps import Method
-from jourdain_jax.motion.native.functions import Form, write_pulled
-from jourdain_jax.motion.native.layout import Lanes, arguments_of_samples, begin_samples, copied, each_row, nearer_knot, pass_knot
-from jourdain_jax.motion.native.loop import COUNT, FIRST_OF_SAMPLES, MOST_KERNELS, TIMES, Start, with_tangents, write_functions, write_job
-from jourdain_jax.motion.native.record import GOALS, STARTS, TO_ENDS, TO_STATES, Slot, prepare, write_record
-from jourdain_jax.motion.native.step import IDLE, near_rank_loss, put_near_rows, slope_is_flat, squares_of, weighted
+from jourdain_jax.motion.native.functions import write_pulled
+from jourdain_jax.motion.native.layout import Form, Lanes, arguments_of_samples, copied, each_row, pass_knot, set_goal
+from jourdain_jax.motion.native.loop import MOST_KERNELS, TIMES, Start, begin_lane, with_tangents, write_functions, write_job
+from jourdain_jax.motion.native.record import GOALS, TO_ENDS, TO_STATES, Slot, prepare, write_record
+from jourdain_jax.motion.native.step import near_rank_loss, put_near_rows, slope_is_flat, squares_of, weighted
 from jourdain_jax.motion.native.values import called
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native.ffi import write_handler
@@ -53,35 +53,20 @@ def write_back(w: Writer, form: Form, method: Method, asked: Sequence[int]) -> N
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
         write_record(w, form, method, len(asked), job)
         w.give(Value(w, "ptr", "null"))
-    write_handler(w, 4 + arguments_of_samples(form.layout), 1, lambda arguments, results: write_job(w, form, arguments, results))
+    write_handler(w, 4 + arguments_of_samples(form), 1, lambda arguments, results: write_job(w, form, arguments, results))
 
 
 def _write_begin(w: Writer, form: Form) -> None:
-    """`begin(job, state, who, lane)`: the start of the lane of the batch that has this place; where there is none, it is idle."""
+    """`begin(job, state, who, lane)`: the start of the lane of the batch that has this place."""
     with w.procedure("begin", "job state who lane:i64") as (job, state, who, lane):
-        lanes, given = Lanes(w, form.layout, state), form.layout.given
         number = w.load(who, lane, "i64")
-        there = number >= 0
-        with w.when(there):
-            starts = w.load(job, STARTS, "ptr")
-            with w.counted(0, given) as row:
-                w.store(w.load(starts, number * given + row, "double"), lanes.place(row, lane))
-            lanes.set("goal", lane, w.load(w.load(job, GOALS, "ptr"), number * w.load(job, TIMES, "i64"), "double"))
-        with w.when(~there):
-            lanes.set("code", lane, IDLE)
-        if form.sampled:  # places without a lane are worked out too
-            words = w.at(job, FIRST_OF_SAMPLES, "i64")
-            begin_samples(w, form.layout, words, w.load(job, COUNT, "i64"), lanes, lane, w.where(there, number, 0))
-            lanes.set("goal", lane, nearer_knot(w, lanes, lane, lanes.of("goal", lane)))
-        lanes.set("taken", lane, 0.0)
-        if form.has_events:
-            lanes.set("search_left", lane, 0.0)
+        begin_lane(w, form, job, w.load(job, GOALS, "ptr"), Lanes(w, form, state), lane, number, number >= 0)
 
 
 def _write_note(w: Writer, form: Form) -> None:
     """`note(job, state, who, saved)`: counts the times that were reached, sets the next one, and ends lanes that have reached all."""
     with w.procedure("note", "job state who saved") as (job, state, who, saved):
-        lanes = Lanes(w, form.layout, state)
+        lanes = Lanes(w, form, state)
         with w.when(w.any(lanes["code"].equals(RUNNING) & lanes["t"].equals(lanes["goal"]))), w.counted(0, w.lanes) as lane:
             times, number = w.load(job, TIMES, "i64"), w.load(who, lane, "i64")
             with w.repeated() as leave:
@@ -98,13 +83,12 @@ def _write_note(w: Writer, form: Form) -> None:
                 with w.when(reached >= times):
                     lanes.set("code", lane, results.SUCCESS)
                 with w.when(reached < times):
-                    goal = w.load(goals, number * times + reached, "double")
-                    lanes.set("goal", lane, nearer_knot(w, lanes, lane, goal) if form.sampled else goal)
+                    set_goal(w, lanes, lane, w.load(goals, number * times + reached, "double"))
 
 
 def _write_added(w: Writer, form: Form) -> None:
     """`added(job, who, first, end, g)`: adds the cotangents of the states saved at the times number `first` to `end - 1`."""
-    count = form.layout.integrated
+    count = form.integrated
     with w.procedure("added", "job who first:real end:real g") as (job, who, first, end, g):
         firsts, ends = w.room(), w.room()
         w.store(first, firsts)
@@ -121,8 +105,8 @@ def _write_added(w: Writer, form: Form) -> None:
 
 def _write_step_back(w: Writer, form: Form, method: Method, asked: int) -> None:
     """`step_back(state, here, g, by_known)`: back over the step in the slot `here`, in lanes that went on in it."""
-    layout, slot = form.layout, Slot.of(form, method)
-    count = layout.integrated
+    slot = Slot.of(form, method)
+    count = form.integrated
     with w.procedure("step_back", "state here g by_known") as (state, here, g, by_known):
         h, t = w.load(here, slot.taken), w.load(here, slot.t)
         took, k = h.differs(0.0), w.at(here, slot.y)
@@ -130,12 +114,12 @@ def _write_step_back(w: Writer, form: Form, method: Method, asked: int) -> None:
         copied(w, count, g, g1)
         each_row(w, asked, added, lambda i: 0.0)
         if form.projects:
-            each_row(w, count, at, lambda i: w.fma(h, weighted(w, method.b, k, layout, i), w.load(here, i)))
+            each_row(w, count, at, lambda i: w.fma(h, weighted(w, method.b, k, form, i), w.load(here, i)))
             _project_back(w, form, state, t + h, at, g1, added)
 
         def state_at(stage: int, i: int | Value) -> Value:
             start = w.load(here, i)
-            return w.fma(h, weighted(w, method.A[stage], k, layout, i), start) if stage else start
+            return w.fma(h, weighted(w, method.A[stage], k, form, i), start) if stage else start
 
         def cotangent(stage: int, later: list[int], i: int | Value) -> Value:
             total = w.load(g1, i) * float(method.b[stage])
@@ -157,7 +141,7 @@ def _write_step_back(w: Writer, form: Form, method: Method, asked: int) -> None:
             each_row(w, count, at, partial(state_at, stage))
             each_row(w, count, v, partial(cotangent, stage, later))
             if near is not None and stage:
-                put_near_rows(w, layout, state, near, time, at)
+                put_near_rows(w, form, state, near, time, at)
             w.run("pull_rates", state, time, at, v, of_stage, added)
             if near is not None and stage:
                 with w.when(w.any(near)):
@@ -177,7 +161,7 @@ def _write_step_back(w: Writer, form: Form, method: Method, asked: int) -> None:
 
 def _project_back_where(w: Writer, form: Form, near: Value, at: tuple[Value, Value, Value], g: Value, added: Value, asked: int) -> None:
     """Cotangents `g` of a stage's state, put back onto the rows in lanes that are `near` a loss of rank; `at`: lanes, time, and the state before."""
-    count = form.layout.integrated
+    count = form.integrated
     pulled, more = w.room(count), w.room(max(asked, 1))
     copied(w, count, g, pulled)
     copied(w, asked, added, more)
@@ -189,7 +173,7 @@ def _project_back_where(w: Writer, form: Form, near: Value, at: tuple[Value, Val
 def _project_back(w: Writer, form: Form, state: Value, t1: Value, free: Value, g: Value, added: Value) -> None:
     """Cotangents `g` of a state put back onto the rows become those of the state `free` before."""
     moves = form.moves
-    count = form.layout.integrated
+    count = form.integrated
     before = w.room(count * len(moves))
     for number, q_moves in enumerate(moves):
         copied(w, count, free, w.at(before, number * count))
@@ -202,26 +186,26 @@ def _project_back(w: Writer, form: Form, state: Value, t1: Value, free: Value, g
 
 def _write_event_back(w: Writer, form: Form, asked: int) -> None:
     """`event_back(job, state, who, g, by_known)`: cotangents at the time and state of an event become those of a state at a number for a time."""
-    layout, count = form.layout, form.layout.integrated
+    count = form.integrated
     with w.procedure("event_back", "job state who g by_known") as (job, state, who, g, by_known):
-        lanes = Lanes(w, layout, state)
+        lanes = Lanes(w, form, state)
         located = lanes["code"].equals(results.EVENT) & (lanes["accepted"] > 0.0)
         with w.when(w.any(located)):
             f, out, pivots, added = (w.room(max(n, 1)) for n in (count, count, len(form.monitored), asked + 1))
-            values, rates, weights = (w.room(layout.events) for _ in range(3))
+            values, rates, weights = (w.room(form.events) for _ in range(3))
             t, g_t = lanes["t"], w.room(1 + len(form.moving))
             with w.counted(0, w.lanes) as lane, w.counted(0, 1 + len(form.moving)) as row:
                 number = w.load(who, lane, "i64")
-                there = w.load(w.load(job, TO_ENDS, "ptr"), w.where(number >= 0, number, 0) * layout.ends + count + row, "double")
+                there = w.load(w.load(job, TO_ENDS, "ptr"), w.where(number >= 0, number, 0) * form.ends + count + row, "double")
                 w.store(there, w.at(g_t, row * w.lanes + lane, "double"))
             w.run("rates", state, t, state, f, pivots)
             if form.moving:  # the tangent, and its rates, at a number for a time
-                dy, dt = w.at(state, layout.y), lanes["dt"]
-                each_row(w, layout.y, dy, lambda i: w.load(dy, i) - w.where(dt.differs(0.0), dt * w.load(f, i), 0.0))
+                dy, dt = w.at(state, form.y), lanes["dt"]
+                each_row(w, form.y, dy, lambda i: w.load(dy, i) - w.where(dt.differs(0.0), dt * w.load(f, i), 0.0))
                 lanes["dt"] = w.number(0.0)
                 w.run("rates", state, t, state, f, pivots)
             w.run("events", state, t, state, f, values, rates)
-            rate = chosen(w, lanes["event"], [w.load(rates, i) for i in range(layout.events)])
+            rate = chosen(w, lanes["event"], [w.load(rates, i) for i in range(form.events)])
             usable = located & rate.differs(0.0) & (w.magnitude(rate) < math.inf)
             each_row(w, asked + 1, added, lambda i: 0.0)
             total = w.load(g_t)
@@ -232,7 +216,7 @@ def _write_event_back(w: Writer, form: Form, asked: int) -> None:
             flat = located & slope_is_flat(w, lanes, rate) & total.differs(0.0)
             by_value = w.where(flat, math.nan, w.where(usable, -total / rate, 0.0))
             usable = usable | flat
-            for i in range(layout.events):
+            for i in range(form.events):
                 w.store(w.where(lanes["event"].equals(i), by_value, 0.0), weights, i)
             w.run("pull_events", state, t, state, weights, out, added)
             each_row(w, count, g, lambda i: w.load(g, i) + w.where(usable, w.load(out, i), 0.0))
@@ -241,8 +225,8 @@ def _write_event_back(w: Writer, form: Form, asked: int) -> None:
 
 def _moved_back(w: Writer, form: Form, lanes: Lanes, usable: Value, cotangents: tuple[Value, Value], rooms: tuple[Value, Value], asked: int) -> Value:
     """The derivative along time of what an event adds to a tangent; changes the cotangents `g` of the state, the first of these, and adds to the others."""
-    (g, g_dt), (out, added), layout = cotangents, rooms, form.layout
-    given, count = w.room(layout.integrated + 2), layout.integrated
+    (g, g_dt), (out, added) = cotangents, rooms
+    given, count = w.room(form.integrated + 2), form.integrated
     copied(w, count, g, given)
     w.store(g_dt, given, count)
     w.store(lanes["event"], given, count + 1)
@@ -257,8 +241,8 @@ def kernel_back(form: Form, method: Method, asked: tuple[int, ...]) -> Callable:
 
     It returns cotangents of the state at the start, and of the numbers `asked` for of those that the rates are given. A state has its tangent after it.
     """
-    count = form.layout.integrated + len(asked)
-    run_rows = called(lambda w: write_back(w, form, method, asked), lambda *_: ((count,),), arguments_of_samples(form.layout))
+    count = form.integrated + len(asked)
+    run_rows = called(lambda w: write_back(w, form, method, asked), lambda *_: ((count,),), arguments_of_samples(form))
     return lambda *arguments: run_rows(*arguments)[0]
 
 
@@ -266,7 +250,7 @@ def flow_back(form: Form, method: Method, asked: tuple[int, ...]) -> Callable[..
     """Cotangents of the start's state, and of the numbers `asked` for of those known, as a function of the start, and of cotangents of the states at the
     goals, and of the end and its time.
     """
-    n = form.layout.y
+    n = form.y
 
     @jax.custom_jvp
     def own(start: Start, g: Float[Array, "times y"], ends: Float[Array, "ends"]):

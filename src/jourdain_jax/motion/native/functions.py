@@ -10,95 +10,16 @@ motion with its tangent are what second derivatives consist of.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
 from jourdain_jax.calculus.derivatives import DifferentiationModeError
-from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.lowering.relations import MOST_WATCHED
-from jourdain_jax.motion.native.layout import Lanes, Layout, looked_up
+from jourdain_jax.motion.native.layout import Form, Lanes, looked_up
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.scalar_program import as_real, unsupported, written, written_in_turn
-from jourdain_jax.program.derivative import cotangents, directional_derivative, on_its_own
+from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
 from jourdain_jax.program.graph import Graph
-
-
-@dataclass(frozen=True)
-class Form:
-    """What is integrated: a lowered scene, with or without work, projection, events and pivots that are monitored."""
-
-    program: Lowered
-    with_work: bool
-    projects: bool
-    affine: bool
-    has_events: bool
-    pivots: int  # how many are monitored
-    moving: tuple[tuple[int, ...], ...] = ()  # of every tangent (`Layout`), which of the numbers known have it
-    sampled: tuple[int, ...] = ()  # which of the inputs are given by samples
-    time_moves: bool = False  # whether time has tangents
-
-    @property
-    def layout(self) -> Layout:
-        """The rows of a lane."""
-        program = self.program
-        known = len(program.fixed) + len(program.inputs)
-        return Layout(
-            len(program.qdot),
-            len(program.ydot),
-            self.with_work,
-            known,
-            len(program.events) if self.has_events else 0,
-            tuple(map(len, self.moving)),
-            len(self.sampled),
-            len(self.watched),
-        )
-
-    @property
-    def rates(self) -> list[int]:
-        """The rates of the state."""
-        program = self.program
-        return [*program.qdot, *program.ydot, *([program.power] if self.with_work else [])]
-
-    @property
-    def relations(self) -> tuple[int, ...]:
-        """The numbers whose signs are watched; none where there are too many."""
-        found = self.program.watched(self.has_events)
-        return found if len(found) <= MOST_WATCHED else ()
-
-    @property
-    def watched(self) -> tuple[int, ...]:
-        """These, and the values of stop events that relations decide."""
-        return (*self.relations, *(self.program.events if self.relations and self.has_events and self.program.event_relations else ()))
-
-    @property
-    def monitored(self) -> list[int]:
-        """What is watched at all stages of a step: pivots first, then directions of rows, then how far rows are from losing rank."""
-        return [*self.program.pivots[: self.pivots], *self.program.directions, *self.squares]
-
-    @property
-    def squares(self) -> tuple[int, ...]:
-        """What is left of rows beside those before them, and their sizes, by turns."""
-        return self.program.squares if self.projects else ()
-
-    @property
-    def directions(self) -> list[range]:
-        """Which of these are the entries of a direction, one direction after the other."""
-        first, width = self.pivots, len(self.program.ydot)
-        return [range(k, k + width) for k in range(first, first + len(self.program.directions), max(width, 1))]
-
-    @property
-    def moves(self) -> list[int]:
-        """A projection step by step, 1: of the coordinates, 0: of the speeds."""
-        return [1, 1] + [0] * (0 if not self.program.projected_u else 1 if self.affine else 2)
-
-    @property
-    def nodes(self) -> list[int]:
-        """All that is evaluated."""
-        program = self.program
-        projected = [*program.projected_q, *program.projected_u] if self.projects else []
-        events = program.events if self.has_events else ()
-        return [*self.rates, *program.guards, *program.pivots, *program.directions, *self.squares, *projected, *events, *self.watched]
 
 
 class Outputs(NamedTuple):
@@ -116,27 +37,25 @@ class Outputs(NamedTuple):
 
 def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
     """The first `pushed` of the nodes with their tangents."""
-    program, layout, count = form.program, form.layout, len(form.moving)
+    program, count = form.program, len(form.moving)
     if not count:
         return Outputs(program.graph, list(nodes), [], program.variables, [], [], [], [])
     graph, values, variables = on_its_own(program.graph, nodes, program.variables)
-    first = len(program.fixed)  # time, then the state
-    y = variables[first + 1 : first + 1 + layout.coordinates + layout.speeds]
-    others = [*variables[:first], *variables[first + 1 + len(y) :]]
+    fixed, t, y, inputs = form.split(variables)
     states = [[graph.input(f"tangent {k} of state {i}", True) for i in range(len(y))] for k in range(count)]
     known = [{i: graph.input(f"tangent {k} of number {i}", True) for i in moving} for k, moving in enumerate(form.moving)]
     times = [graph.input(f"tangent {k} of time", True) for k in range(count if form.time_moves else 0)]
     slopes = [graph.input(f"slope of input {i}", True) for i in (form.sampled if form.time_moves else ())]
-    inputs = {len(variables) - 1 - len(program.inputs) + i: n for i, n in zip(form.sampled, slopes, strict=False)}
+    sampled = {len(y) + len(fixed) + i: n for i, n in zip(form.sampled, slopes, strict=False)}
     # all that varies, and its tangents, in the order of these
-    given = [dict(enumerate([*y, *others, variables[first]]))]
+    given = [dict(enumerate([*y, *fixed, *inputs, t]))]
     for k in range(count):
-        of_time = {len(variables) - 1: times[k]} | {i: graph.mul(n, times[k]) for i, n in inputs.items()} if times else {}
+        of_time = {len(variables) - 1: times[k]} | {i: graph.mul(n, times[k]) for i, n in sampled.items()} if times else {}
         given.append(dict(enumerate(states[k])) | {len(y) + i: n for i, n in known[k].items()} | of_time)
     found = [values[:pushed]]
     while len(found) <= count:
         direction = {given[k][i]: n for k in range(len(found)) for i, n in given[k + len(found)].items()}
-        rates = [rate.get(0, graph.zero) for rate in directional_derivative(graph, [n for part in found for n in part], {0: direction})]
+        rates = derivatives(graph, [n for part in found for n in part], direction)
         found += [rates[k * pushed : (k + 1) * pushed] for k in range(len(found))]
     return Outputs(graph, values, found[1:], variables, states, [n for part in known for n in part.values()], times, slopes)
 
@@ -151,54 +70,54 @@ def _found(w: Writer, form: Form, own: Outputs, known: dict[int, Value], state: 
 
 def given_values(w: Writer, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value) -> dict[int, Value]:
     """Values of all nodes of outputs that are given from outside; `known`: as from `known_values`."""
-    given, lanes = dict(zip(own.variables, known.values(), strict=True)), Lanes(w, form.layout, state)
+    given, lanes = dict(zip(own.variables, known.values(), strict=True)), Lanes(w, form, state)
     for k, states in enumerate(own.states):
-        given |= {n: w.load(y, (k + 1) * form.layout.y + i) for i, n in enumerate(states)}
+        given |= {n: w.load(y, (k + 1) * form.y + i) for i, n in enumerate(states)}
     given |= dict(zip(own.known, lanes.every("dknown"), strict=True)) if own.known else {}
     given |= dict(zip(own.times, lanes.every("dt"), strict=True)) if own.times else {}
-    given |= dict(zip(own.slopes, looked_up(w, form.layout, state, tau, True)[form.layout.sampled :], strict=True)) if own.slopes else {}
+    given |= dict(zip(own.slopes, looked_up(w, form, state, tau, True)[len(form.sampled) :], strict=True)) if own.slopes else {}
     return given
 
 
 def known_values(w: Writer, form: Form, state: Value, tau: Value, y: Value) -> dict[int, Value]:
     """Values of all nodes that are given from outside."""
-    program, layout, lanes = form.program, form.layout, Lanes(w, form.layout, state)
-    states = [w.load(y, k) for k in range(layout.coordinates + layout.speeds)]
+    program, lanes = form.program, Lanes(w, form, state)
+    states = [w.load(y, k) for k in range(form.q_and_v)]
     known, fixed, t = lanes.every("known"), len(program.fixed), lanes["origin"] + tau
-    found = dict(zip(form.sampled, looked_up(w, layout, state, tau, form.time_moves), strict=False))
+    found = dict(zip(form.sampled, looked_up(w, form, state, tau, form.time_moves), strict=False))
     inputs = [found.get(i, x) for i, x in enumerate(known[fixed:])]
     return dict(zip(program.variables, [*known[:fixed], t, *states, *inputs], strict=True))
 
 
 def write_rates(w: Writer, form: Form) -> None:
     """`rates(state, tau, y, k, pivots)`: the rates of the state `y` into `k`, and what is monitored, pivots relative to their usual sizes."""
-    program, layout = form.program, form.layout
+    program = form.program
     # 120 operations: so few are written anew at each stage
     how = "alwaysinline" if program.operations <= 120 else "noinline"
     arguments = {"state": "ptr", "tau": w.real, "y": "ptr", "k": "ptr", "pivots": "ptr"}
     with w.function("rates", "void", arguments, attributes=how) as (state, tau, y, k, pivots):
         known = known_values(w, form, state, tau, y)
-        found, tangents = _found(w, form, outputs_of(form, [*form.rates, *program.guards, *form.monitored], layout.y), known, state, tau, y)
-        for guard in found[layout.y : layout.y + len(program.guards)]:
+        found, tangents = _found(w, form, outputs_of(form, [*form.rates, *program.guards, *form.monitored], form.y), known, state, tau, y)
+        for guard in found[form.y : form.y + len(program.guards)]:
             found[0] = w.where(guard > 0.0, found[0], float("nan"))
-        for i, x in enumerate([*found[: layout.y], *(x for part in tangents for x in part)]):
+        for i, x in enumerate([*found[: form.y], *(x for part in tangents for x in part)]):
             w.store(x, k, i)
-        for i, x in enumerate(found[layout.y + len(program.guards) :]):
+        for i, x in enumerate(found[form.y + len(program.guards) :]):
             w.store(x / known[program.sizes[i]] if i < form.pivots else x, pivots, i)
         w.give()
 
 
 def write_projection(w: Writer, form: Form) -> None:
     """`project(state, tau, y)`: puts the state `y` back onto the rows."""
-    program, layout = form.program, form.layout
+    program = form.program
     with w.procedure("projected_once", "state tau:real y q_moves:i1") as (state, tau, y, q_moves):
         known = known_values(w, form, state, tau, y)
-        for condition, nodes, first in ((q_moves, program.projected_q, 0), (~q_moves, program.projected_u, layout.coordinates)):
+        for condition, nodes, first in ((q_moves, program.projected_q, 0), (~q_moves, program.projected_u, form.coordinates)):
             with w.when(condition):
                 found, tangents = _found(w, form, outputs_of(form, nodes, len(nodes)), known, state, tau, y)
                 for k, part in enumerate([found, *tangents]):
                     for i, x in enumerate(part):
-                        w.store(x, y, k * layout.y + first + i)
+                        w.store(x, y, k * form.y + first + i)
     with w.function("project", "void", {"state": "ptr", "tau": w.real, "y": "ptr"}) as (state, tau, y):
         for q_moves in form.moves:
             w.run("projected_once", state, tau, y, w.literal(q_moves, "i1"))
@@ -209,13 +128,13 @@ def write_projection(w: Writer, form: Form) -> None:
 
 def _write_along(w: Writer, form: Form) -> None:
     """`along(state, tau, y)`: after a state `y` on the rows stands its error, which becomes the part of it along the rows: what a projection leaves."""
-    program, layout, moved = form.program, form.layout, replace(form, moving=((),), time_moves=False)
+    program, moved = form.program, replace(form, moving=((),), time_moves=False)
     with w.procedure("along", "state tau:real y") as (state, tau, y):
-        for nodes, first in ((program.projected_q, 0), (program.projected_u, layout.coordinates)):
+        for nodes, first in ((program.projected_q, 0), (program.projected_u, form.coordinates)):
             known = known_values(w, form, state, tau, y)
             _, (tangent,) = _found(w, form, outputs_of(moved, nodes, len(nodes)), known, state, tau, y)
             for i, x in enumerate(tangent):
-                w.store(x, y, layout.y + first + i)
+                w.store(x, y, form.y + first + i)
 
 
 def write_relations(w: Writer, form: Form) -> None:
@@ -225,34 +144,26 @@ def write_relations(w: Writer, form: Form) -> None:
             w.store(as_real(w, x), values, i)
 
 
-class EventProgram(NamedTuple):
-    """Stop events with their rates, on a graph of its own."""
+@lru_cache(maxsize=64)
+def event_program(form: Form) -> Outputs:
+    """Stop events with their rates, whose states are the rates of the state; `Unsupported` where an operation has no derivative on the graph.
 
-    graph: Graph
-    values: list[int]
-    rates: list[int]
-    variables: list[int]  # for those of the scene's program
-    slopes: list[int]  # inputs for the rates of the state
-
-
-def event_program(form: Form) -> EventProgram:
-    """dc/dt = sum dc/dx_i dx_i/dt; `Unsupported` where an operation has no derivative on the graph."""
-    program, moving = form.program, form.layout.coordinates + form.layout.speeds
-    graph, events, variables = on_its_own(program.graph, program.events, program.variables)
-    slopes = [graph.input(f"rate {i}", True) for i in range(moving)]
-    first = len(program.fixed)  # time, then the state
-    direction = dict(zip(variables[first : first + 1 + moving], [graph.one, *slopes], strict=True))
-    rates = [rate.get(0, graph.zero) for rate in directional_derivative(graph, events, {0: direction})]
-    return EventProgram(graph, events, rates, variables, slopes)
+    dc/dt = sum dc/dx_i dx_i/dt
+    """
+    graph, events, variables = on_its_own(form.program.graph, form.program.events, form.program.variables)
+    _, t, y, _ = form.split(variables)
+    slopes = [graph.input(f"rate {i}", True) for i in range(len(y))]
+    rates = derivatives(graph, events, dict(zip([t, *y], [graph.one, *slopes], strict=True)))
+    return Outputs(graph, events, [rates], variables, [slopes], [], [], [])
 
 
 def write_events(w: Writer, form: Form) -> None:
     """`events(state, tau, y, slope, c, rate)`: the values of all stop events of the state `y`, and their rates where `y` changes at the rate `slope`."""
-    program, own, count = form.program, event_program(form), form.layout.events
+    program, own, count = form.program, event_program(form), form.events
     with w.procedure("events", "state tau:real y slope c rate") as (state, tau, y, slope, c, rate):
         known = dict(zip(own.variables, known_values(w, form, state, tau, y).values(), strict=True))
-        known |= {n: w.load(slope, i) for i, n in enumerate(own.slopes)}
-        found = [as_real(w, x) for x in written(w, own.graph, [*own.values, *own.rates], known)]
+        known |= {n: w.load(slope, i) for i, n in enumerate(own.states[0])}
+        found = [as_real(w, x) for x in written(w, own.graph, [*own.values, *own.tangents[0]], known)]
         for i in range(count):
             w.store(found[i], c, i)
             w.store(found[count + i], rate, i)
@@ -315,8 +226,8 @@ def write_pulled(w: Writer, form: Form, asked: Sequence[int]) -> None:
 
 def steps_of(form: Form) -> dict[str, list[int]]:
     """What a step consists of: rates, all of a state after either part of a projection, stop events."""
-    program, count = form.program, form.layout.coordinates
-    q, u = _state_nodes(form)[:count], _state_nodes(form)[count:]
+    program, (_, _, y, _) = form.program, form.split(form.program.variables)
+    q, u = y[: form.coordinates], y[form.coordinates :]
     found = {"rates": form.rates}
     if form.projects:
         found["q"] = [*program.projected_q, *u]
@@ -330,16 +241,15 @@ def pulled_program(form: Form, nodes: Sequence[int], asked: Sequence[int], pushe
     if not form.moving:
         graph, values, variables = on_its_own(own.graph, own.values, own.variables)
         own = own._replace(graph=graph, values=values, variables=variables)
-    pulled = {part * form.layout.y + i: n for part, each in enumerate([own.values, *own.tangents]) for i, n in enumerate(each)}
+    pulled = {part * form.y + i: n for part, each in enumerate([own.values, *own.tangents]) for i, n in enumerate(each)}
     weights = {row: own.graph.input(f"cotangent {row}", True) for row in pulled}
     return Pulled(own, cotangents(own.graph, pulled.values(), weights.values(), _varying(form, own, asked)), weights)
 
 
 def _varying(form: Form, own: Outputs, asked: Sequence[int]) -> list[int]:
     """The nodes of the state, with its tangent, and of what is asked for."""
-    first, count = len(form.program.fixed), form.layout.coordinates + form.layout.speeds
-    others = [*own.variables[:first], *own.variables[first + 1 + count :]]
-    return [*own.variables[first + 1 : first + 1 + count], *(n for part in own.states for n in part), *(others[i] for i in asked)]
+    fixed, _, y, inputs = form.split(own.variables)
+    return [*y, *(n for part in own.states for n in part), *([*fixed, *inputs][i] for i in asked)]
 
 
 def _moved(form: Form, asked: Sequence[int]) -> Pulled:
@@ -349,22 +259,21 @@ def _moved(form: Form, asked: Sequence[int]) -> Pulled:
 
     The row after the state is that of dt; after what is asked for comes the derivative of all along time.
     """
-    nodes, layout, program = form.rates, form.layout, form.program
-    own = outputs_of(form, [*nodes, *program.events], len(nodes) + layout.events)
-    graph, first, count = own.graph, len(program.fixed), layout.coordinates + layout.speeds
+    nodes = form.rates
+    own = outputs_of(form, [*nodes, *form.program.events], len(nodes) + form.events)
+    graph, (_, t, y, inputs) = own.graph, form.split(own.variables)
     f, c, dc = own.values[: len(nodes)], own.values[len(nodes) :], own.tangents[0][len(nodes) :]
-    along = dict(zip(own.variables[first : first + 1 + count], [graph.one, *f[:count]], strict=True))
-    slopes = [rate.get(0, graph.zero) for rate in directional_derivative(graph, c, {0: along})]
-    rows = [layout.integrated, *(layout.y + i for i in range(len(nodes))), layout.integrated + 1]
+    slopes = derivatives(graph, c, dict(zip([t, *y], [graph.one, *f[: len(y)]], strict=True)))
+    rows = [form.integrated, *(form.y + i for i in range(len(nodes))), form.integrated + 1]
     to_dt, *to_dy, which = weights = [graph.input(f"cotangent {row}", True) for row in rows]
     total, rate, slope = to_dt, dc[0], slopes[0]
     for g, x in zip(to_dy, f, strict=True):
         total = graph.add(total, graph.mul(g, x))
-    for i in range(1, layout.events):
+    for i in range(1, form.events):
         happens = graph.call("eq", which, graph.const(float(i)))
         rate, slope = graph.call("select", happens, rate, dc[i]), graph.call("select", happens, slope, slopes[i])
     by_dt = graph.neg(graph.div(graph.mul(total, rate), slope))
-    times = [own.variables[first], *(own.variables[len(own.variables) - len(program.inputs) + i] for i in form.sampled)]
+    times = [t, *(inputs[i] for i in form.sampled)]
     found = cotangents(graph, [by_dt], [graph.one], [*_varying(form, own, asked), *times])
     by_time, *by_inputs = found[len(found) - len(times) :]
     for n, rate in zip(by_inputs, own.slopes, strict=True):
@@ -372,21 +281,16 @@ def _moved(form: Form, asked: Sequence[int]) -> Pulled:
     return Pulled(own, [*found[: len(found) - len(times)], by_time], dict(zip(rows, weights, strict=True)))
 
 
-def _state_nodes(form: Form) -> list[int]:
-    first = len(form.program.fixed) + 1
-    return form.program.variables[first : first + form.layout.coordinates + form.layout.speeds]
-
-
 def _write_one_pulled(w: Writer, form: Form, name: str, pulled: Pulled, work_stays: bool = False) -> None:
-    layout, each = form.layout, form.layout.coordinates + form.layout.speeds
+    each = form.q_and_v
     end = each * (1 + len(form.moving))
     with w.procedure(name, "state tau:real y g to_y to_known") as (state, tau, y, g, to_y, to_known):
         given = given_values(w, form, pulled.own, known_values(w, form, state, tau, y), state, tau, y)
         given |= {n: w.load(g, row) for row, n in pulled.weights.items()}
         for i, x in written_in_turn(w, pulled.graph, pulled.found, given):
             if i < end:
-                w.store(as_real(w, x), to_y, i // each * layout.y + i % each)
+                w.store(as_real(w, x), to_y, i // each * form.y + i % each)
             else:
                 w.store(w.load(to_known, i - end) + as_real(w, x), to_known, i - end)
-        for row in range(each, layout.integrated, layout.y) if layout.with_work else ():
+        for row in range(each, form.integrated, form.y) if form.with_work else ():
             w.store(w.load(g, row) if work_stays else w.number(0.0), to_y, row)

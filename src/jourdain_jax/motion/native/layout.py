@@ -1,6 +1,6 @@
 """Where the numbers of a lane are: a lane is a column of rows, one row per number, and a row is one vector for all lanes side by side.
 
-A lane is handed over with all rows of `Layout.given`, its progress at the start among them, and handed back with those of its progress. Where tangents are
+A lane is handed over with all rows of `Form.given`, its progress at the start among them, and handed back with those of its progress. Where tangents are
 pushed along, the state is followed by its own, and so are the numbers that the rates are given; `dt` are those of time, which only an event's has. Of
 derivatives of order n in directions e_1 to e_n the tangents are 2^n - 1, in the order of the binary numbers that say which e_i are taken together: of the
 second order those along e_1, e_2, and both. `taken` is by how far the last step has gone; of
@@ -21,6 +21,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
+from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.lowering.relations import MOST_WATCHED
 from jourdain_jax.native.ffi import Given, last_size, product
 from jourdain_jax.native.ir import Value, Writer
 
@@ -30,22 +32,90 @@ CONTROL = ("direction", "last_goal", "rtol", "atol", "shortest", "longest", "max
 
 
 @dataclass(frozen=True)
-class Layout:
-    """The rows of a lane."""
+class Form:
+    """What is integrated: a lowered scene, with or without work, projection, events and pivots that are monitored."""
 
-    coordinates: int
-    speeds: int
+    program: Lowered
     with_work: bool
-    known: int  # numbers that the rates are given: what depends on parameters alone, then the inputs
-    events: int
-    moving: tuple[int, ...] = ()  # of every tangent, how many of those known have it
-    sampled: int = 0  # how many of the inputs are given by samples
-    watched: int = 0  # numbers whose signs are watched
+    projects: bool
+    affine: bool
+    has_events: bool
+    pivots: int  # how many are monitored
+    moving: tuple[tuple[int, ...], ...] = ()  # of every tangent, which of the numbers known have it
+    sampled: tuple[int, ...] = ()  # which of the inputs are given by samples
+    time_moves: bool = False  # whether time has tangents
+
+    @property
+    def rates(self) -> list[int]:
+        """The rates of the state."""
+        program = self.program
+        return [*program.qdot, *program.ydot, *([program.power] if self.with_work else [])]
+
+    @property
+    def relations(self) -> tuple[int, ...]:
+        """The numbers whose signs are watched; none where there are too many."""
+        found = self.program.watched(self.has_events)
+        return found if len(found) <= MOST_WATCHED else ()
+
+    @property
+    def watched(self) -> tuple[int, ...]:
+        """These, and the values of stop events that relations decide."""
+        return (*self.relations, *(self.program.events if self.relations and self.has_events and self.program.event_relations else ()))
+
+    @property
+    def monitored(self) -> list[int]:
+        """What is watched at all stages of a step: pivots first, then directions of rows, then how far rows are from losing rank."""
+        return [*self.program.pivots[: self.pivots], *self.program.directions, *self.squares]
+
+    @property
+    def squares(self) -> tuple[int, ...]:
+        """What is left of rows beside those before them, and their sizes, by turns."""
+        return self.program.squares if self.projects else ()
+
+    @property
+    def directions(self) -> list[range]:
+        """Which of these are the entries of a direction, one direction after the other."""
+        first, width = self.pivots, len(self.program.ydot)
+        return [range(k, k + width) for k in range(first, first + len(self.program.directions), max(width, 1))]
+
+    @property
+    def moves(self) -> list[int]:
+        """A projection step by step, 1: of the coordinates, 0: of the speeds."""
+        return [1, 1] + [0] * (0 if not self.program.projected_u else 1 if self.affine else 2)
+
+    @property
+    def nodes(self) -> list[int]:
+        """All that is evaluated."""
+        program = self.program
+        projected = [*program.projected_q, *program.projected_u] if self.projects else []
+        events = program.events if self.has_events else ()
+        return [*self.rates, *program.guards, *program.pivots, *program.directions, *self.squares, *projected, *events, *self.watched]
+
+    def split(self, variables: list[int]) -> tuple[list[int], int, list[int], list[int]]:
+        """Nodes of what is fixed, of time, of the state without work, and of the inputs."""
+        t = len(self.program.fixed)
+        end = t + 1 + self.q_and_v
+        return variables[:t], variables[t], variables[t + 1 : end], variables[end:]
+
+    @property
+    def coordinates(self) -> int:
+        """Numbers of coordinates."""
+        return len(self.program.qdot)
+
+    @property
+    def q_and_v(self) -> int:
+        """Numbers of coordinates and speeds."""
+        return self.coordinates + len(self.program.ydot)
+
+    @property
+    def events(self) -> int:
+        """Numbers of stop events."""
+        return len(self.program.events) if self.has_events else 0
 
     @property
     def y(self) -> int:
-        """Numbers of the integrated state."""
-        return self.coordinates + self.speeds + self.with_work
+        """Numbers of the integrated state: the work, if any, comes after the coordinates and the speeds."""
+        return self.q_and_v + self.with_work
 
     @property
     def integrated(self) -> int:
@@ -60,17 +130,18 @@ class Layout:
     @property
     def parts(self) -> list[range]:
         """Rows of the coordinates, of the speeds and of the work, where there are any."""
-        ends = [0, self.coordinates, self.coordinates + self.speeds, self.y]
+        ends = [0, self.coordinates, self.q_and_v, self.y]
         return [range(a, b) for a, b in pairwise(ends) if b > a]
 
     @property
     def rows(self) -> dict[str, range]:
         """Name -> rows."""
         search = {"search_t": 3, "search_c": 3 * self.events, "search_step": 1, "search_left": 1, "search_shift": 1, "search_slope": self.events}
+        program, watched = self.program, len(self.watched)
         counts = {"y": self.integrated, **dict.fromkeys(PROGRESS, 1), "dt": len(self.moving), **dict.fromkeys(CONTROL, 1)}
-        counts |= {"known": self.known, "dknown": sum(self.moving)}
+        counts |= {"known": len(program.fixed) + len(program.inputs), "dknown": sum(map(len, self.moving))}
         counts |= {"goal": 1, "taken": 1, "before": 1, "bound": 1, **(search if self.events else {}), **dict.fromkeys(SAMPLES if self.sampled else (), 1)}
-        counts |= {"last": self.watched, "crossing_by": 1} if self.watched else {}
+        counts |= {"last": watched, "crossing_by": 1} if watched else {}
         found, first = {}, 0
         for name, count in counts.items():
             found[name] = range(first, first + count)
@@ -96,8 +167,8 @@ class Layout:
 class Lanes:
     """The rows of the lanes side by side, in memory at `pointer`."""
 
-    def __init__(self, w: Writer, layout: Layout, pointer: Value) -> None:
-        self.w, self.layout, self.pointer, self.rows = w, layout, pointer, layout.rows
+    def __init__(self, w: Writer, form: Form, pointer: Value) -> None:
+        self.w, self.form, self.pointer, self.rows = w, form, pointer, form.rows
 
     def __getitem__(self, name: str) -> Value:
         return self.every(name)[0]
@@ -114,17 +185,17 @@ class Lanes:
         for row, value in zip(self.rows[name], values, strict=True):
             self.w.store(value, self.pointer, row)
 
-    def place(self, row, lane: Value) -> Value:
+    def place(self, name: str, lane: Value) -> Value:
         """Where the number of one lane is."""
-        return self.w.at(self.pointer, row * self.w.lanes + lane if isinstance(row, Value) else lane + row * self.w.lanes, "double")
+        return self.w.at(self.pointer, lane + self.rows[name].start * self.w.lanes, "double")
 
     def of(self, name: str, lane: Value, type: str = "double") -> Value:
         """The number of one lane."""
-        return self.w.load(self.place(self.rows[name].start, lane), type=type)
+        return self.w.load(self.place(name, lane), type=type)
 
     def set(self, name: str, lane: Value, value) -> None:
         """Sets the number of one lane."""
-        self.w.store(self.w.literal(value, "double"), self.place(self.rows[name].start, lane))
+        self.w.store(self.w.literal(value, "double"), self.place(name, lane))
 
 
 def for_rows(w: Writer, rows: range, body: Callable[[int | Value], object]) -> None:
@@ -160,9 +231,9 @@ WORDS_OF_SAMPLES = 6  # of a job: pointers to the tables and the knots, how many
 _TABLES, _KNOTS, _TABLE_COUNT, _KNOT_COUNT, _SAMPLES, _KNOTS_EACH = range(WORDS_OF_SAMPLES)
 
 
-def arguments_of_samples(layout: Layout) -> int:
+def arguments_of_samples(form: Form) -> int:
     """How many arguments of a handler are samples."""
-    return 2 if layout.sampled else 0
+    return 2 if form.sampled else 0
 
 
 def store_samples(w: Writer, words: Value, given: list[Given]) -> None:
@@ -179,23 +250,25 @@ def store_samples(w: Writer, words: Value, given: list[Given]) -> None:
         w.store(value, words, word)
 
 
-def begin_samples(w: Writer, layout: Layout, words: Value, count: Value, lanes: Lanes, lane: Value, number: Value) -> None:
+def begin_samples(w: Writer, form: Form, words: Value, count: Value, lanes: Lanes, lane: Value, number: Value) -> None:
     """A place takes the table and the knots of the lane with this number, of so many."""
     size = w.load(words, _SAMPLES, "i64")
 
     def share(of: int) -> Value:
         return w.binary("sdiv", number * w.load(words, of, "i64"), count)
 
-    table = w.at(w.load(words, _TABLES, "ptr"), share(_TABLE_COUNT) * size * (2 * layout.sampled), "double")
+    table = w.at(w.load(words, _TABLES, "ptr"), share(_TABLE_COUNT) * size * (2 * len(form.sampled)), "double")
     knot = w.at(w.load(words, _KNOTS, "ptr"), share(_KNOT_COUNT) * w.load(words, _KNOTS_EACH, "i64"), "double")
     for name, value in (("table", table), ("samples", size), ("knot", knot)):
         lanes.set(name, lane, value)
 
 
-def nearer_knot(w: Writer, lanes: Lanes, lane: Value, goal: Value) -> Value:
-    """The next knot or the goal, whichever comes first."""
-    knot = w.load(lanes.of("knot", lane, "ptr"), type="double")
-    return w.where((knot - goal) * lanes.of("direction", lane) < 0.0, knot, goal)
+def set_goal(w: Writer, lanes: Lanes, lane: Value, goal: Value) -> None:
+    """A lane goes on to the goal, or to the next knot where that comes first."""
+    if lanes.form.sampled:
+        knot = w.load(lanes.of("knot", lane, "ptr"), type="double")
+        goal = w.where((knot - goal) * lanes.of("direction", lane) < 0.0, knot, goal)
+    lanes.set("goal", lane, goal)
 
 
 def pass_knot(w: Writer, lanes: Lanes, lane: Value) -> None:
@@ -203,14 +276,14 @@ def pass_knot(w: Writer, lanes: Lanes, lane: Value) -> None:
     lanes.set("knot", lane, w.at(lanes.of("knot", lane, "ptr"), 1, "double"))
 
 
-def write_sampled_inputs(w: Writer, layout: Layout, with_slopes: bool) -> None:
+def write_sampled_inputs(w: Writer, form: Form, with_slopes: bool) -> None:
     """`sampled_inputs(state, t, values)`: the values of all inputs that are given by samples, at the time t since the start, of each lane; then df/dt."""
     with w.procedure("sampled_inputs", "state t:real values") as (state, t, values):
-        lanes, times, low, high = Lanes(w, layout, state), w.room(), w.room(type="i64"), w.room(type="i64")
+        lanes, times, low, high = Lanes(w, form, state), w.room(), w.room(type="i64"), w.room(type="i64")
         w.store(t, times)
         with w.counted(0, w.lanes) as lane:
             now, count = w.load(times, lane, "double"), lanes.of("samples", lane, "i64")
-            for i in range(layout.sampled):
+            for i in range(len(form.sampled)):
                 ts = w.at(lanes.of("table", lane, "ptr"), count * (2 * i), "double")
                 fs = w.at(ts, count, "double")
                 w.store(w.literal(0, "i64"), low)
@@ -229,14 +302,14 @@ def write_sampled_inputs(w: Writer, layout: Layout, with_slopes: bool) -> None:
                 share = w.smaller(w.larger(there, 0.0), 1.0)
                 w.store(f_k + share * rise, w.at(values, i * w.lanes + lane, "double"))
                 if with_slopes:
-                    w.store(w.where(there.equals(share), rise / span, 0.0), w.at(values, (layout.sampled + i) * w.lanes + lane, "double"))
+                    w.store(w.where(there.equals(share), rise / span, 0.0), w.at(values, (len(form.sampled) + i) * w.lanes + lane, "double"))
 
 
-def looked_up(w: Writer, layout: Layout, state: Value, t: Value, with_slopes: bool) -> list[Value]:
+def looked_up(w: Writer, form: Form, state: Value, t: Value, with_slopes: bool) -> list[Value]:
     """The values at the time t since the start of all inputs that are given by samples, then their slopes."""
-    if not layout.sampled:
+    if not form.sampled:
         return []
-    count = layout.sampled * (1 + with_slopes)
+    count = len(form.sampled) * (1 + with_slopes)
     values = w.room(count)
     w.run("sampled_inputs", state, t, values)
     return [w.load(values, i) for i in range(count)]

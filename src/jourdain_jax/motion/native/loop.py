@@ -2,7 +2,7 @@
 
 Lanes of a batch run side by side in several threads, in the widest registers, each replaced by the next one when it has ended. One motion by itself runs in
 narrow registers, in which an instruction takes less time. What a lane computes does not depend on the width. A call is given two arrays with one row per
-lane: the rows of `Layout.given`, and the times to save at. It returns the states there, and the rows of the progress at the end with the number of times that
+lane: the rows of `Form.given`, and the times to save at. It returns the states there, and the rows of the progress at the end with the number of times that
 were reached one after the other. Where inputs are given by samples, their tables and knots come first (`layout.py`).
 
 The derivative of a motion is a motion, of states with their tangents. A time of an event has a tangent, which the loop itself finds; all other times are
@@ -22,29 +22,29 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.derivatives import DifferentiationModeError, filled, is_zero
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
 from jourdain_jax.motion.integrators.explicit_steps import Method
-from jourdain_jax.motion.native.functions import Form, check_derivatives, write_events, write_projection, write_rates, write_relations
+from jourdain_jax.motion.native.functions import check_derivatives, write_events, write_projection, write_rates, write_relations
 from jourdain_jax.motion.native.layout import (
     WORDS_OF_SAMPLES,
+    Form,
     Lanes,
-    Layout,
     arguments_of_samples,
     begin_samples,
-    nearer_knot,
     pass_knot,
+    set_goal,
     store_samples,
     write_sampled_inputs,
 )
 from jourdain_jax.motion.native.step import IDLE, write_step
 from jourdain_jax.motion.native.taylor import TaylorSteps, products
 from jourdain_jax.motion.native.values import called
-from jourdain_jax.native.ffi import Given, last_size, next_lane, product, share, start_counting, write_handler
+from jourdain_jax.native.ffi import Given, handed_out, last_size, next_lane, product, share, start_counting, taken_in, write_handler
 from jourdain_jax.native.ir import Value, Writer
 
 # words of a job, shared by all threads: the number of lanes, of times, and of the next lane, of doubles of a kernel's own memory (`ffi.py`), those of
 # samples, then pointers to the arrays
 COUNT, TIMES, NEXT, OWN, FIRST_OF_SAMPLES = range(5)
 FIRST_ARRAY = FIRST_OF_SAMPLES + WORDS_OF_SAMPLES
-_STARTS, _GOALS, _STATES, _ENDS = range(FIRST_ARRAY, FIRST_ARRAY + 4)
+STARTS, _GOALS, _STATES, _ENDS = range(FIRST_ARRAY, FIRST_ARRAY + 4)
 
 
 def write_loop(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
@@ -55,13 +55,13 @@ def write_loop(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
     if isinstance(method, TaylorSteps):
         _write_save_within(w, form, method)
     _write_loop(w, form, method)
-    write_handler(w, 2 + arguments_of_samples(form.layout), 2, lambda arguments, results: write_job(w, form, arguments, results))
+    write_handler(w, 2 + arguments_of_samples(form), 2, lambda arguments, results: write_job(w, form, arguments, results))
 
 
 def write_functions(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
     """`step`, and what it calls."""
     if form.sampled:
-        write_sampled_inputs(w, form.layout, form.time_moves)
+        write_sampled_inputs(w, form, form.time_moves)
     write_rates(w, form)
     if form.projects:
         write_projection(w, form)
@@ -74,7 +74,7 @@ def write_functions(w: Writer, form: Form, method: Method | TaylorSteps) -> None
 
 def write_job(w: Writer, form: Form, arguments: list[Given], results: list[Value]) -> None:
     """All lanes, by this thread and by others that it starts and waits for; the last of the arguments is an array of lanes and times."""
-    of_samples, arguments, times = arguments[: arguments_of_samples(form.layout)], arguments[arguments_of_samples(form.layout) :], arguments[-1]
+    of_samples, arguments, times = arguments[: arguments_of_samples(form)], arguments[arguments_of_samples(form) :], arguments[-1]
     arrays = [*(x.data for x in arguments), *results]
     job = w.room(FIRST_ARRAY + len(arrays), "i64")
     for word, pointer in enumerate(arrays):
@@ -100,11 +100,11 @@ def _write_loop(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
 
 def _write_lanes(w: Writer, form: Form, method: Method | TaylorSteps, job: Value) -> None:
     # of each place, which lane is there and how many of its times are saved; after them, at how many places there is one
-    state, who, k = w.room(form.layout.all), w.room(2 * w.lanes + 1, "i64"), w.room(form.layout.integrated * method.needed)
+    state, who, k = w.room(form.all), w.room(2 * w.lanes + 1, "i64"), w.room(form.integrated * method.needed)
     w.store(w.literal(w.lanes, "i64"), who, 2 * w.lanes)
-    with w.counted(0, form.layout.all) as row:
+    with w.counted(0, form.all) as row:
         w.store(1.0, state, row)
-    lanes = Lanes(w, form.layout, state)
+    lanes = Lanes(w, form, state)
     with w.counted(0, w.lanes) as lane:
         w.run("begin", job, state, who, lane)
         w.run("serve", job, state, who, lane)
@@ -119,37 +119,39 @@ def _write_lanes(w: Writer, form: Form, method: Method | TaylorSteps, job: Value
             w.run("serve", job, state, who, lane)
 
 
+def begin_lane(w: Writer, form: Form, job: Value, goals: Value, lanes: Lanes, lane: Value, number: Value, there: Value) -> None:
+    """The lane of the batch with this number takes a place; where it is not there, the place is idle, and goes by samples of the first one."""
+    if form.sampled:
+        begin_samples(w, form, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load(job, COUNT, "i64"), lanes, lane, w.where(there, number, 0))
+    with w.when(there):
+        given = form.given
+        taken_in(w, given, w.at(w.load(job, STARTS, "ptr"), number * given, "double"), lanes.pointer, lane)
+        set_goal(w, lanes, lane, w.load(goals, number * w.load(job, TIMES, "i64"), "double"))
+    with w.when(~there):
+        lanes.set("code", lane, IDLE)
+    lanes.set("taken", lane, 0.0)
+    lanes.set("bound", lane, math.inf)
+    if form.has_events:
+        lanes.set("search_left", lane, 0.0)
+
+
 def _write_begin(w: Writer, form: Form) -> None:
-    """`begin(job, state, who, lane)`: the next lane of the batch takes this place; where there is none, it is idle."""
+    """`begin(job, state, who, lane)`: the next lane of the batch takes this place."""
     with w.procedure("begin", "job state who lane:i64") as (job, state, who, lane):
-        lanes, given = Lanes(w, form.layout, state), form.layout.given
         number = next_lane(w, job, NEXT)
         there = number < w.load(job, COUNT, "i64")
+        begin_lane(w, form, job, w.load(job, _GOALS, "ptr"), Lanes(w, form, state), lane, number, there)
         with w.when(there):
             w.store(number, who, lane)
             w.store(w.literal(0, "i64"), who, lane + w.lanes)
-            starts = w.load(job, _STARTS, "ptr")
-            with w.counted(0, given) as row:
-                w.store(w.load(starts, number * given + row, "double"), lanes.place(row, lane))
-            goal = w.load(w.load(job, _GOALS, "ptr"), number * w.load(job, TIMES, "i64"), "double")
-            if form.sampled:
-                begin_samples(w, form.layout, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load(job, COUNT, "i64"), lanes, lane, number)
-                goal = nearer_knot(w, lanes, lane, goal)
-            lanes.set("goal", lane, goal)
-            lanes.set("bound", lane, math.inf)
-            if form.has_events:
-                lanes.set("search_left", lane, 0.0)
         with w.when(~there):
-            lanes.set("code", lane, IDLE)
             w.store(w.load(who, 2 * w.lanes, "i64") - 1, who, 2 * w.lanes)
-            if form.sampled:  # rates are worked out there too
-                begin_samples(w, form.layout, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load(job, COUNT, "i64"), lanes, lane, w.literal(0, "i64"))
 
 
 def _write_serve(w: Writer, form: Form) -> None:
     """`serve(job, state, who, lane)`: saves what is due, and where the lane has ended, hands it back and begins with the next one."""
     with w.procedure("serve", "job state who lane:i64") as (job, state, who, lane):
-        lanes = Lanes(w, form.layout, state)
+        lanes = Lanes(w, form, state)
         with w.repeated() as leave:
             code, t, goal = (lanes.of(name, lane) for name in ("code", "t", "goal"))
             runs = code.equals(RUNNING)
@@ -160,7 +162,7 @@ def _write_serve(w: Writer, form: Form) -> None:
                 at_knot = runs & t.differs(next_time)
                 with w.when(at_knot):
                     pass_knot(w, lanes, lane)
-                    lanes.set("goal", lane, nearer_knot(w, lanes, lane, next_time))
+                    set_goal(w, lanes, lane, next_time)
                 with w.when(~at_knot):
                     _save(w, form, job, who, lanes, lane, runs)
             else:
@@ -170,8 +172,8 @@ def _write_serve(w: Writer, form: Form) -> None:
 def _write_save_within(w: Writer, form: Form, method: TaylorSteps) -> None:
     """`save_within(job, state, who, k)`: saves what is due before the end of a step, by the Taylor coefficients `k` of its start."""
     with w.procedure("save_within", "job state who k") as (job, state, who, k):
-        layout, lanes = form.layout, Lanes(w, form.layout, state)
-        every, flags, y = layout.integrated, w.room(), w.room(layout.integrated)
+        lanes = Lanes(w, form, state)
+        every, flags, y = form.integrated, w.room(), w.room(form.integrated)
         times, goals, states = (w.load(job, TIMES, "i64"), *(w.load(job, word, "ptr") for word in (_GOALS, _STATES)))
         with w.repeated() as leave:
             goal = lanes["goal"]
@@ -189,8 +191,7 @@ def _write_save_within(w: Writer, form: Form, method: TaylorSteps) -> None:
             with w.counted(0, w.lanes) as lane, w.when(w.load(flags, lane, "double") > 0.0):
                 saved = w.load(who, lane + w.lanes, "i64")
                 place = w.load(who, lane, "i64") * times + saved
-                with w.counted(0, every) as row:
-                    w.store(w.load(y, row * w.lanes + lane, "double"), states, place * every + row)
+                handed_out(w, every, y, lane, w.at(states, place * every, "double"))
                 w.store(saved + 1, who, lane + w.lanes)
                 lanes.set("goal", lane, lanes.of("direction", lane) * math.inf)  # where an event was found a rounding beyond the last time
                 with w.when((saved + 1) < times):
@@ -199,22 +200,19 @@ def _write_save_within(w: Writer, form: Form, method: TaylorSteps) -> None:
 
 def _save(w: Writer, form: Form, job: Value, who: Value, lanes: Lanes, lane: Value, runs: Value) -> None:
     """The state of a lane at a time to save at; or at the end, where it stands for all that is left, and the next lane begins."""
-    layout, times = form.layout, w.load(job, TIMES, "i64")
+    times = w.load(job, TIMES, "i64")
     goals, states, ends = (w.load(job, word, "ptr") for word in (_GOALS, _STATES, _ENDS))
     number, saved = w.load(who, lane, "i64"), w.load(who, lane + w.lanes, "i64")
     last = w.where(runs, saved + 1, times)
-    with w.counted(saved, last) as k, w.counted(0, layout.integrated) as row:
-        w.store(w.load(lanes.place(row, lane), type="double"), states, (number * times + k) * layout.integrated + row)
+    with w.counted(saved, last) as k:
+        handed_out(w, form.integrated, lanes.pointer, lane, w.at(states, (number * times + k) * form.integrated, "double"))
     w.store(last, who, lane + w.lanes)
     with w.when(last < times):
-        goal = w.load(goals, number * times + last, "double")
-        lanes.set("goal", lane, nearer_knot(w, lanes, lane, goal) if form.sampled else goal)
+        set_goal(w, lanes, lane, w.load(goals, number * times + last, "double"))
     with w.when(last >= times):
-        each = layout.returned + 1
-        with w.counted(0, layout.returned) as row:
-            w.store(w.load(lanes.place(row, lane), type="double"), ends, number * each + row)
-        reached = w.where(runs, times, saved)
-        w.store(w.converted("sitofp", reached, "double"), ends, number * each + layout.returned)
+        end = w.at(ends, number * (form.returned + 1), "double")
+        handed_out(w, form.returned, lanes.pointer, lane, end)
+        w.store(w.converted("sitofp", w.where(runs, times, saved), "double"), end, form.returned)
         w.run("begin", job, lanes.pointer, who, lane)
 
 
@@ -222,7 +220,7 @@ MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the pro
 
 
 class Start(NamedTuple):
-    """A motion as a kernel is given it; the state and what is known are followed by their tangents (`Layout`)."""
+    """A motion as a kernel is given it; the state and what is known are followed by their tangents (`Form`)."""
 
     of_samples: tuple[Array, ...]  # as `layout.py` has them
     control: tuple[Float[Array, ""], ...]  # rtol, atol, shortest, longest and first step, most steps
@@ -250,37 +248,19 @@ class Found(NamedTuple):
     rest: Float[Array, "rest"]  # rows of the progress after its time, and the number of goals that were reached one after the other
 
 
-class Kernel(NamedTuple):
-    """The loop over steps of a form."""
-
-    form: Form
-    run: Callable  # (*samples, rows of starts, goals): states at the goals, and rows of the end
-    motion: Callable[[Start], Found]
-
-    @property
-    def layout(self) -> Layout:
-        """The rows of a lane."""
-        return self.form.layout
-
-
 @lru_cache(maxsize=MOST_KERNELS)
-def kernel(form: Form, method: Method, order: int | None = None) -> Kernel:
-    """The kernel for what is integrated, by a tableau, or by Taylor series up to an order."""
-    steps, layout = method if order is None else TaylorSteps(order), form.layout
+def kernel(form: Form, method: Method, order: int | None = None) -> Callable[[Start], Found]:
+    """The motion of what is integrated, by a tableau, or by Taylor series up to an order.
+
+    A tangent has lanes where anything has that it depends on: all directions share the values of one motion.
+    """
+    steps = method if order is None else TaylorSteps(order)
+    n, parts = form.y, 1 + len(form.moving)
 
     def shapes(*arguments):
-        return (arguments[-1].shape[-1], layout.integrated), (layout.returned + 1,)
+        return (arguments[-1].shape[-1], form.integrated), (form.returned + 1,)
 
-    def run(*arguments: Float[Array, "..."]) -> tuple[Float[Array, "times y"], Float[Array, "ends"]]:
-        return tuple(run_rows(*arguments))
-
-    run_rows = called(lambda w: write_loop(w, form, steps), shapes, arguments_of_samples(layout))
-    return Kernel(form, run, _motion(layout, run))
-
-
-def _motion(layout: Layout, run: Callable) -> Callable[[Start], Found]:
-    """`run` in words; a tangent has lanes where anything has that it depends on: all directions share the values of one motion."""
-    n, parts = layout.y, 1 + len(layout.moving)
+    run = called(lambda w: write_loop(w, form, steps), shapes, arguments_of_samples(form))
 
     @jax.custom_batching.custom_vmap
     def motion(start: Start) -> Found:
@@ -314,7 +294,7 @@ def flow(form: Form, method: Method, order: int | None) -> Callable[[Start], Fou
     """The motion by a kernel; `order`: of Taylor series, in the place of the tableau."""
     # 36_000 of coefficients in a step by Taylor series of second derivatives; where there are more, steps are those of the tableau
     order = None if order is not None and len(form.moving) > 1 and products(form, order) > 36_000 else order
-    own = jax.custom_jvp(kernel(form, method, order).motion)
+    own = jax.custom_jvp(kernel(form, method, order))
 
     @partial(own.defjvp, symbolic_zeros=True)
     def rule(primals, tangents):

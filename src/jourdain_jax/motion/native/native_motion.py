@@ -35,8 +35,8 @@ from jourdain_jax.motion.inputs import Constant, FunctionOfTime, Inputs, Sampled
 from jourdain_jax.motion.integrators.explicit_steps import Method, code_at_end
 from jourdain_jax.motion.native import taylor
 from jourdain_jax.motion.native.back import flow_back
-from jourdain_jax.motion.native.functions import Form, check_derivatives, event_program
-from jourdain_jax.motion.native.layout import Layout
+from jourdain_jax.motion.native.functions import check_derivatives, event_program
+from jourdain_jax.motion.native.layout import Form
 from jourdain_jax.motion.native.loop import Found, Start
 from jourdain_jax.motion.native.values import values_of_nodes
 from jourdain_jax.motion.setup import Begun, Setup, Solved
@@ -166,14 +166,13 @@ def moved(form: Form) -> Callable[[Float[Array, "z"], Float[Array, ""]], Float[A
 
 def _rates(form: Form) -> Callable[[Float[Array, "z"]], Float[Array, "z"]]:
     """G(z), which is zero but for the state, time and what samples give."""
-    program, layout = form.program, form.layout
-    graph, rates, variables = on_its_own(program.graph, form.rates, program.variables)
-    first, count = len(program.fixed), layout.coordinates + layout.speeds
-    work = [graph.input("work", True)] if layout.with_work else []
+    graph, rates, variables = on_its_own(form.program.graph, form.rates, form.program.variables)
+    fixed, t, y, inputs = form.split(variables)
+    work = [graph.input("work", True)] if form.with_work else []
     slopes = [graph.input(f"slope of input {i}", True) for i in form.sampled]
-    z = [*variables[first + 1 : first + 1 + count], *work, variables[first], *variables[:first], *variables[first + 1 + count :], *slopes]
+    z = [*y, *work, t, *fixed, *inputs, *slopes]
     of_inputs = dict(zip(form.sampled, slopes, strict=True))
-    known = [graph.zero] * first + [of_inputs.get(i, graph.zero) for i in range(len(program.inputs))]
+    known = [graph.zero] * len(fixed) + [of_inputs.get(i, graph.zero) for i in range(len(inputs))]
     return values_of_nodes(graph, [*rates, graph.one, *known, *[graph.zero] * len(slopes)], z)
 
 
@@ -264,8 +263,8 @@ def cotangents(form: Form, method: Method, start: Start, asked: Sequence[bool], 
     states = jax.vmap(_packed)(g.ys)
     states = jnp.concatenate([states, jnp.zeros_like(states[:1])])  # nobody asks for the last one: it is that of the end
     found = flow_back(form, method, which)(start, states, jnp.concatenate([_packed(g.y_end), g.t_end[None]]))
-    known = dict(zip(which, entries_of(found[form.layout.y :]), strict=True))
-    return _state(form.layout, found[: form.layout.y]), [known.get(i) for i in range(len(asked))]
+    known = dict(zip(which, entries_of(found[form.y :]), strict=True))
+    return _state(form, found[: form.y]), [known.get(i) for i in range(len(asked))]
 
 
 def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integrated]:
@@ -278,7 +277,7 @@ def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integ
         for i, value in zip(form.sampled, values, strict=True):
             known[fixed + i] = value
         z = jnp.concatenate([_packed(y), jnp.stack([jnp.asarray(x, real_type()) for x in (t, *known, *slopes)])])
-        return _state(form.layout, along_rates(z, d)[: form.layout.y])
+        return _state(form, along_rates(z, d)[: form.y])
 
     return moved_by
 
@@ -338,16 +337,16 @@ def _packed(y: Integrated) -> Float[Array, "y"]:
     return jnp.concatenate([y.q, y.v, *([] if y.work is None else [y.work[None]])])
 
 
-def solved(layout: Layout, goals: Float[Array, "times"], found: Found) -> Solved:
+def solved(form: Form, goals: Float[Array, "times"], found: Found) -> Solved:
     """What a kernel found, in words."""
     h, code, accepted, rejected, event, pivot, crossings, together, count = found.rest
     (states,), (end,), (t,) = found[:3]
     code, accepted, rejected, event, crossings = (x.astype(jnp.int32) for x in (code, accepted, rejected, event, crossings))
     reached = (jnp.arange(len(goals)) < count) | (goals == t)
-    ys, code = jax.vmap(lambda y: _state(layout, y))(states[:-1]), code_at_end(code, h, accepted, t)
-    return Solved(goals[:-1], ys, reached[:-1], t, _state(layout, end), code, event, accepted, rejected, h, pivot, crossings, together)
+    ys, code = jax.vmap(lambda y: _state(form, y))(states[:-1]), code_at_end(code, h, accepted, t)
+    return Solved(goals[:-1], ys, reached[:-1], t, _state(form, end), code, event, accepted, rejected, h, pivot, crossings, together)
 
 
-def _state(layout: Layout, y: Float[Array, "y"]) -> Integrated:
-    n = layout.coordinates
-    return Integrated(y[:n], y[n : n + layout.speeds], y[-1] if layout.with_work else None)
+def _state(form: Form, y: Float[Array, "y"]) -> Integrated:
+    n = form.coordinates
+    return Integrated(y[:n], y[n : form.q_and_v], y[-1] if form.with_work else None)

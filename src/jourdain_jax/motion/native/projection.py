@@ -64,11 +64,7 @@ def write_rotated(w: Writer, rows: int, columns: int) -> None:
                         x, y = w.load(first, k), w.load(second, k)
                         w.store(w.where(slanted, c * x - s * y, x), first, k)
                         w.store(w.where(slanted, s * x + c * y, y), second, k)
-            done, on = w.label(), w.label()
-            w.go(on, w.load(turned, type="i1"), done)
-            w.place(done)
-            w.give()
-            w.place(on)
+            w.give_where(~w.load(turned, type="i1"))
 
 
 def write_inverted(w: Writer, rows: int, columns: int, cutoff: float) -> None:
@@ -91,8 +87,7 @@ def write_solved(w: Writer, rows: int, columns: int) -> None:
     """`solved(B, weights, b, x)`: x = A+ b."""
     width = rows + columns
     with w.procedure("solved", "B weights b x") as (B, weights, b, x):
-        with w.counted(0, columns) as k:
-            w.store(0.0, x, k)
+        cleared(w, x, columns)
         with w.counted(0, rows) as i:
             row = w.at(B, i * width)
             share = w.load(weights, i) * _product_of_rows(w, w.at(row, columns), b, rows)

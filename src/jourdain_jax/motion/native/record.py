@@ -5,47 +5,33 @@ window of slots, the last one first.
 """
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
 from jourdain_jax.motion.integrators.explicit_steps import Method
-from jourdain_jax.motion.native.functions import Form
-from jourdain_jax.motion.native.layout import Lanes, copied, each_row, for_rows
-from jourdain_jax.motion.native.loop import COUNT, FIRST_ARRAY, NEXT, OWN, TIMES
-from jourdain_jax.native.ffi import FIRST_OF_SCRATCH, lanes_taken, next_lane
+from jourdain_jax.motion.native.layout import Form, Lanes, copied, each_row, for_rows
+from jourdain_jax.motion.native.loop import COUNT, NEXT, OWN, STARTS, TIMES
+from jourdain_jax.native.ffi import FIRST_OF_SCRATCH, handed_out, lanes_taken, next_lane
 from jourdain_jax.native.ir import Value, Writer
 
-STARTS, TO_STATES, TO_ENDS, GOALS, FOUND = range(FIRST_ARRAY, FIRST_ARRAY + 5)
+TO_STATES, TO_ENDS, GOALS, FOUND = range(STARTS + 1, STARTS + 5)
 FIRST_SLOTS = 64  # for which there is memory at first; then twice as many, and so on
 
 
-@dataclass(frozen=True)
-class Slot:
-    """Rows of a slot."""
+class Slot(NamedTuple):
+    """Rows of a slot: those of a state come first, then those of its slopes; `all`: how many there are."""
 
     y: int
-    k: int
+    t: int
+    taken: int
+    saved: int
+    all: int
 
     @staticmethod
     def of(form: Form, method: Method) -> "Slot":
-        return Slot(form.layout.integrated, form.layout.integrated * method.needed)
-
-    @property
-    def t(self) -> int:
-        return self.y + self.k
-
-    @property
-    def taken(self) -> int:
-        return self.t + 1
-
-    @property
-    def saved(self) -> int:
-        return self.t + 2
-
-    @property
-    def all(self) -> int:
-        return self.t + 3
+        y = form.integrated
+        t = y * (1 + method.needed)
+        return Slot(y, t, t + 1, t + 2, t + 3)
 
 
 class _Rooms(NamedTuple):
@@ -60,7 +46,7 @@ class _Rooms(NamedTuple):
 
     @staticmethod
     def of(w: Writer, form: Form, asked: int) -> "_Rooms":
-        rows = form.layout.all, form.layout.integrated, max(asked, 1)
+        rows = form.all, form.integrated, max(asked, 1)
         state, g, by_known = (w.room(count) for count in rows)
         return _Rooms(state, w.room(w.lanes, "i64"), w.room(), g, by_known, w.room(type="i64"))
 
@@ -95,11 +81,11 @@ def _write_more_room(w: Writer) -> None:
 
 def _write_blocks(w: Writer, form: Form, method: Method, asked: int, job: Value) -> None:
     """Lanes side by side, forth and back, until none is left."""
-    layout, slot = form.layout, Slot.of(form, method)
+    slot = Slot.of(form, method)
     size = slot.all * w.lanes * 8
     rooms = _Rooms.of(w, form, asked)
     state, who, count = rooms.state, rooms.who, rooms.tries
-    record, bytes_there, lanes = w.room(type="ptr"), w.room(type="i64"), Lanes(w, layout, state)
+    record, bytes_there, lanes = w.room(type="ptr"), w.room(type="i64"), Lanes(w, form, state)
     w.store(w.literal(FIRST_SLOTS * size, "i64"), bytes_there)
     w.store(w.external("aligned_alloc", "ptr", w.literal(64, "i64"), w.literal(FIRST_SLOTS * size, "i64")), record)
 
@@ -133,7 +119,7 @@ def _write_blocks(w: Writer, form: Form, method: Method, asked: int, job: Value)
 def _write_windows(w: Writer, form: Form, method: Method, asked: int, job: Value) -> None:
     """As `_write_blocks`, on a GPU: the lanes of a warp, in memory for so many of the last slots; the numbers of its threads stand side by side."""
     slot, rooms = Slot.of(form, method), _Rooms.of(w, form, asked)
-    lanes, here, end = Lanes(w, form.layout, rooms.state), w.room(slot.all), w.room(type="i64")
+    lanes, here, end = Lanes(w, form, rooms.state), w.room(slot.all), w.room(type="i64")
     (thread, threads), count = w.thread(), rooms.tries
     record = w.at(w.load(job, NEXT, "ptr"), thread + FIRST_OF_SCRATCH)
     slots = w.binary("sdiv", w.load(job, OWN, "i64") - FIRST_OF_SCRATCH, threads * slot.all)
@@ -175,7 +161,7 @@ def _take(w: Writer, job: Value, who: Value) -> None:
 
 def _write_start(w: Writer, form: Form, job: Value, rooms: "_Rooms") -> None:
     """All lanes at their starts."""
-    with w.counted(0, form.layout.all) as row:
+    with w.counted(0, form.all) as row:
         w.store(1.0, rooms.state, row)
     with w.counted(0, w.lanes) as lane:
         w.run("begin", job, rooms.state, rooms.who, lane)
@@ -186,8 +172,8 @@ def _write_start(w: Writer, form: Form, job: Value, rooms: "_Rooms") -> None:
 
 def _write_try(w: Writer, form: Form, slot: Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
     """A step that is tried, and its slot `here`."""
-    lanes = Lanes(w, form.layout, rooms.state)
-    copied(w, form.layout.integrated, rooms.state, here)
+    lanes = Lanes(w, form, rooms.state)
+    copied(w, form.integrated, rooms.state, here)
     w.store(lanes["t"], here, slot.t)
     w.store(w.load(rooms.saved), here, slot.saved)
     w.run("step", rooms.state, w.at(here, slot.y))
@@ -198,12 +184,12 @@ def _write_try(w: Writer, form: Form, slot: Slot, job: Value, rooms: "_Rooms", h
 
 def _write_ends(w: Writer, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
     """Cotangents of the states at the end of a block."""
-    g, layout = rooms.g, form.layout
+    g = rooms.g
     each_row(w, asked, rooms.by_known, lambda i: 0.0)
-    ends, per_end = w.load(job, TO_ENDS, "ptr"), layout.ends
+    ends, per_end = w.load(job, TO_ENDS, "ptr"), form.ends
     with w.counted(0, w.lanes) as lane:
         number = w.load(rooms.who, lane, "i64")
-        with w.counted(0, layout.integrated) as row:
+        with w.counted(0, form.integrated) as row:
             found = w.load(ends, w.where(number >= 0, number, 0) * per_end + row, "double")
             w.store(w.where(number >= 0, found, w.literal(0.0, "double")), w.at(g, row * w.lanes + lane, "double"))
     # what was not reached repeats the last state
@@ -227,21 +213,20 @@ def _write_try_back(w: Writer, slot: Slot, job: Value, rooms: "_Rooms", here: Va
 
 def _write_found(w: Writer, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
     """The results of a block."""
-    g, layout = rooms.g, form.layout
+    g = rooms.g
     w.run("added", job, rooms.who, w.number(0.0), w.load(rooms.saved), g)
-    found, each = w.load(job, FOUND, "ptr"), layout.integrated + asked
+    found, each = w.load(job, FOUND, "ptr"), form.integrated + asked
     with w.counted(0, w.lanes) as lane:
         number = w.load(rooms.who, lane, "i64")
         with w.when(number >= 0):
-            with w.counted(0, layout.integrated) as row:
-                w.store(w.load(g, row * w.lanes + lane, "double"), found, number * each + row)
-            with w.counted(0, asked) as row:
-                w.store(w.load(rooms.by_known, row * w.lanes + lane, "double"), found, number * each + layout.integrated + row)
+            place = w.at(found, number * each, "double")
+            handed_out(w, form.integrated, g, lane, place)
+            handed_out(w, asked, rooms.by_known, lane, w.at(place, form.integrated, "double"))
 
 
 def _give_nan(w: Writer, form: Form, asked: int, job: Value, who: Value) -> None:
     """Where no memory is left: NaN for this block and for all lanes that are left."""
-    found, each = w.load(job, FOUND, "ptr"), form.layout.integrated + asked
+    found, each = w.load(job, FOUND, "ptr"), form.integrated + asked
 
     def lost(number: Value) -> None:
         with w.counted(0, each) as row:

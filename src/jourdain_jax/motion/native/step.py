@@ -15,8 +15,7 @@ from jourdain_jax.motion.integrators.crossings import watched as watched_by
 from jourdain_jax.motion.integrators.erk_step import AMPLIFIED, NEAR_SINE, NOISE
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING, Search, advanced, any_of, chosen, decided, is_flat
 from jourdain_jax.motion.integrators.explicit_steps import Aim, Method, aimed, judged, taken
-from jourdain_jax.motion.native.functions import Form
-from jourdain_jax.motion.native.layout import Lanes, Layout, copied, each_row, for_rows, over_rows
+from jourdain_jax.motion.native.layout import Form, Lanes, copied, each_row, for_rows, over_rows
 from jourdain_jax.motion.native.taylor import TaylorSteps, at_time, jet, monitored_at, radius, slope
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native.ir import Value, Writer
@@ -45,15 +44,14 @@ def _relations(w: Writer, form: Form, p: Lanes, t: Value, y: Value) -> list[Valu
 
 def _watched(w: Writer, form: Form, p: Lanes, t1: Value, step: Value, y1: Value, fits: Value) -> Watched:
     """What a step to the state `y1` crosses; `fits`: it would be accepted."""
-    layout = form.layout
 
     def between(once: Value, share: Value, now: tuple[Value, ...]) -> list[Value]:
         found = w.room(len(now))
         for i, x in enumerate(now):
             w.store(x, found, i)
         with w.when(w.any(once)):
-            y, part = w.room(layout.integrated), w.where(once, share, 0.0)
-            for i in range(layout.coordinates + layout.speeds):
+            y, part = w.room(form.integrated), w.where(once, share, 0.0)
+            for i in range(form.q_and_v):
                 start = w.load(p.pointer, i)
                 w.store(w.fma(part, w.load(y1, i) - start, start), y, i)
             for i, x in enumerate(unless_zero(w, _relations(w, form, p, w.fma(part, step, p["t"]), y), now)):
@@ -84,7 +82,7 @@ def _monitored(w: Writer, form: Form, p: Lanes, k: tuple[Value, Value], y1: Valu
 
     `k`: slopes at its ends; `accept`: it is a step of the motion.
     """
-    layout, count, y, t = form.layout, form.layout.events, p.pointer, p["t"]
+    count, y, t = form.events, p.pointer, p["t"]
 
     def events(t: Value, y: Value, slope: Value) -> list[list[Value]]:
         values, rates = w.room(count), w.room(count)
@@ -109,14 +107,14 @@ def _monitored(w: Writer, form: Form, p: Lanes, k: tuple[Value, Value], y1: Valu
         return _search_of(p, count), w.load(first)
 
     # a motion that starts beyond an event has no motion at all
-    sound = over_rows(w, range(layout.y), 0.0, lambda total, i: total + 0.0 * w.load(y, i)).equals(0.0)
+    sound = over_rows(w, range(form.y), 0.0, lambda total, i: total + 0.0 * w.load(y, i)).equals(0.0)
     found = decided(w, p, new, h, (c_0, rate_0, c_1, rate_1), accept, sound, (_search_of(p, count), advance))
 
     def state(i: int | Value) -> Value:
         after = w.load(y1, i)
         return w.where(found.stays, w.load(y, i), w.where(found.found, w.fma(found.search.shift, w.load(k[0], i), after), after))
 
-    each_row(w, layout.integrated, y1, state)
+    each_row(w, form.integrated, y1, state)
     if form.moving:
         _put_tangents(w, form, p, k[0], found.found, new["t"], rate_0, y1)
     return new | found.new | {"taken": w.where(found.stays, 0.0, new["taken"])}
@@ -136,7 +134,7 @@ def _put_tangents(w: Writer, form: Form, p: Lanes, k: Value, found: Value, t: Va
 
     where values, tangents and rates are those before; dt is NaN where c has no slope there.
     """
-    layout, count, times = form.layout, form.layout.events, form.layout.rows["dt"]
+    count, times = form.events, form.rows["dt"]
     with w.when(w.any(found)):
         values, pivots = w.room(count * len(times)), w.room(max(len(form.monitored), 1))
         slope = chosen(w, p["event"], rate)
@@ -144,7 +142,7 @@ def _put_tangents(w: Writer, form: Form, p: Lanes, k: Value, found: Value, t: Va
         flat = found & slope_is_flat(w, p, slope)
         for part, row in enumerate(times, 1):
             if part > 1:  # what is known of the rates is of the state as it was
-                k = w.room(layout.integrated)
+                k = w.room(form.integrated)
                 w.run("rates", p.pointer, t, y1, k, pivots)
             w.run("event_tangents", p.pointer, t, y1, values)
             dc = chosen(w, p["event"], [w.load(values, (part - 1) * count + i) for i in range(count)])
@@ -152,17 +150,17 @@ def _put_tangents(w: Writer, form: Form, p: Lanes, k: Value, found: Value, t: Va
             w.store(w.where(found, dt, w.load(p.pointer, row)), p.pointer, row)
             for other in range(len(times) + 1):
                 if not other & part:
-                    _move_rows(w, layout, y1, k, (other | part) * layout.y, other * layout.y, dt, usable | flat)
+                    _move_rows(w, form, y1, k, (other | part) * form.y, other * form.y, dt, usable | flat)
 
 
-def _move_rows(w: Writer, layout: Layout, y: Value, k: Value, rows: int, rates: int, dt: Value, moves: Value) -> None:
+def _move_rows(w: Writer, form: Form, y: Value, k: Value, rows: int, rates: int, dt: Value, moves: Value) -> None:
     """Adds the rates that begin with row `rates` of `k`, times `dt`, to those that begin with row `rows` of `y`."""
 
     def moved(i: int | Value) -> Value:
         before = w.load(y, i + rows)
         return w.where(moves, w.fma(w.load(k, i + rates), dt, before), before)
 
-    for_rows(w, range(layout.y), lambda i: w.store(moved(i), y, i + rows))
+    for_rows(w, range(form.y), lambda i: w.store(moved(i), y, i + rows))
 
 
 IDLE = -9.0  # code of a place that has no lane
@@ -181,27 +179,27 @@ class Trial(NamedTuple):
 def write_step(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
     """`step(state, k)`: one step, tried by all lanes that are on their way; `k`: room for the slopes of its stages, or for Taylor coefficients."""
     with w.procedure("step", "state:noalias k:noalias") as (state, k):
-        lanes = Lanes(w, form.layout, state)
+        lanes = Lanes(w, form, state)
         if form.relations:
             _write_first_signs(w, form, lanes)
         if isinstance(method, TaylorSteps):
-            _take(w, form, method, lanes, w.at(k, form.layout.integrated), _tried_by_series(w, form, method, lanes, k))
+            _take(w, form, method, lanes, w.at(k, form.integrated), _tried_by_series(w, form, method, lanes, k))
         else:
             _take(w, form, method, lanes, k, _tried_by_stages(w, form, method, lanes, k))
 
 
 def _tried_by_stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value) -> Trial:
     """A step of a Runge-Kutta method, which ends at the next time to save at, if not before."""
-    layout, y = form.layout, p.pointer  # the state comes first in the rows of a lane
+    y = p.pointer  # the state comes first in the rows of a lane
     aim = aimed(w, p, p["goal"], _reach(w, form, p, p["h"]), p["search_shift"] if form.has_events else None)
     t1, step = aim.t_1, aim.h
     smallest, changed_sign, rank = _stages(w, form, method, p, k, p["t"], step)
-    y1, error = w.room(layout.integrated), w.room(layout.y)
-    each_row(w, layout.integrated, y1, lambda i: w.fma(step, weighted(w, method.b, k, layout, i), w.load(y, i)))
-    each_row(w, layout.y, error, lambda i: step * weighted(w, method.b_error, k, layout, i))
+    y1, error = w.room(form.integrated), w.room(form.y)
+    each_row(w, form.integrated, y1, lambda i: w.fma(step, weighted(w, method.b, k, form, i), w.load(y, i)))
+    each_row(w, form.y, error, lambda i: step * weighted(w, method.b_error, k, form, i))
     if form.projects:
-        _project(w, layout, p, t1, y1, error, rank)
-    size_of_error = _norm(w, layout, p, error, y1)
+        _project(w, form, p, t1, y1, error, rank)
+    size_of_error = _norm(w, form, p, error, y1)
     if form.pivots or form.directions:
         size_of_error = w.where(changed_sign & ~aim.locating, math.inf, size_of_error)
     accept, next_h = judged(w, partial(power, w), p, aim, size_of_error, method.order)
@@ -215,14 +213,14 @@ def _reach(w: Writer, form: Form, p: Lanes, h: Value) -> Value:
 
 def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Value) -> Trial:
     """A step by Taylor series, which goes over the times to save at; puts the coefficients into `k`, and after them the slope at the end of the step."""
-    layout, count = form.layout, form.layout.integrated
+    count = form.integrated
     t, last_goal, direction = p["t"], p["last_goal"], p["direction"]
     locating = p["code"].equals(LOCATING)
     rows, at_start = jet(w, form, p, t, method.order)
     for row, series in enumerate(rows):
         for j, x in enumerate(series):
             w.store(w.number(0.0) if x is None else x, k, j * count + row)
-    length = w.smaller(radius(w, layout, p, rows), p["longest"])
+    length = w.smaller(radius(w, form, p, rows), p["longest"])
     size = _reach(w, form, p, w.smaller(length, p["bound"]))
     rest = w.magnitude(last_goal - t)
     lands = ~locating & (size >= 0.999 * rest)
@@ -245,10 +243,10 @@ def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Va
         accept = accept & ~(((a < 0.0) & (b > 0.0)) | ((a > 0.0) & (b < 0.0)))
     accept = accept & ~_turns_round(w, form, at_start.values, at_end.values)
     if form.projects:
-        error = w.room(layout.y)
-        each_row(w, layout.y, error, lambda i: 0.0)
-        _project(w, layout, p, t1, y1, error)
-        accept = accept & (_norm(w, layout, p, error, y1) <= 1.0)
+        error = w.room(form.y)
+        each_row(w, form.y, error, lambda i: 0.0)
+        _project(w, form, p, t1, y1, error)
+        accept = accept & (_norm(w, form, p, error, y1) <= 1.0)
     accept = locating | accept
     p["bound"] = w.where(accept, math.inf, 0.5 * size)
     p["before"] = t
@@ -257,7 +255,7 @@ def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Va
 
 def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Value, trial: Trial) -> None:
     """What becomes of the lanes after a step that was tried; `k`: slopes, the one at the start first."""
-    layout, y, count = form.layout, p.pointer, form.layout.integrated
+    y, count = p.pointer, form.integrated
     aim, y1, accept, next_h, smallest = trial
     t1, locating = aim.t_1, aim.locating
     watched = _watched(w, form, p, t1, aim.h, y1, accept & ~locating) if form.relations else None
@@ -267,7 +265,7 @@ def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Valu
     new["taken"] = w.where(accept, aim.h, 0.0)  # by how far the state has gone on
     each_row(w, count, y1, lambda i: w.where(accept, w.load(y1, i), w.load(y, i)))
     if form.has_events:
-        ends = k, w.at(k, method.at_the_end * layout.integrated)
+        ends = k, w.at(k, method.at_the_end * form.integrated)
         new = _monitored(w, form, p, ends, y1, new, aim.h, accept & ~locating & new["code"].equals(RUNNING))
     counts = accept & ~locating & new["code"].equals(RUNNING) & new["t"].equals(t1)
     stays = counts | (locating & new["code"].equals(results.EVENT))
@@ -291,8 +289,8 @@ class Rank(NamedTuple):
 
 def _stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value, t: Value, step: Value) -> tuple[Value, Value, Rank | None]:
     """The smallest magnitude of a pivot, whether any changed its sign, and how near rows are to losing rank; puts the slopes of all stages into `k`."""
-    layout, count = form.layout, form.pivots
-    every, turned = layout.integrated, w.literal(0, w.truth)
+    count = form.pivots
+    every, turned = form.integrated, w.literal(0, w.truth)
     first: list[Value] = []
     at, pivots = w.room(every), w.room(max(len(form.monitored), 1))
     rank, square = None, w.room()
@@ -300,13 +298,13 @@ def _stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value, t: Value,
 
     def next_state(i: int, row: int | Value) -> Value:
         start = w.load(p.pointer, row)
-        return w.fma(step, weighted(w, method.A[i], k, layout, row), start) if i else start
+        return w.fma(step, weighted(w, method.A[i], k, form, row), start) if i else start
 
     for i in range(method.needed):
         time = w.fma(step, float(method.c[i]), t)
         each_row(w, every, at, partial(next_state, i))
         if rank is not None:
-            put_near_rows(w, layout, p.pointer, rank.near, time, at)
+            put_near_rows(w, form, p.pointer, rank.near, time, at)
         w.run("rates", p.pointer, time, at, w.at(k, i * every), pivots)
         now = [w.load(pivots, j) for j in range(len(form.monitored) - len(form.squares))]
         if form.squares:
@@ -337,13 +335,13 @@ def near_rank_loss(squares: list[tuple[Value, Value]]) -> Value:
     return any_of([left < NEAR_SINE**2 * size for left, size in squares])
 
 
-def put_near_rows(w: Writer, layout: Layout, state: Value, near: Value, t: Value, y: Value) -> None:
+def put_near_rows(w: Writer, form: Form, state: Value, near: Value, t: Value, y: Value) -> None:
     """Puts the state `y` of a stage back onto the rows in lanes that are `near` a loss of rank."""
     with w.when(w.any(near)):
-        put = w.room(layout.integrated)
-        copied(w, layout.integrated, y, put)
+        put = w.room(form.integrated)
+        copied(w, form.integrated, y, put)
         w.run("project", state, t, put)
-        copied(w, layout.integrated, put, y, near)
+        copied(w, form.integrated, put, y, near)
 
 
 def _turns_round(w: Writer, form: Form, first: list[Value], now: list[Value]) -> Value:
@@ -352,29 +350,29 @@ def _turns_round(w: Writer, form: Form, first: list[Value], now: list[Value]) ->
     return ~reduce(operator.and_, acute) if acute else w.literal(0, w.truth)
 
 
-def weighted(w: Writer, weights: np.ndarray, k: Value, layout: Layout, row: int | Value) -> Value:
+def weighted(w: Writer, weights: np.ndarray, k: Value, form: Form, row: int | Value) -> Value:
     """sum_j w_j k_j of one number of the state."""
     used = [j for j in range(len(weights)) if weights[j] != 0]
-    total = w.load(k, used[0] * layout.integrated + row) * float(weights[used[0]])
+    total = w.load(k, used[0] * form.integrated + row) * float(weights[used[0]])
     for j in used[1:]:
-        total = w.fma(w.load(k, j * layout.integrated + row), float(weights[j]), total)
+        total = w.fma(w.load(k, j * form.integrated + row), float(weights[j]), total)
     return total
 
 
-def _project(w: Writer, layout: Layout, p: Lanes, t1: Value, y1: Value, error: Value, rank: Rank | None = None) -> None:
+def _project(w: Writer, form: Form, p: Lanes, t1: Value, y1: Value, error: Value, rank: Rank | None = None) -> None:
     """Puts `y1` back onto the rows; the error is no smaller than how far that moved it, beyond noise."""
-    free = w.room(layout.y)
-    copied(w, layout.y, y1, free)
+    free = w.room(form.y)
+    copied(w, form.y, y1, free)
     w.run("project", p.pointer, t1, y1)
     amplified = None if rank is None else w.where(rank.near, w.smaller(AMPLIFIED * w.eps / rank.square, w.eps ** (1 - NOISE)), 0.0)
     if rank is not None:
         with w.when(w.any(rank.near)):
-            both = w.room(2 * layout.y)
-            copied(w, layout.y, y1, both)
-            copied(w, layout.y, error, w.at(both, layout.y))
+            both = w.room(2 * form.y)
+            copied(w, form.y, y1, both)
+            copied(w, form.y, error, w.at(both, form.y))
             w.run("along", p.pointer, t1, both)
-            each_row(w, layout.y, error, lambda i: w.where(rank.near, w.load(both, i + layout.y), w.load(error, i)))
-    for part in layout.parts:
+            each_row(w, form.y, error, lambda i: w.where(rank.near, w.load(both, i + form.y), w.load(error, i)))
+    for part in form.parts:
         largest = over_rows(w, part, 0.0, lambda largest, i: w.larger(largest, w.magnitude(w.load(y1, i))))
         noise = (w.eps**NOISE if amplified is None else w.larger(amplified, w.eps**NOISE)) * largest
         by_rows = None if amplified is None else amplified * amplified * largest
@@ -387,9 +385,9 @@ def _project(w: Writer, layout: Layout, p: Lanes, t1: Value, y1: Value, error: V
         each_row(w, part, error, larger_error)
 
 
-def _norm(w: Writer, layout: Layout, p: Lanes, error: Value, y1: Value) -> Value:
+def _norm(w: Writer, form: Form, p: Lanes, error: Value, y1: Value) -> Value:
     """Root mean square of the errors of coordinates and speeds, relative to what is allowed; infinite where one is no number."""
-    rtol, atol, count = p["rtol"], p["atol"], layout.coordinates + layout.speeds
+    rtol, atol, count = p["rtol"], p["atol"], form.q_and_v
 
     def added(total: Value, i: int | Value) -> Value:
         size = w.larger(w.magnitude(w.load(p.pointer, i)), w.magnitude(w.load(y1, i)))

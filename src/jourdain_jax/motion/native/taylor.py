@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from jourdain_jax.calculus.scalar_operations import TABLE
-from jourdain_jax.motion.native.functions import Form, known_values, outputs_of
-from jourdain_jax.motion.native.layout import Lanes, Layout
+from jourdain_jax.motion.native.functions import known_values, outputs_of
+from jourdain_jax.motion.native.layout import Form, Lanes
 from jourdain_jax.native.angles import sine_and_cosine
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.math_functions import FUNCTIONS, exponential, logarithm
@@ -207,38 +207,29 @@ class Monitored(NamedTuple):
     values: list[Value]  # as `Form.monitored`, pivots relative to their usual sizes
 
 
-class Jet(NamedTuple):
-    """The coefficients of every number that is integrated, and what is monitored at their start."""
-
-    rows: list[Coefficients]
-    monitored: Monitored
-
-
-def jet(w: Writer, form: Form, p: Lanes, t: Value, order: int) -> Jet:
-    """The Taylor series of the lanes' states, and of their tangents, at the time t."""
-    program, layout, y = form.program, form.layout, p.pointer
-    rates = form.rates
+def jet(w: Writer, form: Form, p: Lanes, t: Value, order: int) -> tuple[list[Coefficients], Monitored]:
+    """The Taylor series of every number that is integrated, tangents too, at the time t, and what is monitored there."""
+    y, rates = p.pointer, form.rates
     own = outputs_of(form, [*rates, *_monitored(form)], len(rates))
-    first = len(program.fixed)  # time, then the state
     known = dict(zip(own.variables, known_values(w, form, y, t, y).values(), strict=True))
-    states = own.variables[first + 1 : first + 1 + layout.coordinates + layout.speeds]
+    _, clock, states, _ = form.split(own.variables)
     given = {n: x for n, x in known.items() if n not in states} | dict(zip(own.known, p.every("dknown"), strict=True))
     given |= dict(zip(own.times, p.every("dt"), strict=True)) if own.times else {}
 
     def with_work(nodes: list[int], other: int | None) -> list:
-        return [*nodes, *[other] * (layout.y - len(nodes))]
+        return [*nodes, *[other] * (form.y - len(nodes))]
 
     moved = [n for part in (states, *own.states) for n in with_work(part, None)]
     nodes = [n for part in (own.values[: len(rates)], *own.tangents) for n in with_work(part, own.graph.zero)]
-    start = [w.load(y, i) for i in range(layout.integrated)]
-    found = Series(w, own.graph, given, moved, nodes, start, order, own.variables[first])
+    start = [w.load(y, i) for i in range(form.integrated)]
+    found = Series(w, own.graph, given, moved, nodes, start, order, clock)
     values = {n: w.number(0.0) if x[0] is None else x[0] for n, x in found.of.items()}
-    return Jet(found.state, _evaluated(w, form, own.graph, own.values[len(rates) :], values, known))
+    return found.state, _evaluated(w, form, own.graph, own.values[len(rates) :], values, known)
 
 
 def products(form: Form, order: int) -> int:
     """About how many multiplications a step takes, tangents and all."""
-    own = outputs_of(form, form.rates, form.layout.y)
+    own = outputs_of(form, form.rates, form.y)
     nodes = own.graph.reachable([*own.values, *(n for part in own.tangents for n in part)])
     return order * (order + 1) // 2 * sum(own.graph.op[n] not in ("const", "input", "add", "sub", "neg") for n in nodes)
 
@@ -263,9 +254,9 @@ def _evaluated(w: Writer, form: Form, graph, nodes: Sequence[int], values: Mappi
     return Monitored(holds, [*pivots, *found[count + len(pivots) :]])
 
 
-def radius(w: Writer, layout: Layout, p: Lanes, rows: Sequence[Coefficients]) -> Value:
+def radius(w: Writer, form: Form, p: Lanes, rows: Sequence[Coefficients]) -> Value:
     """How long a step may be; zero where a coefficient is no number."""
-    rtol, atol, count = p["rtol"], p["atol"], layout.coordinates + layout.speeds
+    rtol, atol, count = p["rtol"], p["atol"], form.q_and_v
     inverse = [1.0 / w.fma(rtol, w.magnitude(w.load(p.pointer, i)), atol) for i in range(count)]
     order, least = len(rows[0]) - 1, w.number(math.inf)  # of log h
     for k in (order - 1, order):
