@@ -4,6 +4,8 @@
 without compiling, or compiled. `residuals` compares; a reduction is judged where it says that it applies.
 """
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,7 +20,7 @@ from jourdain_jax.calculus.matrices import null_space_qr, null_space_svd, presen
 from jourdain_jax.dynamics.accelerations import diagnosed
 from jourdain_jax.dynamics.power import power
 from jourdain_jax.dynamics.reactions import row_reactions
-from jourdain_jax.eager.lanes import uncompiled
+from jourdain_jax.eager.lanes import uncompiled_lanes
 from jourdain_jax.equations import virtual_power as equations_module
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
 from jourdain_jax.equations.reductions import Partition, _by_null_space, reduce
@@ -55,7 +57,7 @@ def dimensions(recipe: Recipe) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
 def evaluated(recipe: Recipe, *, parameters: int, states: int, seed: int = 0, compiled: bool = False, looks: bool = True) -> dict:
     """Everything at all instances, as NumPy arrays with a leading axis of instances; `looks`: also seen differently."""
     stacked, scene, t, q, u = instances(recipe, parameters, states, seed)
-    run = jax.jit if compiled else uncompiled
+    run = jax.jit if compiled else partial(uncompiled_lanes, shared=None)
     leaves, treedef = jax.tree.flatten(stacked)
     leaves = [np.repeat(x, states, axis=0) for x in leaves]
 

@@ -67,9 +67,9 @@ from jourdain_jax.scene.constraints import knife_edge, pin, rod, weld
 from jourdain_jax.scene.contacts import Contact, ball_contact, disc_contact, ellipsoid_contact, wheel_contact
 from jourdain_jax.scene.coordinates import coordinates, inputs, quaternion, speeds
 from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere, Surface
+from jourdain_jax.scene.identity import clear_caches
 from jourdain_jax.scene.loads import Load, damper, generalized_force, gravity, point_force, spring, torque
 from jourdain_jax.scene.motion_state import fixed_point
-from jourdain_jax.scene.names_read import clear_caches
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.possible_inertia import inertia_from_log_cholesky, log_cholesky
 from jourdain_jax.scene.printing import show_scenes_with as _show_scenes_with

@@ -149,11 +149,9 @@ def diagnosed(found: Reduced, equations: UnconstrainedEquations, rows: Constrain
     )
 
 
-def bare_accelerations(
-    scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None, usual: UsualRows | None = None
-) -> Reduced:
+def bare_accelerations(scene: Scene, t, q, u, inputs, reduction=None) -> Reduced:
     """Accelerations and constraint force alone, as `accelerations` but without multipliers and diagnostics: for use inside integration."""
-    return reduced_at(scene, t, q, u, inputs, reduction, stabilisation, usual_rows(scene) if usual is None else usual)[0]
+    return reduced_at(scene, t, q, u, inputs, reduction, None, usual_rows(scene))[0]
 
 
 def reduced_at(scene: Scene, t, q, u, inputs, reduction, stabilisation, usual) -> tuple[Reduced, UnconstrainedEquations, ConstraintRows]:

@@ -44,7 +44,7 @@ class Power(eqx.Module):
     @property
     def total(self) -> Float[Array, ""]:
         """`d(T + V)/dt`."""
-        return self.loads + self.rows + self.driven + self.potential + self.inertia
+        return sum(jax.tree.leaves(self))
 
 
 def needs_work(scene: Scene, structure: Structure) -> bool:

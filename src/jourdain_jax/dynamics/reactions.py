@@ -69,14 +69,6 @@ class ContactForce(eqx.Module):
     normal_determined: Bool[Array, ""]  # whether they determine the normal force, though two wheels of one axle may share the tangential one
 
 
-class _PerMultiplier(eqx.Module):
-    """What the rows exert where their multipliers are one."""
-
-    on_bodies: Wrenches  # leading axis: rows
-    direct: Float[Array, "rows speeds"]
-    spare: Float[Array, "rows rows"]  # columns: multipliers that change no motion
-
-
 @eager_if_concrete
 def row_reactions(scene: Scene, t, q, u, accelerations: Accelerations, inputs=None) -> RowReactions:
     """Constraint forces per row and per body at (t, q, u), from the multipliers of known `accelerations`.
@@ -87,17 +79,19 @@ def row_reactions(scene: Scene, t, q, u, accelerations: Accelerations, inputs=No
     return _reactions(scene, motion, _per_multiplier(scene, motion, inputs), accelerations.multipliers)
 
 
-def _reactions(scene: Scene, motion: Motion, unit: _PerMultiplier, multipliers) -> RowReactions:
-    force, torque = (multipliers[:, None, None] * part for part in (unit.on_bodies.force, unit.on_bodies.torque))
-    determined = jnp.diagonal(unit.spare) == 0  # a multiplier is unique where its row is no combination of the others
-    return RowReactions(multipliers, force, torque, multipliers[:, None] * unit.direct, determined, names_of_rows(scene), tuple(motion.bodies))
+def _reactions(scene: Scene, motion: Motion, unit: tuple, multipliers) -> RowReactions:
+    on_bodies, direct, spare = unit
+    force, torque = (multipliers[:, None, None] * part for part in (on_bodies.force, on_bodies.torque))
+    determined = jnp.diagonal(spare) == 0  # a multiplier is unique where its row is no combination of the others
+    return RowReactions(multipliers, force, torque, multipliers[:, None] * direct, determined, names_of_rows(scene), tuple(motion.bodies))
 
 
-def _per_multiplier(scene: Scene, motion: Motion, inputs) -> _PerMultiplier:
+def _per_multiplier(scene: Scene, motion: Motion, inputs) -> tuple[Wrenches, Array, Array]:
+    """What rows (leading axes) exert on bodies and on speeds where their multipliers are one; and `_spare_multipliers`."""
     bodies, q, u = motion.bodies.values(), motion.q.array, motion.u.array
     if not names_of_rows(scene):
         nothing = jnp.zeros((0, len(bodies), 3), q.dtype)
-        return _PerMultiplier(Wrenches(nothing, nothing), jnp.zeros((0, u.shape[0]), q.dtype), jnp.zeros((0, 0), q.dtype))
+        return Wrenches(nothing, nothing), jnp.zeros((0, u.shape[0]), q.dtype), jnp.zeros((0, 0), q.dtype)
 
     def rows(v, omega, u):
         return flatten_rows(velocity_rows(scene, _moving(scene, motion, v, omega, u)), q.dtype)
@@ -107,7 +101,7 @@ def _per_multiplier(scene: Scene, motion: Motion, inputs) -> _PerMultiplier:
     rigid = jnp.array([isinstance(body.body, RigidBody) for body in bodies])
     torque = jnp.where(rigid[:, None], torque, 0.0)  # a particle takes no torque
     A = jax.jacfwd(lambda u: velocity_residual(scene, motion.t, q, u, inputs))(u)
-    return _PerMultiplier(Wrenches(force, torque), direct, _spare_multipliers(A, plain_row_lengths(scene)))
+    return Wrenches(force, torque), direct, _spare_multipliers(A, plain_row_lengths(scene))
 
 
 def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
@@ -149,7 +143,7 @@ def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=N
     size = _size_of_forces(scene, motion, total.linear)
     margin = rank_cutoff(size.dtype) * size
     held = Wrenches(total.linear - jnp.sum(rows.force, axis=0), total.angular - jnp.sum(rows.torque, axis=0))  # by construction of the coordinates
-    spare = jax.tree.map(lambda part: jnp.einsum("sr,sbi->rbi", unit.spare, part), unit.on_bodies)
+    spare = jax.tree.map(lambda part: jnp.einsum("sr,sbi->rbi", unit[2], part), unit[0])
     positions = jnp.stack([body.position for body in motion.bodies.values()])
     built_in = normal_forces(contacts, rows.body_names, positions, held, spare, size)
     forces = {}

@@ -11,11 +11,6 @@ from jourdain_jax.calculus.jaxprs import evaluated, needed_only
 from jourdain_jax.eager.numpy_backend import applied
 
 
-def uncompiled(f: Callable) -> Callable:
-    """`f`, of trees of arrays, run on NumPy; also while something else is being traced."""
-    return uncompiled_lanes(f, shared=None)
-
-
 def uncompiled_lanes(f: Callable, shared: int | None = 0) -> Callable:
     """`f`, of trees of arrays of one lane, run on NumPy for arrays with an axis of lanes first.
 

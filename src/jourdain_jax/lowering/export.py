@@ -185,14 +185,10 @@ def latex(lowered) -> str:
     left = [rf"\dot{{{shown[int(n)]}}}" for n in traced.q]
     left += [rf"\ddot{{{rate_of[n]}}}" if n in rate_of else rf"\dot{{{shown[n]}}}" for n in (int(traced.u[i]) for i in lowered.independent)]
     symbols = {sympy.Symbol(names[n]): symbol for n, symbol in shown.items()}
-    values = [value.replace(_is_long, lambda number: sympy.Float(number, 6)) for value in expressions(lowered).values()]
+    # fractions that are longer than their decimals: 9/2 is not, 144952661367387/50000000000000 is
+    values = [value.replace(lambda x: x.is_Rational and x.q >= 1000, lambda number: sympy.Float(number, 6)) for value in expressions(lowered).values()]
     lines = [f"{rate} &= {sympy.latex(value, symbol_names=symbols)}" for rate, value in zip(left, values, strict=True)]
     return " \\\\\n".join(line for line in lines if len(set(line.split(" &= "))) > 1)
-
-
-def _is_long(value) -> bool:
-    """Whether `value` is a fraction that is longer than its decimals: 9/2 is not, 144952661367387/50000000000000 is."""
-    return value.is_Rational and value.q >= 1000
 
 
 def _symbol(name: str) -> str:

@@ -9,7 +9,7 @@ from jourdain_jax.lowering.appell import AppellOnGraph, Equations
 from jourdain_jax.lowering.comparison import enough, values_at
 from jourdain_jax.lowering.elimination import pivots_ok, usual
 from jourdain_jax.program.derivative import cotangents, on_its_own
-from jourdain_jax.program.identity_test import SURE, alike, equal
+from jourdain_jax.program.identity_test import SURE, alike, equal, taken_for_what_they_are
 from jourdain_jax.scene.scene import Scene
 
 FEW = 6  # probes that show most coordinates to count
@@ -27,7 +27,7 @@ def _with_slopes(builder: AppellOnGraph, ydot: list[int], coordinates: list[int]
     own, outputs, variables = on_its_own(graph, ydot, inputs)
     weights = [own.const(x) for x in np.random.default_rng(5).uniform(0.5, 1.5, len(outputs))]
     slopes = cotangents(own, outputs, weights, [variables[inputs.index(n)] for n in coordinates])
-    if not generic.takes_for_what_they_are(own, slopes):
+    if not taken_for_what_they_are(own, slopes):
         return set()
     found = generic.on_graph(own, {str(own.value[n]): str(graph.value[old]) for n, old in zip(variables, inputs, strict=True)})(slopes)
     surely = np.any((np.abs(np.asarray(found)) > SURE * found.error) & np.isfinite(found) & regular, axis=1)

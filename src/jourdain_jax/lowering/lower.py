@@ -93,7 +93,12 @@ def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool
         raise NotLowered("its rows depend on each other, though none may be left out everywhere")
     try:
         traced = traced_scene(scene, structure.potentials_of_inputs)
-        _check_calls(traced)
+        if traced.effects:
+            raise Unsupported(traced.effects)
+        loops = (traced.graph.value[call].loop for call in traced.graph.calls(n for part in traced.motion for n in part.ravel().tolist()))
+        if loop := next(filter(None, loops), None):
+            # measured: a ball on a hill, whose point of contact is found by Newton's method, takes four times as long as by dense matrices
+            raise Unsupported(f"the operation `{loop}`")
         probes = _probes(scene, structure, traced)
         if every_speed and len(structure.row_names) > structure.rank:  # elsewhere they contradict each other
             probes = on_velocity_rows(probes, traced)
@@ -104,15 +109,6 @@ def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool
         raise NotLowered(f"{reason} has no scalar form") from None
     except ZeroDivisionError:
         raise NotLowered("its rows are dependent in a way that no elimination order avoids") from None
-
-
-def _check_calls(traced: TracedScene) -> None:
-    if traced.effects:
-        raise Unsupported(traced.effects)
-    for call in traced.graph.calls(n for part in traced.motion for n in part.ravel().tolist()):
-        if loop := traced.graph.value[call].loop:
-            # measured: a ball on a hill, whose point of contact is found by Newton's method, takes four times as long as by dense matrices
-            raise Unsupported(f"the operation `{loop}`")
 
 
 def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:

@@ -2,6 +2,7 @@
 
 import functools
 import importlib.util
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -151,20 +152,16 @@ class Lowered:
 
         `fixed`, `t` (s), `q`, `y`, `inputs`, `with_power`: as in `rates`.
         """
-        found = list(_program_of_rates(self, with_power)(*self._known(fixed, t, q, y, inputs).values()))
-        found, squares = found[: len(found) - len(self.squares)], found[len(found) - len(self.squares) :]
-        ratios = [left / size for left, size in zip(squares[::2], squares[1::2], strict=True)]
+        found = iter(_program_of_rates(self, with_power)(*self._known(fixed, t, q, y, inputs).values()))
+        taken = lambda nodes: tuple(itertools.islice(found, len(nodes)))  # noqa: E731
+        (first, *qdot), ydot, power = taken(self.qdot), taken(self.ydot), next(found) if with_power else None
+        for guard in taken(self.guards):
+            first = jnp.where(guard > 0, first, jnp.nan)
+        pivots = tuple(value / size for value, size in zip(taken(self.pivots), self.pivot_sizes(fixed), strict=True))
+        directions = taken(self.directions)
+        ratios = [left / size for left, size in zip(found, found, strict=True)]
         sine = jnp.sqrt(jnp.maximum(functools.reduce(jnp.minimum, ratios), 0.0)) if ratios else None
-        count = len(found) - len(self.directions)
-        directions = tuple(found[count:])
-        found, count = found[:count], count - len(self.pivots)
-        pivots = tuple(value / size for value, size in zip(found[count:], self.pivot_sizes(fixed), strict=True))
-        count -= len(self.guards)
-        for guard in found[count : count + len(self.guards)]:
-            found[0] = jnp.where(guard > 0, found[0], jnp.nan)
-        at = len(self.qdot)
-        power = found[count - 1] if with_power else None
-        return tuple(found[:at]), tuple(found[at : at + len(self.ydot)]), power, pivots, directions, sine
+        return (first, *qdot), ydot, power, pivots, directions, sine
 
     @property
     def variables(self) -> list[int]:

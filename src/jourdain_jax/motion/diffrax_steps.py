@@ -75,8 +75,7 @@ class Diffrax(eqx.Module, Integrator):
     alongside: bool = eqx.field(static=True)  # as of `OwnSteps`
     max_steps: int = eqx.field(static=True)
     event_names: tuple[str, ...] = eqx.field(static=True)
-    projects_saved: ClassVar[bool] = False
-    watches: ClassVar[bool] = False
+    own: ClassVar[bool] = False
 
     @property
     def name(self) -> str:

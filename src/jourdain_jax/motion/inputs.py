@@ -36,8 +36,9 @@ from jourdain_jax.eager.lanes import uncompiled_lanes
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.calls import description
 from jourdain_jax.scene.arguments import ChangingInputs
+from jourdain_jax.scene.identity import now_read_by
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.names_read import is_function, now_read_by
+from jourdain_jax.scene.names_read import is_function
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.spline import checked_samples
 
@@ -113,7 +114,7 @@ class FunctionOfTime(eqx.Module):
 def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
     """A function of one time as it is now, and the shape of what it returns; no `FunctionOfTime` where that is not one number.
 
-    It is traced again where it is another function, or what it reads (`scene/names_read.py`) has changed or has state.
+    It is traced again where it is another function, or what it reads (`scene/identity.py`) has changed or has state.
     """
     try:
         kept = _trace(function)

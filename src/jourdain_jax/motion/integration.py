@@ -108,7 +108,7 @@ def _finish(given: Setup, setup: Setup, asked: Float[Array, ""], begun: Begun, s
     t0, field, integrator = setup.t0, setup.field, setup.integrator
     start, args = begun.start, begun.args
     _, scene, inputs, fixed, origin = args
-    puts_back = field.projects and not integrator.projects_saved
+    puts_back = field.projects and not integrator.own
     stored_first = field.stored(scene, t0, start.q, inputs(t0))
     direction = jnp.sign(setup.t1 - t0)
     valid = solved.reached & (solved.ts * direction <= solved.t_end * direction) & begun.timely

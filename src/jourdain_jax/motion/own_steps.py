@@ -50,8 +50,7 @@ class OwnSteps(Integrator):
     native: bool  # whether machine code may integrate
     order: int | None  # of Taylor series, by which machine code steps in place of the solver's tableau
     memory: int  # bytes that the record of reverse mode may take
-    projects_saved: ClassVar[bool] = True
-    watches: ClassVar[bool] = True
+    own: ClassVar[bool] = True
 
     @property
     def name(self) -> str:
@@ -145,7 +144,8 @@ def own_steps(solver, **static) -> OwnSteps | None:
     method = solver if isinstance(solver, Method | ImplicitMethod) else method_of(solver)
     if method is None:
         return None
-    method = method.without_step() if isinstance(method, FixedStepMethod) else method
+    if isinstance(method, FixedStepMethod):
+        method = eqx.tree_at(lambda method: method.step, method, None)  # another step is no other program
     return OwnSteps(method, **static)
 
 
@@ -192,7 +192,7 @@ def reason_against_watching(setup: Setup) -> str:
     if setup.field.lowered is None:
         return "the scene has no scalar program" if loads_have_relations(setup.scene) else ""
     count = len(_relations(setup.field.lowered, setup.inputs, bool(setup.integrator.event_names))[1])
-    if not setup.integrator.watches:
+    if not setup.integrator.own:
         return "solvers of diffrax do not" if count else ""
     return f"they are {count}, more than {MOST_WATCHED}" if count > MOST_WATCHED else ""
 

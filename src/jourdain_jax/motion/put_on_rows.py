@@ -187,7 +187,7 @@ def free_entries(names: tuple[str, ...], held: Sequence[str]) -> Bool[np.ndarray
 
 def projected(scene: Scene, t, start: State, inputs, usual: Usual) -> State:
     """Project a state as `consistent` does, as a part of a larger compiled function."""
-    every_q, every_u = (free_entries(names, ()) for names in (scene.coordinate_names.entries, scene.speed_names.entries))
+    every_q, every_u = np.ones(len(start.q), bool), np.ones(len(start.u), bool)
     return put_onto_constraints(scene, t, Guess(start.q, start.u, every_q, every_u, ~every_q, usual), inputs, None)[0]
 
 

@@ -19,7 +19,6 @@ and relations that a motion crossed are counted by its steps (`motion/integrator
 """
 
 import warnings
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -38,72 +37,6 @@ class SensitivityWarning(UserWarning):
     """A derivative was taken through a motion that amplifies errors so much that few of its digits are right, or whose loads jump."""
 
 
-class _Sizes:
-    """What a state is off by, one tolerance, weighed by cotangents: of the states that are looked at, then of the start."""
-
-    def __init__(self, rtol: float, atol: float):
-        self.rtol, self.atol, self.steps, self.looked_at = rtol, atol, 0, 0.0
-
-    def weighed(self, values, cotangents) -> float:
-        """`sum |g| (atol + rtol |y|)`; what is not finite does not count."""
-        parts = [np.abs(g) * (self.atol + self.rtol * np.abs(y)) for y, g in zip(values, cotangents, strict=True)]
-        return float(sum(np.sum(np.where(np.isfinite(part), part, 0.0)) for part in parts))
-
-    def ends(self, values, steps: int):
-        """What to do with the cotangents of the states that are looked at, which come after so many steps."""
-        self.steps = steps
-
-        def look(cotangents):
-            self.looked_at += self.weighed(values, cotangents)
-
-        return look
-
-    def start(self, values):
-        """What to do with those of the start, which come last."""
-
-        def look(cotangents):
-            begun, self.looked_at, ended = self.weighed(values, cotangents), 0.0, self.looked_at
-            _judge(begun / ended if ended > 0 else 0.0, self.rtol, self.steps)
-
-        return look
-
-
-class _Growth:
-    """How far directions of the start, which tangents have as a first axis, have grown at the end."""
-
-    def __init__(self, rtol: float, atol: float, only_start: bool):
-        self.rtol, self.atol, self.only_start = rtol, atol, only_start
-        self.begun: list[np.ndarray] = []
-
-    def start(self, values):
-        """What to do with the tangents of the start, which come first."""
-
-        def look(tangents):
-            self.begun = tangents
-
-        return look
-
-    def ends(self, values, steps: int):
-        """What to do with those of the states (saved, then last) that come after so many steps."""
-        (q, u, q_end, u_end), middle = values, len(values[0]) // 2
-        tops = [np.max(np.nan_to_num(np.abs(np.concatenate([x, last[None]]))), axis=0) for x, last in ((q, q_end), (u, u_end))]
-
-        def sizes(tangents):
-            parts = [np.max(np.abs(d) / (self.atol + self.rtol * top), axis=1, initial=0.0) for d, top in zip(tangents, tops, strict=True)]
-            return np.maximum(*parts)
-
-        def look(tangents):
-            ended = sizes(tangents[2:])
-            begun = sizes(self.begun) if self.begun else np.zeros_like(ended)  # a start that nothing varies is not asked
-            half = sizes([d[:, middle] for d in tangents[:2]]) if middle else np.zeros_like(ended)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                from_start, from_middle = np.where(begun > 0, ended / begun, np.inf), np.where(half > 0, (ended / half) ** 2, 0.0)
-            grown = np.where(begun > 0, from_start, 0.0) if self.only_start else np.minimum(from_start, from_middle)
-            _judge(float(np.max(grown)), self.rtol, steps)
-
-        return look
-
-
 def _judge(amplification: float, rtol: float, steps: int) -> None:
     """A warning where so many steps, each as wrong as the tolerance lets it be, spoil a derivative."""
     error = steps * amplification * rtol
@@ -120,25 +53,49 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
     varies = tuple(name for name, part in setup._asdict().items() if is_traced(part))
     if not varies:
         return integrate(setup)
-    start, (rtol, atol) = setup.start, setup.tolerances
-    known = numbers_where_known((start.q, start.u, rtol, atol))
+    start = setup.start
+    known = numbers_where_known((start.q, start.u, *setup.tolerances))
     if known is None:
         return integrate(setup)
-    tolerances = float(known[2]), float(known[3])
-    growth = _Growth(*tolerances, varies == ("start",))
-    sizes: list[tuple[Callable, _Growth | _Sizes]] = [(tap_tangents, growth), (tap_cotangents, _Sizes(*tolerances))]
-    at_start = start.q, start.u
-    for shown, size in sizes:
-        at_start = shown(at_start, size.start(known[:2]))
+    rtol, atol, begun, looked_at = float(known[2]), float(known[3]), [], []
+
+    def weighed(values, cotangents) -> float:
+        """Return `sum |g| (atol + rtol |y|)`; what is not finite does not count."""
+        return float(sum(np.sum(np.nan_to_num(np.abs(g) * (atol + rtol * np.abs(y)), posinf=0.0)) for y, g in zip(values, cotangents, strict=True)))
+
+    def start_varies(tangents):
+        begun[:] = tangents
+
+    def ends_vary(tangents):
+        (q, u, q_end, u_end), middle = seen[:-1], len(seen[0]) // 2
+        tops = [np.max(np.nan_to_num(np.abs(np.concatenate([x, last[None]]))), axis=0) for x, last in ((q, q_end), (u, u_end))]
+
+        def sizes(tangents):
+            return np.maximum(*(np.max(np.abs(d) / (atol + rtol * top), axis=1, initial=0.0) for d, top in zip(tangents, tops, strict=True)))
+
+        ended = sizes(tangents[2:])
+        first = sizes(begun) if begun else np.zeros_like(ended)  # a start that nothing varies is not asked
+        half = sizes([d[:, middle] for d in tangents[:2]]) if middle else np.zeros_like(ended)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            from_start, from_middle = np.where(first > 0, ended / first, np.inf), np.where(half > 0, (ended / half) ** 2, 0.0)
+        grown = np.where(first > 0, from_start, 0.0) if varies == ("start",) else np.minimum(from_start, from_middle)
+        _judge(float(np.max(grown)), rtol, steps)
+
+    def start_is_asked(cotangents):  # which comes last
+        ended = sum(looked_at)
+        looked_at.clear()
+        _judge(weighed(known[:2], cotangents) / ended if ended > 0 else 0.0, rtol, steps)
+
+    at_start = tap_cotangents(tap_tangents((start.q, start.u), start_varies), start_is_asked)
     motion = integrate(eqx.tree_at(lambda s: (s.start.q, s.start.u), setup, at_start))
     parts = (motion.q, motion.u, motion.q_end, motion.u_end)
     seen = numbers_where_known((*parts, motion.accepted))
     if seen is None:
         return motion
+    steps = int(seen[-1])
     if {"scene", "start", "inputs", "t0"}.intersection(varies):
         warn_of_jumps(setup.field, motion, "scene" in varies)
-    for shown, size in sizes:
-        parts = shown(parts, size.ends(seen[:-1], int(seen[-1])))
+    parts = tap_cotangents(tap_tangents(parts, ends_vary), lambda cotangents: looked_at.append(weighed(seen[:-1], cotangents)))
     return eqx.tree_at(lambda m: (m.q, m.u, m.q_end, m.u_end), motion, parts)
 
 

@@ -54,8 +54,7 @@ class Integrator(abc.ABC):
     max_steps: int
     event_names: tuple[str, ...]
     solver: "diffrax.AbstractSolver | Method | ImplicitMethod"
-    watches: ClassVar[bool]  # whether steps watch relations (`crossings.py`)
-    projects_saved: ClassVar[bool]  # whether the states that it returns are on the rows
+    own: ClassVar[bool]  # whether steps watch relations (`crossings.py`), and states are put onto the rows
 
     @property
     @abc.abstractmethod

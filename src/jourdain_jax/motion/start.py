@@ -5,14 +5,13 @@ g(t, q) = 0,  phi(t, q, u) = 0
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from types import MappingProxyType
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from jourdain_jax.build.sampling import guesses_of
 from jourdain_jax.build.structure import structure_of
@@ -124,16 +123,13 @@ def named_start(model: Model, values: Mapping, t0, inputs, *, near: Mapping = _N
     held, contradict = model.once((given, about), lambda: _held(model, given, about))
     guess = Guess(q, u, *held)
 
-    guesses = partial(_guesses, scene, q, guess.free_q)
+    def guesses():
+        known = structure_of(scene)
+        return guesses_of(scene, known.coordinates[: known.random], q, guess.free_q)
+
     state = _consistent(scene, t, guess, inputs, guesses)
     _check_residual(scene, guess, state, inputs, given)
     return _moved_if_near(model, state, inputs) if contradict else state
-
-
-def _guesses(scene: Scene, q, free) -> Float[Array | np.ndarray, "guesses coordinates"]:
-    """Return coordinates from which the search begins: those of states of the domain, where they are `free`."""
-    known = structure_of(scene)
-    return guesses_of(scene, known.coordinates[: known.random], q, free)
 
 
 def _held(model: Model, given: tuple[str, ...], about: tuple[str, ...]) -> tuple[tuple, bool]:

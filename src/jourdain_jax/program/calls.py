@@ -16,7 +16,7 @@ from jax.extend.core import Literal, jaxpr_as_fun
 
 from jourdain_jax.calculus.jaxprs import loops
 from jourdain_jax.calculus.reals import is_array
-from jourdain_jax.eager.lanes import uncompiled
+from jourdain_jax.eager.lanes import uncompiled_lanes
 from jourdain_jax.program.graph import Unsupported
 
 
@@ -27,8 +27,7 @@ class Call:
         self.closed, self.reasons = closed, reasons
         self._described = description(closed)
         self._hash, self.name = hash(self._described), repr(self._described)  # the name tells it from calls of other functions
-        function = jaxpr_as_fun(closed)
-        self._together, self._alone = uncompiled(jax.vmap(function)), uncompiled(function)
+        self.at_probes = uncompiled_lanes(jaxpr_as_fun(closed))  # on NumPy, operands and results with a leading axis of probes
 
     def __hash__(self):
         return self._hash
@@ -89,13 +88,6 @@ class Call:
             raise NotImplementedError(f"a callback in a load or stop event does not say how it takes a batch: {str(error).splitlines()[0]}") from None
         return tuple(jnp.asarray(x, jnp.result_type(*real)) if real and jnp.issubdtype(x.dtype, jnp.floating) else x for x in found)
 
-    def at_probes(self, *operands) -> list[np.ndarray]:
-        """The results on NumPy, operands and results with a leading axis of probes."""
-        try:
-            return self._together(*operands)
-        except NotImplementedError:  # a callback that takes one at a time
-            return [np.stack(x) for x in zip(*(self._alone(*one) for one in zip(*operands, strict=True)), strict=True)]
-
 
 def _array(shape_and_type, *entries):
     shape, dtype = shape_and_type
@@ -116,13 +108,8 @@ def _entry(index, x):
 EMITTED: dict[str, Callable] = {"array": _array, "opaque": lambda call, *operands: call.results(*operands), "output": _output, "entry": _entry}
 
 
-def _array_at_probes(shape_and_type, *entries):
-    shape, dtype = shape_and_type
-    return np.stack(entries, axis=-1).reshape(-1, *shape).astype(dtype)
-
-
 AT_PROBES: dict[str, Callable] = {
-    "array": _array_at_probes,
+    "array": lambda about, *entries: np.stack(entries, axis=-1).reshape(-1, *about[0]).astype(about[1]),
     "opaque": lambda call, *operands: call.at_probes(*operands),
     "output": _output,
     "entry": lambda index, x: x.reshape(len(x), -1)[:, index[0]],
@@ -132,7 +119,18 @@ AT_PROBES: dict[str, Callable] = {
 _SEVERAL = tuple, list  # a union of types is made anew wherever it stands
 
 
-def _itself(x) -> Hashable:
+def description(x) -> Hashable:
+    """What tells a jaxpr, or a parameter of an operation, from another; two traces of one function have the same, unless they hold new functions."""
+    if isinstance(x, _SEVERAL):
+        return tuple(map(description, x))
+    if isinstance(x, dict):
+        return tuple((key, description(value)) for key, value in sorted(x.items()))
+    if hasattr(x, "consts"):  # from JAX 0.12 on, every jaxpr has them
+        return "closed", _of_jaxpr(x.jaxpr), tuple(map(description, x.consts))
+    if hasattr(x, "eqns"):
+        return _of_jaxpr(x)
+    if (is_array(x) and not np.asarray(x).dtype.hasobject) or isinstance(x, float):
+        return str(np.asarray(x).dtype), np.shape(x), np.asarray(x).tobytes()
     try:
         hash(x)
     except TypeError:
@@ -140,33 +138,12 @@ def _itself(x) -> Hashable:
     return x
 
 
-def description(x, details: Callable = lambda equation: equation.params, of_other: Callable = _itself) -> Hashable:
-    """What tells a jaxpr, or a parameter of an operation, from another; two traces of one function have the same, unless they hold new functions.
-
-    `details`: what tells an equation from others of the same operation; `of_other`: what tells a thing from others that is neither jaxpr nor array nor tuple.
-    """
-
-    def of(x) -> Hashable:
-        if isinstance(x, _SEVERAL):
-            return tuple(map(of, x))
-        if isinstance(x, dict):
-            return tuple((key, of(value)) for key, value in sorted(x.items()))
-        if hasattr(x, "consts"):  # from JAX 0.12 on, every jaxpr has them
-            return "closed", of_jaxpr(x.jaxpr), tuple(map(of, x.consts))
-        if hasattr(x, "eqns"):
-            return of_jaxpr(x)
-        if (is_array(x) and not np.asarray(x).dtype.hasobject) or isinstance(x, float):
-            return str(np.asarray(x).dtype), np.shape(x), np.asarray(x).tobytes()
-        return of_other(x)
-
-    def of_jaxpr(x) -> Hashable:
-        number = {v: k for k, v in enumerate([*x.constvars, *x.invars])}
-        atom = lambda v: of(np.asarray(v.val, v.aval.dtype)) if isinstance(v, Literal) else number[v]  # noqa: E731
-        lines: list = [tuple(v.aval for v in number)]
-        for equation in x.eqns:
-            inputs = tuple(map(atom, equation.invars))
-            number |= {v: len(number) + k for k, v in enumerate(equation.outvars)}
-            lines.append((equation.primitive, inputs, of(details(equation)), tuple(v.aval for v in equation.outvars)))
-        return *lines, tuple(map(atom, x.outvars))
-
-    return of(x)
+def _of_jaxpr(x) -> Hashable:
+    number = {v: k for k, v in enumerate([*x.constvars, *x.invars])}
+    atom = lambda v: description(np.asarray(v.val, v.aval.dtype)) if isinstance(v, Literal) else number[v]  # noqa: E731
+    lines: list = [tuple(v.aval for v in number)]
+    for equation in x.eqns:
+        inputs = tuple(map(atom, equation.invars))
+        number |= {v: len(number) + k for k, v in enumerate(equation.outvars)}
+        lines.append((equation.primitive, inputs, description(equation.params), tuple(v.aval for v in equation.outvars)))
+    return *lines, tuple(map(atom, x.outvars))

@@ -39,8 +39,8 @@ class Probes:
     def sign(self, node: int) -> int:
         """1 or -1 where the node has this sign at every probe, 0 otherwise."""
         value = self([node])[0]
-        finite = value[np.isfinite(value)]
-        return 0 if not finite.size or np.any(finite == 0) else int(np.sign(finite[0])) if np.all(np.sign(finite) == np.sign(finite[0])) else 0
+        signs = set(np.sign(value[np.isfinite(value)]).tolist())
+        return int(signs.pop()) if len(signs) == 1 else 0
 
     def _compute(self, nodes) -> None:
         graph, row = self.graph, self._row

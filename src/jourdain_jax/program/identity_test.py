@@ -73,11 +73,6 @@ class IdentityProbes:
         x, error = (np.broadcast_to(x, self.count) for x in (self.inputs[name], self._errors.get(name, 0.0)))
         return bool(np.any(np.abs(x - np.roll(x, 1)) > SURE * (error + np.roll(error, 1))))
 
-    @staticmethod
-    def takes_for_what_they_are(graph: Graph, nodes: Sequence[int]) -> bool:
-        """Whether no operation that the nodes need is replaced by another function."""
-        return all(graph.op[n] in _KNOWN for n in graph.reachable(nodes))
-
     def exchanged(self, groups: Sequence[Collection[str]], at: np.ndarray) -> Self:
         """The probes numbered `at`, for each group of names in turn with the values that these inputs had at another probe; all others are kept."""
 
@@ -87,6 +82,11 @@ class IdentityProbes:
 
         inputs = {name: in_turn(name, x) for name, x in self.inputs.items()}
         return type(self)(self.graph, inputs, {name: in_turn(name, x) for name, x in self._errors.items()}, np.tile(self._radix[at], len(groups)))
+
+
+def taken_for_what_they_are(graph: Graph, nodes: Sequence[int]) -> bool:
+    """Whether no operation that the nodes need is replaced by another function."""
+    return all(graph.op[n] in _KNOWN for n in graph.reachable(nodes))
 
 
 def equal(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarray:
@@ -151,8 +151,7 @@ def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinat
 
     The probes unchanged where the rows hold another function than the known ones, of which nothing can be solved.
     """
-    graph = probes.graph
-    if any(graph.op[n] not in _KNOWN for n in graph.reachable(rows)):
+    if not taken_for_what_they_are(probes.graph, rows):
         return probes
     begun = probes.with_inputs({name: near.inputs[name] for name in coordinates}, dict.fromkeys(coordinates, 0.0))
     found = onto_rows(begun, rows, coordinates, most=30, longest=1.0)

@@ -179,14 +179,11 @@ def _called(graph: Graph, part: list[_Step], values: dict, users: dict[_Variable
     made = [v for step in part for v in step.outputs]
     operands = [v for v in dict.fromkeys(v for step in part for v in step.variables) if v not in made]
     results = [v for v in made if v in asked or any(user.part is not part for user in users.get(v, ()))]
-    arrays = [_as_array(graph, values[v], v.aval) for v in operands]
+    given = [(values[v], v.aval) for v in operands]
+    arrays = [x.node if isinstance(x, _Opaque) else graph.array(x.ids.ravel().tolist(), aval.shape, str(aval.dtype)) for x, aval in given]
     found = graph.results(graph.opaque(_call(part, operands, results), arrays), {k: (v.aval.shape, str(v.aval.dtype)) for k, v in enumerate(results)})
     taken_apart = [v in asked or not all(user.opaque for user in users[v]) for v in results]
     return {v: Nodes(graph.entries(node)) if apart else _Opaque(node) for v, node, apart in zip(results, found, taken_apart, strict=True)}
-
-
-def _as_array(graph: Graph, value, aval) -> int:
-    return value.node if isinstance(value, _Opaque) else graph.array(value.ids.ravel().tolist(), aval.shape, str(aval.dtype))
 
 
 def _call(part: list[_Step], operands: list[_Variable], results: list[_Variable]) -> Call:

@@ -1,14 +1,21 @@
-"""Reference parameters: numbers that stand in for parameters that JAX traces.
+"""What tells a scene from another: what its methods read, its structure, and the values of its parameters.
 
-What holds of a scene at every state, such as the rank of its rows and which speeds are independent, must be known before anything is compiled. It is found
-by evaluating the scene at a few states, which takes numbers for its parameters.
+As everywhere in JAX, a method is traced once, and what it reads that is no field of the scene is a constant
+of the trace (`names_read.py`): a part of the structure of the scene, looked at when its class is made and
+again at each call. What helpers read is not followed. `clear_caches` makes every scene be traced anew.
+
+Reference parameters are numbers that stand in for parameters that JAX traces. What holds of a scene at every
+state, such as the rank of its rows and which speeds are independent, must be known before anything is
+compiled. It is found by evaluating the scene at a few states, which takes numbers for its parameters.
 """
 
+import sys
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import MISSING, fields
 from functools import lru_cache, wraps
+from itertools import repeat
 from operator import is_
 from threading import Lock
 from types import MappingProxyType
@@ -19,8 +26,106 @@ import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.calculus.reals import is_traced_type
+from jourdain_jax.scene.names_read import StatefulError, functions_in, key_or_refusal, member_key, own_classes, spaces
 from jourdain_jax.scene.parameters import stacked_parameters
-from jourdain_jax.scene.scene import Scene
+
+_UNSET = object()
+
+
+def clear_caches() -> None:
+    """Empty the caches of this package and of JAX, and free their memory.
+
+    Every scene is traced, probed and compiled anew at its next use. Call this after a change of values that helpers, modules or classes hold. Machine code
+    stays: it depends on the text of its program alone, and another thread may be running it.
+    """
+    for name, module in list(sys.modules.items()):
+        if name.startswith("jourdain_jax.") and ".native" not in name:
+            for value in list(vars(module).values()):
+                if callable(value) and hasattr(value, "cache_clear"):  # no module: one that is imported on first use would be
+                    value.cache_clear()
+    jax.clear_caches()
+
+
+class NamesRead:
+    """Names that methods or functions read; a pytree without leaves, whose structure changes with what they stand for."""
+
+    def __init__(self, watch: "_Watch"):
+        self._watch = watch
+
+    def now(self) -> tuple["_Watch", int]:
+        """Return the watch and a version: equal contents have equal versions. ValueError where a name has come to stand for an object with state."""
+        return self._watch, self._watch.version()
+
+    def __reduce__(self):
+        return names_read, self._watch.roots
+
+
+jax.tree_util.register_pytree_node(NamesRead, lambda read: ((), read.now()), lambda now, _: NamesRead(now[0]))
+
+
+def names_read(*roots: type | Callable) -> NamesRead:
+    """Return the names that the methods of classes, and functions, read. ValueError where one of a method stands for an array, a container or an object with
+    state; of a function in a field such an object is a constant.
+    """
+    return NamesRead(_watch(*roots))
+
+
+def now_read_by(function: Callable) -> Hashable | None:
+    """What the names that a function reads stand for now; None where one has state, so that a trace of the function cannot be kept."""
+    try:
+        return _watch(function, strict=True).version(), function
+    except (StatefulError, TypeError):  # the second: it cannot be hashed
+        return None
+
+
+class _Watch:
+    """Compares what names stand for with what they stood for when they were last looked up."""
+
+    def __init__(self, roots: tuple, strict: bool):
+        self.roots, self._strict = roots, strict
+        self._numbers: dict[Hashable, int] = {}
+        self._look()
+
+    def __reduce__(self):
+        return _watch, self.roots
+
+    def version(self) -> int:
+        """The number of the present content."""
+        same = all(len(members) == size for members, size in self._sizes)
+        if not same or not all(all(map(is_, map(get, names, repeat(_UNSET)), before)) for get, names, before in self._before):
+            self._look()
+        return self._number
+
+    def _look(self) -> None:
+        content: list[tuple] = []
+        before: list[tuple] = []
+        sizes: list[tuple] = []
+
+        def noted(get: Callable, names: tuple[str, ...]) -> tuple:
+            before.append((get, names, tuple(map(get, names, repeat(_UNSET)))))
+            return before[-1][-1]
+
+        for root in self.roots:
+            classes = own_classes(root) if isinstance(root, type) else ()
+            members = [(name, x) for kind in classes for name, x in vars(kind).items()] or [("", root)]
+            for kind in classes:
+                noted(vars(kind).get, tuple(vars(kind)))
+                sizes.append((vars(kind), len(vars(kind))))
+            told = key_or_refusal if classes or self._strict else lambda x, *_: member_key(x)
+            for name, member in members:
+                content.append((name, member_key(member)))
+                for f in () if name.startswith("__") and name != "__call__" else functions_in(member):
+                    where = f"`{root.__name__}.{name}`" if name else f"the function `{f.__qualname__}`"
+                    for get, names in spaces(f):
+                        found = noted(get, names)
+                        content += [(n, told(x, n, where)) for n, x in zip(names, found, strict=True)]
+        self._number = self._numbers.setdefault(tuple(content), len(self._numbers))
+        self._before, self._sizes = before, sizes  # last: what is refused now is refused at the next call, too
+
+
+@lru_cache(maxsize=1024)
+def _watch(*roots, strict: bool = False) -> _Watch:
+    return _Watch(roots, strict)
 
 
 def once_per_values(probe, of_traced: Callable | None = None):
@@ -31,7 +136,7 @@ def once_per_values(probe, of_traced: Callable | None = None):
     cached = lru_cache(maxsize=512)(lambda wrapped, *case: _described(probe, wrapped.scene, case))
 
     @wraps(probe)
-    def of(scene: Scene, *case: Hashable):
+    def of(scene, *case: Hashable):
         leaves, treedef = jax.tree.flatten(scene)
         known = _asked_about_before(leaves, treedef)
         if known is None:
@@ -58,7 +163,7 @@ class Values:
         self._hash = hash(self.key)
 
     @property
-    def scene(self) -> Scene:
+    def scene(self):
         """The scene."""
         return jax.tree.unflatten(self.structure[0], self.leaves)
 
@@ -82,11 +187,11 @@ def _asked_about_before(leaves: list, treedef) -> Values | None:
 
 vars(_asked_about_before)["cache_clear"] = _latest.clear
 
-_STAND_IN: ContextVar[Scene | None] = ContextVar("stand_in", default=None)
+_STAND_IN: ContextVar[Any] = ContextVar("stand_in", default=None)
 
 
 @contextmanager
-def reference_parameters(scene: Scene) -> Iterator[None]:
+def reference_parameters(scene) -> Iterator[None]:
     """Inside, numbers near those of `scene` stand in for the parameters of scenes of its class that are traced (as far as it has numbers)."""
     token = _STAND_IN.set(scene)
     try:
@@ -95,7 +200,7 @@ def reference_parameters(scene: Scene) -> Iterator[None]:
         _STAND_IN.reset(token)
 
 
-def with_reference_parameters(scene: Scene) -> Scene:
+def with_reference_parameters(scene):
     """The scene with numbers in place of traced parameters: generic ones near those that stand in, the class's defaults, or one.
 
     Generic, because a default of zero (a tilt, a rate) must not pass for a term that is absent, nor two equal defaults for one length.
@@ -112,7 +217,7 @@ def with_reference_parameters(scene: Scene) -> Scene:
     return jax.tree.unflatten(treedef, numbers)
 
 
-def _defaults(scene: Scene) -> list:
+def _defaults(scene) -> list:
     """For every leaf of a scene the class's default for it, or None."""
     found: list = []
     for field in fields(scene):
@@ -166,9 +271,6 @@ def _is_inertia(x: np.ndarray) -> bool:
     return bool(np.linalg.eigvalsh(_second_moments(x))[0] >= -0.01 * np.trace(x))
 
 
-_UNKNOWN = object()
-
-
 def once_per_class(describe: Callable, most: int = 1024) -> Callable:
     """A function of a scene (and of what else tells its cases apart) that depends on its class and the shapes of its parameters only: worked out once.
 
@@ -178,11 +280,11 @@ def once_per_class(describe: Callable, most: int = 1024) -> Callable:
     keeping = Lock()  # threads may ask at the same time; they may work the same out
 
     @wraps(describe)
-    def of(scene: Scene, *case: Hashable):
+    def of(scene, *case: Hashable):
         leaves, treedef = jax.tree.flatten(scene)
         key = (treedef, tuple(np.shape(x) for x in leaves), jax.config.jax_enable_x64, case)
-        found = known.get(key, _UNKNOWN)
-        if found is _UNKNOWN:
+        found = known.get(key, _UNSET)
+        if found is _UNSET:
             found = _described(describe, scene, case)
             with keeping:
                 known[key] = found
@@ -207,7 +309,7 @@ def found_before(found: Mapping[Hashable, Any]) -> Iterator[None]:
         _BEFORE.reset(token)
 
 
-def _described(describe: Callable, scene: Scene, case: tuple):
+def _described(describe: Callable, scene, case: tuple):
     if (key := (describe.__name__, *case[:1])) in (before := _BEFORE.get()):
         return before[key]
     try:

@@ -1,90 +1,38 @@
 """Names that methods read besides their arguments.
 
-As everywhere in JAX, a method is traced once, and what it reads that is no field of the scene is a constant of the trace. Looked at are the global names and
-the variables of enclosing functions that a method loads itself, when its class is made and again at each call:
+Looked at are the global names and the variables of enclosing functions that a method loads itself:
 
 - numbers, texts and tuples of them are compared by type and value, functions by identity, so that `g = 1.62` in the next cell of a notebook is noticed;
 - modules and classes are constants, as are their attributes;
 - arrays, containers and objects with state are refused by name: what changes in them could not be seen.
 
-What helpers read is not followed. `clear_caches` makes every scene be traced anew.
+`identity.py` compares them.
 """
 
 import dis
 import enum
 import functools
 import re
-import sys
 from collections.abc import Callable, Hashable
 from dataclasses import fields, is_dataclass
 from decimal import Decimal
 from fractions import Fraction
-from itertools import repeat
-from operator import is_
 from pathlib import PurePath
 from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.reals import is_traced
 
-_UNSET = object()
 _BASE = f"{__name__.rpartition('.')[0]}.scene"  # the module of the base class, below which nothing of a user's stands
 _VALUES = (bool, int, float, complex, str, bytes, type(None), type(...), range, Fraction, Decimal, re.Pattern, np.dtype)
 
 
 class StatefulError(ValueError):
     """A name stands for something whose changes cannot be seen."""
-
-
-def clear_caches() -> None:
-    """Empty the caches of this package and of JAX, and free their memory.
-
-    Every scene is traced, probed and compiled anew at its next use. Call this after a change of values that helpers, modules or classes hold. Machine code
-    stays: it depends on the text of its program alone, and another thread may be running it.
-    """
-    for name, module in list(sys.modules.items()):
-        if name.startswith("jourdain_jax.") and ".native" not in name:
-            for value in list(vars(module).values()):
-                if callable(value) and hasattr(value, "cache_clear"):  # no module: one that is imported on first use would be
-                    value.cache_clear()
-    jax.clear_caches()
-
-
-class NamesRead:
-    """Names that methods or functions read; a pytree without leaves, whose structure changes with what they stand for."""
-
-    def __init__(self, watch: "_Watch"):
-        self._watch = watch
-
-    def now(self) -> tuple["_Watch", int]:
-        """Return the watch and a version: equal contents have equal versions. ValueError where a name has come to stand for an object with state."""
-        return self._watch, self._watch.version()
-
-    def __reduce__(self):
-        return names_read, self._watch.roots
-
-
-jax.tree_util.register_pytree_node(NamesRead, lambda read: ((), read.now()), lambda now, _: NamesRead(now[0]))
-
-
-def names_read(*roots: type | Callable) -> NamesRead:
-    """Return the names that the methods of classes, and functions, read. ValueError where one of a method stands for an array, a container or an object with
-    state; of a function in a field such an object is a constant.
-    """
-    return NamesRead(_watch(*roots))
-
-
-def now_read_by(function: Callable) -> Hashable | None:
-    """What the names that a function reads stand for now; None where one has state, so that a trace of the function cannot be kept."""
-    try:
-        return _watch(function, strict=True).version(), function
-    except (StatefulError, TypeError):  # the second: it cannot be hashed
-        return None
 
 
 def is_function(x) -> bool:
@@ -105,56 +53,6 @@ class _Same:
 
     def __hash__(self):
         return id(self.x)
-
-
-class _Watch:
-    """Compares what names stand for with what they stood for when they were last looked up."""
-
-    def __init__(self, roots: tuple, strict: bool):
-        self.roots, self._strict = roots, strict
-        self._numbers: dict[Hashable, int] = {}
-        self._look()
-
-    def __reduce__(self):
-        return _watch, self.roots
-
-    def version(self) -> int:
-        """The number of the present content."""
-        same = all(len(members) == size for members, size in self._sizes)
-        if not same or not all(all(map(is_, map(get, names, repeat(_UNSET)), before)) for get, names, before in self._before):
-            self._look()
-        return self._number
-
-    def _look(self) -> None:
-        content: list[tuple] = []
-        before: list[tuple] = []
-        sizes: list[tuple] = []
-
-        def noted(get: Callable, names: tuple[str, ...]) -> tuple:
-            before.append((get, names, tuple(map(get, names, repeat(_UNSET)))))
-            return before[-1][-1]
-
-        for root in self.roots:
-            classes = own_classes(root) if isinstance(root, type) else ()
-            members = [(name, x) for kind in classes for name, x in vars(kind).items()] or [("", root)]
-            for kind in classes:
-                noted(vars(kind).get, tuple(vars(kind)))
-                sizes.append((vars(kind), len(vars(kind))))
-            told = _key_or_refusal if classes or self._strict else lambda x, *_: _member_key(x)
-            for name, member in members:
-                content.append((name, _member_key(member)))
-                for f in () if name.startswith("__") and name != "__call__" else functions_in(member):
-                    where = f"`{root.__name__}.{name}`" if name else f"the function `{f.__qualname__}`"
-                    for get, names in spaces(f):
-                        found = noted(get, names)
-                        content += [(n, told(x, n, where)) for n, x in zip(names, found, strict=True)]
-        self._number = self._numbers.setdefault(tuple(content), len(self._numbers))
-        self._before, self._sizes = before, sizes  # last: what is refused now is refused at the next call, too
-
-
-@functools.lru_cache(maxsize=1024)
-def _watch(*roots, strict: bool = False) -> _Watch:
-    return _Watch(roots, strict)
 
 
 def own_classes(kind: type) -> tuple[type, ...]:
@@ -204,7 +102,7 @@ def names_in(code: CodeType, operations: tuple[str, ...] | None = None) -> froze
     return own.union(*(names_in(inner, operations) for inner in code.co_consts if isinstance(inner, CodeType)))
 
 
-def _member_key(member) -> Hashable:
+def member_key(member) -> Hashable:
     """The key of a member of a class: by value where it has no state, otherwise by identity."""
     try:
         return key(member)
@@ -212,7 +110,7 @@ def _member_key(member) -> Hashable:
         return _Same(member)
 
 
-def _key_or_refusal(x: Any, name: str, where: str) -> Hashable:
+def key_or_refusal(x: Any, name: str, where: str) -> Hashable:
     try:
         return key(x)
     except StatefulError:

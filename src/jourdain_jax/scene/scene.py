@@ -17,10 +17,11 @@ from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.coordinates import Coordinates, Names
 from jourdain_jax.scene.description import check_description, checked_arguments
+from jourdain_jax.scene.identity import NamesRead, names_read
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.names import Named, nearest
-from jourdain_jax.scene.names_read import NamesRead, is_function, names_read
+from jourdain_jax.scene.names_read import is_function
 from jourdain_jax.scene.parameters import check_parameters, parameters_of
 from jourdain_jax.scene.printing import scene_html, scene_text
 from jourdain_jax.scene.visuals import Visual

@@ -186,8 +186,7 @@ def _by_equations(problem: Problem, method: ImplicitMethod, p: Progress, h) -> t
         return found, [], None
     end = p.t + h, jax.tree.map(jnp.add, p.y, found.change)
     states = jax.tree.map(lambda a, b: jnp.stack([a, (a + b) / 2, b]), (p.t, p.y), end)
-    seen_at = problem.rates_and_pivots if monitored else lambda *given: (problem.rates(*given), None, None, None)
-    slopes, seen, directions, _ = jax.lax.map(lambda at: tuple(seen_at(*at, inside.args)), states)
+    slopes, seen, directions, _ = jax.lax.map(lambda at: tuple(problem.watching(monitored)(*at, inside.args)), states)
     ends = [jax.tree.map(lambda k, y, i=i: as_in(k[i], y), slopes, p.y) for i in (0, 2)]
     return found, ends, _pivots(seen, directions) if monitored else None
 
@@ -269,7 +268,7 @@ def stages(problem: Problem, method: Method, t, y: PyTree, h, monitored: bool = 
     leaves, treedef = jax.tree.flatten(y)
     problem = problem.in_step(t, h)
     monitored = monitored and problem.rates_and_pivots is not None
-    watch = problem.rates_and_pivots if monitored or problem.near_rank_loss else lambda *given: (problem.rates(*given), None, None, None)
+    watch = problem.watching(monitored or problem.near_rank_loss)
 
     def stage(carried, row):
         # k_i = f(y_i), then the next y_i: what is carried from stage to stage is computed once, whatever uses it

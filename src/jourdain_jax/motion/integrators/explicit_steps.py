@@ -42,14 +42,10 @@ class Method:
     even: ClassVar[bool] = False  # whether it takes steps of one length
 
     @property
-    def last_is_next_first(self) -> bool:
-        """Whether the last stage is taken at y_1."""
-        return bool(np.array_equal(self.A[-1], self.b) and self.c[-1] == 1.0)
-
-    @property
     def needed(self) -> int:
         """How many stages a step takes: without a last one that nothing else needs."""
-        return len(self.c) - int(self.last_is_next_first and self.b_error[-1] == 0)
+        at_y_1 = np.array_equal(self.A[-1], self.b) and self.c[-1] == 1.0
+        return len(self.c) - int(at_y_1 and self.b_error[-1] == 0)
 
     @property
     def at_the_end(self) -> int:

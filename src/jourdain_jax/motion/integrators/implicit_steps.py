@@ -63,10 +63,6 @@ class FixedStepMethod(ImplicitMethod):
         if isinstance(step, np.ndarray) and not 0 < float(step) < np.inf:
             raise ValueError(f"`step` of `{self.name}` is {float(step):g}, expected a positive finite length of steps in s")
 
-    def without_step(self) -> "FixedStepMethod":
-        """The method alone: another step is no other program."""
-        return eqx.tree_at(lambda method: method.step, self, None)
-
 
 def sizes(unknowns: int, x: Float[Array, "numbers"], change: Float[Array, "numbers"]) -> Float[Array, "unknowns"]:
     """The size of each unknown, against which round-off counts: that of the state x and of its change; 1 where both are zero."""

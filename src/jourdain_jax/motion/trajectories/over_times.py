@@ -64,7 +64,9 @@ def map_over_times(f, record: Record, by_inputs: bool = False):
 
     `by_inputs`: f needs the rates of the inputs, where rows depend on some that change. Of a batch of motions: with its axes of lanes first.
     """
-    by_inputs, known = by_inputs and _needs_rates(record), not is_traced((f, record))
+    first = lambda: jax.tree.map(lambda x: x[(0,) * (record.q.ndim - 2)], record.scene)  # noqa: E731  of a batch, the first
+    by_inputs = by_inputs and not record.inputs.constant and structure_of(first()).rows_of_inputs  # accelerations depend on the rates of the inputs
+    known = not is_traced((f, record))
     # of one motion that is known: NumPy is done before a program is compiled (contact forces of a bicycle at 101 times: 1 s, not 7)
     if known and record.q.ndim == 2 and len(record.ts) <= 1000:
         return _on_numpy(f, record, by_inputs)
@@ -110,12 +112,6 @@ def _on_numpy(f, record: Record, by_inputs: bool):
 
 
 _uncompiled = eval_numpy(_at_one_time)
-
-
-def _needs_rates(record: Record) -> bool:
-    """Whether accelerations depend on the rates of the inputs."""
-    scene = jax.tree.map(lambda x: x[(0,) * (record.q.ndim - 2)], record.scene)  # of a batch, the first
-    return not record.inputs.constant and structure_of(scene).rows_of_inputs
 
 
 class BodyPoint(eqx.Module):

@@ -63,10 +63,22 @@ def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
     Inputs are stored as samples at the saved times. ValueError where the path is a folder, or the scene has a field that is no array, number or text.
     Read it with `load_trajectory` or `load_rollout`.
     """
-    _check_saved(motion, path)
+    if not isinstance(motion, Trajectory | Rollout):
+        raise ValueError(f"`save` was given {described(motion)}, expected a `Trajectory` from `jj.simulate` or a `Rollout` from `jj.rollout`")
     trajectory, kind, reruns = (motion.lanes, "rollout", motion.reruns) if isinstance(motion, Rollout) else (motion, "trajectory", ())
+    if trajectory is motion and motion.q.ndim != 2:
+        raise ValueError(
+            f"`save` takes one motion and was given a batch of shape {motion.q.shape[:-2]}; save a `Rollout`, `jj.Rollout(batch)` for one axis of lanes"
+        )
     scene = trajectory.scene
     parameters, static = _stored_fields(scene)
+    for field in fields(scene):
+        if field.init and field.name not in (*parameters, *static) and getattr(scene, field.name) is not field.default:
+            raise ValueError(
+                f"field `{field.name}` of `{type(scene).__name__}` is {described(getattr(scene, field.name))}, which `save` cannot store; "
+                "expected arrays, numbers or texts, or the class's default"
+            )
+    check_place(path)
     arrays = {name: np.asarray(getattr(trajectory, name)) for name in (*_ARRAYS, "work") if getattr(trajectory, name) is not None}
     arrays["inputs"] = np.asarray((jax.vmap(_sampled) if isinstance(motion, Rollout) else _sampled)(trajectory.inputs, trajectory.ts))
     arrays |= {f"parameter:{name}": np.asarray(value) for name, value in parameters.items()}
@@ -91,25 +103,6 @@ def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
 
 def _sampled(inputs: Inputs, ts):
     return jax.vmap(inputs)(ts).reshape(ts.shape[0], len(inputs.channels))
-
-
-def _check_saved(motion, path) -> None:
-    """One motion or a rollout, of a scene that can be stored, and a path that can be written."""
-    if not isinstance(motion, Trajectory | Rollout):
-        raise ValueError(f"`save` was given {described(motion)}, expected a `Trajectory` from `jj.simulate` or a `Rollout` from `jj.rollout`")
-    if isinstance(motion, Trajectory) and motion.q.ndim != 2:
-        raise ValueError(
-            f"`save` takes one motion and was given a batch of shape {motion.q.shape[:-2]}; save a `Rollout`, `jj.Rollout(batch)` for one axis of lanes"
-        )
-    scene = motion.lanes.scene if isinstance(motion, Rollout) else motion.scene
-    parameters, static = _stored_fields(scene)
-    for field in fields(scene):
-        if field.init and field.name not in (*parameters, *static) and getattr(scene, field.name) is not field.default:
-            raise ValueError(
-                f"field `{field.name}` of `{type(scene).__name__}` is {described(getattr(scene, field.name))}, which `save` cannot store; "
-                "expected arrays, numbers or texts, or the class's default"
-            )
-    check_place(path)
 
 
 @with_nan_as_a_mark
