@@ -39,7 +39,6 @@ from jourdain_jax.program.calls import Call
 from jourdain_jax.scene.identity import now_read_by, once_per_values
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import check_name, nearest
-from jourdain_jax.scene.identity import now_read_by
 from jourdain_jax.scene.names_read import is_function
 from jourdain_jax.scene.scene import Scene
 

@@ -57,7 +57,9 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
     known = numbers_where_known((start.q, start.u, *setup.tolerances))
     if known is None:
         return integrate(setup)
-    rtol, atol, begun, looked_at = float(known[2]), float(known[3]), [], []
+    rtol, atol = float(known[2]), float(known[3])
+    begun: list[np.ndarray] = []  # tangents of the start
+    looked_at: list[float] = []  # the ends that are looked at, weighed by their cotangents
 
     def weighed(values, cotangents) -> float:
         """Return `sum |g| (atol + rtol |y|)`; what is not finite does not count."""

@@ -38,9 +38,8 @@ class Problem(eqx.Module):
         return self if self.within is None else replace(self, args=self.within(t + 0.5 * h, self.args))
 
     def watching(self, monitored: bool) -> Callable:
-        """Return `rates_and_pivots`, or, where they are not `monitored`, rates alone in their place."""
-        assert self.rates_and_pivots is not None or not monitored
-        return self.rates_and_pivots if monitored else lambda *given: (self.rates(*given), None, None, None)
+        """Return `rates_and_pivots` where they are `monitored` and there are any, otherwise rates alone in their place."""
+        return (monitored and self.rates_and_pivots) or (lambda *given: (self.rates(*given), None, None, None))
 
     def knot_ahead(self, t: Float[Array, "*lanes"], knot: Int[Array, "*lanes"], direction) -> Float[Array, "*lanes"]:
         """The time of the `knot` ahead of t, infinity with the sign of the motion where there is none."""
