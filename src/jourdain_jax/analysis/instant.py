@@ -17,9 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.row_program import row_program
-from jourdain_jax.build.structure import structure_of, usual_rows
+from jourdain_jax.build.structure import usual_rows
 from jourdain_jax.calculus.reals import RUN_SELDOM, Entries, array_module, compiled, real_type
-from jourdain_jax.dynamics.reduced import DEPENDS, ignorable_coordinates
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import closure_residual
@@ -132,10 +131,6 @@ class ByProgram:
         """v, D and the mass matrix of a scene at an instant."""
         return self.of(numbers_of(scene, t, q, u, f))
 
-    def ignorable(self, scene: Scene) -> tuple[str, ...]:
-        """Names of the coordinates on which no acceleration depends."""
-        return self.program.held
-
 
 def numbers_of(scene: Scene, t, q, u, f) -> Float[Entries, "numbers"]:
     """All numbers in a row: parameters, t, q, u, inputs."""
@@ -153,10 +148,6 @@ class ByMatrices:
     def __call__(self, scene: Scene, t, q, u, f) -> Slopes:
         """v, D and the mass matrix of a scene at an instant."""
         return _by_matrices(scene, self.constant, t, q, u, f)
-
-    def ignorable(self, scene: Scene) -> tuple[str, ...]:
-        """Names of the coordinates on which no acceleration depends."""
-        return ignorable_coordinates(scene)
 
 
 @partial(compiled, options=RUN_SELDOM)
@@ -191,11 +182,6 @@ def instant_of(scene: Scene | BuiltFor, constant: tuple[int, ...], masses: bool 
 def by_program(scene: Scene, *parts) -> ByProgram:
     """The program of a class of scenes; `parts`: as of `ByProgram`. `NotLowered` where there is none."""
     return ByProgram(scene, *parts)
-
-
-def on_rows(scene: Scene) -> np.ndarray:
-    """Which coordinates geometric rows and unit norms depend on, at some probed state."""
-    return np.any(np.abs(structure_of(scene).closure_slopes) > DEPENDS, axis=(0, 1))
 
 
 def _copied(graph: Graph, parts: Sequence, of: Graph, variables: tuple, given: Sequence[int]) -> list[list[int]]:

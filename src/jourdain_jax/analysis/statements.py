@@ -70,7 +70,7 @@ class Check(eqx.Module):
     def as_dict(self) -> dict:
         """The check for machines; a value that is not finite is None."""
         value = float(self.value) if np.isfinite(self.value) else None
-        return {"name": self.name, "value": value, "threshold": self.threshold, "passed": self.passed, "culprit": self.culprit, "note": self.note}
+        return vars(self) | {"value": value, "passed": self.passed}
 
 
 def check(name: str, values: dict, dtype, note: str = "") -> Check:

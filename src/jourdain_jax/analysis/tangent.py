@@ -12,16 +12,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jourdain_jax.build.rank import best_privileged, named_speeds, pivots_at
-from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import WELL_CONDITIONED, structure_of, usual_rows
-from jourdain_jax.calculus.reals import Entries, array_module, is_traced, rank_cutoff
+from jourdain_jax.calculus.reals import Entries, array_module, rank_cutoff
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows
-from jourdain_jax.equations.rows import position_residual
 from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.motion.put_on_rows import State
-from jourdain_jax.scene.identity import with_reference_parameters
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
@@ -115,7 +112,7 @@ def dependent_coordinates(
 ) -> Int[np.ndarray, "dependent"]:
     """Indices of the perturbations `ds` that follow from the geometric rows: those named, else well conditioned ones.
 
-    The choice looks at the state, or at the scene's domain where the state or the parameters are traced. `G`: dg/dq at the state, if it is known.
+    `G`: dg/dq at the state, if it is known; otherwise the choice looks at states of the scene's domain.
     """
     names = perturbed_names(scene)
     for name in (*named, *(dependent or ())):
@@ -130,36 +127,18 @@ def dependent_coordinates(
         return np.array([names.index(name) for name in dependent], int)
     if not names_of_position_rows(scene):
         return np.zeros(0, int)
-    t, q = state.t[None], state.q[None]
-    if is_traced((scene, state)):
-        scene = with_reference_parameters(scene)
-        t, q, _ = sample_states(scene, 16)
-    G = _geometric_rows(scene, t, q) if G is None else G[None]
+    known, count = structure_of(scene), len(names_of_position_rows(scene))
+    G, q = (known.closure_slopes[:, :count], known.coordinates) if G is None else (G[None], np.asarray(state.q)[None])
     S, B = perturbations(scene)
-    return _pivots(G @ np.stack([S + B @ x for x in np.asarray(q)]), [names.index(name) for name in named], type(scene).__name__)
-
-
-@eval_numpy
-def _geometric_rows(scene: Scene, t, q):
-    """dg/dq at every state."""
-    return jax.vmap(lambda t, q: jax.jacfwd(position_residual, 2)(scene, t, q))(t, q)
-
-
-def _pivots(G: Float[np.ndarray, "samples rows columns"], kept: list[int], scene: str) -> Int[np.ndarray, "dependent"]:
-    """Columns chosen one after another by the largest remaining length in their worst sample (pivoted QR), none of those `kept`."""
+    G = G @ np.stack([S + B @ x for x in q[: len(G)]])
     G = G / np.maximum(np.linalg.norm(G, axis=2, keepdims=True), np.finfo(G.dtype).tiny)
-    rank = max(int(np.linalg.matrix_rank(block, tol=rank_cutoff(G.dtype))) for block in G)
-    chosen: list[int] = []
-    for _ in range(rank):
-        lengths = np.linalg.norm(G, axis=1)
-        worst = lengths.min(axis=0)
-        worst[kept + chosen] = -1.0
-        k = int(np.argmax(worst))
-        if worst[k] <= rank_cutoff(G.dtype):
-            raise ValueError(
-                f"the geometric rows of `{scene}` tie the asked coordinates to each other; ask for fewer in `coordinates`, or name the `dependent` ones"
-            )
-        chosen.append(k)
-        e = G[:, :, k] / lengths[:, k, None]
-        G = G - e[:, :, None] * np.einsum("sr,src->sc", e, G)[:, None, :]
-    return np.array(sorted(chosen), int)
+    cutoff = rank_cutoff(G.dtype)
+    rank = max(int(np.linalg.matrix_rank(block, tol=cutoff)) for block in G)
+    free = others([names.index(name) for name in named], len(names))
+    chosen = np.delete(free, best_privileged(G[:, :, free], len(free), rank)) if len(free) >= rank else free
+    if len(chosen) < rank or np.any(pivots_at(G, chosen.tolist(), rank) <= cutoff):
+        raise ValueError(
+            f"the geometric rows of `{type(scene).__name__}` tie the asked coordinates to each other; ask for fewer in `coordinates`, or name the "
+            "`dependent` ones"
+        )
+    return chosen
