@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.row_program import row_program
-from jourdain_jax.build.structure import usual_rows
+from jourdain_jax.build.structure import structure_of, usual_rows
 from jourdain_jax.calculus.reals import RUN_SELDOM, Entries, array_module, compiled, real_type
+from jourdain_jax.dynamics.reduced import DEPENDS
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import closure_residual
@@ -182,6 +183,11 @@ def instant_of(scene: Scene | BuiltFor, constant: tuple[int, ...], masses: bool 
 def by_program(scene: Scene, *parts) -> ByProgram:
     """The program of a class of scenes; `parts`: as of `ByProgram`. `NotLowered` where there is none."""
     return ByProgram(scene, *parts)
+
+
+def on_rows(scene: Scene) -> np.ndarray:
+    """Which coordinates geometric rows and unit norms depend on, at some probed state: others may stand in their graph, and cancel."""
+    return np.any(np.abs(structure_of(scene).closure_slopes) > DEPENDS, axis=(0, 1))
 
 
 def _copied(graph: Graph, parts: Sequence, of: Graph, variables: tuple, given: Sequence[int]) -> list[list[int]]:

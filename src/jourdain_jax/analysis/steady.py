@@ -16,10 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.analysis.instant import ByMatrices, ByProgram, instant_of, places_of
+from jourdain_jax.analysis.instant import ByMatrices, ByProgram, instant_of, on_rows, places_of
 from jourdain_jax.analysis.tangent import privileged_speeds
 from jourdain_jax.build.assembling import coordinate_bounds
-from jourdain_jax.build.probed_on_graph import coordinates_on_rows
 from jourdain_jax.calculus.matrices import pseudo_inverse
 from jourdain_jax.calculus.reals import RUN_SELDOM, Number, Numbers, compiled, described
 from jourdain_jax.calculus.roots import damped_search
@@ -102,7 +101,7 @@ def steady(
     carried = {entry for name in moving for entry in groups.get(name, (name,))}
     resting = tuple(i for i, name in enumerate(entries) if name not in carried)
     # nothing that vanishes changes with them: they keep the guess's value, and no step runs away along them
-    idle = ignorable - set(np.array(entries)[coordinates_on_rows(scene)])
+    idle = ignorable - set(np.array(entries)[on_rows(scene)])
     free = jnp.array([name not in held and name not in idle for name in names], bool)
     return _solve(_Problem(scene, t, f, instant, y, resting), q, u, free, most_steps)
 

@@ -15,9 +15,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.analysis.instant import by_program, numbers_of, places_of
+from jourdain_jax.analysis.instant import by_program, numbers_of, on_rows, places_of
 from jourdain_jax.build.assembling import coordinate_bounds
-from jourdain_jax.build.probed_on_graph import coordinates_on_rows
 from jourdain_jax.lowering.lower import lower
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import parameters_of
@@ -45,7 +44,7 @@ class SteadyEquations:
         self.given = np.asarray(numbers_of(scene, self.t, q, u, inputs), float)
         first, varied = sum(np.size(leaf) for leaf in jax.tree.leaves(scene)), self._place_of(vary)
         self.instant = by_program(scene, program, (), *(varied or (None,)))
-        matters, bound = np.array([name not in program.held for name in program.coordinates], bool), coordinates_on_rows(scene)
+        matters, bound = np.array([name not in program.held for name in program.coordinates], bool), on_rows(scene)
         kept, y = np.flatnonzero(matters | bound), np.array(program.independent, int)
         columns = np.concatenate([at.q[kept], at.u])
         self.places = np.concatenate([first + columns, varied]).astype(int)
