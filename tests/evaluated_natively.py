@@ -14,6 +14,7 @@ from jourdain_jax.program.graph import Graph
 
 def function(graph: Graph, outputs: Sequence[int], inputs: Sequence[int]) -> Callable[[Float[Array, "points inputs"]], Float[Array, "points outputs"]]:
     """Values of the outputs, truth values as 0 or 1, given those of the inputs."""
+    assert not host.reason_against()  # it makes LLVM and C's library known
     outputs, inputs = list(outputs), list(inputs)
     w = Writer(host.lanes(), host.fuses())
 
