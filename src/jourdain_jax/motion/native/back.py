@@ -35,7 +35,7 @@ from jourdain_jax.motion.native.record import GOALS, TO_ENDS, TO_STATES, Slot, p
 from jourdain_jax.motion.native.step import near_rank_loss, put_near_rows, slope_is_flat, squares_of, weighted
 from jourdain_jax.motion.native.values import called
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.native.ffi import write_handler
+from jourdain_jax.native.ffi import taken_in, write_handler
 from jourdain_jax.native.ir import Value, Writer
 
 
@@ -194,10 +194,10 @@ def _write_event_back(w: Writer, form: Form, asked: int) -> None:
             f, out, pivots, added = (w.room(max(n, 1)) for n in (count, count, len(form.monitored), asked + 1))
             values, rates, weights = (w.room(form.events) for _ in range(3))
             t, g_t = lanes["t"], w.room(1 + len(form.moving))
-            with w.counted(0, w.lanes) as lane, w.counted(0, 1 + len(form.moving)) as row:
+            with w.counted(0, w.lanes) as lane:
                 number = w.load(who, lane, "i64")
-                there = w.load(w.load(job, TO_ENDS, "ptr"), w.where(number >= 0, number, 0) * form.ends + count + row, "double")
-                w.store(there, w.at(g_t, row * w.lanes + lane, "double"))
+                end = w.at(w.load(job, TO_ENDS, "ptr"), w.where(number >= 0, number, 0) * form.ends + count, "double")
+                taken_in(w, 1 + len(form.moving), end, g_t, lane)
             w.run("rates", state, t, state, f, pivots)
             if form.moving:  # the tangent, and its rates, at a number for a time
                 dy, dt = w.at(state, form.y), lanes["dt"]

@@ -11,7 +11,7 @@ from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.native.layout import Form, Lanes, copied, each_row, for_rows
 from jourdain_jax.motion.native.loop import COUNT, NEXT, OWN, STARTS, TIMES
-from jourdain_jax.native.ffi import FIRST_OF_SCRATCH, handed_out, lanes_taken, next_lane
+from jourdain_jax.native.ffi import FIRST_OF_SCRATCH, handed_out, lanes_taken, next_lane, taken_in
 from jourdain_jax.native.ir import Value, Writer
 
 TO_STATES, TO_ENDS, GOALS, FOUND = range(STARTS + 1, STARTS + 5)
@@ -186,17 +186,15 @@ def _write_ends(w: Writer, form: Form, asked: int, job: Value, rooms: "_Rooms") 
     """Cotangents of the states at the end of a block."""
     g = rooms.g
     each_row(w, asked, rooms.by_known, lambda i: 0.0)
-    ends, per_end = w.load(job, TO_ENDS, "ptr"), form.ends
+    each_row(w, form.integrated, g, lambda i: 0.0)
+    ends = w.load(job, TO_ENDS, "ptr")
     with w.counted(0, w.lanes) as lane:
         number = w.load(rooms.who, lane, "i64")
-        with w.counted(0, form.integrated) as row:
-            found = w.load(ends, w.where(number >= 0, number, 0) * per_end + row, "double")
-            w.store(w.where(number >= 0, found, w.literal(0.0, "double")), w.at(g, row * w.lanes + lane, "double"))
+        with w.when(number >= 0):
+            taken_in(w, form.integrated, w.at(ends, number * form.ends, "double"), g, lane)
     # what was not reached repeats the last state
-    all_times = w.room()
-    with w.counted(0, w.lanes) as lane:
-        w.store(w.converted("sitofp", w.load(job, TIMES, "i64"), "double"), w.at(all_times, lane, "double"))
-    w.run("added", job, rooms.who, w.load(rooms.saved), w.load(all_times), g)
+    all_times = w.spread(w.converted("sitofp", w.load(job, TIMES, "i64"), "double"))
+    w.run("added", job, rooms.who, w.load(rooms.saved), all_times, g)
     if form.has_events:
         w.run("event_back", job, rooms.state, rooms.who, g, rooms.by_known)
 
