@@ -97,7 +97,7 @@ def test_reverse_mode_to_an_event_does_not_depend_on_derivatives_beyond_it():
 )
 def test_an_event_is_found_in_its_step_whatever_its_shape(value, digits):
     end = stopped(jnp.array([0.0]), value, rates=lambda t, y: jnp.ones_like(y))
-    assert int(end.code) == results.EVENT
+    assert end.code == results.EVENT
     assert_allclose(end.t, 0.7, atol=digits)
     assert_allclose(end.y[0], end.t, rtol=1e-13)
 
@@ -171,7 +171,7 @@ KINDS = {
     "scaled": (lambda x, t, a, w: (jnp.abs(x - a) - w) * (2.0 + x), A - W),
     "either of two": (lambda x, t, a, w: jnp.minimum(jnp.abs(x - a), jnp.abs(x - 1.5)) - w, A - W),
 }
-USUAL = ("distance", "window", "clock")
+USUAL = ("distance", "window", "clock", "floor")
 
 
 def scene_of(kind: str):
@@ -194,7 +194,7 @@ def test_a_short_window_is_met(kind):
     for backend in BACKENDS:
         motion = jj.simulate(scene, start, ts=[2.0], backend=backend)
         assert motion.event_names[int(motion.event)] == "met"
-        assert abs(float(motion.t_end) - KINDS[kind][1]) < 1e-9
+        assert abs(motion.t_end - KINDS[kind][1]) < 1e-9
     lanes = jj.rollout(scene, {"x": 0.0, "x_rate": jnp.linspace(0.5, 1.5, 7)}, ts=[4.0], progress=False).lanes
     np.testing.assert_array_equal(lanes.result, results.EVENT)
 
@@ -350,7 +350,7 @@ def test_a_start_whose_event_is_no_number_is_beyond_it_and_a_state_that_is_none_
     beyond = jj.simulate(Bounded(), {"x": 1.5, "x_rate": 1.0}, ts=[5.0])
     assert (int(beyond.result), float(beyond.t_end)) == (results.EVENT, 0.0)
     lost = eqx.tree_at(lambda s: s.q, jj.start(Bounded(), x_rate=1.0), jnp.array([jnp.nan]))
-    assert int(jj.simulate(Bounded(), lost, t1=5.0).result) == results.BAD_START
+    assert jj.simulate(Bounded(), lost, t1=5.0).result == results.BAD_START
 
 
 def test_a_value_that_falls_below_zero_and_rises_again_within_a_step_is_an_event():
@@ -391,7 +391,7 @@ def test_an_event_is_no_mistake_to_a_search_for_nan_and_a_mistake_still_is():
 
     with jax.debug_nans(True):
         motion = jj.simulate(Thrown(), t1=5.0)
-        assert int(motion.result) == results.EVENT
+        assert motion.result == results.EVENT
         assert np.isnan(np.asarray(motion["x"])[-1])
         assert "stopped at an event" in str(motion)
         with pytest.raises(FloatingPointError):
@@ -446,7 +446,7 @@ def test_bounces_go_on_from_the_end(backend, level):
         motion = jj.simulate(scene, thrown_back(scene, motion, restitution), ts=[10.0], backend=backend)
         expected += 2 * fall * restitution**k
         assert motion.event_names[int(motion.event)] == "floor"
-        assert abs(float(motion.t_end) - expected) < 1e-9 * max(1.0, level)
+        assert abs(motion.t_end - expected) < 1e-9 * max(1.0, level)
 
 
 def test_lanes_and_jit_start_at_an_event():
@@ -455,7 +455,7 @@ def test_lanes_and_jit_start_at_an_event():
         lanes = jj.rollout(Ball(), starts, ts=[2.0], backend=backend, progress=False).lanes
         np.testing.assert_array_equal(lanes.result, results.EVENT)
         np.testing.assert_allclose(lanes.t_end, [6 / GRAVITY, 2e-3 / GRAVITY, 0.0, 0.0], atol=1e-9)
-        assert int(jnp.sum(lanes.accepted[2:])) == 0
+        assert jnp.sum(lanes.accepted[2:]) == 0
     one = jax.jit(lambda rate: jj.simulate(Ball(), {"z": 0.0, "z_rate": rate}, ts=[2.0]).t_end)(2.0)
     assert abs(float(one) - 4 / GRAVITY) < 1e-9
 
@@ -489,6 +489,6 @@ def test_a_bounce_that_is_over_has_happened(backend):
 def test_solvers_of_diffrax_start_at_an_event_too():
     for solver in (diffrax.Tsit5(), diffrax.Bosh3()):
         motion = jj.simulate(Ball(), {"z": 0.0, "z_rate": 3.0}, ts=[2.0], solver=solver)
-        assert abs(float(motion.t_end) - 6 / GRAVITY) < 1e-6
+        assert abs(motion.t_end - 6 / GRAVITY) < 1e-6
         assert float(jj.simulate(Ball(), {"z": 0.0, "z_rate": -3.0}, ts=[2.0], solver=solver).t_end) == 0.0
 

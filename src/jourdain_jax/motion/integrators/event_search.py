@@ -12,7 +12,8 @@ the start, as it has where the value is lower, or does not rise.
 All event values are positive at t_b, or rise from zero there, and one of them is not at t_a. What is not a number is not positive: such a value lies
 beyond its boundary. Of the values that are not positive at t_a, the one whose secant from t_b falls to zero first is followed; the next trial, between t_b
 and t_a, is by Chandrupatla's method (inverse quadratic interpolation where it is safe, otherwise the middle). Where a trial finds another event, all that
-is after it no longer counts: so the event that is found has no other before it, as far as values were seen.
+is after it no longer counts: so the event that is found has no other before it, as far as values were seen. A value of zero may be one that stays zero
+beyond the event: it is an end of the bracket like a negative one, which is then halved.
 
 The times tried are numbers to differentiation. Near the event, shifts of Newton's method follow,
 
@@ -125,7 +126,8 @@ def trial(w, t, c, step, last) -> tuple:
     slope, tried = (c_1 - c_3) / (t_1 - t_3), w.magnitude(t_3) < math.inf
     slope = w.where(w.magnitude(slope) < math.inf, slope, (c_1 - c_2) / (t_1 - t_2))
     small = (w.magnitude(c_1) <= math.sqrt(eps) * step * w.magnitude(slope)) & (w.magnitude(c_1) <= 1e-3 * w.magnitude(c_2))
-    near = w.equal(c_1, 0.0) | (tried & small)
+    zero = w.equal(c_1, 0.0)  # at the event, or anywhere beyond it where the value stays zero
+    near, share = tried & small & ~zero, w.where(tried & (zero | w.equal(c_2, 0.0)), 0.5, share)
     closed = (w.magnitude(width) <= 2.0 * tiny) | last
     clipped = w.smaller(w.larger(share, least), 1.0 - least)
     return w.where(closed, t_2, t_1 + clipped * width), near | (closed & (w.magnitude(c_1) < math.inf))
