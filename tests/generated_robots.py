@@ -51,7 +51,7 @@ class PlanarRobot(jj.Scene):
         ahead = jnp.stack([given.q.x, given.q.y, o]) - jj.rot_z(given.q.heading) @ jnp.stack([self.hitch, o, o])
         for i in range(self.trailers):
             body = given[f"trailer{i}"]
-            made[f"hitch{i}"] = (body.place(jnp.stack([self.length, o, o])) - ahead)[:2]
+            made[f"hitch{i}"] = (body.place([self.length, o, o]) - ahead)[:2]
             ahead = body.position
         return made
 
@@ -99,7 +99,7 @@ class BeadOnCurve(jj.Scene):
 
     def bodies(self, t, q):
         o = 0 * q.x
-        return {"bead": jj.Particle(1.0, jnp.stack([q.x, q.y, o])), "slider": jj.Particle(0.5, jnp.stack([q.s, o, o]))}
+        return {"bead": jj.Particle(1.0, [q.x, q.y, o]), "slider": jj.Particle(0.5, [q.s, o, o])}
 
     def _own(self, x, y):
         c, s = jnp.cos(self.turned), jnp.sin(self.turned)

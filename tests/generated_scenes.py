@@ -227,7 +227,7 @@ class Generated(jj.Scene):
         part, factor, t = self.recipe.rows[s], self.factors[s], motion.t
         if part.kind == "edge":
             body = motion[body_name(part.on[0])]
-            return jj.knife_edge(body, body.place(jnp.stack([0.4, 0.0, 0.1])), body.orientation[:, 1])
+            return jj.knife_edge(body, body.place([0.4, 0.0, 0.1]), body.orientation[:, 1])
         if part.kind == "constant speed":
             v = motion[body_name(part.on[0])].velocity
             return v @ v - 0.6

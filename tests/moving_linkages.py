@@ -63,7 +63,7 @@ class SliderCrank(jj.Scene):
         return {
             "crank": rod_body(0.5 * x, 0.5 * z, q.a, one, 1.0),
             "rod": rod_body(x + 0.5 * jnp.cos(q.b), z + 0.5 * jnp.sin(q.b), q.b, one, 1.0),
-            "slider": jj.Particle(self.slider, jnp.stack([q.x, 0 * q.x, 0 * q.x])),
+            "slider": jj.Particle(self.slider, [q.x, 0.0, 0.0]),
         }
 
     def geometric_constraints(self, pose):
@@ -94,7 +94,7 @@ class NarrowPendulum(jj.Scene):
     example = {"x": 0.3, "z": -np.sqrt(0.91), "x_rate": 1.0}
 
     def bodies(self, t, q):
-        return {"bob": jj.Particle(1.0, jnp.stack([q.x, 0 * q.x, q.z]))}
+        return {"bob": jj.Particle(1.0, [q.x, 0.0, q.z])}
 
     def loads(self, motion):
         return (jj.gravity(motion, 9.81),)

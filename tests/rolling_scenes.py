@@ -25,7 +25,7 @@ class Rolls(jj.Scene):
 
     def bodies(self, t, q):
         moments = self.moments * self.mass * self.radius**2
-        return {"body": jj.RigidBody(self.mass, moments, jnp.stack([q.x, q.y, q.z]), jj.quaternion_to_matrix(q.attitude))}
+        return {"body": jj.RigidBody(self.mass, moments, [q.x, q.y, q.z], jj.quaternion_to_matrix(q.attitude))}
 
     def loads(self, motion):
         return (jj.gravity(motion, GRAVITY),)
@@ -91,7 +91,7 @@ class Cart(jj.Scene):
         return made
 
     def loads(self, motion):
-        down = jnp.stack([jnp.sin(self.slope), 0.0 * self.slope, -jnp.cos(self.slope)])
+        down = jnp.stack([jnp.sin(self.slope), 0.0, -jnp.cos(self.slope)])
         return jj.gravity(motion, GRAVITY, down), jj.point_force(motion["chassis"].point((0.1, 0.2, 0.1)), self.push)
 
     height = "coordinates"
@@ -123,7 +123,7 @@ class BallInBowl(jj.Scene):
 
     def bodies(self, t, q):
         z = self.bowl - jnp.sqrt((self.bowl - self.radius) ** 2 - q.x**2 - q.y**2)
-        return {"ball": jj.RigidBody.ball(self.mass, self.radius, position=jnp.stack([q.x, q.y, z]), orientation=jj.quaternion_to_matrix(q.attitude))}
+        return {"ball": jj.RigidBody.ball(self.mass, self.radius, position=[q.x, q.y, z], orientation=jj.quaternion_to_matrix(q.attitude))}
 
     def loads(self, motion):
         return (jj.gravity(motion, self.gravity),)
@@ -174,7 +174,7 @@ class RouthSphere(jj.Scene):
         return (jj.gravity(motion, GRAVITY),)
 
     def contacts(self, pose):
-        return {"floor": jj.ball_contact(pose["ball"], self.radius, centre=jnp.stack([0.0 * self.off, 0.0 * self.off, self.off]))}
+        return {"floor": jj.ball_contact(pose["ball"], self.radius, centre=jnp.stack([0.0, 0.0, self.off]))}
 
     def invariants(self, motion):
         # Jellett's and Routh's: L.r and w3 sqrt(A C + m r.I r), r from the contact to the mass centre
@@ -192,7 +192,7 @@ class TyredBicycle(jj.models.WhippleBicycle):
 
     def bodies(self, t, q):
         up = (jj.rot_z(q.yaw) @ jj.rot_x(q.lean))[:, 2]
-        raised = self.rear_tyre * (jnp.stack([0.0 * q.x, 0.0 * q.x, 1.0 + 0.0 * q.x]) - up)
+        raised = self.rear_tyre * (jnp.stack([0.0, 0.0, 1.0 + 0.0 * q.x]) - up)
         return {name: eqx.tree_at(lambda b: b.position, body, body.position + raised) for name, body in super().bodies(t, q).items()}
 
     def contacts(self, pose):

@@ -11,7 +11,7 @@ class OnLine(jj.Scene):
     coordinates = jj.coordinates("x")
 
     def bodies(self, t, q):
-        return {"mass": jj.Particle(getattr(self, "mass", 1.0), jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+        return {"mass": jj.Particle(getattr(self, "mass", 1.0), [q.x, 0.0, 0.0])}
 
 
 class OnPlane(jj.Scene):
@@ -20,7 +20,7 @@ class OnPlane(jj.Scene):
     coordinates = jj.coordinates("x y")
 
     def bodies(self, t, q):
-        return {"mass": jj.Particle(getattr(self, "mass", 1.0), jnp.stack([q.x, q.y, 0.0 * q.x]))}
+        return {"mass": jj.Particle(getattr(self, "mass", 1.0), [q.x, q.y, 0.0])}
 
 
 class InSpace(jj.Scene):
@@ -29,7 +29,7 @@ class InSpace(jj.Scene):
     coordinates = jj.coordinates("x y z")
 
     def bodies(self, t, q):
-        return {"mass": jj.Particle(getattr(self, "mass", 1.0), jnp.stack([q.x, q.y, q.z]))}
+        return {"mass": jj.Particle(getattr(self, "mass", 1.0), [q.x, q.y, q.z])}
 
 
 class Upright(jj.Scene):
@@ -38,15 +38,15 @@ class Upright(jj.Scene):
     coordinates = jj.coordinates("x z")
 
     def bodies(self, t, q):
-        return {"mass": jj.Particle(getattr(self, "mass", 1.0), jnp.stack([q.x, 0.0 * q.x, q.z]))}
+        return {"mass": jj.Particle(getattr(self, "mass", 1.0), [q.x, 0.0, q.z])}
 
 
 class DiscWithHeightRow(jj.Scene):
     """A disc with six coordinates that rolls without slip; its height is a row."""
 
-    mass: jnp.ndarray = jj.parameter(1.0, unit="kg", positive=True)
-    radius: jnp.ndarray = jj.parameter(0.5, unit="m", positive=True)
-    gravity: jnp.ndarray = jj.parameter(9.81, unit="m/s^2")
+    mass: float = jj.parameter(1.0, unit="kg", positive=True)
+    radius: float = jj.parameter(0.5, unit="m", positive=True)
+    gravity: float = jj.parameter(9.81, unit="m/s^2")
     coordinates = jj.coordinates("x y z yaw lean spin")
     domain = {"yaw": (-3.2, 3.2), "lean": (-1.2, 1.2), "spin": (-3.2, 3.2)}
 
@@ -69,21 +69,21 @@ class Bead(jj.Scene):
     coordinates = jj.coordinates("x y")
 
     def bodies(self, t, q):
-        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+        return {"bead": jj.Particle(self.mass, [q.x, q.y, 0.0])}
 
 
 class BeadOnTurningWire(jj.Scene):
     """A bead on a straight wire that is turned at a given rate about the vertical: pose given as a function of time."""
 
-    mass: jnp.ndarray = jj.parameter(0.6, unit="kg", positive=True)
-    rate: jnp.ndarray = jj.parameter(1.7, unit="rad/s")
-    damping: jnp.ndarray = jj.parameter(0.0, unit="N s/m")
+    mass: float = jj.parameter(0.6, unit="kg", positive=True)
+    rate: float = jj.parameter(1.7, unit="rad/s")
+    damping: float = jj.parameter(0.0, unit="N s/m")
     coordinates = jj.coordinates("r")
     domain = {"r": (0.2, 1.0)}
 
     def bodies(self, t, q):
         angle = self.rate * t
-        return {"bead": jj.Particle(self.mass, q.r * jnp.stack([jnp.cos(angle), jnp.sin(angle), 0.0 * angle]))}
+        return {"bead": jj.Particle(self.mass, q.r * jnp.stack([jnp.cos(angle), jnp.sin(angle), 0.0]))}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, r_rate=-self.damping * motion.u.r_rate),)
@@ -92,17 +92,17 @@ class BeadOnTurningWire(jj.Scene):
 class DrivenPendulum(jj.Scene):
     """A pendulum whose pivot is driven sideways as a given function of time, by a prescribed coordinate; damped and sprung."""
 
-    mass: jnp.ndarray = jj.parameter(0.8, unit="kg", positive=True)
-    length: jnp.ndarray = jj.parameter(0.9, unit="m", positive=True)
-    stiffness: jnp.ndarray = jj.parameter(5.0, unit="N/m")
-    damping: jnp.ndarray = jj.parameter(0.3, unit="N s/m")
-    gravity: jnp.ndarray = jj.parameter(9.81, unit="m/s^2")
+    mass: float = jj.parameter(0.8, unit="kg", positive=True)
+    length: float = jj.parameter(0.9, unit="m", positive=True)
+    stiffness: float = jj.parameter(5.0, unit="N/m")
+    damping: float = jj.parameter(0.3, unit="N s/m")
+    gravity: float = jj.parameter(9.81, unit="m/s^2")
     coordinates = jj.coordinates("pivot angle")
     domain = {"angle": (-1.0, 1.0)}
 
     def bodies(self, t, q):
-        hang = self.length * jnp.stack([jnp.sin(q.angle), 0.0 * q.angle, -jnp.cos(q.angle)])
-        pivot = jnp.stack([q.pivot, 0.0 * q.pivot, 0.0 * q.pivot])
+        hang = self.length * jnp.stack([jnp.sin(q.angle), 0.0, -jnp.cos(q.angle)])
+        pivot = jnp.stack([q.pivot, 0.0, 0.0])
         return {"cart": jj.Particle(0.5 * self.mass, pivot), "bob": jj.Particle(self.mass, pivot + hang)}
 
     def loads(self, motion):
@@ -137,7 +137,7 @@ class Goursat(jj.Scene):
 class AffineRows(InSpace):
     """A particle with an integrable row that is not homogeneous, and one that differs from an integrable row by `strength`."""
 
-    strength: jnp.ndarray = jj.parameter(0.0)
+    strength: float = jj.parameter(0.0)
 
     def velocity_constraints(self, motion):
         q, u = motion.q, motion.u
@@ -148,15 +148,15 @@ class AffineRows(InSpace):
 class Cart(jj.Scene):
     """`m x'' = push - c x' - k x`."""
 
-    mass: jnp.ndarray = jj.parameter(2.0, unit="kg", positive=True)
-    damping: jnp.ndarray = jj.parameter(0.6, unit="N s/m", non_negative=True)
-    stiffness: jnp.ndarray = jj.parameter(5.0, unit="N/m")
+    mass: float = jj.parameter(2.0, unit="kg", positive=True)
+    damping: float = jj.parameter(0.6, unit="N s/m", non_negative=True)
+    stiffness: float = jj.parameter(5.0, unit="N/m")
 
     coordinates = jj.coordinates("x")
     inputs = jj.inputs("push")
 
     def bodies(self, t, q):
-        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+        return {"cart": jj.Particle(self.mass, [q.x, 0.0, 0.0])}
 
     def loads(self, motion):
         force = motion.inputs.push - self.damping * motion.u.x_rate - self.stiffness * motion.q.x
@@ -166,13 +166,13 @@ class Cart(jj.Scene):
 class Oscillator(jj.Scene):
     """`m x'' = - c x' - k x`: mass and stiffness show only in their ratio where nothing else is known."""
 
-    mass: jnp.ndarray = jj.parameter(2.0, positive=True)
-    damping: jnp.ndarray = jj.parameter(0.3, non_negative=True)
-    stiffness: jnp.ndarray = jj.parameter(5.0, positive=True)
+    mass: float = jj.parameter(2.0, positive=True)
+    damping: float = jj.parameter(0.3, non_negative=True)
+    stiffness: float = jj.parameter(5.0, positive=True)
     coordinates = jj.coordinates("x")
 
     def bodies(self, t, q):
-        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+        return {"cart": jj.Particle(self.mass, [q.x, 0.0, 0.0])}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=-self.damping * motion.u.x_rate - self.stiffness * motion.q.x),)

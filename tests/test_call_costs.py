@@ -21,7 +21,7 @@ K = 2.0
 class Pushed(OnPlane):
     """A mass that two inputs push, on a spring."""
 
-    stiffness: jnp.ndarray = jj.parameter(4.0, unit="N/m")
+    stiffness: float = jj.parameter(4.0, unit="N/m")
     inputs = jj.inputs("f g")
 
     def loads(self, motion):

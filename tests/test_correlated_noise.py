@@ -44,7 +44,7 @@ def test_the_likelihood_is_the_dense_normal_one_at_uneven_times_and_across_gaps(
     V = SIGMA**2 * np.exp(-np.abs(ts[:, None] - ts) / tau)
     expected = -0.5 * r @ np.linalg.solve(V, r) - 0.5 * np.linalg.slogdet(2 * np.pi * V)[1]
     # the simulation's error of 1e-8 m is multiplied where neighbours nearly agree
-    assert float(jj.log_likelihood(truth, data, rtol=1e-10, atol=1e-10)) == pytest.approx(expected, abs=1e-4 * abs(expected))
+    assert jj.log_likelihood(truth, data, rtol=1e-10, atol=1e-10) == pytest.approx(expected, abs=1e-4 * abs(expected))
 
 
 @pytest.mark.parametrize("sigma", [SIGMA, None], ids=["sigmas known", "sigmas estimated"])

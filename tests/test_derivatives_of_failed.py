@@ -15,9 +15,9 @@ import jourdain_jax as jj
 class Slider(OnLine):
     """A mass on a spring, in a well that has no numbers below its edge."""
 
-    stiffness: jnp.ndarray = jj.parameter(4.0, unit="N/m")
-    mass: jnp.ndarray = jj.parameter(1.0, unit="kg", positive=True)
-    edge: jnp.ndarray = jj.parameter(-50.0, unit="m")
+    stiffness: float = jj.parameter(4.0, unit="N/m")
+    mass: float = jj.parameter(1.0, unit="kg", positive=True)
+    edge: float = jj.parameter(-50.0, unit="m")
 
     def loads(self, motion):
         force = -self.stiffness * motion.q.x + jnp.sqrt(motion.q.x - self.edge)

@@ -134,7 +134,7 @@ def test_redundant_rows_are_as_their_page_says(capsys):
 def test_the_code_of_the_page_on_inputs_runs():
     page = run(DOCS / "howto" / "inputs.md")
     # the blow of 0.9 N s on 2 kg shows in the speed right after it
-    shortly = jj.simulate(page["Cart"](gain=0.0), ts=jnp.array([0.0, 1.002]), inputs={"push": page["blow"]})
+    shortly = jj.simulate(page["Cart"](gain=0.0), ts=[0.0, 1.002], inputs={"push": page["blow"]})
     assert_allclose(shortly["x_rate"][-1], 0.45, rtol=5e-3)
 
 

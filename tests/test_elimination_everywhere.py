@@ -44,7 +44,7 @@ def motion_and_reference(scene, start, t1, *, traced=(), **options):
         return jj.simulate(scene.replace(**values) if values else scene, start, ts=jnp.linspace(0.0, t1, 9), rtol=1e-10, atol=1e-10, work=False, **options)
 
     values = {name: getattr(scene, name) for name in traced}
-    reference = jj.simulate(scene, start, ts=jnp.array([t1]), formulation=jj.Formulation("full"), backend="dense", rtol=1e-11, atol=1e-11, work=False)
+    reference = jj.simulate(scene, start, ts=[t1], formulation=jj.Formulation("full"), backend="dense", rtol=1e-11, atol=1e-11, work=False)
     return jax.jit(run)(values, jj.start(scene, **start)), reference
 
 
@@ -105,7 +105,7 @@ def test_rows_along_axes_at_any_angle_that_is_traced_are_served():
     scene = PlanarRobot(trailers=1)
     start = jj.start(scene, **scene.start(**ROBOT))
     angles = jnp.array([0.0, 0.4, np.pi / 2, -2.0])
-    ends = jax.jit(jax.vmap(lambda a: jj.simulate(scene.replace(turned=a), start, ts=jnp.array([2.0]), rtol=1e-10, atol=1e-10, work=False)))(angles)
+    ends = jax.jit(jax.vmap(lambda a: jj.simulate(scene.replace(turned=a), start, ts=[2.0], rtol=1e-10, atol=1e-10, work=False)))(angles)
     assert np.all(np.asarray(ends.result) == results.SUCCESS)
     assert_allclose(ends.q_end, jnp.broadcast_to(ends.q_end[0], ends.q_end.shape), atol=1e-8)
 
@@ -166,7 +166,7 @@ def test_a_disc_held_by_a_quaternion_keeps_its_norm_by_the_program():
     y = tuple(u[k] for k in program.independent)
     found, same = program.projected(program.fixed_values(scene), t, tuple(1.001 * q), y, jnp.zeros(0), True)
     ((first, _),) = scene.coordinates.quaternions
-    assert abs(float(jnp.linalg.norm(jnp.stack(found)[first : first + 4])) - 1) <= tolerance("round_off")
+    assert abs(jnp.linalg.norm(jnp.stack(found)[first : first + 4]) - 1) <= tolerance("round_off")
     assert same == y
 
 

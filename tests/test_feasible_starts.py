@@ -93,7 +93,7 @@ def test_a_start_is_put_together_in_the_domain_that_its_scene_states(given):
     found = jj.start(Hanging(), given)
     assert found.residual < 1e-12
     assert -1.05 <= float(found["z"]) <= -0.1
-    assert_allclose(jj.simulate(Hanging(), given, ts=np.array([0.0, 0.01])).q[0], found.q, atol=1e-9)
+    assert_allclose(jj.simulate(Hanging(), given, ts=[0.0, 0.01]).q[0], found.q, atol=1e-9)
 
 
 @pytest.mark.parametrize("x", [1.7, 2.1, 2.6, 2.9])

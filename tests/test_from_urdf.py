@@ -59,7 +59,7 @@ class ByHand(jj.Scene):
         matrix = np.array([[0.1, 0.01, -0.02], [0.01, 0.12, 0.005], [-0.02, 0.005, 0.09]])
         own = rpy(0.3, -0.4, 0.5)
         second = first @ rpy(0.0, 0.0, 1.0)
-        middle = start + first @ jnp.array([0.0, 0.0, 0.4]) + second @ jnp.stack([0.0 * q.slide, 0.0 * q.slide, q.slide])
+        middle = start + first @ jnp.array([0.0, 0.0, 0.4]) + second @ jnp.stack([0.0, 0.0, q.slide])
         third = second @ jj.rot_x(q.follow)
         return {
             "first": jj.RigidBody(2.0, own @ matrix @ own.T, start + first @ jnp.array([0.1, 0.2, 0.3]), first),

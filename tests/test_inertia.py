@@ -17,7 +17,7 @@ import jourdain_jax as jj
 class Weightless(OnLine):
     """A bead at x, and a force on a coordinate y that moves nothing."""
 
-    mass: jnp.ndarray = jj.parameter(2.0, unit="kg")
+    mass: float = jj.parameter(2.0, unit="kg")
     coordinates = jj.coordinates("x y")
 
     def loads(self, motion):
@@ -35,7 +35,7 @@ class Twice(Weightless):
     """x and y move the same bead along the same line."""
 
     def bodies(self, t, q):
-        return {"bead": jj.Particle(self.mass, jnp.stack([q.x + q.y, 0.0 * q.x, 0.0 * q.x]))}
+        return {"bead": jj.Particle(self.mass, [q.x + q.y, 0.0, 0.0])}
 
 
 class ThinRod(jj.Scene):
@@ -55,7 +55,7 @@ class OnSphere(jj.Scene):
 
     def bodies(self, t, q):
         s = jnp.sin(q.polar)
-        return {"particle": jj.Particle(1.0, jnp.stack([s * jnp.cos(q.azimuth), s * jnp.sin(q.azimuth), jnp.cos(q.polar)]))}
+        return {"particle": jj.Particle(1.0, [s * jnp.cos(q.azimuth), s * jnp.sin(q.azimuth), jnp.cos(q.polar)])}
 
 
 class Tumbling(jj.Scene):
@@ -119,7 +119,7 @@ def test_an_isolated_loss_of_inertia_is_no_fault_of_the_scene():
 def test_a_motion_that_starts_without_inertia_says_so_instead_of_inventing_an_acceleration():
     q, u, _ = OnSphere().named(azimuth_rate=0.5)
     stuck = jj.simulate(OnSphere(), jj.consistent(OnSphere(), 0.0, q, u), t1=1.0)
-    assert int(stuck.result) == results.NOT_FINITE
+    assert stuck.result == results.NOT_FINITE
     assert "no inertia along a free direction" in stuck.message
 
 
@@ -153,7 +153,7 @@ class BurningRocket(jj.Scene):
 
     def bodies(self, t, q):
         left = 2.0 - 0.5 * t
-        return {"rocket": jj.RigidBody(left, left * jnp.ones(3), jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]), jj.rot_z(q.angle))}
+        return {"rocket": jj.RigidBody(left, left * jnp.ones(3), [q.x, 0.0, 0.0], jj.rot_z(q.angle))}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=3.0),)
@@ -180,14 +180,14 @@ def test_an_inertia_is_impossible_where_an_eigenvalue_is_negative():
 class Wheel(jj.Scene):
     """A wheel that rolls on a plane, each of its numbers open to mistakes."""
 
-    mass: jnp.ndarray = jj.parameter(1.0)
-    moment: jnp.ndarray = jj.parameter(0.3)
-    lopsided: jnp.ndarray = jj.parameter(0.0)
-    stretch: jnp.ndarray = jj.parameter(1.0)
-    mirror: jnp.ndarray = jj.parameter(1.0)
-    radius: jnp.ndarray = jj.parameter(0.1)
-    height: jnp.ndarray = jj.parameter(0.1)
-    tyre: jnp.ndarray = jj.parameter(0.02)
+    mass: float = jj.parameter(1.0)
+    moment: float = jj.parameter(0.3)
+    lopsided: float = jj.parameter(0.0)
+    stretch: float = jj.parameter(1.0)
+    mirror: float = jj.parameter(1.0)
+    radius: float = jj.parameter(0.1)
+    height: float = jj.parameter(0.1)
+    tyre: float = jj.parameter(0.02)
     down: jnp.ndarray = jj.parameter((0.0, 0.0, -1.0))
     coordinates = jj.coordinates("x roll")
 
@@ -195,7 +195,7 @@ class Wheel(jj.Scene):
         o = 0.0 * q.x
         inertia = jnp.diag(jnp.stack([self.moment, 0.3 + o, 0.3 + o])) + self.lopsided * jnp.eye(3, k=1)
         turned = jj.rot_y(q.roll) @ jnp.diag(jnp.stack([self.stretch, self.stretch * self.mirror, self.stretch]))
-        return {"wheel": jj.RigidBody(self.mass, inertia, jnp.stack([q.x, o, o + self.height]), turned)}
+        return {"wheel": jj.RigidBody(self.mass, inertia, [q.x, o, o + self.height], turned)}
 
     def contacts(self, pose):
         return {"rim": jj.wheel_contact(pose["wheel"], self.radius, self.tyre)}

@@ -18,7 +18,7 @@ from jourdain_jax.models import ChaplyginSleigh
 class OnBelt(OnPlane):
     """A bead that slides across a belt; the belt, at the speed of an input, carries it along faster the farther out it is."""
 
-    mass: jnp.ndarray = jj.parameter(2.0, unit="kg", positive=True)
+    mass: float = jj.parameter(2.0, unit="kg", positive=True)
     inputs = jj.inputs("speed push")
     domain = {"y": (-0.4, 0.4)}
 
@@ -94,15 +94,15 @@ def test_a_scene_without_inputs_takes_none_in_a_start():
 class PulledBead(OnLine):
     """A bead between a spring to the origin and one, stiffening in time, to a hand at the place of an input; a damper besides."""
 
-    mass: jnp.ndarray = jj.parameter(2.0, unit="kg", positive=True)
-    stiffness: jnp.ndarray = jj.parameter(18.0, unit="N/m")
-    stiffening: jnp.ndarray = jj.parameter(5.0, unit="N/m/s")
-    damping: jnp.ndarray = jj.parameter(0.5, unit="N s/m")
+    mass: float = jj.parameter(2.0, unit="kg", positive=True)
+    stiffness: float = jj.parameter(18.0, unit="N/m")
+    stiffening: float = jj.parameter(5.0, unit="N/m/s")
+    damping: float = jj.parameter(0.5, unit="N s/m")
     inputs = jj.inputs("push hand")
     example = {"x": 0.2}
 
     def loads(self, motion):
-        bead, hand = motion["mass"].point(), jnp.stack([motion.inputs.hand, 0.0 * motion.t, 0.0 * motion.t])
+        bead, hand = motion["mass"].point(), jnp.stack([motion.inputs.hand, 0.0, 0.0])
         return (
             jj.spring(bead, jj.fixed_point((0.0, 0.0, 0.0)), self.stiffness),
             jj.spring(bead, jj.fixed_point(hand), self.stiffness + self.stiffening * motion.t),
@@ -152,7 +152,7 @@ def test_the_work_of_a_sampled_input_in_a_potential_is_that_of_a_quadrature(opti
 def test_an_input_that_jumps_does_the_work_of_moving_the_spring_at_once():
     jumps = {"hand": lambda t: jnp.where(t < 0.5, 0.1, 0.3)}
     scene = PulledBead(damping=0.0, stiffening=0.0, stiffness=18.0)
-    motion = jj.simulate(scene, ts=jnp.array([0.0, 0.5 - 1e-9, 0.5, 1.0]), rtol=1e-10, atol=1e-10, inputs=jumps).raise_if_failed()
+    motion = jj.simulate(scene, ts=[0.0, 0.5 - 1e-9, 0.5, 1.0], rtol=1e-10, atol=1e-10, inputs=jumps).raise_if_failed()
     before, after = (0.5 * 18.0 * (motion["x"][2] - hand) ** 2 for hand in (0.1, 0.3))
     assert_allclose(motion.work, [0.0, 0.0, after - before, after - before], atol=1e-7)
     balance = np.asarray(motion.energies().balance)

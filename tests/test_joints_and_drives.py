@@ -18,28 +18,28 @@ def upright(angle):
 class BodyPendulum(jj.Scene):
     """A rod in the plane, free in its coordinates and pinned at one end."""
 
-    mass: jnp.ndarray = jj.parameter(1.2, unit="kg", positive=True)
-    length: jnp.ndarray = jj.parameter(0.8, unit="m", positive=True)
+    mass: float = jj.parameter(1.2, unit="kg", positive=True)
+    length: float = jj.parameter(0.8, unit="m", positive=True)
     coordinates = jj.coordinates("x z angle")
     domain = {"x": (-0.4, 0.4), "z": (-0.4, 0.4), "angle": (-1.2, 1.2)}
 
     def bodies(self, t, q):
-        place = jnp.stack([q.x, 0.0 * q.x, q.z])
+        place = jnp.stack([q.x, 0.0, q.z])
         return {"rod": jj.RigidBody.rod(self.mass, self.length, axis="x", position=place, orientation=upright(q.angle))}
 
     def loads(self, motion):
         return (jj.gravity(motion, GRAVITY),)
 
     def geometric_constraints(self, pose):
-        end = pose["rod"].place(jnp.stack([-0.5 * self.length, 0.0, 0.0]))
+        end = pose["rod"].place([-0.5 * self.length, 0.0, 0.0])
         return {"hinge": jj.pin(jnp.zeros(3), end, axes="xz")}
 
 
 class PendulumInAngle(jj.Scene):
     """A pendulum in its one angle."""
 
-    mass: jnp.ndarray = jj.parameter(1.2, unit="kg", positive=True)
-    length: jnp.ndarray = jj.parameter(0.8, unit="m", positive=True)
+    mass: float = jj.parameter(1.2, unit="kg", positive=True)
+    length: float = jj.parameter(0.8, unit="m", positive=True)
     coordinates = jj.coordinates("angle")
 
     def bodies(self, t, q):
@@ -72,8 +72,8 @@ def test_a_pinned_rod_is_the_pendulum_in_its_angle_and_the_pin_carries_newtons_f
 class Welded(jj.Scene):
     """Two half rods in space, welded end to end at a right angle, free in space as one."""
 
-    mass: jnp.ndarray = jj.parameter(0.7, unit="kg", positive=True)
-    length: jnp.ndarray = jj.parameter(0.5, unit="m", positive=True)
+    mass: float = jj.parameter(0.7, unit="kg", positive=True)
+    length: float = jj.parameter(0.5, unit="m", positive=True)
     coordinates = jj.coordinates("x1 y1 z1", jj.quaternion("a1"), "x2 y2 z2", jj.quaternion("a2"))
     domain = dict.fromkeys(("x1", "y1", "z1", "x2", "y2", "z2"), (-0.3, 0.3))
 
@@ -116,15 +116,15 @@ def test_a_weld_of_two_bodies_keeps_them_together_and_their_momentum():
 class Driven(jj.Scene):
     """A mass on a spring whose other end is driven as a given function of time."""
 
-    mass: jnp.ndarray = jj.parameter(2.0, unit="kg", positive=True)
-    stiffness: jnp.ndarray = jj.parameter(18.0, unit="N/m", positive=True)
-    amplitude: jnp.ndarray = jj.parameter(0.1, unit="m")
-    rate: jnp.ndarray = jj.parameter(2.0, unit="rad/s")
+    mass: float = jj.parameter(2.0, unit="kg", positive=True)
+    stiffness: float = jj.parameter(18.0, unit="N/m", positive=True)
+    amplitude: float = jj.parameter(0.1, unit="m")
+    rate: float = jj.parameter(2.0, unit="rad/s")
     coordinates = jj.coordinates("end place")
 
     def bodies(self, t, q):
         o = 0.0 * q.place
-        return {"end": jj.Particle(0.5, jnp.stack([q.end, o, o])), "mass": jj.Particle(self.mass, jnp.stack([1.0 + q.place, o, o]))}
+        return {"end": jj.Particle(0.5, [q.end, o, o]), "mass": jj.Particle(self.mass, [1.0 + q.place, o, o])}
 
     def loads(self, motion):
         return (jj.spring(motion["end"].point(), motion["mass"].point(), self.stiffness, 1.0),)

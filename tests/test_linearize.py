@@ -499,7 +499,7 @@ def test_a_double_eigenvalue_has_no_derivative(bicycle, straight):
 def test_critical_speeds_are_the_published_ones(bicycle, straight, what, speed):
     point = jj.critical(bicycle, straight, what)
     assert point.code == 0
-    assert float(point.speed) == pytest.approx(speed, abs=2e-12)
+    assert point.speed == pytest.approx(speed, abs=2e-12)
     assert point.eigenvalue.real == (pytest.approx(3.78290405129, abs=1e-9) if what == "double root" else 0.0)
     assert point.message == "found"
 

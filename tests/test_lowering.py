@@ -47,13 +47,13 @@ def test_the_summary_says_what_was_dropped_and_chosen():
 class Rough(jj.Scene):
     """A bead on a rough wire, pushed while it is slow or far: signs, sizes, choices, and names that a program might use itself."""
 
-    mass: jnp.ndarray = jj.parameter(1.3, unit="kg", positive=True)
-    k1: jnp.ndarray = jj.parameter(2.0, unit="N/m")
-    double: jnp.ndarray = jj.parameter(0.7, unit="N")
+    mass: float = jj.parameter(1.3, unit="kg", positive=True)
+    k1: float = jj.parameter(2.0, unit="N/m")
+    double: float = jj.parameter(0.7, unit="N")
     coordinates = jj.coordinates("s0 rates")  # a length, and an angle
 
     def bodies(self, t, q):
-        return {"bead": jj.RigidBody(self.mass, jnp.ones(3), jnp.stack([q.s0, 0.0 * q.s0, 0.0 * q.s0]), jj.rot_x(q.rates))}
+        return {"bead": jj.RigidBody(self.mass, jnp.ones(3), [q.s0, 0.0, 0.0], jj.rot_x(q.rates))}
 
     def loads(self, motion):
         x, v = motion.q.s0, motion.u.s0_rate
@@ -171,7 +171,7 @@ class Mistaken(jj.Scene):
     coordinates = jj.coordinates("x")
 
     def bodies(self, t, q):
-        return {"point": jj.Particle(1.0, jnp.stack([_half_believed(q.x), 0.0 * q.x, 0.0 * q.x]))}
+        return {"point": jj.Particle(1.0, [_half_believed(q.x), 0.0, 0.0])}
 
 
 @jax.custom_jvp
@@ -252,8 +252,8 @@ def test_what_a_scene_has_not_costs_nothing():
 class Falling(Upright):
     """A stone."""
 
-    mass: jnp.ndarray = jj.parameter(1.3, unit="kg", positive=True)
-    gravity: jnp.ndarray = jj.parameter(9.81, unit="m/s^2")
+    mass: float = jj.parameter(1.3, unit="kg", positive=True)
+    gravity: float = jj.parameter(9.81, unit="m/s^2")
 
     def loads(self, motion):
         return (jj.gravity(motion, self.gravity),)
@@ -294,11 +294,11 @@ def test_loops_over_steps_are_compiled_into_one_function():
 class OnNarrowEllipse(jj.Scene):
     """A bead on an ellipse whose eccentricity is near one: a tenth more, and it has no minor axis."""
 
-    eccentricity: jnp.ndarray = jj.parameter(0.97)
+    eccentricity: float = jj.parameter(0.97)
     coordinates = jj.coordinates("angle")
 
     def bodies(self, t, q):
-        return {"bead": jj.Particle(1.0, jnp.stack([jnp.cos(q.angle), jnp.sqrt(1 - self.eccentricity**2) * jnp.sin(q.angle), 0.0 * q.angle]))}
+        return {"bead": jj.Particle(1.0, [jnp.cos(q.angle), jnp.sqrt(1 - self.eccentricity**2) * jnp.sin(q.angle), 0.0])}
 
 
 def test_a_parameter_near_the_end_of_its_range_does_not_keep_a_scene_from_its_program():
@@ -332,7 +332,7 @@ class Looped(jj.Scene):
         return type(self).loop(x) if where == self.where else x
 
     def bodies(self, t, q):
-        return {"mass": jj.Particle(1.0, jnp.stack([q.x, self.asked("bodies", q.y), 0.0 * q.x]))}
+        return {"mass": jj.Particle(1.0, [q.x, self.asked("bodies", q.y), 0.0])}
 
     def loads(self, motion):
         return (jj.Load(generalized={"x_rate": self.asked("loads", -motion.q.x)}),)

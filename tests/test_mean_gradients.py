@@ -12,11 +12,11 @@ import jourdain_jax as jj
 class Thrown(jj.Scene):
     """A particle thrown upwards: z = z0 + v t - g t^2 / 2; it may reach the ground."""
 
-    gravity: jnp.ndarray = jj.parameter(9.0, unit="m/s^2")
+    gravity: float = jj.parameter(9.0, unit="m/s^2")
     coordinates = jj.coordinates("z")
 
     def bodies(self, t, q):
-        return {"ball": jj.Particle(1.0, jnp.stack([0.0 * q.z, 0.0 * q.z, q.z]))}
+        return {"ball": jj.Particle(1.0, [0.0, 0.0, q.z])}
 
     def loads(self, motion):
         return (jj.gravity(motion, self.gravity),)

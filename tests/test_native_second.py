@@ -25,7 +25,7 @@ class Falling(jj.Scene):
     inputs = jj.inputs("wind")
 
     def bodies(self, t, q):
-        return {"ball": jj.Particle(self.mass, jnp.stack([0.0 * q.z, 0.0 * q.z, q.z]))}
+        return {"ball": jj.Particle(self.mass, [0.0, 0.0, q.z])}
 
     def loads(self, motion):
         return (jj.generalized_force(motion, z_rate=-self.drag * (motion.u.z_rate - motion.inputs.wind) - 9.81 * self.mass),)

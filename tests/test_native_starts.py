@@ -62,7 +62,7 @@ def test_named_starts_of_all_models_are_alike(name):
     scene = MODELS[name]()
     theirs, ours = (jj.start(jj.build(scene, backend=backend), scene.example) for backend in BACKENDS)
     _same(ours, theirs)
-    assert float(ours.residual) < 1e-12 * (1 + float(jnp.max(jnp.abs(ours.u))))
+    assert ours.residual < 1e-12 * (1 + float(jnp.max(jnp.abs(ours.u))))
 
 
 def test_lanes_that_are_no_numbers_and_those_that_run_away():
@@ -102,7 +102,7 @@ def test_what_is_held_does_not_move():
 class Driven(jj.Scene):
     """A rod on a floor that moves, with a row that an input turns: rows of time and inputs, a quaternion, and a mass matrix that is full."""
 
-    length: jnp.ndarray = jj.parameter(0.7, positive=True)
+    length: float = jj.parameter(0.7, positive=True)
     moments: jnp.ndarray = jj.parameter(jnp.array([0.3, 0.5, 0.4]), unit="kg m^2")
 
     coordinates = jj.coordinates("x y", jj.quaternion("attitude"))

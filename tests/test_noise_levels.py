@@ -30,8 +30,8 @@ def test_few_samples_of_unknown_noise_give_the_textbook_intervals_of_regression(
     X = np.stack([np.ones(count), ts], axis=1)
     b, (rss,), *_ = np.linalg.lstsq(X, y)
     errors = np.sqrt(rss / (count - 2) * np.diag(np.linalg.inv(X.T @ X)))
-    assert float(found.sigma["x"]) == pytest.approx(np.sqrt(rss / (count - 2)), rel=1e-6)
-    assert float(found.reduced_chi_square) == pytest.approx(1.0)
+    assert found.sigma["x"] == pytest.approx(np.sqrt(rss / (count - 2)), rel=1e-6)
+    assert found.reduced_chi_square == pytest.approx(1.0)
     assert_allclose(found.values, b, rtol=1e-6)
     assert_allclose(found.standard_errors, errors, rtol=1e-6)
     assert_allclose(found.high - found.values, stdtrit(count - 2, 0.975) * errors, rtol=1e-6)
@@ -55,7 +55,7 @@ def test_what_priors_tell_is_not_taken_from_the_samples():
     X, P = np.stack([np.ones(6), ts], axis=1), np.diag([0.03**-2, 0.1**-2])
     known = jj.fit(Bead(), run(ts, {"x": y}, 0.1, prior))
     C = np.linalg.inv(X.T @ X / 0.1**2 + P)
-    assert float(known.degrees_of_freedom) == pytest.approx(6 - np.trace(C @ X.T @ X) / 0.1**2, rel=1e-9)
+    assert known.degrees_of_freedom == pytest.approx(6 - np.trace(C @ X.T @ X) / 0.1**2, rel=1e-9)
     found = jj.fit(Bead(), run(ts, {"x": y}, None, prior))
     s, residuals = float(found.sigma["x"]), y - X @ found.values
     C = np.linalg.inv(X.T @ X / s**2 + P)
@@ -137,7 +137,7 @@ def test_a_robust_loss_does_not_widen_what_a_prior_tells():
     ts, noise = np.linspace(0.0, 1.0, 12), np.random.default_rng(4)
     y, sure = 1 + 2 * ts + 0.1 * noise.standard_t(4, size=12), jj.Normal(2.0, 1e-3)
     found = jj.fit(Bead(), run(ts, {"x": y}, 0.05, {"x": None, "x_rate": sure}), loss=jj.student_t())
-    assert float(found["run 0: x_rate"].standard_error) == pytest.approx(1e-3, rel=1e-3)
+    assert found["run 0: x_rate"].standard_error == pytest.approx(1e-3, rel=1e-3)
     r = np.asarray(found.residuals[0]["x"])
     psi, slope = 5 * r / (4 + r**2), 5 * (4 - r**2) / (4 + r**2) ** 2
     p = 12 - float(found.degrees_of_freedom)
@@ -145,7 +145,7 @@ def test_a_robust_loss_does_not_widen_what_a_prior_tells():
     # Huber and Ronchetti (2009), section 7.6, of a mean; J'J from the weighted one
     K = 1 + p / 12 * np.var(slope) / np.mean(slope) ** 2
     variance = K**2 * np.sum(psi**2) / (12 - p) / np.mean(slope) ** 2 * np.mean(5 / (4 + r**2)) / np.sum(5 / (4 + r**2)) * 0.05**2
-    assert float(found["run 0: x"].standard_error) == pytest.approx(np.sqrt(variance), rel=1e-2)
+    assert found["run 0: x"].standard_error == pytest.approx(np.sqrt(variance), rel=1e-2)
 
 
 @pytest.mark.parametrize("sigma", [0.1, None], ids=["sigma known", "sigma estimated"])
@@ -193,5 +193,5 @@ def test_a_bound_that_decides_is_named_where_its_misfit_counts_as_noise():
         for far in (2.0, 8.0):
             bounded = jj.Estimate(slope + 10 * error, range=jj.bounds(slope + far * error, 90.0))
             found = jj.fit(Bead(), run(ts, {"x": y}, sigma, {"x": None, "x_rate": bounded}))
-            assert float(found.beyond[1]) == pytest.approx(far, rel=1e-4)
+            assert found.beyond[1] == pytest.approx(far, rel=1e-4)
             assert any("decides its value" in sentence for sentence in found.warnings) == (far > 3)

@@ -202,25 +202,25 @@ def test_motions_with_a_call_are_the_dense_ones_alone_and_in_lockstep(name):
 class OnCam(jj.Scene):
     """A bead whose height is a table of where it is."""
 
-    mass: jnp.ndarray = jj.parameter(1.0, positive=True)
+    mass: float = jj.parameter(1.0, positive=True)
     coordinates = jj.coordinates("x")
 
     def bodies(self, t, q):
-        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, jnp.interp(q.x, jnp.linspace(-9.0, 9.0, 10), jnp.arange(10.0))]))}
+        return {"bead": jj.Particle(self.mass, [q.x, 0.0, jnp.interp(q.x, jnp.linspace(-9.0, 9.0, 10), jnp.arange(10.0))])}
 
 
 class Mixed(OnCam):
     """A bead whose height is a product with a large matrix, which is one sine."""
 
     def bodies(self, t, q):
-        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, jnp.mean(jnp.full((40, 40), 0.3) @ jnp.sin(q.x + jnp.arange(40.0)))]))}
+        return {"bead": jj.Particle(self.mass, [q.x, 0.0, jnp.mean(jnp.full((40, 40), 0.3) @ jnp.sin(q.x + jnp.arange(40.0)))])}
 
 
 class Softly(OnCam):
     """A bead on a ramp that begins softly, by a function with a derivative of its own."""
 
     def bodies(self, t, q):
-        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, jax.nn.softplus(q.x)]))}
+        return {"bead": jj.Particle(self.mass, [q.x, 0.0, jax.nn.softplus(q.x)])}
 
 
 @pytest.mark.parametrize(

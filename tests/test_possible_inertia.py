@@ -66,7 +66,7 @@ class Turning(jj.Scene):
 class TurningBody(Turning):
     """Its motion, with moments that a body can have."""
 
-    moments: jnp.ndarray = jj.parameter(jj.log_cholesky([0.5, 0.7, 0.4])[:3])
+    moments: float = jj.parameter(jj.log_cholesky([0.5, 0.7, 0.4])[:3])
 
     def inertia(self):
         return jj.inertia_from_log_cholesky(jnp.concatenate([self.moments, jnp.zeros(3)]))

@@ -28,7 +28,7 @@ class OnPath(jj.Scene):
     def bodies(self, t, q):
         newton = lambda v: v - (v**3 + v - q.x) / (3 * v * v + 1)  # noqa: E731
         root = jax.lax.while_loop(lambda v: jnp.abs(newton(v) - v) > 1e-14, newton, jnp.zeros_like(q.x))
-        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, root, q.z]))}
+        return {"bead": jj.Particle(self.mass, [q.x, root, q.z])}
 
     def geometric_constraints(self, pose):
         return {"rod": pose["bead"].position @ pose["bead"].position - 0.5}

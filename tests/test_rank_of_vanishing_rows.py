@@ -84,7 +84,7 @@ class HangingPlate(jj.Scene):
     example = {"x": 0.3, "z": -0.4}
 
     def bodies(self, t, q):
-        return {"plate": jj.RigidBody(2.0, 0.1 * jnp.ones(3), jnp.stack([q.x, 0.0 * q.x, q.z]), jj.rot_y(q.turned))}
+        return {"plate": jj.RigidBody(2.0, 0.1 * jnp.ones(3), [q.x, 0.0, q.z], jj.rot_y(q.turned))}
 
     def loads(self, motion):
         return (jj.gravity(motion, 9.81),)
@@ -177,7 +177,7 @@ def test_losses_of_rank_are_passed_at_every_tolerance(backend, tolerance):
 
 def test_derivatives_past_losses_of_rank_agree_in_both_modes():
     def end(rate):
-        return jj.simulate(_swinging("auto"), _start(rate), ts=jnp.array([0.0, 2.0]), rtol=1e-12, atol=1e-12).q_end[0]
+        return jj.simulate(_swinging("auto"), _start(rate), ts=[0.0, 2.0], rtol=1e-12, atol=1e-12).q_end[0]
 
     h, forward = 1e-3, jax.jacfwd(end)(1.0)
     by_values = (8 * (end(1 + h) - end(1 - h)) - end(1 + 2 * h) + end(1 - 2 * h)) / (12 * h)

@@ -67,7 +67,7 @@ def test_the_derivative_of_a_long_motion_at_round_off_is_right(backend):
 
     def turned(factor):
         begun = eqx.tree_at(lambda s: s.u, start, factor * start.u)
-        motion = jj.simulate(STONE, begun, ts=jnp.array([2.0]), rtol=1e-13, atol=1e-13, formulation=jj.Formulation(stabilisation=None), backend=backend)
+        motion = jj.simulate(STONE, begun, ts=[2.0], rtol=1e-13, atol=1e-13, formulation=jj.Formulation(stabilisation=None), backend=backend)
         return jnp.sum(motion.q_end), motion.accepted
 
     found, steps = jax.grad(turned, has_aux=True)(1.0)

@@ -69,7 +69,7 @@ class Roller(jj.Scene):
 
     def bodies(self, t, q):
         turned = jj.rot_z(q.heading) @ jj.rot_y(q.spin)
-        return {"roller": jj.RigidBody(1.0, jnp.array([0.1, 0.05, 0.1]), jnp.stack([q.x, q.y, 0.0 * q.x + 0.3]), turned)}
+        return {"roller": jj.RigidBody(1.0, jnp.array([0.1, 0.05, 0.1]), [q.x, q.y, 0.0 * q.x + 0.3], turned)}
 
     def contacts(self, pose):
         return {side: jj.disc_contact(pose["roller"], 0.3, centre=(0.0, y, 0.0)) for side, y in (("left", 0.5), ("right", -0.5))}

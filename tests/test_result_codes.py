@@ -56,7 +56,7 @@ def test_lanes_are_told_each_by_itself():
 
 def test_nonlinear_rows_are_told_as_well():
     run = lambda speed: jj.simulate(Circling(), {"x_rate": 1.0}, ts=[1.0], inputs={"speed": speed})  # noqa: E731
-    assert int(run(lambda t: 1.0 + 0.0 * t).result) == results.SUCCESS
+    assert run(lambda t: 1.0 + 0.0 * t).result == results.SUCCESS
     assert int(run(lambda t: 1.0 + t).result) != results.SUCCESS
 
 
@@ -64,8 +64,8 @@ def test_what_long_steps_violate_is_no_contradiction():
     formulation = jj.Formulation("full", stabilisation=None)
     long = {"solver": diffrax.Heun(), "rtol": 1e3, "atol": 1e3, "max_step": np.inf, "work": False}
     motion = jj.simulate(TwoBelts(), {"y_rate": 1.0}, ts=[1.0], inputs=belts(0.0), formulation=formulation, **long)
-    assert float(jnp.max(jnp.abs(motion.residuals()[1]))) > 0.3  # of 10 sin(1)
-    assert int(motion.result) == results.SUCCESS
+    assert jnp.max(jnp.abs(motion.residuals()[1])) > 0.3  # of 10 sin(1)
+    assert motion.result == results.SUCCESS
 
 
 def test_derivatives_are_as_without_the_check():
@@ -122,13 +122,13 @@ def test_a_feature_that_steps_pass_over_is_told_by_the_energy(way):
 
 def test_an_edge_that_steps_can_follow_is_passed():
     motion = jj.simulate(Step(width=0.05), {"x_rate": 3.0, "y_rate": 1.0}, ts=[1.5])
-    assert int(motion.result) == results.SUCCESS
+    assert motion.result == results.SUCCESS
     assert_allclose(motion.u_end[0], np.sqrt(9.0 - 4.0), rtol=1e-6)
 
 
 def test_a_potential_that_is_not_that_of_its_force_is_told():
     motion = jj.simulate(WrongPotential(), {"x": 1.0}, ts=[0.7])
-    assert int(motion.result) == results.ENERGY_LOST
+    assert motion.result == results.ENERGY_LOST
     with pytest.raises(jj.SimulationError, match="energy"):
         motion.raise_if_failed()
 
@@ -139,7 +139,7 @@ def test_errors_that_the_tolerance_allows_are_not_told(amplitude, level, toleran
     scene, turns = Spring(k, level), 40 * np.pi / np.sqrt(k)
     for ts in ([turns], np.linspace(0.1, 1.0, 7) * turns):
         motion = jj.simulate(scene, {"x": amplitude}, ts=ts, rtol=tolerance, atol=tolerance)
-        assert int(motion.result) == results.SUCCESS
+        assert motion.result == results.SUCCESS
 
 
 class Damped(Spring):
@@ -155,12 +155,12 @@ class Damped(Spring):
 
 @pytest.mark.parametrize("k", [1e4, 1e7])
 def test_where_work_is_integrated_nothing_is_told(k):
-    assert int(jj.simulate(Damped(k), {"x": 0.7}, ts=[2.0, 6.0]).result) == results.SUCCESS
+    assert jj.simulate(Damped(k), {"x": 0.7}, ts=[2.0, 6.0]).result == results.SUCCESS
 
 
 def test_steps_without_control_are_taken_as_they_are():
     motion = jj.simulate(Spring(), {"x": 1.0}, ts=[40.0], solver=jj.ImplicitMidpoint(step=0.5))
-    assert int(motion.result) == results.SUCCESS
+    assert motion.result == results.SUCCESS
 
 
 # Speeds of a scene's own in which rates of coordinates become infinite: motions that come there end with a code.
@@ -191,7 +191,7 @@ def _scene(rate):
             return jnp.stack([rate(q.a, u.w), u.v])
 
         def bodies(self, t, q):
-            return {"mass": jj.Particle(1.0, jnp.stack([q.a, q.x, 0.0 * q.x]))}
+            return {"mass": jj.Particle(1.0, [q.a, q.x, 0.0])}
 
     return Sliding()
 
@@ -222,7 +222,7 @@ def test_lanes_that_go_through_end_with_a_code_and_others_arrive(case):
 
 def test_a_single_motion_says_why_it_ended():
     motion = jj.simulate(_scene(RATES["sine"][0]), {"a": 1.0, "w": -1.0}, t1=3.0)
-    assert int(motion.result) == results.SINGULAR_PARTITION
+    assert motion.result == results.SINGULAR_PARTITION
     assert "infinite" in motion.message
-    assert float(motion.t_end) < np.sin(1.0)  # a = 0 is met before, as w falls no faster than sin(a)
+    assert motion.t_end < np.sin(1.0)  # a = 0 is met before, as w falls no faster than sin(a)
 

@@ -77,7 +77,7 @@ class Sleigh(jj.Scene):
 
     def bodies(self, t, q):
         metre, kilogram, _ = self.units
-        position = jnp.stack([q.x + 0.1 * metre * jnp.cos(q.heading), q.y + 0.1 * metre * jnp.sin(q.heading), 0.0 * q.x])
+        position = jnp.stack([q.x + 0.1 * metre * jnp.cos(q.heading), q.y + 0.1 * metre * jnp.sin(q.heading), 0.0])
         return {"sleigh": jj.RigidBody(2.0 * kilogram, 0.05 * kilogram * metre**2 * jnp.eye(3), position, jj.rot_z(q.heading))}
 
     def velocity_constraints(self, motion):

@@ -160,8 +160,8 @@ def test_a_sensor_shows_functions_and_coordinates_under_other_names():
 class Swing(jj.Scene):
     """An arm on an axle along z with a torsional spring: `I turn'' = - k turn`."""
 
-    inertia: jnp.ndarray = jj.parameter(0.5, unit="kg m^2", positive=True)
-    stiffness: jnp.ndarray = jj.parameter(8.0, unit="N m/rad", positive=True)
+    inertia: float = jj.parameter(0.5, unit="kg m^2", positive=True)
+    stiffness: float = jj.parameter(8.0, unit="N m/rad", positive=True)
     coordinates = jj.coordinates("turn")
 
     def bodies(self, t, q):
@@ -224,7 +224,7 @@ def test_a_lag_of_zero_is_left_where_a_delay_stands_in_for_it():
     near, far = (jj.fit(Cart(), late(0, 0.1, *guess), ("mass",)) for guess in ((0.07, jj.Estimate(0.1)), (0.17, jj.Estimate(1e-4))))
     assert far.converged
     assert not far.warnings
-    assert float(far.chi_square) == pytest.approx(float(near.chi_square), rel=1e-6)
+    assert far.chi_square == pytest.approx(float(near.chi_square), rel=1e-6)
     assert_allclose(far.values, near.values, rtol=1e-3)
     assert far["late.lag"].low < 0.1 < far["late.lag"].high
 

@@ -27,7 +27,7 @@ class Rolling(jj.Scene):
     example = {"x": -0.5, "x_rate": 0.5}
 
     def bodies(self, t, q):
-        place = jnp.stack([q.x, 0.0 * q.x, self.radius])
+        place = jnp.stack([q.x, 0.0, self.radius])
         moments = 0.4 * 2.0 * self.radius**2 * jnp.ones(3)
         return {"ball": jj.RigidBody(2.0, moments, place, jj.rot_y(q.turn))}
 
@@ -203,7 +203,7 @@ def test_grounds_of_every_kind_are_drawn_where_they_are(make, lowest):
         coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
 
         def bodies(self, t, q):
-            return {"ball": jj.RigidBody.ball(1.0, 0.1, position=jnp.stack([q.x, q.y, q.z]), orientation=jj.quaternion_to_matrix(q.attitude))}
+            return {"ball": jj.RigidBody.ball(1.0, 0.1, position=[q.x, q.y, q.z], orientation=jj.quaternion_to_matrix(q.attitude))}
 
         def contacts(self, pose):
             return {"ground": jj.ball_contact(pose["ball"], 0.1, ground=make(), height="row")}
@@ -287,7 +287,7 @@ def test_a_mesh_in_the_visuals_of_a_scene_is_drawn_with_its_body(tmp_path):
         coordinates = jj.coordinates("z")
 
         def bodies(self, t, q):
-            return {"part": jj.RigidBody(1.0, jnp.ones(3), jnp.stack([0.0 * q.z, 0.0 * q.z, q.z]), jj.rot_z(0.0 * q.z))}
+            return {"part": jj.RigidBody(1.0, jnp.ones(3), [0.0, 0.0, q.z], jj.rot_z(0.0 * q.z))}
 
         def visuals(self, pose):
             return {"part": jj.Visual.from_file(tmp_path / "part.stl", scale=0.001)}

@@ -38,7 +38,7 @@ def flight_time(speed, gravity=9.81, drop=0.5):
 
 def test_an_event_stops_the_motion_at_the_closed_form_time():
     motion = jj.simulate(Falling(), t1=3.0, rtol=1e-10, atol=1e-10)
-    assert int(motion.result) == results.EVENT
+    assert motion.result == results.EVENT
     assert "`landed`" in motion.message
     assert_allclose(motion.t_end, flight_time(5.0), rtol=1e-12)
     assert_allclose(motion.q_end, [2 * flight_time(5.0), -0.5], rtol=1e-11)
@@ -56,7 +56,7 @@ def test_an_event_time_does_not_depend_on_the_times_saved():
 
 def test_a_motion_that_starts_beyond_an_event_does_not_start():
     motion = jj.simulate(Falling(), {"z": -1.0}, t1=1.0)
-    assert int(motion.result) == results.EVENT
+    assert motion.result == results.EVENT
     assert float(motion.t_end) == 0.0
 
 
@@ -80,15 +80,15 @@ def test_minimal_and_full_state_give_the_same_motion():
     minimal, full = (jj.simulate(ChaplyginSleigh(), formulation=jj.Formulation(form), **options) for form in ("minimal", "full"))
     assert (minimal.state_form, full.state_form) == ("minimal", "full")
     assert_allclose(minimal.q, full.q, atol=1e-8)
-    assert float(jnp.max(jnp.abs(minimal.residuals()[1]))) < 1e-14
-    assert float(jnp.max(jnp.abs(full.residuals()[1]))) < 1e-13  # by projection
+    assert jnp.max(jnp.abs(minimal.residuals()[1])) < 1e-14
+    assert jnp.max(jnp.abs(full.residuals()[1])) < 1e-13  # by projection
 
 
 def test_geometric_rows_hold_after_every_step_by_projection_and_drift_without():
     options = {"t1": 10.0, "rtol": 1e-6, "atol": 1e-6, "ts": jnp.linspace(0.0, 10.0, 21)}
     kept, drifted = (jj.simulate(DoublePendulumRods(), formulation=jj.Formulation("full", stabilisation=by), **options) for by in ("projection", None))
-    assert float(jnp.max(jnp.abs(kept.residuals()[0]))) < 1e-12
-    assert float(jnp.max(jnp.abs(drifted.residuals()[0]))) > 1e-8
+    assert jnp.max(jnp.abs(kept.residuals()[0])) < 1e-12
+    assert jnp.max(jnp.abs(drifted.residuals()[0])) > 1e-8
 
 
 def test_the_default_state_is_full_where_no_partition_serves_everywhere():
@@ -102,12 +102,12 @@ def test_a_start_off_the_constraints_is_moved_onto_them_and_the_motion_says_how_
     pushed = jj.State(off.t, off.q, off.u + 1e-3, off.moved_q, off.moved_u, off.residual, off.names)
     motion = jj.simulate(scene, pushed, t1=0.5)
     assert 1e-5 < float(motion.moved_u) < 2e-3
-    assert float(jnp.max(jnp.abs(motion.residuals()[1]))) < 1e-13
+    assert jnp.max(jnp.abs(motion.residuals()[1])) < 1e-13
 
 
 def test_too_few_steps_are_a_result_code_and_an_error_only_on_request():
     motion = jj.simulate(ChaplyginSleigh(), t1=5.0, max_steps=8)
-    assert int(motion.result) == results.MAX_STEPS
+    assert motion.result == results.MAX_STEPS
     assert np.isnan(np.asarray(motion.q)[-1]).all()
     assert np.isfinite(np.asarray(motion.q_end)).all()
     with pytest.raises(jj.SimulationError, match=r"`ChaplyginSleigh` at t = .* s: ran out of steps"):
@@ -145,7 +145,7 @@ def test_a_scene_and_a_start_in_float32_move_in_double_precision_where_it_is_swi
     scene, state = (jax.tree.map(lambda x: x.astype(jnp.float32), x) for x in (Falling(), jj.start(Falling(), z=4.0, z_rate=1.0)))
     motion = jj.simulate(scene, state, t1=0.1, rtol=1e-8)
     assert (motion.q.dtype, recwarn.list) == (jnp.float64, [])
-    assert float(motion["z"][-1]) == pytest.approx(4.0 + 0.1 - 0.5 * float(scene.gravity) * 0.01, abs=1e-12)
+    assert motion["z"][-1] == pytest.approx(4.0 + 0.1 - 0.5 * float(scene.gravity) * 0.01, abs=1e-12)
 
 
 class Trolley(jj.Scene):
@@ -155,7 +155,7 @@ class Trolley(jj.Scene):
     coordinates = jj.coordinates("x y turn")
 
     def bodies(self, t, q):
-        place = jnp.stack([q.x, q.y, 0.0 * q.x])
+        place = jnp.stack([q.x, q.y, 0.0])
         wheel = jj.RigidBody(0.0, self.inertia * jnp.ones(3), place, jj.rot_z(q.turn))
         return {"load": jj.Particle(1.0, place), "wheel": wheel}
 
@@ -185,7 +185,7 @@ def test_a_reduction_by_privileged_speeds_too_light_for_the_precision_is_warned_
         assert_allclose(motion.q_end, 2 / (1 + inertia) * np.array([1.0, 0.0, 1.0]), rtol=1e-7)
         assert motion.warnings == ()
     # one digit is left of the wheel's acceleration: what its turning would be off by, the projection of its rate does not show
-    assert int(pulled(1e-30, "qr").result) == results.MAX_STEPS
+    assert pulled(1e-30, "qr").result == results.MAX_STEPS
     lost = pulled(1e-30, by_wheel)  # the scaled row of the wheel hardly holds x: A_z is singular in 64-bit floats
     assert lost.q_end[0] < 1e-3
     assert any("hardly determine the others, pivot 1.0e-15" in text for text in lost.warnings)
@@ -223,7 +223,7 @@ def test_the_path_of_a_point_is_where_the_body_says_it_is(rolling):
 def test_a_motion_goes_on_from_the_end_of_another():
     scene, start = TiltingDisc(), {"lean": 0.3, "spin_rate": 4.0}
     first = jj.simulate(scene, start, t1=0.7)
-    second = jj.simulate(scene, first.end, ts=jnp.array([1.5]))
+    second = jj.simulate(scene, first.end, ts=[1.5])
     whole = jj.simulate(scene, start, t1=1.5)
     assert float(second.ts[0]) == 1.5
     assert_allclose(second.q[-1], whole.q_end, atol=2e-8)
@@ -247,9 +247,9 @@ def test_an_object_and_its_fields_by_name_ask_for_the_same_and_names_replace_fie
     mixed = jj.simulate(SLEIGH, START, ts=TS, options=jj.Options(rtol=1e-4, atol=1e-9), atol=1e-4, max_step=np.inf)
     for motion in (jj.simulate(SLEIGH, START, ts=TS, options=coarse), mixed):
         np.testing.assert_array_equal(motion.q, by_name.q)
-        assert int(motion.accepted) == int(by_name.accepted)
+        assert motion.accepted == int(by_name.accepted)
     lanes = jj.rollout(SLEIGH, START | {"x_rate": np.array([0.6, 0.7])}, ts=TS, options=coarse)
-    assert int(lanes.lane(0).accepted) == int(by_name.accepted)
+    assert lanes.lane(0).accepted == int(by_name.accepted)
     assert float(jj.log_likelihood(SLEIGH, DATA, options=coarse)) == float(jj.log_likelihood(SLEIGH, DATA, rtol=1e-4, atol=1e-4, max_step=np.inf))
 
 
@@ -264,7 +264,7 @@ def test_options_are_a_tree_whose_numbers_may_be_traced():
 
 def test_a_step_that_ends_a_little_before_a_saved_time_leaves_no_sliver():
     motion = jj.simulate(MODELS["ball-on-turntable"]())  # ended at 4.9 of 10 s with a step size that shrank to nothing
-    assert int(motion.result) == results.SUCCESS
+    assert motion.result == results.SUCCESS
     assert float(motion.t_end) == 10.0
 
 
@@ -272,7 +272,7 @@ def test_a_step_that_ends_a_little_before_a_saved_time_leaves_no_sliver():
 def test_any_solver_lands_on_the_saved_times(solver):
     ts = jnp.array([0.11, 0.123, 0.3])
     motion = jj.simulate(Falling(), {"x_rate": 2.0}, ts=ts, solver=solver, work=False)
-    assert int(motion.result) == results.SUCCESS
+    assert motion.result == results.SUCCESS
     assert_allclose(motion["x"], 2.0 * ts, rtol=1e-12)
 
 
@@ -280,7 +280,7 @@ def test_an_implicit_solver_serves_a_projected_scene():
     scene = MODELS["double-pendulum-rods"]()
     options = {"t1": 0.5, "rtol": 1e-8, "atol": 1e-8}
     implicit, explicit = jj.simulate(scene, solver=diffrax.Kvaerno5(), **options), jj.simulate(scene, **options)
-    assert int(implicit.result) == results.SUCCESS
+    assert implicit.result == results.SUCCESS
     assert_allclose(implicit.q_end, explicit.q_end, atol=1e-6)
 
 
@@ -299,8 +299,8 @@ def test_a_start_given_by_names_says_how_far_it_was_moved():
 class Tied(jj.Scene):
     """A bead at height z, tied to the origin by a rod and to the line y = 3: its default rod is too short to be assembled."""
 
-    mass: jnp.ndarray = jj.parameter(1.0, positive=True)
-    length: jnp.ndarray = jj.parameter(1.0, positive=True)
+    mass: float = jj.parameter(1.0, positive=True)
+    length: float = jj.parameter(1.0, positive=True)
     coordinates = jj.coordinates("x y z")
     domain = {"x": (3.0, 6.0), "y": (2.0, 4.0)}
 

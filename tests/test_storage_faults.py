@@ -7,7 +7,6 @@ import zipfile
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_inputs import OnBelt
@@ -23,7 +22,7 @@ INFORMATIVE = ("versions",)  # read by people only
 class Belt(OnBelt):
     """With a parameter that has a default, which must not stand in for what moved, and a count."""
 
-    drag: jnp.ndarray = jj.parameter(0.0, unit="N s/m")
+    drag: float = jj.parameter(0.0, unit="N s/m")
     sides: int = eqx.field(static=True, default=2)
 
     def loads(self, motion):
@@ -233,8 +232,8 @@ def test_motions_back_in_time_and_to_an_event_are_read_back(tmp_path):
         (
             jj.simulate(scene, start, t0=1.0, t1=0.0),
             jj.simulate(scene, {"lean": 0.9}, t1=5.0),  # falls
-            jj.simulate(scene, start, ts=np.array([0.3, 0.3 + 1e-15, 0.7])),
-            jj.simulate(scene, start, ts=np.array([0.5])),
+            jj.simulate(scene, start, ts=[0.3, 0.3 + 1e-15, 0.7]),
+            jj.simulate(scene, start, ts=[0.5]),
         )
     ):
         jj.save(motion, tmp_path / f"{k}.npz")

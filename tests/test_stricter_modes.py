@@ -36,7 +36,7 @@ class Spring(jj.Scene):
 
 
 def _end(stiffness, **options):
-    return jj.simulate(Spring(stiffness=stiffness), {"x": 1}, ts=jnp.array([0.0, 1.0]), **options)["x"][-1]
+    return jj.simulate(Spring(stiffness=stiffness), {"x": 1}, ts=[0.0, 1.0], **options)["x"][-1]
 
 
 SLOPE = -np.sin(RATE) / (2 * RATE)  # d/dk of cos(sqrt(k)) at k = RATE^2

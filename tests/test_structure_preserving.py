@@ -28,7 +28,7 @@ def named(method) -> str:
 
 def run(scene, start, method, *, t1, step, t0=0.0, **options):
     """The end of a motion; always the same shapes, so that a method and a scene are compiled once."""
-    motion = jj.simulate(scene, start, t0=t0, t1=t1, ts=jnp.array([t1]), solver=method(step=step), **options)
+    motion = jj.simulate(scene, start, t0=t0, t1=t1, ts=[t1], solver=method(step=step), **options)
     return motion.raise_if_failed() if not isinstance(motion.result, jax.core.Tracer) else motion
 
 
@@ -58,7 +58,7 @@ def test_the_chaplygin_sleigh_is_followed_to_second_order(solver):
 def test_discrete_forces_and_prescribed_coordinates_are_of_second_order_too():
     pendulum = DrivenPendulum()  # damped, sprung to a moving point, its pivot driven
     start = jj.start(pendulum, angle=0.3)
-    exact = jj.simulate(pendulum, start, ts=jnp.array([1.0]), rtol=1e-11, atol=1e-11)
+    exact = jj.simulate(pendulum, start, ts=[1.0], rtol=1e-11, atol=1e-11)
     ends = [run(pendulum, start, TRAPEZOIDAL, t1=1.0, step=step) for step in (0.02, 0.01)]
     for part in ("q_end", "u_end", "work"):
         errors = [np.max(np.abs(getattr(end, part) - getattr(exact, part))) for end in ends]
@@ -89,7 +89,7 @@ def change(scene, solver, quantity, step, **options) -> float:
     """Largest relative change of `quantity(q, u)` after 300, 700 and 1000 steps."""
     start = jj.start(scene, **scene.example)
     ends = [run(scene, start, solver, t1=steps * step, step=jnp.array(step), **options) for steps in (300, 700, 1000)]
-    assert int(ends[-1].accepted) == 1000
+    assert ends[-1].accepted == 1000
     first = quantity(start.q, start.u)
     return max(float(jnp.abs(quantity(end.q_end, end.u_end) / first - 1)) for end in ends)
 
@@ -134,14 +134,14 @@ def test_a_gauge_changes_no_motion_but_that_of_the_discrete_lagrangian():
     assert_array_equal(found.udot, of_twin.udot)
     for solver, told_apart in ((MIDPOINT, False), (DLA, True)):
         ends = [run(scene, start, solver, t1=4.0, step=0.2).q_end for scene in (oscillator, twin)]
-        assert (float(jnp.max(jnp.abs(ends[0] - ends[1]))) > 1e-4) == told_apart, named(solver)
+        assert (jnp.max(jnp.abs(ends[0] - ends[1])) > 1e-4) == told_apart, named(solver)
 
 
 def test_geometric_rows_hold_at_every_node():
     rods = MODELS["double-pendulum-rods"]()
     motion = run(rods, jj.start(rods, **rods.example), DLA, t1=1.0, step=0.02)
-    assert float(jnp.max(jnp.abs(motion.residuals()[0]))) < tolerance("round_off")
-    assert float(jnp.max(jnp.abs(motion.residuals()[1]))) < tolerance("round_off")
+    assert jnp.max(jnp.abs(motion.residuals()[0])) < tolerance("round_off")
+    assert jnp.max(jnp.abs(motion.residuals()[1])) < tolerance("round_off")
 
 
 # Derivatives and batches. ----------------------------------------------------------------------------------------------
@@ -189,10 +189,10 @@ def test_a_rollout_solves_every_lane_and_names_those_whose_step_was_not_solved()
 
 def test_steps_between_saved_times_are_equal_and_no_longer_than_asked():
     oscillator = ContactOscillator()
-    motion = jj.simulate(oscillator, ts=jnp.array([0.0, 1.0, 1.5, 4.0]), solver=MIDPOINT(step=0.3))
-    assert int(motion.raise_if_failed().accepted) == 4 + 2 + 9
-    whole = jj.simulate(oscillator, ts=jnp.array([0.0, 1.0, 1.5, 3.0]), t1=3.0, solver=MIDPOINT(step=0.1))
-    assert int(whole.raise_if_failed().accepted) == 30
+    motion = jj.simulate(oscillator, ts=[0.0, 1.0, 1.5, 4.0], solver=MIDPOINT(step=0.3))
+    assert motion.raise_if_failed().accepted == 4 + 2 + 9
+    whole = jj.simulate(oscillator, ts=[0.0, 1.0, 1.5, 3.0], t1=3.0, solver=MIDPOINT(step=0.1))
+    assert whole.raise_if_failed().accepted == 30
 
 
 def test_reversed_time_is_what_projections_and_events_are_given():
@@ -205,6 +205,6 @@ def test_reversed_time_is_what_projections_and_events_are_given():
     pendulum = Watched()
     start = jj.start(pendulum, t0=1.0, angle=0.3)
     back = jj.simulate(pendulum, start, t1=0.0, ts=[1.0, 0.0], rtol=1e-8, atol=1e-8, solver=diffrax.Bosh3(), work=False)
-    assert int(back.result) == results.EVENT
+    assert back.result == results.EVENT
     assert_allclose(back.t_end, 0.5, rtol=1e-12)
     assert_allclose(back.q_end[0], 0.3 * np.sin(1.0), rtol=0, atol=1e-9)  # the prescribed pivot

@@ -62,10 +62,10 @@ def test_every_lane_is_the_motion_that_simulate_gives(whole):
     for number in (0, 31, 32, COUNT - 1, int(fell[0])):
         lane = whole.lane(number)
         motion = lane.simulate()
-        assert int(arrays["result"][number]) == int(motion.result)
-        assert int(arrays["steps"][number]) == int(motion.accepted)
+        assert arrays["result"][number] == int(motion.result)
+        assert arrays["steps"][number] == int(motion.accepted)
         for name, expected in outputs(motion).items():
-            assert float(arrays[name][number]) == pytest.approx(float(expected), rel=1e-9, abs=1e-9, nan_ok=True), name
+            assert arrays[name][number] == pytest.approx(float(expected), rel=1e-9, abs=1e-9, nan_ok=True), name
         assert float(motion.scene.radius) == lane.parameters["radius"] == float(arrays["radius"][number])
     assert "stopped at an event" in str(whole.lane(int(fell[0])))
 
@@ -97,7 +97,7 @@ def test_a_failed_lane_is_named_and_left_out_of_statistics(whole):
     assert whole.failed.tolist() == [BAD]
     assert whole.counts["bad_parameter"] == 1
     arrays = whole.to_xarray()
-    assert int(arrays["result"][BAD]) == results.BAD_PARAMETER
+    assert arrays["result"][BAD] == results.BAD_PARAMETER
     assert all(np.isnan(arrays[name][BAD]) for name in OUTPUTS)
     own = np.delete(arrays["distance"].values, BAD)
     assert whole.mean("distance") == pytest.approx(own.mean(), rel=1e-13)

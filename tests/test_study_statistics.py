@@ -54,7 +54,7 @@ class Pendulum(jj.Scene):
     example = {"angle": 1.0}
 
     def bodies(self, t, q):
-        return {"bob": jj.Particle(1.0, self.length * jnp.stack([jnp.sin(q.angle), 0.0 * q.angle, -jnp.cos(q.angle)]))}
+        return {"bob": jj.Particle(1.0, self.length * jnp.stack([jnp.sin(q.angle), 0.0, -jnp.cos(q.angle)]))}
 
     def loads(self, motion):
         return (jj.gravity(motion, self.gravity),)

@@ -21,15 +21,15 @@ from jourdain_jax.models import ChaplyginSleigh
 class TwoBlades(jj.Scene):
     """A plate on two parallel blades, turned by a torque: at one place they are one blade, at two places the plate can only slide along."""
 
-    mass: jnp.ndarray = jj.parameter(1.3, unit="kg", positive=True)
-    inertia: jnp.ndarray = jj.parameter(0.4, unit="kg m^2", positive=True)
-    front: jnp.ndarray = jj.parameter(0.3, unit="m")
-    rear: jnp.ndarray = jj.parameter(0.3, unit="m")
-    torque: jnp.ndarray = jj.parameter(0.6, unit="N m")
+    mass: float = jj.parameter(1.3, unit="kg", positive=True)
+    inertia: float = jj.parameter(0.4, unit="kg m^2", positive=True)
+    front: float = jj.parameter(0.3, unit="m")
+    rear: float = jj.parameter(0.3, unit="m")
+    torque: float = jj.parameter(0.6, unit="N m")
     coordinates = jj.coordinates("x y heading")
 
     def bodies(self, t, q):
-        position = jnp.stack([q.x, q.y, 0.0 * q.x])
+        position = jnp.stack([q.x, q.y, 0.0])
         return {"plate": jj.RigidBody(self.mass, self.inertia * jnp.ones(3), position, jj.rot_z(q.heading))}
 
     def loads(self, motion):
@@ -38,15 +38,15 @@ class TwoBlades(jj.Scene):
     def velocity_constraints(self, motion):
         plate = motion["plate"]
         places = {"front": self.front, "rear": self.rear}
-        return {name: jj.knife_edge(plate, plate.place(jnp.stack([a, 0.0 * a, 0.0 * a])), plate.orientation[:, 1]) for name, a in places.items()}
+        return {name: jj.knife_edge(plate, plate.place([a, 0.0, 0.0]), plate.orientation[:, 1]) for name, a in places.items()}
 
 
 class Slope(OnPlane):
     """A bead on a slope: level by default, where its place does not matter; a wind across, none by default."""
 
-    mass: jnp.ndarray = jj.parameter(2.0, unit="kg", positive=True)
-    slope: jnp.ndarray = jj.parameter(0.0, unit="1/m")
-    wind: jnp.ndarray = jj.parameter(0.0, unit="m/s")
+    mass: float = jj.parameter(2.0, unit="kg", positive=True)
+    slope: float = jj.parameter(0.0, unit="1/m")
+    wind: float = jj.parameter(0.0, unit="m/s")
 
     def potential(self, pose):
         return 0.5 * self.mass * 9.81 * self.slope * pose.q.x**2
@@ -58,13 +58,13 @@ class Slope(OnPlane):
 class Hanging(jj.Scene):
     """A pendulum of two rods in a row; none of its parameters has a default."""
 
-    mass: jnp.ndarray = jj.parameter(unit="kg", positive=True)
-    upper: jnp.ndarray = jj.parameter(unit="m", positive=True)
-    lower: jnp.ndarray = jj.parameter(unit="m", positive=True)
+    mass: float = jj.parameter(unit="kg", positive=True)
+    upper: float = jj.parameter(unit="m", positive=True)
+    lower: float = jj.parameter(unit="m", positive=True)
     coordinates = jj.coordinates("angle")
 
     def bodies(self, t, q):
-        rod = (self.upper + self.lower) * jnp.stack([jnp.sin(q.angle), 0.0 * q.angle, -jnp.cos(q.angle)])
+        rod = (self.upper + self.lower) * jnp.stack([jnp.sin(q.angle), 0.0, -jnp.cos(q.angle)])
         return {"bob": jj.Particle(self.mass, rod)}
 
     def loads(self, motion):
@@ -74,7 +74,7 @@ class Hanging(jj.Scene):
 class SmallLoop(Upright):
     """A bead on a small ring, in a domain of the ring's size; its radius has no default."""
 
-    radius: jnp.ndarray = jj.parameter(unit="m", positive=True)
+    radius: float = jj.parameter(unit="m", positive=True)
     mass = 0.1
     domain = {"x": (-0.03, 0.03), "z": (-0.03, 0.03)}
 

@@ -21,8 +21,8 @@ class Sledge(jj.Scene):
 
     def bodies(self, t, q):
         zero = jnp.zeros_like(q.x)
-        sledge = jj.RigidBody(self.mass, self.inertia(), jnp.stack([q.x, q.y, zero]), jj.rot_z(q.yaw))
-        return {"bead": jj.Particle(0.3 * self.mass, jnp.stack([q.bead_x, q.bead_y, zero])), "sledge": sledge}
+        sledge = jj.RigidBody(self.mass, self.inertia(), [q.x, q.y, zero], jj.rot_z(q.yaw))
+        return {"bead": jj.Particle(0.3 * self.mass, [q.bead_x, q.bead_y, zero]), "sledge": sledge}
 
     def inertia(self):
         return jnp.diag(jnp.array([0.2, 0.3, 0.4]))

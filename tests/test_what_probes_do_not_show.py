@@ -189,7 +189,7 @@ class LateMass(OnPlane):
     """Matter joins from t = 2 on."""
 
     def bodies(self, t, q):
-        return {"particle": jj.Particle(1.0 + jnp.maximum(t - 2.0, 0.0) ** 3, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+        return {"particle": jj.Particle(1.0 + jnp.maximum(t - 2.0, 0.0) ** 3, [q.x, q.y, 0.0])}
 
     def loads(self, motion):
         return (jj.spring(motion["particle"].point(), jj.fixed_point(jnp.zeros(3)), 1.0, 0.5),)
@@ -202,7 +202,7 @@ class LateLift(jj.Scene):
 
     def bodies(self, t, q):
         lifted = jnp.exp(-jnp.exp(-40.0 * (t - 3.0)))
-        return {"particle": jj.Particle(1.0, jnp.stack([q.x, 0.3 * q.x + lifted, 0.0 * q.x]))}
+        return {"particle": jj.Particle(1.0, [q.x, 0.3 * q.x + lifted, 0.0])}
 
 
 LATE = [

@@ -13,13 +13,13 @@ def along_x(x):
 class Bead(OnLine):
     """A free bead on a line."""
 
-    mass: jnp.ndarray = jj.parameter(2.0, unit="kg", positive=True)
+    mass: float = jj.parameter(2.0, unit="kg", positive=True)
 
 
 class GrowingField(Bead):
     """V = -f t x: x = f t^3/(6 m), T = f^2 t^4/(8 m), V = -f^2 t^4/(6 m)."""
 
-    slope: jnp.ndarray = jj.parameter(3.0, unit="N/s")
+    slope: float = jj.parameter(3.0, unit="N/s")
 
     def potential(self, pose):
         return -self.slope * pose.t * pose.q.x
@@ -31,9 +31,9 @@ class GrowingField(Bead):
 class ShakenAnchor(Bead):
     """m x'' = -k (x - a sin W t), from rest: x = b (sin W t - W/w sin w t), b = a w^2/(w^2 - W^2)."""
 
-    stiffness: jnp.ndarray = jj.parameter(18.0, unit="N/m")
-    amplitude: jnp.ndarray = jj.parameter(0.1, unit="m")
-    rate: jnp.ndarray = jj.parameter(2.0, unit="rad/s")
+    stiffness: float = jj.parameter(18.0, unit="N/m")
+    amplitude: float = jj.parameter(0.1, unit="m")
+    rate: float = jj.parameter(2.0, unit="rad/s")
 
     def loads(self, motion):
         anchor = jj.fixed_point(along_x(self.amplitude * jnp.sin(self.rate * motion.t)))
@@ -49,8 +49,8 @@ class ShakenAnchor(Bead):
 class TurningRates(jj.Scene):
     """A bead on a wire that a coordinate's given rate turns: r = r0 cosh W t from rest, T = m W^2 r0^2 cosh(2 W t)/2."""
 
-    mass: jnp.ndarray = jj.parameter(2.0, unit="kg", positive=True)
-    rate: jnp.ndarray = jj.parameter(1.3, unit="rad/s")
+    mass: float = jj.parameter(2.0, unit="kg", positive=True)
+    rate: float = jj.parameter(1.3, unit="rad/s")
     coordinates = jj.coordinates("turn r")
     speeds = jj.speeds("r_rate")
     domain = {"r": (0.2, 1.0)}
@@ -60,7 +60,7 @@ class TurningRates(jj.Scene):
         return jnp.stack([self.rate, u.r_rate])
 
     def bodies(self, t, q):
-        return {"bead": jj.Particle(self.mass, q.r * jnp.stack([jnp.cos(q.turn), jnp.sin(q.turn), 0.0 * q.turn]))}
+        return {"bead": jj.Particle(self.mass, q.r * jnp.stack([jnp.cos(q.turn), jnp.sin(q.turn), 0.0]))}
 
     def work(self, t):
         return 0.5 * self.mass * self.rate**2 * 0.5**2 * (jnp.cosh(2 * self.rate * t) - 1)
@@ -69,7 +69,7 @@ class TurningRates(jj.Scene):
 class DrivenOrientation(jj.Scene):
     """A ball on a gimbal whose outer axis is turned by the angle c t^2: its inertia is the same all around, so T = I ((2 c t)^2 + lean_rate^2)/2."""
 
-    rate: jnp.ndarray = jj.parameter(0.8, unit="rad/s^2")
+    rate: float = jj.parameter(0.8, unit="rad/s^2")
     coordinates = jj.coordinates("lean")
     example = {"lean": 0.3, "lean_rate": 0.7}
 
@@ -83,7 +83,7 @@ class DrivenOrientation(jj.Scene):
 class LosingMass(Bead):
     """A bead that loses mass at its own velocity: it goes on as it went, T = m exp(-c t) v^2/2."""
 
-    loss: jnp.ndarray = jj.parameter(0.4, unit="1/s")
+    loss: float = jj.parameter(0.4, unit="1/s")
     example = {"x_rate": 1.5}
 
     def bodies(self, t, q):
@@ -96,8 +96,8 @@ class LosingMass(Bead):
 class Lifted(Upright):
     """A weight whose height is prescribed, `height + rate t`: the winch does m g rate t."""
 
-    mass: jnp.ndarray = jj.parameter(2.0, unit="kg", positive=True)
-    rate: jnp.ndarray = jj.parameter(0.5, unit="m/s")
+    mass: float = jj.parameter(2.0, unit="kg", positive=True)
+    rate: float = jj.parameter(0.5, unit="m/s")
     example = {"z": 2.0, "x_rate": 1.0}
 
     def loads(self, motion):
@@ -113,7 +113,7 @@ class Lifted(Upright):
 class Towed(Bead):
     """A bead that an input tows at its speed through a row, against a spring at the origin: the tow does k x^2/2."""
 
-    stiffness: jnp.ndarray = jj.parameter(18.0, unit="N/m")
+    stiffness: float = jj.parameter(18.0, unit="N/m")
     inputs = jj.inputs("speed")
 
     def loads(self, motion):
