@@ -86,16 +86,11 @@ def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
         return known[reduction]
     if not isinstance(reduction, Reduction | GibbsAppell):
         raise ValueError(f"`reduction` is {described(reduction)}, expected a name ({', '.join(reductions(scene))}) or an object such as `jj.NullSpaceQR()`")
-    if isinstance(reduction, Privileged | GibbsAppell):
-        _check_independent(scene, reduction.independent)
-    return reduction
-
-
-def _check_independent(scene: Scene, chosen) -> None:
-    count = len(scene.speed_names)
+    chosen, count = reduction.independent if isinstance(reduction, Privileged | GibbsAppell) else (), len(scene.speed_names)
     if any(not isinstance(i, int | np.integer) or not 0 <= i < count for i in chosen) or len(set(chosen)) != len(chosen):
         where = f"speeds of `{type(scene).__name__}`, 0 to {count - 1}"
         raise ValueError(f"`independent` is {chosen}, expected different indices of {where}; or give the reduction by its name")
+    return reduction
 
 
 def as_stabilisation(stabilisation) -> Baumgarte | None:

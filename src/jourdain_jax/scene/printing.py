@@ -21,7 +21,7 @@ class Printed:
         return str(self)
 
     def _repr_html_(self) -> str:
-        return preformatted(str(self)) + ("" if is_traced(self) else self._picture())
+        return f"<pre>{html.escape(str(self))}</pre>" + ("" if is_traced(self) else self._picture())
 
     def _picture(self) -> str:
         """What a notebook shows below the text, as HTML."""
@@ -81,11 +81,6 @@ def in_digits(values) -> list[str]:
     values = np.asarray(values)
     least = np.finfo(values.dtype).eps * np.nanmax(np.abs(values), initial=0.0, where=np.isfinite(values))
     return [f"{0.0 if abs(x) < least else x:.6g}" for x in values]
-
-
-def preformatted(text: str) -> str:
-    """A text for a notebook, its columns kept."""
-    return f"<pre>{html.escape(text)}</pre>"
 
 
 def shapes_of(result) -> str:

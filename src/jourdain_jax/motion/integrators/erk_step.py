@@ -186,7 +186,8 @@ def _by_equations(problem: Problem, method: ImplicitMethod, p: Progress, h) -> t
         return found, [], None
     end = p.t + h, jax.tree.map(jnp.add, p.y, found.change)
     states = jax.tree.map(lambda a, b: jnp.stack([a, (a + b) / 2, b]), (p.t, p.y), end)
-    slopes, seen, directions, _ = jax.lax.map(lambda at: tuple(problem.watching(monitored)(*at, inside.args)), states)
+    watch = _watching(problem, monitored)
+    slopes, seen, directions, _ = jax.lax.map(lambda at: tuple(watch(*at, inside.args)), states)
     ends = [jax.tree.map(lambda k, y, i=i: as_in(k[i], y), slopes, p.y) for i in (0, 2)]
     return found, ends, _pivots(seen, directions) if monitored else None
 
@@ -268,7 +269,7 @@ def stages(problem: Problem, method: Method, t, y: PyTree, h, monitored: bool = 
     leaves, treedef = jax.tree.flatten(y)
     problem = problem.in_step(t, h)
     monitored = monitored and problem.rates_and_pivots is not None
-    watch = problem.watching(monitored or problem.near_rank_loss)
+    watch = _watching(problem, monitored or problem.near_rank_loss)
 
     def stage(carried, row):
         # k_i = f(y_i), then the next y_i: what is carried from stage to stage is computed once, whatever uses it
@@ -292,6 +293,11 @@ def stages(problem: Problem, method: Method, t, y: PyTree, h, monitored: bool = 
     rank = Rank(jnp.zeros(jnp.shape(t), bool), jnp.full(jnp.shape(t), jnp.inf, leaves[0].dtype)) if problem.near_rank_loss else None
     (y_1, slopes, rank), (at, watched) = jax.lax.scan(stage, (leaves, slopes, rank), rows)
     return Stages(treedef.unflatten(y_1), treedef.unflatten(slopes), treedef.unflatten(at), _pivots(*watched) if monitored else None, rank)
+
+
+def _watching(problem: Problem, monitored: bool):
+    """Return what rates are taken by: with what is watched where they are `monitored`, otherwise alone."""
+    return problem.rates_and_pivots if monitored else lambda *given: (problem.rates(*given), None, None, None)
 
 
 def _pivots(seen: Float[Array, "stages pivots *lanes"], directions: Float[Array, "stages rows speeds *lanes"]) -> Pivots:

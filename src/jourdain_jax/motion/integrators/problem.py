@@ -37,10 +37,6 @@ class Problem(eqx.Module):
         """The problem for the stages of a step."""
         return self if self.within is None else replace(self, args=self.within(t + 0.5 * h, self.args))
 
-    def watching(self, monitored: bool) -> Callable:
-        """Return `rates_and_pivots` where they are `monitored` and there are any, otherwise rates alone in their place."""
-        return (monitored and self.rates_and_pivots) or (lambda *given: (self.rates(*given), None, None, None))
-
     def knot_ahead(self, t: Float[Array, "*lanes"], knot: Int[Array, "*lanes"], direction) -> Float[Array, "*lanes"]:
         """The time of the `knot` ahead of t, infinity with the sign of the motion where there is none."""
         if self.knots is None:
