@@ -76,6 +76,8 @@ def events_met(problem: Problem, theta: Float[np.ndarray, "places"]) -> tuple[st
     return tuple(found)
 
 
+Counts = Int[np.ndarray, "*repeats"]
+Marks = Bool[np.ndarray, "*repeats"]
 PerRepeat = Float[np.ndarray, "*repeats"]
 PerUnknown = Float[np.ndarray, "*repeats unknowns"]
 @dataclass(frozen=True, eq=False)
@@ -97,7 +99,7 @@ class Statistics:
     correlation_time: dict[str, PerRepeat]  # s, of channels where they were estimated; near zero: white
     untold: tuple[str, ...]  # channels that do not tell their sigma, in any repeat
     chi_square: PerRepeat  # sum of squared whitened residuals; NaN where the motion fails
-    samples: Int[np.ndarray, "*repeats"]  # with a finite sigma
+    samples: Counts  # with a finite sigma
     degrees_of_freedom: PerRepeat  # samples less the directions that they determined; priors take their share
     of_rise: PerUnknown  # by what 2 (F - F_min) is to be divided, for an interval that ends where it is `RISE_95`
     from_prior: PerUnknown  # in standard deviations of the prior; zero where there is none
@@ -227,11 +229,11 @@ class Estimates(Printed):
 
     values: PerUnknown
     beyond: PerUnknown  # of estimates at a bound, by how many standard errors the data would put them beyond; NaN elsewhere
-    converged: Bool[np.ndarray, "*repeats"]
-    stuck: Bool[np.ndarray, "*repeats"]  # no step lowers the sum of squares, however short, and this is no minimum
-    steps: Int[np.ndarray, "*repeats"]  # tried
-    grown: Bool[np.ndarray, "*repeats"]  # whether the minimum was found over growing spans, far from where the first guess led to
-    agreeing: Int[np.ndarray, "*repeats"]  # first guesses that led to this minimum, of those tried; of a batch, which has one for each repeat, zero
+    converged: Marks
+    stuck: Marks  # no step lowers the sum of squares, however short, and this is no minimum
+    steps: Counts  # tried
+    grown: Marks  # whether the minimum was found over growing spans, far from where the first guess led to
+    agreeing: Counts  # first guesses that led to this minimum, of those tried; of a batch, which has one for each repeat, zero
     shooting: Shot | None  # how it was found by multiple shooting
     trace: tuple[tuple[str, tuple[float, ...]], ...]  # what was minimised, and F at first and after each step tried; none of a batch
     asked: Asked  # the arguments of `fit`; `guesses` and `errors` of these

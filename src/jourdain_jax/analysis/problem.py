@@ -33,6 +33,9 @@ from jourdain_jax.calculus.reals import Number, checked_real
 from jourdain_jax.motion.options import AllOptions
 from jourdain_jax.scene.scene import Scene
 
+Residuals = Float[np.ndarray, "samples"]
+Samples = Float[np.ndarray, "*samples"]
+
 
 @dataclass(frozen=True)
 class Loss:
@@ -51,16 +54,16 @@ class Loss:
         inside = np.minimum(abs(r), k)
         return np.sum(inside * (np.minimum(abs(r), np.finfo(float).max / max(k, 1.0)) - 0.5 * inside), axis=-1)
 
-    def weight(self, r: Float[np.ndarray, "*samples"]) -> Float[np.ndarray, "*samples"]:
+    def weight(self, r: Samples) -> Samples:
         """w(r)."""
         k = self.parameter
         return (k + 1) / (k + r**2) if self.kind == "student-t" else np.minimum(1.0, k / np.maximum(abs(r), np.finfo(float).tiny))
 
-    def weighted(self, rows: Float[np.ndarray, "*samples width"], r: Float[np.ndarray, "*samples"]):
+    def weighted(self, rows: Float[np.ndarray, "*samples width"], r: Samples):
         """Rows times the roots of their weights."""
         return rows if math.isinf(self.parameter) else np.sqrt(self.weight(r))[..., None] * rows
 
-    def inflation(self, r: Float[np.ndarray, "samples"], determined: float) -> float:
+    def inflation(self, r: Residuals, determined: float) -> float:
         """The factor by which the covariance (J'WJ)^-1 is to be multiplied, from the residuals that count, which determined so many unknowns."""
         if not np.isfinite(bend := self.bend(r)):
             return bend
@@ -68,12 +71,12 @@ class Loss:
         left, K = max(r.size - determined, 1.0), 1 + determined / r.size * np.var(slope) / np.mean(slope) ** 2
         return bend * K**2 * float(np.sum(psi**2) / left / np.mean(slope))
 
-    def bend(self, r: Float[np.ndarray, "samples"]) -> float:
+    def bend(self, r: Residuals) -> float:
         """The factor by which (J'WJ)^-1 is to be multiplied to be the inverse of the second derivatives of F; infinite where F is not convex in residuals."""
         slope = float(np.mean(self._slope(r)))
         return float(np.mean(self.weight(r))) / slope if slope > 0 else math.inf
 
-    def _slope(self, r: Float[np.ndarray, "samples"]) -> Float[np.ndarray, "samples"]:
+    def _slope(self, r: Residuals) -> Residuals:
         """psi'."""
         k = self.parameter
         return (k + 1) * (k - r**2) / (k + r**2) ** 2 if self.kind == "student-t" else (np.abs(r) <= k).astype(float)

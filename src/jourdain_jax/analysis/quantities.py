@@ -42,6 +42,8 @@ from jourdain_jax.scene.names import check_name, nearest
 from jourdain_jax.scene.names_read import is_function
 from jourdain_jax.scene.scene import Scene
 
+OverTimes = Float[Array, "times 3"]
+
 
 class Channel(eqx.Module):
     """A function of a motion as it was when it was given."""
@@ -112,7 +114,7 @@ class Instrument(eqx.Module):
         """ValueError, which names the channel and the run, where the scene has nothing that it could show."""
 
     @abstractmethod
-    def over_times(self, motion: Trajectory) -> Float[Array, "times 3"]:
+    def over_times(self, motion: Trajectory) -> OverTimes:
         """What it shows at all times of one motion."""
 
 
@@ -146,7 +148,7 @@ class Accelerometer(Instrument):
         bodies = motion_shape(scene).bodies
         check_name(self.body, bodies, f"the accelerometer `{channel}` of {where} sits on body `{self.body}`, which is not there")
 
-    def over_times(self, motion: Trajectory) -> Float[Array, "times 3"]:
+    def over_times(self, motion: Trajectory) -> OverTimes:
         """What it feels at all times of one motion."""
         return jax.vmap(lambda *state: self._felt(motion.scene, *state))(motion.ts, motion.q, motion.u, motion.accelerations().udot)
 
@@ -188,7 +190,7 @@ class LoadCell(Instrument):
                 f"the load cell `{channel}` of {where} is under contact `{self.contact}`, whose force is not determined: others share it; leave the channel out"
             )
 
-    def over_times(self, motion: Trajectory) -> Float[Array, "times 3"]:
+    def over_times(self, motion: Trajectory) -> OverTimes:
         """What it shows at all times of one motion."""
         force = motion.contact_forces()[self.contact]
         return jnp.concatenate([force.tangential, force.normal[..., None]], axis=-1)

@@ -33,6 +33,7 @@ from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.scene import Scene
 
+Ends = Int[np.ndarray, "ends"]
 NODE, LAST = "node of a piece", "time of the next node"  # in the start of a run that is a piece
 
 
@@ -81,7 +82,7 @@ class MultipleShooting:
                 raise ValueError(f"`duration` of `MultipleShooting` is {self.duration} s, expected a finite time above zero")
 
 
-def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> Int[np.ndarray, "ends"]:
+def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> Ends:
     """Samples at which pieces begin, and the last sample. ValueError where there are fewer intervals than pieces, and for a run that ended by an event."""
     if run.ended_by:
         raise ValueError(f"run {index} gives the time of its event `{run.ended_by}`, which `shooting` does not use; leave it out, and samples after it")
@@ -103,7 +104,7 @@ def numbers_of_filters(run: Experiment) -> int:
     return sum(math.prod(x.shape[1:]) for name, x in run.values.items() if name in run.readings and run.readings[name].has_filter)
 
 
-def owned(run: Experiment, ends: Int[np.ndarray, "ends"]) -> dict[str, Int[np.ndarray, "ends"]]:
+def owned(run: Experiment, ends: Ends) -> dict[str, Ends]:
     """For each channel, the first sample that belongs to each piece, and one past the last of all.
 
     A sample at which two pieces meet belongs to the later one; of a sensor with a delay, to the piece that has begun the largest delay before.
@@ -116,7 +117,7 @@ def owned(run: Experiment, ends: Int[np.ndarray, "ends"]) -> dict[str, Int[np.nd
     return found
 
 
-def in_pieces(run: Experiment, ends: Int[np.ndarray, "ends"], states: int) -> list[Experiment]:
+def in_pieces(run: Experiment, ends: Ends, states: int) -> list[Experiment]:
     """The pieces of a run that was `checked`; all but the first begin at a node of so many numbers. Each goes on to the last sample that belongs to it."""
     found, firsts = [], owned(run, ends)
     for k, (first, end) in enumerate(pairwise(ends)):

@@ -27,6 +27,7 @@ from jourdain_jax.calculus.reals import RUN_SELDOM, compiled
 from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.parameters import Scalar
 
+PerHanging = Float[Array, "hangings"]
 Values = dict[str, Scalar]
 
 
@@ -120,7 +121,7 @@ def _parameters(y: Values, hangings: dict[str, tuple[int, ...]], by_table: bool)
     return found if "G" not in hangings else found | _of_whole_bicycle(found)
 
 
-def _column(what: str, part: str, numbers: tuple[int, ...], y: Values) -> Float[Array, "hangings"]:
+def _column(what: str, part: str, numbers: tuple[int, ...], y: Values) -> PerHanging:
     return jnp.stack([y[f"{what}{part}{k}"] for k in numbers])
 
 
@@ -148,7 +149,7 @@ def _handlebar_to_axle(y: Values, lam: Scalar) -> Float[Array, "2"]:
     return jnp.stack([along * jnp.sin(lam) - across * jnp.cos(lam), along * jnp.cos(lam) + across * jnp.sin(lam)])
 
 
-def _mass_centre(tilts: Float[Array, "hangings"], beside: Float[Array, "hangings"]) -> tuple[Float[Array, "2"], Float[Array, "hangings"]]:
+def _mass_centre(tilts: PerHanging, beside: PerHanging) -> tuple[Float[Array, "2"], PerHanging]:
     """(x, z) from where the part hangs by to its mass centre, m, and by how much the lines of the rod miss it.
 
     cos(tilt) x + sin(tilt) z = a: the rod, whose line is upright, is a beside the point that the part hangs by.

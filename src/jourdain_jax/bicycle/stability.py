@@ -31,16 +31,18 @@ from jaxtyping import Bool, Complex, Float
 from jourdain_jax.calculus.reals import RUN_SELDOM, compiled
 
 Scalar = Float[Array, ""]
+Given = Float[ArrayLike, "2 2"]
+Square = Float[Array, "2 2"]
 Polynomial = Float[Array, " coefficients"]
 
 
 class BicycleMatrices(NamedTuple):
     """The linear bicycle; unpacks into the arguments below: `stability_speeds(*matrices)`."""
 
-    M: Float[Array, "2 2"]  # kg m^2
-    C1: Float[Array, "2 2"]  # kg m
-    K0: Float[Array, "2 2"]  # kg m
-    K2: Float[Array, "2 2"]  # kg
+    M: Square  # kg m^2
+    C1: Square  # kg m
+    K0: Square  # kg m
+    K2: Square  # kg
     g: Scalar  # m/s^2
 
 
@@ -58,10 +60,10 @@ class StabilitySpeeds(eqx.Module):
 
 
 def eigenvalues(
-    M: Float[ArrayLike, "2 2"],
-    C1: Float[ArrayLike, "2 2"],
-    K0: Float[ArrayLike, "2 2"],
-    K2: Float[ArrayLike, "2 2"],
+    M: Given,
+    C1: Given,
+    K0: Given,
+    K2: Given,
     g: ArrayLike,
     speeds: Float[ArrayLike, " speeds"],
 ) -> Complex[Array, "speeds 4"]:
@@ -81,10 +83,10 @@ def eigenvalues(
 
 
 def stability_speeds(
-    M: Float[ArrayLike, "2 2"],
-    C1: Float[ArrayLike, "2 2"],
-    K0: Float[ArrayLike, "2 2"],
-    K2: Float[ArrayLike, "2 2"],
+    M: Given,
+    C1: Given,
+    K0: Given,
+    K2: Given,
     g: ArrayLike,
     *,
     max_speed: ArrayLike = 50.0,

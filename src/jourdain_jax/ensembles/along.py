@@ -17,10 +17,12 @@ from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.parameters import Scalar
 
+Values = Float[Array, "times"]
+Count = Int[Array, ""]
 FOR_EXTREMES, FOR_INTEGRALS = 5, 4  # values that a polynomial goes through
 
 
-def sampled(motion: Trajectory, quantity: str | Callable) -> tuple[Float[Array, "more"], Float[Array, "more"], Int[Array, ""]]:
+def sampled(motion: Trajectory, quantity: str | Callable) -> tuple[Float[Array, "more"], Float[Array, "more"], Count]:
     """Times and values of a quantity (a name, or a function of a trajectory that gives its values at all times), and how many of them count.
 
     These are the saved times that were reached, and the end where it is none of them, in place of the last where it is near; all others repeat the end.
@@ -44,7 +46,7 @@ def sampled(motion: Trajectory, quantity: str | Callable) -> tuple[Float[Array, 
     return times, values, jnp.where(beyond > 0, place + 1, jnp.maximum(reached, 1))
 
 
-def largest(times: Float[Array, "times"], values: Float[Array, "times"], count: Int[Array, ""]) -> Scalar:
+def largest(times: Values, values: Values, count: Count) -> Scalar:
     """The largest of the first `count` of `values`, and between them. Its derivative is that of the quantity at the time of the largest value."""
     k = jnp.argmax(jnp.where(jnp.arange(times.shape[0]) < count, values, -jnp.inf))
     if times.shape[0] < FOR_EXTREMES:
@@ -60,7 +62,7 @@ def largest(times: Float[Array, "times"], values: Float[Array, "times"], count: 
     return jnp.where(count >= FOR_EXTREMES, jnp.maximum(values[k], _polynomial(s, y, jax.lax.stop_gradient(at))), values[k])
 
 
-def integral(times: Float[Array, "times"], values: Float[Array, "times"], count: Int[Array, ""]) -> Scalar:
+def integral(times: Values, values: Values, count: Count) -> Scalar:
     """The integral over time of the first `count` of `values`."""
 
     def over(i):
