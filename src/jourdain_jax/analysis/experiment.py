@@ -296,11 +296,12 @@ def _check_overlap(run: Experiment, name: str, signal, where: str) -> None:
 
 def _named_shape(scene: Scene, name: str, channel_name: str, where: str) -> tuple[int, ...]:
     """The shape of a coordinate or speed: of a quaternion (4,), of its rates (3,)."""
-    valid: list[str] = []
-    for names in (scene.coordinate_names, scene.speed_names):
-        named = names.view(np.zeros(len(names)))
-        if name in named:
-            return named[name].shape
-        valid += named.keys()
-    unknown = f"unknown channel `{name}`" if name == channel_name else f"channel `{channel_name}`, whose sensor measures an unknown quantity `{name}`"
-    raise ValueError(f"{where} has {unknown}; {nearest(name, valid)} For other quantities give a function of the motion in `sensors`.")
+    both = scene.coordinate_names, scene.speed_names
+    entries = both[0].entries + both[1].entries
+    if name in entries:
+        return ()
+    groups = {group: length for names in both for group, _, length in names.groups}
+    if name not in groups:
+        unknown = f"unknown channel `{name}`" if name == channel_name else f"channel `{channel_name}`, whose sensor measures an unknown quantity `{name}`"
+        raise ValueError(f"{where} has {unknown}; {nearest(name, (*groups, *entries))} For other quantities give a function of the motion in `sensors`.")
+    return (groups[name],)
