@@ -48,9 +48,13 @@ def check(scene: Scene | BuiltFor) -> Checked:
     serve) and a moment of inertia above the sum of the others.
     ValueError where no admissible state is found, or a motion that the rows leave free has no inertia.
     """
-    scene = as_scene(scene)
+    return _checked(as_scene(scene), None)
+
+
+def _checked(scene: Scene, every_speed: bool | None) -> Checked:
+    """The table, with the program of one state (`lowered`)."""
     known = structure_whatever_its_faults(scene)
-    program = "" if known.kinks or known.odd_grounds or known.faults else lowered(scene)
+    program = "" if known.kinks or known.odd_grounds or known.faults else lowered(scene, every_speed)
     found = {
         "smoothness": known.kinks,
         "grounds": known.odd_grounds,
@@ -61,7 +65,7 @@ def check(scene: Scene | BuiltFor) -> Checked:
 
 
 @once_per_class
-def warn_of_mistakes(scene: Scene) -> None:
-    """Warn with the table where something looks wrong, once for each class."""
-    if not (found := check(scene)).passed:
+def warn_of_mistakes(scene: Scene, every_speed: bool) -> None:
+    """Warn with the table where something looks wrong, once for each class and state."""
+    if not (found := _checked(scene, every_speed)).passed:
         warnings.warn(str(found), stacklevel=users_level())

@@ -186,8 +186,8 @@ class Model(BuiltFor, Printed):
             raise ValueError("a model with a reduction or a stabilisation of its own has no file; build it anew")
         how = {"state": formulation.state, "projects": formulation.projects, "backend": self.backend, "memory": self.memory}
         found = {("_structure",): self.structure, ("coordinates_on_rows",): coordinates_on_rows(scene), ("row_program",): row_program(scene)}
-        known = self.structure
-        found |= {("_lowered", every or not known.row_names): lowered(scene, every) for every in (self.state == "full", not known.has_minimal_state)}
+        every = self.state == "full"
+        found["_lowered", every or not self.structure.row_names] = lowered(scene, every)
         model_file.write(path, scene, how, {what: x for what, x in found.items() if not isinstance(x, NotLowered)})
 
     def __reduce__(self):
@@ -268,8 +268,8 @@ def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backe
     formulation = replace(model.formulation, state="full" if model.field().independent is None else "minimal")
     settled = Model(scene, formulation, backend, Reference(scene), None if memory is None else bytes_of(memory))
     modelled(settled).made.update(model.made)
-    if backend != "dense":  # which asks for no program to compare
-        warn_of_mistakes(settled.reference.scene)
+    if backend != "dense" and formulation.reduction is None:  # dense matrices ask for no program to compare
+        warn_of_mistakes(settled.reference.scene, settled.state == "full")
     return settled
 
 
