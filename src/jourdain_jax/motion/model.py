@@ -187,7 +187,7 @@ class Model(BuiltFor, Printed):
         how = {"state": formulation.state, "projects": formulation.projects, "backend": self.backend, "memory": self.memory}
         found = {("_structure",): self.structure, ("coordinates_on_rows",): coordinates_on_rows(scene), ("row_program",): row_program(scene)}
         every = self.state == "full"
-        found["_lowered", every or not self.structure.row_names] = lowered(scene, every)
+        found |= {("_lowered", every or not self.structure.row_names): lowered(scene, every)}
         model_file.write(path, scene, how, {what: x for what, x in found.items() if not isinstance(x, NotLowered)})
 
     def __reduce__(self):
