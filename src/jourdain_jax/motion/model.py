@@ -185,9 +185,9 @@ class Model(BuiltFor, Printed):
         if formulation.reduction is not None or formulation.baumgarte is not None:
             raise ValueError("a model with a reduction or a stabilisation of its own has no file; build it anew")
         how = {"state": formulation.state, "projects": formulation.projects, "backend": self.backend, "memory": self.memory}
-        found = {("_structure",): self.structure, ("coordinates_on_rows",): coordinates_on_rows(scene), ("row_program",): row_program(scene)}
         every = self.state == "full"
-        found |= {("_lowered", every or not self.structure.row_names): lowered(scene, every)}
+        found: dict[Hashable, Any] = {("_structure",): self.structure, ("_lowered", every or not self.structure.row_names): lowered(scene, every)}
+        found |= {("coordinates_on_rows",): coordinates_on_rows(scene), ("row_program",): row_program(scene)}
         model_file.write(path, scene, how, {what: x for what, x in found.items() if not isinstance(x, NotLowered)})
 
     def __reduce__(self):
