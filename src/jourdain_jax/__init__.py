@@ -83,6 +83,7 @@ if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.analysis.experiment import Experiment
     from jourdain_jax.analysis.families.critical import critical
     from jourdain_jax.analysis.families.family import family
+    from jourdain_jax.analysis.families.periodic import periodic
     from jourdain_jax.analysis.filtering import filtered_log_likelihood
     from jourdain_jax.analysis.fit import fit, fit_batch
     from jourdain_jax.analysis.fit_result import Fit
@@ -129,6 +130,7 @@ _ON_FIRST_USE = {
     "analysis.experiment": "Experiment",
     "analysis.families.critical": "critical",
     "analysis.families.family": "family",
+    "analysis.families.periodic": "periodic",
     "analysis.filtering": "filtered_log_likelihood",
     "analysis.fit": "fit fit_batch",
     "analysis.fit_result": "Fit",
@@ -308,6 +310,7 @@ __all__ = [
     "newton_residual",
     "parameter",
     "partial_velocities",
+    "periodic",
     "pin",
     "planned_information",
     "plot",

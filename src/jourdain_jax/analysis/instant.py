@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.build.structure import structure_of, usual_rows
 from jourdain_jax.calculus.reals import RUN_SELDOM, Entries, array_module, compiled, real_type
-from jourdain_jax.dynamics.reduced import DEPENDS
+from jourdain_jax.dynamics.reduced import DEPENDS, ignorable_coordinates
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import closure_residual
@@ -177,6 +177,13 @@ def instant_of(scene: Scene | BuiltFor, constant: tuple[int, ...], masses: bool 
     except NotLowered:
         return ByMatrices(constant)
     return found if found.of.is_made and (found.has_masses or not masses) else ByMatrices(constant)
+
+
+def unseen(instant: "ByProgram | ByMatrices", scene: Scene) -> set[str]:
+    """Names of the coordinates on which no acceleration depends, of a quaternion those of its parts."""
+    groups = {group: scene.coordinate_names.entries[first : first + length] for group, first, length in scene.coordinate_names.groups}
+    found = instant.program.held if isinstance(instant, ByProgram) else ignorable_coordinates(scene)
+    return {entry for name in found for entry in groups.get(name, (name,))}
 
 
 @once_per_class

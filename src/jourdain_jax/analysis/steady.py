@@ -16,13 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.analysis.instant import ByMatrices, ByProgram, instant_of, on_rows, places_of
+from jourdain_jax.analysis.instant import ByMatrices, ByProgram, instant_of, on_rows, places_of, unseen
 from jourdain_jax.analysis.tangent import privileged_speeds
 from jourdain_jax.build.assembling import coordinate_bounds
 from jourdain_jax.calculus.matrices import pseudo_inverse
 from jourdain_jax.calculus.reals import RUN_SELDOM, Number, Numbers, compiled, described
 from jourdain_jax.calculus.roots import damped_search
-from jourdain_jax.dynamics.reduced import ignorable_coordinates
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, shown_from_users_lines
@@ -94,8 +93,7 @@ def steady(
     _check_names(scene, held, names)
     instant = instant_of(built, y := privileged_speeds(scene, privileged))
     groups = {group: entries[first : first + length] for group, first, length in scene.coordinate_names.groups}
-    unseen = instant.program.held if isinstance(instant, ByProgram) else ignorable_coordinates(scene)
-    ignorable = {entry for name in unseen for entry in groups.get(name, (name,))}
+    ignorable = unseen(instant, scene)
     moving = ignorable if moving is None else as_names(moving)
     _check_names(scene, tuple(moving), (*entries, *groups))
     carried = {entry for name in moving for entry in groups.get(name, (name,))}

@@ -1,0 +1,273 @@
+"""Periodic motions by shooting over several pieces of one period, and their Floquet multipliers.
+
+    z_k -> f_k(z_k),  k = 1 .. n:  motions over equal parts of the period T,   z = (q, u)
+    R(z_1, .., z_n, T) = ( g(z_1), phi(z_1),  f_k(z_k) - z_{k+1},  f_n(z_n) - z_1 of what matters,  c(z_1) )
+
+c: the value of an event, where T is unknown. Coordinates on which no acceleration depends may shift by as much in every period. With small motions
+dz_k = B_k x_k that meet the constraints, and L_k B_k = 1,
+
+    x_{k+1} = M_k x_k,  M_k = L_{k+1} (df_k/dz_k) B_k:       the multipliers are the eigenvalues of M_n .. M_1
+
+which are n-th powers of eigenvalues of the cyclic matrix with the blocks M_k: so small and large multipliers keep their digits side by side. R has
+more rows than it needs, which agree; the pseudo-inverse of its slopes at the root carries the derivatives with respect to parameters.
+Source: R. Seydel, Practical Bifurcation and Stability Analysis (2010), sections 7.4 and 7.6.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Unpack
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
+
+from jourdain_jax.analysis.families.equations import sizes
+from jourdain_jax.analysis.families.special import SURE
+from jourdain_jax.analysis.instant import ByMatrices, ByProgram, instant_of, places_of, unseen
+from jourdain_jax.analysis.table import complex_numbers
+from jourdain_jax.build.structure import structure_of
+from jourdain_jax.build.trace import event_values
+from jourdain_jax.calculus.matrices import pseudo_inverse
+from jourdain_jax.calculus.reals import RUN_SELDOM, Number, compiled, known_numbers
+from jourdain_jax.calculus.roots import damped_search
+from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.listed import names_of_events
+from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
+from jourdain_jax.motion.integrators.of_diffrax import diffrax
+from jourdain_jax.motion.model import modelled
+from jourdain_jax.motion.options import SPAN, AllOptions, MotionFields, OptionFields, Options, as_options
+from jourdain_jax.motion.put_on_rows import State
+from jourdain_jax.motion.simulate import as_state, simulate
+from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
+from jourdain_jax.scene.names import as_names, nearest
+from jourdain_jax.scene.printing import Printed
+from jourdain_jax.scene.scene import Scene
+
+
+class PeriodicMotion(Printed, eqx.Module):
+    """A motion that repeats itself after each period; `orbit["yaw_rate"]` at its start, `jj.simulate(scene, orbit.state, t1=orbit.period)`."""
+
+    state: State  # at the start of a period
+    period: Float[Array, ""]  # s
+    shift: dict[str, Float[Array, ""]]  # by how much coordinates move in a period: those on which no acceleration depends, and those given
+    multipliers: Complex[Array, "multipliers"]  # by which small motions grow in a period, the largest first
+    residual: Float[Array, ""]  # largest difference after one period, in units of the unknowns' sizes
+    converged: Bool[Array, ""]
+
+    def __getitem__(self, name: str) -> Float[Array, ""]:
+        """A coordinate or speed at the start, by name."""
+        return self.state[name]
+
+    @property
+    def stable(self) -> Bool[Array, ""]:
+        """Whether no small motion grows; multipliers of symmetries and of conserved quantities are one, often twice, but for round-off."""
+        return jnp.all(jnp.abs(self.multipliers) <= 1 + SURE)
+
+    def _text(self) -> str:
+        if self.residual.ndim:
+            return f"{int(self.converged.sum())} of {self.converged.size} periodic motions found\n{self.state}"
+        head = f"periodic motion of {float(self.period):.9g} s" if self.converged else "no periodic motion found near the guess"
+        shifts = ", ".join(f"{name} by {float(value):.6g}" for name, value in self.shift.items())
+        lines = [f"{head}: residual {float(self.residual):.1e}", *([f"in a period, it shifts {shifts}"] if shifts else []), str(self.state)]
+        return "\n".join([*lines, f"multipliers: {', '.join(complex_numbers(self.multipliers))} ({'stable' if self.stable else 'unstable'})"])
+
+
+@shown_from_users_lines
+def periodic(
+    scene: Scene | BuiltFor,
+    guess: "State | dict",
+    period: Number,
+    *,
+    until: str | None = None,
+    held: str | tuple[str, ...] = (),
+    shift: Mapping[str, Number] | None = None,
+    pieces: int = 4,
+    options: Options | None = None,
+    **by_name: Unpack[MotionFields],
+) -> PeriodicMotion:
+    """Find the periodic motion near a guess, with its Floquet multipliers.
+
+        orbit = jj.periodic(sleigh, {"forward": 0.4}, jnp.pi, inputs={"torque": lambda t: 0.6 * jnp.sin(2 * t)})
+        orbit.multipliers, orbit.stable, orbit.shift["heading"]
+        jax.jacfwd(lambda drag: jj.periodic(sleigh.replace(drag=drag), guess, jnp.pi).multipliers)(0.15)
+
+    **Arguments**
+    - `guess`: a `State`, or named values (a start, as `simulate` takes it), of a state near the motion.
+    - `period`: s; of loads or inputs that repeat themselves, and kept. With `until` a rough one.
+    - `until`: the name of an event of the scene whose value is zero where a period begins and ends; the period is found, too. For scenes in which nothing
+      depends on time.
+    - `held`: names of coordinates and speeds that keep the guess's value at the start, where several periodic motions lie side by side.
+    - `shift`: name -> by how much a coordinate moves in a period: `{"crank": 2 * jnp.pi}` of an angle that goes round.
+    - `pieces`: parts of the period over which motions run side by side. More of them serve motions whose disturbances grow by more than 1e3 in a part.
+    - `options`, `by_name`: as of `simulate`, `inputs` among them; the default tolerance is 1e-12.
+
+    **Returns** a `PeriodicMotion`; look at `converged` and `residual`, nothing is raised where none is found. Stop events do not end the
+    motion, but one that has passed at any of 100 times in the period counts as not found. Runs under `jit` and `vmap`; differentiable in
+    the parameters of the scene, where the motion is a smooth function of them and its multipliers are distinct.
+
+    **Raises** ValueError: an unknown name, a period that is not positive; TypeError for unknown options.
+    """
+    built, scene = scene, as_scene(scene)
+    inputs = as_inputs(scene, by_name.pop("inputs", None))
+    tolerances = {"rtol": 1e-12, "atol": 1e-12} if options is None else {}
+    options = as_options(options, {**tolerances, **by_name}, "periodic", dict.fromkeys(SPAN, "`period` says how long it lasts"), built)
+    options = replace(options, solver=options.solver or diffrax.Dopri8())  # tolerances are traced below
+    if not np.all(known_numbers(period) > 0) or not np.all(np.isfinite(known_numbers(period))):
+        raise ValueError(f"`period` is {period}, expected a positive time in s")
+    if not isinstance(pieces, int | np.integer) or pieces < 1:
+        raise ValueError(f"`pieces` is {pieces!r}, expected a whole number of at least 1")
+    events, held, entries = names_of_events(scene), as_names(held), scene.coordinate_names.entries
+    names = entries + scene.speed_names.entries
+    if until is not None and until not in events:
+        raise ValueError(f"`until` names `{until}`, which is no event of `{type(scene).__name__}`; {nearest(until, events)}")
+    shift = dict(shift or {})
+    for name, valid in [*((name, names) for name in held), *((name, entries) for name in shift)]:
+        if name not in valid:
+            raise ValueError(f"`{type(scene).__name__}` has no `{name}` to hold or to shift; {nearest(name, valid)}")
+    start = as_state(modelled(built), guess, what="guess", inputs=inputs_at(inputs, 0.0))
+    instant = instant_of(built, structure_of(scene).independent)
+    carried = unseen(instant, scene)
+    kept = tuple(k for k, name in enumerate(names) if name not in carried)
+    free = tuple(k for k in kept if names[k] not in held)
+    shifted = jnp.array([shift.get(name, 0.0) for name in names], start.q.dtype)
+    problem = _Shooting(scene, inputs, options, shifted, instant, pieces, None if until is None else events.index(until), kept, free, tuple(shift))
+    return _found(problem, start, jnp.asarray(period, start.q.dtype))
+
+
+class _Shooting(eqx.Module):
+    """R and its slopes, as functions of the states at which pieces begin, shape (pieces, states), and of the period."""
+
+    scene: Scene
+    inputs: Inputs
+    options: AllOptions
+    shift: Float[Array, "states"]  # by how much what matters moves in a period
+    instant: ByProgram | ByMatrices = eqx.field(static=True)
+    pieces: int = eqx.field(static=True)
+    until: int | None = eqx.field(static=True)
+    kept: tuple[int, ...] = eqx.field(static=True)  # numbers of z that matter
+    free: tuple[int, ...] = eqx.field(static=True)  # and of those that are unknown at the start
+    shifted: tuple[str, ...] = eqx.field(static=True)  # names of what the user says to move
+
+    @property
+    def sizes(self) -> Float[np.ndarray, "states"]:
+        """Sizes of coordinates and speeds."""
+        return sizes(self.scene, range(len(self.scene.coordinate_names.entries)), np.zeros(0))
+
+    def motion(self, t0, z: Float[Array, "states"], ts: Float[Array, "times"]):
+        """The motion from a state."""
+        n, none = len(self.scene.coordinate_names.entries), jnp.zeros(())
+        start = State(t0, z[:n], z[n:], none, none, none, (self.scene.coordinate_names, self.scene.speed_names))
+        fields = {name: value for name, value in vars(self.options).items() if name in OptionFields.__annotations__}
+        return simulate(self.scene, start, t0=t0, ts=ts, inputs=self.inputs, **{**fields, "events": False, "work": False}).nan_if_failed()
+
+    def moved(self, k, z: Float[Array, "states"], t, period) -> Float[Array, "states"]:
+        """f_k."""
+        part = period / self.pieces
+        motion = self.motion(t + k * part, z, (t + (k + 1) * part)[None])
+        return jnp.concatenate([motion.q_end, motion.u_end])
+
+    def events(self, t, z: Float[Array, "states"]) -> Float[Array, "events"]:
+        """Values of the stop events, c among them."""
+        n = len(self.scene.coordinate_names.entries)
+        return event_values(self.scene, motion_at(self.scene, t, z[:n], z[n:], inputs_at(self.inputs, t)))
+
+    def constraints(self, t, z: Float[Array, "states"]) -> tuple[Array, Array]:
+        """g and phi with their slopes by z."""
+        at, n = places_of(self.scene), len(self.scene.coordinate_names.entries)
+        v, D, _ = self.instant(self.scene, t, z[:n], z[n:], inputs_at(self.inputs, t))
+        rows = np.concatenate([at.g, at.phi])
+        return v[rows], D[rows][:, np.concatenate([at.q, at.u])]
+
+    def aligned(self, there: Float[Array, "states"], here: Float[Array, "states"]) -> Float[Array, "states"]:
+        """The state `there`, with those signs of its quaternions that bring it nearest to `here`."""
+        for first, _ in self.scene.coordinates.quaternions:
+            part = slice(first, first + 4)
+            there = there.at[part].multiply(jnp.where(there[part] @ here[part] < 0, -1.0, 1.0))
+        return there
+
+    def pieces_of(self, x: Float[Array, "unknowns"]) -> tuple[Float[Array, "pieces states"], Float[Array, ""]]:
+        """States at which pieces begin, and the period."""
+        return jnp.reshape(x[:-1], (self.pieces, -1)), x[-1]
+
+    def rows(self, t, x: Float[Array, "unknowns"], ends: Float[Array, "pieces states"]) -> Float[Array, "rows"]:
+        """R, in units of the sizes of what is compared, where the pieces end at `ends`."""
+        zs, _ = self.pieces_of(x)
+        there = jnp.roll(zs, -1, axis=0)
+        changes = (jax.vmap(self.aligned)(ends.at[-1].add(-self.shift), there) - there) / self.sizes
+        found = [self.constraints(t, zs[0])[0], jnp.ravel(changes[:-1]), changes[-1][np.array(self.kept)]]
+        return jnp.concatenate([*found, *([] if self.until is None else [self.events(t, zs[0])[self.until][None]])])
+
+    def ends(self, t, x: Float[Array, "unknowns"]) -> Float[Array, "pieces states"]:
+        """All f_k."""
+        return jax.vmap(lambda k, z: self.moved(k, z, t, self.pieces_of(x)[1]))(jnp.arange(self.pieces), self.pieces_of(x)[0])
+
+    def slopes(self, t, x: Float[Array, "unknowns"]) -> tuple[Array, Array]:
+        """df_k/dz_k and df_k/dT."""
+        zs, period = self.pieces_of(x)
+        return jax.vmap(lambda k, z: jax.jacfwd(self.moved, (1, 3))(k, z, t, period))(jnp.arange(self.pieces), zs)
+
+    def look(self, t, x: Float[Array, "unknowns"]) -> tuple[Array, Array]:
+        """R and dR/dx."""
+        ends, (D, of_period) = self.ends(t, x), self.slopes(t, x)
+
+        def linear(change):
+            dz, dT = self.pieces_of(change)
+            return self.rows(t, x + change, ends + jnp.einsum("kij,kj->ki", D, dz) + of_period * dT)
+
+        return self.rows(t, x, ends), jax.jacfwd(linear)(jnp.zeros_like(x))
+
+    def multipliers(self, t, x: Float[Array, "unknowns"]) -> Complex[Array, "multipliers"]:
+        """Eigenvalues of M_n .. M_1, the largest first, without the one of going on along the motion where the period is unknown."""
+        (zs, period), kept, known, n = self.pieces_of(x), np.array(self.kept), structure_of(self.scene), self.pieces
+        places = kept[kept < len(self.scene.coordinate_names.entries)]
+        rank = np.linalg.matrix_rank(known.closure_slopes[0][:, places]) if known.closure_slopes.size else 0
+        count = len(places) - int(rank) + known.degrees_of_freedom
+        there = jnp.roll(zs, -1, axis=0)
+        signs = jax.vmap(jax.jacfwd(self.aligned))(self.ends(t, x), there)
+        D = (signs @ self.slopes(t, x)[0])[:, kept][:, :, kept]
+        C = jax.vmap(lambda k, z: self.constraints(t + k * period / n, z)[1])(jnp.arange(n), zs)[:, :, kept]
+        L = jnp.linalg.svd(jax.lax.stop_gradient(C))[2][:, len(kept) - count :]  # a basis of what the constraints leave
+        B = jax.vmap(lambda C, L: L.T - pseudo_inverse(C, 1e-9) @ (C @ L.T))(C, L)
+        L, following = jnp.roll(L, -1, axis=0), jnp.roll(B, -1, axis=0)
+        M = jnp.linalg.solve(L @ following, L @ D @ B)
+        cyclic = jnp.zeros((n, count, n, count), M.dtype).at[(np.arange(n) + 1) % n, :, np.arange(n)].set(M)
+        roots = jnp.linalg.eigvals(jnp.reshape(cyclic, (n * count, -1)))
+        # of the n roots that belong to one multiplier, one lies in this sector; its bounds are those of no real multiplier
+        beyond = jnp.mod(jnp.angle(roots) - 0.1, 2 * np.pi) >= 2 * np.pi / n
+        found = (roots**n)[jnp.argsort(beyond, stable=True)[:count]]
+        found = jnp.where(jnp.abs(found.imag) < 1e-9 * jnp.abs(found), found.real, found)
+        trivial = jnp.argmin(jnp.abs(found - 1)) if self.until is not None else -1
+        order = jnp.lexsort((-found.imag, -jnp.round(jnp.abs(found), 9), jnp.arange(count) == trivial))
+        return found[order[: count - (self.until is not None)]]
+
+
+@partial(compiled, options=RUN_SELDOM)
+def _found(problem: _Shooting, start: State, period: Float[Array, ""]) -> PeriodicMotion:
+    t, begun = start.t, jnp.concatenate([start.q, start.u])
+    still, z, given = jax.lax.stop_gradient((problem, begun, period))
+    motion = still.motion(t, z, t + given * np.arange(1, problem.pieces + 1) / problem.pieces)
+    zs = jnp.concatenate([z[None], jnp.concatenate([motion.q, motion.u], axis=1)[:-1]])
+    guess = jax.lax.stop_gradient(jnp.append(jnp.ravel(zs), given))
+    count = len(problem.sizes)
+    free = np.ones((problem.pieces, count))
+    free[0] = [k in problem.free for k in range(count)]
+    size = jnp.append(jnp.asarray(np.ravel(free * problem.sizes)), given if problem.until is not None else 0.0)
+    tolerance = 10.0 * jnp.asarray(problem.options.rtol)
+    found = jax.lax.stop_gradient(damped_search(lambda x: still.look(t, x), guess, size, tolerance))
+    inverse, x = size[:, None] * pseudo_inverse(found.J, 1e-9), found.best
+    x = jnp.where(size > 0, x, jnp.append(jnp.tile(begun, problem.pieces), period))  # what is held, with its derivatives
+    for _ in range(3):  # each carries one order of derivatives
+        x = x - inverse @ problem.rows(t, x, problem.ends(t, x))
+    zs, period = problem.pieces_of(x)
+    ends = problem.ends(t, x)
+    residual = jnp.max(jnp.abs(problem.rows(t, x, ends)))
+    whole = jax.lax.stop_gradient(problem).motion(t, zs[0], t + period * np.linspace(0.01, 1.0, 100))
+    values = jax.vmap(problem.events)(whole.ts, jnp.concatenate([whole.q, whole.u], axis=1))
+    stopped = jnp.any((values < 0) & (np.arange(values.shape[1]) != problem.until))
+    n, names = len(start.q), problem.scene.coordinate_names.entries
+    shifts = {name: ends[-1, k] - zs[0, k] for k, name in enumerate(names) if k not in problem.kept or name in problem.shifted}
+    state = State(t, zs[0, :n], zs[0, n:], start.moved_q, start.moved_u, residual, (problem.scene.coordinate_names, problem.scene.speed_names))
+    return PeriodicMotion(state, period, shifts, problem.multipliers(t, x), residual, (residual < 1e-8) & ~stopped)

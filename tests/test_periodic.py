@@ -1,0 +1,163 @@
+"""Periodic motions: closed forms, references by SciPy, derivatives, multipliers side by side that are 22 powers of ten apart."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
+
+import jourdain_jax as jj
+
+
+class DrivenSleigh(jj.models.ChaplyginSleigh):
+    """A sleigh with drag, and a torque that changes its sign."""
+
+    along: float = jj.parameter(0.15)
+    turning: float = jj.parameter(0.05)
+    torque: float = jj.parameter(0.6)
+
+    def loads(self, motion):
+        c, s, u = jnp.cos(motion.q.heading), jnp.sin(motion.q.heading), motion.u
+        push = -self.along * (c * u.x_rate + s * u.y_rate)
+        turn = self.torque * jnp.sin(2 * motion.t) - self.turning * u.heading_rate
+        return (jj.generalized_force(motion, x_rate=push * c, y_rate=push * s, heading_rate=turn),)
+
+
+def on_a_line(force):
+    """A scene of one particle of 1 kg on a line, with the force as a function of the scene, its place, speed and the time, and `crossing` as an event."""
+
+    class Line(jj.Scene):
+        size: float = jj.parameter(1.0)
+        coordinates = jj.coordinates("x")
+
+        def bodies(self, t, q):
+            return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0 * q.x, 0 * q.x]))}
+
+        def loads(self, motion):
+            return (jj.generalized_force(motion, x_rate=force(self.size, motion.q.x, motion.u.x_rate, motion.t)),)
+
+        def events(self, motion):
+            return {"crossing": motion.q.x}
+
+    return Line()
+
+
+VAN_DER_POL = on_a_line(lambda size, x, v, t: size * (1 - x**2) * v - x)
+INVERTED = on_a_line(lambda size, x, v, t: 16 * size * x + jnp.sin(t))
+
+
+def test_a_driven_sleigh_has_its_orbit_and_multipliers():
+    """Digits of an independent integration; the heading at the start is free, and shifts back within the period."""
+    orbit = jj.periodic(DrivenSleigh(), {"x_rate": 0.4, "heading_rate": -0.6}, np.pi, held="heading")
+    assert orbit.converged
+    assert_allclose([orbit["x_rate"], orbit["heading_rate"]], [0.412558059020941, -0.603149615333924], rtol=1e-12)
+    assert_allclose(orbit.multipliers, [1.0, 0.687051124958722, 0.307594179012466], rtol=1e-10)
+    assert orbit.stable
+    assert set(orbit.shift) == {"x", "y"}
+    again = jj.simulate(DrivenSleigh(), orbit.state, t1=float(orbit.period), rtol=1e-12, atol=1e-12)
+    assert_allclose(again.u_end, orbit.state.u, atol=1e-11)
+    assert_allclose([again.q_end[0], again.q_end[1]], [orbit.shift["x"], orbit.shift["y"]], atol=1e-10)
+    assert "periodic motion of 3.14159" in str(orbit)
+
+
+def test_derivatives_of_an_orbit_are_those_of_the_reference():
+    def found(torque):
+        orbit = jj.periodic(DrivenSleigh(torque=torque), {"x_rate": 0.4, "heading_rate": -0.6}, np.pi, held="heading", pieces=1)
+        return jnp.array([orbit["x_rate"], orbit["heading_rate"]]), orbit.multipliers[1:].real
+
+    of_states, of_multipliers = jax.jacfwd(found)(0.6)
+    assert_allclose(of_states, [1.322948602, -0.912193312], atol=1e-9)
+    assert_allclose(of_multipliers, [-0.056298649, -0.822442543], atol=1e-9)
+
+
+@pytest.mark.parametrize("guess", [{"x_rate": -2.0}, {"x": 0.5, "x_rate": -1.5}], ids=["on the event", "beside it"])
+def test_a_limit_cycle_has_its_period(guess):
+    """The multiplier is exp of the integral of the divergence, here by SciPy; period: 6.6632868593231 s for a damping of one."""
+    orbit = jj.periodic(VAN_DER_POL, guess, 6.0, until="crossing")
+    assert float(orbit.period) == pytest.approx(6.6632868593231301, abs=1e-12)
+
+    def rates(t, y):
+        return [y[1], (1 - y[0] ** 2) * y[1] - y[0], 1 - y[0] ** 2]
+
+    growth = solve_ivp(rates, (0, float(orbit.period)), [0.0, float(orbit["x_rate"]), 0.0], method="DOP853", rtol=1e-12, atol=1e-12).y[2, -1]
+    assert_allclose(orbit.multipliers, [np.exp(growth)], rtol=1e-9)
+
+
+def test_the_period_has_its_derivative_in_a_batch():
+    period = lambda size: jj.periodic(VAN_DER_POL.replace(size=size), {"x_rate": -2.0}, 6.0, until="crossing").period  # noqa: E731
+    h = 1e-3
+    periods, slopes = jax.jit(jax.vmap(jax.value_and_grad(period)))(1.0 + h * jnp.array([-2.0, -1.0, 0.0, 1.0, 2.0]))
+    by_values = (8 * (periods[3] - periods[1]) - periods[4] + periods[0]) / (12 * h)
+    assert float(slopes[2]) == pytest.approx(float(by_values), rel=1e-9)
+
+
+def test_multipliers_far_apart_keep_their_digits():
+    """`x = -sin(t)/17` from an unstable rest; multipliers exp(+-8 pi)."""
+    orbit = jj.periodic(INVERTED, {"x_rate": 0.0}, 2 * np.pi, pieces=8)
+    assert float(orbit["x_rate"]) == pytest.approx(-1 / 17, abs=1e-13)
+    assert_allclose(orbit.multipliers, np.exp([8 * np.pi, -8 * np.pi]), rtol=1e-11)
+    assert not orbit.stable
+
+
+class Whirling(jj.Scene):
+    """A rod of 1 m that hangs from a ball joint; a torque about y drives it round, against drag."""
+
+    drive: float = jj.parameter(12.0)
+    by_angle: bool = eqx.field(static=True, default=True)
+
+    @property
+    def coordinates(self):
+        return jj.coordinates("angle") if self.by_angle else jj.coordinates(jj.quaternion("attitude"))
+
+    def bodies(self, t, q):
+        turn = jj.rot_y(q.angle) if self.by_angle else jj.quaternion_to_matrix(q.attitude)
+        return {"rod": jj.RigidBody(1.0, jnp.diag(jnp.array([0.09, 0.08, 0.01])), position=turn @ jnp.array([0.0, 0.0, -0.5]), orientation=turn)}
+
+    def loads(self, motion):
+        moment = jnp.array([0.0, self.drive, 0.0]) - 1.5 * motion["rod"].angular_velocity
+        return jj.gravity(motion, 9.81), jj.torque(motion, "rod", moment)
+
+    def events(self, motion):
+        return {"hanging": motion["rod"].position[0]}
+
+
+def test_an_angle_goes_round_and_a_quaternion_changes_its_sign():
+    """Both are the same motion; the quaternion also has small motions out of the plane."""
+    rate = 8.0
+    plane = jj.periodic(Whirling(), {"angle_rate": rate}, 0.9, until="hanging", shift={"angle": 2 * np.pi})
+    space = jj.periodic(Whirling(by_angle=False), {"attitude_omega_y": rate}, 0.9, until="hanging")
+    assert plane.converged
+    assert space.converged
+    assert_allclose([space.period, space["attitude_omega_y"]], [plane.period, plane["angle_rate"]], rtol=1e-10)
+    assert float(plane.shift["angle"]) == pytest.approx(2 * np.pi, abs=1e-12)
+    assert len(space.multipliers) == 5
+    assert np.min(np.abs(space.multipliers - plane.multipliers[0])) < 1e-9
+
+
+def test_orbits_side_by_side_have_multipliers_of_one():
+    """A ball on a turntable goes round in 2/7 of its rate, wherever it is."""
+    ball = jj.models.BallOnTurntable()
+    rate = 2 / 7 * float(ball.turn_rate)
+    orbit = jj.periodic(ball, ball.example, 2 * np.pi / rate, pieces=1)
+    assert orbit.converged
+    assert_allclose(np.abs(orbit.multipliers), 1.0, atol=1e-6)
+
+
+def test_what_is_asked_wrongly_is_named():
+    with pytest.raises(ValueError, match=r"`until` names `crosing`.*crossing"):
+        jj.periodic(VAN_DER_POL, {}, 6.0, until="crosing")
+    with pytest.raises(ValueError, match=r"`period` is 0\.0, expected a positive time"):
+        jj.periodic(VAN_DER_POL, {}, 0.0)
+    with pytest.raises(ValueError, match="no `xx` to hold"):
+        jj.periodic(VAN_DER_POL, {}, 6.0, held="xx")
+    with pytest.raises(ValueError, match="`pieces` is 0"):
+        jj.periodic(VAN_DER_POL, {}, 6.0, pieces=0)
+
+
+def test_a_motion_that_is_none_says_so():
+    """A particle that is pushed along never comes back; with a parameter that is no number nothing is found."""
+    pushed = on_a_line(lambda size, x, v, t: size * (1 + v**2))
+    found = jax.jit(jax.vmap(lambda size: jj.periodic(pushed.replace(size=size), {"x_rate": 0.5}, 0.5, pieces=1).converged))
+    assert not np.any(found(jnp.array([1.0, jnp.nan])))
