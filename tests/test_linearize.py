@@ -223,6 +223,7 @@ def test_speeds_are_chosen_at_the_state_where_those_of_the_domain_do_not_serve(h
     assert_allclose(small.state_eigenvalues().real, [-1.0, 0.0, 0.0, 0.0, 0.0, 0.0], atol=1e-6)
     in_jit = jax.jit(lambda u: linearize(scene, jj.consistent(scene, 0.0, state.q, u), ()))(state.u)
     assert in_jit.pivot < 1e-12
+    assert in_jit.code == 6
     assert np.isnan(in_jit.A).all()
     with pytest.raises(ValueError, match="do not follow from its rows at this state"):
         linearize(scene, state, (), privileged=("heading_rate", "steer_rate"))

@@ -225,3 +225,28 @@ def test_a_linearization_at_rest_on_dry_friction_says_so():
         warnings.simplefilter("error")
         jj.linearize(scene, {"y_rate": 0.1})
         jax.jit(lambda u: jj.linearize(scene, jj.start(scene, y_rate=u)).A)(0.1)
+
+
+ONE_SIGN = {  # at all probed states; u_y(4) from rest at x = 0 with 3 m/s along x
+    "of a place": (lambda m, p: jnp.abs(m.q.x - 5.0), 12.5 / 3 + 49.0 / 6),
+    "by a root": (lambda m, p: jnp.sqrt((m.q.x - 5.0) ** 2), 12.5 / 3 + 49.0 / 6),
+    "of a time": (lambda m, p: jnp.abs(m.t - 1.0), 5.0),
+    "of a length": (lambda m, p: jnp.hypot(m.t - 1.0, 0.0), 5.0),
+    "a bump": (lambda m, p: jnp.maximum(0.0, 1.0 - jnp.abs(m.q.x - 6.0)), 1.0 / 3),
+}
+
+
+@pytest.mark.parametrize("backend", ["auto", "xla"])
+@pytest.mark.parametrize("name", ONE_SIGN)
+def test_a_magnitude_goes_on_past_its_switch(name, backend):
+    push, expected = ONE_SIGN[name]
+    motion = jj.simulate(Pushed(push=push), {"x_rate": 3.0}, ts=[4.0], rtol=1e-9, atol=1e-9, backend=backend)
+    assert motion.succeeded
+    assert float(motion["y_rate"][-1]) == pytest.approx(expected, abs=2e-3)
+
+
+def test_a_magnitude_is_written_as_text():
+    """The hypotenuse holds an infinity."""
+    source = jj.lower(Pushed(push=ONE_SIGN["of a length"][0])).python_source()
+    assert "abs(t - 1.0)" in source
+    assert "math.inf" in source

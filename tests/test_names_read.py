@@ -130,6 +130,8 @@ HAS_STATE = {
     "SimpleNamespace": "k = types.SimpleNamespace(a=1.0)",
     "ContextVar": "k = contextvars.ContextVar('k', default=1.0)",
     "dataclass": "@dataclasses.dataclass\nclass Two:\n    a: float = 1.0\nk = Two()",
+    "class beneath a dataclass": TWO_FIELDS + "class Beneath(Two): pass\nk = Beneath()",
+    "frozen dataclass with a list of its own": TWO_FIELDS + "k = Two()\nobject.__setattr__(k, 'more', [1.0])",
     "frozen dataclass with a list": TWO_FIELDS + "k = Two(b=[1.0])",
     "object": "class Own: pass\nk = Own()",
     "object with slots": "class Own:\n    __slots__ = ('a',)\nk = Own()",

@@ -1,5 +1,6 @@
 """Rows that are nonlinear in the speeds and lose their slope where these vanish: no motion is determined beyond, whatever times are saved."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -60,6 +61,20 @@ def test_no_lane_goes_through_a_row_that_is_lost(name, options):
     stops = jnp.concatenate([ts[lanes // 2 : lanes], jnp.linspace(0.3, 1.7, lanes // 2)])  # half of them are saved times
     pulls = jnp.asarray(np.random.default_rng(len(name)).choice([0.0, 0.7, 2.0], lanes))
     assert not np.isin(jax.jit(jax.vmap(code))(stops, pulls), (results.SUCCESS, results.EVENT)).any()
+
+
+@pytest.mark.parametrize("backend", ["native", "xla"])
+def test_no_step_is_so_long_that_it_misses_the_loss(backend):
+    """Whatever the tolerance and the saved times: a step may begin as far before the loss as it ends behind."""
+    row, speeds = ROWS["speed"]
+
+    def code(ts, tolerance):
+        options = {"solver": diffrax.Tsit5(), "rtol": tolerance, "atol": tolerance, "backend": backend}
+        return _end(_scene(row, 1.0, 0.3), speeds, ts=ts, **options).result
+
+    times = jnp.array([[0.1, 0.2, 2.0], [2 / 3, 4 / 3, 2.0]])
+    found = jax.jit(jax.vmap(jax.vmap(code, (None, 0)), (0, None)))(times, jnp.array([1e-3, 1e-4, 1e-5, 1e-6]))
+    assert np.all(found == results.STEP_TOO_SMALL)
 
 
 @pytest.mark.parametrize("backend", ["native", "dense"])

@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Int
 
 from jourdain_jax.analysis.families.critical import Sensitivities, sensitivities
 from jourdain_jax.analysis.families.spectrum import mode_names
@@ -39,6 +39,7 @@ from jourdain_jax.lowering.kinks import bent_load
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import as_state
+from jourdain_jax.motion.trajectories import results
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, shown_from_users_lines, users_level
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.printing import Printed
@@ -83,6 +84,11 @@ class Linearization(Printed, eqx.Module):
 
     def _text(self) -> str:
         return linearization_text(self)
+
+    @property
+    def code(self) -> Int[Array, ""]:
+        """0, or `SINGULAR_PARTITION` where the privileged speeds and coordinates do not determine the others: all is NaN there."""
+        return jnp.where(self.pivot >= SMALLEST_PIVOT, results.SUCCESS, results.SINGULAR_PARTITION)
 
     def eigenvalues(self) -> Complex[Array, "modes"]:
         """Roots of `det(M s^2 + C s + K) = 0`, 1/s, by ascending real part. Differentiable where distinct."""
@@ -153,7 +159,7 @@ def linearize(
     Nothing is integrated and nothing searched for, so that no field of `jj.Options` would mean anything; `jj.build` settles the backend.
 
     **Returns** a `Linearization`. Pure: runs under jit, vmap and differentiation, over scene parameters and the state. Where the privileged speeds do not
-    determine the others, all is NaN there and `pivot` is zero, or nearly: name others.
+    determine the others, all is NaN there and `code` is not 0: name others.
 
     **Raises** ValueError: an unknown coordinate or speed, a coordinate that is both named and dependent, or whose rate is no privileged speed; at a known
     state, speeds or coordinates that do not determine the others there.

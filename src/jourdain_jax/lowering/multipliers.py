@@ -35,7 +35,7 @@ class Accelerations(NamedTuple):
     sines: list[int]  # one per row, between that row and those before it; or the pivots of privileged speeds
     margins: list[int]  # must stay positive: what is left of each entry, above its least
     usual: dict[int, int]  # inputs for the usual value of an entry, with the node of that entry
-    directions: Columns = []  # that rows must not leave by more than a right angle within a step
+    directions: Columns = []  # that rows must not leave within a step
     squares: list[int] = []  # of rows by turns: what is left of an entry, and its size; the ratio is a squared sine
 
 

@@ -141,18 +141,22 @@ class NormalForms:
         return None
 
     def _absolute(self, p: Polynomial) -> Polynomial:
-        """|p|, a product factor by factor: what the sign of one is says nothing of another's."""
+        """|p|, a product factor by factor."""
         if len(p) != 1:
-            return self._magnitude(self.rebuilt(p))
+            return self._kept_absolute(self.rebuilt(p))
         ((monomial, c),) = p.items()
-        return self._times({(): abs(c)}, self._magnitude, monomial)
+        return self._times({(): abs(c)}, self._kept_absolute, monomial)
+
+    def _kept_absolute(self, node: int) -> Polynomial:
+        value = self.graph.call("abs", node)
+        return self._atom(value) if self.graph.op[value] == "abs" else self.expanded(value)
 
     def _magnitude(self, node: int) -> Polynomial:
-        sign = self._sign(node) if self.graph.varies[node] or self.graph.is_const(node) else 0  # parameters may have either sign
+        """|x| that comes out of a root. That of a sine or a cosine, as lengths in contacts have it, is the one of the probed states; a guard says where."""
+        sign = self._sign(node) if self.graph.op[node] in ("sin", "cos") and self.graph.varies[node] else 0
         if sign == 0:
-            return self._atom(self.graph.call("abs", node))
-        if not self.graph.is_const(node):
-            self.guards.add(node if sign > 0 else self.graph.neg(node))
+            return self._kept_absolute(node)
+        self.guards.add(node if sign > 0 else self.graph.neg(node))
         return self.expanded(node if sign > 0 else self.graph.neg(node))
 
     def _reciprocal(self, p: Polynomial) -> Polynomial:

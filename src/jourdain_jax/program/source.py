@@ -15,6 +15,7 @@ class Language:
     name: str  # the field of an operation that says how it is written
     library: str
     assignment: str
+    infinity: str
 
     @property
     def names(self) -> set[str]:
@@ -27,8 +28,8 @@ class Language:
         return f"({form.format(*operands)})" if "{" in form else f"{form}({', '.join(operands)})"
 
 
-PYTHON = Language("python", "math.", "    {name} = {value}")
-C = Language("c", "", "    const double {name} = {value};")
+PYTHON = Language("python", "math.", "    {name} = {value}", "math.inf")
+C = Language("c", "", "    const double {name} = {value};", "INFINITY")
 
 
 def statements(graph: Graph, outputs: Sequence[int], names: Mapping[int, str], language: Language, prefix: str = "s") -> tuple[list[str], list[str]]:
@@ -64,7 +65,7 @@ def _expression(graph: Graph, node: int, written, language: Language) -> tuple[s
     op, args = graph.op[node], graph.args[node]
     if op == "const":
         value = graph.value[node]
-        text = repr(int(value)) + ".0" if value == int(value) and abs(value) < 1e15 else repr(value)
+        text = repr(value) if abs(value) < float("inf") else language.infinity if value > 0 else f"-{language.infinity}"
         return text, 9 if value >= 0 else 1
     if op == "input":
         return str(graph.value[node]), 9

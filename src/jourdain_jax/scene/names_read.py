@@ -138,8 +138,9 @@ def key(x: Any) -> Hashable:
         return type(x), tuple(map(key, x)) if isinstance(x, tuple) else frozenset(map(key, x))
     if isinstance(x, functools.partial):
         return type(x), key(x.func), key(x.args), tuple((name, key(value)) for name, value in x.keywords.items())
-    if is_dataclass(x) and not isinstance(x, type) and vars(type(x))["__dataclass_params__"].frozen:
-        return type(x), tuple(key(getattr(x, field.name, None)) for field in fields(x))
+    if is_dataclass(x) and not isinstance(x, type) and getattr(vars(type(x)).get("__dataclass_params__"), "frozen", False):
+        own = {field.name: getattr(x, field.name, None) for field in fields(x)} | getattr(x, "__dict__", {})
+        return type(x), tuple((name, key(value)) for name, value in own.items())
     if _is_constant(x):
         return _Same(x)
     raise StatefulError

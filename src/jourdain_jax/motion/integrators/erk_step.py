@@ -39,6 +39,7 @@ from jourdain_jax.motion.integrators.problem import Problem, as_in
 from jourdain_jax.motion.trajectories import results
 
 NOISE = 0.6  # exponent of round-off: its power 0.6 counts as noise anywhere, and no more than its power 0.4
+LEAST_SHARE = 0.5  # of the slope of a row nonlinear in the speeds, along what it was: a step in which less is left is tried again
 NEAR_SINE, AMPLIFIED = 0.1, 16.0  # below it rows are about to lose rank; the number of round-offs over its square that count as noise
 
 
@@ -302,7 +303,8 @@ def _watching(problem: Problem, monitored: bool):
 
 def _pivots(seen: Float[Array, "stages pivots *lanes"], directions: Float[Array, "stages rows speeds *lanes"]) -> Pivots:
     lowest, highest = jnp.min(seen, axis=0), jnp.max(seen, axis=0)
-    turned = ~jnp.all(jnp.sum(directions[0] * directions, axis=2) > 0, axis=(0, 1))
+    along = jnp.sum(directions[0] * directions, axis=2)  # of those at the start
+    turned = ~jnp.all(along > LEAST_SHARE * along[0], axis=(0, 1))
     return Pivots(jnp.min(jnp.minimum(jnp.abs(lowest), jnp.abs(highest)), axis=0, initial=jnp.inf), jnp.any((lowest < 0) & (highest > 0), axis=0) | turned)
 
 

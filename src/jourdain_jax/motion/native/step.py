@@ -12,7 +12,7 @@ import numpy as np
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.integrators.crossings import Crossings, Watched, noted, reach, unless_zero
 from jourdain_jax.motion.integrators.crossings import watched as watched_by
-from jourdain_jax.motion.integrators.erk_step import AMPLIFIED, NEAR_SINE, NOISE
+from jourdain_jax.motion.integrators.erk_step import AMPLIFIED, LEAST_SHARE, NEAR_SINE, NOISE
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING, Search, advanced, any_of, chosen, decided, is_flat
 from jourdain_jax.motion.integrators.explicit_steps import Aim, Method, aimed, judged, taken
 from jourdain_jax.motion.native.layout import Form, Lanes, copied, each_row, for_rows, over_rows
@@ -345,9 +345,10 @@ def put_near_rows(w: Writer, form: Form, state: Value, near: Value, t: Value, y:
 
 
 def _turns_round(w: Writer, form: Form, first: list[Value], now: list[Value]) -> Value:
-    """Return whether the angle between a direction of a row and its first direction is not acute."""
-    acute = [reduce(operator.add, (first[k] * now[k] for k in row)) > 0.0 for row in form.directions]
-    return ~reduce(operator.and_, acute) if acute else w.literal(0, w.truth)
+    """Return whether the part of a row's slope along its first one has fallen below its least share."""
+    along = lambda row, slope: reduce(operator.add, (first[k] * slope[k] for k in row))  # noqa: E731
+    lasting = [along(row, now) > LEAST_SHARE * along(row, first) for row in form.directions]
+    return ~reduce(operator.and_, lasting) if lasting else w.literal(0, w.truth)
 
 
 def weighted(w: Writer, weights: np.ndarray, k: Value, form: Form, row: int | Value) -> Value:
