@@ -202,16 +202,25 @@ class _Shooting(eqx.Module):
 
     def ends(self, t, x: Float[Array, "unknowns"]) -> Float[Array, "pieces states"]:
         """All f_k."""
-        return jax.vmap(lambda k, z: self.moved(k, z, t, self.pieces_of(x)[1]))(jnp.arange(self.pieces), self.pieces_of(x)[0])
-
-    def slopes(self, t, x: Float[Array, "unknowns"]) -> tuple[Array, Array]:
-        """df_k/dz_k and df_k/dT."""
         zs, period = self.pieces_of(x)
-        return jax.vmap(lambda k, z: jax.jacfwd(self.moved, (1, 3))(k, z, t, period))(jnp.arange(self.pieces), zs)
+        return jax.vmap(self.moved, (0, 0, None, None))(jnp.arange(self.pieces), zs, t, period)
+
+    def slopes(self, t, x: Float[Array, "unknowns"]) -> tuple[Array, Array, Array]:
+        """df_k/dz_k, df_k/dT, and f_k."""
+        zs, period = self.pieces_of(x)
+
+        def of_piece(k, z):
+            def end(z, period):
+                return (found := self.moved(k, z, t, period)), found
+
+            (D, of_period), found = jax.jacfwd(end, (0, 1), has_aux=True)(z, period)
+            return D, of_period, found
+
+        return jax.vmap(of_piece)(jnp.arange(self.pieces), zs)
 
     def look(self, t, x: Float[Array, "unknowns"]) -> tuple[Array, Array]:
         """R and dR/dx."""
-        ends, (D, of_period) = self.ends(t, x), self.slopes(t, x)
+        D, of_period, ends = self.slopes(t, x)
 
         def linear(change):
             dz, dT = self.pieces_of(change)
@@ -219,15 +228,15 @@ class _Shooting(eqx.Module):
 
         return self.rows(t, x, ends), jax.jacfwd(linear)(jnp.zeros_like(x))
 
-    def multipliers(self, t, x: Float[Array, "unknowns"]) -> Complex[Array, "multipliers"]:
-        """Eigenvalues of M_n .. M_1, the largest first, without the one of going on along the motion where the period is unknown."""
+    def multipliers(self, t, x: Float[Array, "unknowns"], D: Float[Array, "pieces states states"], ends) -> Complex[Array, "multipliers"]:
+        """Eigenvalues of M_n .. M_1 by df_k/dz_k and f_k, the largest first, without the one of going on along the motion where the period is unknown."""
         (zs, period), kept, known, n = self.pieces_of(x), np.array(self.kept), structure_of(self.scene), self.pieces
         places = kept[kept < len(self.scene.coordinate_names.entries)]
         rank = np.linalg.matrix_rank(known.closure_slopes[0][:, places]) if known.closure_slopes.size else 0
         count = len(places) - int(rank) + known.degrees_of_freedom
         there = jnp.roll(zs, -1, axis=0)
-        signs = jax.vmap(jax.jacfwd(self.aligned))(self.ends(t, x), there)
-        D = (signs @ self.slopes(t, x)[0])[:, kept][:, :, kept]
+        signs = jax.vmap(jax.jacfwd(self.aligned))(ends, there)
+        D = (signs @ D)[:, kept][:, :, kept]
         C = jax.vmap(lambda k, z: self.constraints(t + k * period / n, z)[1])(jnp.arange(n), zs)[:, :, kept]
         L = jnp.linalg.svd(jax.lax.stop_gradient(C))[2][:, len(kept) - count :]  # a basis of what the constraints leave
         B = jax.vmap(lambda C, L: L.T - pseudo_inverse(C, 1e-9) @ (C @ L.T))(C, L)
@@ -259,15 +268,17 @@ def _found(problem: _Shooting, start: State, period: Float[Array, ""]) -> Period
     found = jax.lax.stop_gradient(damped_search(lambda x: still.look(t, x), guess, size, tolerance))
     inverse, x = size[:, None] * pseudo_inverse(found.J, 1e-9), found.best
     x = jnp.where(size > 0, x, jnp.append(jnp.tile(begun, problem.pieces), period))  # what is held, with its derivatives
-    for _ in range(3):  # each carries one order of derivatives
-        x = x - inverse @ problem.rows(t, x, problem.ends(t, x))
+    x = jax.lax.scan(lambda x, _: (x - inverse @ problem.rows(t, x, problem.ends(t, x)), None), x, length=3)[0]  # one order of derivatives each
     zs, period = problem.pieces_of(x)
-    ends = problem.ends(t, x)
+    D, _, ends = problem.slopes(t, x)
     residual = jnp.max(jnp.abs(problem.rows(t, x, ends)))
-    whole = jax.lax.stop_gradient(problem).motion(t, zs[0], t + period * np.linspace(0.01, 1.0, 100))
-    values = jax.vmap(problem.events)(whole.ts, jnp.concatenate([whole.q, whole.u], axis=1))
-    stopped = jnp.any((values < 0) & (np.arange(values.shape[1]) != problem.until))
+    others = [k for k in range(len(names_of_events(problem.scene))) if k != problem.until]
+    goes_on = jnp.array(True)
+    if others:
+        whole = jax.lax.stop_gradient(problem).motion(t, zs[0], t + period * np.linspace(0.01, 1.0, 100))
+        values = jax.vmap(problem.events)(whole.ts, jnp.concatenate([whole.q, whole.u], axis=1))
+        goes_on = jnp.all(values[:, np.array(others)] >= 0)
     n, names = len(start.q), problem.scene.coordinate_names.entries
     shifts = {name: ends[-1, k] - zs[0, k] for k, name in enumerate(names) if k not in problem.kept or name in problem.shifted}
     state = State(t, zs[0, :n], zs[0, n:], start.moved_q, start.moved_u, residual, (problem.scene.coordinate_names, problem.scene.speed_names))
-    return PeriodicMotion(state, period, shifts, problem.multipliers(t, x), residual, (residual < 1e-8) & ~stopped)
+    return PeriodicMotion(state, period, shifts, problem.multipliers(t, x, D, ends), residual, (residual < 1e-8) & goes_on)
