@@ -24,7 +24,7 @@ CEILINGS = {
     "ways: state put back onto its constraints within a step": 1,
     "ways: rows and their slopes for a projection": 2,
     "ways: damped least squares": 2,
-    "code tokens of tests": 308_733,
+    "code tokens of tests": 308_744,
     "code tokens of bench": 99_987,
     "test files that reach private names": 36,
 }
