@@ -10,7 +10,8 @@ dz_k = B_k x_k that meet the constraints, and L_k B_k = 1,
 
 which are n-th powers of eigenvalues of the cyclic matrix with the blocks M_k: so small and large multipliers keep their digits side by side. R has
 more rows than it needs, which agree; the pseudo-inverse of its slopes at the root carries the derivatives with respect to parameters.
-Source: R. Seydel, Practical Bifurcation and Stability Analysis (2010), sections 7.4 and 7.6.
+Source: R. Seydel, Practical Bifurcation and Stability Analysis (2010), chapter 7; multipliers without products: T. F. Fairgrieve and
+A. D. Jepson, SIAM J. Numer. Anal. 28 (1991) 1446.
 """
 
 from collections.abc import Mapping
@@ -42,7 +43,7 @@ from jourdain_jax.motion.options import SPAN, AllOptions, MotionFields, OptionFi
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.simulate import as_state, simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
-from jourdain_jax.scene.names import as_names, nearest
+from jourdain_jax.scene.names import as_names, check_name
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
@@ -121,12 +122,12 @@ def periodic(
         raise ValueError(f"`pieces` is {pieces!r}, expected a whole number of at least 1")
     events, held, entries = names_of_events(scene), as_names(held), scene.coordinate_names.entries
     names = entries + scene.speed_names.entries
-    if until is not None and until not in events:
-        raise ValueError(f"`until` names `{until}`, which is no event of `{type(scene).__name__}`; {nearest(until, events)}")
-    shift = dict(shift or {})
-    for name, valid in [*((name, names) for name in held), *((name, entries) for name in shift)]:
-        if name not in valid:
-            raise ValueError(f"`{type(scene).__name__}` has no `{name}` to hold or to shift; {nearest(name, valid)}")
+    who, shift = f"`{type(scene).__name__}`", dict(shift or {})
+    if until is not None:
+        check_name(until, events, f"`until` names `{until}`, which is no event of {who}")
+    for given, valid in ((held, names), (shift, entries)):
+        for name in given:
+            check_name(name, valid, f"{who} has no `{name}` to hold or to shift")
     start = as_state(modelled(built), guess, what="guess", inputs=inputs_at(inputs, 0.0))
     instant = instant_of(built, structure_of(scene).independent)
     carried = unseen(instant, scene)
