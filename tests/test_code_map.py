@@ -13,19 +13,19 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 440_879,
+    "code tokens of src": 438_194,
     "code tokens of docs": 11_441,
     "code tokens of notebooks": 7_444,
     "caches": 49,
-    "named numbers": 268,
-    "tests for a tracer": 77,
+    "named numbers": 266,
+    "tests for a tracer": 60,
     "functions with more than 8 parameters": 2,
     "ways: state put onto its constraints": 3,
     "ways: state put back onto its constraints within a step": 1,
     "ways: rows and their slopes for a projection": 2,
     "ways: damped least squares": 2,
-    "code tokens of tests": 308_744,
-    "code tokens of bench": 99_987,
+    "code tokens of tests": 308_728,
+    "code tokens of bench": 99_973,
     "test files that reach private names": 36,
 }
 

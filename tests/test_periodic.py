@@ -58,7 +58,7 @@ def test_a_driven_sleigh_has_its_orbit_and_multipliers():
     assert set(orbit.shift) == {"x", "y"}
     again = jj.simulate(DrivenSleigh(), orbit.state, t1=float(orbit.period), rtol=1e-12, atol=1e-12)
     assert_allclose(again.u_end, orbit.state.u, atol=1e-11)
-    assert_allclose([again.q_end[0], again.q_end[1]], [orbit.shift["x"], orbit.shift["y"]], atol=1e-10)
+    assert_allclose(again.q_end[:2], [orbit.shift["x"], orbit.shift["y"]], atol=1e-10)
     assert "periodic motion of 3.14159" in str(orbit)
 
 
@@ -77,10 +77,7 @@ def test_a_limit_cycle_has_its_period(guess):
     """The multiplier is exp of the integral of the divergence, here by SciPy; period: 6.6632868593231 s for a damping of one."""
     orbit = jj.periodic(VAN_DER_POL, guess, 6.0, until="crossing")
     assert float(orbit.period) == pytest.approx(6.6632868593231301, abs=1e-12)
-
-    def rates(t, y):
-        return [y[1], (1 - y[0] ** 2) * y[1] - y[0], 1 - y[0] ** 2]
-
+    rates = lambda t, y: [y[1], (1 - y[0] ** 2) * y[1] - y[0], 1 - y[0] ** 2]  # noqa: E731
     growth = solve_ivp(rates, (0, float(orbit.period)), [0.0, float(orbit["x_rate"]), 0.0], method="DOP853", rtol=1e-12, atol=1e-12).y[2, -1]
     assert_allclose(orbit.multipliers, [np.exp(growth)], rtol=1e-9)
 
@@ -147,15 +144,20 @@ def test_orbits_side_by_side_have_multipliers_of_one():
     assert_allclose(np.abs(orbit.multipliers), 1.0, atol=1e-6)
 
 
-def test_what_is_asked_wrongly_is_named():
-    with pytest.raises(ValueError, match=r"`until` names `crosing`.*crossing"):
-        jj.periodic(VAN_DER_POL, {}, 6.0, until="crosing")
-    with pytest.raises(ValueError, match=r"`period` is 0\.0, expected a positive time"):
-        jj.periodic(VAN_DER_POL, {}, 0.0)
-    with pytest.raises(ValueError, match="no `xx` to hold"):
-        jj.periodic(VAN_DER_POL, {}, 6.0, held="xx")
-    with pytest.raises(ValueError, match="`pieces` is 0"):
-        jj.periodic(VAN_DER_POL, {}, 6.0, pieces=0)
+WRONG = {
+    "`until` names `crosing`.*crossing": {"until": "crosing"},
+    "in `Line` loads do; give `period` alone": {"until": "crossing"},
+    "`period` is 0.0, expected a positive time": {"period": 0.0},
+    "no `xx` to hold": {"held": "xx"},
+    "`pieces` is 0": {"pieces": 0},
+    r"periodic\(\) takes no `events`": {"events": False},
+}
+
+
+@pytest.mark.parametrize("said", WRONG)
+def test_what_is_asked_wrongly_is_named(said):
+    with pytest.raises((ValueError, TypeError), match=said):
+        jj.periodic(INVERTED, {}, **{"period": 6.0, **WRONG[said]})
 
 
 def test_a_motion_that_is_none_says_so():

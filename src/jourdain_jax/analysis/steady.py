@@ -3,7 +3,7 @@
     g(t, q) = 0,   phi(t, q, u) = 0,   dy/dt = 0,   qdot_j = 0        y: the privileged speeds;  j: the coordinates not ignorable
 
 These are the equations of families of steady motions, too (`instant.py`). Whether what was found is steady is then judged without that list, by dy/dt and
-d2y/dt2 along the motion. Levenberg-Marquardt from the guess (`calculus/damped`).
+d2y/dt2 along the motion. Levenberg-Marquardt from the guess (`calculus/roots.py`).
 """
 
 from collections.abc import Mapping
@@ -16,12 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jourdain_jax.analysis.families.equations import sizes
 from jourdain_jax.analysis.instant import ByMatrices, ByProgram, instant_of, on_rows, places_of, unseen
 from jourdain_jax.analysis.tangent import privileged_speeds
-from jourdain_jax.build.assembling import coordinate_bounds
-from jourdain_jax.calculus.matrices import pseudo_inverse
 from jourdain_jax.calculus.reals import RUN_SELDOM, Number, Numbers, compiled, described
-from jourdain_jax.calculus.roots import damped_search
+from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, shown_from_users_lines
@@ -30,7 +29,6 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 _REFUSED = dict.fromkeys({*SPAN, *OPTION_NAMES} - {"max_steps"}, "no motion is integrated; `max_steps` bounds the search, and a backend goes to `jj.build`")
-_SPEEDS = 10.0  # size of a speed, SI units: how far it moves in some steps of the search
 
 
 class SteadyMotion(Printed, eqx.Module):
@@ -154,15 +152,11 @@ def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], most_steps: i
 
 
 def _root(problem: _Problem, z: Float[Array, "unknowns"], free: Bool[Array, "unknowns"], most_steps: int) -> Float[Array, "unknowns"]:
-    """The root near z: a search without derivative, then steps `z <- z - J+ R(z)` with the J found, which carry one order of derivative each."""
+    """The root near z."""
     still, guess, movable = jax.lax.stop_gradient((problem, z, free))
-    low, high = coordinate_bounds(problem.scene)
-    sizes = np.concatenate([np.where(high > low, high - low, 1.0), np.full(z.shape[0] - low.size, _SPEEDS)])
-    size = jnp.where(movable, jnp.asarray(sizes, z.dtype), 0.0)
-    found = damped_search(lambda z: still(z)[:2], guess, size, float(np.finfo(z.dtype).eps), most_steps=most_steps)
-    found = jax.lax.stop_gradient(found)
-    inverse = size[:, None] * pseudo_inverse(found.J, _round_off_root(z.dtype))
-    return jax.lax.scan(lambda z, _: (z - inverse @ problem(z)[0], None), jnp.where(free, found.best, z), length=3)[0]
+    size = jnp.where(movable, jnp.asarray(sizes(problem.scene, range(len(places_of(problem.scene).q))), z.dtype), 0.0)
+    eps, cutoff = float(np.finfo(z.dtype).eps), _round_off_root(z.dtype)
+    return smooth_root(lambda z: still(z)[:2], lambda z: problem(z)[0], guess, z, size, eps, cutoff, most_steps)
 
 
 def _round_off_root(dtype) -> float:

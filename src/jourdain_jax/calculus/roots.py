@@ -28,6 +28,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
+from jourdain_jax.calculus.matrices import pseudo_inverse
 from jourdain_jax.calculus.reals import with_usual_promotion
 
 
@@ -129,6 +130,17 @@ def damped_search(
     unknown = jnp.full(f.shape, jnp.inf, f.dtype), jnp.zeros(J.shape, J.dtype)
     start = Search(guess, guess, *unknown, jnp.full((), 6e-2, f.dtype), jnp.zeros((), jnp.int32), jnp.array(True))
     return jax.lax.while_loop(lambda search: search.going, once, start)
+
+
+def smooth_root(look: Callable, rows: Callable, guess: Float[Array, "unknowns"], x, size, tolerance, cutoff: float, most_steps=80) -> Float[Array, "unknowns"]:
+    """The root near a guess, differentiable: a search without derivative, then steps `x <- x - J+ R(x)` with the J found, which carry one order each.
+
+    `look`: x -> R and J, of numbers without derivatives; `rows`: x -> R; `x`: values of what is held (of size zero), with their derivatives; `cutoff`: of J+.
+    All else is as for `damped_search`.
+    """
+    found = jax.lax.stop_gradient(damped_search(look, jax.lax.stop_gradient(guess), size, tolerance, most_steps=most_steps))
+    inverse = size[:, None] * pseudo_inverse(found.J, cutoff)
+    return jax.lax.scan(lambda x, _: (x - inverse @ rows(x), None), jnp.where(size > 0, found.best, x), length=3)[0]
 
 
 def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, tolerance: float, good: float, *bounds) -> tuple[Nearest, Int[Array, ""]]:

@@ -6,7 +6,7 @@ Both give states at the saved times, which of those were reached, and where and 
 Two more checks are result codes, inside `jit` and in every lane. Where nothing does work that no potential accounts for, T + V is constant for a right motion.
 Step-size control leaves in each number y of the state an error of about `atol + rtol |y|` per step. With dE the change of the energy by errors of that size in
 all numbers together, N steps change the energy by some N dE, and round-off by some N eps of it. Over all models, at tolerances from 1e-4 to 1e-11, no drift is
-larger than half of N dE (`bench/energy_drift.py`); ten times as much, and at least 1 % of the energy that moves, means that the motion is not that of the
+larger than half of N dE; ten times as much, and at least 1 % of the energy that moves, means that the motion is not that of the
 scene: it went through a singular position, or over a feature, without notice. And rows that depend on each other may contradict each other on the way,
 
     A u + phi_0 = 0,   rank A < number of rows:   a row that is left out holds by itself only where phi_0 is in the range of A

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool
 
 from jourdain_jax.build.sampling import guesses_of
 from jourdain_jax.build.structure import structure_of
-from jourdain_jax.calculus.reals import RUN_SELDOM, Number, Numbers, at_once, compiled, described, is_traced, known_numbers
+from jourdain_jax.calculus.reals import RUN_SELDOM, Number, Numbers, at_once, compiled, described, is_traced, known_numbers, nothing_is_traced
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import closure_residual
@@ -53,7 +53,7 @@ def consistent(scene: Scene | BuiltFor, t, q: Numbers, u: Numbers, inputs=None, 
 def _consistent(scene: Scene, t, start: Guess, inputs, guesses: Callable | None = None) -> State:
     """Return the nearest state; where Newton's method does not arrive, what a damped search finds from q, and then from other configurations, `guesses()`."""
     given = scene, t, start, inputs
-    if is_traced(given):
+    if not nothing_is_traced() and is_traced(given):  # the first takes less time
         return _compiled_projection(*given, None if guesses is None else guesses())[0]
     # numbers are put onto the rows at once, also where a function around this call is being traced; elsewhere that would compile constants one by one
     with at_once():

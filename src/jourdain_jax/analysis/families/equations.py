@@ -49,7 +49,7 @@ class SteadyEquations:
         columns = np.concatenate([at.q[kept], at.u])
         self.places = np.concatenate([first + columns, varied]).astype(int)
         self.unknowns = (*(self.names[k] for k in kept), *scene.speed_names.entries, *([] if vary is None else [vary]))
-        self.size = sizes(scene, kept.tolist(), self.given[self.places])
+        self.size = np.append(sizes(scene, kept.tolist()), [abs(x) or 1.0 for x in self.given[varied]])
         self.states_of_z = [*range(len(kept)), *(len(kept) + k for k in y)]
         columns = np.concatenate([columns, [-1] if varied else []]).astype(int)
         self.rows = np.concatenate([at.g, at.phi, at.udot[y], at.qdot[matters]])
@@ -111,10 +111,8 @@ class SteadyEquations:
         return q, u, numbers[self.places[-1]] if self.vary else 0 * numbers[0] + np.nan
 
 
-def sizes(scene: Scene, kept: Sequence[int], values: np.ndarray) -> np.ndarray:
-    """Sizes of some coordinates, of all speeds and of parameters with these values after them: the unknowns' units."""
+def sizes(scene: Scene, kept: Sequence[int]) -> np.ndarray:
+    """Sizes of some coordinates, by their domain, and of all speeds: the units in which unknowns are measured."""
     low, high = coordinate_bounds(scene)
     of_coordinates = [high[k] - low[k] if high[k] > low[k] else 1.0 for k in kept]
-    of_speeds = [10.0] * len(scene.speed_names.entries)  # SI units
-    of_parameter = [abs(x) if x else 1.0 for x in values[len(of_coordinates) + len(of_speeds) :]]
-    return np.array([*of_coordinates, *of_speeds, *of_parameter])
+    return np.array([*of_coordinates, *[10.0] * len(scene.speed_names.entries)])  # SI units

@@ -3,13 +3,14 @@
     z_k -> f_k(z_k),  k = 1 .. n:  motions over equal parts of the period T,   z = (q, u)
     R(z_1, .., z_n, T) = ( g(z_1), phi(z_1),  f_k(z_k) - z_{k+1},  f_n(z_n) - z_1 of what matters,  c(z_1) )
 
-c: the value of an event, where T is unknown. Coordinates on which no acceleration depends may shift by as much in every period. With small motions
+c: the value of an event, where T is unknown. Ignorable coordinates may shift by the same amount in every period. With small motions
 dz_k = B_k x_k that meet the constraints, and L_k B_k = 1,
 
     x_{k+1} = M_k x_k,  M_k = L_{k+1} (df_k/dz_k) B_k:       the multipliers are the eigenvalues of M_n .. M_1
 
-which are n-th powers of eigenvalues of the cyclic matrix with the blocks M_k: so small and large multipliers keep their digits side by side. R has
-more rows than it needs, which agree; the pseudo-inverse of its slopes at the root carries the derivatives with respect to parameters.
+They are n-th powers of eigenvalues of the cyclic matrix with the blocks M_k, so that small multipliers keep their digits beside large
+ones. R has more rows than it needs, which agree; the pseudo-inverse of its slopes at the root carries derivatives with respect to
+parameters.
 Source: R. Seydel, Practical Bifurcation and Stability Analysis (2010), chapter 7; multipliers without products: T. F. Fairgrieve and
 A. D. Jepson, SIAM J. Numer. Anal. 28 (1991) 1446.
 """
@@ -33,7 +34,7 @@ from jourdain_jax.build.structure import structure_of
 from jourdain_jax.build.trace import event_values
 from jourdain_jax.calculus.matrices import pseudo_inverse
 from jourdain_jax.calculus.reals import RUN_SELDOM, Number, compiled, known_numbers
-from jourdain_jax.calculus.roots import damped_search
+from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
@@ -49,12 +50,15 @@ from jourdain_jax.scene.scene import Scene
 
 
 class PeriodicMotion(Printed, eqx.Module):
-    """A motion that repeats itself after each period; `orbit["yaw_rate"]` at its start, `jj.simulate(scene, orbit.state, t1=orbit.period)`."""
+    """A motion that repeats itself after each period; `orbit["yaw_rate"]` is a value at its start.
+
+    `jj.simulate(scene, orbit.state, t1=orbit.period)` is the motion itself.
+    """
 
     state: State  # at the start of a period
     period: Float[Array, ""]  # s
-    shift: dict[str, Float[Array, ""]]  # by how much coordinates move in a period: those on which no acceleration depends, and those given
-    multipliers: Complex[Array, "multipliers"]  # by which small motions grow in a period, the largest first
+    shift: dict[str, Float[Array, ""]]  # change of a coordinate in a period: of those that are ignorable, and of those given
+    multipliers: Complex[Array, "multipliers"]  # factors by which small motions grow in a period, the largest first
     residual: Float[Array, ""]  # largest difference after one period, in units of the unknowns' sizes
     converged: Bool[Array, ""]
 
@@ -64,7 +68,7 @@ class PeriodicMotion(Printed, eqx.Module):
 
     @property
     def stable(self) -> Bool[Array, ""]:
-        """Whether no small motion grows; multipliers of symmetries and of conserved quantities are one, often twice, but for round-off."""
+        """Whether no small motion grows; multipliers of symmetries and conserved quantities are one, up to round-off."""
         return jnp.all(jnp.abs(self.multipliers) <= 1 + SURE)
 
     def _text(self) -> str:
@@ -97,12 +101,13 @@ def periodic(
 
     **Arguments**
     - `guess`: a `State`, or named values (a start, as `simulate` takes it), of a state near the motion.
-    - `period`: s; of loads or inputs that repeat themselves, and kept. With `until` a rough one.
-    - `until`: the name of an event of the scene whose value is zero where a period begins and ends; the period is found, too. For scenes in which nothing
-      depends on time.
+    - `period`: s, kept as it is; of loads or inputs that repeat themselves. With `until` a rough value is enough.
+    - `until`: the name of an event of the scene whose value is zero where a period begins and ends; the period is found, too. For scenes
+      in which nothing depends on time.
     - `held`: names of coordinates and speeds that keep the guess's value at the start, where several periodic motions lie side by side.
-    - `shift`: name -> by how much a coordinate moves in a period: `{"crank": 2 * jnp.pi}` of an angle that goes round.
-    - `pieces`: parts of the period over which motions run side by side. More of them serve motions whose disturbances grow by more than 1e3 in a part.
+    - `shift`: name -> change of a coordinate in a period, `{"crank": 2 * jnp.pi}` for an angle that goes round.
+    - `pieces`: number of equal parts of the period, which are integrated side by side. Increase it where disturbances grow by more than
+      1e3 in a part.
     - `options`, `by_name`: as of `simulate`, `inputs` among them; the default tolerance is 1e-12.
 
     **Returns** a `PeriodicMotion`; look at `converged` and `residual`, nothing is raised where none is found. Stop events do not end the
@@ -114,7 +119,8 @@ def periodic(
     built, scene = scene, as_scene(scene)
     inputs = as_inputs(scene, by_name.pop("inputs", None))
     tolerances = {"rtol": 1e-12, "atol": 1e-12} if options is None else {}
-    options = as_options(options, {**tolerances, **by_name}, "periodic", dict.fromkeys(SPAN, "`period` says how long it lasts"), built)
+    beside = "it finds a motion whose length is `period`, which no stop event ends, by runs without work and retries"
+    options = as_options(options, {**tolerances, **by_name}, "periodic", dict.fromkeys((*SPAN, "events", "work", "retry"), beside), built)
     options = replace(options, solver=options.solver or diffrax.Dopri8())  # tolerances are traced below
     if not np.all(known_numbers(period) > 0) or not np.all(np.isfinite(known_numbers(period))):
         raise ValueError(f"`period` is {period}, expected a positive time in s")
@@ -125,6 +131,8 @@ def periodic(
     who, shift = f"`{type(scene).__name__}`", dict(shift or {})
     if until is not None:
         check_name(until, events, f"`until` names `{until}`, which is no event of {who}")
+        if timed := structure_of(scene).timed:
+            raise ValueError(f"`until` finds the period where nothing depends on time, and in {who} {' and '.join(timed)} do; give `period` alone")
     for given, valid in ((held, names), (shift, entries)):
         for name in given:
             check_name(name, valid, f"{who} has no `{name}` to hold or to shift")
@@ -144,7 +152,7 @@ class _Shooting(eqx.Module):
     scene: Scene
     inputs: Inputs
     options: AllOptions
-    shift: Float[Array, "states"]  # by how much what matters moves in a period
+    shift: Float[Array, "states"]  # change in a period, as given
     instant: ByProgram | ByMatrices = eqx.field(static=True)
     pieces: int = eqx.field(static=True)
     until: int | None = eqx.field(static=True)
@@ -155,7 +163,7 @@ class _Shooting(eqx.Module):
     @property
     def sizes(self) -> Float[np.ndarray, "states"]:
         """Sizes of coordinates and speeds."""
-        return sizes(self.scene, range(len(self.scene.coordinate_names.entries)), np.zeros(0))
+        return sizes(self.scene, range(len(self.scene.coordinate_names.entries)))
 
     def motion(self, t0, z: Float[Array, "states"], ts: Float[Array, "times"]):
         """The motion from a state."""
@@ -260,16 +268,13 @@ def _found(problem: _Shooting, start: State, period: Float[Array, ""]) -> Period
     still, z, given = jax.lax.stop_gradient((problem, begun, period))
     motion = still.motion(t, z, t + given * np.arange(1, problem.pieces + 1) / problem.pieces)
     zs = jnp.concatenate([z[None], jnp.concatenate([motion.q, motion.u], axis=1)[:-1]])
-    guess = jax.lax.stop_gradient(jnp.append(jnp.ravel(zs), given))
+    guess, held = jnp.append(jnp.ravel(zs), given), jnp.append(jnp.tile(begun, problem.pieces), period)
     count = len(problem.sizes)
     free = np.ones((problem.pieces, count))
     free[0] = [k in problem.free for k in range(count)]
     size = jnp.append(jnp.asarray(np.ravel(free * problem.sizes)), given if problem.until is not None else 0.0)
-    tolerance = 10.0 * jnp.asarray(problem.options.rtol)
-    found = jax.lax.stop_gradient(damped_search(lambda x: still.look(t, x), guess, size, tolerance))
-    inverse, x = size[:, None] * pseudo_inverse(found.J, 1e-9), found.best
-    x = jnp.where(size > 0, x, jnp.append(jnp.tile(begun, problem.pieces), period))  # what is held, with its derivatives
-    x = jax.lax.scan(lambda x, _: (x - inverse @ problem.rows(t, x, problem.ends(t, x)), None), x, length=3)[0]  # one order of derivatives each
+    rows, tolerance = lambda x: problem.rows(t, x, problem.ends(t, x)), 10.0 * jnp.asarray(problem.options.rtol)
+    x = smooth_root(partial(still.look, t), rows, guess, held, size, tolerance, 1e-9)
     zs, period = problem.pieces_of(x)
     D, _, ends = problem.slopes(t, x)
     residual = jnp.max(jnp.abs(problem.rows(t, x, ends)))

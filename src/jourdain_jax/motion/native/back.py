@@ -11,7 +11,7 @@ and where a motion ended at a stop event, at its time t_e = t - c(t, y)/cdot and
     s = -(g_t + g_y . f)/cdot,   g_y += s dc/dy,   g_p += s dc/dp
 
 As `motion/integrators/recorded_adjoint.py` and `step_adjoint.py` have it. JAX differentiates this once more, by cotangents of the motion with a tangent.
-Let S be the sum of all states, each times its cotangent g, and g' what S' changes by along a tangent. What is asked for is dS/dx, x the start's state and the
+Let S be the sum of all states, each times its cotangent g, and g' what S' changes by along a tangent. The result is dS/dx, where x is the start's state and the
 numbers known. It changes by d(dS)/dx, where dS is the sum of the states times g' and of their tangents times g: cotangents are g' of the states and g of
 their tangents.
 """

@@ -3,7 +3,7 @@
 Where a tangent is pushed along, it follows its state in memory, and each function also gives the tangents of what it gives; others give cotangents:
 
     d f(t, y, p) = df/dy dy + df/dp dp          p: numbers that the rates are given, of which those in `Form.moving` have tangents
-    G_y = (df/dy)' g,   G_p += (df/dp)' g       of those that are asked for
+    G_y = (df/dy)' g,   G_p += (df/dp)' g       for the requested p
 
 and, of derivatives of higher order, the tangents of these along the next direction. A tangent that is pushed along belongs to the state: cotangents of a
 motion with its tangent are what second derivatives consist of.
@@ -179,7 +179,7 @@ LARGEST_DERIVATIVE = 10_000, 40_000
 
 
 class Pulled(NamedTuple):
-    """Cotangents of the state and of what is asked for, on a graph of their own."""
+    """Cotangents of the state and of the requested numbers, on a graph of their own."""
 
     own: Outputs
     found: list[int]
@@ -247,7 +247,7 @@ def pulled_program(form: Form, nodes: Sequence[int], asked: Sequence[int], pushe
 
 
 def _varying(form: Form, own: Outputs, asked: Sequence[int]) -> list[int]:
-    """The nodes of the state, with its tangent, and of what is asked for."""
+    """List the nodes of the state, of its tangent, and of the requested numbers."""
     fixed, _, y, inputs = form.split(own.variables)
     return [*y, *(n for part in own.states for n in part), *([*fixed, *inputs][i] for i in asked)]
 
@@ -257,7 +257,7 @@ def _moved(form: Form, asked: Sequence[int]) -> Pulled:
 
         dt = -dc/cdot,   dy <- dy + f dt,   dc = dc/dy dy + dc/dp dp,   cdot = dc/dt + dc/dy f
 
-    The row after the state is that of dt; after what is asked for comes the derivative of all along time.
+    The row after the state is the one of dt; the last row is the derivative of the whole along time.
     """
     nodes = form.rates
     own = outputs_of(form, [*nodes, *form.program.events], len(nodes) + form.events)

@@ -57,7 +57,7 @@ _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load
 
 @of_known_numbers
 def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
-    """Write a `motion`, one trajectory or a whole rollout, to `path` (`.npz`, format 1 of `motion/storage.py`).
+    """Write a `motion`, one trajectory or a whole rollout, to `path` (`.npz`, format 1 of `motion/trajectories/storage.py`).
 
     A file that is there already is replaced at once, when the new one is whole: an interruption leaves the old one.
     Inputs are stored as samples at the saved times. ValueError where the path is a folder, or the scene has a field that is no array, number or text.
