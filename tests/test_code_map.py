@@ -25,7 +25,7 @@ CEILINGS = {
     "ways: rows and their slopes for a projection": 2,
     "ways: damped least squares": 2,
     "code tokens of tests": 308_728,
-    "code tokens of bench": 99_973,
+    "code tokens of bench": 99_978,
     "test files that reach private names": 36,
 }
 
