@@ -16,7 +16,7 @@ from types import CodeType, FunctionType, MethodType, ModuleType
 import jax
 import numpy as np
 
-from jourdain_jax.scene.names_read import names_in, spaces
+from jourdain_jax.scene.names_read import is_installed, names_in, spaces
 from jourdain_jax.scene.scene import Scene
 
 
@@ -118,17 +118,6 @@ def _function(f: FunctionType, of) -> object:
     if installed:
         return "function", name, around
     return "function", of(f.__code__), of(f.__defaults__), of(f.__kwdefaults__), around, named
-
-
-def is_installed(name: str | None) -> bool:
-    """Whether a module belongs to Python, to an installed package, or to this one."""
-    top = (name or "").partition(".")[0]
-    if top == "__main__":
-        return False
-    if top == __name__.partition(".")[0] or top in sys.builtin_module_names or top in sys.stdlib_module_names:
-        return True
-    file = getattr(sys.modules.get(name or ""), "__file__", None) or ""
-    return "site-packages" in file or "dist-packages" in file
 
 
 def _class(kind: type, of) -> object:

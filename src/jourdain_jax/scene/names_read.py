@@ -3,7 +3,7 @@
 Looked at are the global names and the variables of enclosing functions that a method loads itself:
 
 - numbers, texts and tuples of them are compared by type and value, functions by identity, so that `g = 1.62` in the next cell of a notebook is noticed;
-- modules and classes are constants, as are their attributes;
+- modules and classes are constants, as are their attributes; so is a function that Python, JAX or another package has wrapped, by identity;
 - arrays, containers and objects with state are refused by name: what changes in them could not be seen.
 
 `identity.py` compares them.
@@ -13,6 +13,7 @@ import dis
 import enum
 import functools
 import re
+import sys
 from collections.abc import Callable, Hashable
 from dataclasses import fields, is_dataclass
 from decimal import Decimal
@@ -53,6 +54,17 @@ class _Same:
 
     def __hash__(self):
         return id(self.x)
+
+
+def is_installed(name: str | None) -> bool:
+    """Whether a module belongs to Python, to an installed package, or to this one."""
+    top = (name or "").partition(".")[0]
+    if top == "__main__":
+        return False
+    if top == __name__.partition(".")[0] or top in sys.builtin_module_names or top in sys.stdlib_module_names:
+        return True
+    file = getattr(sys.modules.get(name or ""), "__file__", None) or ""
+    return "site-packages" in file or "dist-packages" in file
 
 
 def own_classes(kind: type) -> tuple[type, ...]:
@@ -130,7 +142,7 @@ def key(x: Any) -> Hashable:
 
     **Raises** StatefulError for what may change: arrays, containers, objects.
     """
-    if type(x) in _VALUES or isinstance(x, np.number | np.bool_ | enum.Enum | PurePath):
+    if type(x) in _VALUES or isinstance(x, np.number | np.bool_ | PurePath):
         return type(x), repr(x)
     if isinstance(x, slice):
         return type(x), key((x.start, x.stop, x.step))
@@ -138,8 +150,8 @@ def key(x: Any) -> Hashable:
         return type(x), tuple(map(key, x)) if isinstance(x, tuple) else frozenset(map(key, x))
     if isinstance(x, functools.partial):
         return type(x), key(x.func), key(x.args), tuple((name, key(value)) for name, value in x.keywords.items())
-    if is_dataclass(x) and not isinstance(x, type) and getattr(vars(type(x)).get("__dataclass_params__"), "frozen", False):
-        own = {field.name: getattr(x, field.name, None) for field in fields(x)} | getattr(x, "__dict__", {})
+    if isinstance(x, enum.Enum) or getattr(vars(type(x)).get("__dataclass_params__"), "frozen", False):
+        own = {field.name: getattr(x, field.name, None) for field in (fields(x) if is_dataclass(x) else ())} | getattr(x, "__dict__", {})
         return type(x), tuple((name, key(value)) for name, value in own.items())
     if _is_constant(x):
         return _Same(x)
@@ -152,4 +164,6 @@ def _is_constant(x: Any) -> bool:
         return x.__self__ is None or isinstance(x.__self__, ModuleType | type)
     if isinstance(x, ModuleType | type | FunctionType | staticmethod | classmethod | property | np.ufunc | jnp.ufunc | functools.cached_property):
         return True
-    return type(x) is object or type(x).__module__ == "typing" or type(x) is eqx.filter_custom_jvp or callable(_attribute(x, "__wrapped__"))
+    if type(x) is object or type(x).__module__ == "typing" or type(x) is eqx.filter_custom_jvp:
+        return True
+    return callable(_attribute(x, "__wrapped__")) and is_installed(type(x).__module__)  # a user's own class of wrappers may have state
