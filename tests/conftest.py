@@ -23,7 +23,7 @@ if importlib.metadata.version("jaxlib").startswith("0.10."):  # from 0.11.1 on, 
 os.environ.setdefault("XLA_FLAGS", quick)
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # no line numbers for each operation of a program
 
-# Every annotated function of these layers is checked, shapes and dtypes included. Not in the layers whose small
+# Every annotated function of these layers that is not inside of another is checked, shapes and dtypes included. Not in the layers whose small
 # functions are called a million times while scenes are traced: there it takes a tenth of the time of all tests.
 LAYERS = ("equations", "dynamics", "motion", "analysis", "ensembles", "models", "bicycle", "plotting", "cli")
 
@@ -125,9 +125,19 @@ def pytest_configure(config: pytest.Config) -> None:
         return  # this process hands out tests: workers start seconds sooner if it does not import JAX first
     gc.disable()  # until all tests are collected: what imports make is there for good
     import jax
-    from jaxtyping import install_import_hook
+    from jaxtyping import _import_hook, install_import_hook
+
+    visit = _import_hook.JaxtypingTransformer.visit_FunctionDef
+
+    def without_inner_functions(transformer, node):
+        """These are made anew with each call of the one around them: making their checks anew each time took a tenth of the time of all tests."""
+        body, node.body = node.body, []
+        visit(transformer, node)
+        node.body = body
+        return node
 
     if os.environ.get("JOURDAIN_JAX_NO_TYPE_CHECKS") != "1":
+        _import_hook.JaxtypingTransformer.visit_FunctionDef = without_inner_functions
         install_import_hook([f"jourdain_jax.{layer}" for layer in LAYERS], "beartype.beartype")  # before any import of the package
     if not config.pluginmanager.hasplugin("cacheprovider"):
         return
