@@ -17,6 +17,7 @@ from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.motion.native.taylor import Series
 from jourdain_jax.native import ffi, host
 from jourdain_jax.native.ir import Writer
+from jourdain_jax.native.scalar_program import written
 from jourdain_jax.program.graph import Graph
 
 pytestmark = machine_code.needed
@@ -31,14 +32,14 @@ def coefficients(graph: Graph, s: int, outputs, at, known=None) -> np.ndarray:
     w = Writer(host.lanes(), host.fuses())
 
     def block(arguments, found):
-        start = w.load(arguments[0].data)
         # z' = f(s), s' = 1: coefficients of z are those of f over their order plus one
+        moved = [s, *(graph.input(f"z{i}", True) for i in range(len(outputs)))]
         given = {clock: w.number(0.0)} | {node: w.number(value) for node, value in (known or {}).items()}
-        series = Series(w, graph, given, [s, *[None] * len(outputs)], [graph.one, *outputs], [start, *[w.number(0.0)] * len(outputs)], ORDER, clock)
-        for i in range(len(outputs)):
-            for k in range(1, ORDER + 1):
-                x = series.state[1 + i][k]
-                w.store(w.number(0.0) if x is None else x * float(k), found[0], (k - 1) * len(outputs) + i)
+        series = Series(graph, given, moved, [graph.one, *outputs], ORDER, clock).state[1:]
+        nodes = [graph.mul(graph.const(k), x[k]) for k in range(1, ORDER + 1) for x in series]
+        start = dict.fromkeys(moved, w.number(0.0)) | {s: w.load(arguments[0].data)}
+        for i, x in enumerate(written(w, graph, nodes, given | start)):
+            w.store(x, found[0], i)
 
     clock = graph.input("clock", True)
     ffi.write_handler(w, 1, 1, block)

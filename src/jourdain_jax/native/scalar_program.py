@@ -89,12 +89,14 @@ def unsupported(graph: Graph, nodes: Iterable[int]) -> str:
     return ""
 
 
-def written(w: Writer, graph: Graph, outputs: Iterable[int], known: Mapping[int, Value]) -> list[Value]:
-    """Values of the outputs, given those of inputs and of nodes computed before."""
-    return [value for _, value in sorted(written_in_turn(w, graph, outputs, known), key=itemgetter(0))]
+def written(w: Writer, graph: Graph, outputs: Iterable[int], known: Mapping[int, Value], by_llvm: bool = False) -> list[Value]:
+    """Values of the outputs, given those of inputs and of nodes computed before; `by_llvm`: it decides which values are in registers."""
+    return [value for _, value in sorted(written_in_turn(w, graph, outputs, known, by_llvm), key=itemgetter(0))]
 
 
-def written_in_turn(w: Writer, graph: Graph, outputs: Iterable[int], known: Mapping[int, Value]) -> Iterator[tuple[int, Value]]:
+def written_in_turn(
+    w: Writer, graph: Graph, outputs: Iterable[int], known: Mapping[int, Value], by_llvm: bool = False
+) -> Iterator[tuple[int, Value]]:
     """The number and the value of each output, as soon as that is worked out: what is done with it is written next. What is known stays in memory."""
     numbers: dict[int, list[int]] = {}
     for number, node in enumerate(outputs):
@@ -104,7 +106,7 @@ def written_in_turn(w: Writer, graph: Graph, outputs: Iterable[int], known: Mapp
     yield from ((number, values[node]) for node in numbers if node in values for number in numbers[node])
     fusible = _used_once_in_a_sum(graph, needed, numbers)
     steps = [(n, _made_of(graph, n, fusible)) for n in needed if n not in values and n not in fusible]
-    at_hand = _AtHand(w, values, steps)
+    at_hand = _AtHand(w, values, [] if by_llvm else steps)
     waves: dict[int, tuple[Value, Value]] = {}
     for i, (node, _) in enumerate(steps):
         at_hand.before(i)

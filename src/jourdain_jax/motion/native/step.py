@@ -219,7 +219,7 @@ def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Va
     rows, at_start = jet(w, form, p, t, method.order)
     for row, series in enumerate(rows):
         for j, x in enumerate(series):
-            w.store(w.number(0.0) if x is None else x, k, j * count + row)
+            w.store(x, k, j * count + row)
     length = w.smaller(radius(w, form, p, rows), p["longest"])
     size = _reach(w, form, p, w.smaller(length, p["bound"]))
     rest = w.magnitude(last_goal - t)

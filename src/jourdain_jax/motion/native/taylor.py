@@ -15,21 +15,24 @@ Sums add the newest coefficients last: all others are known long before. Source:
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, reduce
+from itertools import combinations
 from typing import NamedTuple
 
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.motion.native.functions import known_values, outputs_of
 from jourdain_jax.motion.native.layout import Form, Lanes
-from jourdain_jax.native.angles import sine_and_cosine
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.math_functions import FUNCTIONS, exponential, logarithm
+from jourdain_jax.native.math_functions import exponential, logarithm
 from jourdain_jax.native.scalar_program import as_real, unsupported, written
+from jourdain_jax.program.derivative import on_its_own
 from jourdain_jax.program.graph import Graph
 
 _OWN = ("add", "sub", "neg", "mul", "div", "sqrt", "pow")  # that need no derivative on the graph
-Coefficients = list[Value | None]  # None: zero
+Coefficients = list[Value]
 
 
 def reason_against(graph: Graph, outputs: Sequence[int]) -> str:
@@ -46,38 +49,28 @@ def reason_against(graph: Graph, outputs: Sequence[int]) -> str:
 
 
 class Series:
-    """Coefficients of all numbers of a graph along the solution with these rates.
+    """Coefficients of all numbers of a graph along the solution with these rates, as nodes of the same graph.
 
-    **Arguments:** `known`, the values of what does not vary and of the time; `states` and `rates`, the nodes of the state's numbers (None: one that no rate
-    depends on) and of their rates; `start`, values of the state; `order`, of the last coefficient of the state; `clock`, the node of the time.
+    **Arguments:** `known`, the nodes of what does not vary; `states` and `rates`, those of the state's numbers and of their rates; `order`, of the last
+    coefficient of the state; `clock`, the node of the time.
     """
 
-    def __init__(self, w: Writer, graph: Graph, known: Mapping[int, Value], states: Sequence[int | None], rates, start, order: int, clock: int) -> None:
-        self.w, self.graph, self.order = w, graph, order
-        self.of: dict[int, Coefficients] = {node: [value] for node, value in known.items()}
-        self.of[clock] = [known[clock], w.number(1.0)]
-        self.state: list[Coefficients] = [[value] for value in start]
-        self.of |= {node: series for node, series in zip(states, self.state, strict=True) if node is not None}
-        self._rates = {node: rate for node, rate in zip(states, rates, strict=True) if node is not None}
+    def __init__(self, graph: Graph, known: Iterable[int], states: Sequence[int], rates: Sequence[int], order: int, clock: int) -> None:
+        self.graph = graph
+        self.of = {n: [n] for n in (*known, *states)} | {clock: [clock, graph.one]}
+        self.state = [self.of[n] for n in states]
         self._partial: dict[tuple[int, int], int] = {}  # of a function and the number of an argument: the derivative's node
-        self._scaled: dict[tuple[int, int], Value | None] = {}
-        self._inverse: dict[int, Value] = {}
-        self._waves: dict[int, tuple[Value, Value]] = {}
-        given = set(self.of)
-        needed = self._with_derivatives(graph.needed(rates, given), given)
-        for node in needed:
-            self.of[node] = []
+        needed = self._with_derivatives(graph.needed(rates, self.of), set(self.of))
+        self.of |= {node: [] for node in needed}
         for k in range(order):
             for node in needed:
                 self.of[node].append(self._coefficient(node, k))
             for series, rate in zip(self.state, rates, strict=True):
-                found = self.at(rate, k)
-                series.append(found if found is None or k == 0 else found * (1.0 / (k + 1)))
+                series.append(graph.div(self._at(rate, k), graph.const(k + 1)))
 
-    def at(self, node: int, k: int) -> Value | None:
+    def _at(self, node: int, k: int) -> int:
         """The coefficient of a node; those beyond the last one known of what is given are zero."""
-        series = self.of[node]
-        return series[k] if k < len(series) else None
+        return self.of[node][k] if k < len(self.of[node]) else self.graph.zero
 
     def _with_derivatives(self, nodes: Sequence[int], given: set[int]) -> list[int]:
         """The nodes in order, with those of the derivatives that their recurrences ask for."""
@@ -95,79 +88,42 @@ class Series:
                 left += new
         return sorted(found)
 
-    def _coefficient(self, node: int, k: int) -> Value | None:
-        graph, w, op, args = self.graph, self.w, self.graph.op[node], self.graph.args[node]
+    def _coefficient(self, node: int, k: int) -> int:
+        graph, op, args = self.graph, self.graph.op[node], self.graph.args[node]
+        if k == 0 and op != "div":
+            return node
         if op == "const":
-            return w.number(graph.value[node]) if k == 0 else None
-        if op in ("add", "sub"):
-            return _sum(self.at(args[0], k), self.at(args[1], k), op)
-        if op == "neg":
-            a = self.at(args[0], k)
-            return None if a is None else -a
-        if k == 0:
-            return self._value(node)
+            return graph.zero
+        if op in ("add", "sub", "neg"):
+            return graph.again(node, [self._at(a, k) for a in args])
         if op == "mul":
-            return self._product(args[0], args[1], k, range(k + 1))
+            return self._product(*args, k, range(k + 1))
         if op == "div":
-            rest = _sum(self.at(args[0], k), self._product(args[1], node, k, range(1, k + 1)), "sub")
-            return None if rest is None else rest * self._reciprocal(args[1])
+            rest = graph.sub(self._at(args[0], k), self._product(args[1], node, k, range(1, k + 1)))
+            return graph.mul(rest, graph.div(graph.one, args[1]))
         if op == "sqrt":
-            rest = _sum(self.at(args[0], k), self._product(node, node, k, range(1, k)), "sub")
-            return None if rest is None else rest * 0.5 * self._reciprocal(node)
+            rest = graph.sub(self._at(args[0], k), self._product(node, node, k, range(1, k)))
+            return graph.mul(rest, graph.div(graph.const(0.5), node))
         if op == "pow":
             e = graph.value[args[1]]
-            total = self._convolved([(self.at(args[0], j), self.at(node, k - j), (e * j - (k - j)) / k) for j in range(k, 0, -1)])
-            return None if total is None else total * self._reciprocal(args[0])
-        total = None
-        for i, a in enumerate(args):
-            derivative = self._partial[node, i]
-            terms = [(self._times_order(a, j), self.at(derivative, k - j), 1.0) for j in _newest_last(range(1, k + 1), k)]
-            total = _sum(total, self._convolved(terms), "add")
-        return None if total is None else total * (1.0 / k)
+            terms = (graph.mul(graph.const((e * j - (k - j)) / k), self._term(args[0], node, j, k)) for j in range(k, 0, -1))
+            return graph.mul(graph.total(terms), graph.div(graph.one, args[0]))
+        found = [
+            graph.mul(graph.mul(graph.const(j), self._at(a, j)), self._at(self._partial[node, i], k - j))
+            for i, a in enumerate(args)
+            for j in _newest_last(range(1, k + 1), k)
+        ]
+        return graph.div(graph.total(found), graph.const(k))
 
-    def _value(self, node: int) -> Value:
-        op, args = self.graph.op[node], self.graph.args[node]
-        values = [self.of[a][0] or self.w.number(0.0) for a in args]
-        if op in ("sin", "cos"):
-            if args[0] not in self._waves:
-                self._waves[args[0]] = sine_and_cosine(self.w, values[0])
-            return self._waves[args[0]][op == "cos"]
-        if op == "div":
-            return values[0] * self._reciprocal(args[1])
-        return FUNCTIONS[op](self.w, *values)
-
-    def _reciprocal(self, node: int) -> Value:
-        if node not in self._inverse:
-            self._inverse[node] = 1.0 / (self.of[node][0] or self.w.number(0.0))
-        return self._inverse[node]
-
-    def _times_order(self, node: int, j: int) -> Value | None:
-        """j a_j"""
-        if node in self._rates and j > 1:
-            return self.at(self._rates[node], j - 1)
-        if (node, j) not in self._scaled:
-            a = self.at(node, j)
-            self._scaled[node, j] = a if a is None or j == 1 else a * float(j)
-        return self._scaled[node, j]
-
-    def _product(self, a: int, b: int, k: int, js: range) -> Value | None:
+    def _product(self, a: int, b: int, k: int, js: range) -> int:
         """sum_j a_j b_{k-j}"""
-        if a != b:
-            return self._convolved([(self.at(a, j), self.at(b, k - j), 1.0) for j in _newest_last(js, k)])
-        halves = self._convolved([(self.at(a, j), self.at(a, k - j), 1.0) for j in _newest_last([j for j in js if 2 * j > k], k)])
-        middle = self.at(a, k // 2) if k % 2 == 0 and k // 2 in js else None
-        if middle is None:
-            return None if halves is None else halves + halves
-        return middle * middle if halves is None else self.w.fma(middle, middle, halves + halves)
+        graph, ordered = self.graph, _newest_last(js, k)
+        half = graph.total(self._term(a, a, j, k) for j in ordered if a == b and 2 * j > k)
+        rest = graph.total(self._term(a, b, j, k) for j in ordered if a != b or 2 * j == k)
+        return graph.add(rest, graph.add(half, half))
 
-    def _convolved(self, terms: Sequence[tuple[Value | None, Value | None, float]]) -> Value | None:
-        total = None
-        for a, b, weight in terms:
-            if a is None or b is None or weight == 0.0:
-                continue
-            a = a if weight == 1.0 else a * weight
-            total = a * b if total is None else self.w.fma(a, b, total)
-        return total
+    def _term(self, a: int, b: int, j: int, k: int) -> int:
+        return self.graph.mul(self._at(a, j), self._at(b, k - j))
 
 
 def _newest_last(js: Sequence[int], k: int) -> list[int]:
@@ -175,12 +131,85 @@ def _newest_last(js: Sequence[int], k: int) -> list[int]:
     return sorted(js, key=lambda j: max(j, k - j))
 
 
-def _sum(a: Value | None, b: Value | None, op: str) -> Value | None:
-    if b is None:
-        return a
-    if a is None:
-        return b if op == "add" else -b
-    return a + b if op == "add" else a - b
+Terms = list[tuple[tuple[int, ...], int]]  # a sum of products: factors that vary, in order, and what they are multiplied by, which does not
+
+
+def with_few_products(graph: Graph, outputs: Sequence[int], moving: Iterable[int]) -> list[int]:
+    """Nodes for the same numbers, up to round-off, by fewer products of what varies, each of which is a sum in every coefficient; `moving`: inputs that vary.
+
+    Sums and products are taken apart into terms. Then what saves most products is shared, one after the other: x y where several terms hold it, and
+    x y + x z = x (y + z) in one sum. Accelerations of a disc with s, c = sin, cos of its lean take 12, and after that 7, with p = v w/c and q = c u:
+
+        v (2 s w/c - 5/3 c u),  s (g + c u^2) + 6/5 c u w,  -2 v w/c      ->      2 s p - 5/3 v q,  g s + q (s u + 6/5 w),  -2 p
+    """
+    one, nodes = graph.one, graph.reachable(outputs)
+    signs = {"add": (one, one), "sub": (one, graph.const(-1.0)), "neg": (graph.const(-1.0),)}
+    uses = Counter(a for n in nodes for a in graph.args[n])
+    whole = {*outputs, *(a for n in nodes if graph.op[n] not in (*signs, "mul") for a in graph.args[n])}
+    forms: dict[int, Terms] = {n: [((n,), one)] for n in moving}
+    sums: dict[int, Terms] = {}  # of what is a factor, or asked for; new ones have negative numbers
+
+    def named(n: int) -> Terms:
+        sums[n] = forms[n]
+        return [((n,), one)]
+
+    for n in nodes:
+        op, args = graph.op[n], graph.args[n]
+        if forms.keys().isdisjoint(args):
+            continue
+        if op == "div":
+            inverse = graph.div(one, args[1])
+            forms |= {inverse: [((inverse,), one)]} if args[1] in forms else {}
+            op, args = "mul", (args[0], inverse)
+        parts = [forms.get(a) or [((), a)] for a in args]
+        if op == "mul" and min(map(len, parts)) > 1 and len(parts[0]) * len(parts[1]) > 8:
+            parts[0] = named(args[0])
+        if op == "mul":
+            forms[n] = [(tuple(sorted(f + g)), graph.mul(c, d)) for f, c in parts[0] for g, d in parts[1]]
+        elif op in signs:
+            forms[n] = [(f, graph.mul(c, sign)) for sign, part in zip(signs[op], parts, strict=True) for f, c in part]
+        else:
+            forms[n] = [((n,), one)]
+            continue
+        if n in whole or uses[n] > 1 < len(forms[n]):
+            own = named(n)
+            forms[n] = own if len(forms[n]) > 1 else forms[n]
+
+    while True:
+        shared = Counter(pair for terms in sums.values() for f, _ in terms for pair in {*combinations(f, 2)})
+        shared.update((n, x, n) for n, terms in sums.items() for f, _ in terms if len(f) > 1 for x in {*f})
+        found, count = max(shared.items(), key=lambda item: (item[1], -len(item[0]), item[0]), default=((), 0))
+        if count < 2:
+            break
+        new, (a, b) = -len(sums) - 1, found[:2]
+        if len(found) == 2:
+            for n, terms in sums.items():
+                sums[n] = [((new, *_without(f, a, b)) if found in combinations(f, 2) else f, c) for f, c in terms]
+            sums[new] = [(found, one)]
+        else:
+            inside = [term for term in sums[a] if b in term[0] and len(term[0]) > 1]
+            sums[a] = [((new, b), one), *(term for term in sums[a] if term not in inside)]
+            sums[new] = [(_without(f, b), c) for f, c in inside]
+
+    def inverts(x: int) -> bool:
+        return x > 0 and graph.op[x] == "div"
+
+    def times(a: int, x: int) -> int:
+        return graph.div(a, node(graph.args[x][1])) if inverts(x) else graph.mul(a, node(x))
+
+    @cache
+    def node(n: int) -> int:
+        if n in sums:
+            return graph.total(graph.mul(c, reduce(times, sorted(f, key=inverts), one)) for f, c in sums[n])
+        return graph.again(n, map(node, graph.args[n])) if n in forms and graph.args[n] else n
+
+    for n in nodes:  # older ones first: no deep recursion
+        node(n)
+    return list(map(node, outputs))
+
+
+def _without(factors: tuple[int, ...], *some: int) -> tuple[int, ...]:
+    return tuple(sorted((Counter(factors) - Counter(some)).elements()))
 
 
 @dataclass(frozen=True)
@@ -215,16 +244,15 @@ def jet(w: Writer, form: Form, p: Lanes, t: Value, order: int) -> tuple[list[Coe
     _, clock, states, _ = form.split(own.variables)
     given = {n: x for n, x in known.items() if n not in states} | dict(zip(own.known, p.every("dknown"), strict=True))
     given |= dict(zip(own.times, p.every("dt"), strict=True)) if own.times else {}
-
-    def with_work(nodes: list[int], other: int | None) -> list:
-        return [*nodes, *[other] * (form.y - len(nodes))]
-
-    moved = [n for part in (states, *own.states) for n in with_work(part, None)]
-    nodes = [n for part in (own.values[: len(rates)], *own.tangents) for n in with_work(part, own.graph.zero)]
-    start = [w.load(y, i) for i in range(form.integrated)]
-    found = Series(w, own.graph, given, moved, nodes, start, order, clock)
-    values = {n: w.number(0.0) if x[0] is None else x[0] for n, x in found.of.items()}
-    return found.state, _evaluated(w, form, own.graph, own.values[len(rates) :], values, known)
+    nodes = [n for part in (own.values[: len(rates)], *own.tangents, own.values[len(rates) :]) for n in part]
+    # on a graph that nothing has been derived on: the numbers of its nodes decide on the order
+    graph, nodes, inputs = on_its_own(own.graph, nodes, [*given, *states, *(n for part in own.states for n in part)])
+    clock, fixed, varying = inputs[[*given].index(clock)], inputs[: len(given)], iter(inputs[len(given) :])
+    moved = [next(varying) if i % form.y < form.q_and_v else graph.input(f"work {i}", True) for i in range(form.integrated)]
+    values = dict(zip(fixed, given.values(), strict=True)) | {n: w.load(y, i) for i, n in enumerate(moved)}
+    series = Series(graph, fixed, moved, with_few_products(graph, nodes[: form.integrated], [*moved, clock]), order, clock).state
+    found = iter(written(w, graph, [*(n for row in series for n in row), *nodes[form.integrated :]], values, by_llvm=True))
+    return [[next(found) for _ in row] for row in series], _judged(w, form, list(found), known)
 
 
 def products(form: Form, order: int) -> int:
@@ -241,11 +269,11 @@ def _monitored(form: Form) -> list[int]:
 def monitored_at(w: Writer, form: Form, p: Lanes, t: Value, y: Value) -> Monitored:
     """What is monitored, at a state in memory."""
     known = known_values(w, form, p.pointer, t, y)
-    return _evaluated(w, form, form.program.graph, _monitored(form), known, known)
+    return _judged(w, form, written(w, form.program.graph, _monitored(form), known), known)
 
 
-def _evaluated(w: Writer, form: Form, graph, nodes: Sequence[int], values: Mapping[int, Value], known: Mapping[int, Value]) -> Monitored:
-    found, of_variables = [as_real(w, x) for x in written(w, graph, nodes, values)], list(known.values())
+def _judged(w: Writer, form: Form, values: Sequence[Value], known: Mapping[int, Value]) -> Monitored:
+    found, of_variables = [as_real(w, x) for x in values], list(known.values())
     count, holds = len(form.program.guards), w.literal(-1, w.truth)
     for guard in found[:count]:
         holds = holds & (guard > 0.0)
@@ -262,9 +290,8 @@ def radius(w: Writer, form: Form, p: Lanes, rows: Sequence[Coefficients]) -> Val
     for k in (order - 1, order):
         square = w.number(0.0)  # of N_k, times `count`
         for x, share in zip(rows, inverse, strict=False):
-            if x[k] is not None:
-                relative = x[k] * share
-                square = w.fma(relative, relative, square)
+            relative = x[k] * share
+            square = w.fma(relative, relative, square)
         least = w.smaller(least, (-0.5 / k) * logarithm(w, square * (1.0 / count)))
     reach = w.where(least < math.inf, exponential(w, least), least)
     return 0.9 * w.where(w.is_nan(reach), 0.0, reach)
@@ -272,12 +299,12 @@ def radius(w: Writer, form: Form, p: Lanes, rows: Sequence[Coefficients]) -> Val
 
 def at_time(w: Writer, series: Coefficients, s: Value) -> Value:
     """sum_k x_k s^k"""
-    total = w.number(0.0) if series[-1] is None else series[-1]
+    total = series[-1]
     for x in reversed(series[:-1]):
-        total = total * s if x is None else w.fma(total, s, x)
+        total = w.fma(total, s, x)
     return total
 
 
 def slope(series: Coefficients) -> Coefficients:
     """Coefficients of the derivative."""
-    return [x if x is None or k == 0 else x * float(k + 1) for k, x in enumerate(series[1:])]
+    return [x * float(k) for k, x in enumerate(series) if k]
