@@ -18,7 +18,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, reduce
+from functools import reduce
 from itertools import combinations
 from typing import NamedTuple
 
@@ -97,7 +97,7 @@ class Series:
         if op in ("add", "sub", "neg"):
             return graph.again(node, [self._at(a, k) for a in args])
         if op == "mul":
-            return self._product(*args, k, range(k + 1))
+            return self._product(args[0], args[1], k, range(k + 1))
         if op == "div":
             rest = graph.sub(self._at(args[0], k), self._product(args[1], node, k, range(1, k + 1)))
             return graph.mul(rest, graph.div(graph.one, args[1]))
@@ -181,15 +181,17 @@ def with_few_products(graph: Graph, outputs: Sequence[int], moving: Iterable[int
         found, count = max(shared.items(), key=lambda item: (item[1], -len(item[0]), item[0]), default=((), 0))
         if count < 2:
             break
-        new, (a, b) = -len(sums) - 1, found[:2]
+        name, (a, b) = -len(sums) - 1, found[:2]
         if len(found) == 2:
             for n, terms in sums.items():
-                sums[n] = [((new, *_without(f, a, b)) if found in combinations(f, 2) else f, c) for f, c in terms]
-            sums[new] = [(found, one)]
+                sums[n] = [((name, *_without(f, a, b)) if found in combinations(f, 2) else f, c) for f, c in terms]
+            sums[name] = [(found, one)]
         else:
             inside = [term for term in sums[a] if b in term[0] and len(term[0]) > 1]
-            sums[a] = [((new, b), one), *(term for term in sums[a] if term not in inside)]
-            sums[new] = [(_without(f, b), c) for f, c in inside]
+            sums[a] = [((name, b), one), *(term for term in sums[a] if term not in inside)]
+            sums[name] = [(_without(f, b), c) for f, c in inside]
+
+    new: dict[int, int] = {}
 
     def inverts(x: int) -> bool:
         return x > 0 and graph.op[x] == "div"
@@ -197,11 +199,12 @@ def with_few_products(graph: Graph, outputs: Sequence[int], moving: Iterable[int
     def times(a: int, x: int) -> int:
         return graph.div(a, node(graph.args[x][1])) if inverts(x) else graph.mul(a, node(x))
 
-    @cache
     def node(n: int) -> int:
-        if n in sums:
-            return graph.total(graph.mul(c, reduce(times, sorted(f, key=inverts), one)) for f, c in sums[n])
-        return graph.again(n, map(node, graph.args[n])) if n in forms and graph.args[n] else n
+        if n not in new and n in sums:
+            new[n] = graph.total(graph.mul(c, reduce(times, sorted(f, key=inverts), one)) for f, c in sums[n])
+        elif n not in new:
+            new[n] = graph.again(n, map(node, graph.args[n])) if n in forms and graph.args[n] else n
+        return new[n]
 
     for n in nodes:  # older ones first: no deep recursion
         node(n)
