@@ -42,6 +42,8 @@ def test_an_event_stops_the_motion_at_the_closed_form_time():
     assert "`landed`" in motion.message
     assert_allclose(motion.t_end, flight_time(5.0), rtol=1e-12)
     assert_allclose(motion.q_end, [2 * flight_time(5.0), -0.5], rtol=1e-11)
+    assert float(motion.end.t) == float(motion.t_end)
+    assert_allclose(motion.end.q, motion.q_end, atol=1e-12)
     later = np.asarray(motion.ts) > float(motion.t_end)
     assert np.all(np.isnan(np.asarray(motion.q)[later]))
     assert np.all(np.isfinite(np.asarray(motion.q)[~later]))
@@ -230,13 +232,6 @@ def test_a_motion_goes_on_from_the_end_of_another():
     assert_allclose(second.u[-1], whole.u_end, atol=2e-8)
 
 
-def test_the_end_is_the_state_at_an_event():
-    fallen = jj.simulate(TiltingDisc(), {"lean": 0.3}, t1=5.0)
-    assert fallen.event_names[int(fallen.event)] == "fallen"
-    assert float(fallen.end.t) == float(fallen.t_end) < 5.0
-    assert_allclose(fallen.end.q, fallen.q_end, atol=1e-12)
-
-
 SLEIGH, START, TS = jj.models.ChaplyginSleigh(), {"x_rate": 0.6, "heading_rate": 0.9}, np.array([0.5, 1.0])
 DATA = jj.Experiment(TS, {"x": np.array([0.3, 0.5])}, 0.01, start=START)
 
@@ -282,13 +277,6 @@ def test_an_implicit_solver_serves_a_projected_scene():
     implicit, explicit = jj.simulate(scene, solver=diffrax.Kvaerno5(), **options), jj.simulate(scene, **options)
     assert implicit.result == results.SUCCESS
     assert_allclose(implicit.q_end, explicit.q_end, atol=1e-6)
-
-
-def test_a_motion_starts_at_the_time_of_its_state():
-    start = jj.start(Falling(), t0=3.0, x_rate=1.0)
-    motion = jj.simulate(Falling(), start, t1=3.2)
-    assert float(motion.ts[0]) == 3.0
-    assert_allclose(motion.q_end[0], 0.2, rtol=1e-12)
 
 
 def test_a_start_given_by_names_says_how_far_it_was_moved():
