@@ -5,9 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from small_scenes import OnPlane
 
-import jourdain_jax as jj
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.evaluate import Probes
@@ -112,22 +110,6 @@ def test_nothing_is_assumed_of_the_sign_of_a_parameter():
     assert forms.guards == {c}
     negative = probes.with_inputs({"p": np.linspace(-2.0, -1.0, 8)})
     assert_allclose(negative(found), negative(nodes), rtol=1e-14)
-
-
-class Weighed(OnPlane):
-    """A particle drawn by magnitudes of a parameter."""
-
-    p: object = jj.parameter(2.0)
-
-    def loads(self, motion):
-        q = motion.q
-        return (jj.generalized_force(motion, x_rate=-jnp.abs(self.p) * q.x - jnp.sqrt(self.p * self.p) * q.y),)
-
-
-def test_a_parameter_of_the_other_sign_is_no_other_domain():
-    motion = jax.vmap(lambda p: jj.simulate(Weighed(p=p), {"x": 1.0}, t1=1.0, rtol=1e-9, atol=1e-9))(jnp.array([1.5, -1.5]))
-    assert_array_equal(motion.result, 0)
-    assert_allclose(motion.q_end[:, 0], np.cos(np.sqrt(1.5)), rtol=1e-7)
 
 
 def test_an_array_is_taken_apart_as_newer_versions_of_jax_do_where_it_is_iterated_over():

@@ -62,7 +62,10 @@ def test_a_driven_sleigh_has_its_orbit_and_multipliers():
 
 
 def test_a_limit_cycle_has_its_period_and_multiplier_with_their_derivatives_in_a_batch():
-    """Also by a guess beside the event. The multiplier is exp of the integral of the divergence, here by SciPy; period: 6.6632868593231 s for a damping of one."""
+    """Also by a guess beside the event. The multiplier is exp of the integral of the divergence, here by SciPy.
+
+    The period for a damping of one is 6.6632868593231 s.
+    """
 
     def found(size, x, rate):
         orbit = jj.periodic(VAN_DER_POL.replace(size=size), {"x": x, "x_rate": rate}, 6.0, until="crossing")
@@ -70,14 +73,16 @@ def test_a_limit_cycle_has_its_period_and_multiplier_with_their_derivatives_in_a
         return both, (both, orbit["x_rate"])
 
     h = 1e-3
-    guesses = 1.0 + h * jnp.array([0.0, 0.0, -2.0, -1.0, 1.0, 2.0]), jnp.zeros(6).at[1].set(0.5), jnp.full(6, -2.0).at[1].set(-1.5)
-    slopes, (values, speeds) = jax.jit(jax.vmap(jax.jacrev(found, has_aux=True)))(*guesses)
+    sizes = 1.0 + h * jnp.array([0.0, 0.0, -2.0, -1.0, 1.0, 2.0])
+    x, rate = jnp.zeros(6).at[1].set(0.5), jnp.full(6, -2.0).at[1].set(-1.5)
+    slopes, (values, speeds) = jax.jit(jax.vmap(jax.jacrev(found, has_aux=True)))(sizes, x, rate)
     rates = lambda t, y: [y[1], (1 - y[0] ** 2) * y[1] - y[0], 1 - y[0] ** 2]  # noqa: E731
-    growth = solve_ivp(rates, (0, values[0, 0]), [0.0, speeds[0], 0.0], method="DOP853", rtol=1e-12, atol=1e-12).y[2, -1]
+    solved = solve_ivp(rates, (0, values[0, 0]), [0.0, speeds[0], 0.0], method="DOP853", rtol=1e-12, atol=1e-12)
+    by_values = (values[2] - 8 * values[3] + 8 * values[4] - values[5]) / (12 * h)
     for lane in (0, 1):
         assert float(values[lane, 0]) == pytest.approx(6.6632868593231301, abs=1e-12)
-        assert float(values[lane, 1]) == pytest.approx(np.exp(growth), rel=1e-9)
-        assert_allclose(slopes[lane], (values[2] - 8 * values[3] + 8 * values[4] - values[5]) / (12 * h), rtol=1e-8)
+        assert float(values[lane, 1]) == pytest.approx(np.exp(solved.y[2, -1]), rel=1e-9)
+        assert_allclose(slopes[lane], by_values, rtol=1e-8)
 
 
 def test_multipliers_far_apart_keep_their_digits():
@@ -97,11 +102,12 @@ class Whirling(jj.Scene):
     coordinates = jj.coordinates("angle")
 
     def bodies(self, t, q):
-        turn = jj.rot_y(q.angle)
-        return {"rod": jj.RigidBody(1.0, jnp.array([0.09, 0.08, 0.01]), position=turn @ jnp.array([0.0, 0.0, -0.5]), orientation=turn)}
+        turn, hang = jj.rot_y(q.angle), jnp.array([0.0, 0.0, -0.5])
+        return {"rod": jj.RigidBody(1.0, jnp.array([0.09, 0.08, 0.01]), turn @ hang, turn)}
 
     def loads(self, motion):
-        return jj.gravity(motion, 9.81), jj.generalized_force(motion, angle_rate=self.drive - 1.5 * motion.u.angle_rate)
+        torque = self.drive - 1.5 * motion.u.angle_rate
+        return jj.gravity(motion, 9.81), jj.generalized_force(motion, angle_rate=torque)
 
     def events(self, motion):
         return {"hanging": motion["rod"].position[0]}
@@ -116,7 +122,7 @@ def test_an_angle_goes_round():
 
 
 def test_a_quaternion_changes_its_sign_and_orbits_side_by_side_have_multipliers_of_one():
-    """A free body that spins about a principal axis is back after a turn, however it was turned at first; its rates go round as Euler says."""
+    """A free body that spins about a principal axis is back after a turn, however it was turned at first."""
     body, rate = jj.models.FreeRigidBody(), 2.0
     orbit = jj.periodic(body, {"attitude_omega_z": rate}, 2 * np.pi / rate, pieces=1)
     assert orbit.converged

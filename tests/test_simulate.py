@@ -279,11 +279,6 @@ def test_an_implicit_solver_serves_a_projected_scene():
     assert_allclose(implicit.q_end, explicit.q_end, atol=1e-6)
 
 
-def test_a_start_given_by_names_says_how_far_it_was_moved():
-    motion = jj.simulate(MODELS["skate"](), {"heading": 0.5, "x_rate": 1.0}, t1=0.1)
-    assert_allclose(motion.moved_u, np.tan(0.5), rtol=1e-9)  # y_rate, from zero
-
-
 class Tied(jj.Scene):
     """A bead at height z, tied to the origin by a rod and to the line y = 3: its default rod is too short to be assembled."""
 

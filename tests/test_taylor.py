@@ -65,17 +65,17 @@ def test_recurrences_of_functions_give_their_taylor_series():
         assert_allclose(series, true, rtol=1e-13, atol=1e-14 * np.max(np.abs(true)), err_msg=op)
 
 
-@pytest.mark.parametrize("op", ["add", "sub", "mul", "div", "atan2", "pow"])
-def test_recurrences_of_two_arguments_give_their_taylor_series(op):
+def test_recurrences_of_two_arguments_give_their_taylor_series():
     graph = Graph()
     s = graph.input("s", True)
-    a, b = graph.call("sin", s), graph.const(2.7) if op == "pow" else graph.call("exp", s)
-    found = coefficients(graph, s, [graph.call(op, a, b), graph.call(op, b, a) if op != "pow" else a], 0.7)
-    f = in_mpmath(op)
-    other = (lambda s: mpmath.mpf(2.7)) if op == "pow" else mpmath.exp
-    assert_allclose(found[:, 0], expected(lambda s: f(mpmath.sin(s), other(s)), 0.7), rtol=1e-13, atol=1e-13)
-    second = mpmath.sin if op == "pow" else lambda s: f(mpmath.exp(s), mpmath.sin(s))
-    assert_allclose(found[:, 1], expected(second, 0.7), rtol=1e-13, atol=1e-13)
+    nodes = {"sin": graph.call("sin", s), "exp": graph.call("exp", s), "2.7": graph.const(2.7)}
+    true = {"sin": mpmath.sin, "exp": mpmath.exp, "2.7": lambda s: mpmath.mpf(2.7)}
+    cases = [(op, *pair) for op in ("add", "sub", "mul", "div", "atan2") for pair in (("sin", "exp"), ("exp", "sin"))]
+    cases.append(("pow", "sin", "2.7"))
+    found = coefficients(graph, s, [graph.call(op, nodes[a], nodes[b]) for op, a, b in cases], 0.7)
+    for (op, a, b), series in zip(cases, found.T, strict=True):
+        f = lambda s, op=op, a=a, b=b: in_mpmath(op)(true[a](s), true[b](s))  # noqa: E731
+        assert_allclose(series, expected(f, 0.7), rtol=1e-13, atol=1e-13, err_msg=f"{op} of {a} and {b}")
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -13,15 +13,16 @@ from small_scenes import InSpace, OnPlane
 import jourdain_jax as jj
 
 KNOTS = jnp.linspace(-3.0, 3.0, 7)
+TIGHT = {"rtol": 1e-9, "atol": 1e-9}
 
 
 def looked_up(x, table=None):
     return jnp.interp(x, KNOTS, jnp.sin(KNOTS) if table is None else table)
 
 
-def ends(scene, start, **options):
+def ends(scene, start):
     """Of the lowered and of the dense motion."""
-    return [jj.simulate(scene, start, t1=1.0, rtol=1e-9, atol=1e-9, backend=backend, **options).q_end for backend in ("auto", "dense")]
+    return [jj.simulate(scene, start, t1=1.0, backend=backend, **TIGHT).q_end for backend in ("auto", "dense")]
 
 
 class Fading(OnPlane):
@@ -48,7 +49,7 @@ class Filtered(OnPlane):
 
 
 def test_calls_of_what_different_calls_made_stay_two():
-    assert_allclose(*ends(Filtered(), {"x": 1.0, "y": -0.4, "x_rate": 0.3}), atol=1e-7)
+    assert len(jj.lower(Filtered()).graph.calls(jj.lower(Filtered()).ydot)) == 5  # three filtered, two halved
 
 
 class Pushed(OnPlane):
@@ -121,7 +122,8 @@ def test_operands_are_compared_relative_to_their_size():
 
 def test_a_callback_that_knows_no_batches_runs_alone_and_is_refused_by_name_in_batches():
     called = Pushed(lambda motion, _: jax.pure_callback(lambda x: np.asarray(-np.sin(x)), jax.ShapeDtypeStruct((), motion.q.x.dtype), motion.q.x))
-    assert_allclose(*ends(called, {"x": 1.0}, formulation=jj.Formulation(stabilisation=None)), atol=1e-7)
+    motion = jj.simulate(called, {"x": 1.0}, t1=1.0, formulation=jj.Formulation(stabilisation=None), **TIGHT)
+    assert motion.u_end[0] ** 2 / 2 - np.cos(motion.q_end[0]) == pytest.approx(-np.cos(1.0), abs=1e-7)
     with pytest.raises(NotImplementedError, match="vmap"):
         jj.rollout(called, {"x": jnp.array([1.0, 1.1])}, t1=0.1)
 
