@@ -1,14 +1,14 @@
 """Random admissible states of a scene, and all its reductions against each other there."""
 
-import jax.numpy as jnp
+import numpy as np
 from solved_states import over_states
 
 import jourdain_jax as jj
 
 
 def admissible_states(scene: jj.Scene, count: int, seed: int = 0) -> list[tuple]:
-    """Random states (t, q, u) on the constraints, as JAX arrays."""
-    return list(zip(*map(jnp.asarray, jj.sample_states(scene, count, seed)), strict=True))
+    """Random states (t, q, u) on the constraints."""
+    return list(zip(*jj.sample_states(scene, count, seed), strict=True))
 
 
 def disagreement(scene: jj.Scene, count: int = 20, seed: int = 0) -> dict[str, float]:
@@ -22,8 +22,8 @@ def disagreement(scene: jj.Scene, count: int = 20, seed: int = 0) -> dict[str, f
     def all_of_them(t, q, u):
         found = {name: jj.accelerations(scene, t, q, u, reduction=reduction) for name, reduction in by_name.items()}
         equations = jj.unconstrained_equations(scene, t, q, u)
-        forces = jnp.stack([equations.h, equations.Q, found["qr"].constraint_force])
-        sizes = jnp.max(jnp.abs(found["qr"].udot)), jnp.max(jnp.abs(forces))
+        forces = np.stack([equations.h, equations.Q, found["qr"].constraint_force])
+        sizes = np.max(np.abs(found["qr"].udot)), np.max(np.abs(forces))
         return {name: (a.udot, a.constraint_force, a.applicable) for name, a in found.items()}, sizes
 
     states = admissible_states(scene, count, seed)
@@ -32,9 +32,9 @@ def disagreement(scene: jj.Scene, count: int = 20, seed: int = 0) -> dict[str, f
     return {
         name: max(_relative(*compared) for compared in zip(result[:2], results["qr"][:2], sizes, strict=True))
         for name, result in results.items()
-        if name != "qr" and bool(jnp.all(result[2]))
+        if name != "qr" and np.all(result[2])
     }
 
 
 def _relative(values, expected, size) -> float:
-    return float(jnp.max(jnp.max(jnp.abs(values - expected), axis=1) / jnp.where(size > 0, size, 1.0)))
+    return float(np.max(np.max(np.abs(values - expected), axis=1) / np.where(size > 0, size, 1.0)))

@@ -1,7 +1,6 @@
 """Accelerations of a scene at given and at random admissible states, each worked out once."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import jourdain_jax as jj
@@ -9,7 +8,7 @@ import jourdain_jax as jj
 
 def over_states(f, *states):
     """What `f` finds at each of some states, stacked."""
-    return jax.tree.map(lambda *found: jnp.asarray(np.stack(found)), *(f(*state) for state in zip(*states, strict=True)))
+    return jax.tree.map(lambda *found: np.stack(found), *(f(*state) for state in zip(*states, strict=True)))
 
 
 def solved_at_random_states(scene: jj.Scene, count: int = 20):
