@@ -1,11 +1,13 @@
 """Derivatives by machine code of our own: against closed forms, against those of XLA, of lanes that end in all ways, and when they are left to XLA."""
 
+import ctypes
+
 import jax
 import jax.numpy as jnp
 import machine_code
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import OnLine
 
 import jourdain_jax as jj
@@ -143,3 +145,44 @@ def test_a_branch_that_is_not_taken_has_no_cotangent_however_steep_it_is():
     root = graph.call("select", graph.call("gt", x, graph.zero), graph.zero, graph.call("sqrt", x))
     (found,) = emit.run(graph, cotangents(graph, [root], [w], [x]), {x: jnp.zeros(()), w: jnp.ones(())})
     assert float(found) == 0.0
+
+
+RECORDS: list[int] = []  # bytes of each that was taken
+
+
+@ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_size_t, ctypes.c_size_t)
+def _counted(alignment, size):
+    RECORDS.append(size)
+    return _taken(alignment, size)
+
+
+_taken = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_size_t, ctypes.c_size_t)(("aligned_alloc", ctypes.CDLL(None)))
+
+
+def _largest_record(memory: int, lanes: int):
+    """Gradients of motions of some hundred steps, and how many bytes their largest record takes."""
+    model = jj.build(jj.models.TiltingDisc(), backend="native", memory=memory)
+
+    def seen(lean, radius):
+        start = {"lean": lean, "yaw_rate": 1.0, "spin_rate": 5.0}
+        return jnp.sin(jj.simulate(model.replace(radius=radius), start, ts=jnp.linspace(0.1, 4.0, 40), rtol=1e-10, atol=1e-10).q).sum()
+
+    RECORDS.clear()
+    each = jax.vmap(jax.grad(seen, (0, 1))) if lanes > 1 else lambda *x: jax.grad(seen, (0, 1))(*(x[0] for x in x))
+    found = jax.block_until_ready(jax.jit(each)(jnp.linspace(0.1, 0.4, lanes), jnp.linspace(0.3, 0.6, lanes)))
+    return np.asarray(found), max(RECORDS)
+
+
+@pytest.mark.parametrize("lanes", [1, 11])
+def test_records_of_reverse_mode_keep_to_the_memory_of_the_model(monkeypatch, lanes):
+    llvm = pytest.importorskip("llvmlite.binding")
+    monkeypatch.setenv("JOURDAIN_JAX_THREADS", "1")
+    llvm.add_symbol("aligned_alloc", ctypes.cast(_counted, ctypes.c_void_p).value)
+    try:
+        whole, needed = _largest_record(10**9 + lanes, lanes)
+        for memory in (needed, needed // 20):  # half of it is there too where a record has grown
+            found, most = _largest_record(memory, lanes)
+            assert 0.2 * memory < 1.5 * most <= memory
+            assert_array_equal(found, whole)
+    finally:
+        llvm.add_symbol("aligned_alloc", ctypes.cast(_taken, ctypes.c_void_p).value)

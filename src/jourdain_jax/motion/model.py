@@ -253,8 +253,8 @@ def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backe
         motion = jj.simulate(model, {"lean": 0.3}, t1=5.0)
         slope = jax.grad(lambda r: jj.simulate(model.replace(radius=r), {"lean": 0.3}, t1=5.0).q_end[0])(0.5)
 
-    `formulation`, `backend`: as of `simulate`. `memory`: bytes, or a text such as "2GB", that chunks of a `rollout` and what reverse mode of XLA keeps of a
-    motion may take (default: 4 GiB), and, where it is stated, the processes of a `Study`. All functions of a scene build on first use and keep what they
+    `formulation`, `backend`: as of `simulate`. `memory`: bytes, or a text such as "2GB", that chunks of a `rollout` and what reverse mode keeps of
+    motions may take (default: 4 GiB), and, where it is stated, the processes of a `Study`. All functions of a scene build on first use and keep what they
     found. `start`, `simulate`, `rollout`, `fit`, `fit_batch`, `linearize`, `steady`, `report`, `verify`, `lower` and `Study` take what this returns in the
     place of `scene`; all others take its `.scene`.
     The first call for a class warns with the table of `check` where something looks wrong.

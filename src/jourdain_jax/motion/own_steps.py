@@ -132,7 +132,8 @@ class OwnSteps(Integrator):
             raise DifferentiationModeError(OF_SAMPLES)
         asked = [bool(varies) for varies in native_motion.known_of(perturbed[1].args)]
         assert isinstance(self.solver, Method)
-        by_start, by_known = native_motion.cotangents(self._form(setup), self.solver, native_motion.start_of(setup, begun), asked, g)
+        start = native_motion.start_of(setup, begun)
+        by_start, by_known = native_motion.cotangents(self._form(setup), self.solver, start, asked, self.memory, g)
         by_setup, by_begun = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, (setup, begun))
         field, scene, inputs, fixed, origin = by_begun.args
         y0 = jax.tree.map(lambda varies, by: by if varies else None, perturbed[1].y0, by_start)

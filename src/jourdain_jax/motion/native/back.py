@@ -39,8 +39,8 @@ from jourdain_jax.native.ffi import taken_in, write_handler
 from jourdain_jax.native.ir import Value, Writer
 
 
-def write_back(w: Writer, form: Form, method: Method, asked: Sequence[int]) -> None:
-    """The module; `asked`: of which of the numbers that the rates are given cotangents are asked."""
+def write_back(w: Writer, form: Form, method: Method, asked: Sequence[int], memory: int) -> None:
+    """The module; `asked`: of which of the numbers that the rates are given cotangents are asked; `memory`: bytes that the records of all threads may take."""
     write_functions(w, form, method)
     write_pulled(w, form, asked)
     prepare(w, form, method)
@@ -51,7 +51,7 @@ def write_back(w: Writer, form: Form, method: Method, asked: Sequence[int]) -> N
     if form.has_events:
         _write_event_back(w, form, len(asked))
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
-        write_record(w, form, method, len(asked), job)
+        write_record(w, form, method, len(asked), memory, job)
         w.give(Value(w, "ptr", "null"))
     write_handler(w, 4 + arguments_of_samples(form), 1, lambda arguments, results: write_job(w, form, arguments, results))
 
@@ -236,17 +236,17 @@ def _moved_back(w: Writer, form: Form, lanes: Lanes, usable: Value, cotangents: 
 
 
 @lru_cache(maxsize=MOST_KERNELS)
-def kernel_back(form: Form, method: Method, asked: tuple[int, ...]) -> Callable:
+def kernel_back(form: Form, method: Method, asked: tuple[int, ...], memory: int) -> Callable:
     """A function of samples, the rows of a start, cotangents of the states at the goals and of the end (with its time last), and the goals.
 
     It returns cotangents of the state at the start, and of the numbers `asked` for of those that the rates are given. A state has its tangent after it.
     """
     count = form.integrated + len(asked)
-    run_rows = called(lambda w: write_back(w, form, method, asked), lambda *_: ((count,),), arguments_of_samples(form))
+    run_rows = called(lambda w: write_back(w, form, method, asked, memory), lambda *_: ((count,),), arguments_of_samples(form))
     return lambda *arguments: run_rows(*arguments)[0]
 
 
-def flow_back(form: Form, method: Method, asked: tuple[int, ...]) -> Callable[..., Float[Array, "found"]]:
+def flow_back(form: Form, method: Method, asked: tuple[int, ...], memory: int) -> Callable[..., Float[Array, "found"]]:
     """Cotangents of the start's state, and of the numbers `asked` for of those known, as a function of the start, and of cotangents of the states at the
     goals, and of the end and its time.
     """
@@ -254,7 +254,7 @@ def flow_back(form: Form, method: Method, asked: tuple[int, ...]) -> Callable[..
 
     @jax.custom_jvp
     def own(start: Start, g: Float[Array, "times y"], ends: Float[Array, "ends"]):
-        return _pulled(form, method, asked, start, g, ends)
+        return _pulled(kernel_back(form, method, asked, memory), form, start, g, ends)
 
     @partial(own.defjvp, symbolic_zeros=True)
     def rule(primals, tangents):
@@ -264,12 +264,12 @@ def flow_back(form: Form, method: Method, asked: tuple[int, ...]) -> Callable[..
         # of the state and its tangent, at the goals, at the end, and of the time of that
         both = jnp.concatenate([dg, g], axis=1), jnp.concatenate([dends[:n], ends[:n], dends[n:], ends[n:]])
         raised = replace(raised, time_moves=form.has_events and bool(form.sampled))  # an event needs to know how fast samples change
-        d = _pulled(raised, method, asked, more, *both)
+        d = _pulled(kernel_back(raised, method, asked, memory), raised, more, *both)
         return own(*primals), jnp.concatenate([d[:n], d[2 * n :]])
 
     return own
 
 
-def _pulled(form: Form, method: Method, asked: tuple[int, ...], start: Start, g, ends) -> Float[Array, "found"]:
+def _pulled(kernel: Callable, form: Form, start: Start, g, ends) -> Float[Array, "found"]:
     rows = start.rows([jnp.zeros(())] * len(form.moving))
-    return kernel_back(form, method, asked)(*start.of_samples, rows, g, ends, start.goals)
+    return kernel(*start.of_samples, rows, g, ends, start.goals)

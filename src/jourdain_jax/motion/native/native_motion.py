@@ -256,13 +256,16 @@ def form_of(field: VectorField, inputs: Inputs, has_events: bool) -> Form:
     return Form(program, field.with_work, field.projects, field.affine, has_events, field.pivots, sampled=sampled)
 
 
-def cotangents(form: Form, method: Method, start: Start, asked: Sequence[bool], g: Solved) -> tuple[Integrated, list]:
-    """Cotangents of the start, and of each of the numbers that the rates are given, where it is `asked` for, from those of what was found."""
+def cotangents(form: Form, method: Method, start: Start, asked: Sequence[bool], memory: int, g: Solved) -> tuple[Integrated, list]:
+    """Cotangents of the start, and of each of the numbers that the rates are given, where it is `asked` for, from those of what was found.
+
+    `memory`: bytes that records of steps may take.
+    """
     which = tuple(i for i, is_asked in enumerate(asked) if is_asked)
     check_derivatives(form, 1)
     states = jax.vmap(_packed)(g.ys)
     states = jnp.concatenate([states, jnp.zeros_like(states[:1])])  # nobody asks for the last one: it is that of the end
-    found = flow_back(form, method, which)(start, states, jnp.concatenate([_packed(g.y_end), g.t_end[None]]))
+    found = flow_back(form, method, which, memory)(start, states, jnp.concatenate([_packed(g.y_end), g.t_end[None]]))
     known = dict(zip(which, entries_of(found[form.y :]), strict=True))
     return _state(form, found[: form.y]), [known.get(i) for i in range(len(asked))]
 

@@ -1,10 +1,11 @@
 """The record of steps of a motion's way forth, by which its cotangents go back (`back.py`): one slot for each try of a step, for all lanes of a block.
 
-On a CPU the record grows with the steps. A GPU has memory for so many slots for each thread; of motions that take more, the lanes go forth again for each
-window of slots, the last one first.
+There is memory for so many slots: on a CPU for those of all threads within that of the model, where the record grows with the steps until then; on a GPU for
+what its memory has for each thread. Of motions that take more, the lanes go forth again for each window of slots, the last one first.
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
@@ -51,12 +52,51 @@ class _Rooms(NamedTuple):
         return _Rooms(state, w.room(w.lanes, "i64"), w.room(), g, by_known, w.room(type="i64"))
 
 
-def write_record(w: Writer, form: Form, method: Method, asked: int, job: Value) -> None:
+class _Places(NamedTuple):
+    """Where slots are; each function takes the number of a try."""
+
+    slots: Value  # how many there are
+    free: Callable[[Value], Value]  # where the slot is written
+    keep: Callable[[Value], None]  # what is done then
+    kept: Callable[[Value], Value]  # where it is read
+    lost: Callable[[], Value]  # whether memory has run out
+
+
+def write_record(w: Writer, form: Form, method: Method, asked: int, memory: int, job: Value) -> None:
     """Lanes side by side, forth and back, until none is left; inside a function."""
-    if w.device:
-        _write_windows(w, form, method, asked, job)
-    else:
-        _write_blocks(w, form, method, asked, job)
+    slot, rooms = Slot.of(form, method), _Rooms.of(w, form, asked)
+    lanes, end, count = Lanes(w, form, rooms.state), w.room(type="i64"), rooms.tries
+    places = _on_gpu(w, slot, job) if w.device else _on_cpu(w, slot, memory)
+    with w.repeated() as leave:
+        leave(~w.together(lanes_taken(w, job, NEXT) < w.load(job, COUNT, "i64")) | places.lost())
+        _take(w, job, rooms.who)
+        w.store(w.literal(2**62, "i64"), end)
+        with w.repeated() as done:
+            _write_start(w, form, job, rooms)
+            with w.repeated() as ended:
+                code, number = lanes["code"], w.load(count, type="i64")
+                on_its_way = w.any(code.equals(RUNNING) | code.equals(LOCATING))
+                ended(~w.together(on_its_way & (number < w.load(end, type="i64"))))
+                here = places.free(number)
+                ended(places.lost())
+                _write_try(w, form, slot, job, rooms, here)
+                places.keep(number)
+            done(places.lost())
+            with w.when(w.load(end, type="i64").equals(2**62)):
+                _write_ends(w, form, asked, job, rooms)
+            first = w.load(count, type="i64") - places.slots
+            w.store(w.where(first > 0, first, 0), end)
+            with w.repeated() as at_start:
+                number = w.load(count, type="i64") - 1
+                at_start(~w.together(number >= w.load(end, type="i64")))
+                _write_try_back(w, slot, job, rooms, places.kept(number))
+            done(~w.together(w.load(end, type="i64") > 0))
+        leave(places.lost())
+        _write_found(w, form, asked, job, rooms)
+    if not w.device:
+        with w.when(places.lost()):
+            _give_nan(w, form, asked, job, rooms.who)
+        w.external("free", "void", places.kept(w.literal(0, "i64")))
 
 
 def prepare(w: Writer, form: Form, method: Method) -> None:
@@ -79,77 +119,44 @@ def _write_more_room(w: Writer) -> None:
         w.give(new)
 
 
-def _write_blocks(w: Writer, form: Form, method: Method, asked: int, job: Value) -> None:
-    """Lanes side by side, forth and back, until none is left."""
-    slot = Slot.of(form, method)
+def _on_cpu(w: Writer, slot: Slot, memory: int) -> _Places:
+    """As many slots as a third of the memory has for each thread: the record, of up to twice as many, is there beside half of itself while it grows."""
     size = slot.all * w.lanes * 8
-    rooms = _Rooms.of(w, form, asked)
-    state, who, count = rooms.state, rooms.who, rooms.tries
-    record, bytes_there, lanes = w.room(type="ptr"), w.room(type="i64"), Lanes(w, form, state)
-    w.store(w.literal(FIRST_SLOTS * size, "i64"), bytes_there)
-    w.store(w.external("aligned_alloc", "ptr", w.literal(64, "i64"), w.literal(FIRST_SLOTS * size, "i64")), record)
+    most = max(memory // (3 * size * w.threads), 1)
+    slots, first = w.literal(most, "i64"), w.literal(min(FIRST_SLOTS, most) * size, "i64")
+    record, bytes_there = w.room(type="ptr"), w.room(type="i64")
+    w.store(first, bytes_there)
+    w.store(w.external("aligned_alloc", "ptr", w.literal(64, "i64"), first), record)
 
-    def has_room() -> Value:
-        return w.converted("ptrtoint", w.load(record, type="ptr"), "i64").differs(0)
+    def kept(number: Value) -> Value:
+        return w.at(w.load(record, type="ptr"), w.binary("srem", number, slots) * slot.all)
 
-    with w.repeated() as leave:
-        leave(w.load(job, NEXT, "i64") >= w.load(job, COUNT, "i64"))
-        leave(~has_room())
-        _take(w, job, who)
-        _write_start(w, form, job, rooms)
-        with w.repeated() as ended:
-            code, number = lanes["code"], w.load(count, type="i64")
-            ended(~w.any(code.equals(RUNNING) | code.equals(LOCATING)))
-            with w.when((number + 1) * size > w.load(bytes_there, type="i64")):
-                w.store(w.call("more_room", "ptr", w.load(record, type="ptr"), w.load(bytes_there, type="i64")), record)
-                w.store(w.load(bytes_there, type="i64") * 2, bytes_there)
-            ended(~has_room())
-            _write_try(w, form, slot, job, rooms, w.at(w.load(record, type="ptr"), number * slot.all))
-        leave(~has_room())
-        _write_ends(w, form, asked, job, rooms)
-        with w.repeated() as at_start:
-            at_start(w.load(count, type="i64") <= 0)
-            _write_try_back(w, slot, job, rooms, w.at(w.load(record, type="ptr"), (w.load(count, type="i64") - 1) * slot.all))
-        _write_found(w, form, asked, job, rooms)
-    with w.when(~has_room()):
-        _give_nan(w, form, asked, job, who)
-    w.external("free", "void", w.load(record, type="ptr"))
+    def free(number: Value) -> Value:
+        with w.when((number < slots) & ((number + 1) * size > w.load(bytes_there, type="i64"))):
+            w.store(w.call("more_room", "ptr", w.load(record, type="ptr"), w.load(bytes_there, type="i64")), record)
+            w.store(w.load(bytes_there, type="i64") * 2, bytes_there)
+        return kept(number)
+
+    return _Places(slots, free, lambda number: None, kept, lambda: w.converted("ptrtoint", w.load(record, type="ptr"), "i64").equals(0))
 
 
-def _write_windows(w: Writer, form: Form, method: Method, asked: int, job: Value) -> None:
-    """As `_write_blocks`, on a GPU: the lanes of a warp, in memory for so many of the last slots; the numbers of its threads stand side by side."""
-    slot, rooms = Slot.of(form, method), _Rooms.of(w, form, asked)
-    lanes, here, end = Lanes(w, form, rooms.state), w.room(slot.all), w.room(type="i64")
-    (thread, threads), count = w.thread(), rooms.tries
+def _on_gpu(w: Writer, slot: Slot, job: Value) -> _Places:
+    """As many slots as a thread has memory for; the numbers of threads stand side by side."""
+    here, (thread, threads) = w.room(slot.all), w.thread()
     record = w.at(w.load(job, NEXT, "ptr"), thread + FIRST_OF_SCRATCH)
     slots = w.binary("sdiv", w.load(job, OWN, "i64") - FIRST_OF_SCRATCH, threads * slot.all)
 
     def place(number: Value, row: int | Value) -> Value:
         return w.at(record, (w.binary("srem", number, slots) * slot.all + row) * threads)
 
-    with w.repeated() as leave:
-        leave(~w.together(lanes_taken(w, job, NEXT) < w.load(job, COUNT, "i64")))
-        _take(w, job, rooms.who)
-        w.store(w.literal(2**62, "i64"), end)
-        with w.repeated() as done:
-            _write_start(w, form, job, rooms)
-            with w.repeated() as ended:
-                code, number = lanes["code"], w.load(count, type="i64")
-                on_its_way = w.any(code.equals(RUNNING) | code.equals(LOCATING))
-                ended(~w.together(on_its_way & (number < w.load(end, type="i64"))))
-                _write_try(w, form, slot, job, rooms, here)
-                for_rows(w, range(slot.all), lambda row, number=number: w.store(w.load(here, row), place(number, row)))
-            with w.when(w.load(end, type="i64").equals(2**62)):
-                _write_ends(w, form, asked, job, rooms)
-            first = w.load(count, type="i64") - slots
-            w.store(w.where(first > 0, first, 0), end)
-            with w.repeated() as at_start:
-                number = w.load(count, type="i64") - 1
-                at_start(~w.together(number >= w.load(end, type="i64")))
-                for_rows(w, range(slot.all), lambda row, number=number: w.store(w.load(place(number, row)), here, row))
-                _write_try_back(w, slot, job, rooms, here)
-            done(~w.together(w.load(end, type="i64") > 0))
-        _write_found(w, form, asked, job, rooms)
+    def keep(number: Value) -> None:
+        for_rows(w, range(slot.all), lambda row: w.store(w.load(here, row), place(number, row)))
+
+    def kept(number: Value) -> Value:
+        for_rows(w, range(slot.all), lambda row: w.store(w.load(place(number, row)), here, row))
+        return here
+
+    return _Places(slots, lambda number: here, keep, kept, lambda: w.literal(0, "i1"))
 
 
 def _take(w: Writer, job: Value, who: Value) -> None:
