@@ -2,11 +2,11 @@
 
 m >= 0,   I = I' >= 0,   R' R = 1,   det R = 1
 n.n = 1,   e.e = 1 of gravity,   gap = 0 where the coordinates keep a body on the ground,   0 < r of what rolls and of its ground,   0 <= tyre < r
+d[n.(p - o)]/dt at a fixed point p = - n.(v + w x (p - o))        a plane's motion, stated twice: by o(t, q), n(t, q) and by v, w
 
 They are one table, `CHECKS`, of functions of numbers. What one state shows has a `label`: it is looked at where a scene is probed, where a fault is an error
 with its text, and at the start of each motion, in the compiled program, where it is a result code. What is without is looked at where a scene is probed:
 
-d[n.(p - o)]/dt at a fixed point p = - n.(v + w x (p - o))        a plane's motion, stated twice: by o(t, q), n(t, q) and by v, w
 dg/dt along the motion of the other bodies = 0  or  v, w != 0      g: all that says where the ground of a contact is
 I_3 <= I_1 + I_2
 """
@@ -56,7 +56,7 @@ def stated_of(scene: Scene, pose: Pose, loads: tuple[Load, ...] = ()) -> Numbers
     rigid = {name: body for name, body in bodies.items() if isinstance(body, RigidBody)}
     closed = {name: c for name, c in contacts.items() if c.height == "coordinates"}
     size = lambda x: jnp.sum(jnp.abs(x))  # noqa: E731
-    away = 1e6 * jnp.finfo(pose.q.array.dtype).eps  # of round-off in the places of contacts that are far out
+    away = _round_off(pose)  # in the places of contacts that are far out
     return {
         "mass": {name: body.mass for name, body in bodies.items()},  # kg
         # kg m^2; the fourth row is round-off: moments of bodies whose radius of gyration is below 1e-9 m
@@ -70,6 +70,10 @@ def stated_of(scene: Scene, pose: Pose, loads: tuple[Load, ...] = ()) -> Numbers
         "tyre": {name: c.shape.tyre for name, c in contacts.items() if isinstance(c.shape, Wheel) and c.shape.tyre is not None},  # m
         "gravity": {f"the direction of gravity in load {k}": load.direction @ load.direction for k, load in enumerate(loads, 1) if isinstance(load, Gravity)},
     }
+
+
+def _round_off(pose: Pose):
+    return 1e6 * jnp.finfo(pose.q.array.dtype).eps
 
 
 def _lengths(contact: Contact) -> dict[str, Float[Array, ""]]:
@@ -223,12 +227,13 @@ CHECKS = (
     ),
     Check(
         "plane",
-        lambda x: abs(x[:, 0] - x[:, 1]) > TOLERANCE * x[:, 2],
+        lambda x: abs(x[..., 0] - x[..., 1]) > TOLERANCE * x[..., 2],
         lambda x: (
             f"moves along its normal at {x[0]:.4g} m/s by `origin` and `tilt`, but at {x[1]:.4g} m/s by `velocity` and `angular_velocity`; state the motion "
             "in both: velocity = d origin/dt, angular_velocity = (0, d tilt/dt, 0); where coordinates move it, omit the contact and "
             f"{_ROWS_INSTEAD}"
         ),
+        label="a plane that moves in another way than is stated",
         group="grounds",
     ),
     Check(
@@ -245,9 +250,8 @@ CHECKS = (
 
 def faults_at(scene: Scene, t, q, u, inputs) -> dict[str, Bool[Array, ""]]:
     """Return fault -> whether the scene has it at this state; also under jit and vmap. NaN is no fault."""
-    motion = motion_at(scene, t, q, u, inputs)
-    stated = stated_of(scene, motion.pose(), loads_of(scene, motion))
-    return {f"{check.label}: {name}": check.wrong(x) for check in CHECKS if check.label for name, x in stated[check.of].items()}
+    numbers = numbers_of(scene, motion_at(scene, t, q, u, inputs))
+    return {f"{check.label}: {name}": check.wrong(x) for check in CHECKS if check.label for name, x in numbers[check.of].items()}
 
 
 known_faults_at = eval_numpy(faults_at)
@@ -285,6 +289,7 @@ def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
         normal_rate, origin_rate, _ = rates(name, jnp.ones_like(motion.t), motion.qdot.array, moving)
         twice = plane.normal @ origin_rate - normal_rate @ arm, plane.normal @ plane.velocity_at(contact.point)
         could = size(origin_rate, plane.velocity) + size(arm) * size(normal_rate, plane.angular_velocity)
+        could += _round_off(pose)  # of rates of 1 m/s that vanish at this state
         found["plane"][f"the plane of contact `{name}`"] = jnp.stack([*twice, could])
         if contact.ground is not None:
             others = {body: rate if body != contact.body else jax.tree.map(jnp.zeros_like, rate) for body, rate in moving.items()}
