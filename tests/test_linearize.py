@@ -213,14 +213,15 @@ class TwoSkates(jj.Scene):
         return {name: body.orientation[:, 1] @ body.velocity for name, body in motion.bodies.items()}
 
 
-@pytest.mark.parametrize("heading", [0.0, 0.7, np.pi / 2])
-def test_speeds_are_chosen_at_the_state_where_those_of_the_domain_do_not_serve(heading):
+def test_speeds_are_chosen_at_the_state_where_those_of_the_domain_do_not_serve():
     scene = TwoSkates()
-    state = jj.start(scene, heading=heading, x_rate=np.cos(heading), y_rate=np.sin(heading))
-    small = linearize(scene, state, ())
-    assert small.pivot > 0.02
-    # straight ahead at 1 m/s with both skates in line: a heading stays, a steer of the front one falls as exp(-t), an offset and the speed stay
-    assert_allclose(small.state_eigenvalues().real, [-1.0, 0.0, 0.0, 0.0, 0.0, 0.0], atol=1e-6)
+    for heading in (0.0, 0.7, np.pi / 2):
+        state = jj.start(scene, heading=heading, x_rate=np.cos(heading), y_rate=np.sin(heading))
+        small = linearize(scene, state, ())
+        assert small.pivot > 0.02
+        # straight ahead at 1 m/s with both skates in line: a heading stays, a steer of the front one falls
+        # as exp(-t), an offset and the speed stay
+        assert_allclose(small.state_eigenvalues().real, [-1.0, 0.0, 0.0, 0.0, 0.0, 0.0], atol=1e-6)
     in_jit = jax.jit(lambda u: linearize(scene, jj.consistent(scene, 0.0, state.q, u), ()))(state.u)
     assert in_jit.pivot < 1e-12
     assert in_jit.code == 6
@@ -536,7 +537,7 @@ class Fluttering(OnLine):
 def frequency(stiffness):
     """Of small motions about the equilibrium without damping, of a unit mass."""
     x = 0.2
-    for _ in range(20):
+    for _ in range(5):
         x = x - (stiffness * x + x**3 - 1.0) / (stiffness + 3 * x**2)
     return jnp.sqrt(stiffness + 3 * x**2)
 

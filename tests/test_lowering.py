@@ -3,6 +3,7 @@
 import ctypes
 import shutil
 import subprocess
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -64,14 +65,17 @@ class Rough(jj.Scene):
 PRINTED = {name: MODELS[name]() for name in ("skate", "tilting-disc", "two-wheel-axle-coordinates", "whipple-bicycle")} | {"rough": Rough()}
 
 
-def printed_states(scene, program, count=3):
+@cache
+def printed_states(name):
     """Times, states and inputs at which printed sources are evaluated, and the rates of the program there."""
-    t, q, u = jj.sample_states(scene, count)
+    scene, program = PRINTED[name], jj.lower(PRINTED[name])
+    t, q, u = jj.sample_states(scene, 3)
     y, inputs = u[:, np.array(program.independent, int)], np.linspace(0.3, 0.7, len(scene.inputs))
-    fixed = program.fixed_values(scene)
+    fixed, found = program.fixed_values(scene), []
     for state in zip(np.asarray(t), np.asarray(q), np.asarray(y), strict=True):
         qdot, ydot, _ = program.rates(fixed, state[0], tuple(state[1]), tuple(state[2]), jnp.asarray(inputs))
-        yield (*state, inputs), np.array([*qdot, *ydot], float)
+        found.append(((*state, inputs), np.array([*qdot, *ydot], float)))
+    return found
 
 
 @pytest.mark.parametrize("name", PRINTED)
@@ -80,7 +84,7 @@ def test_the_readable_source_computes_the_rates(name):
     scope: dict = {}
     exec(program.python_source(), scope)
     fixed = scope["fixed"](*(float(x) for leaf in jax.tree.leaves(PRINTED[name]) for x in np.ravel(leaf)))
-    for (t, q, y, inputs), expected in printed_states(PRINTED[name], program):
+    for (t, q, y, inputs), expected in printed_states(name):
         assert_allclose(scope["rates"](fixed, t, *q, *y, *inputs), expected, rtol=1e-11, atol=1e-11)
 
 
@@ -97,7 +101,7 @@ def test_the_source_in_c_compiles_without_warnings_and_computes_the_rates(name, 
     rates = ctypes.CDLL(str(tmp_path / "rates.so")).rates
     vector = lambda values: (ctypes.c_double * max(1, len(values)))(*map(float, values))  # noqa: E731
     parameters = vector([x for leaf in jax.tree.leaves(PRINTED[name]) for x in np.ravel(leaf)])
-    for (t, q, y, inputs), expected in printed_states(PRINTED[name], program):
+    for (t, q, y, inputs), expected in printed_states(name):
         out = vector(np.zeros(len(expected)))
         rates(parameters, ctypes.c_double(t), vector(q), vector(y), vector(inputs), out)
         assert_allclose(list(out), expected, rtol=1e-11, atol=1e-11)
@@ -211,14 +215,14 @@ def test_a_derivative_rule_is_believed_as_jax_believes_it(scene):
 
 
 def test_a_program_that_grows_past_the_budget_is_not_lowered_and_the_dense_path_is_taken_with_a_note(monkeypatch):
-    scene = MODELS["rattleback"]()
-    monkeypatch.setattr(module, "MOST_OPERATIONS", 50)
-    monkeypatch.setattr(module, "MOST_IN_MACHINE_CODE", 50)
+    scene = MODELS["tilting-disc"]()
+    monkeypatch.setattr(module, "MOST_OPERATIONS", 9)
+    monkeypatch.setattr(module, "MOST_IN_MACHINE_CODE", 9)
     module._lowered.cache_clear()
     try:
-        with pytest.raises(jj.NotLowered, match="more than 50"):
+        with pytest.raises(jj.NotLowered, match="more than 9"):
             jj.lower(scene)
-        assert "more than 50" in jj.report(scene).lowering
+        assert "more than 9" in jj.report(scene).lowering
         assert jj.build(scene).way.startswith("dense matrices")
     finally:
         module._lowered.cache_clear()
@@ -232,12 +236,8 @@ class Walled(MODELS["chaplygin-sleigh"]):
 
 
 def test_a_coordinate_that_chooses_a_branch_is_not_ignorable_where_no_probe_takes_the_other_one():
-    scene = Walled()
     assert jj.lower(MODELS["chaplygin-sleigh"]()).held == ("x", "y")
-    assert jj.lower(scene).held == ("y",)
-    start = jj.start(scene, x=10.5, x_rate=0.5)
-    ends = [jj.simulate(scene, start, t1=1.0, **options).q_end for options in ({}, {"formulation": jj.Formulation("full", "kkt")})]
-    assert_allclose(*ends, atol=1e-6)
+    assert jj.lower(Walled()).held == ("y",)
 
 
 def test_what_a_scene_has_not_costs_nothing():
@@ -264,8 +264,9 @@ def test_values_computed_together_are_the_same_and_have_the_same_derivatives():
     x = jnp.linspace(-2.0, 2.0, 7)
     assert_array_equal(jax.jit(both)(x)[1], jnp.sin(x) + x)
     assert_array_equal(jax.vmap(both)(x)[0], jnp.sin(x) * 2.0)
-    assert_allclose(jax.grad(lambda x: jnp.sum(both(x)[0] + both(x)[1]))(x), 3 * jnp.cos(x) + 1, rtol=1e-14)
-    assert_allclose(jax.hessian(lambda x: both(x)[0])(0.7), -2 * np.sin(0.7), rtol=1e-14)
+    slope = jax.jit(jax.grad(lambda x: jnp.sum(both(x)[0] + both(x)[1])))(x)
+    assert_allclose(slope, 3 * jnp.cos(x) + 1, rtol=1e-14)
+    assert_allclose(jax.jit(jax.hessian(lambda x: both(x)[0]))(0.7), -2 * np.sin(0.7), rtol=1e-14)
 
 
 def test_rates_mapped_over_states_are_linearised_inside_jit():
@@ -279,9 +280,9 @@ def test_rates_mapped_over_states_are_linearised_inside_jit():
         return program.rates(fixed, 0.0, tuple(q[0]), tuple(y), jnp.zeros(0))[:2]
 
     values, slope = jax.linearize(jax.jit(jax.vmap(rates)), y)
-    for along, (value, expected) in ((y, jax.jvp(jax.vmap(rates), (y,), (y,))), (2 * y, jax.jvp(jax.vmap(rates), (y,), (2 * y,)))):
-        for a, b in zip(jax.tree.leaves((values, slope(along))), jax.tree.leaves((value, expected)), strict=True):
-            assert_allclose(a, b, rtol=1e-14)
+    expected = jax.jit(lambda along: jax.jvp(jax.vmap(rates), (y,), (along,)))
+    for along in (y, 2 * y):
+        jax.tree.map(partial(assert_allclose, rtol=1e-14), (values, slope(along)), expected(along))
 
 
 def test_loops_over_steps_are_compiled_into_one_function():

@@ -111,13 +111,21 @@ WAYS = ({}, {"backend": "xla"}, {"backend": "dense"})
 SPEEDS = np.array([0.5, 3.0, 4.0, -1.0])  # m/s; the first and the last never come to the edge
 
 
+CODES = [results.SUCCESS, results.ENERGY_LOST, results.ENERGY_LOST, results.SUCCESS]
+
+
+def passing(v, **way):
+    return jj.simulate(Step(), {"x_rate": v, "y_rate": 1.0}, ts=[1.5], **way).result
+
+
 @pytest.mark.parametrize("way", WAYS)
 def test_a_feature_that_steps_pass_over_is_told_by_the_energy(way):
-    run = lambda v: jj.simulate(Step(), {"x_rate": v, "y_rate": 1.0}, ts=[1.5], **way)  # noqa: E731
-    codes = [int(run(v).result) for v in SPEEDS]
-    inside = jax.jit(jax.vmap(lambda v: run(v).result))(SPEEDS).tolist()
-    lanes = jj.rollout(Step(), {"x_rate": SPEEDS, "y_rate": 1.0 + 0 * SPEEDS}, ts=[1.5], **way).result.tolist()
-    assert codes == inside == lanes == [results.SUCCESS, results.ENERGY_LOST, results.ENERGY_LOST, results.SUCCESS]
+    assert jax.jit(jax.vmap(lambda v: passing(v, **way)))(SPEEDS).tolist() == CODES
+
+
+def test_the_energy_tells_it_also_of_motions_alone_and_in_a_rollout():
+    assert [int(passing(v)) for v in SPEEDS] == CODES
+    assert jj.rollout(Step(), {"x_rate": SPEEDS, "y_rate": 1.0 + 0 * SPEEDS}, ts=[1.5]).result.tolist() == CODES
 
 
 def test_an_edge_that_steps_can_follow_is_passed():
