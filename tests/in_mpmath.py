@@ -1,33 +1,23 @@
 """Functions of the table in as many digits as one likes, and what the round-off of their arguments makes of them."""
 
+import operator
 from collections.abc import Callable
 from typing import NamedTuple
 
 import mpmath
 
 EPS = 2.0**-52
-COMPARED = {
-    "lt": lambda a, b: a < b,
-    "le": lambda a, b: a <= b,
-    "gt": lambda a, b: a > b,
-    "ge": lambda a, b: a >= b,
-    "eq": lambda a, b: a == b,
-    "ne": lambda a, b: a != b,
-}
+COMPARED = {name: getattr(operator, name) for name in ("lt", "le", "gt", "ge", "eq", "ne")}
 TRUTHS = {"and": lambda a, b: a and b, "or": lambda a, b: a or b, "not": lambda a: not a}
 STEPS = ("sign", "floor", "ceil", "round")
 NUMBERS: dict[str, Callable] = {
-    "neg": lambda a: -a,
+    **{name: getattr(operator, name) for name in ("neg", "add", "sub", "mul", "pow")},
+    "div": operator.truediv,
     "abs": abs,
     "exp2": lambda a: mpmath.power(2, a),
     "cbrt": lambda a: mpmath.sign(a) * mpmath.cbrt(abs(a)),
     "logistic": lambda a: 1 / (1 + mpmath.exp(-a)),
     "round": mpmath.nint,
-    "add": lambda a, b: a + b,
-    "sub": lambda a, b: a - b,
-    "mul": lambda a, b: a * b,
-    "div": lambda a, b: a / b,
-    "pow": lambda a, b: a**b,
     "rem": lambda a, b: a - b * (mpmath.floor(a / b) if a / b > 0 else mpmath.ceil(a / b)),
     "max": max,
     "min": min,

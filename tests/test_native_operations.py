@@ -101,17 +101,21 @@ OWN = ["sin", "cos", *BY_POLYNOMIALS]
 
 
 @functools.cache
-def _our_own(lanes: int, fused: bool) -> Callable:
-    """Values of our own functions by machine code of other machines: (x, y) -> name -> value."""
+def _functions(fused: bool) -> Callable:
+    """Of points (x, y); for machines that round products and sums together, or for others."""
+    graph = Graph()
+    inputs = [graph.input("x", True), graph.input("y", True)]
+    nodes = [graph.call(op, *inputs[: 1 if op in ONE else 2]) for op in OWN]
+    return evaluated_natively.function(graph, [*nodes, graph.call("pow", inputs[0], graph.const(1.5))], inputs)
+
+
+def _our_own(lanes: int, fused: bool, x, y) -> dict:
+    """Values of our own functions by machine code of other machines."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(host, "lanes", lambda: lanes)
         patch.setattr(host, "fuses", lambda: fused)
-        graph = Graph()
-        inputs = [graph.input("x", True), graph.input("y", True)]
-        nodes = [graph.call(op, *inputs[: 1 if op in ONE else 2]) for op in OWN]
-        nodes.append(graph.call("pow", inputs[0], graph.const(1.5)))
-        function = evaluated_natively.function(graph, nodes, inputs)
-    return lambda x, y: dict(zip([*OWN, "x^1.5"], np.asarray(function(np.stack([x, y], axis=1))).T, strict=True))
+        found = np.asarray(_functions(fused)(np.stack([x, y], axis=1)))
+    return dict(zip([*OWN, "x^1.5"], found.T, strict=True))
 
 
 def _arguments(op: str) -> tuple[np.ndarray, np.ndarray]:
@@ -140,7 +144,7 @@ def test_functions_of_our_own_are_right_to_the_last_digit(op, fused):
     if fused and not host.fuses():
         pytest.skip("sums and products are rounded one after the other here")
     x, y = _arguments(op)
-    found = _our_own(host.lanes(), fused)(x, y)[op]
+    found = _our_own(host.lanes(), fused, x, y)[op]
     function = (lambda x: mpmath.sqrt(x) * x) if op == "x^1.5" else in_mpmath(op)
     with mpmath.workdps(60):
         exact = [function(*(mpmath.mpf(float(x)) for x in arguments)) for arguments in (zip(x, y, strict=True) if op in TWO else zip(x, strict=True))]
@@ -155,9 +159,9 @@ def test_functions_of_our_own_are_the_same_beside_any_others(fused):
         pytest.skip("sums and products are rounded one after the other here")
     x = np.concatenate([SPECIAL, [1e-310, -1e-310], np.random.default_rng(2).normal(size=400) * 10.0 ** np.random.default_rng(3).integers(-5, 7, size=400)])
     y = np.random.default_rng(4).permutation(x)
-    expected = _our_own(2, fused)(x, y)
+    expected = _our_own(2, fused, x, y)
     for lanes in (4, 8):
         order = np.random.default_rng(lanes).permutation(len(x))
-        found = _our_own(lanes, fused)(x[order], y[order])
+        found = _our_own(lanes, fused, x[order], y[order])
         for op, values in expected.items():
             assert_array_equal(found[op].view(np.int64), values[order].view(np.int64), err_msg=op)

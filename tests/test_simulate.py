@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import Upright
 
 import jourdain_jax as jj
-from jourdain_jax.models import MODELS, ChaplyginSleigh, DoublePendulumRods, Skate, TiltingDisc
+from jourdain_jax.models import MODELS, ChaplyginSleigh, DoublePendulumRods, TiltingDisc
 
 
 class Falling(Upright):
@@ -56,12 +56,6 @@ def test_an_event_time_does_not_depend_on_the_times_saved():
     assert_allclose(jax.grad(landing)(1.0), 0.0, atol=1e-10)
 
 
-def test_a_motion_that_starts_beyond_an_event_does_not_start():
-    motion = jj.simulate(Falling(), {"z": -1.0}, t1=1.0)
-    assert motion.result == results.EVENT
-    assert float(motion.t_end) == 0.0
-
-
 def test_work_without_potential_is_taken_off_the_energy_and_the_result_says_so():
     options = {"rtol": 1e-11, "atol": 1e-11}
     motion = jj.simulate(Falling(drag=0.3), t1=1.0, inputs={"force": lambda t: jnp.sin(3 * t)}, **options)
@@ -91,11 +85,6 @@ def test_geometric_rows_hold_after_every_step_by_projection_and_drift_without():
     kept, drifted = (jj.simulate(DoublePendulumRods(), formulation=jj.Formulation("full", stabilisation=by), **options) for by in ("projection", None))
     assert jnp.max(jnp.abs(kept.residuals()[0])) < 1e-12
     assert jnp.max(jnp.abs(drifted.residuals()[0])) > 1e-8
-
-
-def test_the_default_state_is_full_where_no_partition_serves_everywhere():
-    motion = jj.simulate(Skate(), t1=1.0)  # the heading passes through all angles
-    assert motion.state_form == "full"
 
 
 def test_a_start_off_the_constraints_is_moved_onto_them_and_the_motion_says_how_far():
