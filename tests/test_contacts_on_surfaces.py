@@ -33,7 +33,7 @@ def poses(scene, count: int):
         place = place * np.array([0.3, 0.3, 0.02]) + np.array([0.0, 0.0, 0.13])
     else:
         place *= 0.55 / np.linalg.norm(place, axis=1)[:, None]
-    return jnp.asarray(np.hstack([place, random.normal(size=(count, 4))]))
+    return np.hstack([place, random.normal(size=(count, 4))])
 
 
 def rolling(ground: str, shape: str) -> Rolls:
@@ -59,7 +59,7 @@ def outside(scene, place, R, point):
 def test_body_and_ground_are_nearest_where_their_normals_are_opposite(ground, shape):
     scene = rolling(ground, shape)
 
-    @jax.jit
+    @eval_numpy  # compiling it takes seconds
     @jax.vmap
     def miss(q):
         pose = jj.pose_at(scene, 0.0, q)

@@ -1,6 +1,7 @@
 """Stop events: found in their step to round-off, the first of several, in short windows, and again from where they stopped; with derivatives."""
 
 import itertools
+from functools import cache
 
 import diffrax
 import equinox as eqx
@@ -174,6 +175,7 @@ KINDS = {
 USUAL = ("distance", "window", "clock", "floor")
 
 
+@cache
 def scene_of(kind: str):
     value, _ = KINDS[kind]
 
@@ -204,7 +206,7 @@ def test_the_time_of_a_short_window_has_derivatives(derivative):
     def time(a):
         return jj.simulate(scene_of("distance")(a=a), {"x": 0.0, "x_rate": 1.0}, ts=[2.0]).t_end
 
-    assert abs(derivative(time)(A) - 1.0) < 1e-8
+    assert abs(jax.jit(derivative(time))(A) - 1.0) < 1e-8
 
 
 def test_values_with_a_peak_where_a_relation_changes_are_not_watched():
