@@ -29,7 +29,7 @@ FAILURES = {
     "steps": ((1.0, 1e8, 1.0, -50.0), True),
     "domain": ((1.0, 40.0, 1.0, 0.3), True),
     "parameter": ((1.0, 1.0, -1.0, -50.0), False),
-    "start": ((jnp.nan, 1.0, 1.0, -50.0), False),
+    "start": ((np.nan, 1.0, 1.0, -50.0), False),
 }
 TIMES = [2e-4, 1.0]
 
@@ -40,7 +40,7 @@ def _first(p, amplitude):
 
 def _lanes(kind, backend, rolled):
     """p -> (loss over lanes that succeeded, the early state of the second lane, its end); p is shared by all lanes."""
-    factors = jnp.array([(1.0, 1.0, 1.0, -50.0), FAILURES[kind][0]])
+    factors = np.array([(1.0, 1.0, 1.0, -50.0), FAILURES[kind][0]])
 
     def found(p):
         def one(numbers):
