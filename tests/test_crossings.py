@@ -194,7 +194,7 @@ class Bead(OnLine):
 
 FREE = Bead()
 BEGIN = {"x": 1.0, "x_rate": 0.5}
-WAYS = {"native": {}, "xla": {"backend": "xla"}, "dense": {"backend": "dense"}, "Taylor": {"solver": jj.Taylor()}, "Tsit5": {"solver": diffrax.Tsit5()}}
+WAYS = {"native": {}, "xla": {"backend": "xla"}, "dense": {"backend": "dense"}, "Taylor": {"solver": jj.Taylor()}}
 WAYS |= {"implicit": {"solver": jj.RadauIIA()}, "diffrax": {"solver": diffrax.Kvaerno3(), "work": False}}
 
 
