@@ -168,6 +168,8 @@ def test_round_off_is_printed_as_zero():
     assert "z1_rate = 0," in str(small)
     tiny = eqx.tree_at(lambda s: (s.q, s.u), state, (1e-30 * state.q, 1e-30 * state.u))
     assert "x1 = 6e-31" in str(tiny)
+    still = eqx.tree_at(lambda s: (s.q, s.u), state, (-0.0 * abs(state.q), -0.0 * abs(state.u)))
+    assert "-0" not in str(still).split("moved")[0]
 
 
 @functools.cache

@@ -24,7 +24,7 @@ def complex_numbers(values) -> list[str]:
     values = np.asarray(values)
     parts = in_digits(np.concatenate([values.real, values.imag]))
     pairs = zip(parts[: len(values)], parts[len(values) :], strict=True)
-    return [real if imag in ("0", "-0") else f"{real}{imag if imag.startswith('-') else f'+{imag}'}i" for real, imag in pairs]
+    return [real if imag == "0" else f"{real}{imag if imag.startswith('-') else f'+{imag}'}i" for real, imag in pairs]
 
 
 def linearization_text(found) -> str:

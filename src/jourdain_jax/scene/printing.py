@@ -80,7 +80,7 @@ def in_digits(values) -> list[str]:
     """Numbers with six digits; those that are round-off of the largest of them are 0."""
     values = np.asarray(values)
     least = np.finfo(values.dtype).eps * np.nanmax(np.abs(values), initial=0.0, where=np.isfinite(values))
-    return [f"{0.0 if abs(x) < least else x:.6g}" for x in values]
+    return [f"{0.0 if abs(x) <= least else x:.6g}" for x in values]
 
 
 def shapes_of(result) -> str:
