@@ -54,7 +54,7 @@ def _derivatives(x, A):
 def test_lanes_are_those_of_vmap(f):
     random = np.random.default_rng(0)
     x, A = random.normal(size=(5, 4)), random.normal(size=(5, 3, 4))
-    found, expected = uncompiled_lanes(f)(x, A), jax.vmap(f)(x, A)
+    found, expected = uncompiled_lanes(f)(x, A), jax.jit(jax.vmap(f))(x, A)
     assert jax.tree.structure(found) == jax.tree.structure(expected)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert a.dtype == b.dtype
@@ -64,7 +64,7 @@ def test_lanes_are_those_of_vmap(f):
 def test_what_all_lanes_share_has_no_axis_of_lanes():
     random = np.random.default_rng(0)
     x, A = random.normal(size=4), random.normal(size=(5, 3, 4))
-    found, expected = uncompiled_lanes(_products, shared=1)(x, A), jax.vmap(_products, in_axes=(None, 0))(x, A)
+    found, expected = uncompiled_lanes(_products, shared=1)(x, A), jax.jit(jax.vmap(_products, in_axes=(None, 0)))(x, A)
     jax.tree.map(lambda a, b: assert_allclose(a, b, rtol=1e-12, atol=1e-12), found, expected)
 
 
