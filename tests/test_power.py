@@ -9,7 +9,7 @@ from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
 from jourdain_jax import coordinate_rates
-from jourdain_jax.dynamics.power import power, power_of_nonconservative
+from jourdain_jax.dynamics.power import power
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.models import BallOnTurntable, ChaplyginSleigh, IsokineticParticle, TiltingDisc, TwoWheelAxleCoordinates
 
@@ -25,7 +25,7 @@ def energy_rate_and_power(scene, t, q, u):
     _, (dT, dV) = jax.jvp(energy, (t, q, u), (jnp.ones_like(t), coordinate_rates(scene, t, q, u), found.udot))
     equations = jj.unconstrained_equations(scene, t, q, u)
     size = jnp.abs(u) @ (jnp.abs(equations.M) @ jnp.abs(found.udot) + jnp.abs(equations.h) + jnp.abs(equations.Q)) + jnp.abs(dV)
-    return dT + dV, power_of_nonconservative(scene, t, q, u, None, found), size
+    return dT + dV, power(scene, jj.motion_at(scene, t, q, u), found).total, size
 
 
 SCENES = [
@@ -59,7 +59,7 @@ def test_the_wire_does_the_work_that_turns_the_bead():
 def test_a_damper_takes_energy_at_the_rate_c_times_speed_squared():
     scene = small.BeadOnTurningWire(rate=0.0, damping=0.4)
     t, q, u = jnp.asarray(0.0), jnp.array([0.5]), jnp.array([0.8])
-    found = power_of_nonconservative(scene, t, q, u, None, jj.accelerations(scene, t, q, u))
+    found = power(scene, jj.motion_at(scene, t, q, u), jj.accelerations(scene, t, q, u)).total
     assert jnp.allclose(found, -0.4 * 0.8**2, rtol=tolerance("round_off"))
 
 

@@ -20,7 +20,7 @@ from jaxtyping import Array, Complex, Float, Int
 from jourdain_jax.analysis.families.critical import Sensitivities, sensitivities
 from jourdain_jax.analysis.families.spectrum import mode_names
 from jourdain_jax.analysis.instant import ByMatrices, instant_of, places_of
-from jourdain_jax.analysis.table import linearization_text
+from jourdain_jax.analysis.table import complex_numbers, matrix
 from jourdain_jax.analysis.tangent import (
     dependent_coordinates,
     eliminated,
@@ -83,7 +83,18 @@ class Linearization(Printed, eqx.Module):
     about: tuple[Scene, State, Float[Array, "inputs"]]  # what was linearized
 
     def _text(self) -> str:
-        return linearization_text(self)
+        if self.A.ndim != 2:
+            return f"Linearizations of shape {self.A.shape[:-2]}; named coordinates: {', '.join(self.coordinates) or 'none'}"
+        lines, names = [f"Small motions: residual {float(self.residual):.1e} (zero if the motion is steady), pivot {float(self.pivot):.2g}"], self.coordinates
+        if names:
+            lines += [line for what in ("M", "C", "K") for line in matrix(what, getattr(self, what), names, names)]
+            lines += matrix("F", self.F, names, self.inputs) if self.inputs else []
+            lines.append(f"  coupling to what is not named {float(self.coupling):.1e}")
+        else:
+            lines += matrix("A", self.A, self.states, self.states)
+            lines += matrix("B", self.B, self.states, self.inputs) if self.inputs else []
+        values = complex_numbers(self.eigenvalues() if names else self.state_eigenvalues())
+        return "\n".join([*lines, "  eigenvalues in 1/s: " + ", ".join(values)])
 
     @property
     def code(self) -> Int[Array, ""]:

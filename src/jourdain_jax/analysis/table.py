@@ -25,21 +25,3 @@ def complex_numbers(values) -> list[str]:
     parts = in_digits(np.concatenate([values.real, values.imag]))
     pairs = zip(parts[: len(values)], parts[len(values) :], strict=True)
     return [real if imag == "0" else f"{real}{imag if imag.startswith('-') else f'+{imag}'}i" for real, imag in pairs]
-
-
-def linearization_text(found) -> str:
-    """M, C, K and F of the named coordinates with their eigenvalues; A and B where none are named."""
-    if found.A.ndim != 2:
-        return f"Linearizations of shape {found.A.shape[:-2]}; named coordinates: {', '.join(found.coordinates) or 'none'}"
-    lines = [f"Small motions: residual {float(found.residual):.1e} (zero if the motion is steady), pivot {float(found.pivot):.2g}"]
-    names = found.coordinates
-    if names:
-        lines += [line for what in ("M", "C", "K") for line in matrix(what, getattr(found, what), names, names)]
-        lines += matrix("F", found.F, names, found.inputs) if found.inputs else []
-        lines.append(f"  coupling to what is not named {float(found.coupling):.1e}")
-        values = found.eigenvalues()
-    else:
-        lines += matrix("A", found.A, found.states, found.states)
-        lines += matrix("B", found.B, found.states, found.inputs) if found.inputs else []
-        values = found.state_eigenvalues()
-    return "\n".join([*lines, "  eigenvalues in 1/s: " + ", ".join(complex_numbers(values))])

@@ -26,7 +26,7 @@ from jourdain_jax.calculus.matrices import null_space_svd
 from jourdain_jax.calculus.reals import Numbers
 from jourdain_jax.dynamics.accelerations import diagnosed, reductions
 from jourdain_jax.dynamics.newton_euler import newton_residual
-from jourdain_jax.dynamics.power import power_of_nonconservative
+from jourdain_jax.dynamics.power import power
 from jourdain_jax.dynamics.reactions import row_reactions
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.gibbs_appell import gibbs_equations
@@ -100,7 +100,8 @@ def _evaluate(scene, t, q, u, inputs, usual, plain) -> dict:
     reactions = row_reactions(scene, t, q, u, reference, inputs)
     torque = jnp.einsum("bji,sbj->sbi", turned, reactions.torque)
     by_row = jnp.einsum("bik,sbi->sk", partial.linear, reactions.force) + jnp.einsum("bik,sbi->sk", partial.angular, torque) + reactions.direct
-    energy_rate = jax.jvp(lambda t, q, u: _energy_of(scene, t, q, u, inputs), (t, q, u), (jnp.ones_like(t), coordinate_rates(scene, t, q, u), reference.udot))
+    energy = lambda t, q, u: sum(energies_at(scene, motion_at(scene, t, q, u, inputs)))  # noqa: E731
+    energy_rate = jax.jvp(energy, (t, q, u), (jnp.ones_like(t), coordinate_rates(scene, t, q, u), reference.udot))
     forms = {"Gibbs function": gibbs_equations(scene, t, q, u, inputs)}
     # a mass that changes joins at the body's own velocity (m a = F); d/dt dT/dqdot would count its momentum as lost
     if speeds_are_rates(scene) and not structure_of(scene).varying_inertia:
@@ -120,7 +121,7 @@ def _evaluate(scene, t, q, u, inputs, usual, plain) -> dict:
         "rows": by_row * c,
         "reference": reference.constraint_force * c,
         "energy_rate": energy_rate[1],
-        "power": power_of_nonconservative(scene, t, q, u, inputs, reference),
+        "power": power(scene, motion_at(scene, t, q, u, inputs), reference).total,
         "power_scale": jnp.abs(energy_rate[0]) + jnp.linalg.norm(u / c) * jnp.linalg.norm(c * (jnp.abs(equations.Q) + jnp.abs(equations.h))),
     }
 
@@ -137,10 +138,6 @@ def _size(found: dict, *others) -> float:
     """What differences of forces are relative to: the forces at hand, impressed and inertial ones among them."""
     forces = (found["impressed"], found["gyroscopic"], *others)
     return sum(np.max(np.abs(force)) for force in forces) + np.finfo(found["M"].dtype).tiny
-
-
-def _energy_of(scene, t, q, u, inputs):
-    return sum(energies_at(scene, motion_at(scene, t, q, u, inputs)))
 
 
 def _comparisons(scene: Scene, found: dict, applicable: list[str]) -> dict[str, dict[str, float]]:

@@ -32,11 +32,6 @@ class Assembled:
         return np.isfinite(self.error)
 
 
-def without_rows(q: np.ndarray) -> Assembled:
-    """Configurations of a scene that has no geometric rows."""
-    return Assembled(q, *np.zeros((3, len(q))))
-
-
 def assemble(look: Look, pattern: Pattern, q: np.ndarray, low: np.ndarray, high: np.ndarray, generic: np.ndarray, tries: int = 4) -> Assembled:
     """Configurations near q on the rows: `look(q[k], k)` gives residuals and slopes of the rows at the states numbered k, these by the entries of a pattern.
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.build.assembling import Assembled, assemble, coordinate_bounds, speed_scales, typical_lengths, without_rows
+from jourdain_jax.build.assembling import Assembled, assemble, coordinate_bounds, speed_scales, typical_lengths
 from jourdain_jax.build.plausibility import Numbers
 from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
 from jourdain_jax.calculus.reals import Entries
@@ -257,7 +257,7 @@ class _AtStates:
             length = np.linalg.norm(q[:, first : first + 4], axis=1, keepdims=True)
             q[:, first : first + 4] /= np.where(length == 0, 1.0, length)
         if not self.traced.at.closure.size:
-            return without_rows(q)
+            return Assembled(q, *np.zeros((3, len(q))))
         rows, entries, place = self.nodes.closures, self.nodes.of_closures, {n: k for k, n in enumerate(self.traced.q.tolist())}
         pattern = Pattern.of([(i, place[n]) for i, row in enumerate(entries) for n in row], (len(rows), len(place)))
         slopes = [node for row in entries for node in row.values()]

@@ -192,11 +192,6 @@ def plain_row_lengths(scene: Scene) -> Float[np.ndarray, "rows"]:
     return structure_whatever_its_faults(scene).plain_row_lengths * trust(scene)
 
 
-def rows_are_affine(scene: Scene) -> bool:
-    """Whether all rows are linear or affine in the speeds."""
-    return structure_whatever_its_faults(scene).affine
-
-
 def closure_lengths(scene: Scene) -> Float[np.ndarray, "closures"]:
     """Typical lengths of the geometric rows and of quaternion norms in the coordinates, for `project_positions`; of the former as rates."""
     geometric = plain_row_lengths(scene)[: len(names_of_position_rows(scene))]

@@ -57,11 +57,6 @@ def _rows_work(structure: Structure) -> bool:
     return not (structure.affine and structure.homogeneous)
 
 
-def power_of_nonconservative(scene: Scene, t, q, u, inputs, accelerations: Accelerations | Reduced) -> Float[Array, ""]:
-    """`d(T + V)/dt` in W along the motion with the given accelerations, at constant inputs: zero where the energy T + V is conserved."""
-    return power(scene, motion_at(scene, t, q, u, inputs), accelerations).total
-
-
 def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) -> Power:
     """The power that changes T + V, in W, split by where it comes from."""
     structure = structure_of(scene)

@@ -5,15 +5,14 @@ import math
 import jax.numpy as jnp
 
 from jourdain_jax.calculus.rotations import quaternion_to_matrix, rot_x, rot_y, rot_z
+from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contacts import disc_contact
 from jourdain_jax.scene.coordinates import coordinates, quaternion
-from jourdain_jax.scene.loads import gravity
 from jourdain_jax.scene.parameters import Scalar, parameter
-from jourdain_jax.scene.scene import Scene
 
 
-class VerticalDisc(Scene):
+class VerticalDisc(Heavy):
     """An upright disc that rolls and turns on a level plane: both rates are constant, the path is a circle or a straight line.
 
         xdot = R cos(heading) rolldot,   ydot = R sin(heading) rolldot
@@ -47,9 +46,6 @@ class VerticalDisc(Scene):
         )
         return {"disc": disc}
 
-    def loads(self, motion):
-        return (gravity(motion, self.gravity),)
-
     def contacts(self, pose):
         return {"rim": disc_contact(pose["disc"], self.radius)}
 
@@ -57,7 +53,7 @@ class VerticalDisc(Scene):
         return {"turn rate": motion.u.heading_rate, "roll rate": motion.u.roll_rate}
 
 
-class _ThinDisc(Scene):
+class _ThinDisc(Heavy):
     """A uniform thin disc on a level plane; the axle is body y."""
 
     mass: Scalar = parameter(1.0, unit="kg", positive=True)
@@ -68,9 +64,6 @@ class _ThinDisc(Scene):
 
     def _disc(self, centre, orientation) -> dict[str, RigidBody]:
         return {"disc": RigidBody.thin_disc(self.mass, self.radius, axis="y", position=centre, orientation=orientation)}
-
-    def loads(self, motion):
-        return (gravity(motion, self.gravity),)
 
 
 class TiltingDisc(_ThinDisc):

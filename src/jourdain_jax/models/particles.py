@@ -2,10 +2,10 @@
 
 import jax.numpy as jnp
 
+from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import Particle
 from jourdain_jax.scene.coordinates import coordinates
 from jourdain_jax.scene.grounds import tangents_of
-from jourdain_jax.scene.loads import gravity
 from jourdain_jax.scene.parameters import Scalar, parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
@@ -76,7 +76,7 @@ class HeisenbergParticle(_OnSheets):
         return {"x rate": motion.u.x_rate, "y rate": motion.u.y_rate, "z rate": motion.u.z_rate}
 
 
-class IsokineticParticle(Scene):
+class IsokineticParticle(Heavy):
     """A particle kept at constant speed c under gravity: a row *nonlinear* in the velocities.
 
         (v.v - c^2)/(2 c) = 0,     A = v/c,     virtual velocities obey v.dv = 0
@@ -104,9 +104,6 @@ class IsokineticParticle(Scene):
 
     def bodies(self, t, q):
         return {"particle": Particle(self.mass, jnp.stack([q.x, jnp.zeros_like(q.x), q.z]))}
-
-    def loads(self, motion):
-        return (gravity(motion, self.gravity),)
 
     def velocity_constraints(self, motion):
         v = motion["particle"].velocity

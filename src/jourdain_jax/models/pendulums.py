@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import checked_whole
+from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import Particle
 from jourdain_jax.scene.constraints import rod
 from jourdain_jax.scene.coordinates import coordinates
@@ -15,7 +16,7 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 
 
-class _DoublePendulum(Scene):
+class _DoublePendulum(Heavy):
     """Two particles on massless rods, one below the other."""
 
     mass1: Scalar = parameter(1.0, unit="kg", positive=True)
@@ -23,9 +24,6 @@ class _DoublePendulum(Scene):
     length1: Scalar = parameter(1.0, unit="m", positive=True)
     length2: Scalar = parameter(0.8, unit="m", positive=True)
     gravity: Scalar = parameter(9.81, unit="m/s^2")
-
-    def loads(self, motion):
-        return (gravity(motion, self.gravity),)
 
     def visuals(self, pose):
         return {"": Visual.line(jnp.zeros(3), pose["first"].position, pose["second"].position, radius=0.012 * self.length1)}
@@ -135,7 +133,7 @@ class SpringAndRod(Scene):
         return {"": [Visual.coil(jnp.zeros(3), first, 0.06 * self.rod_length), Visual.line(first, second, radius=0.02 * self.rod_length)]}
 
 
-class PendulumChain(Scene):
+class PendulumChain(Heavy):
     """A chain of particles joined by massless rods, hanging from a pivot in a vertical plane: n particles, n geometric rows.
 
         |r_i - r_{i-1}|^2 = l_i^2,   r_0 = 0
@@ -183,9 +181,6 @@ class PendulumChain(Scene):
         level = jnp.zeros_like(q.x1)
         places = {i: jnp.stack([q[f"x{i}"], level, q[f"z{i}"]]) for i in range(1, self.links + 1)}
         return {f"particle {i}": Particle(masses[i - 1], place) for i, place in places.items()}
-
-    def loads(self, motion):
-        return (gravity(motion, self.gravity),)
 
     def geometric_constraints(self, pose):
         lengths = self._per_link(self.length)

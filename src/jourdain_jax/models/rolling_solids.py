@@ -6,17 +6,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import quaternion_rate, quaternion_to_matrix, rot_x, rot_y, rot_z
+from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contacts import ball_contact, ellipsoid_contact
 from jourdain_jax.scene.coordinates import coordinates, quaternion, speeds
 from jourdain_jax.scene.grounds import Plane
-from jourdain_jax.scene.loads import gravity
 from jourdain_jax.scene.parameters import Scalar, parameter
-from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 
 
-class BallOnTurntable(Scene):
+class BallOnTurntable(Heavy):
     """A ball that rolls on a turntable, flat or tilted: affine rows, because the ground moves.
 
     Its centre moves like a charge in a magnetic field: in a circle on the flat table, drifting *along* the slope of the tilted one.
@@ -56,9 +55,6 @@ class BallOnTurntable(Scene):
         omega_body = quaternion_to_matrix(q.attitude).T @ omega
         return jnp.concatenate([jnp.stack([u.x_rate, u.y_rate]), quaternion_rate(q.attitude, omega_body)])
 
-    def loads(self, motion):
-        return (gravity(motion, self.gravity),)
-
     def contacts(self, pose):
         normal = self._axes()[2]
         table = Plane(tilt=self.tilt, angular_velocity=self.turn_rate * normal)
@@ -82,7 +78,7 @@ class BallOnTurntable(Scene):
         return jnp.concatenate([table.tangents, table.normal[None]])
 
 
-class Rattleback(Scene):
+class Rattleback(Heavy):
     """The rattleback (celt): an ellipsoid rolling without slip on a level plane, its inertia axes turned against its own axes.
 
     Space axes n1, n2 level, n3 DOWN. Body axes are those of the ellipsoid, axis 3 down at zero angles; the body is turned by gamma
@@ -134,9 +130,6 @@ class Rattleback(Scene):
         alpha_rate = u.w1 * jnp.cos(q.beta) + u.w3 * jnp.sin(q.beta)
         beta_rate = u.w2 - gamma_rate * jnp.sin(q.alpha)
         return jnp.stack([u.x_rate, u.y_rate, alpha_rate, beta_rate, gamma_rate])
-
-    def loads(self, motion):
-        return (gravity(motion, self.gravity),)
 
     def contacts(self, pose):
         return {"sole": ellipsoid_contact(pose["stone"], self._semi_axes(), centre=-self._below_centre())}

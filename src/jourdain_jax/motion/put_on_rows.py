@@ -23,7 +23,7 @@ from jourdain_jax.build.assembling import coordinate_bounds
 from jourdain_jax.build.probed_on_graph import coordinates_on_rows
 from jourdain_jax.build.row_program import RowProgram, row_program
 from jourdain_jax.build.sampling import NEARLY_INSIDE
-from jourdain_jax.build.structure import Structure, closure_lengths, plain_row_lengths, rows_are_affine, usual_rows
+from jourdain_jax.build.structure import Structure, closure_lengths, plain_row_lengths, structure_whatever_its_faults, usual_rows
 from jourdain_jax.calculus.derivatives import differentiated_as
 from jourdain_jax.calculus.reals import rank_cutoff, real_type
 from jourdain_jax.calculus.roots import first_root
@@ -100,7 +100,8 @@ def usual_sizes(scene: Scene, determined: bool, native: bool) -> Usual:
         # the domain, and a little more, of the coordinates for which a scene states it and on which rows depend
         bounded, more = coordinates_on_rows(scene) & [name in scene.domain for name in scene.coordinate_names.entries], NEARLY_INSIDE * (high - low)
         low, high = np.where(bounded, low - more, -np.inf), np.where(bounded, high + more, np.inf)
-        return Usual(closure_lengths(scene), rows, width, low.astype(width.dtype), high.astype(width.dtype), rows_are_affine(scene), determined, program)
+        affine = structure_whatever_its_faults(scene).affine
+        return Usual(closure_lengths(scene), rows, width, low.astype(width.dtype), high.astype(width.dtype), affine, determined, program)
     except ValueError:  # of a scene that is wrong in itself; said where its structure is asked for
         norms, geometric = len(scene.coordinates.quaternions), len(names_of_position_rows(scene))
         return Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), width, -np.inf * width, np.inf * width, False, False, None)

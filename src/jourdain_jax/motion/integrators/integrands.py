@@ -36,11 +36,6 @@ def rates_and_pivots(tau, y, args):
 
 
 @eqx.filter_jit
-def pivots(tau, y, args):
-    return rates_and_pivots(tau, y, args)[1]
-
-
-@eqx.filter_jit
 def project(tau, y, args):
     field, scene, inputs, fixed, origin = args
     t = origin + tau
