@@ -290,7 +290,7 @@ def test_a_stop_event_without_a_scalar_form_is_a_call_and_leaves_the_program_as_
     assert program.operations == jj.lower(TiltingDisc()).operations
     assert program.calls == ("the operation `svd`",)
     (t,), (q,), (u,) = jj.sample_states(watched, 1)
-    values = program.event_values(program.fixed_values(watched), t, tuple(q), tuple(u[np.array(program.independent)]), jnp.zeros(0))
+    values = program.values(program.events, program.fixed_values(watched), t, tuple(q), tuple(u[np.array(program.independent)]), jnp.zeros(0))
     assert_allclose(values, event_values(watched, jj.motion_at(watched, t, q, u)), rtol=1e-14)
     found = jj.simulate(watched, {"lean": 0.1, "spin_rate": -3.0}, t1=2.0)
     assert_allclose(jnp.hypot(found.q_end[0], found.q_end[1]), 0.5, rtol=1e-9)

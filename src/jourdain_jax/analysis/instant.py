@@ -112,8 +112,6 @@ class ByProgram:
         given = [graph.input(f"x{k}", True) for k in range(first + 1 + n + m + len(scene.inputs))]
         t, q, u = given[first], given[first + 1 :][:n], given[first + 1 + n :][:m]
         of_rates = [program.qdot, program.ydot, program.z if asked else (), program.guards]
-        if set(program.usual) & set(program.graph.reachable([n for part in of_rates for n in part])):
-            raise NotLowered(f"the rates of `{type(scene).__name__}` depend on what its rows usually are")
         qdot, ydot, z, self.guards = _copied(graph, of_rates, program.graph, (of.parameters, of.t, of.q, of.u, of.inputs), given)
         M, self.has_masses = rows.M or {}, rows.M is not None
         g, phi, of_masses = _copied(graph, [rows.g, rows.phi, M.values()], rows.graph, (rows.parameters, rows.t, rows.q, rows.u, rows.inputs), given)

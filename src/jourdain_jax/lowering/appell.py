@@ -56,7 +56,6 @@ class Equations:
     power: int = 0  # `rate_of_work`
     events: list[int] = field(default_factory=list)  # values of the stop events
     energies: list[int] = field(default_factory=list)  # kinetic and potential
-    usual: dict[int, int] = field(default_factory=dict)  # inputs that stand for what a node usually is, with that node
     directions: list[int] = field(default_factory=list)  # of rows nonlinear in the speeds, an entry for each speed: must not turn round
     squares: list[int] = field(default_factory=list)  # of rows kept by multipliers (`Accelerations`)
 
@@ -84,7 +83,7 @@ class AppellOnGraph:
         if self.kept and self.multiplied:
             found = self.kept.accelerations(M, f, *kinematics.rows_along_motion(self.multiplied), forms)
         else:
-            found = Accelerations(self._solved(M, f, forms_of_equations, strategy.by_determinants), [], [], {})
+            found = Accelerations(self._solved(M, f, forms_of_equations, strategy.by_determinants), [], [])
         ydot, sines, directions = found.udot, found.sines, [n for row in found.directions for n in row]
         z, qdot, pivots = self._true_rates(kinematics, forms) if held else (kinematics.z, kinematics.qdot, [])
         guards = forms.guards | forms_of_equations.guards | set(found.margins)
@@ -100,7 +99,7 @@ class AppellOnGraph:
             true_power = self._power(_Kinematics(self, forms, {}, explicit=False), ydot)
             power = power if equal(self.identity_probes([power]), self.identity_probes([true_power])).all() else true_power
         pivots = list(dict.fromkeys([*kinematics.pivots, *pivots, *sines]))
-        return Equations(qdot, ydot, z, pivots, sorted(guards), power, events, [T, V], found.usual, directions, found.squares)
+        return Equations(qdot, ydot, z, pivots, sorted(guards), power, events, [T, V], directions, found.squares)
 
     def _at_reference(self, held: tuple[int, ...]) -> dict[int, int]:
         return {int(self.traced.q[i]): self.graph.const(self.reference[i]) for i in held}

@@ -22,7 +22,7 @@ def summary(lowered) -> str:
         *([f"  rows left out, as the others imply them: {', '.join(lowered.left_out)}"] if lowered.left_out else []),
         f"  parameters, which stay inputs (SI units and radians): {_parameters(lowered) or 'none'}",
         f"  computed once per motion, from parameters alone: {len(lowered.fixed)} number{'' if len(lowered.fixed) == 1 else 's'}",
-        f"  must not vanish, pivots that are monitored: {_shown(lowered, lowered.pivots)}",
+        f"  must not vanish, pivots that are monitored: {_shown(lowered, [_alone(lowered.graph, n) for n in lowered.pivots])}",
         f"  must stay positive, signs that are relied on: {_shown(lowered, lowered.guards)}",
         f"  way: {lowered.way}; {lowered.seconds:.2f} s",
     ]
@@ -43,6 +43,12 @@ def _shown(lowered, nodes) -> str:
     return ", ".join([*short, *([f"{more} longer expression{'s' if more > 1 else ''}"] if more else [])]) or "none"
 
 
+def _alone(graph, pivot: int) -> int:
+    """What a pivot is a multiple or the sign of."""
+    args = graph.args[pivot]
+    return next((a for a in args if graph.varies[a]), args[0]) if graph.op[pivot] in ("mul", "sign") else pivot
+
+
 def _speeds(lowered) -> list[str]:
     if lowered.projected_u:
         return [f"  speeds, all integrated, with rows kept by multipliers: {', '.join(lowered.speeds)}"]
@@ -61,7 +67,6 @@ def identifiers(lowered) -> dict[int, str]:
         named += [(n, name if len(flat) == 1 else f"{name}_{i}") for i, n in enumerate(flat)]
     for nodes, given in ((traced.q, lowered.coordinates), (traced.u, lowered.speeds), (traced.inputs, lowered.inputs)):
         named += zip(nodes.tolist(), given, strict=True)
-    named += [(n, str(lowered.graph.value[n])) for n in lowered.usual]
     names: dict[int, str] = {}
     taken = {"fixed", "math", "sign"}
     for n, name in named:

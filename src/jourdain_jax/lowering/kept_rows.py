@@ -64,7 +64,7 @@ class KeptRows:
             for j in range(i + 1):
                 inertia[i][j] = inertia[j][i] = forms.simplified(graph.dot(C[i], moved[j]))
         ydot = solve_symmetric(graph, inertia, [[forms.simplified(graph.dot(column, rest)) for column in C]]).solution[0]
-        return Accelerations([graph.add(graph.dot([column[k] for column in C], ydot), c[k]) for k in speeds], found.pivots, [], {})
+        return Accelerations([graph.add(graph.dot([column[k] for column in C], ydot), c[k]) for k in speeds], found.pivots, [])
 
     def _inertia(self, M: Columns, A: Columns) -> Columns:
         return with_inertia_of_rows(self.graph, M, A, self.probes) if self.massless else M

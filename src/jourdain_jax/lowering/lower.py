@@ -178,7 +178,8 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
     put_q, put_u = builder.projection(MOST_TERMS if fewest < small else 0, held)
     groups = {name: getattr(best, name) for name in ("qdot", "ydot", "z", "pivots", "directions", "squares", "guards", "power", "events", "energies")}
     of_rates = [] if scene.speeds is None else _divisors(graph, builder.traced.at.qdot.tolist())
-    groups |= {"power": [best.power], "projected_q": put_q, "projected_u": put_u, "pivots": [*of_rates, *best.pivots]}
+    pivots = _relative(graph, probes, [*of_rates, *best.pivots])
+    groups |= {"power": [best.power], "projected_q": put_q, "projected_u": put_u, "pivots": pivots}
     outputs = graph.with_quotients(_with_equal_calls_once(builder.identity_probes, [n for group in groups.values() for n in group]))
     rest = iter(outputs)
     nodes = {name: tuple(islice(rest, len(group))) for name, group in groups.items()}
@@ -186,12 +187,10 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
     rates = [*nodes["qdot"], *nodes["ydot"]]
     nodes["relations"], nodes["event_relations"] = watched = relations(graph, rates, nodes["events"], probes)
     nodes["jumps"] = jumps(graph, nodes["relations"], rates, probes)
-    sizes = {graph.input(f"usual_pivot_{k}", False): n for k, n in enumerate(nodes["pivots"])}
-    nodes |= {"sizes": tuple(sizes), "fixed": graph.fixed([*outputs, *sizes, *(n for part in watched for n in part)])}
-    stands_for, own = best.usual | sizes, builder.traced
+    nodes["fixed"], own = graph.fixed([*outputs, *(n for part in watched for n in part)]), builder.traced
     given = [own.t, *own.q.tolist(), *own.u.tolist(), *own.inputs.tolist(), *(n for x in own.parameters for n in x.ravel().tolist())]
     # without what was tried for it
-    alone, places = part_of(graph, [*given, power, *stands_for, *stands_for.values(), *(n for part in nodes.values() for n in part)])
+    alone, places = part_of(graph, [*given, power, *(n for part in nodes.values() for n in part)])
     place = places.tolist()
     names = scene.coordinate_names.entries
     leaves = tuple(jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(scene)[0])
@@ -215,8 +214,6 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
         stages=tuple(stages),
         way=builder.kept.description if builder.kept else way.description,
         seconds=0.0,  # not known yet
-        usual={place[a]: place[b] for a, b in stands_for.items()},
-        states={place[n]: x for n, x in _some_states(graph, probes, stands_for.values()).items()},
         **{name: tuple(place[n] for n in part) for name, part in nodes.items()},
     )
 
@@ -246,11 +243,9 @@ def _strategies(builder: AppellOnGraph, held: tuple[int, ...], small: bool, plai
             yield Strategy(True, MOST_TERMS, held=held)
 
 
-def _some_states(graph: Graph, probes: Probes, nodes) -> dict[int, np.ndarray]:
-    """Values of what varies among the inputs of some nodes, at the first probes."""
-    varying = [n for n in graph.reachable(nodes) if graph.op[n] == "input" and graph.varies[n]]
-    # states at which a motion finds out what is usual for its parameters
-    return {n: np.broadcast_to(probes.inputs[str(graph.value[n])], probes.count)[:16] for n in varying}
+def _relative(graph: Graph, probes: Probes, pivots: list[int]) -> list[int]:
+    """Pivots over what each of them is, for the same parameters, at a probed state; signs of those that never vary."""
+    return [graph.div(n, probes.in_the_middle(n)) if graph.varies[n] else graph.call("sign", n) for n in pivots]
 
 
 def _operands(graph: Graph, call: int) -> list[int]:

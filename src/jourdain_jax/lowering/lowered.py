@@ -51,9 +51,8 @@ class Lowered:
     qdot: tuple[int, ...]  # nodes
     ydot: tuple[int, ...]
     z: tuple[int, ...]  # dependent speeds
-    pivots: tuple[int, ...]  # must not vanish; those that coordinate rates are divided by come first
+    pivots: tuple[int, ...]  # must keep their signs, relative to their size at a probed state; those that coordinate rates are divided by come first
     divisors: int  # how many those are
-    sizes: tuple[int, ...]  # inputs for what the magnitudes of the pivots usually are
     directions: tuple[int, ...]  # of rows nonlinear in the speeds, an entry for each speed: must not turn round
     squares: tuple[int, ...]  # of rows kept by multipliers by turns: what is left of one beside those before it, and its size; the ratio is a squared sine
     guards: tuple[int, ...]  # must stay positive
@@ -72,8 +71,6 @@ class Lowered:
     way: str  # which way of building it took fewest operations
     seconds: float  # that lowering took
     fixed: tuple[int, ...]  # nodes that depend on parameters alone, computed once per motion
-    usual: dict[int, int]  # inputs that stand for what a node usually is, with that node
-    states: dict[int, Float[np.ndarray, "probes"]]  # time, coordinates and speeds at which that is found
 
     @property
     def graph(self) -> Graph:
@@ -125,19 +122,11 @@ class Lowered:
             owners = {place[a][0] for a in args if a in place} if self.graph.op[n] == "array" and all(a in place for a in args) else ()
             if len(owners) == 1:  # entries of one parameter: taken together
                 known[n] = leaves[owners.pop()][np.array([place[a][1] for a in args])].reshape(self.graph.value[n][0])
-        for n in self.graph.needed([*self.fixed, *self.usual.values()], known):
+        for n in self.graph.needed(self.fixed, known):
             if n in place:
                 leaf, i = place[n]
                 known[n] = leaves[leaf][i]
-        return tuple(jnp.asarray(x) for x in run(self.graph, self.fixed, known | self.usual_values(known)))
-
-    def usual_values(self, parameters: dict) -> dict[int, Float[Array, ""]]:
-        """Return usual magnitudes for these parameters, geometric means over `states`; constants to differentiation."""
-        if not self.usual:
-            return {}
-        parameters = jax.lax.stop_gradient(parameters)
-        found = run(self.graph, list(self.usual.values()), parameters | {n: jnp.asarray(x) for n, x in self.states.items()})
-        return {n: _usual(jnp.abs(jnp.atleast_1d(jnp.asarray(x)))) for n, x in zip(self.usual, found, strict=True)}
+        return tuple(jnp.asarray(x) for x in run(self.graph, self.fixed, known))
 
     def rates(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple[tuple, tuple, Float[Array, "*lanes"] | None]:
         """`qdot` and `ydot`, tuples of scalars, and the power (W) where `with_power` asks for it; NaN where a guard is not positive.
@@ -147,7 +136,7 @@ class Lowered:
         return self.rates_and_pivots(fixed, t, q, y, inputs, with_power)[:3]
 
     def rates_and_pivots(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple:
-        """Return `rates`; the pivots relative to their usual sizes, which must keep their signs; directions; and the smallest sine between a row that is
+        """Return `rates`; the pivots, which must keep their signs; directions; and the smallest sine between a row that is
         kept by multipliers and those before it, None where there are none. The last three are numbers to differentiation.
 
         `fixed`, `t` (s), `q`, `y`, `inputs`, `with_power`: as in `rates`.
@@ -157,8 +146,7 @@ class Lowered:
         (first, *qdot), ydot, power = taken(self.qdot), taken(self.ydot), next(found) if with_power else None
         for guard in taken(self.guards):
             first = jnp.where(guard > 0, first, jnp.nan)
-        pivots = tuple(value / size for value, size in zip(taken(self.pivots), self.pivot_sizes(fixed), strict=True))
-        directions = taken(self.directions)
+        pivots, directions = taken(self.pivots), taken(self.directions)
         ratios = [left / size for left, size in zip(found, found, strict=True)]
         sine = jnp.sqrt(jnp.maximum(functools.reduce(jnp.minimum, ratios), 0.0)) if ratios else None
         return (first, *qdot), ydot, power, pivots, directions, sine
@@ -171,25 +159,14 @@ class Lowered:
         return [*self.fixed, traced.t, *state, *map(int, traced.inputs)]
 
     def speeds_and_pivot(self, fixed, t, q: Sequence, y: Sequence, inputs) -> tuple[Float[Array, "speeds *lanes"], Float[Array, "*lanes"]]:
-        """All speeds, and the smallest pivot relative to its usual size: it changes sign where the elimination does not serve.
+        """All speeds, and the smallest pivot: it changes sign where the elimination does not serve.
 
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
         """
         out = self.values([*self.z, *self.pivots], fixed, t, q, y, inputs)
         every = [*y, *out[: len(self.z)]]
         u = jnp.stack([every[i] for i in np.argsort([*self.independent, *self.dependent])])
-        return u, self.smallest_pivot(fixed, out[len(self.z) :])
-
-    def smallest_pivot(self, fixed, values: Float[Array, "pivots *lanes"]) -> Float[Array, "*lanes"]:
-        """Return the smallest of the pivots, given their `values`, relative to its usual size; its sign is the product of theirs.
-
-        `fixed`: as in `rates`.
-        """
-        pivot = jnp.ones(values.shape[1:], values.dtype)
-        for value, size in zip(jax.lax.stop_gradient(values), self.pivot_sizes(fixed), strict=True):
-            ratio = value / size
-            pivot = jnp.sign(pivot) * jnp.sign(ratio) * jnp.minimum(jnp.abs(pivot), jnp.abs(ratio))
-        return pivot
+        return u, smallest_pivot(out[len(self.z) :])
 
     def energy_values(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "2 *lanes"]:
         """Kinetic and potential energy, J: numbers to differentiation. `fixed`, `q`, `y`, `inputs`: as in `rates`."""
@@ -210,17 +187,6 @@ class Lowered:
         if not self.projected_u:
             return q, tuple(y)
         return q, jax.lax.scan(lambda y, _: (step(self.projected_u, q, y), None), tuple(y), length=1 if affine else 2)[0]
-
-    def pivot_sizes(self, fixed) -> list[Float[Array, "*lanes"]]:
-        """What the magnitudes of the pivots usually are, for the parameters of a motion; `fixed`: from `fixed_values`."""
-        return [fixed[self.fixed.index(n)] for n in self.sizes]
-
-    def event_values(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "events *lanes"]:
-        """Values of the stop events, sorted by name.
-
-        `fixed`, `q`, `y`, `inputs`: as in `rates`.
-        """
-        return self.values(self.events, fixed, t, q, y, inputs)
 
     def watched(self, has_events: bool) -> tuple[int, ...]:
         """The numbers whose signs are watched over every step, in the rates and, where it `has_events`, in those."""
@@ -252,8 +218,7 @@ def _program_of_rates(program: Lowered, with_power: bool) -> Callable[..., tuple
     return differentiable(program.graph, outputs, program.variables, like=len(program.fixed) + 1, monitored=monitored)
 
 
-def _usual(sizes: Float[Array, "states"]) -> Float[Array, ""]:
-    """Return the geometric mean of the finite entries that are not zero, or 1; constant to differentiation."""
-    counts = (sizes > 0) & jnp.isfinite(sizes)
-    total = jnp.sum(jnp.where(counts, jnp.log(jnp.where(counts, sizes, 1.0)), 0.0))
-    return jax.lax.stop_gradient(jnp.exp(total / jnp.maximum(jnp.sum(counts), 1)))
+def smallest_pivot(pivots: Float[Array, "pivots *lanes"]) -> Float[Array, "*lanes"]:
+    """Return the smallest magnitude of any, 1 at most; its sign is the product of theirs."""
+    pivots = jax.lax.stop_gradient(pivots)
+    return jnp.prod(jnp.sign(pivots), axis=0) * jnp.min(jnp.abs(pivots), axis=0, initial=1.0)

@@ -6,9 +6,9 @@
 
 S is symmetric and positive definite where the rows are independent, and as sparse as the rows are local: tridiagonal for a chain. What is
 left of a diagonal entry of S after elimination, relative to the entry, is the squared sine of the angle between that row and those before it.
-Accelerations lose as many digits as that square is small. A row that vanishes at some configuration makes no small angle, but a small entry: entries
-are therefore compared with what they usually are, at the states where the scene was probed, for the parameters of the motion. Rows that are nonlinear in
-the speeds are as small as these, and are lost where what is left of one after elimination, L^-1 A, passes through zero: it turns round there.
+Accelerations lose as many digits as that square is small. A row that vanishes at some configuration makes no small angle, but a small entry: an entry
+counts for no less than what it is, for the same parameters, at a probed state (`Probes.in_the_middle`). Rows that are nonlinear in the speeds are as small
+as these, and are lost where what is left of one after elimination, L^-1 A, passes through zero: it turns round there.
 
 Where M is singular, though no admissible velocity is without inertia, M + A' W A stands in its place: A udot is known, so only the multipliers change.
 """
@@ -34,7 +34,6 @@ class Accelerations(NamedTuple):
     udot: list[int]
     sines: list[int]  # one per row, between that row and those before it; or the pivots of privileged speeds
     margins: list[int]  # must stay positive: what is left of each entry, above its least
-    usual: dict[int, int]  # inputs for the usual value of an entry, with the node of that entry
     directions: Columns = []  # that rows must not leave within a step
     squares: list[int] = []  # of rows by turns: what is left of an entry, and its size; the ratio is a squared sine
 
@@ -42,7 +41,7 @@ class Accelerations(NamedTuple):
 def accelerations_by_multipliers(
     graph: Graph, M: Columns, f: list[int], A: Columns, drift: list[int], probes: Probes, forms: NormalForms, *, affine: bool
 ) -> Accelerations:
-    """The accelerations under all rows; at `probes` usual entries are found, of rows that are `affine` in the speeds."""
+    """The accelerations under all rows; entries are judged at `probes`, of rows that are `affine` in the speeds or not."""
     *impulses, free = (list(column) for column in solve_symmetric(graph, M, [*A, f]).solution)  # M^-1 A' column by column, M^-1 f
     S = _products(graph, A, impulses, forms)
     for r in range(len(A)):
@@ -56,19 +55,14 @@ def accelerations_by_multipliers(
     udot = [graph.add(w, graph.dot(column, multipliers)) for w, *column in zip(free, *impulses, strict=True)]
     left = [(r, pivot) for r, pivot in enumerate(solved.pivots) if graph.varies[pivot]]
     sines = [graph.call("sqrt", graph.call("max", graph.zero, graph.div(pivot, S[r][r]))) for r, pivot in left]
-    # sine, or length of a row beside its usual one: below it round-off decides how a motion goes on, and the program does not serve
-    least = undecided(jnp.result_type(float)) ** 2
-    usual = {graph.input(f"usual_{r}", False): S[r][r] for r, _ in left}
-    margins, squares = [], []
-    for (r, pivot), (size, entry) in zip(left, usual.items(), strict=True):
-        values = np.abs(probes([entry])[0])
-        probes.inputs[f"usual_{r}"] = np.full(probes.count, np.median(values[np.isfinite(values)]) if np.isfinite(values).any() else np.nan)
-        squares += [pivot, graph.call("max", entry, size)]
-        margins.append(graph.sub(pivot, graph.mul(graph.const(least), squares[-1])))
+    # sine, or length of a row beside that at the probed state: below it round-off decides how a motion goes on, and the program does not serve
+    least = graph.const(undecided(jnp.result_type(float)) ** 2)
+    sizes = [graph.call("max", S[r][r], probes.in_the_middle(S[r][r])) for r, _ in left]
+    margins = [graph.sub(pivot, graph.mul(least, size)) for (_, pivot), size in zip(left, sizes, strict=True)]
     if affine:
-        return Accelerations(udot, sines, margins, usual, squares=squares)
+        return Accelerations(udot, sines, margins, squares=[n for (_, pivot), size in zip(left, sizes, strict=True) for n in (pivot, size)])
     signs = [[margin, *[graph.zero] * (len(f) - 1)] for margin in margins]
-    return Accelerations(udot, sines, [], usual, [*signs, *([column[r] for column in solved.forward[1:]] for r, _ in left)])
+    return Accelerations(udot, sines, [], [*signs, *([column[r] for column in solved.forward[1:]] for r, _ in left)])
 
 
 def with_inertia_of_rows(graph: Graph, M: Columns, A: Columns, probes: Probes) -> Columns:

@@ -90,7 +90,7 @@ def known_values(w: Writer, form: Form, state: Value, tau: Value, y: Value) -> d
 
 
 def write_rates(w: Writer, form: Form) -> None:
-    """`rates(state, tau, y, k, pivots)`: the rates of the state `y` into `k`, and what is monitored, pivots relative to their usual sizes."""
+    """`rates(state, tau, y, k, pivots)`: the rates of the state `y` into `k`, and what is monitored, pivots first."""
     program = form.program
     # 120 operations: so few are written anew at each stage
     how = "alwaysinline" if program.operations <= 120 else "noinline"
@@ -103,7 +103,7 @@ def write_rates(w: Writer, form: Form) -> None:
         for i, x in enumerate([*found[: form.y], *(x for part in tangents for x in part)]):
             w.store(x, k, i)
         for i, x in enumerate(found[form.y + len(program.guards) :]):
-            w.store(x / known[program.sizes[i]] if i < form.pivots else x, pivots, i)
+            w.store(x, pivots, i)
         w.give()
 
 

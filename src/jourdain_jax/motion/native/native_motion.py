@@ -50,7 +50,7 @@ from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 
 # Parts of a program that are nodes; `power` is another one.
 _NODES = (
-    *("qdot", "ydot", "pivots", "sizes", "directions", "squares", "guards", "events"),
+    *("qdot", "ydot", "pivots", "directions", "squares", "guards", "events"),
     *("projected_q", "projected_u", "relations", "event_relations", "jumps"),
 )
 MOST_NUMBERS = 200  # in a function of time; of a long table each is a row of a lane, and `jj.Sampled` looks up in it
@@ -96,8 +96,6 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
         **on_it,
         z=(),  # what is seen of a motion is evaluated with the values of inputs
         energies=(),
-        usual={},
-        states={},
     )
 
 

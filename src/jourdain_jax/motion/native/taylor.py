@@ -16,7 +16,7 @@ Sums add the newest coefficients last: all others are known long before. Source:
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from itertools import combinations
@@ -236,7 +236,7 @@ class Monitored(NamedTuple):
     """What must not change its sign."""
 
     holds: Value  # whether all guards are positive
-    values: list[Value]  # as `Form.monitored`, pivots relative to their usual sizes
+    values: list[Value]  # as `Form.monitored`
 
 
 def jet(w: Writer, form: Form, p: Lanes, t: Value, order: int) -> tuple[list[Coefficients], Monitored]:
@@ -255,7 +255,7 @@ def jet(w: Writer, form: Form, p: Lanes, t: Value, order: int) -> tuple[list[Coe
     values = dict(zip(fixed, given.values(), strict=True)) | {n: w.load(y, i) for i, n in enumerate(moved)}
     series = Series(graph, fixed, moved, with_few_products(graph, nodes[: form.integrated], [*moved, clock]), order, clock).state
     found = iter(written(w, graph, [*(n for row in series for n in row), *nodes[form.integrated :]], values, by_llvm=True))
-    return [[next(found) for _ in row] for row in series], _judged(w, form, list(found), known)
+    return [[next(found) for _ in row] for row in series], _judged(w, form, list(found))
 
 
 def products(form: Form, order: int) -> int:
@@ -272,17 +272,15 @@ def _monitored(form: Form) -> list[int]:
 def monitored_at(w: Writer, form: Form, p: Lanes, t: Value, y: Value) -> Monitored:
     """What is monitored, at a state in memory."""
     known = known_values(w, form, p.pointer, t, y)
-    return _judged(w, form, written(w, form.program.graph, _monitored(form), known), known)
+    return _judged(w, form, written(w, form.program.graph, _monitored(form), known))
 
 
-def _judged(w: Writer, form: Form, values: Sequence[Value], known: Mapping[int, Value]) -> Monitored:
-    found, of_variables = [as_real(w, x) for x in values], list(known.values())
+def _judged(w: Writer, form: Form, values: Sequence[Value]) -> Monitored:
+    found = [as_real(w, x) for x in values]
     count, holds = len(form.program.guards), w.literal(-1, w.truth)
     for guard in found[:count]:
         holds = holds & (guard > 0.0)
-    sizes = [of_variables[form.program.variables.index(n)] for n in form.program.sizes[: form.pivots]]
-    pivots = [x / size for x, size in zip(found[count:], sizes, strict=False)]
-    return Monitored(holds, [*pivots, *found[count + len(pivots) :]])
+    return Monitored(holds, found[count:])
 
 
 def radius(w: Writer, form: Form, p: Lanes, rows: Sequence[Coefficients]) -> Value:

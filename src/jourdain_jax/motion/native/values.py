@@ -12,7 +12,6 @@ Beside the steps stand numbers that depend on parameters alone, and all speeds, 
 for which rows of the numbers that are needed are put together. Speeds of few operations are XLA's (`lowering/lowered.py`).
 """
 
-import math
 from collections.abc import Callable, Sequence
 from functools import cache, lru_cache, partial
 from typing import NamedTuple
@@ -31,9 +30,8 @@ from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.native import ffi, gpu, host, nvidia
 from jourdain_jax.native.ffi import write_rows
-from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.math_functions import FUNCTIONS
-from jourdain_jax.native.scalar_program import as_real, unsupported, written, written_in_turn
+from jourdain_jax.native.ir import Writer
+from jourdain_jax.native.scalar_program import as_real, unsupported, written_in_turn
 from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import Graph, Unsupported
@@ -221,8 +219,7 @@ class Beside(NamedTuple):
     """Machine code of what stands beside the steps of a program."""
 
     needed: tuple[tuple[int, ...], ...]  # nodes of those entries of the scene's parameters on which something that is fixed depends, -1 for others
-    fixed: Callable[[Array], Array]  # of those entries and of what is usual
-    usual: Callable[[Array], Array] | None  # of those entries; JAX does not differentiate it
+    fixed: Callable[[Array], Array]  # of those entries
     at_states: "AtStates | None"  # None where XLA is quicker
 
 
@@ -236,16 +233,15 @@ class AtStates(NamedTuple):
 @lru_cache(maxsize=64)
 def beside(program: Lowered) -> Beside | None:
     """All this; None where it cannot be machine code."""
-    graph, nodes = program.graph, [*program.z, *program.pivots, *program.energies, *program.fixed, *program.usual.values()]
+    graph, nodes = program.graph, [*program.z, *program.pivots, *program.energies, *program.fixed]
     truths = any(_is_truth(graph, n) for n in program.fixed)  # which XLA hands on as such
     # 60_000 operations
     if truths or graph.operations(nodes) > 60_000 or unsupported(graph, nodes):
         return None
-    used = set(graph.reachable([*program.fixed, *program.usual.values()]))
+    used = set(graph.reachable(program.fixed))
     needed = tuple(tuple(n if n in used else -1 for n in np.ravel(leaf).tolist()) for leaf in program.traced.parameters)
     given = [n for leaf in needed for n in leaf if n >= 0]
-    usual = called(partial(_write_usual, program, given), lambda *_: ((len(program.usual),),), effort=1) if program.usual else None
-    return Beside(needed, values_of_nodes(graph, program.fixed, [*given, *program.usual]), usual, _at_states(program))
+    return Beside(needed, values_of_nodes(graph, program.fixed, given), _at_states(program))
 
 
 def _at_states(program: Lowered) -> AtStates | None:
@@ -294,9 +290,7 @@ def fixed_values(program: Lowered, scene: Scene) -> tuple[Float[Array, ""], ...]
     parameters = [] if own is None else entries(scene, own.needed)
     if own is None or not program.fixed or not parameters:  # nothing to hand over, or nothing asked for
         return program.fixed_values(scene)
-    x = jnp.concatenate(parameters)
-    usual = [] if own.usual is None else own.usual(jax.lax.stop_gradient(x))
-    return entries_of(own.fixed(jnp.concatenate([x, *usual])))
+    return entries_of(own.fixed(jnp.concatenate(parameters)))
 
 
 def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
@@ -304,7 +298,7 @@ def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Ar
     if (own := beside(program)) is None or own.at_states is None:
         return program.speeds_and_pivot(fixed, t, tuple(q), tuple(y), inputs)
     pivots = own.at_states.numbers(fixed, t, q, y, inputs)[:-2]
-    return own.at_states.speeds(fixed, t, q, y, inputs), program.smallest_pivot(fixed, pivots)
+    return own.at_states.speeds(fixed, t, q, y, inputs), smallest_pivot(pivots)
 
 
 def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
@@ -319,28 +313,3 @@ def is_right(program: RowProgram, scene: Scene, t, q) -> Bool[Array, ""]:
     parts = [*entries(scene, program.parameters), jnp.asarray(t)[None], q]
     run = nodes_called(program.graph, [program.right], [*(n for leaf in program.parameters for n in leaf if n >= 0), program.t, *program.q])
     return run(jax.lax.stop_gradient(jnp.concatenate([jnp.asarray(x, real_type()) for x in parts])))[0] > 0
-
-
-def _write_usual(program: Lowered, given: Sequence[int], w: Writer) -> None:
-    """`row(state, found)`: as `Lowered.usual_values`, of the magnitudes at the probed states."""
-    nodes, states = list(program.usual.values()), list(program.states)
-    probes = len(next(iter(program.states.values()), (None,)))
-    table = w.constants("probed", (x[p] for p in range(probes) for x in program.states.values())) if states else Value(w, "ptr", "null")
-    log, exp = FUNCTIONS["log"], FUNCTIONS["exp"]
-    with w.procedure("row", "state found") as (state, found):
-        totals = w.room(2 * len(nodes))  # of logarithms, and of how many these are
-        for k in range(2 * len(nodes)):
-            w.store(0.0, totals, k)
-        known = {n: w.load(state, k) for k, n in enumerate(given)}
-        with w.counted(0, probes) as p:
-            at = {n: w.spread(w.load(table, p * len(states) + k, "double")) for k, n in enumerate(states)}
-            for k, value in enumerate(written(w, program.graph, nodes, known | at)):
-                size = w.magnitude(as_real(w, value))
-                counts = (size > 0.0) & (size < math.inf)
-                more = log(w, w.where(counts, size, w.number(1.0))), w.where(counts, 1.0, 0.0)
-                for place, x in zip((2 * k, 2 * k + 1), more, strict=True):
-                    w.store(w.load(totals, place) + x, totals, place)
-        for k in range(len(nodes)):
-            count = w.larger(w.load(totals, 2 * k + 1), w.number(1.0))
-            w.store(exp(w, w.load(totals, 2 * k) / count), found, k)
-    write_rows(w, len(given), len(nodes))

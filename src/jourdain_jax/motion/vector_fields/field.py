@@ -263,7 +263,7 @@ class ByProgram(VectorField):
         return self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[0]
 
     def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
-        """All speeds, and the smallest pivot of the elimination relative to its usual size."""
+        """All speeds, and the smallest pivot of the elimination."""
         if self.native:
             return values.speeds_and_pivot(self.program, fixed, t, y.q, y.v, inputs)
         return self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)
@@ -275,11 +275,11 @@ class ByProgram(VectorField):
 
     def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:
         if self.program.events:
-            return self.program.event_values(fixed, t, tuple(y.q), tuple(y.v), inputs)
+            return self.program.values(self.program.events, fixed, t, tuple(y.q), tuple(y.v), inputs)
         return super().events(scene, fixed, t, y, inputs)
 
     def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Watched:
-        """Return `rates`, the pivots of the elimination relative to their usual sizes, and the eliminated rows."""
+        """Return `rates`, the pivots of the elimination, and the eliminated rows."""
         qdot, vdot, power, pivots, directions, sine = self.program.rates_and_pivots(fixed, t, tuple(y.q), tuple(y.v), inputs, self.with_work)
         pivots = pivots[: self.pivots]
         monitored = jnp.stack(pivots) if pivots else jnp.zeros((0, *y.q.shape[1:]))
