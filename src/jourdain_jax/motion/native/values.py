@@ -27,7 +27,7 @@ from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.derivatives import OtherDeviceError, Rules, differentiated_as, filled, is_zero, with_rules
 from jourdain_jax.calculus.markers import entries_of, with_lanes_first
 from jourdain_jax.calculus.reals import real_type
-from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.lowering.lowered import Lowered, smallest_pivot
 from jourdain_jax.native import ffi, gpu, host, nvidia
 from jourdain_jax.native.ffi import write_rows
 from jourdain_jax.native.ir import Writer
