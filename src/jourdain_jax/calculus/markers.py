@@ -13,12 +13,13 @@ Both count as linear maps, whose own derivatives are such maps. In reverse mode 
 past `left`, by what the first derivative was taken at: therefore that zero counts as such, too.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Bool, Float, Shaped
@@ -139,15 +140,16 @@ def tap_cotangents(values: tuple, look: Callable) -> tuple:
 
 
 @jax.custom_jvp
-def entered(x: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, ""]]:
-    """`x`, and the zero to be handed to `left`: where several arrays enter, their sum."""
-    return lanes_first((x, jnp.zeros((), x.dtype)))
+def entered(*each: Float[Array, "..."]) -> tuple[list[Array], Float[Array, ""]]:
+    """These arrays, and the zero to be handed to `left`."""
+    *each, asked = lanes_first((*each, jnp.zeros((), each[0].dtype)))
+    return each, asked
 
 
 @jax.custom_jvp
-def left(failed: Bool[Array, "..."], asked: Float[Array, ""], x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """`x`, which `failed` or did not, number by number; `asked`: the zero of what entered."""
-    return lanes_first((x, failed, asked))[0]
+def left(asked: Float[Array, ""], failed: Sequence[Bool[Array, "..."]], each: Sequence[Float[Array, "..."]]) -> list[Array]:
+    """`each` of some arrays, which `failed` or did not, along its first axes; `asked`: the zero of what entered."""
+    return lanes_first([*each, *failed, asked])[: len(each)]
 
 
 @jnp.vectorize
@@ -155,54 +157,60 @@ def nan_where(failed: Bool[Array, ""], x: Float[Array, ""]) -> Float[Array, ""]:
     """`x`, with NaN where `failed` holds, and so are its derivatives; those of what depends on nothing, or on
     which nothing depends, stay zero.
     """
-    x, asked = entered(x)
-    return left(failed, asked, x + jnp.where(failed, jnp.nan, 0.0))
+    (x,), asked = entered(x)
+    return left(asked, [failed], [x + jnp.where(failed, jnp.nan, 0.0)])[0]
 
 
-@entered.defjvp
+@partial(entered.defjvp, symbolic_zeros=True)
 def _entering(primals, tangents):
-    return entered(*primals), tuple(_counted_p.bind(jnp.asarray(tangents[0]), lanes=0))
+    each, asked = entered(*primals)
+    moved = {k: _counted_p.bind(jnp.asarray(x), lanes=0) for k, x in enumerate(tangents) if not isinstance(x, SymbolicZero)}
+    count = sum((count.astype(asked.dtype) for _, count in moved.values()), jnp.zeros((), asked.dtype))
+    return (each, asked), ([moved[k][0] if k in moved else x for k, x in enumerate(tangents)], count)
 
 
 @left.defjvp
 def _leaving(primals, tangents):
-    failed, asked, x = primals
-    none, count = jnp.zeros_like(asked), tangents[1].astype(asked.dtype)
-    failed, rates = jnp.broadcast_to(failed, x.shape), jnp.asarray(tangents[2])
-    rates = _lost_p.bind(failed, none, asked, count, rates, lanes=0)
-    return left(*primals), rates[0]
+    (asked, failed, each), (count, _, rates) = primals, tangents
+    none, count = jnp.zeros_like(asked), count.astype(asked.dtype)
+
+    def lost(failed, x, rate):
+        failed = jnp.broadcast_to(jnp.reshape(failed, (*failed.shape, *[1] * (x.ndim - failed.ndim))), x.shape)
+        return _lost_p.bind(failed, none, asked, count, jnp.asarray(rate), lanes=0)[0]
+
+    return left(*primals), list(map(lost, failed, each, rates))
 
 
-# The maps. Numbers of a lane are those after the leading axes of lanes; `before`: what was counted where this
-# is the derivative of a derivative.
+# The maps, by NumPy or JAX's NumPy as `m`. Numbers of a lane are those after the leading axes of lanes; `before`:
+# what was counted where this is the derivative of a derivative.
 
 
-def _any(x, lanes):
-    return jnp.any(x.astype(bool), axis=tuple(range(lanes, jnp.ndim(x)))).astype(x.dtype)
+def _any(m, x, lanes):
+    return m.any(x.astype(bool), axis=tuple(range(lanes, x.ndim))).astype(x.dtype)
 
 
 def _over(counts, x):
     """The counts of lanes beside the numbers of those."""
-    count = sum(map(jnp.abs, counts))
-    return jnp.reshape(count, (*count.shape, *[1] * (x.ndim - count.ndim)))
+    count = sum(map(abs, counts))
+    return count.reshape((*count.shape, *[1] * (x.ndim - count.ndim)))
 
 
-def _counted(x, *, lanes):
-    return x, _any(x, lanes)
+def _counted(m, x, *, lanes):
+    return x, _any(m, x, lanes)
 
 
-def _masked(before, count, x, *, lanes):
+def _masked(m, before, count, x, *, lanes):
     count = _over((before, count), x)
-    return (jnp.where(count == 0, 0.0, jnp.where(jnp.isnan(count), jnp.nan, x)).astype(x.dtype),)
+    return (m.where(count == 0, 0.0, m.where(m.isnan(count), m.nan, x)).astype(x.dtype),)
 
 
-def _lost(failed, before, asked, count, x, *, lanes):
-    return (jnp.where(failed & (_over((before, count), x) != 0), jnp.nan, x).astype(x.dtype),)
+def _lost(m, failed, before, asked, count, x, *, lanes):
+    return (m.where(failed & (_over((before, count), x) != 0), m.nan, x).astype(x.dtype),)
 
 
-def _lost_and_counted(failed, asked, x, *, lanes):
-    x = jnp.where(failed & (x != 0), jnp.nan, x).astype(x.dtype)
-    return jnp.where(_any(jnp.isnan(x), lanes), jnp.nan, _any(x, lanes)).astype(x.dtype), x
+def _lost_and_counted(m, failed, asked, x, *, lanes):
+    x = m.where(failed & (x != 0), m.nan, x).astype(x.dtype)
+    return m.where(_any(m, m.isnan(x), lanes), m.nan, _any(m, x, lanes)).astype(x.dtype), x
 
 
 def _counted_back(cotangents, x, *, lanes):
@@ -233,13 +241,13 @@ def _map(function: Callable, back: Callable, at: int) -> Primitive:
     p = Primitive(f"jourdain_nan{function.__name__}")
 
     def shapes(*avals, lanes):
-        found = jax.eval_shape(partial(function, lanes=lanes), *avals)
+        found = jax.eval_shape(partial(function, jnp, lanes=lanes), *avals)
         return [avals[-1].update(shape=x.shape, weak_type=False) for x in found]
 
     p.multiple_results = True
-    p.def_impl(lambda *values, lanes: list(function(*values, lanes=lanes)))
+    p.def_impl(jax.jit(lambda *values, lanes: list(function(jnp, *values, lanes=lanes)), static_argnames="lanes"))
     p.def_abstract_eval(shapes)
-    mlir.register_lowering(p, mlir.lower_fun(function, multiple_results=True))
+    mlir.register_lowering(p, mlir.lower_fun(partial(function, jnp), multiple_results=True))
 
     def pushed(primals, tangents, *, lanes):
         taken_at = list(primals[:at])
@@ -264,3 +272,4 @@ def _map(function: Callable, back: Callable, at: int) -> Primitive:
 
 _counted_p, _masked_p = _map(_counted, _counted_back, 0), _map(_masked, _masked_back, 1)
 _lost_p, _lost_and_counted_p = _map(_lost, _lost_back, 2), _map(_lost_and_counted, _lost_and_counted_back, 1)
+MAPS = (_counted_p, _counted), (_masked_p, _masked), (_lost_p, _lost), (_lost_and_counted_p, _lost_and_counted)

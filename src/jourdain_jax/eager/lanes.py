@@ -5,7 +5,6 @@ from functools import lru_cache, wraps
 
 import jax
 import numpy as np
-from jax.extend.core import jaxpr_as_fun
 
 from jourdain_jax.calculus.jaxprs import evaluated, needed_only
 from jourdain_jax.eager.numpy_backend import applied
@@ -19,17 +18,22 @@ def uncompiled_lanes(f: Callable, shared: int | None = 0) -> Callable:
 
     @lru_cache(maxsize=64)
     def traced(treedef, shapes, first: int = 0, count: int = 0):
-        if not count:
-            closed, shape = jax.make_jaxpr(f, return_shape=True)(*jax.tree.unflatten(treedef, _arrays(shapes)))
-            return needed_only(closed), jax.tree.structure(shape)
-        closed, structure = traced(treedef, shapes)
-        one = jaxpr_as_fun(closed)
-        arrays = _arrays([(shape if i < first else (count, *shape), dtype) for i, (shape, dtype) in enumerate(shapes)])
-        axes = [None if i < first else 0 for i in range(len(shapes))]
+        arrays = _arrays([((count,) * (i >= first and count > 0) + shape, dtype) for i, (shape, dtype) in enumerate(shapes)])
+
+        def one(*leaves):
+            return f(*jax.tree.unflatten(treedef, leaves))
+
+        def of_all(*leaves):
+            return jax.vmap(one, [None if i < first else 0 for i in range(len(leaves))])(*leaves) if count else one(*leaves)
+
+        def one_by_one(*leaves):  # callbacks that take one lane at a time
+            return jax.lax.map(lambda lane: one(*leaves[:first], *lane), leaves[first:])
+
         try:
-            return jax.make_jaxpr(jax.vmap(one, in_axes=axes))(*arrays), structure
-        except NotImplementedError:  # callbacks that take one lane at a time
-            return jax.make_jaxpr(lambda *x: jax.lax.map(lambda lane: one(*x[:first], *lane), x[first:]))(*arrays), structure
+            closed, shape = jax.make_jaxpr(of_all, return_shape=True)(*arrays)
+        except NotImplementedError:
+            closed, shape = jax.make_jaxpr(one_by_one, return_shape=True)(*arrays)
+        return needed_only(closed), jax.tree.structure(shape)
 
     @wraps(f)
     def run(*arguments):

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.jaxprs import called, evaluated, parts_of_scan
+from jourdain_jax.calculus.markers import MAPS
 from jourdain_jax.calculus.scalar_operations import VALUES
 from jourdain_jax.eager.indexing import gathered, scattered
 
@@ -110,6 +111,10 @@ _CONTROL: dict[str, Callable] = {
     "jourdain_linear_map": _linear_map,
     "custom_lin": lambda equation, inputs: inputs,
     "custom_linear_solve": _linear_solve,
+    "custom_vmap_call": lambda equation, inputs: evaluated(equation.params["call"], inputs, applied),
+    "jourdain_lanes_first": lambda equation, inputs: inputs,
+    "jourdain_entries": lambda equation, inputs: list(*inputs),
+    **{p.name: lambda equation, inputs, f=f: f(np, *inputs, **equation.params) for p, f in MAPS},
 }
 
 # Primitives.

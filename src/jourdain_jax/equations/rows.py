@@ -64,13 +64,17 @@ def velocity_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
 def _rates_of_position_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
     """`dg/dt` along the velocities that the motion carries, so that it can be differentiated with respect to a body's velocity alone."""
 
+    names: list[str] = []
+
     def g(t, q, bodies):
-        return position_rows(scene, Pose(t, scene.coordinate_names.view(q), bodies))
+        rows = position_rows(scene, Pose(t, scene.coordinate_names.view(q), bodies))
+        names[:] = rows  # in their order: JAX returns dictionaries sorted by name
+        return tuple(rows.values())
 
     pose = motion.pose()
     rates = {name: body.rate_of_pose() for name, body in motion.bodies.items()}
     values = jax.jvp(g, (motion.t, motion.q.array, pose.bodies), (jnp.ones_like(motion.t), motion.qdot.array, rates))[1]
-    return {name: values[name] for name in position_rows(scene, pose)}  # JAX returns dictionaries sorted by name
+    return dict(zip(names, values, strict=True))
 
 
 def _coordinate(scene: Scene, name: str) -> str:

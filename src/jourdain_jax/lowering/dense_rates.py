@@ -13,7 +13,6 @@ Source: Wang and Pao (2003).
 from collections.abc import Callable
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
@@ -41,14 +40,10 @@ def dense_rates(scene: Scene, structure: Structure, independent: tuple[int, ...]
 
     values, level = of_state("qdot", "omega", "force", "torque", "direct", "mass", "inertia", "events"), of_state("v", "omega", "phi")
 
-    def by_speeds(scene, t, q, u, inputs):
-        return level(scene, t, q, u, inputs)[2], jax.jacfwd(lambda u: level(scene, t, q, u, inputs))(u)
+    def slopes(scene, t, q, u, inputs, *along):
+        return jax.jvp(lambda *state: level(scene, *state, inputs), (t, q, u), along)
 
-    def along_motion(scene, t, q, u, inputs):
-        found = values(scene, t, q, u, inputs)
-        return found, jax.jvp(lambda t, q: level(scene, t, q, u, inputs), (t, q), (jnp.ones_like(t), found[0]))[1]
-
-    functions, states = (uncompiled_lanes(by_speeds), uncompiled_lanes(along_motion)), (parameters, t, q, u, inputs)
+    functions, states = (uncompiled_lanes(values), uncompiled_lanes(slopes)), (parameters, t, q, u, inputs)
     # 4096 states times directions are worked out at once
     size = -(-len(t) // (1 + u.size // 4096))
     found = [_rates(functions, structure, independent, *jax.tree.map(lambda x, i=i: x[i : i + size], states)) for i in range(0, len(t), size)]
@@ -56,15 +51,24 @@ def dense_rates(scene: Scene, structure: Structure, independent: tuple[int, ...]
 
 
 def _rates(functions: tuple[Callable, Callable], structure: Structure, independent: tuple[int, ...], parameters, t, q, u, inputs) -> tuple[np.ndarray, ...]:
-    by_speeds, along_motion = functions
-    kept, dependent = list(structure.kept_rows), np.setdiff1d(np.arange(u.shape[1]), independent)
-    u = np.where(np.isin(np.arange(u.shape[1]), dependent), 0.0, u)
-    phi, (beta, gamma, A) = by_speeds(parameters, t, q, u, inputs)
+    values, slopes = functions
+    kept, (states, speeds) = list(structure.kept_rows), u.shape
+    dependent = np.setdiff1d(np.arange(speeds), independent)
+
+    lanes = lambda *given: jax.tree.map(lambda x: np.repeat(x, speeds, axis=0), given)  # noqa: E731
+    parted = lambda found: jax.tree.map(lambda x: x.reshape(states, speeds, *x.shape[1:]), found)  # noqa: E731
+
+    u = np.where(np.isin(np.arange(speeds), dependent), 0.0, u)
+    none, still, each = np.zeros(states * speeds), np.zeros((states * speeds, q.shape[1])), np.tile(np.eye(speeds), (states, 1))
+    (_, _, phi), found = parted(slopes(*lanes(parameters, t, q, u, inputs), none, still, each))
+    beta, gamma, A = (np.moveaxis(x, 1, -1) for x in found)
     A = A[:, kept]
     if dependent.size:  # A (u - y) = -phi(y)
         A_z = A[:, :, dependent]
-        u[:, dependent] = -shortest(A_z, phi[:, kept], typical_lengths(np.linalg.norm(A_z, axis=2)))
-    (qdot, omega, force, torque, direct, m, I, events), (a, alpha, drift) = along_motion(parameters, t, q, u, inputs)
+        u[:, dependent] = -shortest(A_z, phi[:, 0, kept], typical_lengths(np.linalg.norm(A_z, axis=2)))
+    qdot, omega, force, torque, direct, m, I, events = values(parameters, t, q, u, inputs)
+    # in as many lanes as above, so that JAX traces this once
+    a, alpha, drift = (x[:, 0] for x in parted(slopes(*lanes(parameters, t, q, u, inputs, np.ones(states), qdot, np.zeros_like(u))))[1])
     turned = lambda x: np.einsum("sbij,sbj->sbi", I, x)  # noqa: E731
     force, torque = force - m[..., None] * a, torque - turned(alpha) - np.cross(omega, turned(omega))
     f = np.einsum("sbik,sbi->sk", beta, force) + np.einsum("sbik,sbi->sk", gamma, torque) + direct

@@ -163,10 +163,12 @@ class Lowered:
 
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
         """
-        out = self.values([*self.z, *self.pivots], fixed, t, q, y, inputs)
-        every = [*y, *out[: len(self.z)]]
-        u = jnp.stack([every[i] for i in np.argsort([*self.independent, *self.dependent])])
-        return u, smallest_pivot(out[len(self.z) :])
+        return self.all_speeds(fixed, t, q, y, inputs), smallest_pivot(self.values(self.pivots, fixed, t, q, y, inputs))
+
+    def all_speeds(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "speeds *lanes"]:
+        """Return the speeds of the state and those that follow from them. `fixed`, `q`, `y`, `inputs`: as in `rates`."""
+        every = [*y, *self.values(self.z, fixed, t, q, y, inputs)]
+        return jnp.stack([every[i] for i in np.argsort([*self.independent, *self.dependent])])
 
     def energy_values(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "2 *lanes"]:
         """Kinetic and potential energy, J: numbers to differentiation. `fixed`, `q`, `y`, `inputs`: as in `rates`."""

@@ -9,7 +9,7 @@ either side of such places, which are found between the states that are probed; 
 A rate jumps where such a number vanishes if it changes as much over a way that is much shorter, and bends there if it does not.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
@@ -85,12 +85,11 @@ def relations(graph: Graph, rates: Sequence[int], events: Sequence[int], probes:
 
 def _counts(graph: Graph, number: int, nodes: list[tuple[int, int]], outputs: Sequence[int], counts, probes: Probes) -> bool:
     """Whether the branches of relations matter on either side of where their number vanishes."""
-    beside = [here for place in _places(number, probes) for here in place(ASIDE)]
-    if not beside:
+    if (beside := _beside(number, probes)) is None:
         return True
     above, below = branches(graph, nodes, outputs)
-    size = np.nanmax(np.abs(probes(outputs)), axis=1, initial=0.0)
-    return any(counts(here(outputs)[:, 0], here(above)[:, 0], here(below)[:, 0], AGREE * size) for here in beside)
+    least = AGREE * np.nanmax(np.abs(probes(outputs)), axis=1, initial=0.0)[:, None]
+    return any(counts(here(outputs), here(above), here(below), least) for here in beside(ASIDE))
 
 
 def _differ(values, above, below, least) -> bool:
@@ -104,27 +103,32 @@ def _may_dip(values, above, below, least) -> bool:
 
 def jumps(graph: Graph, numbers: Iterable[int], outputs: Sequence[int], probes: Probes) -> tuple[int, ...]:
     """Return the numbers at whose zeros, between probes, an output jumps."""
-    size = np.nanmax(np.abs(probes(outputs)), axis=1, initial=0.0)
+    least = AGREE * np.nanmax(np.abs(probes(outputs)), axis=1, initial=0.0)[:, None]
 
     def jumps_at(number: int) -> bool:
-        changes = ([np.abs(behind(outputs) - before(outputs))[:, 0] for before, behind in map(place, (1e-9, ASIDE))] for place in _places(number, probes))
-        return any(np.any((closer > AGREE * size) & (closer > 0.5 * wide)) for closer, wide in changes)
+        if (beside := _beside(number, probes)) is None:
+            return False
+        closer, wide = (np.abs(behind(outputs) - before(outputs)) for before, behind in map(beside, (1e-9, ASIDE)))
+        return bool(np.any((closer > least) & (closer > 0.5 * wide)))
 
     return tuple(n for n in numbers if jumps_at(n))
 
 
-def _places(number: int, probes: Probes) -> Iterator[Callable[[float], tuple[Probes, Probes]]]:
-    """Places where a number vanishes, as functions: states on either side of it, this far away."""
+def _beside(number: int, probes: Probes) -> Callable[[float], tuple[Probes, Probes]] | None:
+    """States on either side of places where a number vanishes, so far away; None where it vanishes between no probes."""
     values = probes([number])[0]
     positive, negative = np.flatnonzero(values > 0), np.flatnonzero(values < 0)
-    for i, j in list(zip(positive, negative, strict=False))[:6]:
-        a, b = ({name: np.atleast_1d(np.broadcast_to(x, probes.count)[k]) for name, x in probes.inputs.items()} for k in (i, j))
+    count = min(len(positive), len(negative), 6)  # places
+    if not count:
+        return None
+    a, b = ({name: np.broadcast_to(x, probes.count)[k[:count]] for name, x in probes.inputs.items()} for k in (positive, negative))
 
-        def at(share: float, a=a, b=b) -> Probes:
-            return probes.with_inputs({name: a[name] + share * (b[name] - a[name]) for name in a})
+    def at(share) -> Probes:
+        return probes.with_inputs({name: a[name] + share * (b[name] - a[name]) for name in a})
 
-        low, high = 0.0, 1.0
-        for _ in range(40):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if at(middle)([number])[0, 0] > 0 else (low, middle)
-        yield lambda aside, at=at, low=low, high=high: (at(low - aside), at(high + aside))
+    low, high = np.zeros(count), np.ones(count)
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        above = at(middle)([number])[0] > 0
+        low, high = np.where(above, middle, low), np.where(above, high, middle)
+    return lambda aside: (at(low - aside), at(high + aside))

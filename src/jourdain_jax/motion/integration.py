@@ -91,8 +91,8 @@ def _entered(setup: Setup) -> tuple[Setup, Float[Array, ""]]:
     """
     numbers, rest = eqx.partition(_numbers(setup), eqx.is_inexact_array)
     leaves, treedef = jax.tree.flatten(numbers)
-    each, asked = zip(*map(entered, lanes_first(leaves)), strict=True)  # also of what all motions share
-    return setup._replace(**eqx.combine(jax.tree.unflatten(treedef, each), rest)), sum(asked)
+    each, asked = entered(*lanes_first(leaves))  # also of what all motions share
+    return setup._replace(**eqx.combine(jax.tree.unflatten(treedef, each), rest)), asked
 
 
 def _begin(setup: Setup) -> Begun:
@@ -146,18 +146,19 @@ def _finish(given: Setup, setup: Setup, asked: Float[Array, ""], begun: Begun, s
     noticed = passed | (result == solved.code) | (result == results.NOT_FINITE)
     beyond = failed & ~(noticed & jnp.append(valid, False))  # of the saved states, and of the end
 
-    def marked(x, failed):
-        return left(jnp.reshape(failed, (*failed.shape, *[1] * (x.ndim - failed.ndim))), asked, x)
-
-    q, u, work = jax.tree.map(lambda x: marked(x[1:], beyond), found)
     t_end = jnp.where(solved.t_end == setup.t1 - origin, setup.t1, origin + solved.t_end)
+    saved, treedef = jax.tree.flatten(jax.tree.map(lambda x: x[1:], found))
+    whole = jnp.where(begun.timely, t_end, given.t0), start.moved_q, start.moved_u, pivot
+    marked = left(asked, [beyond] * len(saved) + [failed] * len(whole), [*saved, *whole])
+    q, u, work = jax.tree.unflatten(treedef, marked[: len(saved)])
+    t_end, moved_q, moved_u, pivot = marked[len(saved) :]
     return Trajectory(
         scene=given.scene,
         ts=given.ts,
         q=q[:-1],
         u=u[:-1],
         work=None if work is None else work[:-1],
-        t_end=marked(jnp.where(begun.timely, t_end, given.t0), failed),
+        t_end=t_end,
         q_end=q[-1],
         u_end=u[-1],
         result=result,
@@ -168,9 +169,9 @@ def _finish(given: Setup, setup: Setup, asked: Float[Array, ""], begun: Begun, s
         crossings=jnp.full_like(solved.crossings, -1) if unwatched else solved.crossings,
         together=solved.together,
         fallback=jnp.zeros((), jnp.int32) + results.AS_ASKED,
-        moved_q=marked(start.moved_q, failed),
-        moved_u=marked(start.moved_u, failed),
-        smallest_pivot=marked(pivot, failed),
+        moved_q=moved_q,
+        moved_u=moved_u,
+        smallest_pivot=pivot,
         inputs=given.inputs,
         state_form=field.name,
         reduction=field.reduction_name if setup.reason_against_machine_code else f"{field.reduction_name} to machine code",
