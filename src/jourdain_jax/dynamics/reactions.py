@@ -46,9 +46,16 @@ class RowReactions(eqx.Module):
 
     def forces_on(self, body: str) -> dict[str, Float[Array, "*times 3"]]:
         """Force on one body (N), by row."""
+        return self._by_row(self.force, body)
+
+    def torques_on(self, body: str) -> dict[str, Float[Array, "*times 3"]]:
+        """Torque on one body about its mass centre (N m), by row."""
+        return self._by_row(self.torque, body)
+
+    def _by_row(self, values, body):
         if body not in self.body_names:
             raise UnknownNameError(f"no body `{body}` in this scene; {nearest(body, self.body_names)}")
-        return {row: self.force[..., s, self.body_names.index(body), :] for s, row in enumerate(self.row_names)}
+        return {row: values[..., s, self.body_names.index(body), :] for s, row in enumerate(self.row_names)}
 
 
 class ContactForce(eqx.Module):
