@@ -41,7 +41,7 @@ class Accelerations(NamedTuple):
 def accelerations_by_multipliers(
     graph: Graph, M: Columns, f: list[int], A: Columns, drift: list[int], probes: Probes, forms: NormalForms, *, affine: bool
 ) -> Accelerations:
-    """The accelerations under all rows; entries are judged at `probes`, of rows that are `affine` in the speeds or not."""
+    """The accelerations under all rows; `probes` give the sizes by which entries are judged; `affine`: whether rows are, in the speeds."""
     *impulses, free = (list(column) for column in solve_symmetric(graph, M, [*A, f]).solution)  # M^-1 A' column by column, M^-1 f
     S = _products(graph, A, impulses, forms)
     for r in range(len(A)):

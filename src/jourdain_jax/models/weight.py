@@ -1,11 +1,11 @@
-"""Models on which weight acts and nothing else."""
+"""The load of models on which weight alone acts."""
 
 from jourdain_jax.scene.loads import gravity
 from jourdain_jax.scene.scene import Scene
 
 
 class Heavy(Scene):
-    """A scene that its `gravity` pulls down, m/s^2."""
+    """A scene on whose bodies weight acts and no other load; `gravity` in m/s^2."""
 
     def loads(self, motion):
         return (gravity(motion, self.gravity),)

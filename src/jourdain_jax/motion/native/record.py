@@ -1,7 +1,7 @@
 """The record of steps of a motion's way forth, by which its cotangents go back (`back.py`): one slot for each try of a step, for all lanes of a block.
 
-There is memory for so many slots: on a CPU for those of all threads within that of the model, where the record grows with the steps until then; on a GPU for
-what its memory has for each thread. Of motions that take more, the lanes go forth again for each window of slots, the last one first.
+The number of slots is bounded: on a CPU by the memory of the model, which all threads share, and up to which the record grows with the steps; on a GPU by the
+memory of each thread. If a motion takes more steps, its lanes run forward again for each window of slots, the last window first.
 """
 
 import math
