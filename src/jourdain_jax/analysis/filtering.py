@@ -28,7 +28,7 @@ from jourdain_jax.analysis.quantities import Channel, Instrument, StopEvent
 from jourdain_jax.analysis.runs import Run, equal_runs
 from jourdain_jax.analysis.sensors import gauss_legendre, ideal
 from jourdain_jax.analysis.tangent import dependent_coordinates, others, privileged_at, privileged_speeds
-from jourdain_jax.calculus.reals import checked_real, holds
+from jourdain_jax.calculus.reals import Scalar, Speeds, checked_real, holds
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
@@ -38,7 +38,6 @@ from jourdain_jax.motion.start import consistent
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.parameters import Scalar
 from jourdain_jax.scene.scene import Scene
 
 _NODES, _WEIGHTS = gauss_legendre(5)
@@ -92,7 +91,7 @@ def filtered_log_likelihood(
 class _Filter:
     """The filter of one run."""
 
-    def __init__(self, scene: Scene, run: Run, options: AllOptions, speeds: tuple[int, ...], intensities: Float[Array, "speeds"]):
+    def __init__(self, scene: Scene, run: Run, options: AllOptions, speeds: tuple[int, ...], intensities: Speeds):
         assert isinstance(run.inputs, Inputs)  # of a run that was checked
         self.scene, self.run, self.inputs, self.options = scene, run, run.inputs, options
         self.speeds, self.intensities = np.array(speeds, int), intensities
@@ -219,7 +218,7 @@ def _independent_speeds(scene: Scene, run: Experiment) -> tuple[int, ...]:
     return usual if determined else at_start()
 
 
-def _intensities(scene: Scene, speeds: tuple[int, ...], given: Mapping) -> Float[Array, "speeds"]:
+def _intensities(scene: Scene, speeds: tuple[int, ...], given: Mapping) -> Speeds:
     names = [scene.speed_names.entries[i] for i in speeds]
     if not isinstance(given, Mapping):
         raise ValueError(f"`process_noise` is {given!r}, expected a dictionary: independent speed -> intensity in (unit of the speed)^2 / s")

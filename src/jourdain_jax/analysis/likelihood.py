@@ -33,14 +33,13 @@ from jourdain_jax.analysis.runs import Run, equal_runs, run_of
 from jourdain_jax.analysis.table import table
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import array_module, compiled, described, holds, is_traced
+from jourdain_jax.calculus.reals import Scalar, array_module, compiled, described, holds, is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines, users_level
 from jourdain_jax.scene.identity import with_reference_parameters
 from jourdain_jax.scene.names import UnknownNameError, as_names, check_name
-from jourdain_jax.scene.parameters import Scalar
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 

@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float, Int
+from jaxtyping import Array, Complex, Float
 
 from jourdain_jax.analysis.families.critical import Sensitivities, sensitivities
 from jourdain_jax.analysis.families.spectrum import mode_names
@@ -33,7 +33,7 @@ from jourdain_jax.analysis.tangent import (
     smallest_pivot,
 )
 from jourdain_jax.build.structure import WELL_CONDITIONED
-from jourdain_jax.calculus.reals import RUN_SELDOM, Numbers, array_module, compiled, holds, is_traced
+from jourdain_jax.calculus.reals import RUN_SELDOM, Count, Numbers, Scalar, array_module, compiled, holds, is_traced
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.lowering.kinks import bent_load
 from jourdain_jax.motion.put_on_rows import State
@@ -73,10 +73,10 @@ class Linearization(Printed, eqx.Module):
     C: Float[Array, "parts parts"]
     K: Float[Array, "parts parts"]
     F: Float[Array, "parts inputs"]
-    acceleration: Float[Array, ""]  # largest |dy/dt| of the privileged speeds at the state: zero if it is steady
-    residual: Float[Array, ""]  # the larger of that and of |d2y/dt2| along the motion: both zero if it is steady
-    coupling: Float[Array, ""]  # largest coefficient, in the second form, of what is not named, relative to those in M, C, K
-    pivot: Float[Array, ""]  # smallest singular value of the eliminated (scaled) rows; near zero: choose other dependent ones
+    acceleration: Scalar  # largest |dy/dt| of the privileged speeds at the state: zero if it is steady
+    residual: Scalar  # the larger of that and of |d2y/dt2| along the motion: both zero if it is steady
+    coupling: Scalar  # largest coefficient, in the second form, of what is not named, relative to those in M, C, K
+    pivot: Scalar  # smallest singular value of the eliminated (scaled) rows; near zero: choose other dependent ones
     states: tuple[str, ...] = eqx.field(static=True)  # names of the entries of x
     inputs: tuple[str, ...] = eqx.field(static=True)
     coordinates: tuple[str, ...] = eqx.field(static=True)  # names of p
@@ -97,7 +97,7 @@ class Linearization(Printed, eqx.Module):
         return "\n".join([*lines, "  eigenvalues in 1/s: " + ", ".join(values)])
 
     @property
-    def code(self) -> Int[Array, ""]:
+    def code(self) -> Count:
         """0, or `SINGULAR_PARTITION` where the privileged speeds and coordinates do not determine the others: all is NaN there."""
         return jnp.where(self.pivot >= SMALLEST_PIVOT, results.SUCCESS, results.SINGULAR_PARTITION)
 

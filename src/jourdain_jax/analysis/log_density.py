@@ -26,13 +26,12 @@ from jourdain_jax.analysis.likelihood import as_fit_options, as_runs, in_all_or_
 from jourdain_jax.analysis.runs import Run, equal_runs
 from jourdain_jax.analysis.unknowns import Places, check_starts, unknowns_of
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import compiled, holds, is_traced
+from jourdain_jax.calculus.reals import Scalar, compiled, holds, is_traced
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.identity import reference_parameters
 from jourdain_jax.scene.names import check_name
-from jourdain_jax.scene.parameters import Scalar
 from jourdain_jax.scene.scene import Scene
 
 Point = Float[Array, "unknowns"]

@@ -29,7 +29,7 @@ from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.sampling import sample_states
-from jourdain_jax.calculus.reals import array_module, checked_known, checked_real, described, is_traced
+from jourdain_jax.calculus.reals import Scalar, Vector3, array_module, checked_known, checked_real, described, is_traced
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reactions import contact_forces
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
@@ -133,8 +133,8 @@ class Accelerometer(Instrument):
     """
 
     body: str = eqx.field(static=True)
-    point: Float[Array, "3"]  # m
-    gravity: Float[Array, "3"]  # m/s^2
+    point: Vector3  # m
+    gravity: Vector3  # m/s^2
 
     def __init__(self, body, point=(0.0, 0.0, 0.0), gravity=(0.0, 0.0, -9.81)):
         if not isinstance(body, str):
@@ -152,7 +152,7 @@ class Accelerometer(Instrument):
         """What it feels at all times of one motion."""
         return jax.vmap(lambda *state: self._felt(motion.scene, *state))(motion.ts, motion.q, motion.u, motion.accelerations().udot)
 
-    def _felt(self, scene: Scene, t, q, u, udot) -> Float[Array, "3"]:
+    def _felt(self, scene: Scene, t, q, u, udot) -> Vector3:
         def velocity(t, q, u):
             body = motion_at(scene, t, q, u)[self.body]
             return body.velocity_at(body.place(self.point)), body.orientation
@@ -219,7 +219,7 @@ class StopEvent(eqx.Module):
             raise ValueError(f"`events` of {where} names `{name}`, which is no event of the scene; {has}")
         return StopEvent(name)
 
-    def time(self, motion: Callable, t0, span) -> Float[Array, ""]:
+    def time(self, motion: Callable, t0, span) -> Scalar:
         """When the motion stops at it, NaN where it does not. `motion`: of times, with its events; `span`: from the start to the observed time."""
         found = motion((t0 + LATEST * span)[None])
         return jnp.where(found.event == found.event_names.index(self.name), found.t_end, jnp.nan)

@@ -31,11 +31,10 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.estimate import Estimate, positive, unbounded
 from jourdain_jax.analysis.quantities import Channel, Instrument, StopEvent
-from jourdain_jax.calculus.reals import array_module, checked_real, described, holds, is_traced
+from jourdain_jax.calculus.reals import Scalar, array_module, checked_real, described, holds, is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.parameters import Scalar
 
 FEWEST_INTERVALS = 64  # up to the end of a run, or to the next node of a piece
 Numbers = Float[Array | np.ndarray, "..."]

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import plain_row_lengths, usual_rows
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import as_real, described, rank_cutoff
+from jourdain_jax.calculus.reals import Scalar, as_real, described, rank_cutoff
 from jourdain_jax.dynamics.accelerations import reductions
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
@@ -33,7 +33,6 @@ from jourdain_jax.equations.virtual_power import equations_and_rows, resultants
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.loads import Gravity, Load
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.parameters import Scalar
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import loads_of, potential_of

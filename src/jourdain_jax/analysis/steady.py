@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.analysis.families.equations import sizes
 from jourdain_jax.analysis.instant import ByMatrices, ByProgram, instant_of, on_rows, places_of, unseen
 from jourdain_jax.analysis.tangent import privileged_speeds
-from jourdain_jax.calculus.reals import RUN_SELDOM, Number, Numbers, compiled, described
+from jourdain_jax.calculus.reals import RUN_SELDOM, Flag, Number, Numbers, Scalar, compiled, described
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State
@@ -35,9 +35,9 @@ class SteadyMotion(Printed, eqx.Module):
     """A state of steady motion, and how steady it is."""
 
     state: State
-    acceleration: Float[Array, ""]  # largest |dy/dt| that is left
-    residual: Float[Array, ""]  # largest of that, of |d2y/dt2| along the motion, and of what is left of the rows
-    converged: Bool[Array, ""]  # whether `residual` is below the root of round-off
+    acceleration: Scalar  # largest |dy/dt| that is left
+    residual: Scalar  # largest of that, of |d2y/dt2| along the motion, and of what is left of the rows
+    converged: Flag  # whether `residual` is below the root of round-off
 
     def __getitem__(self, name: str):
         """A coordinate, speed, quaternion or angular velocity by name."""
@@ -122,7 +122,7 @@ class _Problem(eqx.Module):
     """What vanishes at a steady motion, as a function of z = (q, u)."""
 
     scene: Scene
-    t: Float[Array, ""]
+    t: Scalar
     f: Float[Array, "inputs"]
     instant: ByProgram | ByMatrices = eqx.field(static=True)
     privileged: tuple[int, ...] = eqx.field(static=True)

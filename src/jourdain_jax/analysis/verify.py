@@ -17,13 +17,12 @@ Everything is worked out once, uncompiled: compiling it would take several times
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.statements import Verification, by_reduction, check, gradient_checks, statement_checks
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import plain_row_lengths, structure_of, usual_rows
 from jourdain_jax.calculus.matrices import null_space_svd
-from jourdain_jax.calculus.reals import Numbers
+from jourdain_jax.calculus.reals import Numbers, Speeds
 from jourdain_jax.dynamics.accelerations import diagnosed, reductions
 from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.dynamics.power import power
@@ -126,7 +125,7 @@ def _evaluate(scene, t, q, u, inputs, usual, plain) -> dict:
     }
 
 
-def _gyroscopic(scene, t, q, u, partial) -> Float[Array, "speeds"]:
+def _gyroscopic(scene, t, q, u, partial) -> Speeds:
     """Size of the inertia forces that may cancel inside `h`: of `m v omega` and `omega I omega`. What is left of them is round-off of this size."""
     weights, known = inertias(scene, t, q), velocities(scene, t, q, u)
     v, w = (jnp.linalg.norm(x, axis=1) for x in (known.linear, known.angular))

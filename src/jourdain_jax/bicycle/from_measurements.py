@@ -23,9 +23,8 @@ from jaxtyping import Array, Float
 from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, shipped_measurements
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, doubts, violations
 from jourdain_jax.bicycle.readings import Readings, read_readings
-from jourdain_jax.calculus.reals import RUN_SELDOM, compiled
+from jourdain_jax.calculus.reals import RUN_SELDOM, Scalar, compiled
 from jourdain_jax.scene.names import check_name
-from jourdain_jax.scene.parameters import Scalar
 
 PerHanging = Float[Array, "hangings"]
 Values = dict[str, Scalar]

@@ -10,11 +10,10 @@ from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.linearize import linearize
 from jourdain_jax.bicycle.stability import BicycleMatrices
-from jourdain_jax.calculus.reals import RUN_SELDOM, compiled
+from jourdain_jax.calculus.reals import RUN_SELDOM, Scalar, compiled
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 from jourdain_jax.motion.put_on_rows import State
 
@@ -29,12 +28,12 @@ def upright_running(bicycle: WhippleBicycle, speed) -> State:
     return State(zero, q, u, zero, zero, zero, (bicycle.coordinate_names, bicycle.speed_names))
 
 
-def linear_matrices(values: Mapping[str, float | Float[Array, ""]]) -> BicycleMatrices:
+def linear_matrices(values: Mapping[str, float | Scalar]) -> BicycleMatrices:
     """M, C1, K0, K2 (2x2, in lean and steer) and g from the 26 parameters by name. Runs under jit and vmap."""
     return _matrices({name: jnp.asarray(value) for name, value in values.items()})
 
 
-def _linearised(values: dict[str, Float[Array, ""]]) -> BicycleMatrices:
+def _linearised(values: dict[str, Scalar]) -> BicycleMatrices:
     bicycle = WhippleBicycle.from_values(values)
 
     def at(speed):

@@ -28,9 +28,8 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Complex, Float
 
-from jourdain_jax.calculus.reals import RUN_SELDOM, compiled
+from jourdain_jax.calculus.reals import RUN_SELDOM, Flag, Scalar, compiled
 
-Scalar = Float[Array, ""]
 Given = Float[ArrayLike, "2 2"]
 Square = Float[Array, "2 2"]
 Polynomial = Float[Array, " coefficients"]
@@ -56,7 +55,7 @@ class StabilitySpeeds(eqx.Module):
     double_root_eigenvalue: Scalar  # 1/s, at the double root speed
     stable_from: Scalar  # the widest range of speeds where all four eigenvalues decay (no derivative)
     stable_to: Scalar  # its end: the largest speed looked at if it is still stable there (no derivative)
-    stable_range_exists: Bool[Array, ""]
+    stable_range_exists: Flag
 
 
 def eigenvalues(
@@ -220,7 +219,7 @@ def _root_where(there, x: Scalar) -> Scalar:
     return jnp.where(there, jnp.sqrt(jnp.where(there, x, 1.0)), jnp.nan)
 
 
-def _merging(matrices: BicycleMatrices, x: Scalar) -> tuple[Scalar, Bool[Array, ""]]:
+def _merging(matrices: BicycleMatrices, x: Scalar) -> tuple[Scalar, Flag]:
     """The double eigenvalue (1/s) at a root x, and whether two positive real ones become a pair there, as the speed grows."""
     v = jnp.sqrt(x)
     coefficients, slopes = jax.jvp(lambda v: _characteristic(matrices, v), (v,), (jnp.ones_like(v),))

@@ -13,7 +13,7 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Key, UInt32
 
-from jourdain_jax.scene.parameters import Scalar
+from jourdain_jax.calculus.reals import Scalar
 
 from .parameter_files import MeasuredBicycle
 from .parameters import PARAMETER_NAMES, violations

@@ -20,8 +20,9 @@ from operator import or_
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import Flag, Scalar
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import motion_at, pose_at
 from jourdain_jax.scene.bodies import RigidBody
@@ -76,7 +77,7 @@ def _round_off(pose: Pose):
     return 1e6 * jnp.finfo(pose.q.array.dtype).eps
 
 
-def _lengths(contact: Contact) -> dict[str, Float[Array, ""]]:
+def _lengths(contact: Contact) -> dict[str, Scalar]:
     """Return the lengths (m) that must be positive."""
     found, shape, ground = {}, contact.shape, contact.ground
     if isinstance(shape, Ball | Wheel):
@@ -248,7 +249,7 @@ CHECKS = (
 )
 
 
-def faults_at(scene: Scene, t, q, u, inputs) -> dict[str, Bool[Array, ""]]:
+def faults_at(scene: Scene, t, q, u, inputs) -> dict[str, Flag]:
     """Return fault -> whether the scene has it at this state; also under jit and vmap. NaN is no fault."""
     numbers = numbers_of(scene, motion_at(scene, t, q, u, inputs))
     return {f"{check.label}: {name}": check.wrong(x) for check in CHECKS if check.label for name, x in numbers[check.of].items()}
@@ -257,7 +258,7 @@ def faults_at(scene: Scene, t, q, u, inputs) -> dict[str, Bool[Array, ""]]:
 known_faults_at = eval_numpy(faults_at)
 
 
-def any_wrong(stacked: dict[str, Array]) -> Bool[Array, ""]:
+def any_wrong(stacked: dict[str, Array]) -> Flag:
     """Return whether one state shows a fault in numbers stacked along a first axis, by their kinds."""
     return jnp.any(jnp.concatenate([jnp.zeros(1, bool), *(check.wrong(stacked[check.of]) for check in CHECKS if check.label and check.of in stacked)]))
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Num, PyTree
 
 from jourdain_jax.build.plausibility import Numbers, numbers_of
 from jourdain_jax.calculus.jaxprs import needed_only
-from jourdain_jax.calculus.reals import Entries, is_traced
+from jourdain_jax.calculus.reals import Entries, Scalar, is_traced
 from jourdain_jax.equations.kinematics import coordinate_rates, inertias_of, motion_at, pose_at, velocities_of
 from jourdain_jax.equations.listed import names_of_bodies, names_of_position_rows
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
@@ -225,13 +225,13 @@ def owned(scene: Scene, **fields: np.ndarray) -> dict[int, str]:
     return {node: owner for owner, nodes in reversed(pairs) for node in np.ravel(nodes).tolist()}
 
 
-def stored_by_inputs(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Float[Array, ""]:
+def stored_by_inputs(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Scalar:
     """Potential energy in J of the loads with the numbers `of_inputs`."""
     loads = tuple(loads_of(scene, motion))
     return sum((loads[k].potential for k in of_inputs), start=jnp.zeros_like(motion.t))
 
 
-def explicit_power(scene: Scene, motion: Motion, of_inputs: tuple[int, ...], loads: tuple[Load, ...] | None = None) -> Float[Array, ""]:
+def explicit_power(scene: Scene, motion: Motion, of_inputs: tuple[int, ...], loads: tuple[Load, ...] | None = None) -> Scalar:
     """The part of `rate_of_work` that needs no accelerations: of loads without a potential, of potentials that depend on time or on inputs; W.
 
     sum F.v + L.omega + Q_k u_k           loads without a potential
@@ -244,7 +244,7 @@ def explicit_power(scene: Scene, motion: Motion, of_inputs: tuple[int, ...], loa
     return by_time + _of_driven_poses(scene, motion) + forces_for_potentials(scene, motion, of_inputs)
 
 
-def _of_driven_poses(scene: Scene, motion: Motion) -> Float[Array, ""]:
+def _of_driven_poses(scene: Scene, motion: Motion) -> Scalar:
     """Rate of the scene's own potential as poses move at `u = 0`: its forces stand on the speeds, along which no such motion is."""
     if potential_of(scene, motion.pose()) is None:
         return jnp.zeros_like(motion.t)
@@ -256,7 +256,7 @@ def _of_driven_poses(scene: Scene, motion: Motion) -> Float[Array, ""]:
     return whole - jax.jvp(lambda t, q: potential_of(scene, Pose(t, scene.coordinate_names.view(q), held)), *along)[1]
 
 
-def forces_for_potentials(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Float[Array, ""]:
+def forces_for_potentials(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Scalar:
     """Power in W of the loads `of_inputs` less the explicit rate of what they store."""
     if not of_inputs:
         return jnp.zeros_like(motion.t)
@@ -266,7 +266,7 @@ def forces_for_potentials(scene: Scene, motion: Motion, of_inputs: tuple[int, ..
 
 def power_of_loads(
     scene: Scene, motion: Motion, *, conservative: bool | None = None, among: tuple[int, ...] | None = None, loads: tuple[Load, ...] | None = None
-) -> Float[Array, ""]:
+) -> Scalar:
     """`sum F.v + L.omega + Q_k u_k` in W; only loads with (`conservative=True`) or without a potential (`False`), or with the numbers `among`.
 
     `loads`: as in `explicit_power`.
@@ -277,7 +277,7 @@ def power_of_loads(
     return jnp.sum(total.force * v) + jnp.sum(total.torque * omega) + total.direct @ motion.u.array
 
 
-def explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Float[Array, ""]:
+def explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Scalar:
     """`dV/dt` of a `potential` with all poses held, and with coordinates moving only as they do at `u = 0`."""
     q = motion.q.array
     nu = coordinate_rates(scene, motion.t, q, jnp.zeros_like(motion.u.array))

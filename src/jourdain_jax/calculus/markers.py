@@ -24,6 +24,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Bool, Float, Shaped
 
+from jourdain_jax.calculus.reals import Flag, Scalar
+
 
 def identity(name: str) -> Primitive:
     """The identity of several arrays, whatever its parameters; under `vmap` their axes of lanes stay where they are. It has no derivative yet."""
@@ -140,20 +142,20 @@ def tap_cotangents(values: tuple, look: Callable) -> tuple:
 
 
 @jax.custom_jvp
-def entered(*each: Float[Array, "..."]) -> tuple[list[Array], Float[Array, ""]]:
+def entered(*each: Float[Array, "..."]) -> tuple[list[Array], Scalar]:
     """These arrays, and the zero to be handed to `left`."""
     *each, asked = lanes_first((*each, jnp.zeros((), each[0].dtype)))
     return each, asked
 
 
 @jax.custom_jvp
-def left(asked: Float[Array, ""], failed: Sequence[Bool[Array, "..."]], each: Sequence[Float[Array, "..."]]) -> list[Array]:
+def left(asked: Scalar, failed: Sequence[Bool[Array, "..."]], each: Sequence[Float[Array, "..."]]) -> list[Array]:
     """`each` of some arrays, which `failed` or did not, along its first axes; `asked`: the zero of what entered."""
     return lanes_first([*each, *failed, asked])[: len(each)]
 
 
 @jnp.vectorize
-def nan_where(failed: Bool[Array, ""], x: Float[Array, ""]) -> Float[Array, ""]:
+def nan_where(failed: Flag, x: Scalar) -> Scalar:
     """`x`, with NaN where `failed` holds, and so are its derivatives; those of what depends on nothing, or on
     which nothing depends, stay zero.
     """

@@ -16,9 +16,9 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.calculus.reals import rank_cutoff, with_usual_promotion
+from jourdain_jax.calculus.reals import Count, rank_cutoff, with_usual_promotion
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
@@ -53,7 +53,7 @@ def singular_values(A: Float[Array, "rows columns"]) -> Float[Array, "values"]:
     return jnp.linalg.svd(jax.lax.stop_gradient(A), compute_uv=False)
 
 
-def numerical_rank(sigma: Float[Array, "values"], cutoff: float | None = None) -> Int[Array, ""]:
+def numerical_rank(sigma: Float[Array, "values"], cutoff: float | None = None) -> Count:
     """How many singular values exceed `cutoff` times the largest (default: the cut-off of their dtype)."""
     if sigma.shape[0] == 0:
         return jnp.zeros((), jnp.int32)

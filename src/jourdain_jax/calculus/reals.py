@@ -18,12 +18,20 @@ import jaxlib.version
 import numpy as np
 from jax import dtypes
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, Bool, Float, Int, Real
 
 Entries: TypeAlias = Array | np.ndarray
 Number = ArrayLike  # one number
 Numbers = Real[Array | np.ndarray, "_"] | Sequence[ArrayLike]  # any count of them
 Vector = Real[Array | np.ndarray, "3"] | Sequence[ArrayLike]  # three numbers
+# what annotations of all layers name most often
+Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
+Count = Int[Array, ""]
+Vector3 = Float[Array, "3"]
+Matrix3 = Float[Array, "3 3"]
+Speeds = Float[Array, "speeds"]
+PerLane = Float[Array, "*lanes"]
 
 
 def real_type() -> np.dtype:

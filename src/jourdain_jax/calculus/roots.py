@@ -26,17 +26,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import with_usual_promotion
+from jourdain_jax.calculus.reals import Count, Flag, Scalar, with_usual_promotion
 
 
 class Root(eqx.Module):
     """Where an iteration ended, and whether that is a root."""
 
     x: Float[Array, "unknowns"]
-    converged: Bool[Array, ""]
+    converged: Flag
 
 
 def newton_root(residual: Callable, guess: Float[Array, "unknowns"], scale: Float[Array, "unknowns"]) -> Root:
@@ -80,7 +80,7 @@ class Nearest(eqx.Module):
     """Where a search ended, and what is left of the rows there."""
 
     x: Float[Array, "unknowns"]
-    left: Float[Array, ""]  # largest of the rows
+    left: Scalar  # largest of the rows
 
 
 class Search(eqx.Module):
@@ -90,12 +90,12 @@ class Search(eqx.Module):
     best: Float[Array, "unknowns"]
     f: Float[Array, "rows"]  # at the best, and their slopes
     J: Float[Array, "rows unknowns"]
-    damping: Float[Array, ""]
-    steps: Int[Array, ""]
-    going: Bool[Array, ""]
+    damping: Scalar
+    steps: Count
+    going: Flag
 
     @property
-    def left(self) -> Float[Array, ""]:
+    def left(self) -> Scalar:
         """The largest of the rows at the best point."""
         left = jnp.max(jnp.abs(self.f), initial=0.0)
         return jnp.where(jnp.isfinite(left), left, jnp.inf)
@@ -143,7 +143,7 @@ def smooth_root(look: Callable, rows: Callable, guess: Float[Array, "unknowns"],
     return jax.lax.scan(lambda x, _: (x - inverse @ rows(x), None), jnp.where(size > 0, found.best, x), length=3)[0]
 
 
-def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, tolerance: float, good: float, *bounds) -> tuple[Nearest, Int[Array, ""]]:
+def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, tolerance: float, good: float, *bounds) -> tuple[Nearest, Count]:
     """The root that is found from the first of the `guesses` that leads to one, and its number; where none does, what comes nearest.
 
     A root leaves at most `good`; all else, also the `bounds`, is as for `damped_search`.

@@ -13,14 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Real
 
-from jourdain_jax.calculus.reals import Number, Vector, checked_real, holds
+from jourdain_jax.calculus.reals import Matrix3, Number, Scalar, Vector, Vector3, checked_real, holds
 
 
-def _angle(angle: Number) -> Float[Array, ""]:
+def _angle(angle: Number) -> Scalar:
     return checked_real(angle, "angle of a rotation", (), advice="give one angle in rad; use `jax.vmap` for many")
 
 
-def rot_x(angle: Number) -> Float[Array, "3 3"]:
+def rot_x(angle: Number) -> Matrix3:
     """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the x axis.
 
     With x ahead and z up a positive angle leans to the right. Column k, `R[:, k]`, is body axis k in the inertial frame.
@@ -31,7 +31,7 @@ def rot_x(angle: Number) -> Float[Array, "3 3"]:
     return jnp.stack([jnp.stack([i, o, o]), jnp.stack([o, c, -s]), jnp.stack([o, s, c])])
 
 
-def rot_y(angle: Number) -> Float[Array, "3 3"]:
+def rot_y(angle: Number) -> Matrix3:
     """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the y axis.
 
     With x ahead and z up a positive angle pitches the nose down, and rolls a wheel ahead. Column k, `R[:, k]`, is body axis k in the inertial frame.
@@ -42,7 +42,7 @@ def rot_y(angle: Number) -> Float[Array, "3 3"]:
     return jnp.stack([jnp.stack([c, o, s]), jnp.stack([o, i, o]), jnp.stack([-s, o, c])])
 
 
-def rot_z(angle: Number) -> Float[Array, "3 3"]:
+def rot_z(angle: Number) -> Matrix3:
     """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the z axis.
 
     With z up a positive angle turns to the left. Column k, `R[:, k]`, is body axis k in the inertial frame.
@@ -53,19 +53,19 @@ def rot_z(angle: Number) -> Float[Array, "3 3"]:
     return jnp.stack([jnp.stack([c, -s, o]), jnp.stack([s, c, o]), jnp.stack([o, o, i])])
 
 
-def skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
+def skew(v: Vector3) -> Matrix3:
     """The matrix of the cross product, `skew(v) w = v x w`."""
     x, y, z = v[0], v[1], v[2]
     o = jnp.zeros_like(x)
     return jnp.stack([jnp.stack([o, -z, y]), jnp.stack([z, o, -x]), jnp.stack([-y, x, o])])
 
 
-def vee(S: Float[Array, "3 3"]) -> Float[Array, "3"]:
+def vee(S: Matrix3) -> Vector3:
     """The vector of the antisymmetric part of `S`, the inverse of `skew`."""
     return 0.5 * jnp.stack([S[2, 1] - S[1, 2], S[0, 2] - S[2, 0], S[1, 0] - S[0, 1]])
 
 
-def quaternion_to_matrix(quaternion: Real[Array | np.ndarray, "4"] | Sequence[Number]) -> Float[Array, "3 3"]:
+def quaternion_to_matrix(quaternion: Real[Array | np.ndarray, "4"] | Sequence[Number]) -> Matrix3:
     """Rotation matrix (3, 3), body to space, of a `quaternion` (w, x, y, z) of any norm but zero (the formula divides by the squared norm).
 
     ValueError where it is known to be zero; NaN where a traced one is.
@@ -102,7 +102,7 @@ def matrices_to_quaternions(rotations: Float[np.ndarray, "matrices 3 3"]) -> Flo
     return found
 
 
-def quaternion_rate(quaternion: Float[Array, "4"], omega_body: Float[Array, "3"]) -> Float[Array, "4"]:
+def quaternion_rate(quaternion: Float[Array, "4"], omega_body: Vector3) -> Float[Array, "4"]:
     """`d quaternion / dt = 1/2 quaternion (0, omega_body)` for the body angular velocity `omega_body` (rad/s)."""
     return 0.5 * quaternion_product(quaternion, jnp.concatenate([jnp.zeros_like(omega_body[:1]), omega_body]))
 

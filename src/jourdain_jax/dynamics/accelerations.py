@@ -7,11 +7,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import structure_of, usual_rows
 from jourdain_jax.calculus.matrices import numerical_rank, pseudo_inverse, singular_values
-from jourdain_jax.calculus.reals import checked_real, described
+from jourdain_jax.calculus.reals import Count, Flag, Scalar, Speeds, checked_real, described
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.reductions import (
@@ -40,8 +40,8 @@ class Baumgarte(eqx.Module):
     accurate.
     """
 
-    alpha: Float[Array, ""] = eqx.field(converter=lambda x: checked_real(x, "`alpha` of `Baumgarte`", ()), default=5.0)
-    beta: Float[Array, ""] = eqx.field(converter=lambda x: checked_real(x, "`beta` of `Baumgarte`", ()), default=5.0)
+    alpha: Scalar = eqx.field(converter=lambda x: checked_real(x, "`alpha` of `Baumgarte`", ()), default=5.0)
+    beta: Scalar = eqx.field(converter=lambda x: checked_real(x, "`beta` of `Baumgarte`", ()), default=5.0)
 
 
 class Accelerations(eqx.Module):
@@ -50,13 +50,13 @@ class Accelerations(eqx.Module):
     Units are those of the speeds (per s) and of the rows; a `constraint_force` is per speed, in N or N m.
     """
 
-    udot: Float[Array, "speeds"]
+    udot: Speeds
     multipliers: Float[Array, "rows"]  # lambda of minimum norm: the constraint force on the speeds is A' lambda
-    constraint_force: Float[Array, "speeds"]  # A' lambda = M udot + h - Q
-    rank: Int[Array, ""]  # of the rows at this state
-    smallest_singular_value: Float[Array, ""]  # of the scaled rows, the last one of their usual rank (1 without rows); the reduction's own pivot where smaller
-    residual: Float[Array, ""]  # |A udot + drift| in scaled rows; large where rows contradict each other
-    applicable: Bool[Array, ""]  # whether this reduction works at this state
+    constraint_force: Speeds  # A' lambda = M udot + h - Q
+    rank: Count  # of the rows at this state
+    smallest_singular_value: Scalar  # of the scaled rows, the last one of their usual rank (1 without rows); the reduction's own pivot where smaller
+    residual: Scalar  # |A udot + drift| in scaled rows; large where rows contradict each other
+    applicable: Flag  # whether this reduction works at this state
 
 
 def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:

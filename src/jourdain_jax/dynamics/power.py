@@ -18,10 +18,10 @@ Source: Wang and Pao (2003), eqs. (71)-(73).
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.build.trace import explicit_rate, forces_for_potentials, power_of_loads
+from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.equations.kinematics import inertias, motion_at
@@ -35,14 +35,14 @@ from jourdain_jax.scene.scene import Scene
 class Power(eqx.Module):
     """Power in W by origin; positive where it adds to T + V."""
 
-    loads: Float[Array, ""]  # of loads without a potential
-    rows: Float[Array, ""]  # of constraint rows that do real work
-    driven: Float[Array, ""]  # of whatever moves poses that are given functions of time
-    potential: Float[Array, ""]  # explicit rate of potentials that depend on time
-    inertia: Float[Array, ""]  # of masses and inertias that change
+    loads: Scalar  # of loads without a potential
+    rows: Scalar  # of constraint rows that do real work
+    driven: Scalar  # of whatever moves poses that are given functions of time
+    potential: Scalar  # explicit rate of potentials that depend on time
+    inertia: Scalar  # of masses and inertias that change
 
     @property
-    def total(self) -> Float[Array, ""]:
+    def total(self) -> Scalar:
         """`d(T + V)/dt`."""
         return sum(jax.tree.leaves(self))
 
@@ -71,7 +71,7 @@ def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) 
     )
 
 
-def rate_of_work(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced, of_inputs: tuple[int, ...]) -> Float[Array, ""]:
+def rate_of_work(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced, of_inputs: tuple[int, ...]) -> Scalar:
     """What is integrated for the work done, in W: the power, with the forces of the loads `of_inputs` in place of their potentials.
 
     `of_inputs`: numbers of the loads whose potential depends on inputs; what they store (`stored_by_inputs`) is added to the integral.
@@ -79,7 +79,7 @@ def rate_of_work(scene: Scene, motion: Motion, accelerations: Accelerations | Re
     return power(scene, motion, accelerations).total + forces_for_potentials(scene, motion, of_inputs)
 
 
-def _power_of_drives(scene: Scene, motion: Motion, udot) -> Float[Array, ""]:
+def _power_of_drives(scene: Scene, motion: Motion, udot) -> Scalar:
     """The constraint forces of bodies that move while all speeds are zero, times those velocities."""
     t, q, u, inputs = motion.t, motion.q.array, motion.u.array, motion.inputs.array
     total = newton_residual(scene, t, q, u, udot, inputs)
@@ -88,7 +88,7 @@ def _power_of_drives(scene: Scene, motion: Motion, udot) -> Float[Array, ""]:
     return jnp.sum(total.linear * v) + jnp.sum(total.angular * omega)
 
 
-def _power_of_changing_inertia(scene: Scene, motion: Motion) -> Float[Array, ""]:
+def _power_of_changing_inertia(scene: Scene, motion: Motion) -> Scalar:
     """`sum mdot v.v/2 + omega.(dI/dt omega)/2`, with dI/dt in body axes."""
     t, q, bodies = motion.t, motion.q.array, motion.bodies.values()
     _, rate = jax.jvp(lambda t, q: inertias(scene, t, q), (t, q), (jnp.ones_like(t), motion.qdot.array))

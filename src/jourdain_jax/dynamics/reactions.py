@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.structure import plain_row_lengths
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import rank_cutoff
+from jourdain_jax.calculus.reals import Flag, Scalar, rank_cutoff
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.dynamics.normal_forces import Wrenches, normal_forces
@@ -61,12 +61,12 @@ class RowReactions(eqx.Module):
 class ContactForce(eqx.Module):
     """The force of the ground on the body at one rolling contact."""
 
-    normal: Float[Array, ""]  # N, along the plane's normal; negative where the contact would have to pull
+    normal: Scalar  # N, along the plane's normal; negative where the contact would have to pull
     tangential: Float[Array, "2"]  # N, along the plane's tangents
-    friction_needed: Float[Array, ""]  # |tangential| / normal; infinite where the contact would have to pull, zero where it bears nothing
-    pulls: Bool[Array, ""]  # whether the normal force is negative beyond round-off: the body would lift off
-    determined: Bool[Array, ""]  # whether the rows at hand determine these numbers
-    normal_determined: Bool[Array, ""]  # whether they determine the normal force, though two wheels of one axle may share the tangential one
+    friction_needed: Scalar  # |tangential| / normal; infinite where the contact would have to pull, zero where it bears nothing
+    pulls: Flag  # whether the normal force is negative beyond round-off: the body would lift off
+    determined: Flag  # whether the rows at hand determine these numbers
+    normal_determined: Flag  # whether they determine the normal force, though two wheels of one axle may share the tangential one
 
 
 @eager_if_concrete
@@ -159,7 +159,7 @@ def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=N
     return forces
 
 
-def _size_of_forces(scene: Scene, motion: Motion, total) -> Float[Array, ""]:
+def _size_of_forces(scene: Scene, motion: Motion, total) -> Scalar:
     """Size of the forces at hand (N): of `m a - F`, of F and of `m |v| |omega|` on the bodies."""
     size = jnp.max(jnp.abs(total)) + jnp.max(jnp.abs(resultants(scene, motion).force))
     for body in motion.bodies.values():

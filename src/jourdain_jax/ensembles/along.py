@@ -11,14 +11,12 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.reals import Count, Scalar, described
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.scene.parameters import Scalar
 
 Values = Float[Array, "times"]
-Count = Int[Array, ""]
 FOR_EXTREMES, FOR_INTEGRALS = 5, 4  # values that a polynomial goes through
 
 

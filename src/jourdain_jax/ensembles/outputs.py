@@ -9,13 +9,12 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 
-from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.reals import Scalar, described
 from jourdain_jax.ensembles.along import integral, largest, sampled
 from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.motion.trajectories.results import EVENT
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.names import check_name, nearest
-from jourdain_jax.scene.parameters import Scalar
 from jourdain_jax.scene.scene import Scene
 
 

@@ -10,8 +10,8 @@ Source: Wang and Pao (2003), section II.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.kinematics import bias_accelerations, inertias, velocities
 from jourdain_jax.equations.reductions import APPLICABLE_PIVOT, Partition, Reduced, reduced, solve_definite
@@ -22,7 +22,7 @@ from jourdain_jax.scene.arguments import as_coordinates, as_speeds
 from jourdain_jax.scene.scene import Scene
 
 
-def gibbs_function(scene: Scene, t, q, u, udot) -> Float[Array, ""]:
+def gibbs_function(scene: Scene, t, q, u, udot) -> Scalar:
     """The Gibbs function `G = sum m a.a/2 + alpha.I alpha/2 + alpha.(omega x I omega)` in kg m^2/s^4, up to terms without accelerations; (12)-(14).
 
     `udot`: accelerations of all speeds, free: they need not obey the rows.

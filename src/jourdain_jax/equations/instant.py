@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import as_real
+from jourdain_jax.calculus.reals import Scalar, as_real
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.kinematics import Inertias, Velocities, coordinate_rates, inertias_of, motion_at, velocities_of
 from jourdain_jax.equations.listed import names_of_rows
@@ -81,6 +81,6 @@ def rates_along_motion(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityLeve
 
 
 @eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
-def _velocity_level(scene: Scene, t: Float[Array, ""], q, u, inputs) -> tuple[VelocityLevel, Motion]:
+def _velocity_level(scene: Scene, t: Scalar, q, u, inputs) -> tuple[VelocityLevel, Motion]:
     motion = motion_at(scene, t, q, u, inputs)
     return VelocityLevel(velocities_of(motion), flatten_rows(velocity_rows(scene, motion), q.dtype)), motion

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Numbers, as_real, real_type
+from jourdain_jax.calculus.reals import Numbers, Scalar, Vector3, as_real, real_type
 from jourdain_jax.calculus.rotations import vee
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.scene.arguments import ChangingInputs, as_coordinates, as_input_vector, as_speeds, as_time
@@ -77,7 +77,7 @@ def shapes_along_motion(look: Callable[[Scene, Motion], Any], scene: Scene):
     return jax.eval_shape(lambda scene, t, q, u: look(scene, motion_at(scene, t, q, u)), scene, *numbers)
 
 
-def _space_angular_velocity(body, rate) -> Float[Array, "3"]:
+def _space_angular_velocity(body, rate) -> Vector3:
     if isinstance(body, RigidBody):
         return vee(rate.orientation @ body.orientation.T)  # omega = vee(Rdot R')
     return jnp.zeros_like(body.position)
@@ -89,7 +89,7 @@ def velocities(scene: Scene, t, q, u) -> Velocities:
 
 
 @eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
-def _velocities(scene: Scene, t: Float[Array, ""], q, u) -> Velocities:
+def _velocities(scene: Scene, t: Scalar, q, u) -> Velocities:
     return velocities_of(motion_at(scene, t, q, u))
 
 

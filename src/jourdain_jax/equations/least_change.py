@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import with_usual_promotion
+from jourdain_jax.calculus.reals import Flag, with_usual_promotion
 from jourdain_jax.equations.reductions import cholesky
 from jourdain_jax.equations.scaling import row_scale, speed_scale
 
@@ -53,7 +53,7 @@ class _Solved(NamedTuple):
     d: Float[Array, "rows"]
     c: Float[Array, "moving"]  # zero for what is held
     L: Float[Array, "moving moving"] | None
-    definite: Bool[Array, ""] | None
+    definite: Flag | None
 
 
 def _solved(A, r, M, free, typical, cutoff) -> _Solved:

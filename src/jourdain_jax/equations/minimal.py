@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import Speeds
 from jourdain_jax.equations.instant import Instant, VelocityLevel, derivatives_in_speeds, rates_along_motion
 from jourdain_jax.equations.kinematics import Inertias, inertias_of
 from jourdain_jax.equations.reductions import Partition, Reduced, appell, reduced
@@ -26,11 +27,11 @@ from jourdain_jax.scene.scene import Scene
 class MinimalKinematics(eqx.Module):
     """All speeds from the privileged ones, with what was needed on the way."""
 
-    u: Float[Array, "speeds"]
+    u: Speeds
     partial: VelocityLevel  # beta, gamma, A
     weights: Inertias
     split: Partition  # of the scaled rows d A c
-    c: Float[Array, "speeds"]
+    c: Speeds
     d: Float[Array, "rows"]
     rows: tuple[int, ...] = eqx.field(static=True)  # which of the scene's
 

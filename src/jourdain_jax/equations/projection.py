@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jourdain_jax.calculus.reals import Speeds
 from jourdain_jax.calculus.roots import fixed_point
 from jourdain_jax.equations.least_change import least_change
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
@@ -98,7 +99,7 @@ def project_speeds(
     scene: Scene,
     t,
     q,
-    u: Float[Array, "speeds"],
+    u: Speeds,
     inputs=None,
     *,
     free: Bool[Array | np.ndarray, "speeds"] | None = None,
@@ -108,7 +109,7 @@ def project_speeds(
     affine: bool = False,
     determined: bool = False,
     by: RowFunctions = BY_AUTODIFF,
-) -> Float[Array, "speeds"]:
+) -> Speeds:
     """Speeds on the velocity rows, nearest to u in the metric of the mass matrix; only speeds that are `free` move.
 
     Rows count as dependent below `cutoff` (default: `rank_cutoff`). `typical`: lengths of the rows in scaled speeds by which one counts as vanishing,

@@ -19,10 +19,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.matrices import null_space_qr, null_space_svd, numerical_rank, pivots_qr, present, pseudo_inverse, singular_values
-from jourdain_jax.calculus.reals import rank_cutoff
+from jourdain_jax.calculus.reals import Flag, Scalar, Speeds, rank_cutoff
 from jourdain_jax.equations.rows import ConstraintRows, UsualRows
 from jourdain_jax.equations.scaling import ScaledProblem, scaled
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations
@@ -38,17 +38,17 @@ class Reduction(eqx.Module):
     name: eqx.AbstractClassVar[str]
 
     @abc.abstractmethod
-    def solve(self, problem: ScaledProblem) -> tuple[Float[Array, "speeds"], Float[Array, ""], Bool[Array, ""]]:
+    def solve(self, problem: ScaledProblem) -> tuple[Speeds, Scalar, Flag]:
         """Scaled accelerations of the scaled `problem`, the reduction's smallest pivot, and whether it applies."""
 
 
 class Reduced(eqx.Module):
     """What a reduction finds, before multipliers and diagnostics are worked out."""
 
-    udot: Float[Array, "speeds"]
-    constraint_force: Float[Array, "speeds"]  # A' lambda = M udot + h - Q
-    pivot: Float[Array, ""]
-    applicable: Bool[Array, ""]
+    udot: Speeds
+    constraint_force: Speeds  # A' lambda = M udot + h - Q
+    pivot: Scalar
+    applicable: Flag
 
 
 def reduce(reduction: Reduction, equations: UnconstrainedEquations, rows: ConstraintRows) -> Reduced:
@@ -64,7 +64,7 @@ def reduced(udot, pivot, applicable, equations: UnconstrainedEquations) -> Reduc
     return Reduced(udot, equations.M @ udot + equations.h - equations.Q, pivot, applicable)
 
 
-def smallest_that_counts(sigma: Float[Array, "values"], usual: UsualRows | None = None) -> Float[Array, ""]:
+def smallest_that_counts(sigma: Float[Array, "values"], usual: UsualRows | None = None) -> Scalar:
     """The last singular value of the usual rank, which goes to zero where rank is lost; where that is not known, the smallest above the cut-off.
 
     1 where there is none.
@@ -77,7 +77,7 @@ def smallest_that_counts(sigma: Float[Array, "values"], usual: UsualRows | None 
     return jnp.min(jnp.where(counts, sigma, jnp.inf), initial=1.0)
 
 
-def cholesky(M: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
+def cholesky(M: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Flag]:
     """Lower Cholesky factor, and whether M is positive definite; the identity's factor where it is not."""
     factor = jnp.linalg.cholesky(jax.lax.stop_gradient(M))
     # a pivot at round-off means a singular matrix, whatever its sign came out as
@@ -86,7 +86,7 @@ def cholesky(M: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, "
     return jnp.linalg.cholesky(jnp.where(usable, M, jnp.eye(M.shape[0], dtype=M.dtype))), definite
 
 
-def solve_definite(M: Float[Array, "n n"], f: Float[Array, "n"]) -> tuple[Float[Array, "n"], Bool[Array, ""]]:
+def solve_definite(M: Float[Array, "n n"], f: Float[Array, "n"]) -> tuple[Float[Array, "n"], Flag]:
     """`M^-1 f` by Cholesky, and whether M is positive definite; NaN where it is not, so that no invented number passes for a solution."""
     factor, definite = cholesky(M)
     return jnp.where(definite, jax.scipy.linalg.cho_solve((factor, True), f), jnp.nan), definite
@@ -138,22 +138,22 @@ class Partition(eqx.Module):
         B = self._solved(-self.A[:, np.array(self.independent, int)])
         return self.all_from(jnp.eye(len(self.independent), dtype=B.dtype), B)
 
-    def particular(self, b: Float[Array, "rows"]) -> Float[Array, "speeds"]:
+    def particular(self, b: Float[Array, "rows"]) -> Speeds:
         """`c`: the solution of `A c = b` with all independent speeds zero."""
         return self.all_from(jnp.zeros(len(self.independent), b.dtype), self._solved(b[:, None])[:, 0])
 
-    def pivot(self) -> Float[Array, ""]:
+    def pivot(self) -> Scalar:
         """Smallest singular value of A_z; 1 without rows."""
         A_z = self._A_z
         if not self.dependent:
             return jnp.ones((), A_z.dtype)
         return singular_values(A_z)[-1] if A_z.shape[0] >= A_z.shape[1] else jnp.zeros((), A_z.dtype)
 
-    def signed_pivot(self) -> Float[Array, ""]:
+    def signed_pivot(self) -> Scalar:
         """The pivot with the sign of det A_z where A_z is square: a change of sign along a motion means that A_z was singular in between."""
         return self.pivot() * self.orientation()
 
-    def orientation(self) -> Float[Array, ""]:
+    def orientation(self) -> Scalar:
         """The sign of det A_z, 1 where A_z is not square; a number to differentiation."""
         square = self.A.shape[0] == len(self.dependent) > 0
         return jnp.linalg.slogdet(jax.lax.stop_gradient(self._A_z))[0] if square else jnp.ones((), self.A.dtype)

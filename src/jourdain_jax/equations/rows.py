@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.equations.kinematics import motion_at, pose_at
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
 from jourdain_jax.scene.motion_state import Motion, Pose
@@ -101,7 +102,7 @@ def position_residual(scene: Scene, t, q) -> Float[Array, "geometric_rows"]:
 
 
 @eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
-def _position_residual(scene: Scene, t: Float[Array, ""], q):
+def _position_residual(scene: Scene, t: Scalar, q):
     return flatten_rows(position_rows(scene, pose_at(scene, t, q)), q.dtype)
 
 
@@ -114,5 +115,5 @@ def velocity_residual(scene: Scene, t, q, u, inputs=None) -> Float[Array, "rows"
 
 
 @eqx.filter_jit
-def _velocity_residual(scene: Scene, t: Float[Array, ""], q, u, inputs):
+def _velocity_residual(scene: Scene, t: Scalar, q, u, inputs):
     return flatten_rows(velocity_rows(scene, motion_at(scene, t, q, u, inputs)), q.dtype)

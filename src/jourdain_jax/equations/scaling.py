@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import Speeds
 from jourdain_jax.equations.rows import ConstraintRows, UsualRows
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations
 
@@ -20,15 +21,15 @@ class ScaledProblem(eqx.Module):
     """`M w + A' mu = f`, `A w = b` in scaled speeds and rows."""
 
     M: Float[Array, "speeds speeds"]
-    f: Float[Array, "speeds"]
+    f: Speeds
     A: Float[Array, "rows speeds"]
     b: Float[Array, "rows"]
-    c: Float[Array, "speeds"]
+    c: Speeds
     d: Float[Array, "rows"]
     usual: UsualRows | None
 
 
-def speed_scale(M: Float[Array, "speeds speeds"]) -> Float[Array, "speeds"]:
+def speed_scale(M: Float[Array, "speeds speeds"]) -> Speeds:
     """`M_ii^(-1/2)`, and 1 for a speed without inertia of its own."""
     diagonal = jax.lax.stop_gradient(jnp.diagonal(M))
     heavy = diagonal > 0

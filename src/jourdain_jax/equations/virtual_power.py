@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Entries, described
+from jourdain_jax.calculus.reals import Entries, Scalar, Speeds, described
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.instant import Instant, instant_at, rows_of
 from jourdain_jax.equations.kinematics import (
@@ -41,8 +41,8 @@ class UnconstrainedEquations(eqx.Module):
     """`M udot + h = Q`, the equations without constraint forces."""
 
     M: Float[Array, "speeds speeds"]  # mass matrix
-    h: Float[Array, "speeds"]  # inertia forces at udot = 0
-    Q: Float[Array, "speeds"]  # generalized impressed forces
+    h: Speeds  # inertia forces at udot = 0
+    Q: Speeds  # generalized impressed forces
 
 
 class Resultants(eqx.Module):
@@ -50,7 +50,7 @@ class Resultants(eqx.Module):
 
     force: Float[Array, "bodies 3"]  # N
     torque: Float[Array, "bodies 3"]  # N m
-    direct: Float[Array, "speeds"]
+    direct: Speeds
 
 
 def resultants(
@@ -77,7 +77,7 @@ def resultants(
     return Resultants(force, torque, jnp.stack(list(direct.values())) if direct else jnp.zeros(0))
 
 
-def potential_energy(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> Float[Array, ""]:
+def potential_energy(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> Scalar:
     """V in J at a `motion`: the potentials of the loads and of the scene. `loads`: those of the scene at this motion, where they are known already."""
     if not isinstance(motion, Motion):
         raise ValueError(f"`motion` is {described(motion)}, expected a motion, such as `jj.motion_at(scene, t, q, u)`")
@@ -89,17 +89,17 @@ def potential_energy(scene: Scene, motion: Motion, loads: tuple[Load, ...] | Non
     return V if extra is None else V + extra
 
 
-def kinetic_energy(scene: Scene, t, q, u) -> Float[Array, ""]:
+def kinetic_energy(scene: Scene, t, q, u) -> Scalar:
     """T = sum m v.v/2 + omega.I omega/2 in J."""
     return _kinetic_energy(motion_at(scene, t, as_coordinates(scene, q), as_speeds(scene, u)))
 
 
-def energies_at(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def energies_at(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> tuple[Scalar, Scalar]:
     """T and V in J at a `motion`. `loads`: those of the scene at this motion, where they are known already."""
     return _kinetic_energy(motion), potential_energy(scene, motion, loads)
 
 
-def _kinetic_energy(motion: Motion) -> Float[Array, ""]:
+def _kinetic_energy(motion: Motion) -> Scalar:
     bodies, speeds = inertias_of(motion), velocities_of(motion)
     v, w = speeds.linear, speeds.angular
     return 0.5 * (jnp.sum(bodies.mass * jnp.sum(v * v, 1)) + jnp.einsum("bi,bij,bj->", w, bodies.inertia, w))
@@ -160,7 +160,7 @@ def inertia_resultants(weights: Inertias, velocity: Velocities, acceleration: Ve
 
 
 @eager_if_concrete
-def generalized_forces(scene: Scene, t, q, u, inputs=None) -> Float[Array, "speeds"]:
+def generalized_forces(scene: Scene, t, q, u, inputs=None) -> Speeds:
     """`Q = sum beta' F + gamma' L + Q_direct - N' dV/dq`, shape (speeds,), in N or N m; eq. (41).
 
     `inputs`: values of the scene's inputs (default: zero).
@@ -169,7 +169,7 @@ def generalized_forces(scene: Scene, t, q, u, inputs=None) -> Float[Array, "spee
     return _generalized_forces(scene, motion_at(scene, t, q, u, inputs), partial_velocities(scene, t, q, u))
 
 
-def _generalized_forces(scene: Scene, motion: Motion, partial: Velocities) -> Float[Array, "speeds"]:
+def _generalized_forces(scene: Scene, motion: Motion, partial: Velocities) -> Speeds:
     loads = impressed(scene, motion)
     return jnp.einsum("bik,bi->k", partial.linear, loads.force) + jnp.einsum("bik,bi->k", partial.angular, loads.torque) + loads.direct
 
@@ -182,7 +182,7 @@ def impressed(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = Non
     return Resultants(total.force, torque, total.direct - _potential_gradient(scene, motion))
 
 
-def _potential_gradient(scene: Scene, motion: Motion) -> Float[Array, "speeds"]:
+def _potential_gradient(scene: Scene, motion: Motion) -> Speeds:
     """`N' dV/dq` of the scene's own potential."""
     t, q, u = motion.t, motion.q.array, motion.u.array
     if potential_of(scene, motion.pose()) is None:
@@ -192,7 +192,7 @@ def _potential_gradient(scene: Scene, motion: Motion) -> Float[Array, "speeds"]:
     return dV @ N
 
 
-def virtual_power(scene: Scene, t, q, u, udot, virtual_velocity, inputs=None) -> Float[Array, ""]:
+def virtual_power(scene: Scene, t, q, u, udot, virtual_velocity, inputs=None) -> Scalar:
     """Jourdain's variational equation (18) as a residual: `sum (m a - F) . delta_1 v = delta u . (M udot + h - Q)`, in W.
 
     `udot`: the accelerations; `virtual_velocity`: `delta u`, any, shape (speeds,). `inputs`: values of the scene's inputs (default: zero).

@@ -6,9 +6,8 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import checked_real, described
+from jourdain_jax.calculus.reals import Scalar, checked_real, described
 from jourdain_jax.importers.formulas import Formulas, sympy_package
 from jourdain_jax.importers.scene_class import identifiers, scene_class
 from jourdain_jax.importers.sympy_kinematics import Pose, poses_of
@@ -34,7 +33,7 @@ class _Expressions:
     is_rigid: dict[str, bool]  # body -> whether it is a rigid one
     formulas: dict[str, Formulas]  # bodies, rates, loads, and geometric and velocity rows
 
-    def values(self, part: str, scene: "SympyScene", t, q, *others) -> dict[Any, list[Float[Array, ""]]]:
+    def values(self, part: str, scene: "SympyScene", t, q, *others) -> dict[Any, list[Scalar]]:
         """The values of a part; `others`: speeds and inputs, where it depends on these."""
         leaves = {self.time: t} | {constant: getattr(scene, name) for constant, name in self.fields.items()}
         for symbols, named in zip((self.q, self.u, self.inputs), (q, *others), strict=False):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import Matrix3, Vector3
 from jourdain_jax.calculus.rotations import quaternion_to_matrix
 from jourdain_jax.importers.placing import combined, cross_matrix, onto_axis
 from jourdain_jax.importers.scene_class import identifiers, scene_class
@@ -22,7 +23,7 @@ from jourdain_jax.scene.visuals import Visual
 ROUNDED = 0.05  # of the largest moment of inertia: some are published with two digits
 POINT = 1e-6**2  # m^2: of bodies whose radius of gyration is smaller, moments are round-off
 
-Frame = tuple[Float[Array, "3 3"], Float[Array, "3"]]  # orientation and origin in the inertial frame
+Frame = tuple[Matrix3, Vector3]  # orientation and origin in the inertial frame
 
 
 class TreeScene(Scene):
@@ -160,7 +161,7 @@ def _moved(joint: Joint, name: str, R, origin, q) -> Frame:
     return R, held - R @ joint.anchor
 
 
-def _about(axis, angle) -> Float[Array, "3 3"]:
+def _about(axis, angle) -> Matrix3:
     """Rotation by an angle that JAX may trace about a known axis."""
     along = np.outer(axis, axis)
     return along + jnp.cos(angle) * (np.eye(3) - along) + jnp.sin(angle) * cross_matrix(axis)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Num
 
 from jourdain_jax.build.trace import Variables
+from jourdain_jax.calculus.reals import PerLane
 from jourdain_jax.lowering import export
 from jourdain_jax.program.derivative import differentiable
 from jourdain_jax.program.emit import run
@@ -128,7 +129,7 @@ class Lowered:
                 known[n] = leaves[leaf][i]
         return tuple(jnp.asarray(x) for x in run(self.graph, self.fixed, known))
 
-    def rates(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple[tuple, tuple, Float[Array, "*lanes"] | None]:
+    def rates(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple[tuple, tuple, PerLane | None]:
         """`qdot` and `ydot`, tuples of scalars, and the power (W) where `with_power` asks for it; NaN where a guard is not positive.
 
         `fixed`: from `fixed_values`; `q`, `y`: coordinates and privileged speeds, one scalar (or array of lanes) each; `inputs`: a vector.
@@ -158,7 +159,7 @@ class Lowered:
         state = [*traced.q.tolist(), *(int(traced.u[k]) for k in self.independent)]
         return [*self.fixed, traced.t, *state, *map(int, traced.inputs)]
 
-    def speeds_and_pivot(self, fixed, t, q: Sequence, y: Sequence, inputs) -> tuple[Float[Array, "speeds *lanes"], Float[Array, "*lanes"]]:
+    def speeds_and_pivot(self, fixed, t, q: Sequence, y: Sequence, inputs) -> tuple[Float[Array, "speeds *lanes"], PerLane]:
         """All speeds, and the smallest pivot: it changes sign where the elimination does not serve.
 
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
@@ -199,7 +200,7 @@ class Lowered:
         out, like = run(self.graph, nodes, self._known(fixed, t, q, y, inputs)), q[0]
         return jnp.stack([jnp.broadcast_to(jnp.asarray(c, like.dtype), jnp.shape(like)) for c in out]) if nodes else jnp.zeros((0, *like.shape), like.dtype)
 
-    def _known(self, fixed, t, q, y, inputs) -> dict[int, Float[Array, "*lanes"]]:
+    def _known(self, fixed, t, q, y, inputs) -> dict[int, PerLane]:
         def lanes_last(n, x):
             is_array = self.graph.op[n] in ARRAYS
             return jnp.moveaxis(x, 0, -1) if is_array and x.ndim > len(self.graph.value[n][-2]) else x
@@ -220,7 +221,7 @@ def _program_of_rates(program: Lowered, with_power: bool) -> Callable[..., tuple
     return differentiable(program.graph, outputs, program.variables, like=len(program.fixed) + 1, monitored=monitored)
 
 
-def smallest_pivot(pivots: Float[Array, "pivots *lanes"]) -> Float[Array, "*lanes"]:
+def smallest_pivot(pivots: Float[Array, "pivots *lanes"]) -> PerLane:
     """Return the smallest magnitude of any, 1 at most; its sign is the product of theirs."""
     pivots = jax.lax.stop_gradient(pivots)
     return jnp.prod(jnp.sign(pivots), axis=0) * jnp.min(jnp.abs(pivots), axis=0, initial=1.0)

@@ -4,13 +4,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import checked_whole
+from jourdain_jax.calculus.reals import Scalar, Vector3, checked_whole
 from jourdain_jax.calculus.rotations import rot_y, rot_z
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.constraints import knife_edge, pin
 from jourdain_jax.scene.coordinates import coordinates, inputs, speeds
 from jourdain_jax.scene.loads import generalized_force, gravity
-from jourdain_jax.scene.parameters import Scalar, parameter
+from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 
@@ -96,7 +96,7 @@ class ChaplyginSleigh(Scene):
         turned = jnp.sign(turn) * jnp.arctan2(_forward(motion), k * jnp.abs(turn))
         return {"heading and slide": self.offset * motion.q.heading - k * turned}
 
-    def _blade(self) -> Float[Array, "3"]:
+    def _blade(self) -> Vector3:
         return jnp.stack([-self.offset, 0 * self.offset, 0 * self.offset])
 
 

@@ -4,12 +4,13 @@ import math
 
 import jax.numpy as jnp
 
+from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.calculus.rotations import quaternion_to_matrix, rot_x, rot_y, rot_z
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contacts import disc_contact
 from jourdain_jax.scene.coordinates import coordinates, quaternion
-from jourdain_jax.scene.parameters import Scalar, parameter
+from jourdain_jax.scene.parameters import parameter
 
 
 class VerticalDisc(Heavy):

@@ -2,11 +2,12 @@
 
 import jax.numpy as jnp
 
+from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import Particle
 from jourdain_jax.scene.coordinates import coordinates
 from jourdain_jax.scene.grounds import tangents_of
-from jourdain_jax.scene.parameters import Scalar, parameter
+from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 

@@ -4,14 +4,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import checked_whole
+from jourdain_jax.calculus.reals import Scalar, Vector3, checked_whole
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import Particle
 from jourdain_jax.scene.constraints import rod
 from jourdain_jax.scene.coordinates import coordinates
 from jourdain_jax.scene.loads import damper, gravity, spring
 from jourdain_jax.scene.motion_state import fixed_point
-from jourdain_jax.scene.parameters import Scalar, parameter
+from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 
@@ -51,7 +51,7 @@ class DoublePendulumAngles(_DoublePendulum):
         return {"first": Particle(self.mass1, first), "second": Particle(self.mass2, first + self.length2 * _along(q.theta2))}
 
 
-def _along(angle) -> Float[Array, "3"]:
+def _along(angle) -> Vector3:
     """Unit vector at `angle` from straight down, in the x-z plane."""
     return jnp.stack([jnp.sin(angle), jnp.zeros_like(angle), -jnp.cos(angle)])
 
@@ -191,7 +191,7 @@ class PendulumChain(Heavy):
         places = self._joints(pose)
         return {"": Visual.line(*places, radius=0.02 * jnp.min(self.length))}
 
-    def _joints(self, pose) -> list[Float[Array, "3"]]:
+    def _joints(self, pose) -> list[Vector3]:
         return [jnp.zeros(3), *(body.position for body in pose.bodies.values())]
 
     def _per_link(self, value) -> Float[Array, "links"]:

@@ -3,15 +3,15 @@
 import math
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector3
 from jourdain_jax.calculus.rotations import quaternion_rate, quaternion_to_matrix, rot_x, rot_y, rot_z
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contacts import ball_contact, ellipsoid_contact
 from jourdain_jax.scene.coordinates import coordinates, quaternion, speeds
 from jourdain_jax.scene.grounds import Plane
-from jourdain_jax.scene.parameters import Scalar, parameter
+from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.visuals import Visual
 
 
@@ -72,7 +72,7 @@ class BallOnTurntable(Heavy):
         guide_x, guide_y = u.x_rate + gyration * q.y - push * motion.t, u.y_rate - gyration * q.x
         return {"spin": u.spin, "guiding centre along x": guide_x, "guiding centre along y": guide_y}
 
-    def _axes(self) -> Float[Array, "3 3"]:
+    def _axes(self) -> Matrix3:
         """Downhill, level and normal unit vectors of the table, in rows."""
         table = Plane(tilt=self.tilt)
         return jnp.concatenate([table.tangents, table.normal[None]])
@@ -137,17 +137,17 @@ class Rattleback(Heavy):
     def events(self, motion):
         return {"on edge": 1.4 - jnp.abs(motion.q.alpha)}
 
-    def contact_arm(self, down: Float[Array, "3"]) -> Float[Array, "3"]:
+    def contact_arm(self, down: Vector3) -> Vector3:
         """rho (m), body axes: from the mass centre to the ellipsoid's lowest point when `down` is the downward vertical."""
         weighted = self._semi_axes() ** 2 * down
         return weighted / jnp.sqrt(down @ weighted) - self._below_centre()
 
-    def _semi_axes(self) -> Float[Array, "3"]:
+    def _semi_axes(self) -> Vector3:
         return jnp.stack([self.a, self.b, self.c])
 
-    def _below_centre(self) -> Float[Array, "3"]:
+    def _below_centre(self) -> Vector3:
         return jnp.stack([0 * self.h, 0 * self.h, self.h])
 
-    def _inertia(self) -> Float[Array, "3 3"]:
+    def _inertia(self) -> Matrix3:
         o = jnp.zeros_like(self.A)
         return jnp.stack([jnp.stack([self.A, self.D, o]), jnp.stack([self.D, self.B, o]), jnp.stack([o, o, self.C])])

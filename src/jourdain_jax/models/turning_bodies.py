@@ -2,10 +2,11 @@
 
 import jax.numpy as jnp
 
+from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.calculus.rotations import quaternion_to_matrix
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.coordinates import coordinates, quaternion
-from jourdain_jax.scene.parameters import Scalar, parameter
+from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
 
 

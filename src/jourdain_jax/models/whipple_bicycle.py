@@ -15,15 +15,16 @@ from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
+from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector3
 from jourdain_jax.calculus.rotations import rot_x, rot_y, rot_z
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contacts import disc_contact
 from jourdain_jax.scene.coordinates import coordinates, inputs
 from jourdain_jax.scene.loads import generalized_force, gravity
 from jourdain_jax.scene.names import check_name
-from jourdain_jax.scene.parameters import Scalar, parameter, parameters_of
+from jourdain_jax.scene.parameters import parameter, parameters_of
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 
@@ -149,13 +150,13 @@ class WhippleBicycle(Scene):
         return {"fallen": jnp.minimum(1.2 - jnp.abs(motion.q.lean), jnp.pi / 2 - jnp.abs(motion.q.steer))}
 
 
-def _vector(x, z) -> Float[Array, "3"]:
+def _vector(x, z) -> Vector3:
     """Components (x, 0, -z) in the engine's axes of a vector in the plane of symmetry, with z down."""
     x, z = jnp.asarray(x), jnp.asarray(z)
     return jnp.stack([x, jnp.zeros_like(x), -z])
 
 
-def _inertia(xx, yy, zz, xz) -> Float[Array, "3 3"]:
+def _inertia(xx, yy, zz, xz) -> Matrix3:
     """Inertia in the engine's axes: the product changes sign under half a turn about x."""
     zero = jnp.zeros_like(xx)
     return jnp.stack([xx, zero, -xz, zero, yy, zero, -xz, zero, zz]).reshape(3, 3)

@@ -31,7 +31,7 @@ from jourdain_jax.build.probed_on_graph import looked_at
 from jourdain_jax.build.smoothness import SPEEDS_WOULD_JUMP
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.jumps import jumps
-from jourdain_jax.calculus.reals import as_real, checked_unless_traced, compiled, described, in_default_precision, is_traced, real_type
+from jourdain_jax.calculus.reals import PerLane, as_real, checked_unless_traced, compiled, described, in_default_precision, is_traced, real_type
 from jourdain_jax.eager.lanes import uncompiled_lanes
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.calls import description
@@ -344,7 +344,7 @@ class SeenFromWithin(eqx.Module):
     """An input by samples, at times of a step: at a knot it is on the line that belongs to the step."""
 
     sampled: Sampled
-    middle: Float[Array, "*lanes"]  # s, of the step; infinite where there is none
+    middle: PerLane  # s, of the step; infinite where there is none
 
     def __call__(self, t):
         """The value at time t, f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k)."""
@@ -358,7 +358,7 @@ class SeenFromWithin(eqx.Module):
         return jnp.where(at < knots[0], values[0], jnp.where(at > knots[-1], values[-1], on_line))
 
 
-def seen_from_within(inputs: Inputs, middle: Float[Array, "*lanes"]) -> Inputs:
+def seen_from_within(inputs: Inputs, middle: PerLane) -> Inputs:
     """`inputs` whose samples are looked at in a step with this middle (s); infinite where there is no step yet."""
 
     def within(channel):

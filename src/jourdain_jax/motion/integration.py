@@ -19,12 +19,12 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from jourdain_jax.build.plausibility import faults_at
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.calculus.markers import entered, lanes_first, left
-from jourdain_jax.calculus.reals import RUN_SELDOM, in_default_precision
+from jourdain_jax.calculus.reals import RUN_SELDOM, Count, Flag, Scalar, in_default_precision
 from jourdain_jax.equations.projection import linearised_rows
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.inputs import for_programs
@@ -85,7 +85,7 @@ def integrate_lanes(setups: Setup) -> Trajectory:
     return eqx.filter_vmap(_finish)(given, fitting, asked, begun, solved)
 
 
-def _entered(setup: Setup) -> tuple[Setup, Float[Array, ""]]:
+def _entered(setup: Setup) -> tuple[Setup, Scalar]:
     """The setup, whose derivatives are zero where nothing is asked of its motion, and NaN where what failed is;
     and the zero by which `_finish` tells (`calculus/markers.py`).
     """
@@ -104,7 +104,7 @@ def _begin(setup: Setup) -> Begun:
     return Begun(right, times_fit(setup.ts, setup.t0, setup.t1), start, args, field.pack(start.q, start.u))
 
 
-def _finish(given: Setup, setup: Setup, asked: Float[Array, ""], begun: Begun, solved: Solved) -> Trajectory:
+def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Solved) -> Trajectory:
     t0, field, integrator = setup.t0, setup.field, setup.integrator
     start, args = begun.start, begun.args
     _, scene, inputs, fixed, origin = args
@@ -182,14 +182,14 @@ def _finish(given: Setup, setup: Setup, asked: Float[Array, ""], begun: Begun, s
     )
 
 
-def _step_errors(setup: Setup, free: Integrated, y: Integrated) -> Float[Array, ""]:
+def _step_errors(setup: Setup, free: Integrated, y: Integrated) -> Scalar:
     """Return how far a projection moved a state from `free` to `y`, in tolerances of a step."""
     rtol, atol = setup.tolerances
     parts = jax.lax.stop_gradient(((free.q, y.q), (free.v, y.v)))
     return jnp.max(jnp.stack([jnp.max(jnp.abs(a - b) / (atol + rtol * jnp.abs(b)), initial=0.0) for a, b in parts]))
 
 
-def _without_faults(setup: Setup, start: State) -> tuple[Bool[Array, ""], State]:
+def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
     """Return whether parameters, bodies and contacts are right, and the start: NaN where they are not, so that such a lane ends at once."""
     scene, t0, field = setup.scene, setup.t0, setup.field
     program = row_program(scene) if isinstance(field, ByProgram) and field.native else None
@@ -200,7 +200,7 @@ def _without_faults(setup: Setup, start: State) -> tuple[Bool[Array, ""], State]
     return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u)))
 
 
-def _result(setup: Setup, begun: Begun, solved: Solved, code, pivot) -> Int[Array, ""]:
+def _result(setup: Setup, begun: Begun, solved: Solved, code, pivot) -> Count:
     """Return the result code, with the cause where one is known; what comes later counts more."""
     start, end = begun.start, solved.y_end
     eps, finite = jnp.finfo(start.q.dtype).eps, lambda *parts: jnp.all(jnp.isfinite(jnp.concatenate(parts)))
@@ -240,7 +240,7 @@ def energies_near(setup: Setup, args, t: Float[Array, "times"], y: Integrated) -
     return found.reshape(2, -1, 2)
 
 
-def energy_lost(energies: Float[Array, "2 times 2"], steps) -> Bool[Array, ""]:
+def energy_lost(energies: Float[Array, "2 times 2"], steps) -> Flag:
     """Whether T + V changed by more than N `steps` explain."""
     (T, V), off = energies[0].T, energies[1].T
     error = jnp.abs(off[0] - T) + jnp.abs(off[1] - V) + jnp.finfo(T.dtype).eps * (T + jnp.abs(V))
@@ -249,7 +249,7 @@ def energy_lost(energies: Float[Array, "2 times 2"], steps) -> Bool[Array, ""]:
     return jnp.nanmax(T + V) - jnp.nanmin(T + V) > allowed
 
 
-def rows_violated(setup: Setup, t: Float[Array, "times"], q: Float[Array, "times coordinates"], u: Float[Array, "times speeds"]) -> Bool[Array, ""]:
+def rows_violated(setup: Setup, t: Float[Array, "times"], q: Float[Array, "times coordinates"], u: Float[Array, "times speeds"]) -> Flag:
     """Whether some row is violated at some of these states; those that were not reached are NaN, and do not count.
 
     |phi| > 1 % of |phi - A u| + |A| |u|, where that is largest

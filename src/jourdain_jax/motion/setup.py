@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import array_module
+from jourdain_jax.calculus.reals import Flag, PerLane, array_module
 from jourdain_jax.motion.inputs import knots_between
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
@@ -33,16 +33,16 @@ class Solved(eqx.Module):
     ts: Float[Array, "times *lanes"]  # as t_end, since the start
     ys: PyTree
     reached: Bool[Array, "times *lanes"]
-    t_end: Float[Array, "*lanes"]
+    t_end: PerLane
     y_end: PyTree
     code: Int[Array, "*lanes"]
     event: Int[Array, "*lanes"]  # index of the event that ended the motion, -1: none
     accepted: Int[Array, "*lanes"]
     rejected: Int[Array, "*lanes"]
-    last_step: Float[Array, "*lanes"]  # s, that the step-size control would take next; NaN where it keeps that to itself
-    pivot: Float[Array, "*lanes"]  # smallest magnitude of a pivot in any step, negative where one changed its sign; infinite: none was monitored
+    last_step: PerLane  # s, that the step-size control would take next; NaN where it keeps that to itself
+    pivot: PerLane  # smallest magnitude of a pivot in any step, negative where one changed its sign; infinite: none was monitored
     crossings: Int[Array, "*lanes"]  # as in `Trajectory`
-    together: Float[Array, "*lanes"]
+    together: PerLane
 
 
 class Integrator(abc.ABC):
@@ -116,7 +116,7 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
         return jnp.concatenate([ts, self.t1[None]]) - self.t0
 
     @property
-    def shortest(self) -> Float[Array, "*lanes"]:
+    def shortest(self) -> PerLane:
         """The shortest step, s."""
         return 1e-14 * jnp.abs(self.t1 - self.t0)
 
@@ -129,8 +129,8 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
 class Begun(eqx.Module):
     """The start of the integration, marked for the adjoint."""
 
-    right: Bool[Array, ""]  # whether all parameters are, and the masses and inertias that they make
-    timely: Bool[Array, ""] | np.bool_  # whether the times go together
+    right: Flag  # whether all parameters are, and the masses and inertias that they make
+    timely: Flag | np.bool_  # whether the times go together
     start: State
     args: tuple  # vector field, scene, inputs, what the rates need of the scene, the time from which times count
     y0: Integrated

@@ -22,6 +22,8 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.derivatives import DifferentiationModeError
 from jourdain_jax.calculus.reals import (
     Entries,
+    Scalar,
+    Speeds,
     at_once,
     checked_real,
     checked_unless_traced,
@@ -79,7 +81,7 @@ def of_known_numbers(function: F) -> F:
     return called  # type: ignore[return-value]
 
 
-def as_time(t) -> Float[Array, ""]:
+def as_time(t) -> Scalar:
     """A time in s, as a number of the default floating-point type."""
     return checked_real(t, "`t`", (), advice="give one time in s; use `jax.vmap` for many").astype(real_type())
 
@@ -102,7 +104,7 @@ def as_coordinates(scene: Scene, q) -> Float[Array, "coordinates"]:
     return _as_vector(scene, "q", q, as_scene(scene).coordinate_names.entries)
 
 
-def as_speeds(scene: Scene, u, what: str = "u") -> Float[Array, "speeds"]:
+def as_speeds(scene: Scene, u, what: str = "u") -> Speeds:
     """u (or another vector over the speeds, named by `what`) as a vector of the scene's speeds."""
     return _as_vector(scene, what, u, as_scene(scene).speed_names.entries)
 
@@ -120,7 +122,7 @@ def _as_vector(scene: Scene, what: str, x, names: tuple[str, ...]) -> Array:
 class ChangingInputs(eqx.Module):
     """Inputs near one time: where rows depend on them, accelerations depend on their rates."""
 
-    t: Float[Array, ""]  # s
+    t: Scalar  # s
     values: Float[Array, "inputs"]
     rates: Float[Array, "inputs"]  # per s
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import checked_real
+from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector3, checked_real
 
 _AXES = {"x": 0, "y": 1, "z": 2}
 
@@ -20,8 +20,8 @@ class Particle(eqx.Module):
     Where the mass depends on time or coordinates, `m a` holds with what it is at each instant; the thrust of what leaves is a load.
     """
 
-    mass: Float[Array, ""]  # kg
-    position: Float[Array, "3"]  # m, inertial frame
+    mass: Scalar  # kg
+    position: Vector3  # m, inertial frame
 
     def __init__(self, mass, position):
         self.mass = checked_real(mass, "mass of a particle", ())
@@ -42,10 +42,10 @@ class RigidBody(eqx.Module):
     joins takes its momentum with it, and its thrust is a load. A skater who draws in the arms is several bodies.
     """
 
-    mass: Float[Array, ""]  # kg
-    inertia: Float[Array, "3 3"]  # kg m^2, about the mass centre, body axes
-    position: Float[Array, "3"]  # m, mass centre, inertial frame
-    orientation: Float[Array, "3 3"]  # body components to space components
+    mass: Scalar  # kg
+    inertia: Matrix3  # kg m^2, about the mass centre, body axes
+    position: Vector3  # m, mass centre, inertial frame
+    orientation: Matrix3  # body components to space components
     outline: Float[Array, "points 3"]  # m, body frame, relative to the mass centre; for drawing only
     solid: str = eqx.field(static=True)
 

@@ -8,16 +8,16 @@ Geometric rows are functions of a `Pose` and vanish; the engine differentiates t
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Number, Vector, checked_positive, checked_real, described
+from jourdain_jax.calculus.reals import Number, Scalar, Vector, Vector3, checked_positive, checked_real, described
 from jourdain_jax.calculus.rotations import vee
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose
 
 
-def _point(position: Vector, what: str) -> Float[Array, "3"]:
+def _point(position: Vector, what: str) -> Vector3:
     return checked_real(position, what, (3,), advice="give three components in the inertial frame, m")
 
 
-def knife_edge(body: BodyMotion, contact: Vector, lateral: Vector) -> Float[Array, ""]:
+def knife_edge(body: BodyMotion, contact: Vector, lateral: Vector) -> Scalar:
     """Velocity row of a blade or skate: `v(contact) . lateral`, in m/s. The point of `body` at `contact` does not move along `lateral`.
 
     - `body`: `motion["name"]`; `contact` (m) and the unit vector `lateral`, both in the inertial frame. Eq. (7). The body's own axis y is
@@ -27,7 +27,7 @@ def knife_edge(body: BodyMotion, contact: Vector, lateral: Vector) -> Float[Arra
     return body.velocity_at(contact) @ checked_real(lateral, f"lateral direction of the knife edge of `{body.name}`", (3,), advice="give a unit vector")
 
 
-def rod(a: Vector, b: Vector, length: Number) -> Float[Array, ""]:
+def rod(a: Vector, b: Vector, length: Number) -> Scalar:
     """Geometric row of a massless rod of the given `length` (m) between two points `a`, `b` (m, inertial frame): `(|b - a|^2 - l^2)/(2 l)`, in m.
 
     To first order the excess length; its multiplier is the thrust (positive, N) in the rod. Smooth also where the points meet. Eq. (5).

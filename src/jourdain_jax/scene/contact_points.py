@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector3
 from jourdain_jax.calculus.roots import newton_root
 from jourdain_jax.scene.grounds import Cylinder, Ground, Plane, Sphere, normal_at
 
@@ -21,10 +22,10 @@ from jourdain_jax.scene.grounds import Cylinder, Ground, Plane, Sphere, normal_a
 class Ball(eqx.Module):
     """A ball."""
 
-    centre: Float[Array, "3"]  # m, inertial frame
-    radius: Float[Array, ""]  # m
+    centre: Vector3  # m, inertial frame
+    radius: Scalar  # m
 
-    def lowest(self, n: Float[Array, "3"]) -> Float[Array, "3"]:
+    def lowest(self, n: Vector3) -> Vector3:
         """The point farthest down where n is up: `c - a n`."""
         return self.centre - self.radius * n
 
@@ -32,17 +33,17 @@ class Ball(eqx.Module):
 class Wheel(eqx.Module):
     """A wheel with a tyre of circular section: a torus; a thin disc where the tyre is None."""
 
-    centre: Float[Array, "3"]  # m, inertial frame
-    axle: Float[Array, "3"]  # unit vector
-    radius: Float[Array, ""]  # m, outer
-    tyre: Float[Array, ""] | None  # m, of the tyre's section
+    centre: Vector3  # m, inertial frame
+    axle: Vector3  # unit vector
+    radius: Scalar  # m, outer
+    tyre: Scalar | None  # m, of the tyre's section
 
     @property
-    def circle(self) -> Float[Array, ""]:
+    def circle(self) -> Scalar:
         """Radius (m) of the circle of the centres of the tyre's sections."""
         return self.radius if self.tyre is None else self.radius - self.tyre
 
-    def lowest(self, n: Float[Array, "3"]) -> Float[Array, "3"]:
+    def lowest(self, n: Vector3) -> Vector3:
         """The point farthest down where n is up: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n` with the axle k."""
         up = n - (n @ self.axle) * self.axle
         point = self.centre - self.circle * up / jnp.sqrt(up @ up)
@@ -52,11 +53,11 @@ class Wheel(eqx.Module):
 class Ellipsoid(eqx.Module):
     """An ellipsoid."""
 
-    centre: Float[Array, "3"]  # m, inertial frame
-    orientation: Float[Array, "3 3"]  # columns: its axes
-    semi_axes: Float[Array, "3"]  # m
+    centre: Vector3  # m, inertial frame
+    orientation: Matrix3  # columns: its axes
+    semi_axes: Vector3  # m
 
-    def lowest(self, n: Float[Array, "3"]) -> Float[Array, "3"]:
+    def lowest(self, n: Vector3) -> Vector3:
         """The point farthest down where n is up: `c - R S n'/sqrt(n'.S n')`, `n' = R' n`, S the squares of the semi-axes."""
         local = n @ self.orientation
         weighted = self.semi_axes**2 * local
@@ -69,9 +70,9 @@ Shape = Ball | Wheel | Ellipsoid
 class Touch(eqx.Module):
     """Where a body is nearest to a ground."""
 
-    point: Float[Array, "3"]  # m, inertial frame, of the body
+    point: Vector3  # m, inertial frame, of the body
     plane: Plane  # tangent to the ground
-    gap: Float[Array, ""] | None  # m; None: the point's height above the plane
+    gap: Scalar | None  # m; None: the point's height above the plane
 
 
 def touch(shape: Shape, ground: Ground) -> Touch:
@@ -85,7 +86,7 @@ def touch(shape: Shape, ground: Ground) -> Touch:
     return _by_newton(shape, ground)
 
 
-def _of_circle(wheel: Wheel, sphere: Sphere) -> Float[Array, "3"]:
+def _of_circle(wheel: Wheel, sphere: Sphere) -> Vector3:
     """The point of the circle within the tyre that is nearest to the sphere: nearest to its centre, or farthest from it when inside."""
     arm = wheel.centre - sphere.origin
     in_plane = arm - (arm @ wheel.axle) * wheel.axle
@@ -93,7 +94,7 @@ def _of_circle(wheel: Wheel, sphere: Sphere) -> Float[Array, "3"]:
     return wheel.centre + wheel.circle * (towards if sphere.side == "inside" else -towards)
 
 
-def _of_core(core: Float[Array, "3"], distance: Float[Array, ""], ground: Cylinder | Sphere) -> Touch:
+def _of_core(core: Vector3, distance: Scalar, ground: Cylinder | Sphere) -> Touch:
     """The point at `distance` (m) from the core towards the ground; NaN where a hollow has no room for it."""
     if ground.side == "inside":
         distance = jnp.where(distance < ground.radius, distance, jnp.nan)

@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterable
 from typing import TypedDict, Unpack, get_args
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from jourdain_jax.calculus.reals import Vector, checked_positive, checked_real, described
+from jourdain_jax.calculus.reals import Scalar, Vector, Vector3, checked_positive, checked_real, described
 from jourdain_jax.scene.bodies import RigidBody, _axis_index
 from jourdain_jax.scene.contact_points import Ball, Ellipsoid, Shape, Wheel, touch
 from jourdain_jax.scene.grounds import Ground, Plane
@@ -37,11 +37,11 @@ class Contact(eqx.Module):
     """
 
     body: str = eqx.field(static=True)
-    point: Float[Array, "3"]  # m, inertial frame
+    point: Vector3  # m, inertial frame
     plane: Plane
     height: str = eqx.field(static=True)  # "coordinates" or "row"
     carried: tuple[str, ...] | None = eqx.field(static=True)  # bodies that this contact holds up; None: all of them
-    distance: Float[Array, ""] | None  # m; None: the point's height above the plane
+    distance: Scalar | None  # m; None: the point's height above the plane
     shape: Shape | None  # what rolls, for pictures
     ground: Ground | None  # what it rolls on, for pictures; None: the plane
 
@@ -65,7 +65,7 @@ class Contact(eqx.Module):
         self.distance = None if distance is None else checked_real(distance, f"distance of the contact of `{self.body}`", ())
         self.shape, self.ground = shape, ground
 
-    def gap(self) -> Float[Array, ""]:
+    def gap(self) -> Scalar:
         """Signed distance of the contact point from the ground, m."""
         return self.plane.height_of(self.point) if self.distance is None else self.distance
 
@@ -138,7 +138,7 @@ def wheel_contact(body: BodyPose, radius, tyre, *, axis: str = "y", **options: U
     return rolling(body, lambda centre: Wheel(centre, body.orientation[:, _axis_index(axis)], _radius(body, radius), tyre), **options)
 
 
-def _radius(body: BodyPose, radius) -> Float[Array, ""]:
+def _radius(body: BodyPose, radius) -> Scalar:
     return checked_positive(radius, f"radius of the contact of `{body.name}`")
 
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import described, real_type
+from jourdain_jax.calculus.reals import Speeds, described, real_type
 from jourdain_jax.calculus.rotations import quaternion_rate
 from jourdain_jax.scene.names import Named, nearest
 
@@ -67,7 +67,7 @@ class Coordinates:
         q[[first for first, _ in self.quaternions]] = 1.0
         return q
 
-    def default_rates(self, q: Float[Array, "coordinates"], u: Float[Array, "speeds"]) -> Float[Array, "coordinates"]:
+    def default_rates(self, q: Float[Array, "coordinates"], u: Speeds) -> Float[Array, "coordinates"]:
         """`qdot` from the default speeds: `xdot = x_rate`, `d quaternion/dt = 1/2 quaternion (0, omega)`."""
         parts: list[tuple[int, Array]] = [(i, u[k : k + 1]) for i, k in self.plain]
         parts += [(i, quaternion_rate(q[i : i + 4], u[k : k + 3])) for i, k in self.quaternions]

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Vector, as_real, checked_positive, checked_real, described, known_numbers
+from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector, Vector3, as_real, checked_positive, checked_real, described, known_numbers
 from jourdain_jax.calculus.rotations import rot_y
 
 
@@ -32,11 +32,11 @@ class RigidMotion(TypedDict, total=False):
 class _Ground(eqx.Module):
     """Where a ground lies, and how it moves."""
 
-    origin: Float[Array, "3"]  # m
-    velocity: Float[Array, "3"]  # m/s, of the point at the origin
-    angular_velocity: Float[Array, "3"]  # rad/s
+    origin: Vector3  # m
+    velocity: Vector3  # m/s, of the point at the origin
+    angular_velocity: Vector3  # rad/s
 
-    def velocity_at(self, position: Vector) -> Float[Array, "3"]:
+    def velocity_at(self, position: Vector) -> Vector3:
         """Velocity (m/s, inertial frame) of the ground's material point at `position` (m, inertial frame)."""
         return self.velocity + jnp.cross(self.angular_velocity, as_real(position) - self.origin)
 
@@ -67,7 +67,7 @@ class Plane(_Ground):
     ValueError: an `along` that is normal to the plane, or both `tilt` and `normal`; a normal that is no unit vector, where its scene is built.
     """
 
-    normal: Float[Array, "3"]  # unit vector, out of the ground
+    normal: Vector3  # unit vector, out of the ground
     tangents: Float[Array, "2 3"]  # unit vectors along the no-slip rows
 
     def __init__(self, origin=(0.0, 0.0, 0.0), tilt=None, velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0), *, normal=None, along=None):
@@ -84,15 +84,15 @@ class Plane(_Ground):
         self._moves("a plane", origin, velocity, angular_velocity)
 
     @property
-    def axes(self) -> Float[Array, "3 3"]:
+    def axes(self) -> Matrix3:
         """Rotation matrix whose columns are the two tangents and the normal: from components in the plane to those in the inertial frame."""
         return jnp.concatenate([self.tangents, self.normal[None]]).T
 
-    def height_of(self, position: Vector) -> Float[Array, ""]:
+    def height_of(self, position: Vector) -> Scalar:
         """Signed distance (m) of the point at `position` (m, inertial frame) from the plane, positive along the normal."""
         return self.normal @ (as_real(position) - self.origin)
 
-    def value(self, point: Vector) -> Float[Array, ""]:
+    def value(self, point: Vector) -> Scalar:
         """f (m) at a `point` (m, inertial frame): its height above the plane."""
         return self.height_of(point)
 
@@ -105,15 +105,15 @@ class Plane(_Ground):
 class _Round(_Ground):
     """A ground at one distance from an axis or a centre."""
 
-    radius: Float[Array, ""]  # m
+    radius: Scalar  # m
     side: str = eqx.field(static=True)  # "inside" or "outside"
 
     @abstractmethod
-    def arm_to(self, point: Vector) -> Float[Array, "3"]:
+    def arm_to(self, point: Vector) -> Vector3:
         """The vector from the nearest point of the axis, or the centre, to the `point` (m, inertial frame)."""
 
     @abstractmethod
-    def _tangents(self, normal: Float[Array, "3"]) -> Float[Array, "2 3"]:
+    def _tangents(self, normal: Vector3) -> Float[Array, "2 3"]:
         """Unit vectors along the no-slip rows."""
 
     def _is(self, what: str, radius, side: str, motion: RigidMotion) -> None:
@@ -123,7 +123,7 @@ class _Round(_Ground):
         self.radius, self.side = checked_positive(radius, f"radius of {what}"), side
         self._moves(what, **motion)
 
-    def value(self, point: Vector) -> Float[Array, ""]:
+    def value(self, point: Vector) -> Scalar:
         """f (m) at a `point` (m, inertial frame): half of the difference of squared distance and squared radius, over the radius."""
         arm = self.arm_to(point)
         outward = (arm @ arm - self.radius**2) / (2 * self.radius)
@@ -145,19 +145,19 @@ class Cylinder(_Round):
     ValueError: a radius that is not positive, an unknown side; an axis that is no unit vector, where its scene is built.
     """
 
-    axis: Float[Array, "3"]  # unit vector
+    axis: Vector3  # unit vector
 
     def __init__(self, radius, axis, *, side: str, **motion: Unpack[RigidMotion]):
         """A cylinder of `radius` (m) about the line through `origin` along the unit vector `axis`, touched from its `side`; `motion`: of the ground."""
         self._is("a cylinder", radius, side, motion)
         self.axis = checked_real(axis, "axis of a cylinder", (3,), advice="give a unit vector")
 
-    def arm_to(self, point: Vector) -> Float[Array, "3"]:
+    def arm_to(self, point: Vector) -> Vector3:
         """The vector from the nearest point of the axis to the `point` (m, inertial frame)."""
         arm = as_real(point) - self.origin
         return arm - (arm @ self.axis) * self.axis
 
-    def _tangents(self, normal: Float[Array, "3"]) -> Float[Array, "2 3"]:
+    def _tangents(self, normal: Vector3) -> Float[Array, "2 3"]:
         return jnp.stack([self.axis, jnp.cross(normal, self.axis)])
 
 
@@ -172,11 +172,11 @@ class Sphere(_Round):
         """A sphere of `radius` (m) about `origin` (m), touched from its `side`; `motion`: of the ground."""
         self._is("a sphere", radius, side, motion)
 
-    def arm_to(self, point: Vector) -> Float[Array, "3"]:
+    def arm_to(self, point: Vector) -> Vector3:
         """The vector from the sphere's centre to the `point` (m, inertial frame)."""
         return as_real(point) - self.origin
 
-    def _tangents(self, normal: Float[Array, "3"]) -> Float[Array, "2 3"]:
+    def _tangents(self, normal: Vector3) -> Float[Array, "2 3"]:
         return tangents_of(normal)
 
 
@@ -195,7 +195,7 @@ class Surface(_Ground):
         self.f = _function(f, "a surface", "lambda x, y, z: z - 0.1 * x**2")
         self._moves("a surface", **motion)
 
-    def value(self, point: Vector) -> Float[Array, ""]:
+    def value(self, point: Vector) -> Scalar:
         """f at a `point` (m, inertial frame)."""
         x, y, z = as_real(point)
         return checked_real(self.f(x, y, z), "f(x, y, z) of a surface", (), advice="return one number, positive on the side of the bodies")
@@ -222,11 +222,11 @@ class HeightMap(_Ground):
         self.h = _function(h, "a height map", "lambda x, y: 0.1 * x**2")
         self._moves("a height map", **motion)
 
-    def height_at(self, x, y) -> Float[Array, ""]:
+    def height_at(self, x, y) -> Scalar:
         """h (m) at `x`, `y` (m)."""
         return checked_real(self.h(x, y), "h(x, y) of a height map", (), advice="return one height, m")
 
-    def value(self, point: Vector) -> Float[Array, ""]:
+    def value(self, point: Vector) -> Scalar:
         """`z - h(x, y)` (m) at a `point` (m, inertial frame)."""
         x, y, z = as_real(point)
         return z - self.height_at(x, y)
@@ -241,7 +241,7 @@ class HeightMap(_Ground):
         first, normal = first / jnp.sqrt(1 + along_x * along_x), normal / jnp.sqrt(1 + along_x * along_x + along_y * along_y)
         return self._tangent(jnp.stack([x, y, height]), normal, jnp.stack([first, jnp.cross(normal, first)]))
 
-    def point_at(self, x, y) -> Float[Array, "3"]:
+    def point_at(self, x, y) -> Vector3:
         """The point (m, inertial frame) of the surface at `x`, `y` (m)."""
         return jnp.stack([as_real(x), as_real(y), self.height_at(x, y)])
 
@@ -249,13 +249,13 @@ class HeightMap(_Ground):
 Ground = Plane | Cylinder | Sphere | Surface | HeightMap
 
 
-def normal_at(ground: Ground, point: Float[Array, "3"]) -> Float[Array, "3"]:
+def normal_at(ground: Ground, point: Vector3) -> Vector3:
     """`grad f/|grad f|` at a point; NaN where the gradient vanishes."""
     gradient = jnp.stack([jax.jvp(ground.value, (point,), (e,))[1] for e in jnp.eye(3, dtype=point.dtype)])
     return gradient / jnp.sqrt(gradient @ gradient)
 
 
-def tangents_of(n: Float[Array, "3"]) -> Float[Array, "2 3"]:
+def tangents_of(n: Vector3) -> Float[Array, "2 3"]:
     """Two unit vectors normal to the unit vector n and to each other, with `t1 x t2 = n`: x and y after the shortest turn of z (or -z) to n.
 
     No field of tangents is continuous on a whole sphere: these change at n_z = 0, and the no-slip rows with them, not what they say.
@@ -267,7 +267,7 @@ def tangents_of(n: Float[Array, "3"]) -> Float[Array, "2 3"]:
     return jnp.stack([jnp.stack([1 + s * x * x * a, s * x * y * a, -s * x]), jnp.stack([x * y * a, s + y * y * a, -y])])
 
 
-def _turned(tilt) -> Float[Array, "3 3"]:
+def _turned(tilt) -> Matrix3:
     """Columns: x, y and z, turned about y."""
     advice = "give one angle in rad, or a rotation matrix, such as jj.rot_x(0.1)"
     tilt = checked_real(tilt, "tilt of a plane", advice=advice)

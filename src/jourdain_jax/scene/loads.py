@@ -7,9 +7,9 @@ the work of the others is integrated along the motion.
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from jourdain_jax.calculus.reals import checked_real, described
+from jourdain_jax.calculus.reals import Scalar, Vector3, checked_real, described
 from jourdain_jax.scene.motion_state import Motion, Point
 from jourdain_jax.scene.names import nearest
 
@@ -22,10 +22,10 @@ class Load(eqx.Module):
     - `potential` in J, whose gradient it must be (`verify` looks); None: not conservative, its work is integrated along the motion.
     """
 
-    forces: dict[str, Float[Array, "3"]]  # N, inertial frame, at the mass centre
-    torques: dict[str, Float[Array, "3"]]  # N m, inertial frame, about the mass centre
-    generalized: dict[str, Float[Array, ""]]  # N or N m, on the named speed
-    potential: Float[Array, ""] | None  # J; None: not conservative, its work is integrated along the motion
+    forces: dict[str, Vector3]  # N, inertial frame, at the mass centre
+    torques: dict[str, Vector3]  # N m, inertial frame, about the mass centre
+    generalized: dict[str, Scalar]  # N or N m, on the named speed
+    potential: Scalar | None  # J; None: not conservative, its work is integrated along the motion
 
     def __init__(self, forces=None, torques=None, generalized=None, potential=None):
         given = {"forces": forces, "torques": torques, "generalized": generalized}
@@ -36,7 +36,7 @@ class Load(eqx.Module):
 class Gravity(Load):
     """What `gravity` makes: its `direction` is looked at when a scene is probed."""
 
-    direction: Float[Array, "3"]
+    direction: Vector3
 
     def __init__(self, forces, potential, direction):
         super().__init__(forces, potential=potential)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import checked_real
+from jourdain_jax.calculus.reals import Scalar, checked_real
 from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.scene.bodies import Body, RigidBody
 from jourdain_jax.scene.names import Named, UnknownNameError, nearest
@@ -103,7 +103,7 @@ class BodyMotion(eqx.Module):
 class Pose(eqx.Module):
     """Time, coordinates and the poses of all bodies; `pose["disc"]` is a body, `pose.q.yaw` a coordinate."""
 
-    t: Float[Array, ""]
+    t: Scalar
     q: Named
     bodies: dict[str, BodyPose]
 
@@ -117,7 +117,7 @@ class Pose(eqx.Module):
 class Motion(eqx.Module):
     """Time, coordinates, speeds, inputs and the motion of all bodies; `motion["disc"].velocity`, `motion.u.yaw_rate`."""
 
-    t: Float[Array, ""]
+    t: Scalar
     q: Named
     u: Named
     qdot: Named

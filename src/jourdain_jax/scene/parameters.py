@@ -6,11 +6,9 @@ from dataclasses import MISSING
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array
 
-from jourdain_jax.calculus.reals import as_real, described, has_unit, known_numbers
-
-Scalar = Float[Array, ""]
+from jourdain_jax.calculus.reals import Flag, as_real, described, has_unit, known_numbers
 
 
 def _as_leaf(value):
@@ -39,7 +37,7 @@ def parameters_of(scene) -> Iterator[tuple[str, Array, dict]]:
             yield name, getattr(scene, name), dict(field.metadata)
 
 
-def parameter_faults(scene) -> dict[str, Bool[Array, ""]]:
+def parameter_faults(scene) -> dict[str, Flag]:
     """Parameter name -> whether it is not finite or has the wrong sign; also under jit and vmap, where nothing can be raised."""
     faults = {}
     for name, value, metadata in parameters_of(scene):

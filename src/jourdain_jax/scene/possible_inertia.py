@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import checked_real, known_numbers
+from jourdain_jax.calculus.reals import Matrix3, checked_real, known_numbers
 
 
-def inertia_from_log_cholesky(numbers) -> Float[Array, "3 3"]:
+def inertia_from_log_cholesky(numbers) -> Matrix3:
     """Inertia matrix (3, 3) about the mass centre in kg m^2, possible whatever the numbers are.
 
     **Arguments:** `numbers`, (d1, d2, d3, s12, s23, s13), d: logarithms of lengths times square roots of masses, s: these themselves, sqrt(kg) m; or, of a body

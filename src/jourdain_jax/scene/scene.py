@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import array_module, checked_unless_traced, described, has_unit, known_numbers, real_type
+from jourdain_jax.calculus.reals import Scalar, Speeds, array_module, checked_unless_traced, described, has_unit, known_numbers, real_type
 from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.coordinates import Coordinates, Names
@@ -75,11 +75,11 @@ class Scene(eqx.Module):
         hold_leaves(self)
         check_parameters(self)
 
-    def bodies(self, t: Float[Array, ""], q: Named) -> dict[str, Body]:
+    def bodies(self, t: Scalar, q: Named) -> dict[str, Body]:
         """Poses of all bodies by name at time t (s) and coordinates q, `q.name`; in the inertial frame. Required."""
         raise NotImplementedError(f"scene `{type(self).__name__}` does not say where its bodies are; define `bodies(self, t, q)`")
 
-    def coordinate_rates(self, t: Float[Array, ""], q: Named, u: Named) -> Float[Array, "coordinates"]:
+    def coordinate_rates(self, t: Scalar, q: Named, u: Named) -> Float[Array, "coordinates"]:
         """`qdot = N(q,t) u + nu(q,t)`, affine in u. The default: every coordinate's own rate, quaternions by body angular velocity."""
         return self.coordinates.default_rates(q.array, u.array)
 
@@ -87,18 +87,18 @@ class Scene(eqx.Module):
         """Impressed forces at a `motion` (t, q, u, inputs, velocities)."""
         return ()
 
-    def potential(self, pose: Pose) -> Float[Array, ""] | None:
+    def potential(self, pose: Pose) -> Scalar | None:
         """Potential energy (J) at a `pose` besides that of the loads, a function of time and coordinates; None where there is none."""
         return None
 
-    def gauge(self, pose: Pose) -> Float[Array, ""] | None:
+    def gauge(self, pose: Pose) -> Scalar | None:
         """A function S (J s) of a `pose` whose rate is taken off the Lagrangian, L = T - V - dS/dt; None where there is none.
 
         The motion does not depend on it. Integrators built on a discrete Lagrangian do: it shows what they owe to a lucky choice of L.
         """
         return None
 
-    def prescribed(self, t: Float[Array, ""]) -> dict[str, Float[Array, ""]]:
+    def prescribed(self, t: Scalar) -> dict[str, Scalar]:
         """Coordinates driven as given functions of time: name -> value. The multiplier of the row is the actuator's force."""
         return {}
 
@@ -114,7 +114,7 @@ class Scene(eqx.Module):
         """Rolling contacts at a `pose`, by name; each adds its no-slip rows, and its height row if it says so."""
         return {}
 
-    def events(self, motion: Motion) -> dict[str, Float[Array, ""]]:
+    def events(self, motion: Motion) -> dict[str, Scalar]:
         """Named stop events at a `motion`: positive while it may go on; it stops where a value falls through zero, or is no number beyond. At a
         start a value of zero that rises has not happened.
 
@@ -125,7 +125,7 @@ class Scene(eqx.Module):
         """
         return {}
 
-    def invariants(self, motion: Motion) -> dict[str, Float[Array, ""]]:
+    def invariants(self, motion: Motion) -> dict[str, Scalar]:
         """Named quantities of a `motion` that this scene is known to conserve, besides its energy; for checks and summaries."""
         return {}
 
@@ -164,7 +164,7 @@ class Scene(eqx.Module):
                 raise ValueError(f"scene `{type(self).__name__}` has no parameter `{name}`; {nearest(name, names)}")
         return replace(self, **changes)
 
-    def named(self, **values) -> tuple[Float[Array, "coordinates"], Float[Array, "speeds"], tuple[str, ...]]:
+    def named(self, **values) -> tuple[Float[Array, "coordinates"], Speeds, tuple[str, ...]]:
         """q and u with the named `values`, the rest at the reference (zero; the identity for quaternions); and the names that were given.
 
         A quaternion or its angular velocity may be given whole, by its own name; of a quaternion that is named in part, the other parts are zero.

@@ -8,7 +8,7 @@ from typing import get_args
 
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import checked_real, described
+from jourdain_jax.calculus.reals import Scalar, checked_real, described
 from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.loads import Gravity, Load
@@ -64,19 +64,19 @@ def _checked_load(scene: Scene, i: int, load) -> Load:
     return Gravity(checked.forces, checked.potential, load.direction) if isinstance(load, Gravity) else checked
 
 
-def potential_of(scene: Scene, pose: Pose) -> Float[Array, ""] | None:
+def potential_of(scene: Scene, pose: Pose) -> Scalar | None:
     """The scene's own potential energy, J; None where it has none."""
     V = scene.potential(pose)
     return None if V is None else checked_real(V, f"what `potential` of `{_name(scene)}` returned", (), advice="return the energy in J, or None")
 
 
-def gauge_of(scene: Scene, pose: Pose) -> Float[Array, ""] | None:
+def gauge_of(scene: Scene, pose: Pose) -> Scalar | None:
     """The scene's gauge function, J s; None where it has none."""
     S = scene.gauge(pose)
     return None if S is None else checked_real(S, f"what `gauge` of `{_name(scene)}` returned", (), advice="return a number in J s, or None")
 
 
-def prescribed_of(scene: Scene, t) -> dict[str, Float[Array, ""]]:
+def prescribed_of(scene: Scene, t) -> dict[str, Scalar]:
     """Prescribed coordinates and their values."""
     advice = "prescribe every coordinate by its own name"
     return _numbers(scene, "prescribed", t, '{"x": 0.1 * jnp.sin(t)}', "prescribed value of", advice)
@@ -101,13 +101,13 @@ def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
     return contacts
 
 
-def events_of(scene: Scene, motion: Motion) -> dict[str, Float[Array, ""]]:
+def events_of(scene: Scene, motion: Motion) -> dict[str, Scalar]:
     """Values of the stop events by name."""
     advice = "return a number, positive while the motion may go on, such as `1.4 - motion.q.lean`; give every condition a name of its own"
     return _numbers(scene, "events", motion, '{"fallen": 1.4 - motion.q.lean}', "event", advice)
 
 
-def invariants_of(scene: Scene, motion: Motion) -> dict[str, Float[Array, ""]]:
+def invariants_of(scene: Scene, motion: Motion) -> dict[str, Scalar]:
     """Values of the conserved quantities by name."""
     advice = "give every component a name of its own"
     return _numbers(scene, "invariants", motion, '{"momentum x": body.mass * body.velocity[0]}', "invariant", advice)

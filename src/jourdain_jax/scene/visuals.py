@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.on_first_use import needed
-from jourdain_jax.calculus.reals import Vector, checked_known, checked_positive, checked_real, described
+from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector, Vector3, checked_known, checked_positive, checked_real, described
 from jourdain_jax.scene.bodies import _axis_index, _stack
 from jourdain_jax.scene.grounds import tangents_of
 
@@ -29,7 +29,7 @@ class Look(TypedDict, total=False):
     """Where a shape is, and how it is painted; see `Visual`."""
 
     at: Vector  # m
-    turn: Float[Array, "3 3"]
+    turn: Matrix3
     colour: str | None
     opacity: float
 
@@ -55,9 +55,9 @@ class Visual(eqx.Module):
     kind: str = eqx.field(static=True)  # "ellipsoid", "wheel", "box", "cylinder", "capsule", "line" or "mesh"
     # m; ellipsoid: semi-axes, box: sides, wheel, cylinder, capsule: radius and length along z (of the capsule without its ends), line: points, mesh: factors
     size: Float[Array, "*size"]
-    position: Float[Array, "3"]  # m, body frame
-    orientation: Float[Array, "3 3"]  # own components to body components
-    radius: Float[Array, ""] | None = None  # m, of a line; None: thin
+    position: Vector3  # m, body frame
+    orientation: Matrix3  # own components to body components
+    radius: Scalar | None = None  # m, of a line; None: thin
     faces: Faces | None = eqx.field(static=True, default=None)
     colour: str | None = eqx.field(static=True, default=None)
     opacity: float = eqx.field(static=True, default=1.0)

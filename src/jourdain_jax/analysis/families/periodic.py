@@ -24,7 +24,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Complex, Float
 
 from jourdain_jax.analysis.families.equations import sizes
 from jourdain_jax.analysis.families.special import SURE
@@ -33,7 +33,7 @@ from jourdain_jax.analysis.table import complex_numbers
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.build.trace import event_values
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import RUN_SELDOM, Number, compiled, known_numbers
+from jourdain_jax.calculus.reals import RUN_SELDOM, Flag, Number, Scalar, compiled, known_numbers
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.listed import names_of_events
@@ -56,18 +56,18 @@ class PeriodicMotion(Printed, eqx.Module):
     """
 
     state: State  # at the start of a period
-    period: Float[Array, ""]  # s
-    shift: dict[str, Float[Array, ""]]  # change of a coordinate in a period: of those that are ignorable, and of those given
+    period: Scalar  # s
+    shift: dict[str, Scalar]  # change of a coordinate in a period: of those that are ignorable, and of those given
     multipliers: Complex[Array, "multipliers"]  # factors by which small motions grow in a period, the largest first
-    residual: Float[Array, ""]  # largest difference after one period, in units of the unknowns' sizes
-    converged: Bool[Array, ""]
+    residual: Scalar  # largest difference after one period, in units of the unknowns' sizes
+    converged: Flag
 
-    def __getitem__(self, name: str) -> Float[Array, ""]:
+    def __getitem__(self, name: str) -> Scalar:
         """A coordinate or speed at the start, by name."""
         return self.state[name]
 
     @property
-    def stable(self) -> Bool[Array, ""]:
+    def stable(self) -> Flag:
         """Whether no small motion grows; multipliers of symmetries and conserved quantities are one, up to round-off."""
         return jnp.all(jnp.abs(self.multipliers) <= 1 + SURE)
 
@@ -197,7 +197,7 @@ class _Shooting(eqx.Module):
             there = there.at[part].multiply(jnp.where(there[part] @ here[part] < 0, -1.0, 1.0))
         return there
 
-    def pieces_of(self, x: Float[Array, "unknowns"]) -> tuple[Float[Array, "pieces states"], Float[Array, ""]]:
+    def pieces_of(self, x: Float[Array, "unknowns"]) -> tuple[Float[Array, "pieces states"], Scalar]:
         """States at which pieces begin, and the period."""
         return jnp.reshape(x[:-1], (self.pieces, -1)), x[-1]
 
@@ -263,7 +263,7 @@ class _Shooting(eqx.Module):
 
 
 @partial(compiled, options=RUN_SELDOM)
-def _found(problem: _Shooting, start: State, period: Float[Array, ""]) -> PeriodicMotion:
+def _found(problem: _Shooting, start: State, period: Scalar) -> PeriodicMotion:
     t, begun = start.t, jnp.concatenate([start.q, start.u])
     still, z, given = jax.lax.stop_gradient((problem, begun, period))
     motion = still.motion(t, z, t + given * np.arange(1, problem.pieces + 1) / problem.pieces)

@@ -4,10 +4,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import structure_of, usual_rows
-from jourdain_jax.calculus.reals import passing_cutoff
+from jourdain_jax.calculus.reals import Count, Scalar, passing_cutoff
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.dynamics.reactions import ContactForce
 from jourdain_jax.eager.eager import eager_if_concrete
@@ -41,23 +41,23 @@ class Energies(eqx.Module):
 class Diagnostics(eqx.Module):
     """Extremes of what can be checked along a motion."""
 
-    energy_drift: Float[Array, ""]  # J, max - min of T + V, less the work done where it is tracked
+    energy_drift: Scalar  # J, max - min of T + V, less the work done where it is tracked
     energy_kind: str = eqx.field(static=True)
-    energy_size: Float[Array, ""]  # J, largest kinetic energy, and max - min of the potential one: what a drift is judged against
-    position_residual: Float[Array, ""]  # largest residual of the geometric rows and quaternion norms
-    velocity_residual: Float[Array, ""]  # largest residual of the velocity rows
-    smallest_singular_value: Float[Array, ""]  # of the scaled rows, smallest along the motion
-    rank: tuple[Int[Array, ""], Int[Array, ""]]  # lowest and highest rank of the rows
-    invariant_drifts: dict[str, Float[Array, ""]]
+    energy_size: Scalar  # J, largest kinetic energy, and max - min of the potential one: what a drift is judged against
+    position_residual: Scalar  # largest residual of the geometric rows and quaternion norms
+    velocity_residual: Scalar  # largest residual of the velocity rows
+    smallest_singular_value: Scalar  # of the scaled rows, smallest along the motion
+    rank: tuple[Count, Count]  # lowest and highest rank of the rows
+    invariant_drifts: dict[str, Scalar]
     contacts: dict[str, "ContactExtremes"]
 
 
 class ContactExtremes(eqx.Module):
     """What a rolling contact had to bear."""
 
-    lowest_normal: Float[Array, ""]  # N; negative: it would have had to pull
-    highest_normal: Float[Array, ""]  # N
-    friction_needed: Float[Array, ""]  # largest |tangential| / normal
+    lowest_normal: Scalar  # N; negative: it would have had to pull
+    highest_normal: Scalar  # N
+    friction_needed: Scalar  # largest |tangential| / normal
     pulls: Array  # whether it would have had to pull at any time, beyond round-off
     determined: Array  # whether the rows determine these forces all along
     normal_determined: Array  # whether they determine the normal force all along
@@ -112,11 +112,11 @@ def _extremes(force: ContactForce) -> ContactExtremes:
     return ContactExtremes(jnp.nanmin(force.normal), jnp.nanmax(force.normal), jnp.max(friction), jnp.any(force.pulls), *known)
 
 
-def _span(values) -> Float[Array, ""]:
+def _span(values) -> Scalar:
     return jnp.nanmax(values) - jnp.nanmin(values)
 
 
-def _largest(values) -> Float[Array, ""]:
+def _largest(values) -> Scalar:
     return jnp.max(jnp.where(jnp.isnan(values), 0.0, jnp.abs(values)), initial=0.0)
 
 

@@ -7,10 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import structure_of
-from jourdain_jax.calculus.reals import is_traced, with_usual_promotion
+from jourdain_jax.calculus.reals import Count, Scalar, Speeds, Vector3, is_traced, with_usual_promotion
 from jourdain_jax.dynamics.accelerations import Accelerations, accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, contact_forces, row_reactions
 from jourdain_jax.eager.eager import eval_numpy
@@ -33,22 +33,22 @@ class Record(eqx.Module):
     q: Float[Array, "times coordinates"]
     u: Float[Array, "times speeds"]
     work: Float[Array, "times"] | None  # J, since the start; None where all forces have potentials and no row does work
-    t_end: Float[Array, ""]  # s
+    t_end: Scalar  # s
     q_end: Float[Array, "coordinates"]
-    u_end: Float[Array, "speeds"]
-    result: Int[Array, ""]  # code, see `jourdain_jax.motion.trajectories.results`
-    event: Int[Array, ""]  # index into `event_names`, -1: none
-    accepted: Int[Array, ""]  # steps
-    rejected: Int[Array, ""]
-    last_step: Float[Array, ""]  # s, that the step-size control would take next; NaN where it keeps that to itself
-    crossings: Int[Array, ""]  # how often relations of loads, poses and rows (`<`, `abs`, `floor`, ...) changed their sides; -1: not watched
-    together: Float[Array, ""]  # s, the end of the first step in which two or more of them did; infinite: none
-    fallback: Int[Array, ""]  # in what other way the motion was run again, see `results.FALLBACKS`; 0: as asked
-    moved_q: Float[Array, ""]  # how far the start was moved onto the constraints
-    moved_u: Float[Array, ""]
+    u_end: Speeds
+    result: Count  # code, see `jourdain_jax.motion.trajectories.results`
+    event: Count  # index into `event_names`, -1: none
+    accepted: Count  # steps
+    rejected: Count
+    last_step: Scalar  # s, that the step-size control would take next; NaN where it keeps that to itself
+    crossings: Count  # how often relations of loads, poses and rows (`<`, `abs`, `floor`, ...) changed their sides; -1: not watched
+    together: Scalar  # s, the end of the first step in which two or more of them did; infinite: none
+    fallback: Count  # in what other way the motion was run again, see `results.FALLBACKS`; 0: as asked
+    moved_q: Scalar  # how far the start was moved onto the constraints
+    moved_u: Scalar
     # of the privileged speeds, along the whole motion (lowered: of the elimination, relative to its usual size); negative if it changed sign;
     # full state, dense: of those of the reduction, 1 where it has none
-    smallest_pivot: Float[Array, ""]
+    smallest_pivot: Scalar
     inputs: Inputs
     state_form: str = eqx.field(static=True)  # "minimal" or "full"
     reduction: str = eqx.field(static=True)
@@ -118,7 +118,7 @@ class BodyPoint(eqx.Module):
     """The place (m, inertial frame) of the point of a body with coordinates `local` (m, body frame, from the mass centre)."""
 
     body: str = eqx.field(static=True)
-    local: Float[Array, "3"]
+    local: Vector3
 
     def __call__(self, scene, t, q, u, inputs):
         return motion_at(scene, t, q, u, inputs)[self.body].place(self.local)

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.probed_on_graph import generic_inputs
 from jourdain_jax.build.structure import closure_lengths, structure_whatever_its_faults, trust, usual_rows
-from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.calculus.reals import Scalar, Speeds, is_traced
 from jourdain_jax.dynamics.accelerations import Baumgarte, bare_accelerations, reduced_at
 from jourdain_jax.dynamics.power import rate_of_work
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
@@ -98,7 +98,7 @@ class ByMatrices(VectorField):
         padded = [jnp.pad(x, ((0, 0), (0, width - x.shape[1]))) for x in (rows, N)]
         return Watched(rates, jnp.append(pivots, self.usual.own_speeds / jnp.linalg.norm(N, axis=1)), jnp.concatenate(padded))
 
-    def power(self, scene: Scene, motion: Motion, found) -> Float[Array, ""] | None:
+    def power(self, scene: Scene, motion: Motion, found) -> Scalar | None:
         """The rate of the work that is integrated, W."""
         return rate_of_work(scene, motion, found, self.of_inputs) if self.with_work else None
 
@@ -120,10 +120,10 @@ class MinimalByMatrices(ByMatrices):
         """The sign of det A_z."""
         return True
 
-    def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "speeds"]:
+    def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Speeds:
         return self._kinematics(scene, t, y, inputs).u
 
-    def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
+    def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Speeds, Scalar]:
         """All speeds, and the pivot with the sign of det A_z."""
         found = self._kinematics(scene, t, y, inputs)
         return found.u, Partition(jax.lax.stop_gradient(found.split.A), self.independent).signed_pivot()
@@ -169,10 +169,10 @@ class FullByMatrices(ByMatrices):
         """Whether branches may cross on the rows that a step is put back onto."""
         return self.projects and self.undecided is not None
 
-    def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "speeds"]:
+    def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Speeds:
         return y.v
 
-    def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
+    def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Speeds, Scalar]:
         if not isinstance(self.reduction, Privileged | GibbsAppell):
             return y.v, jnp.ones(())
         return y.v, bare_accelerations(scene, t, y.q, y.v, inputs, reduction=self.reduction).pivot

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import event_values, stored_by_inputs
-from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.reals import PerLane, Scalar, Speeds, described
 from jourdain_jax.dynamics.accelerations import Baumgarte
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.kinematics import motion_at
@@ -95,7 +95,7 @@ class Integrated(eqx.Module):
 
     q: Float[Array, "coordinates *lanes"]
     v: Float[Array, "integrated_speeds *lanes"]
-    work: Float[Array, "*lanes"] | None
+    work: PerLane | None
 
 
 class Watched(NamedTuple):
@@ -104,7 +104,7 @@ class Watched(NamedTuple):
     rates: Integrated
     pivots: Float[Array, "pivots *lanes"]
     directions: Float[Array, "rows speeds *lanes"]
-    sine: Float[Array, "*lanes"] | None = None  # the smallest between a row and those before it; None: rows that are solved for speeds, or none
+    sine: PerLane | None = None  # the smallest between a row and those before it; None: rows that are solved for speeds, or none
 
 
 class VectorField(eqx.Module):
@@ -176,18 +176,18 @@ class VectorField(eqx.Module):
         v = u if self.independent is None else u[jnp.array(self.independent, jnp.int32)]
         return Integrated(q, v, jnp.zeros((), q.dtype) if self.with_work else None)
 
-    def stored(self, scene: Scene, t, q, inputs) -> Float[Array, ""]:
+    def stored(self, scene: Scene, t, q, inputs) -> Scalar:
         """What loads whose potential depends on inputs store, J: with its change, the integrated work is the work done."""
         if not (self.with_work and self.of_inputs):
             return jnp.zeros((), q.dtype)
         return stored_by_inputs(scene, motion_at(scene, t, q, jnp.zeros(len(scene.speed_names), q.dtype), inputs), self.of_inputs)
 
     @abc.abstractmethod
-    def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "speeds"]:
+    def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Speeds:
         """All speeds."""
 
     @abc.abstractmethod
-    def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
+    def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Speeds, Scalar]:
         """All speeds, and how well the privileged ones determine the others, with a sign that changes where they do not.
 
         For the full state the second is that of its reduction, without a sign, and 1 where it has none.
@@ -259,10 +259,10 @@ class ByProgram(VectorField):
         """What depends on parameters alone."""
         return values.fixed_values(self.program, scene) if self.native else self.program.fixed_values(scene)
 
-    def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "speeds"]:
+    def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Speeds:
         return self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[0]
 
-    def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
+    def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Speeds, Scalar]:
         """All speeds, and the smallest pivot of the elimination."""
         if self.native:
             return values.speeds_and_pivot(self.program, fixed, t, y.q, y.v, inputs)
