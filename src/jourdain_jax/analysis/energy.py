@@ -12,7 +12,7 @@ import numpy as np
 
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import structure_of
-from jourdain_jax.calculus.reals import Scalar
+from jourdain_jax.calculus.reals import Scalar, largest
 from jourdain_jax.dynamics.accelerations import bare_accelerations
 from jourdain_jax.dynamics.power import power
 from jourdain_jax.equations.kinematics import motion_at
@@ -68,7 +68,7 @@ def energy_balance(scene: Scene) -> EnergyBalance:
     inputs = jnp.asarray(np.random.default_rng(0).normal(size=(len(t), len(scene.inputs))))
     powers, size = _powers(scene, t, q, u, inputs)
     limit = (1e-9 if q.dtype == jnp.float64 else 1e-4) * float(jnp.max(size))
-    changed_by = tuple(text for name, text in _ORIGINS.items() if float(jnp.max(jnp.abs(getattr(powers, name)))) > limit)
+    changed_by = tuple(text for name, text in _ORIGINS.items() if float(largest(getattr(powers, name))) > limit)
     changed_by += ("potentials that depend on inputs",) if structure_of(scene).potentials_of_inputs else ()
     return EnergyBalance(not changed_by, changed_by)
 

@@ -32,7 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Number, checked_known, described
+from jourdain_jax.calculus.reals import Number, checked_known, described, largest
 
 Numbers = Float[Array, "*batch"]
 
@@ -162,7 +162,7 @@ def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]
             raise ValueError(f"the variance of `{name}` is {variance:g}, expected one above zero; a number that is known needs no estimate")
     sigma, round_off = np.sqrt(variances), 1e-9  # of correlations
     correlations = C / np.outer(sigma, sigma)
-    if np.abs(correlations - correlations.T).max() > round_off:
+    if largest(correlations - correlations.T) > round_off:
         raise ValueError("`covariance` of `joint_normal` is not symmetric; give cov(a, b) = cov(b, a)")
     if (least := np.linalg.eigvalsh(correlations)[0]) < -n * round_off:
         raise ValueError(f"`covariance` of `joint_normal` is no covariance: its correlations have the eigenvalue {least:.3g}, expected none below zero")

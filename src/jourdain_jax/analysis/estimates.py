@@ -31,7 +31,7 @@ from jourdain_jax.analysis.runs import run_of
 from jourdain_jax.analysis.spread import AtBounds, moved_from_bounds, spread, too_narrow_near_bounds
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.build.plausibility import impossible_bodies
-from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.reals import described, largest
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.model import modelled
 from jourdain_jax.motion.own_steps import moving_jumps
@@ -202,7 +202,7 @@ class ChannelResiduals(Printed, eqx.Module):
     def of(run: int, name: str, r: np.ndarray) -> "ChannelResiduals":
         """The summary of the residuals `r` of a channel, NaN where a sample is missing."""
         r = r[~np.isnan(r)]
-        numbers = (r.mean(), np.sqrt((r**2).mean()), np.abs(r).max()) if r.size else (np.nan,) * 3
+        numbers = (r.mean(), np.sqrt((r**2).mean()), largest(r)) if r.size else (np.nan,) * 3
         return ChannelResiduals(run, name, r.size, *map(float, numbers))
 
     def _text(self) -> str:

@@ -28,7 +28,7 @@ from jourdain_jax.analysis.quantities import Channel, Instrument, StopEvent
 from jourdain_jax.analysis.runs import Run, equal_runs
 from jourdain_jax.analysis.sensors import gauss_legendre, ideal
 from jourdain_jax.analysis.tangent import dependent_coordinates, others, privileged_at, privileged_speeds
-from jourdain_jax.calculus.reals import Scalar, Speeds, checked_real, holds
+from jourdain_jax.calculus.reals import Scalar, Speeds, checked_real, holds, real_type
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
@@ -232,7 +232,7 @@ def _intensities(scene: Scene, speeds: tuple[int, ...], given: Mapping) -> Speed
         number = checked_real(value, f"process noise of `{name}`", (), advice="give one number")
         if not holds(lambda x: np.isfinite(x) & (x >= 0), number):
             raise ValueError(f"process noise of `{name}` is {float(number):g}, expected zero or more")
-        found[name] = number.astype(jnp.result_type(float))
+        found[name] = number.astype(real_type())
     return jnp.stack(list(found.values())) if found else jnp.zeros(0)
 
 
@@ -240,4 +240,4 @@ def _begun(run: Experiment, names: tuple[str, ...]) -> Float[Array, "2 unknown"]
     """Means and standard deviations of these start values."""
     given: dict[str, Any] = dict(run.unknown_start)  # estimates with priors
     known = [(given[name].prior.mean, given[name].prior.sigma) if name in given else (run.start[name], 0.0) for name in names]
-    return jnp.array(known, jnp.result_type(float)).reshape(-1, 2).T
+    return jnp.array(known, real_type()).reshape(-1, 2).T

@@ -35,7 +35,7 @@ from scipy.special import stdtrit
 
 from jourdain_jax.analysis.arrow import Arrow
 from jourdain_jax.analysis.layout import Layout
-from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.reals import described, largest, real_type
 from jourdain_jax.scene.scene import Scene
 
 
@@ -209,7 +209,7 @@ def derived(scene: Scene, layout: Layout, function: Callable[[Scene], Array], sh
     def of(shared):
         value = function(layout.scene(scene, shared))
         try:
-            return jnp.asarray(value, jnp.result_type(float))
+            return jnp.asarray(value, real_type())
         except (TypeError, ValueError):
             raise ValueError(f"the function returns {described(value)}, expected a number or an array of numbers") from None
 
@@ -270,7 +270,7 @@ def weak_combinations(
             break
         change = spread * directions[:, k] * scale / np.where(is_relative, np.abs(values[some]), 1.0)  # d theta / |theta|, or d theta
         # of the largest entry of a direction: what is less is left out
-        parts = np.flatnonzero(np.abs(directions[:, k]) > 0.1 * np.max(np.abs(directions[:, k])))
+        parts = np.flatnonzero(np.abs(directions[:, k]) > 0.1 * largest(directions[:, k]))
         parts = parts[np.argsort(-np.abs(directions[parts, k]))]
         *others, last = [_by(labels[some[i]], change[i] * np.sign(change[parts[0]]), bool(is_relative[i])) for i in parts]
         if others:

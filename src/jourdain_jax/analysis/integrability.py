@@ -26,6 +26,7 @@ import numpy as np
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.build.trace import named_values, traced_scene
+from jourdain_jax.calculus.reals import largest, real_type
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.scene.scene import Scene
@@ -83,7 +84,7 @@ STEP = {"float64": 0.02, "float32": 0.1}  # of the differences, along unit direc
 
 def integrable_below() -> float:
     """The violation of Frobenius' criterion below which a row counts as integrable."""
-    return 1e-9 if jnp.result_type(float) == jnp.float64 else 1e-4
+    return 1e-9 if real_type() == jnp.float64 else 1e-4
 
 
 def frobenius_violations(scene: Scene) -> dict[str, float]:
@@ -99,7 +100,7 @@ def frobenius_violations(scene: Scene) -> dict[str, float]:
     rows, x = RowsOverStates(scene), np.concatenate([t[:, None], q], axis=1)
     ((a, F), along), ((other, _), _) = rows(x, u), rows(x, -0.7 * u[:, ::-1])
     A, other = a[..., 1:], other[..., 1:]
-    curved = np.max(np.abs(A - other), axis=2, initial=0.0) > 1.5e-8 * (1 + np.max(np.abs(A), axis=2, initial=0.0))
+    curved = largest(A - other, 2) > 1.5e-8 * (1 + largest(A, 2))
     changes = [along(np.tile(e, (len(x), 1))) for e in np.eye(x.shape[1])]
     da, dF = (np.stack(parts, axis=-1) for parts in zip(*changes, strict=True))
     worst = {name: max(_frobenius_violation(*one) for one in zip(a[:, s], da[:, s], F, dF, strict=True)) for s, name in enumerate(names)}
@@ -121,7 +122,7 @@ def _frobenius_violation(a: np.ndarray, da: np.ndarray, F: np.ndarray, dF: np.nd
     slopes = coefficients.T @ (da - np.tensordot(basis @ w, dF, 1))
     admitted = np.linalg.svd(w[None])[2][1:].T
     along = admitted.T @ slopes @ basis @ admitted
-    return float(np.max(np.abs(along - along.T), initial=0.0) / (size + np.max(np.abs(slopes))))
+    return float(largest(along - along.T) / (size + largest(slopes)))
 
 
 def growth_vector(scene: Scene, depth: int) -> tuple[tuple[int, ...], bool]:
@@ -146,7 +147,7 @@ def reachable(scene: Scene) -> int:
 
 def _grow(fields: "_Fields", t, q, depth: int) -> tuple[tuple[int, ...], bool]:
     """Dimensions at one state, and whether they stopped growing."""
-    tolerance = 1e-6 if jnp.result_type(float) == jnp.float64 else 1e-2
+    tolerance = 1e-6 if real_type() == jnp.float64 else 1e-2
     x = np.concatenate([t[None], q]) if fields.with_time else q
     generators = np.eye(structure_of(fields.scene).degrees_of_freedom + fields.with_time)
     if not len(generators):
@@ -200,7 +201,7 @@ def _brackets_of(fields: "_Fields", x: np.ndarray, here: np.ndarray, along: Call
     """As `_brackets`, from the generators at these points and their derivatives `along` directions."""
     first = np.einsum("bng,bg->bn", here, parts[:, 0])
     if parts.shape[1] == 1:
-        return first, np.abs(first).max(axis=1)
+        return first, largest(first, 1)
     rest, _ = _brackets_of(fields, x, here, along, parts[:, 1:])
     if parts.shape[1] == 2:
         along_first = np.einsum("bng,bg->bn", along(first), parts[:, 1])
@@ -208,7 +209,7 @@ def _brackets_of(fields: "_Fields", x: np.ndarray, here: np.ndarray, along: Call
         along_first = _differences(lambda x, parts: _brackets(fields, x, parts)[0], x, first, parts[:, 1:])
     along_rest = np.einsum("bng,bg->bn", along(rest), parts[:, 0])
     # [X, Y] = DY X - DX Y
-    return along_first - along_rest, np.abs(along_first).max(axis=1) + np.abs(along_rest).max(axis=1)
+    return along_first - along_rest, largest(along_first, 1) + largest(along_rest, 1)
 
 
 def _differences(f, x: np.ndarray, direction: np.ndarray, parts: np.ndarray) -> np.ndarray:

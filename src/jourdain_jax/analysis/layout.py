@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.reals import described, largest, real_type
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import pose_at
 from jourdain_jax.program.calls import Call
@@ -163,7 +163,7 @@ def _found(scene: Scene, name: str) -> tuple[list[Entry], list[Entry | None]]:
     elsewhere = {of: x * (1 + 0.1 * generator.uniform(size=x.shape)) + 0.01 * generator.uniform(size=x.shape) for of, x in values.items()}
     slopes_of = _slopes(name)
     (I, slopes), (I_there, slopes_there) = slopes_of(scene, values), slopes_of(scene, elsewhere)
-    size, round_off = np.max(np.abs(I)), 1e-9
+    size, round_off = largest(I), 1e-9
 
     def entry(i: int, j: int) -> Entry | None:
         where = [(of, index) for of in names for index in np.ndindex(values[of].shape) if slopes[of][(i, j, *index)] or slopes_there[of][(i, j, *index)]]
@@ -218,7 +218,7 @@ def tied_by(name: str, function: Callable, scene: Scene) -> Tie:
     def of_leaves(*leaves):
         value = function(jax.tree.unflatten(treedef, leaves))
         try:
-            found = jnp.asarray(value, jnp.result_type(float))
+            found = jnp.asarray(value, real_type())
         except (TypeError, ValueError):
             raise ValueError(f"the function in `free` of `{name}` returns {described(value)}, expected a number or an array of shape {expected}") from None
         if found.shape != expected:

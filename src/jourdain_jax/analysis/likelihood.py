@@ -33,7 +33,7 @@ from jourdain_jax.analysis.runs import Run, equal_runs, run_of
 from jourdain_jax.analysis.table import table
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import Scalar, array_module, compiled, described, holds, is_traced
+from jourdain_jax.calculus.reals import Scalar, array_module, compiled, described, holds, is_traced, largest
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_options
 from jourdain_jax.motion.simulate import simulate
@@ -91,7 +91,7 @@ def _of_angle(what: str, values: Float[np.ndarray, "times"], ts: Float[np.ndarra
         return
     steps = np.diff(x)
     (jumps,) = np.nonzero(np.abs(steps) > 0.75 * turn)
-    if jumps.size and np.max(np.abs(steps - turn * np.round(steps / turn))) < 0.25 * turn:
+    if jumps.size and largest(steps - turn * np.round(steps / turn)) < 0.25 * turn:
         yield (
             f"{what} jumps by {steps[jumps[0]]:.3g} at {t[jumps[0] + 1]:.6g} s and stays within one turn: an angle that was wrapped, where coordinates go on; "
             "give `np.unwrap` of it"

@@ -33,7 +33,7 @@ from jourdain_jax.analysis.tangent import (
     smallest_pivot,
 )
 from jourdain_jax.build.structure import WELL_CONDITIONED
-from jourdain_jax.calculus.reals import RUN_SELDOM, Count, Numbers, Scalar, array_module, compiled, holds, is_traced
+from jourdain_jax.calculus.reals import RUN_SELDOM, Count, Numbers, Scalar, array_module, compiled, holds, is_traced, largest
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.lowering.kinks import bent_load
 from jourdain_jax.motion.put_on_rows import State
@@ -244,8 +244,8 @@ def _matrices(scene: Scene, q, v, D, mass, independent: tuple[str, ...], y: tupl
     n = len(kept) + len(y)
     A, B, Z = rates[:, :n], rates[:, n:], T[count : count + m, len(kept) : n]
     found = dict(zip(("M", "C", "K", "F", "coupling"), _second_order(scene, A, B, Z.T @ mass @ Z, independent, y, coordinates), strict=True))
-    acceleration = xp.max(xp.abs(v[constant]), initial=0.0)
-    residual = xp.maximum(acceleration, xp.max(xp.abs(change), initial=0.0))
+    acceleration = largest(v[constant])
+    residual = xp.maximum(acceleration, largest(change))
     found |= {"A": A, "B": B, "acceleration": acceleration, "residual": residual, "pivot": xp.minimum(*pivots)}
     return {name: jnp.asarray(x, q.dtype) for name, x in found.items()}
 
@@ -269,8 +269,8 @@ def _second_order(scene: Scene, A, B, mass, independent: tuple[str, ...], y, coo
 def _relative(neglected, kept):
     """Largest neglected entry over the largest kept one; the entry itself where nothing is kept."""
     xp = array_module(kept)
-    size = xp.max(xp.abs(kept), initial=0.0)
-    return xp.max(xp.abs(neglected), initial=0.0) / xp.where(size > 0, size, 1.0)
+    size = largest(kept)
+    return largest(neglected) / xp.where(size > 0, size, 1.0)
 
 
 @_compiled

@@ -26,7 +26,7 @@ from jourdain_jax.analysis.likelihood import as_fit_options, as_runs, in_all_or_
 from jourdain_jax.analysis.runs import Run, equal_runs
 from jourdain_jax.analysis.unknowns import Places, check_starts, unknowns_of
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import Scalar, compiled, holds, is_traced
+from jourdain_jax.calculus.reals import Scalar, compiled, holds, is_traced, real_type
 from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
@@ -108,7 +108,7 @@ class LogDensity(eqx.Module):
         """
         for name in values:
             check_name(name, self.labels, f"`{name}` is not among the unknowns")
-        theta = jnp.stack([jnp.asarray(values.get(label, self.guess[i]), jnp.result_type(float)) for i, label in enumerate(self.labels)])
+        theta = jnp.stack([jnp.asarray(values.get(label, self.guess[i]), real_type()) for i, label in enumerate(self.labels)])
         x = self._each(Range.unconstrain, theta)
         if not holds(np.isfinite, x):
             off = int(np.argmin(np.isfinite(x)))
@@ -148,7 +148,7 @@ class LogDensity(eqx.Module):
         return eqx.tree_at(lambda d: (d.centre, d.factor), self, (x, factor))
 
     def _checked(self, z) -> Array:
-        z = jnp.asarray(z, jnp.result_type(float))
+        z = jnp.asarray(z, real_type())
         if z.shape[-1:] != (len(self.labels),):
             raise ValueError(f"the vector has shape {z.shape}, expected ({len(self.labels)},): one number for each of {', '.join(self.labels)}")
         return z

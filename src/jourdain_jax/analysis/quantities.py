@@ -29,7 +29,7 @@ from jax.extend.core import ClosedJaxpr
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.sampling import sample_states
-from jourdain_jax.calculus.reals import Scalar, Vector3, array_module, checked_known, checked_real, described, is_traced
+from jourdain_jax.calculus.reals import Scalar, Vector3, array_module, checked_known, checked_real, described, is_traced, real_type
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reactions import contact_forces
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
@@ -102,7 +102,7 @@ def _kind(scene: Scene):
 @lru_cache(maxsize=64)
 def _motion_shape(treedef, shapes) -> Motion:
     scene = jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in shapes])
-    q, u = (jax.ShapeDtypeStruct((len(names),), jnp.result_type(float)) for names in (scene.coordinate_names, scene.speed_names))
+    q, u = (jax.ShapeDtypeStruct((len(names),), real_type()) for names in (scene.coordinate_names, scene.speed_names))
     return jax.eval_shape(lambda scene, q, u: motion_at(scene, 0.0, q, u), scene, q, u)
 
 

@@ -39,6 +39,7 @@ from jourdain_jax.analysis.piecewise import Piecewise
 from jourdain_jax.analysis.problem import Asked, Problem
 from jourdain_jax.analysis.spread import RISE_95, side
 from jourdain_jax.analysis.unknowns import unknowns_of
+from jourdain_jax.calculus.reals import largest
 from jourdain_jax.scene.names import UnknownNameError, check_name
 from jourdain_jax.scene.printing import Printed
 
@@ -58,7 +59,7 @@ def taken_up(fit: Estimates, data: Data) -> tuple[Problem, Minimum]:
         again = problem.by_channel(run, at)
         for name, r in residuals.items():
             here = np.nan_to_num(again[name][0] if name in again else np.nan) * (sigma.get(name, 1.0) / fit.sigma.get(name, 1.0))
-            if here.shape != r.shape or np.max(np.abs(np.nan_to_num(r) - here), initial=0.0) >= 0.01:
+            if here.shape != r.shape or largest(np.nan_to_num(r) - here) >= 0.01:
                 raise ValueError("`data` are not those of the fit: its residuals are others there; give the runs that it was fitted to")
     return problem, Minimum.begun(theta, at, "")
 

@@ -31,7 +31,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.estimate import Estimate, positive, unbounded
 from jourdain_jax.analysis.quantities import Channel, Instrument, StopEvent
-from jourdain_jax.calculus.reals import Scalar, array_module, checked_real, described, holds, is_traced
+from jourdain_jax.calculus.reals import Scalar, array_module, checked_real, described, holds, is_traced, real_type
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.motion_state import Motion
@@ -62,7 +62,7 @@ def grid(t0, ts: Times, count: int, node=None) -> Float[Array | np.ndarray, "gri
     end = ts[-1] if node is None else node
     until = count if node is None or node == ts[-1] else int(count * float((end - t0) / (ts[-1] - t0)) + 1e-9)
     xp = array_module((t0, end))
-    found = xp.asarray(t0 + (end - t0) * xp.arange(count + 1) / until, jnp.result_type(float))
+    found = xp.asarray(t0 + (end - t0) * xp.arange(count + 1) / until, real_type())
     return xp.where(xp.arange(count + 1) == until, end, found)  # this one without round-off
 
 
@@ -245,7 +245,7 @@ def _checked_number(where: str, name: str, value, is_one: bool) -> "Float[Array,
     if isinstance(value, Estimate):
         _check_estimate(where, name, value)
         return value
-    number = checked_real(value, where, () if name in OF_TIME or is_one else None, advice="give a number, or an `Estimate`").astype(jnp.result_type(float))
+    number = checked_real(value, where, () if name in OF_TIME or is_one else None, advice="give a number, or an `Estimate`").astype(real_type())
     if not holds(np.isfinite, number):
         raise ValueError(f"{where} is {number}, expected a finite number")
     if name in OF_TIME and not holds(lambda x: x >= 0, number):
@@ -345,7 +345,7 @@ def response(owner: Sensor | Actuator) -> tuple[dict, tuple[str, ...], tuple[str
     given = {name: getattr(owner, name) for name in NUMBERS}
     unknown = tuple(name for name, value in given.items() if isinstance(value, Estimate))
     numbers = {name: value.guess if name in unknown else value for name, value in given.items()}
-    numbers = {name: array_module(x).asarray(x, jnp.result_type(float)) for name, x in numbers.items()}
+    numbers = {name: array_module(x).asarray(x, real_type()) for name, x in numbers.items()}
     return numbers, unknown, tuple(n for n, x in numbers.items() if n in unknown or holds(lambda x, n=n: np.any(x != NUMBERS[n]), x))
 
 

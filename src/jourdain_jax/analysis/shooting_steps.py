@@ -27,6 +27,7 @@ from jourdain_jax.analysis.levenberg_marquardt import Control, Linearised, Minim
 from jourdain_jax.analysis.piecewise import Piecewise
 from jourdain_jax.analysis.sensors import ideal
 from jourdain_jax.analysis.unknowns import Places, check_starts
+from jourdain_jax.calculus.reals import largest
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.projection import closure_residual
@@ -141,7 +142,7 @@ def _begun(problem: Piecewise, theta: np.ndarray) -> np.ndarray:
     local[:, problem.follows, problem.own :] = nodes[:, problem.follows]
     # sizes: how numbers differ from node to node, and change over a piece
     sizes = np.maximum(np.std(nodes, axis=(0, 1)), np.sqrt(np.mean(changes**2, axis=(0, 1))))
-    sizes = np.maximum(sizes, 0.01 * np.max(np.abs(nodes), axis=(0, 1)))
+    sizes = np.maximum(sizes, 0.01 * largest(nodes, (0, 1)))
     least = np.where(of_y, sizes, np.where(of_q, np.max(sizes[of_q], initial=0.0), np.max(sizes[~of_q & ~of_y], initial=0.0)))
     problem.measure(np.where(least > 0, np.maximum(sizes, 1e-4 * least), 1.0))
     return guess

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import plain_row_lengths, usual_rows
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import Scalar, as_real, described, rank_cutoff
+from jourdain_jax.calculus.reals import Scalar, as_real, described, largest, rank_cutoff
 from jourdain_jax.dynamics.accelerations import reductions
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
@@ -84,7 +84,7 @@ def check(name: str, values: dict, dtype, note: str = "") -> Check:
 
 def along(f: Callable, arguments, point, direction, u) -> tuple:
     """Value and slope of `f(arguments, point)` along a direction, its values at -2h, -h, h and 2h, and h, which goes with the speeds `u`."""
-    h = (2e-2 if u.dtype == jnp.float32 else 1e-3) / (1 + float(np.max(np.abs(u), initial=0.0)))
+    h = (2e-2 if u.dtype == jnp.float32 else 1e-3) / (1 + float(largest(u)))
     ends = [_value(f, arguments, jax.tree.map(lambda x, d, k=k: x + k * h * d, point, direction)) for k in (-2, -1, 1, 2)]
     return *_pushed(f, arguments, point, direction), ends, h
 
@@ -170,7 +170,7 @@ def derivative_exists(scene: Scene, t, q, u, direction: Scene, dq, inputs=None) 
         return True
     P = np.asarray(pseudo_inverse(jnp.asarray(A)))
     split = (np.eye(len(A)) - A @ P) @ dA @ (np.eye(A.shape[1]) - P @ A)
-    return bool(np.max(np.abs(split)) <= 1e3 * rank_cutoff(A.dtype) * (size + np.max(np.abs(dA))))
+    return bool(largest(split) <= 1e3 * rank_cutoff(A.dtype) * (size + largest(dA)))
 
 
 @eval_numpy
@@ -265,13 +265,13 @@ def _inertia(motion: Motion) -> dict[str, Scalar]:
         values[f"body `{name}`: its mass is negative"] = jnp.maximum(-body.mass, 0.0) / jnp.maximum(jnp.abs(body.mass), jnp.finfo(body.mass.dtype).tiny)
         if not isinstance(body, RigidBody):
             continue
-        size = jnp.max(jnp.abs(body.inertia)) + jnp.finfo(body.inertia.dtype).tiny
+        size = largest(body.inertia) + jnp.finfo(body.inertia.dtype).tiny
         moments = jnp.linalg.eigvalsh((body.inertia + body.inertia.T) / 2)
-        values[f"body `{name}`: its inertia is not symmetric"] = jnp.max(jnp.abs(body.inertia - body.inertia.T)) / size
+        values[f"body `{name}`: its inertia is not symmetric"] = largest(body.inertia - body.inertia.T) / size
         values[f"body `{name}`: a principal moment of inertia is negative"] = jnp.maximum(-moments[0], 0.0) / size
         excess = jnp.where(moments[0] >= 0, jnp.maximum(moments[2] - moments[0] - moments[1], 0.0), 0.0)
         values[f"body `{name}`: a principal moment of inertia exceeds the sum of the other two"] = excess / size
-        values[f"body `{name}`: its orientation is no rotation matrix"] = jnp.max(jnp.abs(body.orientation.T @ body.orientation - jnp.eye(3)))
+        values[f"body `{name}`: its orientation is no rotation matrix"] = largest(body.orientation.T @ body.orientation - jnp.eye(3))
     return values
 
 
@@ -298,8 +298,8 @@ def _potentials(scene: Scene, motion: Motion, Z) -> dict[str, Scalar]:
         total = resultants(scene, motion, loads=(loads[i],))
         # Q = beta' F + gamma' L + Q_direct
         Q = jnp.einsum("bik,bi->k", partial.linear, total.force) + jnp.einsum("bik,bji,bj->k", partial.angular, turned, total.torque) + total.direct
-        size = jnp.max(jnp.abs(Q)) + jnp.max(jnp.abs(slope)) + jnp.finfo(q.dtype).tiny
-        values[f"{_name(i, loads[i])}: its potential does not give its force"] = jnp.max(jnp.abs(Z.T @ (Q + slope)), initial=0.0) / size
+        size = largest(Q) + largest(slope) + jnp.finfo(q.dtype).tiny
+        values[f"{_name(i, loads[i])}: its potential does not give its force"] = largest(Z.T @ (Q + slope)) / size
     return values
 
 
@@ -343,7 +343,7 @@ def _derivatives(scene: Scene, t, q, u, inputs, seed: int) -> Check:
         f, slope, ends = np.asarray(value[name]), np.asarray(change[name]), [np.asarray(x[name]) for x in around]
         # 2 s(h) - s(2h) with s(h) = (f(h) - 2 f(0) + f(-h))/h: of third order where f is smooth, the jump of the slope at a kink
         kink = (2 * (ends[1] + ends[2]) - 4 * f) / h - (ends[0] + ends[3] - 2 * f) / (2 * h)
-        size = np.max(np.abs(f), initial=0.0) + np.max(np.abs(slope), initial=0.0) + floor
+        size = largest(f) + largest(slope) + floor
         # a kink is a jump of order one, and its estimate is of lower order than the difference
         error = np.maximum(np.abs(slope - central_difference(ends, h)), 1e-3 * np.abs(kink))
         values[f"{name}: its derivative"] = np.max(error, initial=0.0) / size

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.analysis.families.equations import sizes
 from jourdain_jax.analysis.instant import ByMatrices, ByProgram, instant_of, on_rows, places_of, unseen
 from jourdain_jax.analysis.tangent import privileged_speeds
-from jourdain_jax.calculus.reals import RUN_SELDOM, Flag, Number, Numbers, Scalar, compiled, described
+from jourdain_jax.calculus.reals import RUN_SELDOM, Flag, Number, Numbers, Scalar, compiled, described, largest, real_type
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State
@@ -109,7 +109,7 @@ def guessed(scene: Scene, guess, t0) -> tuple[Array, Array, Array]:
     if not isinstance(guess, Mapping):
         raise ValueError(f"`guess` is {described(guess)}, expected a State or a dictionary of named values; those not named start from zero")
     q, u, _ = scene.named(**guess)
-    return jnp.asarray(t0, jnp.result_type(float)), q, u
+    return jnp.asarray(t0, real_type()), q, u
 
 
 def _check_names(scene: Scene, given: tuple[str, ...], valid: tuple[str, ...]) -> None:
@@ -143,9 +143,9 @@ def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], most_steps: i
     z = _root(problem, jnp.concatenate([q, u]), free, most_steps)
     left, _, second = problem(z)
     rows = len(left) - len(problem.privileged) - len(problem.resting)
-    of_rows, first, second = (jnp.max(jnp.abs(x), initial=0.0) for x in (left[:rows], left[rows : rows + len(problem.privileged)], second))
+    of_rows, first, second = (largest(x) for x in (left[:rows], left[rows : rows + len(problem.privileged)], second))
     n = len(q)
-    moved_q, moved_u = (jnp.max(jnp.abs(a - b), initial=0.0) for a, b in ((z[:n], q), (z[n:], u)))
+    moved_q, moved_u = (largest(a - b) for a, b in ((z[:n], q), (z[n:], u)))
     residual = jnp.maximum(of_rows, jnp.maximum(first, second))
     state = State(problem.t, z[:n], z[n:], moved_q, moved_u, of_rows, (problem.scene.coordinate_names, problem.scene.speed_names))
     return SteadyMotion(state, first, residual, residual < _round_off_root(z.dtype))

@@ -22,7 +22,7 @@ from jourdain_jax.analysis.statements import Verification, by_reduction, check, 
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import plain_row_lengths, structure_of, usual_rows
 from jourdain_jax.calculus.matrices import null_space_svd
-from jourdain_jax.calculus.reals import Numbers, Speeds
+from jourdain_jax.calculus.reals import Numbers, Speeds, largest
 from jourdain_jax.dynamics.accelerations import diagnosed, reductions
 from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.dynamics.power import power
@@ -129,14 +129,14 @@ def _gyroscopic(scene, t, q, u, partial) -> Speeds:
     """Size of the inertia forces that may cancel inside `h`: of `m v omega` and `omega I omega`. What is left of them is round-off of this size."""
     weights, known = inertias(scene, t, q), velocities(scene, t, q, u)
     v, w = (jnp.linalg.norm(x, axis=1) for x in (known.linear, known.angular))
-    force, torque = weights.mass * v * w, jnp.max(jnp.abs(weights.inertia), axis=(1, 2)) * w**2
+    force, torque = weights.mass * v * w, largest(weights.inertia, (1, 2)) * w**2
     return jnp.einsum("bik,b->k", jnp.abs(partial.linear), force) + jnp.einsum("bik,b->k", jnp.abs(partial.angular), torque)
 
 
 def _size(found: dict, *others) -> float:
     """What differences of forces are relative to: the forces at hand, impressed and inertial ones among them."""
     forces = (found["impressed"], found["gyroscopic"], *others)
-    return sum(np.max(np.abs(force)) for force in forces) + np.finfo(found["M"].dtype).tiny
+    return sum(largest(force) for force in forces) + np.finfo(found["M"].dtype).tiny
 
 
 def _comparisons(scene: Scene, found: dict, applicable: list[str]) -> dict[str, dict[str, float]]:
@@ -147,19 +147,15 @@ def _comparisons(scene: Scene, found: dict, applicable: list[str]) -> dict[str, 
     newton = {"rows: their reactions do not add up to the constraint force": found["rows"]}
     if not _acts_on_speeds(scene):
         newton["bodies: m a - F does not add up to the constraint force"] = found["newton"]
-    of_h, of_newton = 1 + np.max(np.abs(found["h"])), _size(found, found["newton"])
+    of_h, of_newton = 1 + largest(found["h"]), _size(found, found["newton"])
     energy = np.abs(found["energy_rate"] - found["power"]) / (np.finfo(found["M"].dtype).tiny + found["power_scale"])
     return {
         "reductions": _reductions(found, applicable),
-        "forms": {f"form `{name}`": np.max([_largest(M - found["M"]), _largest(h - found["h"]) / of_h]) for name, (M, h) in found["forms"].items()},
-        "virtual power": {suspect: _largest(found["Z"].T @ force) / size for suspect, force in virtual.items()},
-        "Newton": {suspect: _largest(forces.sum(0) - found["reference"]) / of_newton for suspect, forces in newton.items()},
+        "forms": {f"form `{name}`": np.max([largest(M - found["M"]), largest(h - found["h"]) / of_h]) for name, (M, h) in found["forms"].items()},
+        "virtual power": {suspect: largest(found["Z"].T @ force) / size for suspect, force in virtual.items()},
+        "Newton": {suspect: largest(forces.sum(0) - found["reference"]) / of_newton for suspect, forces in newton.items()},
         "energy": {"a load whose potential does not give its force, or a row whose power is not counted": energy},
     }
-
-
-def _largest(x: np.ndarray) -> float:
-    return float(np.max(np.abs(x), initial=0.0))
 
 
 def _reductions(found: dict, applicable: list[str]) -> dict[str, float]:
@@ -170,7 +166,7 @@ def _reductions(found: dict, applicable: list[str]) -> dict[str, float]:
         # against the median of all: one wrong way does not make the others look wrong
         middle = np.median(np.stack([found[quantity][name] for name in applicable]), axis=0)
         size = _size(found, middle)
-        differences = {name: np.max([known, _largest(found[quantity][name] - middle) / size]) for name, known in differences.items()}
+        differences = {name: np.max([known, largest(found[quantity][name] - middle) / size]) for name, known in differences.items()}
     return {f"reduction `{name}`": value for name, value in differences.items()}
 
 

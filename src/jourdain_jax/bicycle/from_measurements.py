@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, shipped_measurements
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, doubts, violations
 from jourdain_jax.bicycle.readings import Readings, read_readings
-from jourdain_jax.calculus.reals import RUN_SELDOM, Scalar, compiled
+from jourdain_jax.calculus.reals import RUN_SELDOM, Scalar, compiled, real_type
 from jourdain_jax.scene.names import check_name
 
 PerHanging = Float[Array, "hangings"]
@@ -49,7 +49,7 @@ def benchmark_from_measurements(path: str | Path) -> MeasuredBicycle:
         check_name(path, known, f"there are no measurements of a bicycle `{path}`, and no such file")
         path = known[path]
     readings = read_readings(path)
-    means = {name: jnp.asarray(value, jnp.result_type(float)) for name, value in readings.means.items()}
+    means = {name: jnp.asarray(value, real_type()) for name, value in readings.means.items()}
     found, slopes = _with_slopes(means, tuple(readings.hangings.items()), readings.by_table)
     sigmas = np.array([readings.sigmas[name] for name in readings.means])
     jacobian = np.array([slopes[name] for name in (*PARAMETER_NAMES, *_misses(readings))]) * sigmas

@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Float
 
+from jourdain_jax.calculus.reals import largest
 from jourdain_jax.calculus.roots import Look, nearest_root
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.scene.scene import Scene
@@ -50,8 +51,8 @@ def assemble(look: Look, pattern: Pattern, q: np.ndarray, low: np.ndarray, high:
         """Configurations with their last corrections, judged."""
         residual, G = look(q, every)
         with np.errstate(invalid="ignore"):
-            position_error = np.max(np.abs(residual), axis=1, initial=0.0)
-            size = np.maximum(pattern.lengths(G), typical) * (1 + np.max(np.abs(q), axis=1, initial=0.0, keepdims=True))
+            position_error = largest(residual, 1)
+            size = np.maximum(pattern.lengths(G), typical) * (1 + largest(q, 1, keepdims=True))
             # on the rows: residuals of 1e4 units of round-off of what a row changes by when a coordinate changes by its own size, coordinates at rest
             arrived = np.all(np.abs(residual) <= 1e4 * np.finfo(float).eps * size, axis=1) & (shift <= 1e-7)
             outside = np.max(np.maximum(np.maximum(low - q, q - high), 0.0) / width, axis=1, initial=0.0)

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Flag, Scalar
+from jourdain_jax.calculus.reals import Flag, Scalar, largest
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import motion_at, pose_at
 from jourdain_jax.scene.bodies import RigidBody
@@ -103,7 +103,7 @@ class Check:
 
 
 def _size(x):
-    return abs(x).max((-2, -1))
+    return largest(x, (-2, -1))
 
 
 def _lopsided(x):

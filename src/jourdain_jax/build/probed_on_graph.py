@@ -12,14 +12,13 @@ from functools import partial
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.build.assembling import Assembled, assemble, coordinate_bounds, speed_scales, typical_lengths
 from jourdain_jax.build.plausibility import Numbers
 from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
-from jourdain_jax.calculus.reals import Entries
+from jourdain_jax.calculus.reals import Entries, real_type
 from jourdain_jax.calculus.roots import nearest_root, shortest
 from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.equations.virtual_power import mass_matrix
@@ -207,7 +206,7 @@ class _AtStates:
 
     def real(self, x: np.ndarray) -> np.ndarray:
         """Numbers in the precision that is in use; what is looked at is computed in double precision."""
-        return np.asarray(x, jnp.result_type(float))
+        return np.asarray(x, real_type())
 
     def _matrices(self, probes: Probes, entries: list[dict[int, int]], columns: list[int]) -> np.ndarray:
         """Matrices with these entries by row, with a leading axis of states."""

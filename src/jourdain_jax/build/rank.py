@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from jourdain_jax.build.assembling import speed_scales
 from jourdain_jax.build.probed_on_graph import Probed
-from jourdain_jax.calculus.reals import described, rank_cutoff
+from jourdain_jax.calculus.reals import described, largest, rank_cutoff
 from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.scene import Scene
 
@@ -57,7 +57,7 @@ def contradictions(
     U = U * (np.arange(U.shape[2]) < np.array(ranks)[:, None])[:, None]
     left = at_rest - (U @ (U.transpose(0, 2, 1) @ at_rest[..., None]))[..., 0]
     # numbers may be typed with a few digits, mistakes are larger
-    unmet = np.abs(left) > 1e-4 * np.max(np.abs(at_rest), axis=1, initial=0.0, keepdims=True)
+    unmet = np.abs(left) > 1e-4 * largest(at_rest, 1, keepdims=True)
     if not unmet.size or not unmet.any(axis=1).all():
         return ()
     wrong = [(name, s) for s, name in enumerate(names) if unmet[:, s].any()]
@@ -110,7 +110,7 @@ def _are_bounded(c: np.ndarray) -> bool:
     """Whether coefficients at many states are: none is large, nor far beyond its usual size with both signs, as tangents are."""
     usual = 3.0 * np.median(np.abs(c), axis=0) + np.sqrt(np.finfo(c.dtype).eps)
     poles = (np.max(c, axis=0, initial=0.0) > usual) & (np.min(c, axis=0, initial=0.0) < -usual)
-    return bool(np.all(np.abs(c) < 20.0) and not np.any(poles & (np.max(np.abs(c), axis=0, initial=0.0) > 2)))
+    return bool(np.all(np.abs(c) < 20.0) and not np.any(poles & (largest(c, 0) > 2)))
 
 
 def named_speeds(scene: Scene, names: str | Iterable[str], freedoms: int) -> tuple[int, ...]:

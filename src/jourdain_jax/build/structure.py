@@ -19,7 +19,7 @@ from jourdain_jax.build.probed_on_graph import TIMED, Probed, follow_from_others
 from jourdain_jax.build.rank import Scaled, best_privileged, contradictions, named_speeds, pivots_at, ranks_of, redundant_rows, scaled_states, worst_pivot
 from jourdain_jax.build.sampling import drawn_states, no_numbers, symmetric_configurations, usable_states
 from jourdain_jax.build.smoothness import kinks
-from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.calculus.reals import is_traced, largest
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.rows import UsualRows
 from jourdain_jax.program.graph import Unsupported
@@ -127,7 +127,7 @@ def _exceeds(difference: np.ndarray, tolerance: float, size: np.ndarray) -> bool
 
 def _sizes(found: Probed) -> np.ndarray:
     """The largest entry of every row, at every state."""
-    return np.max(np.abs(found.A), axis=2, initial=0.0)
+    return largest(found.A, 2)
 
 
 def _look(scene: Scene, t, q, u, u_other, generic) -> Probed:

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Num, PyTree
 
 from jourdain_jax.build.plausibility import Numbers, numbers_of
 from jourdain_jax.calculus.jaxprs import needed_only
-from jourdain_jax.calculus.reals import Entries, Scalar, is_traced
+from jourdain_jax.calculus.reals import Entries, Scalar, is_traced, real_type
 from jourdain_jax.equations.kinematics import coordinate_rates, inertias_of, motion_at, pose_at, velocities_of
 from jourdain_jax.equations.listed import names_of_bodies, names_of_position_rows
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
@@ -170,7 +170,7 @@ def jaxpr_of_scene(scene: Scene, of_inputs: tuple[int, ...]):
     `of_inputs`: numbers of the loads whose potential depends on inputs. ValueError where a method reads what JAX is tracing elsewhere.
     """
     leaves, treedef = jax.tree.flatten(scene)
-    real = jnp.result_type(float)
+    real = real_type()
     state = [jax.ShapeDtypeStruct(shape, real) for shape in ((), (len(scene.coordinate_names),), (len(scene.speed_names),), (len(scene.inputs),))]
     numbers = [jax.ShapeDtypeStruct(np.shape(x), real) for x in leaves]
 

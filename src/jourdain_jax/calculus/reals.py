@@ -210,6 +210,11 @@ def known_numbers(x) -> np.ndarray:
     return np.zeros(0) if is_traced(x) else np.asarray(x)
 
 
+def largest(x, axis: int | tuple[int, ...] | None = None, keepdims: bool = False):
+    """Return the largest magnitude in an array, of JAX or of NumPy, or along axes of it; zero where it is empty."""
+    return abs(x).max(axis, keepdims=keepdims, initial=0.0)
+
+
 def array_module(x) -> ModuleType:
     """Return `jax.numpy` where something in `x` is traced, otherwise NumPy."""
     return jnp if is_traced(x) else np

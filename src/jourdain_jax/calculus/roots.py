@@ -29,7 +29,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import Count, Flag, Scalar, with_usual_promotion
+from jourdain_jax.calculus.reals import Count, Flag, Scalar, largest, with_usual_promotion
 
 
 class Root(eqx.Module):
@@ -97,7 +97,7 @@ class Search(eqx.Module):
     @property
     def left(self) -> Scalar:
         """The largest of the rows at the best point."""
-        left = jnp.max(jnp.abs(self.f), initial=0.0)
+        left = largest(self.f)
         return jnp.where(jnp.isfinite(left), left, jnp.inf)
 
 
@@ -121,9 +121,9 @@ def damped_search(
         damping = jnp.clip(jnp.where(better, search.damping / 6, search.damping * 5), 1e-14, 1e8)
         step = -J.T @ jnp.linalg.solve(J @ J.T + damping * jnp.eye(f.shape[0], dtype=f.dtype), f)
         # at most a quarter of the size of the unknowns in one step
-        step = step * jnp.minimum(1.0, 0.25 / jnp.maximum(jnp.max(jnp.abs(step), initial=0.0), jnp.finfo(f.dtype).tiny))
+        step = step * jnp.minimum(1.0, 0.25 / jnp.maximum(largest(step), jnp.finfo(f.dtype).tiny))
         # a damping of 1e7: no step makes the rows smaller
-        going = (jnp.max(jnp.abs(f), initial=0.0) > tolerance) & (damping < 1e7) & (search.steps < most_steps) & jnp.all(jnp.isfinite(f))
+        going = (largest(f) > tolerance) & (damping < 1e7) & (search.steps < most_steps) & jnp.all(jnp.isfinite(f))
         return Search(jnp.clip(best + size * step, low, high), best, f, J, damping, search.steps + 1, going)
 
     f, J = jax.eval_shape(look, guess)
@@ -242,13 +242,13 @@ def nearest_root(
     for _ in range(most):
         g, G = look(x[moving], moving)
         step = solve(G, g)
-        size = np.max(np.abs(step), axis=1, initial=0.0)
+        size = largest(step, 1)
         moves = np.isfinite(size)
         last[moving[~moves]] = np.inf
         step, size, moving = step[moves], size[moves], moving[moves]
         shorter = np.maximum(1.0, np.max(np.abs(step) / longest, axis=1, keepdims=True, initial=0.0))
         x[moving] = np.clip(x[moving] - step / shorter, *within)
-        last[moving] = size / (1 + np.max(np.abs(x[moving]), axis=1, initial=0.0))
+        last[moving] = size / (1 + largest(x[moving], 1))
         moving = moving[last[moving] > 4 * np.finfo(float).eps]
         if not moving.size:
             break

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jourdain_jax.calculus.reals import largest
 from jourdain_jax.calculus.roots import shortest
 
 
@@ -57,7 +58,7 @@ class Pattern:
         with np.errstate(invalid="ignore", over="ignore"):
             found = self.transposed_times(scaled, self.solved(scaled, right_scaled))
             left = _summed(self.rows, self.shape[0], scaled * found[:, self.columns]) - right_scaled
-            others = ~(np.max(np.abs(left), axis=1) <= 1e-8 * np.max(np.abs(right_scaled), axis=1))
+            others = ~(largest(left, 1) <= 1e-8 * largest(right_scaled, 1))
         if others.any():
             found[others] = shortest(self.dense(values[others]), right[others], typical)
         return found

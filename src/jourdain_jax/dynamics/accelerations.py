@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import structure_of, usual_rows
 from jourdain_jax.calculus.matrices import numerical_rank, pseudo_inverse, singular_values
-from jourdain_jax.calculus.reals import Count, Flag, Scalar, Speeds, checked_real, described
+from jourdain_jax.calculus.reals import Count, Flag, Scalar, Speeds, checked_real, described, largest
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.reductions import (
@@ -139,7 +139,7 @@ def diagnosed(found: Reduced, equations: UnconstrainedEquations, rows: Constrain
         constraint_force=found.constraint_force,
         rank=numerical_rank(sigma),
         smallest_singular_value=jax.lax.stop_gradient(jnp.minimum(found.pivot, smallest_that_counts(sigma, rows.usual))),
-        residual=jnp.max(jnp.abs(problem.d * (rows.A @ found.udot + rows.drift)), initial=0.0),
+        residual=largest(problem.d * (rows.A @ found.udot + rows.drift)),
         applicable=found.applicable & jnp.all(jnp.isfinite(found.udot)),
     )
 

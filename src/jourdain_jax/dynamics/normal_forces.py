@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import rank_cutoff
+from jourdain_jax.calculus.reals import largest, rank_cutoff
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.names import nearest
 
@@ -70,7 +70,7 @@ def _of_support(names: list[str], contacts, carried, bodies, positions, hidden: 
     first = pseudo_inverse(by_force)
     left = jnp.eye(len(points)) - first @ by_force  # what the forces leave open
     turning = by_moment @ left
-    turning = jnp.where(jnp.max(jnp.abs(turning)) > rank_cutoff(turning.dtype), turning, 0.0)
+    turning = jnp.where(largest(turning) > rank_cutoff(turning.dtype), turning, 0.0)
     second = pseudo_inverse(turning)
     open_still = left - second @ turning
 
@@ -79,8 +79,8 @@ def _of_support(names: list[str], contacts, carried, bodies, positions, hidden: 
         return N + second @ (m / length - by_moment @ N)
 
     N = solved(forces, moments)
-    missed = jnp.max(jnp.abs(by_force @ N - forces)), jnp.max(jnp.abs(by_moment @ N - moments / length))
-    met = (missed[0] <= tolerance * size) & (missed[1] <= tolerance * (size + jnp.max(jnp.abs(hidden.torque)) / length))
+    missed = largest(by_force @ N - forces), largest(by_moment @ N - moments / length)
+    met = (missed[0] <= tolerance * size) & (missed[1] <= tolerance * (size + largest(hidden.torque) / length))
     by_forces_alone, by_both = jnp.abs(jnp.diagonal(left)) <= tolerance, jnp.abs(jnp.diagonal(open_still)) <= tolerance
     determined = jax.lax.stop_gradient((by_forces_alone | (by_both & met)) & _unmoved(jax.vmap(solved)(*wrenches[1]), spare, tolerance))
     return {name: (N[i], determined[i]) for i, name in enumerate(names)}
@@ -95,8 +95,8 @@ def _resultant(wrench: Wrenches, positions, sets: tuple[tuple[int, ...], ...], h
 
 def _unmoved(changes: Float[Array, "rows contacts"], spare: Wrenches, tolerance) -> Bool[Array, "contacts"]:
     """Which normal forces do not depend on multipliers that the motion leaves open."""
-    size = jnp.maximum(jnp.max(jnp.abs(spare.force), initial=0.0), jnp.max(jnp.abs(spare.torque), initial=0.0))
-    return jnp.max(jnp.abs(changes), axis=0, initial=0.0) <= tolerance * size
+    size = jnp.maximum(largest(spare.force), largest(spare.torque))
+    return largest(changes, 0) <= tolerance * size
 
 
 def _carried(contact: Contact, name: str, bodies: tuple[str, ...]) -> tuple[int, ...]:

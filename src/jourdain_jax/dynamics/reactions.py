@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.structure import plain_row_lengths
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import Flag, Scalar, rank_cutoff
+from jourdain_jax.calculus.reals import Flag, Scalar, largest, rank_cutoff
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.dynamics.normal_forces import Wrenches, normal_forces
@@ -161,9 +161,9 @@ def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=N
 
 def _size_of_forces(scene: Scene, motion: Motion, total) -> Scalar:
     """Size of the forces at hand (N): of `m a - F`, of F and of `m |v| |omega|` on the bodies."""
-    size = jnp.max(jnp.abs(total)) + jnp.max(jnp.abs(resultants(scene, motion).force))
+    size = largest(total) + largest(resultants(scene, motion).force)
     for body in motion.bodies.values():
-        size = size + body.mass * jnp.max(jnp.abs(body.velocity)) * jnp.max(jnp.abs(body.angular_velocity))
+        size = size + body.mass * largest(body.velocity) * largest(body.angular_velocity)
     return jax.lax.stop_gradient(size)
 
 

@@ -18,11 +18,11 @@ from platform import python_version
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
 from jourdain_jax.calculus.on_first_use import version_of
+from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.ensembles import memory
 from jourdain_jax.ensembles.statistics import Grid, Tally
 from jourdain_jax.ensembles.store import Store
@@ -177,7 +177,7 @@ def attributes(task: Task) -> dict:
         "seed": int(task.design.seed),
         "samples": len(task.design),
         "options": {name: _as_text(x) for name, x in task.settled.items()},
-        "precision": str(jnp.result_type(float)),
+        "precision": str(real_type()),
         "versions": versions(),
         "command": " ".join(sys.argv),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from jourdain_jax.calculus.reals import largest
 from jourdain_jax.importers.formulas import sympy_package
 from jourdain_jax.importers.sympy_samples import sampled
 from jourdain_jax.importers.sympy_system import MechanicalSystem
@@ -124,7 +125,7 @@ def _constant(system: MechanicalSystem, matrix, what: str):
     still = matrix.xreplace(dict.fromkeys([*matrix.atoms(sympy.core.function.AppliedUndef), system.time], sympy.S.Zero))
     for sample in sampled(system, {what: matrix, f"{what}, at zero": still}):
         moving, zero = (sample.values[name] for name in (what, f"{what}, at zero"))
-        if np.max(np.abs(moving - zero)) > _SAME * np.max(np.abs(zero)):
+        if largest(moving - zero) > _SAME * largest(zero):
             raise ValueError(f"the {what} changes in time, so that it is no rigid body; state it in the frame of the body")
     return still
 
@@ -138,7 +139,7 @@ def _check_angular_velocity(system: MechanicalSystem, pose: Pose) -> None:
     for sample in sampled(system, lists):
         S = sample.rates[name].reshape(3, 3) @ sample.values[name].reshape(3, 3).T
         omega = np.array([S[2, 1], S[0, 2], S[1, 0]])
-        if np.max(np.abs(omega - sample.values[stated])) > _SAME * (1.0 + np.max(np.abs(omega))):
+        if largest(omega - sample.values[stated]) > _SAME * (1.0 + largest(omega)):
             raise ValueError(
                 f"frame `{pose.frame.name}` has another angular velocity than its orientation changes by; "
                 "check the kinematic equations, or state the angular velocity by `orient_axis` and its like alone"
@@ -156,7 +157,7 @@ def _moved(system: MechanicalSystem, poses: list[Pose]) -> tuple[MechanicalSyste
     for place, speed in zip(places, speeds, strict=True):
         velocities = np.array([sample.values[speed] for sample in samples])
         difference = velocities - np.array([sample.rates[place] for sample in samples])
-        missing.append(np.where(np.abs(difference) > _SAME * (1.0 + np.max(np.abs(velocities))), difference, 0.0))
+        missing.append(np.where(np.abs(difference) > _SAME * (1.0 + largest(velocities)), difference, 0.0))
     leaders = [next(j for j in range(k + 1) if np.allclose(missing[j], missing[k], atol=_SAME)) for k in range(len(poses))]
     taken = {str(x.func) for x in (*system.coordinates, *system.speeds)}
     added: dict[Any, Any] = {}

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.calculus.reals import Scalar, checked_real, described
+from jourdain_jax.calculus.reals import Scalar, checked_real, described, largest, real_type
 from jourdain_jax.importers.formulas import Formulas, sympy_package
 from jourdain_jax.importers.scene_class import identifiers, scene_class
 from jourdain_jax.importers.sympy_kinematics import Pose, poses_of
@@ -38,7 +38,7 @@ class _Expressions:
         leaves = {self.time: t} | {constant: getattr(scene, name) for constant, name in self.fields.items()}
         for symbols, named in zip((self.q, self.u, self.inputs), (q, *others), strict=False):
             leaves |= {symbol: named.array[k] for k, symbol in enumerate(symbols)}
-        dtype = jnp.result_type(float)
+        dtype = real_type()
         return {key: [jnp.asarray(value, dtype) for value in values] for key, values in self.formulas[part].values(leaves).items()}
 
 
@@ -207,7 +207,7 @@ def velocity_rows(system: MechanicalSystem) -> list[Any]:
         given, implied = (affine(lambda at, name=name: formulas.numbers(at)[name], sample.leaves, system.speeds) for name in both)  # type: ignore[misc]
         left = given - given @ np.linalg.pinv(implied) @ implied
         # of a row: what of it the geometric rows leave, relative
-        kept |= np.max(np.abs(left), axis=1) > 1e-9 * np.max(np.abs(given), axis=1)
+        kept |= largest(left, 1) > 1e-9 * largest(given, 1)
     return [row for row, keep in zip(rows, kept, strict=True) if keep]
 
 

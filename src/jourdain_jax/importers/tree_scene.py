@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Matrix3, Vector3
+from jourdain_jax.calculus.reals import Matrix3, Vector3, real_type
 from jourdain_jax.calculus.rotations import quaternion_to_matrix
 from jourdain_jax.importers.placing import combined, cross_matrix, onto_axis
 from jourdain_jax.importers.scene_class import identifiers, scene_class
@@ -129,7 +129,7 @@ class TreeScene(Scene):
 
 
 def _array(x) -> Float[Array, "*shape"]:
-    return jnp.asarray(x, jnp.result_type(float))
+    return jnp.asarray(x, real_type())
 
 
 def parts_of(joint: Joint, name: str) -> tuple[str | Quaternion, ...]:

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.build.structure import Structure
+from jourdain_jax.calculus.reals import largest, real_type
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations
 from jourdain_jax.lowering.dense_rates import dense_rates
 from jourdain_jax.lowering.elimination import pivots_ok
@@ -35,9 +36,9 @@ def agree(values: np.ndarray, expected: np.ndarray) -> bool:
 
 def _sizes(rates: np.ndarray) -> np.ndarray:
     """To which the errors of rates (first axis) at probes are related: the usual size of each, in its own unit."""
-    usual = np.max(np.abs(rates), axis=1, keepdims=True, initial=0.0)
+    usual = largest(rates, 1, keepdims=True)
     # 0.01 of these, relative to the largest rate at a probe, whose round-off elimination spreads over all
-    return usual + 0.01 * np.max(np.abs(rates), axis=0, initial=0.0) + np.finfo(float).tiny
+    return usual + 0.01 * largest(rates, 0) + np.finfo(float).tiny
 
 
 def enough(usable: np.ndarray) -> bool:
@@ -70,7 +71,7 @@ def check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGra
     if not enough(usable):
         raise NotLowered("its scalar program serves at too few of the probed states")
     # between the program (in double precision) and the dense path at the probes, relative to the size of each rate
-    limit = 1e-8 if jnp.result_type(float) == jnp.float64 else 1e-3
+    limit = 1e-8 if real_type() == jnp.float64 else 1e-3
     if np.max(error) > limit:
         worst = names[int(np.argmax(error))]
         raise NotLowered(f"the rate of `{worst}` {DIFFERS} by {np.max(error):.1e}; {LIKELY}")

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 
 from jourdain_jax.build.trace import TracedScene
+from jourdain_jax.calculus.reals import largest
 from jourdain_jax.lowering.pivots import turns
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.onto_rows import onto_rows
@@ -37,7 +38,7 @@ def _at_full_turns(probes: Probes, traced: TracedScene) -> Probes:
     for name in sorted({str(graph.value[graph.args[n][0]]) for n in range(len(graph.op)) if turns(graph, n)}):
         inputs[name] = inputs[name] + generator.uniform(-np.pi, np.pi, count)
     found = onto_rows(probes.with_inputs(inputs), traced.closures, {f"q_{i}": n for i, n in enumerate(coordinates)}, most=12)
-    off = ~(np.max(np.abs(found.probes(traced.closures)), axis=0, initial=0.0) <= 1e-9)  # also where Gauss-Newton does not converge
+    off = ~(largest(found.probes(traced.closures), 0) <= 1e-9)  # also where Gauss-Newton does not converge
     return found.probes.with_inputs({name: np.where(off, np.nan, found.probes.inputs[name]) for name in found.moved})
 
 

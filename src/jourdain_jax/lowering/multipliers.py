@@ -15,10 +15,9 @@ Where M is singular, though no admissible velocity is without inertia, M + A' W 
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.calculus.reals import undecided
+from jourdain_jax.calculus.reals import largest, real_type, undecided
 from jourdain_jax.lowering.elimination import quotient, solve_symmetric
 from jourdain_jax.program.derivative import matrix
 from jourdain_jax.program.evaluate import Probes
@@ -56,7 +55,7 @@ def accelerations_by_multipliers(
     left = [(r, pivot) for r, pivot in enumerate(solved.pivots) if graph.varies[pivot]]
     sines = [graph.call("sqrt", graph.call("max", graph.zero, graph.div(pivot, S[r][r]))) for r, pivot in left]
     # sine, or length of a row beside that at the probed state: below it round-off decides how a motion goes on, and the program does not serve
-    least = graph.const(undecided(jnp.result_type(float)) ** 2)
+    least = graph.const(undecided(real_type()) ** 2)
     sizes = [graph.call("max", S[r][r], probes.in_the_middle(S[r][r])) for r, _ in left]
     margins = [graph.sub(pivot, graph.mul(least, size)) for (_, pivot), size in zip(left, sizes, strict=True)]
     if affine:
@@ -68,7 +67,7 @@ def accelerations_by_multipliers(
 def with_inertia_of_rows(graph: Graph, M: Columns, A: Columns, probes: Probes) -> Columns:
     """`M + A' W A`, positive definite where M is for the velocities that the rows admit; the inertia that is added is of the size of M's own."""
     made, speeds = [list(row) for row in M], range(len(M))
-    heavy = np.nanmedian(np.max(np.abs(probes([row[i] for i, row in enumerate(M)])), axis=0))
+    heavy = np.nanmedian(largest(probes([row[i] for i, row in enumerate(M)]), 0))
     for row in A:
         size = np.nanmedian(np.sum(probes(row) ** 2, axis=0))
         w = float(2.0 ** np.round(np.log2(heavy / size))) if size > 0 else 1.0

@@ -18,6 +18,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
+from jourdain_jax.calculus.reals import largest
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.polynomial import NormalForms
@@ -181,7 +182,7 @@ class Pivots:
     def _size(self, row: int) -> np.ndarray:
         """The size of what a row was made of, at all probes."""
         if row not in self._sizes:
-            self._sizes[row] = np.max(np.abs(self._at(self.A[row])), axis=0)
+            self._sizes[row] = largest(self._at(self.A[row]), 0)
         return self._sizes[row]
 
     def _sizes_at(self, places, count: int | None = None) -> np.ndarray | None:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector3
+from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector3, real_type
 from jourdain_jax.calculus.rotations import rot_x, rot_y, rot_z
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contacts import disc_contact
@@ -91,7 +91,7 @@ class WhippleBicycle(Scene):
 
     def upright(self, speed) -> dict[str, Scalar]:
         """Speeds of running straight and upright at `speed` (m/s), the steady motion of the linear model; all else is zero."""
-        speed = jnp.asarray(speed, jnp.result_type(float))
+        speed = jnp.asarray(speed, real_type())
         return {"x_rate": speed, "rear_spin_rate": speed / self.rR, "front_spin_rate": speed / self.rF}
 
     def bodies(self, t, q):

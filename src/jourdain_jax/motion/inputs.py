@@ -31,7 +31,7 @@ from jourdain_jax.build.probed_on_graph import looked_at
 from jourdain_jax.build.smoothness import SPEEDS_WOULD_JUMP
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.jumps import jumps
-from jourdain_jax.calculus.reals import PerLane, as_real, checked_unless_traced, compiled, described, in_default_precision, is_traced, real_type
+from jourdain_jax.calculus.reals import PerLane, as_real, checked_unless_traced, compiled, described, in_default_precision, is_traced, largest, real_type
 from jourdain_jax.eager.lanes import uncompiled_lanes
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.calls import description
@@ -321,7 +321,7 @@ def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> F
 def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
     """The knots at which steps must end: the straight lines between them are off by `share` of the range of values at most, at the other knots."""
     t, v, share = jax.lax.stop_gradient((sampled.ts, sampled.values, share))
-    allowed = jnp.maximum(share * (jnp.max(v) - jnp.min(v)), 16 * jnp.finfo(v.dtype).eps * jnp.max(jnp.abs(v)))
+    allowed = jnp.maximum(share * (jnp.max(v) - jnp.min(v)), 16 * jnp.finfo(v.dtype).eps * largest(v))
 
     def next_knot(carry, here):
         # lines from the anchor: to the knot before, and the slopes between which a line passes all knots since

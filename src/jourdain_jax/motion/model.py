@@ -8,12 +8,11 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 
 from jourdain_jax.build.probed_on_graph import coordinates_on_rows
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.build.structure import WELL_CONDITIONED, Reference, Structure, structure_of, structure_whatever_its_faults, trust
-from jourdain_jax.calculus.reals import passing_cutoff, undecided
+from jourdain_jax.calculus.reals import passing_cutoff, real_type, undecided
 from jourdain_jax.dynamics.accelerations import as_reduction
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.listed import names_of_events, names_of_invariants, names_of_position_rows
@@ -343,7 +342,7 @@ def _vector_field(model: Model, constant: bool, work: bool) -> VectorField:
     loses_rank = bool(names_of_position_rows(scene)) or not structure.affine
     branches = cutoff is not None and isinstance(reduction, NullSpaceQR) and loses_rank
     known = 1.0 if structure.affine else trust(scene)  # how far usual sizes are; where not, nonlinear rows count as long a thousand times longer
-    return FullByMatrices(**common, undecided=undecided(jnp.result_type(float)) / known if branches else None)
+    return FullByMatrices(**common, undecided=undecided(real_type()) / known if branches else None)
 
 
 def _program(scene: Scene, minimal: bool, backend: str, formulation: Formulation, dense: str) -> Lowered | None:
@@ -374,7 +373,7 @@ def _check(scene: Scene, structure: Structure, state, backend) -> None:
 
 def _cutoff(structure: Structure) -> float | None:
     """Where rows that are well conditioned at most states lose rank, motions pass more safely with a wider cut-off; None: round-off."""
-    return passing_cutoff(jnp.result_type(float)) if structure.typical_pivot >= WELL_CONDITIONED else None
+    return passing_cutoff(real_type()) if structure.typical_pivot >= WELL_CONDITIONED else None
 
 
 def _default_reduction(structure: Structure, independent: tuple[int, ...] | None, program: Lowered | None) -> Reduction:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from jourdain_jax.calculus.reals import largest
 from jourdain_jax.calculus.rotations import matrices_to_quaternions
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.grounds_drawn import grounds_of
@@ -153,7 +154,7 @@ def _whole_turns(quaternions: np.ndarray, velocities: np.ndarray, ts: np.ndarray
 
 def _still(values: np.ndarray) -> np.ndarray:
     """Values at all times; at one time where they stay what they are."""
-    return values[:1] if np.ptp(values, axis=0).max(initial=0.0) < 1e-12 * (1 + np.abs(values).max(initial=0.0)) else values
+    return values[:1] if np.ptp(values, axis=0).max(initial=0.0) < 1e-12 * (1 + largest(values)) else values
 
 
 def _at_rest(drawn: Drawn) -> bool:

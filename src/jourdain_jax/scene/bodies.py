@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector3, checked_real
+from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector3, checked_real, real_type
 
 _AXES = {"x": 0, "y": 1, "z": 2}
 
@@ -118,7 +118,7 @@ Body = Particle | RigidBody
 
 
 def _stack(values) -> Array:
-    return jnp.stack([jnp.asarray(v, jnp.result_type(float)) for v in values])
+    return jnp.stack([jnp.asarray(v, real_type()) for v in values])
 
 
 def _axis_index(axis: str) -> int:

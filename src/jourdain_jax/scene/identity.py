@@ -25,7 +25,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.calculus.reals import is_traced_type
+from jourdain_jax.calculus.reals import is_traced_type, largest
 from jourdain_jax.scene.names_read import StatefulError, functions_in, key_or_refusal, member_key, own_classes, spaces
 from jourdain_jax.scene.parameters import stacked_parameters
 
@@ -266,7 +266,7 @@ def _second_moments(I: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
 
 def _is_inertia(x: np.ndarray) -> bool:
     """Whether numbers can be a tensor of inertia, and are no rotation; within a hundredth, as published moments are."""
-    if x.shape != (3, 3) or not np.any(x) or np.any(np.abs(x - x.T) > 1e-9 * np.max(np.abs(x))) or np.allclose(x @ x.T, np.eye(3)):
+    if x.shape != (3, 3) or not np.any(x) or np.any(np.abs(x - x.T) > 1e-9 * largest(x)) or np.allclose(x @ x.T, np.eye(3)):
         return False
     return bool(np.linalg.eigvalsh(_second_moments(x))[0] >= -0.01 * np.trace(x))
 

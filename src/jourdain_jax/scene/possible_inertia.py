@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Matrix3, checked_real, known_numbers
+from jourdain_jax.calculus.reals import Matrix3, checked_real, known_numbers, largest
 
 
 def inertia_from_log_cholesky(numbers) -> Matrix3:
@@ -62,7 +62,7 @@ def log_cholesky(inertia, *, symmetric: bool = False) -> Float[Array, "numbers"]
 
 
 def _check(I: np.ndarray, S: np.ndarray, symmetric: bool) -> None:
-    size = np.max(np.abs(I))
+    size = largest(I)
     if not np.all(np.abs(I - I.T) <= 1e-9 * size):
         raise ValueError("`inertia` of `log_cholesky` is not symmetric; give Ixy = Iyx, Ixz = Izx, Iyz = Izy")
     if symmetric and max(abs(I[0, 1]), abs(I[1, 2])) > 1e-9 * size:

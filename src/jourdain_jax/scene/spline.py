@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import checked_real, known_numbers
+from jourdain_jax.calculus.reals import checked_real, known_numbers, real_type
 
 
 class Spline(eqx.Module):
@@ -43,7 +43,7 @@ class Spline(eqx.Module):
 
     def __call__(self, t):
         """Value at time t (s)."""
-        return smooth_through_samples(jnp.asarray(t, jnp.result_type(float)), self.ts, self.values)
+        return smooth_through_samples(jnp.asarray(t, real_type()), self.ts, self.values)
 
 
 def checked_samples(kind: str, ts, values, least: int, of: str) -> tuple[Float[Array, "samples"], Float[Array, "samples"]]:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.on_first_use import needed
-from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector, Vector3, checked_known, checked_positive, checked_real, described
+from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector, Vector3, checked_known, checked_positive, checked_real, described, real_type
 from jourdain_jax.scene.bodies import _axis_index, _stack
 from jourdain_jax.scene.grounds import tangents_of
 
@@ -155,7 +155,7 @@ class Visual(eqx.Module):
 
 
 def _lengths(value, what: str, shape=None) -> Float[Array, "*shape"]:
-    return checked_positive(value, what, shape).astype(jnp.result_type(float))
+    return checked_positive(value, what, shape).astype(real_type())
 
 
 def _about(axis: str, kind: str, sizes, **look: Unpack[Look]) -> Visual:
@@ -168,7 +168,7 @@ def _about(axis: str, kind: str, sizes, **look: Unpack[Look]) -> Visual:
 
 def shape(kind: str, size, *, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0, faces: Faces | None = None) -> Visual:
     """A shape of this kind; the other arguments as for all shapes."""
-    at = checked_real(at, f"place of a {kind}", (3,), advice="give three components in the body frame, m").astype(jnp.result_type(float))
+    at = checked_real(at, f"place of a {kind}", (3,), advice="give three components in the body frame, m").astype(real_type())
     turn = jnp.eye(3) if turn is None else checked_real(turn, f"turn of a {kind}", (3, 3), advice="give a rotation matrix")
     return _checked(Visual(kind, size, at, turn, None, faces, colour, opacity))
 

@@ -25,7 +25,7 @@ from jourdain_jax.analysis.families.special import SURE
 from jourdain_jax.analysis.families.spectrum import null_space
 from jourdain_jax.analysis.instant import ByProgram, Sloped, differentiable
 from jourdain_jax.analysis.table import complex_numbers, table
-from jourdain_jax.calculus.reals import RUN_SELDOM, compiled
+from jourdain_jax.calculus.reals import RUN_SELDOM, compiled, largest
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers, shown_from_users_lines
@@ -72,7 +72,7 @@ def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held
     equations = SteadyEquations(scene, (float(state.t), np.asarray(state.q), np.asarray(state.u)), np.asarray(f), None)
     z = equations.start
     look = equations(z)
-    if not np.max(np.abs(look.R), initial=0.0) < 1e-6:
+    if not largest(look.R) < 1e-6:
         raise ValueError(f"this motion of `{type(scene).__name__}` is not steady, and its eigenvalues have no derivatives; `jj.steady` finds one that is")
     fixed = _held(equations, look, as_names(held))
     (values, right), (same, left) = np.linalg.eig(look.F), np.linalg.eig(look.F.T)
@@ -262,7 +262,7 @@ def _found(special: _Special, scene: Scene) -> tuple[Array, Array, Array, Array]
 
         def corrected(new, _):
             change = special.correction(there, new, X)[0]
-            return new - change, jnp.max(jnp.abs(change))
+            return new - change, largest(change)
 
         new, (first, second, third) = jax.lax.scan(corrected, X, length=3)
         good = (first < 0.1) & (second <= 0.2 * first + 1e-9) & (third <= 0.2 * second + 1e-9)
@@ -271,7 +271,7 @@ def _found(special: _Special, scene: Scene) -> tuple[Array, Array, Array, Array]
     start = special.normal(special.X), jnp.zeros(()), jnp.ones(()), jnp.zeros((), jnp.int32)
     X, done, *_ = jax.lax.while_loop(lambda c: (c[1] < 1) & (c[2] > 1e-3) & (c[3] < 100), once, start)
     change, inverse, condition = special.correction(scene, X, X)
-    left = jnp.max(jnp.abs(special.equations_at(scene, X - change, X, sloped=False)[0]))
+    left = largest(special.equations_at(scene, X - change, X, sloped=False)[0])
     return X - change, inverse, condition, jnp.where((done == 1) & (left < 1e-8), jnp.where(condition < 1e-6, SINGULAR, FOUND), NOT_FOUND)
 
 
@@ -313,7 +313,7 @@ def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:
         names = ", ".join(sorted(set().union(*known.values())))
         raise ValueError(f"the family of `{type(curve.equations.scene).__name__}` has no such special point; it has: {names or 'none'}")
     start = curve.equations.start
-    return min(found, key=lambda point: np.max(np.abs(curve.equations.place(point) - start)))
+    return min(found, key=lambda point: largest(curve.equations.place(point) - start))
 
 
 def _special(curve: Family, point: FamilyPoint) -> _Special:

@@ -12,6 +12,7 @@ import numpy as np
 
 from jourdain_jax.analysis.families.equations import Look, Vector
 from jourdain_jax.analysis.families.spectrum import Modes, matched, surely_matched
+from jourdain_jax.calculus.reals import largest
 
 LONGEST, SHORTEST = 0.1, 1e-8  # steps, in sizes of the unknowns; the longest also relative to where the curve is, if that is far
 
@@ -38,7 +39,7 @@ def solved(equations: Equations, z: Vector, rows: Vector, target: float) -> tupl
         step = np.linalg.lstsq(np.vstack([look.J, rows]), -np.append(look.R, rows @ z - target), rcond=1e-9)[0]
         noise = 8 * np.finfo(float).eps * np.max(np.abs(look.J) @ np.abs(z))  # of R: at a branch point steps are this over a small number
         z = z + step
-        if np.max(np.abs(step)) < 1e-11 * (1 + np.max(np.abs(z))) or np.max(np.abs(look.R)) < noise:
+        if largest(step) < 1e-11 * (1 + largest(z)) or largest(look.R) < noise:
             return z, look, k
     return None
 
@@ -77,7 +78,7 @@ def traced(equations: Equations, spectrum: Callable[[Point], Modes], start: Poin
         points.append(there)
         if reason := ended(here, there):
             return points, reason
-        reach = float(np.max(np.abs(there.z)))
+        reach = float(largest(there.z))
         if reach > 1e3:
             return points, "it goes on without bound"
         if there.hardness <= easy:

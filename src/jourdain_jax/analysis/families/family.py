@@ -16,7 +16,7 @@ from jourdain_jax.analysis.families.spectrum import Modes, matched, mode_names
 from jourdain_jax.analysis.steady import guessed
 from jourdain_jax.analysis.table import complex_numbers, table
 from jourdain_jax.calculus.on_first_use import needed
-from jourdain_jax.calculus.reals import Numbers
+from jourdain_jax.calculus.reals import Numbers, largest
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, of_known_numbers, shown_from_users_lines
 from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
@@ -129,8 +129,8 @@ class Family(Printed):
     def point(self, point: Point, kind: str = "", columns: tuple[int, ...] = ()) -> FamilyPoint:
         """A point of the curve with its state and eigenvalues."""
         q, u, value = self.equations.split(self.equations.at(point.z))
-        near = min(self.points, key=lambda p: np.max(np.abs(p.z - point.z)))
-        left, none = jnp.asarray(np.max(np.abs(point.look.R), initial=0.0)), jnp.zeros(())
+        near = min(self.points, key=lambda p: largest(p.z - point.z))
+        left, none = jnp.asarray(largest(point.look.R)), jnp.zeros(())
         scene = self.equations.scene
         state = State(jnp.asarray(self.equations.t), jnp.asarray(q), jnp.asarray(u), none, none, left, (scene.coordinate_names, scene.speed_names))
         modes = point.modes if len(point.modes) else matched(near.modes, self.by.spectrum(point))

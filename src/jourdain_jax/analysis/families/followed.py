@@ -10,6 +10,7 @@ from jourdain_jax.analysis.families.curve import Point, along, located, reversed
 from jourdain_jax.analysis.families.equations import Look, SteadyEquations, Vector
 from jourdain_jax.analysis.families.special import Crossing, branches, changes, folds, tangents_across
 from jourdain_jax.analysis.families.spectrum import Modes, eigenvalues_at, matched
+from jourdain_jax.calculus.reals import largest
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Followed:
             s, step = here.tangent @ (first.z - here.z), np.linalg.norm(there.z - here.z)
             if left and 0 < s <= step and np.linalg.norm(first.z - here.z - s * here.tangent) < 0.1 * step:
                 back = along(self.looked, here, s, first.z)
-                if back is not None and np.max(np.abs(back.z - first.z)) < 1e-7 and back.tangent @ first.tangent > 0:
+                if back is not None and largest(back.z - first.z) < 1e-7 and back.tangent @ first.tangent > 0:
                     return "the curve is closed"
             left = left or here is not first
             return ""
@@ -80,7 +81,7 @@ class Followed:
                 found.append((crossing, point) if point else (replace(crossing, kind=f"{crossing.kind}, before this point"), there))
             branch = next((point for crossing, point in found if crossing.kind == "branch point"), None)
             if branch is not None:  # beside it tangents have few digits: what lies as close as this lies there
-                found = [(crossing, branch if np.max(np.abs(point.z - branch.z)) < 1e-4 else point) for crossing, point in found]
+                found = [(crossing, branch if largest(point.z - branch.z) < 1e-4 else point) for crossing, point in found]
             yield from sorted(found, key=lambda pair: here.tangent @ (pair[1].z - here.z))
 
 
@@ -110,12 +111,12 @@ def first_point(looked: Callable, equations: SteadyEquations, named: list[str], 
                 raise ValueError(f"the equations of `{scene}` are undefined near the guess; start at another state")
             step = np.zeros(len(z))
             step[free] = np.linalg.lstsq(look.J[:, free], -look.R, rcond=1e-7)[0]
-            z = z + step * min(1.0, 0.25 / max(np.max(np.abs(step)), 1e-300))
-            if np.max(np.abs(step)) < 1e-12 * (1 + np.max(np.abs(z))):
+            z = z + step * min(1.0, 0.25 / max(largest(step), 1e-300))
+            if largest(step) < 1e-12 * (1 + largest(z)):
                 break
     look = looked(z)
-    if np.max(np.abs(look.R), initial=0.0) > 1e-9:
-        raise ValueError(f"no steady motion of `{scene}` is found near the guess (residual {np.max(np.abs(look.R)):.1e}); `jj.steady` may find one from afar")
+    if largest(look.R) > 1e-9:
+        raise ValueError(f"no steady motion of `{scene}` is found near the guess (residual {largest(look.R):.1e}); `jj.steady` may find one from afar")
     sigma, V = np.linalg.svd(look.J)[1:]
     sigma = np.append(sigma, np.zeros(len(z) - len(sigma)))
     count = int(np.sum(sigma < 1e-8 * sigma[0]))

@@ -33,7 +33,7 @@ from jourdain_jax.analysis.table import complex_numbers
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.build.trace import event_values
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import RUN_SELDOM, Flag, Number, Scalar, compiled, known_numbers
+from jourdain_jax.calculus.reals import RUN_SELDOM, Flag, Number, Scalar, compiled, known_numbers, largest
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.listed import names_of_events
@@ -277,7 +277,7 @@ def _found(problem: _Shooting, start: State, period: Scalar) -> PeriodicMotion:
     x = smooth_root(partial(still.look, t), rows, guess, held, size, tolerance, 1e-9)
     zs, period = problem.pieces_of(x)
     D, _, ends = problem.slopes(t, x)
-    residual = jnp.max(jnp.abs(problem.rows(t, x, ends)))
+    residual = largest(problem.rows(t, x, ends))
     others = [k for k in range(len(names_of_events(problem.scene))) if k != problem.until]
     goes_on = jnp.array(True)
     if others:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from tqdm import tqdm
 
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import checked_real, described, is_traced, known_numbers
+from jourdain_jax.calculus.reals import checked_real, described, is_traced, known_numbers, real_type
 from jourdain_jax.motion.inputs import as_inputs, check_inputs_in_rows, for_programs
 from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.integrators.problem import MEMORY
@@ -185,7 +185,7 @@ def rollout(
     chunk = _chunk(scene, count, chunk, span["ts"], options.memory or MEMORY)
     span["inputs"] = as_inputs(scene, span["inputs"])
     _check_times_of_lanes(scene, starts, span)
-    times = {name: None if span[name] is None else checked_real(span[name], f"`{name}`").astype(jnp.result_type(float)) for name in ("t0", "t1", "ts")}
+    times = {name: None if span[name] is None else checked_real(span[name], f"`{name}`").astype(real_type()) for name in ("t0", "t1", "ts")}
 
     def run(options: AllOptions, varied, parameters) -> Trajectory:
         return _compiled(span["inputs"].programs)(model.reference, scene, fixed, span | times, _with_arrays(options), varied, parameters)
@@ -245,7 +245,7 @@ _compiled = for_programs(_lanes_in_lockstep)
 
 def _with_arrays(options: AllOptions) -> AllOptions:
     """Return options with their numbers as arrays, so that another tolerance or first step compiles nothing."""
-    real, (solver, order) = jnp.result_type(float), solver_of(options)
+    real, (solver, order) = real_type(), solver_of(options)
     numbers = {name: getattr(options, name) for name in ("rtol", "atol", "max_step")}
     arrays = {name: jnp.asarray(value, real) for name, value in numbers.items() if value is not None}
     return dataclasses.replace(options, solver=solver if order is None else Taylor(order), **arrays)
@@ -263,7 +263,7 @@ def _lanes(scene: Scene, starts, parameters: dict):
         fixed, varied = {}, eqx.tree_at(lambda s: s.guess, starts, jnp.broadcast_to(starts.guess, many))  # a state made by hand has one for all lanes
         lengths["`starts`"] = starts.q.shape[0] if starts.q.ndim == 2 else None
     else:
-        arrays = {name: checked_real(value, f"start `{name}`").astype(jnp.result_type(float)) for name, value in starts.items()}
+        arrays = {name: checked_real(value, f"start `{name}`").astype(real_type()) for name, value in starts.items()}
         groups = {group for names in (scene.coordinate_names, scene.speed_names) for group, _, _ in names.groups}  # quaternions and their rates
         fixed = {name: value for name, value in arrays.items() if value.ndim == (1 if name in groups else 0)}
         varied = {name: value for name, value in arrays.items() if name not in fixed}

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import structure_of, usual_rows
-from jourdain_jax.calculus.reals import Count, Scalar, passing_cutoff
+from jourdain_jax.calculus.reals import Count, Scalar, largest, passing_cutoff
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.dynamics.reactions import ContactForce
 from jourdain_jax.eager.eager import eager_if_concrete
@@ -154,7 +154,7 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
             f"{trajectory.q.dtype}; leave `reduction` at its default, or take float64"
         )
     ts, steps = np.asarray(trajectory.ts), max(int(trajectory.accepted), 1)
-    resolved, step = float(np.spacing(np.max(np.abs(ts)))), abs(float(trajectory.t_end) - float(ts[0])) / steps
+    resolved, step = float(np.spacing(largest(ts))), abs(float(trajectory.t_end) - float(ts[0])) / steps
     by_clock = not trajectory.inputs.constant or bool(structure_of(trajectory.scene).timed)
     # of a step: a clock that resolves less rounds times visibly
     if by_clock and resolved > 1e-3 * step > 0:

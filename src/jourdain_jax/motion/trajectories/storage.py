@@ -28,7 +28,7 @@ from jaxtyping import Int
 from jourdain_jax.build.trace import velocity_quantities
 from jourdain_jax.calculus.files import check_depth, check_place, parsed, write_whole
 from jourdain_jax.calculus.on_first_use import version_of
-from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.reals import described, largest
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.inputs import Inputs, Sampled
@@ -346,7 +346,7 @@ def _go_one_way(arrays: dict, reached: np.ndarray) -> np.ndarray:
     ts, end = np.asarray(arrays["ts"], float), np.asarray(arrays["t_end"], float)[..., None]
     with np.errstate(invalid="ignore"):  # of motions that failed
         steps = np.diff(np.concatenate([np.where(np.isfinite(ts) & reached, ts, end), end], axis=-1), axis=-1)
-    slack = 1e-6 * np.max(np.abs(steps), axis=-1, keepdims=True)
+    slack = 1e-6 * largest(steps, -1, keepdims=True)
     return np.asarray(np.all(steps >= -slack, axis=-1) | np.all(steps <= slack, axis=-1))
 
 
