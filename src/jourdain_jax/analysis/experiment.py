@@ -15,7 +15,7 @@ from jourdain_jax.analysis.sensors import Actuator, Drive, Numbers, Reading, Sen
 from jourdain_jax.calculus.reals import Number, array_module, checked_unless_traced, described, holds, is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled, as_inputs
 from jourdain_jax.scene.arguments import one_time, vector_of_times
-from jourdain_jax.scene.names import as_names, check_name, nearest
+from jourdain_jax.scene.names import as_names, check_names, nearest
 from jourdain_jax.scene.scene import Scene, entries_named
 
 _NO_INPUTS = Inputs(())
@@ -115,8 +115,7 @@ class Experiment(eqx.Module):
             (self.sensors, "sensor `{}` has no measured values", self.values),
             (self.unknown_start, "unknown start value `{}` has no first guess; give one in `start`", self.start),
         ):
-            for name in names:
-                check_name(name, known, what.format(name))
+            check_names(names, known, what)
         for name in self.values:
             if name not in self.sigma:
                 raise ValueError(f"channel `{name}` has no sigma; give `sigma` a number for it, or one number for all channels")

@@ -39,7 +39,7 @@ from jourdain_jax.motion.options import AllOptions, OptionFields, Options, as_op
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines, users_level
 from jourdain_jax.scene.identity import with_reference_parameters
-from jourdain_jax.scene.names import UnknownNameError, as_names, check_name
+from jourdain_jax.scene.names import UnknownNameError, as_names, check_names
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
@@ -216,8 +216,7 @@ class PlannedInformation(Printed, eqx.Module):
         Raises KeyError for names that are not unknown.
         """
         asked = as_names(names) or self.labels
-        for name in asked:
-            check_name(name, self.labels, f"`{name}` is not among the unknowns", UnknownNameError)
+        check_names(asked, self.labels, "`{}` is not among the unknowns", UnknownNameError)
         return -_log_det(self.matrix, tuple(self.labels.index(name) for name in asked))
 
     @property

@@ -41,7 +41,7 @@ from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import as_state
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, shown_from_users_lines, users_level
-from jourdain_jax.scene.names import as_names, nearest
+from jourdain_jax.scene.names import as_names, check_name
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
@@ -121,8 +121,7 @@ class Linearization(Printed, eqx.Module):
         is not 0. ValueError: an unknown mode, a motion that is not steady; `NotLowered` where the scene has no scalar program.
         """
         found = self.modes(names)
-        if mode not in found.names:
-            raise ValueError(f"no mode `{mode}`; {nearest(mode, dict.fromkeys(found.names))}")
+        check_name(mode, dict.fromkeys(found.names), f"no mode `{mode}`")
         eigenvalues = [complex(s) for s, name in zip(found.eigenvalues, found.names, strict=True) if name == mode]
         return sensitivities(self.about, mode, max(eigenvalues, key=lambda s: s.imag), held)
 

@@ -31,7 +31,7 @@ from jourdain_jax.motion.options import AllOptions, OptionFields, Options
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.identity import reference_parameters
-from jourdain_jax.scene.names import check_name
+from jourdain_jax.scene.names import check_names
 from jourdain_jax.scene.scene import Scene
 
 Point = Float[Array, "unknowns"]
@@ -106,8 +106,7 @@ class LogDensity(eqx.Module):
 
         Raises ValueError for names that are not unknown, and for values at or beyond a bound.
         """
-        for name in values:
-            check_name(name, self.labels, f"`{name}` is not among the unknowns")
+        check_names(values, self.labels, "`{}` is not among the unknowns")
         theta = jnp.stack([jnp.asarray(values.get(label, self.guess[i]), real_type()) for i, label in enumerate(self.labels)])
         x = self._each(Range.unconstrain, theta)
         if not holds(np.isfinite, x):

@@ -24,7 +24,7 @@ from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, shown_from_users_lines
-from jourdain_jax.scene.names import as_names, nearest
+from jourdain_jax.scene.names import as_names, check_names
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
@@ -88,12 +88,13 @@ def steady(
     f = as_input_vector(scene, inputs, q.dtype).astype(q.dtype)
     held, entries = as_names(held), scene.coordinate_names.entries
     names = entries + scene.speed_names.entries
-    _check_names(scene, held, names)
+    unknown = f"`{type(scene).__name__}` has no `{{}}` to hold or to move"
+    check_names(held, names, unknown)
     instant = instant_of(built, y := privileged_speeds(scene, privileged))
     groups = {group: entries[first : first + length] for group, first, length in scene.coordinate_names.groups}
     ignorable = unseen(instant, scene)
     moving = ignorable if moving is None else as_names(moving)
-    _check_names(scene, tuple(moving), (*entries, *groups))
+    check_names(moving, (*entries, *groups), unknown)
     carried = {entry for name in moving for entry in groups.get(name, (name,))}
     resting = tuple(i for i, name in enumerate(entries) if name not in carried)
     # nothing that vanishes changes with them: they keep the guess's value, and no step runs away along them
@@ -110,12 +111,6 @@ def guessed(scene: Scene, guess, t0) -> tuple[Array, Array, Array]:
         raise ValueError(f"`guess` is {described(guess)}, expected a State or a dictionary of named values; those not named start from zero")
     q, u, _ = scene.named(**guess)
     return jnp.asarray(t0, real_type()), q, u
-
-
-def _check_names(scene: Scene, given: tuple[str, ...], valid: tuple[str, ...]) -> None:
-    for name in given:
-        if name not in valid:
-            raise ValueError(f"`{type(scene).__name__}` has no `{name}` to hold or to move; {nearest(name, valid)}")
 
 
 class _Problem(eqx.Module):

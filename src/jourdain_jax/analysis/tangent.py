@@ -19,7 +19,7 @@ from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.motion.put_on_rows import State
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_names
 from jourdain_jax.scene.scene import Scene
 
 
@@ -115,9 +115,7 @@ def dependent_coordinates(
     `G`: dg/dq at the state, if it is known; otherwise the choice looks at states of the scene's domain.
     """
     names = perturbed_names(scene)
-    for name in (*named, *(dependent or ())):
-        if name not in names:
-            raise ValueError(f"`{type(scene).__name__}` has no coordinate `{name}` to perturb; {nearest(name, names)}")
+    check_names((*named, *(dependent or ())), names, f"`{type(scene).__name__}` has no coordinate `{{}}` to perturb")
     if len(set(named)) != len(named):
         raise ValueError(f"`coordinates` names one twice ({', '.join(named)}); name each once")
     both = set(named) & set(dependent or ())

@@ -29,7 +29,7 @@ from jourdain_jax.equations.rows import ConstraintRows, UsualRows, position_resi
 from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, equations_and_rows
 from jourdain_jax.scene.arguments import ChangingInputs, as_coordinates, as_input_vector, as_scene, as_speeds, as_time
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.scene import Scene
 
 
@@ -81,8 +81,7 @@ def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
         return NullSpaceQR()
     if isinstance(reduction, str):
         known = reductions(scene)
-        if reduction not in known:
-            raise ValueError(f"unknown reduction `{reduction}`; {nearest(reduction, known)}")
+        check_name(reduction, known, f"unknown reduction `{reduction}`")
         return known[reduction]
     if not isinstance(reduction, Reduction | GibbsAppell):
         raise ValueError(f"`reduction` is {described(reduction)}, expected a name ({', '.join(reductions(scene))}) or an object such as `jj.NullSpaceQR()`")

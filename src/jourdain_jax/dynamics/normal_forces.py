@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.calculus.matrices import pseudo_inverse
 from jourdain_jax.calculus.reals import largest, rank_cutoff
 from jourdain_jax.scene.contacts import Contact
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_names
 
 
 class Wrenches(eqx.Module):
@@ -101,7 +101,5 @@ def _unmoved(changes: Float[Array, "rows contacts"], spare: Wrenches, tolerance)
 
 def _carried(contact: Contact, name: str, bodies: tuple[str, ...]) -> tuple[int, ...]:
     """Numbers of the bodies that a contact holds up."""
-    for body in contact.carried or ():
-        if body not in bodies:
-            raise ValueError(f"contact `{name}` carries unknown body `{body}`; {nearest(body, bodies)}")
+    check_names(contact.carried or (), bodies, f"contact `{name}` carries unknown body `{{}}`")
     return tuple(range(len(bodies))) if contact.carried is None else tuple(sorted({bodies.index(body) for body in contact.carried}))

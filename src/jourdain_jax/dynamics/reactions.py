@@ -28,7 +28,7 @@ from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.equations.virtual_power import resultants
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyMotion, Motion
-from jourdain_jax.scene.names import Named, UnknownNameError, nearest
+from jourdain_jax.scene.names import Named, UnknownNameError, check_name
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import contacts_of
 
@@ -53,8 +53,7 @@ class RowReactions(eqx.Module):
         return self._by_row(self.torque, body)
 
     def _by_row(self, values, body):
-        if body not in self.body_names:
-            raise UnknownNameError(f"no body `{body}` in this scene; {nearest(body, self.body_names)}")
+        check_name(body, self.body_names, f"no body `{body}` in this scene", UnknownNameError)
         return {row: values[..., s, self.body_names.index(body), :] for s, row in enumerate(self.row_names)}
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jourdain_jax.calculus.reals import checked_known, checked_whole, described, has_unit
 from jourdain_jax.ensembles.distributions import Distribution, Levels, special
 from jourdain_jax.ensembles.samplers import MOST_SOBOL, SAMPLERS
-from jourdain_jax.scene.names import check_name, nearest
+from jourdain_jax.scene.names import check_names, nearest
 from jourdain_jax.scene.printing import Printed
 
 GRID, TABLE = "grid", "table"
@@ -116,8 +116,7 @@ class Design(Printed):
             if not isinstance(pair, tuple) or len(pair) != 2:
                 raise ValueError(f"`correlation` has the entry {pair!r}, expected pairs of names, such as ({names[0]!r}, {names[-1]!r}): 0.5")
             value = float(checked_known(value, f"the correlation of {pair}", (), advice="give a number between -1 and 1"))
-            for name in pair:
-                check_name(name, names, f"`correlation` names `{name}`, which does not vary")
+            check_names(pair, names, "`correlation` names `{}`, which does not vary")
             if len(set(pair)) != 2 or not -1 < value < 1:
                 raise ValueError(f"the correlation of {pair} is {value}, expected two names and a number between -1 and 1")
             if (back := self.correlation.get(pair[::-1], value)) != value:

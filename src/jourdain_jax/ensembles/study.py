@@ -23,7 +23,7 @@ from jourdain_jax.motion.model import Model, build
 from jourdain_jax.motion.options import MotionFields, Options, as_options
 from jourdain_jax.motion.simulate import span_and_times
 from jourdain_jax.scene.arguments import as_scene
-from jourdain_jax.scene.names import check_name, nearest
+from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 
@@ -99,8 +99,7 @@ class Study(Printed):
         groups = {group for names in (q, u) for group, _, _ in names.groups}
         constants = {}
         for name, how in (self.scene.example if self.start is None else self.start).items():
-            if name not in q and name not in u:
-                raise ValueError(f"`{type(self.scene).__name__}` has no coordinate or speed `{name}` to start with; {nearest(name, (*q, *u, *groups))}")
+            check_name(name, (*q, *u, *groups), f"`{type(self.scene).__name__}` has no coordinate or speed `{name}` to start with")
             if not isinstance(how, Distribution | Levels) and (np.ndim(how) == 0 or name in groups):
                 constants[name] = checked_real(how, f"start `{name}`", advice="give its value") if has_unit(how) else how
             elif name in groups:

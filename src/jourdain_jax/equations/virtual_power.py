@@ -32,7 +32,7 @@ from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import loads_of, potential_of
 
@@ -70,8 +70,7 @@ def resultants(
             continue
         for total, part, kind in ((force, load.forces, "body"), (torque, load.torques, "body"), (direct, load.generalized, "speed")):
             for name, value in part.items():
-                if name not in total:
-                    raise ValueError(f"a load of `{type(scene).__name__}` acts on unknown {kind} `{name}`; {nearest(name, total)}")
+                check_name(name, total, f"a load of `{type(scene).__name__}` acts on unknown {kind} `{name}`")
                 total[name] = total[name] + value
     force, torque = (jnp.stack(list(of_bodies.values())) for of_bodies in (force, torque))
     return Resultants(force, torque, jnp.stack(list(direct.values())) if direct else jnp.zeros(0))

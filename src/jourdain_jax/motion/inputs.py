@@ -37,7 +37,7 @@ from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.calls import description
 from jourdain_jax.scene.arguments import ChangingInputs
 from jourdain_jax.scene.identity import now_read_by
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_names
 from jourdain_jax.scene.names_read import is_function
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.spline import checked_samples
@@ -261,9 +261,7 @@ def as_inputs(scene: Scene, given) -> Inputs:
         raise ValueError(f"`inputs` is {described(given)}, expected a dictionary: name -> number, function of time, or `jj.Sampled`")
     if not given:
         return Inputs((_ZERO,) * len(scene.inputs))
-    for name in given:
-        if name not in scene.inputs.entries:
-            raise ValueError(f"`{type(scene).__name__}` has no input `{name}`; {nearest(name, scene.inputs.entries)}")
+    check_names(given, scene.inputs.entries, f"`{type(scene).__name__}` has no input `{{}}`")
     channels: list[Callable] = []
     for name in scene.inputs.entries:
         value = given.get(name, _NOTHING)

@@ -30,7 +30,7 @@ from jourdain_jax.motion.vector_fields.by_matrices import FullByMatrices, Minima
 from jourdain_jax.motion.vector_fields.field import ByProgram, Formulation, VectorField, as_formulation, reason_for_matrices
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.identity import found_before, once_per_values
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
@@ -362,8 +362,7 @@ def _program(scene: Scene, minimal: bool, backend: str, formulation: Formulation
 
 
 def _check(scene: Scene, structure: Structure, state, backend) -> None:
-    if backend not in _BACKENDS:
-        raise ValueError(f"unknown backend `{backend}`; {nearest(str(backend), _BACKENDS)}")
+    check_name(backend, _BACKENDS, f"unknown backend `{backend}`")
     if state == "minimal" and not structure.affine:
         raise ValueError(f"the rows of `{type(scene).__name__}` are nonlinear in the speeds and have no minimal state; use jj.Formulation('full')")
     if state == "minimal" and structure.may_set_in:

@@ -16,7 +16,7 @@ from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.page_data import Display, page_data
 from jourdain_jax.scene.arguments import of_known_numbers
-from jourdain_jax.scene.names import check_name
+from jourdain_jax.scene.names import check_names
 
 
 class View:
@@ -64,8 +64,7 @@ def show(motion, path: str | os.PathLike | None = None, **how: Any) -> View:
     motions = _motions(motion)
     display = Display(**{"title": type(motions[0].scene).__name__} | {name: value for name, value in how.items() if value is not None})
     names = list(dict.fromkeys(name for one in motions for name in one.motions().bodies))
-    for name in display.colours:
-        check_name(name, names, f"`colours` names `{name}`, which is no body")
+    check_names(display.colours, names, "`colours` names `{}`, which is no body")
     if np.shape(display.view) != (2,):
         raise ValueError(f"`view` is {display.view!r}, expected elevation and azimuth in degrees, such as (22, -60)")
     description, numbers = page_data(motions, display)

@@ -32,7 +32,7 @@ from jourdain_jax.calculus.reals import (
     real_type,
     with_usual_promotion,
 )
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_names
 from jourdain_jax.scene.scene import Scene
 
 F = TypeVar("F", bound=Callable)
@@ -139,9 +139,7 @@ def as_input_vector(scene: Scene, inputs, dtype=None) -> Float[Array, "inputs"]:
     if not isinstance(inputs, Mapping):
         listed = ", ".join(names) or "none: the scene has no inputs"
         return checked_real(inputs, f"`inputs` of `{type(scene).__name__}`", (len(names),), advice=f"one number for each of {listed}")
-    for name in inputs:
-        if name not in names:
-            raise ValueError(f"`{type(scene).__name__}` has no input `{name}`; {nearest(name, names)}")
+    check_names(inputs, names, f"`{type(scene).__name__}` has no input `{{}}`")
     advice = "a function of time is for `simulate`; here give its value at this instant"
     values = [checked_real(inputs.get(name, 0.0), f"input `{name}` of `{type(scene).__name__}`", (), advice=advice) for name in names]
     return jnp.stack(values) if values else jnp.zeros(0, dtype)

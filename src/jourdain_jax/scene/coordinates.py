@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Speeds, described, real_type
 from jourdain_jax.calculus.rotations import quaternion_rate
-from jourdain_jax.scene.names import Named, nearest
+from jourdain_jax.scene.names import Named, check_name
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,7 @@ class Names:
 
     def index(self, name: str, kind: str) -> int:
         """Position of `name`; a ValueError that lists the valid names, and says what `kind` of name it is, otherwise."""
-        if name not in self.entries:
-            raise ValueError(f"unknown {kind} `{name}`; {nearest(name, self.entries)}")
+        check_name(name, self.entries, f"unknown {kind} `{name}`")
         return self.entries.index(name)
 
     def __len__(self) -> int:

@@ -13,7 +13,7 @@ import numpy as np
 
 from jourdain_jax.calculus.reals import described, has_unit, known_numbers
 from jourdain_jax.scene.coordinates import Names
-from jourdain_jax.scene.names import as_names, nearest
+from jourdain_jax.scene.names import as_names, check_names
 from jourdain_jax.scene.names_read import functions_in, names_in
 
 METHODS = (
@@ -78,9 +78,7 @@ def checked_arguments(kind: type, given: dict) -> None:
     valid = [parameter.name for parameter in taken][1:]
     if any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in taken):
         return
-    for name in unknown:
-        if name not in valid:
-            raise ValueError(f"scene `{kind.__name__}` has no parameter `{name}`; {nearest(name, valid)}")
+    check_names(unknown, valid, f"scene `{kind.__name__}` has no parameter `{{}}`")
 
 
 @lru_cache(maxsize=512)
@@ -139,6 +137,4 @@ def _is_ordered(pair: np.ndarray) -> bool:
 def _check_keys(kind: type, what: str, given, valid) -> None:
     if not isinstance(given, dict):
         raise ValueError(f"`{what}` of `{kind.__name__}` is {described(given)}, expected a dictionary of coordinate or speed names")
-    for name in as_names(given):
-        if name not in valid:
-            raise ValueError(f"`{what}` of `{kind.__name__}` names `{name}`, which is no coordinate or speed; {nearest(name, valid)}")
+    check_names(as_names(given), valid, f"`{what}` of `{kind.__name__}` names `{{}}`, which is no coordinate or speed")

@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from jourdain_jax.calculus.reals import Scalar, Vector3, checked_real, described
 from jourdain_jax.scene.motion_state import Motion, Point
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_names
 
 
 class Load(eqx.Module):
@@ -78,9 +78,7 @@ def torque(motion: Motion, body: str, moment, *, reaction: str | None = None) ->
     motion = _motion(motion, "torque")
     moment = checked_real(moment, f"torque on `{body}`", (3,), advice="give three components in the inertial frame, N m")
     names = [body] if reaction is None else [body, reaction]
-    for name in names:
-        if name not in motion.bodies:
-            raise ValueError(f"torque on unknown body `{name}`; {nearest(name, motion.bodies)}")
+    check_names(names, motion.bodies, "torque on unknown body `{}`")
     return Load(torques={name: sign * moment for name, sign in zip(names, (1.0, -1.0), strict=False)})
 
 
@@ -113,9 +111,7 @@ def generalized_force(motion: Motion, **forces) -> Load:
     `forces`: speed -> force, in N or N m. ValueError for an unknown speed.
     """
     motion = _motion(motion, "generalized_force")
-    for name in forces:
-        if name not in motion.u:
-            raise ValueError(f"generalized force on unknown speed `{name}`; {nearest(name, motion.u.keys())}")
+    check_names(forces, motion.u.keys(), "generalized force on unknown speed `{}`")
     return Load(generalized={name: checked_real(value, f"generalized force on `{name}`", ()) for name, value in forces.items()})
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import Scalar, checked_real
 from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.scene.bodies import Body, RigidBody
-from jourdain_jax.scene.names import Named, UnknownNameError, nearest
+from jourdain_jax.scene.names import Named, UnknownNameError, check_name
 
 
 class Point(eqx.Module):
@@ -136,6 +136,5 @@ class Motion(eqx.Module):
 
 
 def _lookup(bodies: dict, name: str):
-    if name not in bodies:
-        raise UnknownNameError(f"no body `{name}` in this scene; {nearest(name, bodies)}")
+    check_name(name, bodies, f"no body `{name}` in this scene", UnknownNameError)
     return bodies[name]

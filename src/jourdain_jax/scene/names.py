@@ -28,6 +28,12 @@ def check_name(name: str, valid: Iterable[str], what: str, error: type[Exception
         raise error(f"{what}; {nearest(name, valid)}")
 
 
+def check_names(names: Iterable[str], valid: Iterable[str], what: str, error: type[Exception] = ValueError) -> None:
+    """Check each of several names; `{}` in `what` stands for it."""
+    for name in names:
+        check_name(name, valid, what.replace("{}", str(name)), error)
+
+
 def as_names(names: "str | Iterable[str]") -> tuple[str, ...]:
     """Names as a tuple; those in a text are parted by blanks, as in `jj.coordinates`."""
     if not isinstance(names, str | Iterable):

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from jourdain_jax.analysis.instant import by_program, numbers_of, on_rows, places_of
 from jourdain_jax.build.assembling import coordinate_bounds
 from jourdain_jax.lowering.lower import lower
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_name, nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
@@ -64,8 +64,7 @@ class SteadyEquations:
 
     def index(self, name: str) -> int:
         """Number of an unknown; a ValueError with the nearest names where there is none."""
-        if name not in self.unknowns:
-            raise ValueError(f"`{name}` is no unknown of the steady motions of `{type(self.scene).__name__}`; {nearest(name, self.unknowns)}")
+        check_name(name, self.unknowns, f"`{name}` is no unknown of the steady motions of `{type(self.scene).__name__}`")
         return self.unknowns.index(name)
 
     def _place_of(self, vary: str | None) -> list[int]:

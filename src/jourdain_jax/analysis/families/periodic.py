@@ -44,7 +44,7 @@ from jourdain_jax.motion.options import SPAN, AllOptions, MotionFields, OptionFi
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.simulate import as_state, simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
-from jourdain_jax.scene.names import as_names, check_name
+from jourdain_jax.scene.names import as_names, check_name, check_names
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
@@ -134,8 +134,7 @@ def periodic(
         if timed := structure_of(scene).timed:
             raise ValueError(f"`until` finds the period where nothing depends on time, and in {who} {' and '.join(timed)} do; give `period` alone")
     for given, valid in ((held, names), (shift, entries)):
-        for name in given:
-            check_name(name, valid, f"{who} has no `{name}` to hold or to shift")
+        check_names(given, valid, f"{who} has no `{{}}` to hold or to shift")
     start = as_state(modelled(built), guess, what="guess", inputs=inputs_at(inputs, 0.0))
     instant = instant_of(built, structure_of(scene).independent)
     carried = unseen(instant, scene)

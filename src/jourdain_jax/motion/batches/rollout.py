@@ -32,7 +32,7 @@ from jourdain_jax.motion.trajectories.sketch import sketch_of_lanes
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, one_time, shown_from_users_lines
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_names
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
@@ -254,9 +254,7 @@ def _with_arrays(options: AllOptions) -> AllOptions:
 def _lanes(scene: Scene, starts, parameters: dict):
     """Start values common to all lanes, those that vary, and the number of lanes."""
     known = [name for name, _, _ in parameters_of(scene)]
-    for name in parameters:
-        if name not in known:
-            raise ValueError(f"scene `{type(scene).__name__}` has no parameter `{name}`; {nearest(name, known)}")
+    check_names(parameters, known, f"scene `{type(scene).__name__}` has no parameter `{{}}`")
     lengths = {f"parameter `{name}`": value.shape[0] if value.ndim else None for name, value in parameters.items()}
     if isinstance(starts, State):
         many = starts.q.shape[:1] if starts.q.ndim == 2 else ()

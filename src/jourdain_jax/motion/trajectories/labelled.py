@@ -12,7 +12,7 @@ from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.motion.trajectories.over_times import Record
 from jourdain_jax.motion.trajectories.results import CODES
 from jourdain_jax.scene.arguments import of_known_numbers
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_names
 from jourdain_jax.scene.parameters import parameters_of
 
 OF_LANES: dict[str, tuple[str, str, float, dict]] = {  # name: field of a motion, type, what stands for nothing, attributes
@@ -88,7 +88,5 @@ def _units(scene, given: Mapping[str, str] | None) -> dict[str, str]:
     for names, unit in ((scene.coordinate_names, "1"), *(((scene.speed_names, "rad/s"),) if scene.speeds is None else ())):
         known |= {name: unit for _, first, length in names.groups for name in names.entries[first : first + length]}
     valid = (*scene.coordinate_names.entries, *scene.speed_names.entries)
-    for name in given or {}:
-        if name not in valid:
-            raise ValueError(f"`units` names `{name}`, which is no coordinate or speed of `{type(scene).__name__}`; {nearest(name, valid)}")
+    check_names(given or {}, valid, f"`units` names `{{}}`, which is no coordinate or speed of `{type(scene).__name__}`")
     return known | dict(given or {})

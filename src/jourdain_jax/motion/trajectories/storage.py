@@ -38,7 +38,7 @@ from jourdain_jax.motion.trajectories.over_times import Record
 from jourdain_jax.motion.trajectories.results import BAD_PARAMETER, EVENT, FALLBACKS, MESSAGES, SUCCESS
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.arguments import of_known_numbers
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_names
 from jourdain_jax.scene.parameters import parameter_faults, parameters_of
 from jourdain_jax.scene.scene import Scene
 
@@ -195,9 +195,7 @@ def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict)
     if header["scene"] != kind.__name__:
         raise ValueError(f"`{path}` holds a {header['kind']} of `{header['scene']}`, expected `{kind.__name__}`; pass the class it was made with")
     known, parameters = [field.name for field in fields(kind)], _parameters(arrays)
-    for name in (*parameters, *header["static"]):
-        if name not in known:
-            raise ValueError(f"`{path}` has a parameter `{name}` that `{kind.__name__}` has not; {nearest(name, known)}")
+    check_names((*parameters, *header["static"]), known, f"`{path}` has a parameter `{{}}` that `{kind.__name__}` has not")
     for name, value in parameters.items():
         if value.dtype.kind not in "fiub":
             raise refused(path, f"has `{name}` of type {value.dtype}, expected numbers")

@@ -24,7 +24,7 @@ from jourdain_jax.equations.reductions import Reduction
 from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.native import values
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.scene import Scene
 
 _STATES = ("auto", "minimal", "full")
@@ -54,8 +54,7 @@ class Formulation(eqx.Module):
     stabilisation: Baumgarte | Literal["projection"] | None = "projection"
 
     def __check_init__(self) -> None:
-        if self.state not in _STATES:
-            raise ValueError(f"unknown state form `{self.state}`; {nearest(str(self.state), _STATES)}")
+        check_name(self.state, _STATES, f"unknown state form `{self.state}`")
         stabilisation = self.stabilisation
         if not (stabilisation is None or isinstance(stabilisation, Baumgarte) or (isinstance(stabilisation, str) and stabilisation == "projection")):
             raise ValueError(f'`stabilisation` is {described(stabilisation)}, expected "projection", `jj.Baumgarte(alpha, beta)` or None')
