@@ -403,7 +403,7 @@ BATCHES: dict[str, Case] = {
     "jj.rollout(b, {'x': [1.0, 2.0]}, parameters={'mas': [1.0, 2.0]}, t1=0.1)": "scene `Bead` has no parameter `mas`; did you mean `mass`?",
     "jj.rollout(b, {'x': [1.0, 2.0]}, parameters={'mass': 1.0}, t1=0.1)": "parameter `mass` has no axis of lanes",
     "jj.rollout(b, {'x': [1.0, 2.0]}, parameters={'mass': 'heavy'}, t1=0.1)": "parameter `mass` is the text 'heavy', expected real numbers",
-    "jj.rollout(b, {'x': [1.0, 2.0]}, chunk=0, t1=0.1)": "`chunk` is 0, expected a whole number, at least one lane",
+    "jj.rollout(b, {'x': [1.0, 2.0]}, chunk=0, t1=0.1)": "`chunk` is 0, expected a whole number of at least one lane",
     "jj.rollout(b, {'x': [1.0, 2.0]}, chunk=1.5, t1=0.1)": "`chunk` is 1.5, expected a whole number",
     "jj.rollout(b, {'x': [1.0, 2.0]}, t1=0.0)": "the span from t0 = 0.0 to t1 = 0.0 s is empty or not finite",
     "jj.rollout(b, {'x': [1.0, 2.0]}, ts=[0.2, 0.1, 0.3])": "`ts` must be finite and strictly increasing",

@@ -25,7 +25,7 @@ from jourdain_jax.dynamics.accelerations import reductions
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.instant import constraint_rows
-from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, partial_velocities, pose_at
+from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, of_bodies, partial_velocities, pose_at
 from jourdain_jax.equations.reductions import reduce
 from jourdain_jax.equations.rows import position_rows, velocity_rows
 from jourdain_jax.equations.scaling import row_scale
@@ -292,7 +292,7 @@ def _potentials(scene: Scene, motion: Motion, Z) -> dict[str, Scalar]:
         return jnp.stack([at[i].potential for i in stated])
 
     dV = jax.jacfwd(V)(q) @ jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(u)
-    partial, turned = partial_velocities(scene, t, q, u), jnp.stack([body.orientation for body in motion.bodies.values()])
+    partial, turned = partial_velocities(scene, t, q, u), of_bodies(motion, "orientation")
     values = {}
     for i, slope in zip(stated, dV, strict=True):
         total = resultants(scene, motion, loads=(loads[i],))

@@ -22,14 +22,14 @@ from jourdain_jax.analysis.statements import Verification, by_reduction, check, 
 from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import plain_row_lengths, structure_of, usual_rows
 from jourdain_jax.calculus.matrices import null_space_svd
-from jourdain_jax.calculus.reals import Numbers, Speeds, largest
+from jourdain_jax.calculus.reals import Numbers, Speeds, checked_whole, largest
 from jourdain_jax.dynamics.accelerations import diagnosed, reductions
 from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.dynamics.power import power
 from jourdain_jax.dynamics.reactions import row_reactions
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.gibbs_appell import gibbs_equations
-from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at, partial_velocities, shapes_along_motion, velocities
+from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at, of_bodies, partial_velocities, shapes_along_motion, velocities
 from jourdain_jax.equations.lagrange import lagrange_equations, speeds_are_rates
 from jourdain_jax.equations.listed import names_of_rows
 from jourdain_jax.equations.scaling import row_scale, speed_scale
@@ -65,8 +65,7 @@ def verify(scene: Scene | BuiltFor, state: State | dict | None = None, inputs: N
     **Returns** a `Verification`, printed with the table of `jj.check`. Nothing is raised for a failed check; a
     DifferentiationModeError where numbers are traced.
     """
-    if not isinstance(seed, int | np.integer) or seed < 0:
-        raise ValueError(f"`seed` is {seed!r}, expected a whole number that is not negative")
+    checked_whole(seed, "`seed`", 0, expected="that is not negative")
     scene = as_scene(scene)
     inputs = as_input_vector(scene, inputs)
     if state is None and not scene.example:
@@ -93,7 +92,7 @@ def _evaluate(scene, t, q, u, inputs, usual, plain) -> dict:
     reference = ways["svd"]
     newton = newton_residual(scene, t, q, u, reference.udot, inputs)
     partial = partial_velocities(scene, t, q, u)
-    turned = jnp.stack([body.orientation for body in motion_at(scene, t, q, u, inputs).bodies.values()])
+    turned = of_bodies(motion_at(scene, t, q, u, inputs), "orientation")
     hidden_torque = jnp.einsum("bji,bj->bi", turned, newton.angular)
     by_body = jnp.einsum("bik,bi->bk", partial.linear, newton.linear) + jnp.einsum("bik,bi->bk", partial.angular, hidden_torque)
     reactions = row_reactions(scene, t, q, u, reference, inputs)

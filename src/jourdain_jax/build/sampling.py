@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.assembling import Assembled, coordinate_bounds, speed_bounds
 from jourdain_jax.build.probed_on_graph import Probed, sampled_on_graph
-from jourdain_jax.calculus.reals import array_module
+from jourdain_jax.calculus.reals import array_module, checked_whole
 from jourdain_jax.scene.arguments import as_scene, of_known_numbers
 from jourdain_jax.scene.scene import Scene, vectors_named
 
@@ -31,10 +31,8 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
     scene's parameters are traced.
     """
     scene = as_scene(scene)
-    if not isinstance(count, int | np.integer) or count < 1:
-        raise ValueError(f"`count` is {count!r}, expected a whole number of states, at least 1")
-    if not isinstance(seed, int | np.integer) or seed < 0:
-        raise ValueError(f"`seed` is {seed!r}, expected a whole number that is not negative")
+    checked_whole(count, "`count`", 1, expected="of states, at least 1")
+    checked_whole(seed, "`seed`", 0, expected="that is not negative")
     drawn = -(-count // 32) * 32  # always a multiple of this, so that one program serves all small samples
     for t, *begin in drawn_states(scene, drawn, np.random.default_rng(seed)):
         q, u, found = sampled_on_graph(scene, t, *begin)

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Num, PyTree
 from jourdain_jax.build.plausibility import Numbers, numbers_of
 from jourdain_jax.calculus.jaxprs import needed_only
 from jourdain_jax.calculus.reals import Entries, Scalar, is_traced, real_type
-from jourdain_jax.equations.kinematics import coordinate_rates, inertias_of, motion_at, pose_at, velocities_of
+from jourdain_jax.equations.kinematics import coordinate_rates, inertias_of, motion_at, of_bodies, pose_at, velocities_of
 from jourdain_jax.equations.listed import names_of_bodies, names_of_position_rows
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
 from jourdain_jax.equations.virtual_power import energies_at, impressed, potential_energy, resultants
@@ -89,9 +89,9 @@ def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]
     return VelocityQuantities(
         velocities.linear,
         velocities.angular,
-        jnp.stack([body.angular_velocity for body in motion.bodies.values()]),
-        jnp.stack([body.position for body in motion.bodies.values()]),
-        jnp.stack([body.orientation for body in motion.bodies.values()]),
+        of_bodies(motion, "angular_velocity"),
+        of_bodies(motion, "position"),
+        of_bodies(motion, "orientation"),
         weights.mass,
         weights.inertia,
         flatten_rows(velocity_rows(scene, motion), motion.t.dtype),
@@ -272,8 +272,8 @@ def power_of_loads(
     `loads`: as in `explicit_power`.
     """
     total = resultants(scene, motion, conservative=conservative, among=among, loads=loads)
-    v = jnp.stack([body.velocity for body in motion.bodies.values()])
-    omega = jnp.stack([body.angular_velocity for body in motion.bodies.values()])
+    v = of_bodies(motion, "velocity")
+    omega = of_bodies(motion, "angular_velocity")
     return jnp.sum(total.force * v) + jnp.sum(total.torque * omega) + total.direct @ motion.u.array
 
 

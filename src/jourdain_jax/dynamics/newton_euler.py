@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.eager.eager import eager_if_concrete
-from jourdain_jax.equations.kinematics import Velocities, bias_accelerations, coordinate_rates, inertias, motion_at, partial_velocities
+from jourdain_jax.equations.kinematics import Velocities, bias_accelerations, coordinate_rates, inertias, motion_at, of_bodies, partial_velocities
 from jourdain_jax.equations.virtual_power import Resultants, inertia_resultants, resultants
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds
 from jourdain_jax.scene.bodies import RigidBody
@@ -34,7 +34,7 @@ def newton_residual(scene: Scene, t, q, u, udot, inputs=None) -> Velocities:
     force, torque = inertia_resultants(weights, velocity, acceleration)
     motion = motion_at(scene, t, q, u, inputs)
     loads, potential = resultants(scene, motion), potential_resultants(scene, motion)
-    orientation = jnp.stack([body.orientation for body in motion.bodies.values()])
+    orientation = of_bodies(motion, "orientation")
     return Velocities(force - loads.force - potential.force, jnp.einsum("bij,bj->bi", orientation, torque) - loads.torque - potential.torque)
 
 

@@ -24,7 +24,7 @@ from jourdain_jax.build.trace import explicit_rate, forces_for_potentials, power
 from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.newton_euler import newton_residual
-from jourdain_jax.equations.kinematics import inertias, motion_at
+from jourdain_jax.equations.kinematics import inertias, motion_at, of_bodies, velocities_of
 from jourdain_jax.equations.listed import has_load_without_potential
 from jourdain_jax.equations.reductions import Reduced
 from jourdain_jax.equations.virtual_power import potential_energy
@@ -83,14 +83,13 @@ def _power_of_drives(scene: Scene, motion: Motion, udot) -> Scalar:
     """The constraint forces of bodies that move while all speeds are zero, times those velocities."""
     t, q, u, inputs = motion.t, motion.q.array, motion.u.array, motion.inputs.array
     total = newton_residual(scene, t, q, u, udot, inputs)
-    at_rest = motion_at(scene, t, q, jnp.zeros_like(u), inputs).bodies.values()
-    v, omega = jnp.stack([body.velocity for body in at_rest]), jnp.stack([body.angular_velocity for body in at_rest])
+    at_rest = motion_at(scene, t, q, jnp.zeros_like(u), inputs)
+    v, omega = of_bodies(at_rest, "velocity"), of_bodies(at_rest, "angular_velocity")
     return jnp.sum(total.linear * v) + jnp.sum(total.angular * omega)
 
 
 def _power_of_changing_inertia(scene: Scene, motion: Motion) -> Scalar:
     """`sum mdot v.v/2 + omega.(dI/dt omega)/2`, with dI/dt in body axes."""
-    t, q, bodies = motion.t, motion.q.array, motion.bodies.values()
+    t, q, now = motion.t, motion.q.array, velocities_of(motion)
     _, rate = jax.jvp(lambda t, q: inertias(scene, t, q), (t, q), (jnp.ones_like(t), motion.qdot.array))
-    v, w = jnp.stack([body.velocity for body in bodies]), jnp.stack([body.angular_velocity_body for body in bodies])
-    return 0.5 * (rate.mass @ jnp.sum(v * v, axis=1) + jnp.einsum("bi,bij,bj->", w, rate.inertia, w))
+    return 0.5 * (rate.mass @ jnp.sum(now.linear**2, axis=1) + jnp.einsum("bi,bij,bj->", now.angular, rate.inertia, now.angular))

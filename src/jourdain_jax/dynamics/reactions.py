@@ -21,7 +21,7 @@ from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.dynamics.normal_forces import Wrenches, normal_forces
 from jourdain_jax.eager.eager import eager_if_concrete
-from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
+from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, of_bodies
 from jourdain_jax.equations.listed import names_of_rows
 from jourdain_jax.equations.rows import flatten_rows, velocity_residual, velocity_rows
 from jourdain_jax.equations.scaling import row_scale
@@ -95,7 +95,7 @@ def _per_multiplier(scene: Scene, motion: Motion, inputs) -> tuple[Wrenches, Arr
     def rows(v, omega, u):
         return flatten_rows(velocity_rows(scene, _moving(scene, motion, v, omega, u)), q.dtype)
 
-    v, omega = jnp.stack([body.velocity for body in bodies]), jnp.stack([body.angular_velocity for body in bodies])
+    v, omega = of_bodies(motion, "velocity"), of_bodies(motion, "angular_velocity")
     force, torque, direct = jax.jacrev(rows, argnums=(0, 1, 2))(v, omega, u)
     rigid = jnp.array([isinstance(body.body, RigidBody) for body in bodies])
     torque = jnp.where(rigid[:, None], torque, 0.0)  # a particle takes no torque
@@ -143,7 +143,7 @@ def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=N
     margin = rank_cutoff(size.dtype) * size
     held = Wrenches(total.linear - jnp.sum(rows.force, axis=0), total.angular - jnp.sum(rows.torque, axis=0))  # by construction of the coordinates
     spare = jax.tree.map(lambda part: jnp.einsum("sr,sbi->rbi", unit[2], part), unit[0])
-    positions = jnp.stack([body.position for body in motion.bodies.values()])
+    positions = of_bodies(motion, "position")
     built_in = normal_forces(contacts, rows.body_names, positions, held, spare, size)
     forces = {}
     for name, contact in contacts.items():

@@ -28,7 +28,7 @@ from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.dynamics.newton_euler import potential_resultants
 from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.equations.kinematics import coordinate_rates
+from jourdain_jax.equations.kinematics import coordinate_rates, of_bodies
 from jourdain_jax.equations.minimal import MinimalKinematics, accelerations_of, minimal_kinematics
 from jourdain_jax.equations.virtual_power import resultants
 from jourdain_jax.scene.identity import once_per_values
@@ -142,7 +142,7 @@ def _quantities(scene: Scene, t, q, u) -> dict[str, Float[Array, "entries"]]:
     C = rates.C
     bodies = motion.bodies.values()
     velocities = jnp.concatenate([jnp.concatenate([body.velocity, body.angular_velocity]) for body in bodies])
-    turned = jnp.stack([body.orientation for body in bodies])
+    turned = of_bodies(motion, "orientation")
     inertia = jnp.einsum("bij,bjk,blk->bil", turned, known.weights.inertia, turned)
     beta, gamma = known.partial.bodies.linear @ C, jnp.einsum("bij,bjk->bik", turned, known.partial.bodies.angular @ C)
     loads, potential = resultants(scene, motion), potential_resultants(scene, motion)

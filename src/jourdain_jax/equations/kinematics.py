@@ -93,10 +93,14 @@ def _velocities(scene: Scene, t: Scalar, q, u) -> Velocities:
     return velocities_of(motion_at(scene, t, q, u))
 
 
+def of_bodies(motion: Motion, what: str) -> Float[Array, "bodies *shape"]:
+    """Return one quantity of all bodies, such as their `velocity`."""
+    return jnp.stack([getattr(body, what) for body in motion.bodies.values()])
+
+
 def velocities_of(motion: Motion) -> Velocities:
     """Velocities of the mass centres and body angular velocities, from a known motion."""
-    bodies = motion.bodies.values()
-    return Velocities(jnp.stack([b.velocity for b in bodies]), jnp.stack([b.angular_velocity_body for b in bodies]))
+    return Velocities(of_bodies(motion, "velocity"), of_bodies(motion, "angular_velocity_body"))
 
 
 @eager_if_concrete

@@ -24,6 +24,7 @@ from jourdain_jax.equations.kinematics import (
     inertias,
     inertias_of,
     motion_at,
+    of_bodies,
     partial_velocities,
     pose_at,
     velocities_of,
@@ -176,7 +177,7 @@ def _generalized_forces(scene: Scene, motion: Motion, partial: Velocities) -> Sp
 def impressed(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> Resultants:
     """All impressed forces, the torques in body axes, and on the speeds also `-N' dV/dq` of the scene's own potential; `loads`: as in `resultants`."""
     total = resultants(scene, motion, loads=loads)
-    orientation = jnp.stack([body.orientation for body in motion.bodies.values()])
+    orientation = of_bodies(motion, "orientation")
     torque = jnp.einsum("bji,bj->bi", orientation, total.torque)
     return Resultants(total.force, torque, total.direct - _potential_gradient(scene, motion))
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import jax
 import numpy as np
 
-from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, described, known_numbers
+from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, checked_whole, described, known_numbers
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
@@ -196,9 +196,7 @@ def _check(options: AllOptions) -> None:
     for name in ("events", "work", "retry"):
         if not isinstance(value := getattr(options, name), bool | np.bool_):
             raise ValueError(f"`{name}` is {described(value)}, expected True or False")
-    most = options.max_steps
-    if not isinstance(most, int | np.integer) or isinstance(most, bool) or most < 1:
-        raise ValueError(f"`max_steps` is {most!r}, expected a whole number of at least 1; give the number of steps after which to stop")
+    checked_whole(options.max_steps, "`max_steps`", 1, expected="of at least 1; give the number of steps after which to stop")
     solver = options.solver
     own = solver is None or isinstance(solver, Taylor | Method | ImplicitMethod)
     if not own and not isinstance(solver, diffrax.AbstractSolver):

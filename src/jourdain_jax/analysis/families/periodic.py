@@ -33,7 +33,7 @@ from jourdain_jax.analysis.table import complex_numbers
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.build.trace import event_values
 from jourdain_jax.calculus.matrices import pseudo_inverse
-from jourdain_jax.calculus.reals import RUN_SELDOM, Flag, Number, Scalar, compiled, known_numbers, largest
+from jourdain_jax.calculus.reals import RUN_SELDOM, Flag, Number, Scalar, checked_whole, compiled, known_numbers, largest
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.listed import names_of_events
@@ -124,8 +124,7 @@ def periodic(
     options = replace(options, solver=options.solver or diffrax.Dopri8())  # tolerances are traced below
     if not np.all(known_numbers(period) > 0) or not np.all(np.isfinite(known_numbers(period))):
         raise ValueError(f"`period` is {period}, expected a positive time in s")
-    if not isinstance(pieces, int | np.integer) or pieces < 1:
-        raise ValueError(f"`pieces` is {pieces!r}, expected a whole number of at least 1")
+    checked_whole(pieces, "`pieces`", 1, expected="of at least 1")
     events, held, entries = names_of_events(scene), as_names(held), scene.coordinate_names.entries
     names = entries + scene.speed_names.entries
     who, shift = f"`{type(scene).__name__}`", dict(shift or {})

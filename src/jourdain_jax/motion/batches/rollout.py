@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from tqdm import tqdm
 
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import checked_real, described, is_traced, known_numbers, real_type
+from jourdain_jax.calculus.reals import checked_real, checked_whole, described, is_traced, known_numbers, real_type
 from jourdain_jax.motion.inputs import as_inputs, check_inputs_in_rows, for_programs
 from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.integrators.problem import MEMORY
@@ -282,9 +282,8 @@ def _common_length(lengths: dict) -> int:
 
 
 def _chunk(scene: Scene, count: int, chunk: int | None, ts, memory: int) -> int:
-    if chunk is not None and (not isinstance(chunk, int | np.integer) or chunk < 1):
-        raise ValueError(f"`chunk` is {chunk!r}, expected a whole number, at least one lane")
+    chunk = 512 if chunk is None else checked_whole(chunk, "`chunk`", 1, expected="of at least one lane")
     times = DEFAULT_SAMPLES if ts is None else np.shape(ts)[0]
     per_lane = 8 * times * (len(scene.coordinate_names) + len(scene.speed_names) + 2)
     # the stages of 512 lanes fit the cache of a core; of the saved states of a chunk four copies are there at once
-    return max(1, min(count, 512 if chunk is None else chunk, memory // (4 * per_lane)))
+    return max(1, min(count, chunk, memory // (4 * per_lane)))
