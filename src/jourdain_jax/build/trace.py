@@ -36,22 +36,24 @@ from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import events_of, loads_of, potential_of
 
+PerBody = Num[Entries, "bodies 3"]
+
 
 class VelocityQuantities(eqx.Module):
     """What is traced; arrays of numbers, or of nodes."""
 
-    v: Num[Entries, "bodies 3"]
-    omega: Num[Entries, "bodies 3"]  # body axes
-    turning: Num[Entries, "bodies 3"]  # omega in space axes
-    position: Num[Entries, "bodies 3"]
+    v: PerBody
+    omega: PerBody  # body axes
+    turning: PerBody  # omega in space axes
+    position: PerBody
     orientation: Num[Entries, "bodies 3 3"]
     mass: Num[Entries, "bodies"]
     inertia: Num[Entries, "bodies 3 3"]
     phi: Num[Entries, "rows"]
     closure: Num[Entries, "geometric_rows"]
     qdot: Num[Entries, "coordinates"]
-    force: Num[Entries, "bodies 3"]
-    torque: Num[Entries, "bodies 3"]  # body axes
+    force: PerBody
+    torque: PerBody  # body axes
     direct: Num[Entries, "speeds"]
     power: Num[Entries, ""]  # of loads without a potential, and of potentials that depend on time or on inputs
     events: Num[Entries, "events"]  # sorted by name

@@ -31,15 +31,17 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.matrices import pseudo_inverse
 from jourdain_jax.calculus.reals import Count, Flag, Scalar, largest, with_usual_promotion
 
+Unknowns = Float[Array, "unknowns"]
+
 
 class Root(eqx.Module):
     """Where an iteration ended, and whether that is a root."""
 
-    x: Float[Array, "unknowns"]
+    x: Unknowns
     converged: Flag
 
 
-def newton_root(residual: Callable, guess: Float[Array, "unknowns"], scale: Float[Array, "unknowns"]) -> Root:
+def newton_root(residual: Callable, guess: Unknowns, scale: Unknowns) -> Root:
     """x with `residual(x) = 0` near `guess`; `residual` may close over anything, traced numbers included.
 
     `scale`: the size of each unknown, against which round-off counts; infinite for an unknown that need not be looked at. Iterates until the
@@ -79,15 +81,15 @@ def _matrix(linear: Callable, like) -> Float[Array, "unknowns unknowns"]:
 class Nearest(eqx.Module):
     """Where a search ended, and what is left of the rows there."""
 
-    x: Float[Array, "unknowns"]
+    x: Unknowns
     left: Scalar  # largest of the rows
 
 
 class Search(eqx.Module):
     """The best point so far, and the next to try."""
 
-    trial: Float[Array, "unknowns"]
-    best: Float[Array, "unknowns"]
+    trial: Unknowns
+    best: Unknowns
     f: Float[Array, "rows"]  # at the best, and their slopes
     J: Float[Array, "rows unknowns"]
     damping: Scalar
@@ -101,9 +103,7 @@ class Search(eqx.Module):
         return jnp.where(jnp.isfinite(left), left, jnp.inf)
 
 
-def damped_search(
-    rows: Callable, guess: Float[Array, "unknowns"], size: Float[Array, "unknowns"], tolerance: float, low=-np.inf, high=np.inf, most_steps=80
-) -> Search:
+def damped_search(rows: Callable, guess: Unknowns, size: Unknowns, tolerance: float, low=-np.inf, high=np.inf, most_steps=80) -> Search:
     """Search for x near `guess` from `low` to `high` at which no row exceeds the `tolerance`; it ends where they are smallest. J is per size of an unknown.
 
     `rows`: x -> f and J. `size`: of each unknown, by which steps are measured; zero for one that is held. Rows should be of order one where unknowns change
@@ -132,7 +132,7 @@ def damped_search(
     return jax.lax.while_loop(lambda search: search.going, once, start)
 
 
-def smooth_root(look: Callable, rows: Callable, guess: Float[Array, "unknowns"], x, size, tolerance, cutoff: float, most_steps=80) -> Float[Array, "unknowns"]:
+def smooth_root(look: Callable, rows: Callable, guess: Unknowns, x, size, tolerance, cutoff: float, most_steps=80) -> Unknowns:
     """The root near a guess, differentiable: a search without derivative, then steps `x <- x - J+ R(x)` with the J found, which carry one order each.
 
     `look`: x -> R and J, of numbers without derivatives; `rows`: x -> R; `x`: values of what is held (of size zero), with their derivatives; `cutoff`: of J+.

@@ -15,6 +15,8 @@ from jaxtyping import Array, Float, Real
 
 from jourdain_jax.calculus.reals import Matrix3, Number, Scalar, Vector, Vector3, checked_real, holds
 
+Attitude = Float[Array, "4"]
+
 
 def _angle(angle: Number) -> Scalar:
     return checked_real(angle, "angle of a rotation", (), advice="give one angle in rad; use `jax.vmap` for many")
@@ -102,12 +104,12 @@ def matrices_to_quaternions(rotations: Float[np.ndarray, "matrices 3 3"]) -> Flo
     return found
 
 
-def quaternion_rate(quaternion: Float[Array, "4"], omega_body: Vector3) -> Float[Array, "4"]:
+def quaternion_rate(quaternion: Attitude, omega_body: Vector3) -> Attitude:
     """`d quaternion / dt = 1/2 quaternion (0, omega_body)` for the body angular velocity `omega_body` (rad/s)."""
     return 0.5 * quaternion_product(quaternion, jnp.concatenate([jnp.zeros_like(omega_body[:1]), omega_body]))
 
 
-def quaternion_product(p: Float[Array, "4"], q: Float[Array, "4"]) -> Float[Array, "4"]:
+def quaternion_product(p: Attitude, q: Attitude) -> Attitude:
     """Hamilton's product of two quaternions `(w, x, y, z)`."""
     pw, px, py, pz = p[0], p[1], p[2], p[3]
     qw, qx, qy, qz = q[0], q[1], q[2], q[3]
@@ -121,7 +123,7 @@ def quaternion_product(p: Float[Array, "4"], q: Float[Array, "4"]) -> Float[Arra
     )
 
 
-def quaternion_from_axis_angle(axis: Vector, angle: Number) -> Float[Array, "4"]:
+def quaternion_from_axis_angle(axis: Vector, angle: Number) -> Attitude:
     """The unit quaternion (w, x, y, z) `(cos(angle/2), sin(angle/2) axis)` of a turn by `angle` (rad) about the unit vector `axis`."""
     half = _angle(angle) / 2
     axis = checked_real(axis, "axis of a quaternion", (3,), advice="give a unit vector")

@@ -20,6 +20,8 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector, Vector3, as_real, checked_positive, checked_real, described, known_numbers
 from jourdain_jax.calculus.rotations import rot_y
 
+Tangents = Float[Array, "2 3"]
+
 
 class RigidMotion(TypedDict, total=False):
     """How a ground lies and moves; all zero where nothing is said."""
@@ -68,7 +70,7 @@ class Plane(_Ground):
     """
 
     normal: Vector3  # unit vector, out of the ground
-    tangents: Float[Array, "2 3"]  # unit vectors along the no-slip rows
+    tangents: Tangents  # unit vectors along the no-slip rows
 
     def __init__(self, origin=(0.0, 0.0, 0.0), tilt=None, velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0), *, normal=None, along=None):
         """The plane z = 0, turned by `tilt` (rad, about y; or a rotation matrix); or the one with this `normal`, and its first tangent `along`."""
@@ -113,7 +115,7 @@ class _Round(_Ground):
         """The vector from the nearest point of the axis, or the centre, to the `point` (m, inertial frame)."""
 
     @abstractmethod
-    def _tangents(self, normal: Vector3) -> Float[Array, "2 3"]:
+    def _tangents(self, normal: Vector3) -> Tangents:
         """Unit vectors along the no-slip rows."""
 
     def _is(self, what: str, radius, side: str, motion: RigidMotion) -> None:
@@ -157,7 +159,7 @@ class Cylinder(_Round):
         arm = as_real(point) - self.origin
         return arm - (arm @ self.axis) * self.axis
 
-    def _tangents(self, normal: Vector3) -> Float[Array, "2 3"]:
+    def _tangents(self, normal: Vector3) -> Tangents:
         return jnp.stack([self.axis, jnp.cross(normal, self.axis)])
 
 
@@ -176,7 +178,7 @@ class Sphere(_Round):
         """The vector from the sphere's centre to the `point` (m, inertial frame)."""
         return as_real(point) - self.origin
 
-    def _tangents(self, normal: Vector3) -> Float[Array, "2 3"]:
+    def _tangents(self, normal: Vector3) -> Tangents:
         return tangents_of(normal)
 
 
@@ -255,7 +257,7 @@ def normal_at(ground: Ground, point: Vector3) -> Vector3:
     return gradient / jnp.sqrt(gradient @ gradient)
 
 
-def tangents_of(n: Vector3) -> Float[Array, "2 3"]:
+def tangents_of(n: Vector3) -> Tangents:
     """Two unit vectors normal to the unit vector n and to each other, with `t1 x t2 = n`: x and y after the shortest turn of z (or -z) to n.
 
     No field of tangents is continuous on a whole sphere: these change at n_z = 0, and the no-slip rows with them, not what they say.
@@ -274,7 +276,7 @@ def _turned(tilt) -> Matrix3:
     return tilt if tilt.shape == (3, 3) else rot_y(checked_real(tilt, "tilt of a plane", (), advice=advice))
 
 
-def _tangents_along(n, along) -> Float[Array, "2 3"]:
+def _tangents_along(n, along) -> Tangents:
     along = checked_real(along, "`along` of a plane", (3,), advice="give a vector that is not normal to the plane")
     first = along - (n @ along) * n
     if not np.all(known_numbers((first @ first) / (along @ along)) > 1e-8):

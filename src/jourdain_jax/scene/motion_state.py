@@ -14,13 +14,15 @@ from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.scene.bodies import Body, RigidBody
 from jourdain_jax.scene.names import Named, UnknownNameError, check_name
 
+Vectors = Float[Array, "*times 3"]
+
 
 class Point(eqx.Module):
     """A point of a body (or of the inertial frame, `body` None): where it is and how fast it moves."""
 
-    position: Float[Array, "*times 3"]  # m, inertial frame
-    velocity: Float[Array, "*times 3"]  # m/s, inertial frame
-    arm: Float[Array, "*times 3"]  # m, from the mass centre of the body to the point, inertial frame
+    position: Vectors  # m, inertial frame
+    velocity: Vectors  # m/s, inertial frame
+    arm: Vectors  # m, from the mass centre of the body to the point, inertial frame
     body: str | None = eqx.field(static=True, default=None)
 
 
@@ -42,7 +44,7 @@ class BodyPose(eqx.Module):
         return self.body.mass
 
     @property
-    def position(self) -> Float[Array, "*times 3"]:
+    def position(self) -> Vectors:
         """Position of the mass centre, m, inertial frame."""
         return self.body.position
 
@@ -53,7 +55,7 @@ class BodyPose(eqx.Module):
             return self.body.orientation
         return jnp.broadcast_to(jnp.eye(3, dtype=self.position.dtype), (*self.position.shape, 3))
 
-    def place(self, local) -> Float[Array, "*times 3"]:
+    def place(self, local) -> Vectors:
         """Position (inertial frame) of the point with body-frame coordinates `local` (m, relative to the mass centre)."""
         local = checked_real(local, f"point of body `{self.name}`", (3,), advice="give three components in its body frame, m")
         return self.position + self.orientation @ local.astype(self.position.dtype)
@@ -64,8 +66,8 @@ class BodyMotion(eqx.Module):
 
     name: str = eqx.field(static=True)
     body: Body
-    velocity: Float[Array, "*times 3"]  # m/s, mass centre, inertial frame
-    angular_velocity: Float[Array, "*times 3"]  # rad/s, inertial frame; zero for a particle
+    velocity: Vectors  # m/s, mass centre, inertial frame
+    angular_velocity: Vectors  # rad/s, inertial frame; zero for a particle
 
     mass = BodyPose.mass
     position = BodyPose.position
@@ -73,11 +75,11 @@ class BodyMotion(eqx.Module):
     place = BodyPose.place
 
     @property
-    def angular_velocity_body(self) -> Float[Array, "*times 3"]:
+    def angular_velocity_body(self) -> Vectors:
         """Angular velocity in body components, rad/s."""
         return jnp.einsum("...ji,...j->...i", self.orientation, self.angular_velocity)
 
-    def velocity_at(self, position) -> Float[Array, "*times 3"]:
+    def velocity_at(self, position) -> Vectors:
         """Velocity (m/s, inertial frame) of the material point at `position` (m, inertial frame): `v + omega x (position - r)`.
 
         `position`: three components, or along a motion three at each time.

@@ -35,6 +35,8 @@ from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
+Unknowns = Float[Array, "all_unknowns"]
+
 FOUND, NOT_FOUND, SINGULAR = range(3)
 MEANINGS = (
     "found",
@@ -190,25 +192,25 @@ class _Special(eqx.Module):
     held: tuple[int, ...] = eqx.field(static=True)
     kind: str = eqx.field(static=True)
     goes_on: bool = eqx.field(static=True)  # whether steady motions do at the same parameters
-    X: Float[Array, "all_unknowns"]
+    X: Unknowns
 
-    def parts(self, X: Float[Array, "all_unknowns"]) -> list[Array]:
+    def parts(self, X: Unknowns) -> list[Array]:
         """z, a, b and w."""
         n, m = len(self.equations.places), len(self.equations.states)
         return jnp.split(X, [n, n + m, n + 2 * m])
 
-    def numbers(self, scene: Scene, X: Float[Array, "all_unknowns"]) -> Float[Array, "numbers"]:
+    def numbers(self, scene: Scene, X: Unknowns) -> Float[Array, "numbers"]:
         """Parameters, t, q, u and inputs in a row."""
         of, parameters = self.equations, jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(scene)])
         return jnp.concatenate([parameters, of.given[len(parameters) :]]).at[of.places].set(self.parts(X)[0] * of.size)
 
-    def normal(self, X: Float[Array, "all_unknowns"]) -> Float[Array, "all_unknowns"]:
+    def normal(self, X: Unknowns) -> Unknowns:
         """X with a of unit length; of a pair a + i b."""
         z, a, b, w = self.parts(X)
         size = jnp.sqrt(a @ a + b @ b) if self.kind == PAIR else jnp.linalg.norm(a)
         return jnp.concatenate([z, a / size, b if self.kind == ZERO else b / size, w])
 
-    def equations_at(self, scene: Scene, X: Float[Array, "all_unknowns"], near: Float[Array, "all_unknowns"], sloped: bool) -> tuple[Array, Array | None]:
+    def equations_at(self, scene: Scene, X: Unknowns, near: Unknowns, sloped: bool) -> tuple[Array, Array | None]:
         """G, with size and phase of a and b by a normal point near by, and G_X if asked for."""
         _, a, b, w = self.parts(X)
         z, a0, b0, _ = self.parts(near)
@@ -230,7 +232,7 @@ class _Special(eqx.Module):
         size = np.concatenate([self.equations.size, np.ones(2 * m)])
         return jnp.concatenate([G, L @ X - c]), jnp.concatenate([jnp.column_stack([D[:, :-4] * size, D[:, -4:] @ of_w]), L])
 
-    def correction(self, scene: Scene, X: Float[Array, "all_unknowns"], near: Float[Array, "all_unknowns"]) -> tuple[Array, Array, Array]:
+    def correction(self, scene: Scene, X: Unknowns, near: Unknowns) -> tuple[Array, Array, Array]:
         """The step of Gauss and Newton, the pseudo-inverse of G_X, and its least pivot over the largest."""
         G, slopes = self.equations_at(scene, X, near, sloped=True)
         Q, T = jnp.linalg.qr(slopes)

@@ -101,15 +101,15 @@ def reversed_at(point: Point) -> Point:
     return replace(point, tangent=-point.tangent)
 
 
-def located(equations: Equations, here: Point, there: Point, test: Callable[[Point], float], values: tuple[float, float]) -> Point | None:
-    """The point between two neighbours at which a smooth `test` changes its sign, given its values at both; None where the curve is lost.
+def located(equations: Equations, here: Point, there: Point, test: Callable[[Point], float]) -> Point | None:
+    """The point between two neighbours at which a smooth `test` changes its sign; None where the curve is lost.
 
     By unequal halves down to a short piece, and on this along the chord: at a branch point itself the equations lose their rank, and for reasons of symmetry
     it often lies in the middle.
     """
     share, short = 0.4, 1e-6  # a piece that short differs from its chord by the square of its length
-    (a, b), (at_a, at_b) = (0.0, float(here.tangent @ (there.z - here.z))), values
-    low, high = here, there
+    (a, b), low, high = (0.0, float(here.tangent @ (there.z - here.z))), here, there
+    at_a, at_b = test(low), test(high)
     while b - a > short:
         c = a + share * (b - a)
         middle = along(equations, here, c, low.z + share * (high.z - low.z))  # a better guess than the tangent: another branch may be close

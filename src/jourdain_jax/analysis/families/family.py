@@ -115,14 +115,13 @@ class Family(Printed):
             raise ValueError(f"`at` takes one name with its value, and {len(named)} were given: a curve has points for one value")
         ((name, value),) = named.items()
         k = self.equations.index(name)
-        target, found = float(value) / self.equations.size[k], []
+        past, found = lambda p: p.z[k] - float(value) / self.equations.size[k], []
         for here, there in pairwise(self.points):
-            values = here.z[k] - target, there.z[k] - target
-            if values[0] == 0.0:
+            if past(here) == 0.0:
                 found.append(self.point(here))
-            elif values[0] * values[1] < 0 and (point := located(self.by.looked, here, there, lambda p: p.z[k] - target, values)):
+            elif past(here) * past(there) < 0 and (point := located(self.by.looked, here, there, past)):
                 found.append(self.point(point))
-        if self.points[-1].z[k] == target and self.ends[1] != "the curve is closed":
+        if past(self.points[-1]) == 0.0 and self.ends[1] != "the curve is closed":
             found.append(self.point(self.points[-1]))
         return tuple(found)
 

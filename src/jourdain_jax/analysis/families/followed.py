@@ -63,9 +63,8 @@ class Followed:
             return [*points, replace(begin, modes=matched(points[-1].modes, begin.modes))], (last, last)
         if self.targets:
             for k, (_, target) in self.targets.items() if len(points) > 1 else ():
-                here, there = points[-2:]
-                values = here.z[k] - target, there.z[k] - target
-                if values[0] * values[1] < 0 and (end := located(self.looked, here, there, lambda p, k=k, target=target: p.z[k] - target, values)):
+                past = lambda p, k=k, target=target: p.z[k] - target  # noqa: E731
+                if past(points[-2]) * past(points[-1]) < 0 and (end := located(self.looked, *points[-2:], past)):
                     points[-1] = replace(end, modes=matched(points[-1].modes, self.spectrum(end)))
             return points, ("the start", last)
         back, first = traced(self.looked, self.spectrum, reversed_at(begin), self.ended(reversed_at(begin)), most)
@@ -74,10 +73,10 @@ class Followed:
     def special(self, points: list[Point], turning: dict[str, int]) -> Iterator[tuple[Crossing, Point]]:
         """What is special between the points, in their order."""
         for here, there in pairwise(points):
-            crossings = [*branches(here, there), *folds(here, there, turning), *changes(here.modes, there.modes, self.spectrum)]
+            crossings = [*branches(here, there), *folds(here, there, turning), *changes(here, there, self.spectrum)]
             found = []
             for crossing in crossings:
-                point = located(self.looked, here, there, crossing.test, crossing.values)
+                point = located(self.looked, here, there, crossing.test)
                 found.append((crossing, point) if point else (replace(crossing, kind=f"{crossing.kind}, before this point"), there))
             branch = next((point for crossing, point in found if crossing.kind == "branch point"), None)
             if branch is not None:  # beside it tangents have few digits: what lies as close as this lies there

@@ -48,6 +48,10 @@ from jourdain_jax.scene.names import as_names, check_name, check_names
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
+Unknowns = Float[Array, "unknowns"]
+
+States = Float[Array, "states"]
+
 
 class PeriodicMotion(Printed, eqx.Module):
     """A motion that repeats itself after each period; `orbit["yaw_rate"]` is a value at its start.
@@ -150,7 +154,7 @@ class _Shooting(eqx.Module):
     scene: Scene
     inputs: Inputs
     options: AllOptions
-    shift: Float[Array, "states"]  # change in a period, as given
+    shift: States  # change in a period, as given
     instant: ByProgram | ByMatrices = eqx.field(static=True)
     pieces: int = eqx.field(static=True)
     until: int | None = eqx.field(static=True)
@@ -163,43 +167,43 @@ class _Shooting(eqx.Module):
         """Sizes of coordinates and speeds."""
         return sizes(self.scene, range(len(self.scene.coordinate_names.entries)))
 
-    def motion(self, t0, z: Float[Array, "states"], ts: Float[Array, "times"]):
+    def motion(self, t0, z: States, ts: Float[Array, "times"]):
         """The motion from a state."""
         n, none = len(self.scene.coordinate_names.entries), jnp.zeros(())
         start = State(t0, z[:n], z[n:], none, none, none, (self.scene.coordinate_names, self.scene.speed_names))
         fields = {name: value for name, value in vars(self.options).items() if name in OptionFields.__annotations__}
         return simulate(self.scene, start, t0=t0, ts=ts, inputs=self.inputs, **{**fields, "events": False, "work": False}).nan_if_failed()
 
-    def moved(self, k, z: Float[Array, "states"], t, period) -> Float[Array, "states"]:
+    def moved(self, k, z: States, t, period) -> States:
         """f_k."""
         part = period / self.pieces
         motion = self.motion(t + k * part, z, (t + (k + 1) * part)[None])
         return jnp.concatenate([motion.q_end, motion.u_end])
 
-    def events(self, t, z: Float[Array, "states"]) -> Float[Array, "events"]:
+    def events(self, t, z: States) -> Float[Array, "events"]:
         """Values of the stop events, c among them."""
         n = len(self.scene.coordinate_names.entries)
         return event_values(self.scene, motion_at(self.scene, t, z[:n], z[n:], inputs_at(self.inputs, t)))
 
-    def constraints(self, t, z: Float[Array, "states"]) -> tuple[Array, Array]:
+    def constraints(self, t, z: States) -> tuple[Array, Array]:
         """g and phi with their slopes by z."""
         at, n = places_of(self.scene), len(self.scene.coordinate_names.entries)
         v, D, _ = self.instant(self.scene, t, z[:n], z[n:], inputs_at(self.inputs, t))
         rows = np.concatenate([at.g, at.phi])
         return v[rows], D[rows][:, np.concatenate([at.q, at.u])]
 
-    def aligned(self, there: Float[Array, "states"], here: Float[Array, "states"]) -> Float[Array, "states"]:
+    def aligned(self, there: States, here: States) -> States:
         """The state `there`, with those signs of its quaternions that bring it nearest to `here`."""
         for first, _ in self.scene.coordinates.quaternions:
             part = slice(first, first + 4)
             there = there.at[part].multiply(jnp.where(there[part] @ here[part] < 0, -1.0, 1.0))
         return there
 
-    def pieces_of(self, x: Float[Array, "unknowns"]) -> tuple[Float[Array, "pieces states"], Scalar]:
+    def pieces_of(self, x: Unknowns) -> tuple[Float[Array, "pieces states"], Scalar]:
         """States at which pieces begin, and the period."""
         return jnp.reshape(x[:-1], (self.pieces, -1)), x[-1]
 
-    def rows(self, t, x: Float[Array, "unknowns"], ends: Float[Array, "pieces states"]) -> Float[Array, "rows"]:
+    def rows(self, t, x: Unknowns, ends: Float[Array, "pieces states"]) -> Float[Array, "rows"]:
         """R, in units of the sizes of what is compared, where the pieces end at `ends`."""
         zs, _ = self.pieces_of(x)
         there = jnp.roll(zs, -1, axis=0)
@@ -207,12 +211,12 @@ class _Shooting(eqx.Module):
         found = [self.constraints(t, zs[0])[0], jnp.ravel(changes[:-1]), changes[-1][np.array(self.kept)]]
         return jnp.concatenate([*found, *([] if self.until is None else [self.events(t, zs[0])[self.until][None]])])
 
-    def ends(self, t, x: Float[Array, "unknowns"]) -> Float[Array, "pieces states"]:
+    def ends(self, t, x: Unknowns) -> Float[Array, "pieces states"]:
         """All f_k."""
         zs, period = self.pieces_of(x)
         return jax.vmap(self.moved, (0, 0, None, None))(jnp.arange(self.pieces), zs, t, period)
 
-    def slopes(self, t, x: Float[Array, "unknowns"]) -> tuple[Array, Array, Array]:
+    def slopes(self, t, x: Unknowns) -> tuple[Array, Array, Array]:
         """df_k/dz_k, df_k/dT, and f_k."""
         zs, period = self.pieces_of(x)
 
@@ -225,7 +229,7 @@ class _Shooting(eqx.Module):
 
         return jax.vmap(of_piece)(jnp.arange(self.pieces), zs)
 
-    def look(self, t, x: Float[Array, "unknowns"]) -> tuple[Array, Array]:
+    def look(self, t, x: Unknowns) -> tuple[Array, Array]:
         """R and dR/dx."""
         D, of_period, ends = self.slopes(t, x)
 
@@ -235,7 +239,7 @@ class _Shooting(eqx.Module):
 
         return self.rows(t, x, ends), jax.jacfwd(linear)(jnp.zeros_like(x))
 
-    def multipliers(self, t, x: Float[Array, "unknowns"], D: Float[Array, "pieces states states"], ends) -> Complex[Array, "multipliers"]:
+    def multipliers(self, t, x: Unknowns, D: Float[Array, "pieces states states"], ends) -> Complex[Array, "multipliers"]:
         """Eigenvalues of M_n .. M_1 by df_k/dz_k and f_k, the largest first, without the one of going on along the motion where the period is unknown."""
         (zs, period), kept, known, n = self.pieces_of(x), np.array(self.kept), structure_of(self.scene), self.pieces
         places = kept[kept < len(self.scene.coordinate_names.entries)]

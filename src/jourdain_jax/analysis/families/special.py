@@ -26,7 +26,6 @@ class Crossing:
 
     kind: str
     test: Callable[[Point], float]
-    values: tuple[float, float]
     columns: tuple[int, ...] = ()  # of the eigenvalues concerned
 
 
@@ -34,7 +33,7 @@ def folds(here: Point, there: Point, unknowns: dict[str, int]) -> Iterator[Cross
     """Folds of the named unknowns."""
     for name, k in unknowns.items():
         if here.tangent[k] * there.tangent[k] < 0 and min(abs(here.tangent[k]), abs(there.tangent[k])) > 1e-10:  # not round-off
-            yield Crossing(f"fold in {name}", lambda p, k=k: p.tangent[k], (here.tangent[k], there.tangent[k]))
+            yield Crossing(f"fold in {name}", lambda p, k=k: p.tangent[k])
 
 
 def branches(here: Point, there: Point) -> Iterator[Crossing]:
@@ -46,9 +45,8 @@ def branches(here: Point, there: Point) -> Iterator[Crossing]:
         side = np.linalg.slogdet(U.T @ own)[0] * np.linalg.slogdet(V)[0] * np.sign(V[-1] @ point.tangent)
         return float(side * sigma)
 
-    values = test(here), test(there)
-    if values[0] * values[1] < 0:
-        yield Crossing("branch point", test, values)
+    if test(here) * test(there) < 0:
+        yield Crossing("branch point", test)
 
 
 def _held(look: Look) -> tuple[Float[np.ndarray, "rows held"], float, Float[np.ndarray, "unknowns unknowns"]]:
@@ -58,33 +56,26 @@ def _held(look: Look) -> tuple[Float[np.ndarray, "rows held"], float, Float[np.n
     return U[:, :held], float(sigma[held - 1]), V
 
 
-def changes(before: Modes, now: Modes, spectrum: Callable[[Point], Modes]) -> Iterator[Crossing]:
+def changes(here: Point, there: Point, spectrum: Callable[[Point], Modes]) -> Iterator[Crossing]:
     """Eigenvalues that pass zero or the imaginary axis, and pairs that meet; `spectrum`: eigenvalues at a point, in any order."""
+    before, now = here.modes, there.modes
 
-    def part(k: int) -> Callable[[Point], float]:
-        return lambda point: float(matched((before + now) / 2, spectrum(point))[k].real)
-
-    def apart(a: int, b: int) -> Callable[[Point], float]:
-        def test(point: Point) -> float:
-            found = matched((before + now) / 2, spectrum(point))
-            return float(((found[a] - found[b]) ** 2).real)
-
-        return test
+    def modes(point: Point) -> Modes:
+        return point.modes if len(point.modes) else matched((before + now) / 2, spectrum(point))
 
     for k, (a, b) in enumerate(zip(before, now, strict=True)):
-        if a.imag == 0 and b.imag == 0 and _surely_opposite(a, b):
-            yield Crossing("zero eigenvalue", part(k), (a.real, b.real), (k,))
-        if a.imag > 0 and b.imag != 0 and _surely_opposite(a, b):
-            yield Crossing("pair on the imaginary axis", part(k), (a.real, b.real), tuple(np.flatnonzero(np.isin(before, (a, np.conj(a)))).tolist()))
+        if a.real * b.real < 0 and min(abs(a.real), abs(b.real)) > SURE * (1 + abs(a)):
+            if a.imag == 0 and b.imag == 0:
+                yield Crossing("zero eigenvalue", lambda point, k=k: float(modes(point)[k].real), (k,))
+            if a.imag > 0 and b.imag != 0:
+                columns = tuple(np.flatnonzero(np.isin(before, (a, np.conj(a)))).tolist())
+                yield Crossing("pair on the imaginary axis", lambda point, k=k: float(modes(point)[k].real), columns)
     for a, b in {pair for v in (before, now) for pair in _pairs(v)}:
-        values = float(((before[a] - before[b]) ** 2).real), float(((now[a] - now[b]) ** 2).real)
+        test = lambda point, a=a, b=b: float(((modes(point)[a] - modes(point)[b]) ** 2).real)  # noqa: E731
+        values = test(here), test(there)
         least = (SURE * (1 + abs(before[a]))) ** 2
         if values[0] * values[1] < 0 and min(map(abs, values)) > least:
-            yield Crossing("double root", apart(a, b), values, (a, b))
-
-
-def _surely_opposite(a: complex, b: complex) -> bool:
-    return bool(a.real * b.real < 0 and min(abs(a.real), abs(b.real)) > SURE * (1 + abs(a)))
+            yield Crossing("double root", test, (a, b))
 
 
 def _pairs(values: Modes) -> list[tuple[int, int]]:

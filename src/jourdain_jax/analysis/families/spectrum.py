@@ -4,14 +4,15 @@ Directions along which the steady motions themselves go on, at the same paramete
 a subspace, T, not by their size: with P orthonormal and across T the others are those of P' A P.
 """
 
-from itertools import permutations
-
 import numpy as np
 from jaxtyping import Complex, Float
 
 from jourdain_jax.analysis.families.equations import Look
+from jourdain_jax.calculus.on_first_use import module_on_first_use
+from jourdain_jax.calculus.reals import largest
 from jourdain_jax.scene.scene import Scene
 
+optimize = module_on_first_use("scipy.optimize")
 Modes = Complex[np.ndarray, "modes"]
 
 
@@ -39,23 +40,9 @@ def _in_pairs(values: Modes) -> Modes:
 
 
 def matched(before: Modes, now: Modes) -> Modes:
-    """The eigenvalues in the columns of those before: in the order that moves them least."""
-    apart = np.abs(before[:, None] - now[None])
-    n = len(now)
-    if n <= 7:
-        order = min(permutations(range(n)), key=lambda order: sum(apart[k, j] for k, j in enumerate(order)))
-    else:
-        order = _nearest_first(apart)
-    return now[list(order)]
-
-
-def _nearest_first(apart: Float[np.ndarray, "modes modes"]) -> list[int]:
-    order, left = [-1] * len(apart), apart.copy()
-    for _ in order:
-        k, j = np.unravel_index(np.argmin(left), left.shape)
-        order[k] = int(j)
-        left[k], left[:, j] = np.inf, np.inf
-    return order
+    """The eigenvalues in the columns of those before: in the order that moves them least, of equals the first."""
+    apart, place = np.abs(before[:, None] - now), np.arange(len(now))
+    return now[optimize.linear_sum_assignment(apart - 1e-12 * (1 + largest(now)) * np.outer(place, place))[1]]
 
 
 def surely_matched(before: Modes, now: Modes) -> bool:
