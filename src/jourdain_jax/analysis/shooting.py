@@ -40,8 +40,8 @@ NODE, LAST = "node of a piece", "time of the next node"  # in the start of a run
 def begin(scene: Scene, start: dict, t0):
     """What `simulate` begins from: the start of a run; of a later piece its node, which `simulate` puts onto the constraints."""
     if NODE in start:
-        (q, u, _), nothing = jnp.split(start[NODE], np.cumsum([len(scene.coordinate_names), len(scene.speed_names)])), jnp.zeros(())
-        return State(jnp.asarray(t0), q, u, nothing, nothing, nothing, (scene.coordinate_names, scene.speed_names))
+        q, u, _ = jnp.split(start[NODE], np.cumsum([len(scene.coordinate_names), len(scene.speed_names)]))
+        return State.of(scene, t0, q, u)
     return {name: value for name, value in start.items() if name != LAST}
 
 

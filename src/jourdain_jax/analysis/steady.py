@@ -142,7 +142,7 @@ def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], most_steps: i
     n = len(q)
     moved_q, moved_u = (largest(a - b) for a, b in ((z[:n], q), (z[n:], u)))
     residual = jnp.maximum(of_rows, jnp.maximum(first, second))
-    state = State(problem.t, z[:n], z[n:], moved_q, moved_u, of_rows, (problem.scene.coordinate_names, problem.scene.speed_names))
+    state = State.of(problem.scene, problem.t, z[:n], z[n:], moved_q, moved_u, of_rows)
     return SteadyMotion(state, first, residual, residual < _round_off_root(z.dtype))
 
 

@@ -24,8 +24,7 @@ _DEPENDENT = ("pitch",)
 def upright_running(bicycle: WhippleBicycle, speed) -> State:
     """Running straight and upright at `speed` (m/s): an exact steady motion, on the constraints as it stands."""
     q, u, _ = bicycle.named(**bicycle.upright(speed))
-    zero = jnp.zeros(())
-    return State(zero, q, u, zero, zero, zero, (bicycle.coordinate_names, bicycle.speed_names))
+    return State.of(bicycle, 0.0, q, u)
 
 
 def linear_matrices(values: Mapping[str, float | Scalar]) -> BicycleMatrices:

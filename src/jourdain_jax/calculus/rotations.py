@@ -18,6 +18,16 @@ from jourdain_jax.calculus.reals import Matrix3, Number, Scalar, Vector, Vector3
 Attitude = Float[Array, "4"]
 
 
+def onto_axis(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The shortest rotation that takes z to a direction k: `1 + [v]x + (1 - c)/s^2 [v]x [v]x` with v = z x k, s = |v|, c = z.k; half a turn about x to -z."""
+    k = direction / np.linalg.norm(direction)
+    v = np.cross([0.0, 0.0, 1.0], k)
+    if k[2] < 0 and np.linalg.norm(v) < 1e-10:
+        return np.diag([1.0, -1.0, -1.0])
+    factor, turned = 1 / (1 + k[2]) if k[2] > 0 else (1 - k[2]) / (v @ v), np.cross(np.eye(3), v)
+    return np.eye(3) + turned + factor * turned @ turned
+
+
 def _angle(angle: Number) -> Scalar:
     return checked_real(angle, "angle of a rotation", (), advice="give one angle in rad; use `jax.vmap` for many")
 

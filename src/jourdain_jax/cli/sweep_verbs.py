@@ -39,7 +39,7 @@ from jourdain_jax.ensembles.study import REFUSED, Study
 from jourdain_jax.models.registry import model
 from jourdain_jax.motion.model import build
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN
-from jourdain_jax.scene.names import check_name, nearest
+from jourdain_jax.scene.names import check_names, nearest
 
 ACTIONS = ("status", "resume", "export", "merge")
 VARYING: dict[str, Callable] = {"normal": Normal, "uniform": Uniform, "log-normal": LogNormal, "log-uniform": LogUniform}
@@ -107,13 +107,12 @@ def _run(text: str, source: str, out: str, options) -> bool:
 
 def described_study(asked: Mapping, memory: str | None = None) -> tuple[Study, dict]:
     """The study that a file describes, whose processes may hold so much memory, and how it is to be run."""
+    check_names(asked, KEYS, "the file has an entry `{}`")
     for key in asked:
-        check_name(key, KEYS, f"the file has an entry `{key}`")
         if key in TABLES and not isinstance(asked[key], Mapping):
             raise ValueError(f"`{key}` is {described(asked[key])}, expected a table: a line [{key}] with entries below it")
     known_options = [name for name in (*SPAN, *OPTION_NAMES) if name not in REFUSED and name not in asked]
-    for name in asked.get("options", {}):
-        check_name(name, known_options, f"`{name}` is no entry of [options]")
+    check_names(asked.get("options", {}), known_options, "`{}` is no entry of [options]")
     if "model" not in asked:
         raise ValueError("the file names no `model`; write, for example, model = 'tilting-disc'")
     scene = model(asked["model"], **asked.get("set", {}))

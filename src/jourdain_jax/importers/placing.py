@@ -12,11 +12,6 @@ def about(axis: Vector, angle: float) -> Matrix:
     return Rotation.from_rotvec(angle * axis).as_matrix()
 
 
-def cross_matrix(v: Vector) -> Matrix:
-    """The matrix of the cross product with v."""
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-
-
 def by_euler_angles(angles: Vector, sequence: str) -> Matrix:
     """MJCF's `euler`: about axes in turn (rad), those of the turned frame in lower case, fixed ones in upper case."""
     turn = np.eye(3)
@@ -29,16 +24,6 @@ def by_euler_angles(angles: Vector, sequence: str) -> Matrix:
 def by_quaternion(q: Float[np.ndarray, "4"]) -> Matrix:
     """A quaternion (w, x, y, z) of any norm; NaN for zero."""
     return Rotation.from_quat(np.roll(q, -1)).as_matrix() if np.any(q) else np.full((3, 3), np.nan)
-
-
-def onto_axis(direction: Vector) -> Matrix:
-    """The shortest rotation that takes z to a direction k: `1 + [v]x + (1 - c)/s^2 [v]x [v]x` with v = z x k, s = |v|, c = z.k; half a turn about x to -z."""
-    k = direction / np.linalg.norm(direction)
-    v = np.cross([0.0, 0.0, 1.0], k)
-    if k[2] < 0 and np.linalg.norm(v) < 1e-10:
-        return np.diag([1.0, -1.0, -1.0])
-    factor = 1 / (1 + k[2]) if k[2] > 0 else (1 - k[2]) / (v @ v)
-    return np.eye(3) + cross_matrix(v) + factor * cross_matrix(v) @ cross_matrix(v)
 
 
 def combined(masses: list[Mass]) -> Mass:

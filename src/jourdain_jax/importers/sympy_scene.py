@@ -16,7 +16,7 @@ from jourdain_jax.importers.sympy_system import MechanicalSystem, mechanical_sys
 from jourdain_jax.scene.bodies import Particle, RigidBody
 from jourdain_jax.scene.coordinates import coordinates, inputs, speeds
 from jourdain_jax.scene.loads import Load
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import check_names
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
 
@@ -227,6 +227,4 @@ def _check_values(given: Mapping[str, float], names: set[str]) -> None:
     if missing := sorted(names - given.keys()):
         listed = ", ".join(f"`{symbol}`" for symbol in missing)
         raise ValueError(f"no value for {listed}; give `values={{{missing[0]}: 1.0}}`, a number for each constant, by symbol or name")
-    for symbol in given:
-        if symbol not in names:
-            raise ValueError(f"`values` names `{symbol}`, which does not occur in the system; {nearest(symbol, sorted(names))}")
+    check_names(given, sorted(names), "`values` names `{}`, which does not occur in the system")

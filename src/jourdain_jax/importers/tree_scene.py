@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Matrix3, Vector3, real_type
-from jourdain_jax.calculus.rotations import quaternion_to_matrix
-from jourdain_jax.importers.placing import combined, cross_matrix, onto_axis
+from jourdain_jax.calculus.rotations import onto_axis, quaternion_to_matrix
+from jourdain_jax.importers.placing import combined
 from jourdain_jax.importers.scene_class import identifiers, scene_class
 from jourdain_jax.importers.tree import Follower, Joint, Link, Look, Mass, Push, Tree
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.coordinates import Quaternion, coordinates, inputs, quaternion
 from jourdain_jax.scene.loads import Load, generalized_force, gravity, point_force, torque
-from jourdain_jax.scene.names import check_name
+from jourdain_jax.scene.names import check_names
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
@@ -164,7 +164,7 @@ def _moved(joint: Joint, name: str, R, origin, q) -> Frame:
 def _about(axis, angle) -> Matrix3:
     """Rotation by an angle that JAX may trace about a known axis."""
     along = np.outer(axis, axis)
-    return along + jnp.cos(angle) * (np.eye(3) - along) + jnp.sin(angle) * cross_matrix(axis)
+    return along + jnp.cos(angle) * (np.eye(3) - along) + jnp.sin(angle) * np.cross(np.eye(3), axis)
 
 
 def _in_plane(normal) -> Float[np.ndarray, "2 3"]:
@@ -198,9 +198,7 @@ def tree_scene(tree: Tree, source: str, ignore: tuple[str, ...]) -> type[Scene]:
     if not moving:
         raise ValueError(f'{source}: no joint moves anything; expected at least one that does, or a base that moves, such as base="free"')
     _check_masses(tree, source, ignore)
-    known = [link.name for link in tree.links]
-    for name in tree.free:
-        check_name(name, known, f"`free` names `{name}`, which is no link")
+    check_names(tree.free, [link.name for link in tree.links], "`free` names `{}`, which is no link")
     joints = [joint for link in tree.links for joint in link.joints]
     link_names = identifiers([link.name for link in tree.links], "link")
     of_base = () if all(joint.name for joint in joints) else ("x", "y", "z", "heading", "attitude")

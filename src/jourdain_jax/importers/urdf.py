@@ -15,7 +15,7 @@ from jourdain_jax.importers.placing import about
 from jourdain_jax.importers.tree import Follower, Joint, Link, Look, Mass, Matrix, Motor, Tree, Vector
 from jourdain_jax.importers.tree_scene import tree_scene
 from jourdain_jax.importers.xml_file import Holds, Part, XmlFile
-from jourdain_jax.scene.names import as_labels, check_name, nearest
+from jourdain_jax.scene.names import as_labels, check_names, nearest
 from jourdain_jax.scene.scene import Scene
 
 _KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free", "planar": "planar", "fixed": ""}
@@ -133,8 +133,7 @@ class _Reader:
             raise self.file.fault(f"link `{lost}` hangs in a loop of joints; a URDF is a tree, close loops by `geometric_constraints` in a subclass")
         joints = [joint for link in links for joint in link.joints]
         names = [joint.name for joint in joints if joint.kind in ("hinge", "slide")]
-        for name in motors:
-            check_name(name, names, f"`motors` names `{name}`, which is no joint of one coordinate")
+        check_names(motors, names, "`motors` names `{}`, which is no joint of one coordinate")
         mimics = {joint.name: self.joints[joint.name].child("mimic") for joint in joints if joint.name}
         followers = tuple(self._follower(name, mimic, names) for name, mimic in mimics.items() if mimic.element is not None)
         pushed = tuple(Motor(f"{name}_motor", name) for name in motors)

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.calculus.rotations import onto_axis
 from jourdain_jax.equations.kinematics import pose_at
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.plotting.guesses import across
 from jourdain_jax.plotting.looks import Curved, Drawn
 from jourdain_jax.plotting.solids import arc, quads, revolved
 from jourdain_jax.scene.contacts import Contact
@@ -37,7 +37,7 @@ def _ground(trajectory: Trajectory, drawn: Drawn, name: str, contact: Contact, l
         axis, origin = np.asarray(ground.axis)[0], np.asarray(ground.origin)[0]
         corners = np.stack(np.meshgrid(*np.stack([low, high], axis=1)), axis=-1)
         along, radius = (corners - origin) @ axis, float(ground.radius[0])
-        return _mesh(revolved(np.array([[radius, along.min()], [radius, along.max()]]), 2 * _CELLS) @ across(axis).T + origin)
+        return _mesh(revolved(np.array([[radius, along.min()], [radius, along.max()]]), 2 * _CELLS) @ onto_axis(axis).T + origin)
     if isinstance(ground, Curved):
         return _surface(trajectory, drawn, name, contact, low, high)
     plane = contact.plane

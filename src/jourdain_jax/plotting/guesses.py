@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from jourdain_jax.calculus.rotations import onto_axis
 from jourdain_jax.scene.bodies import Particle, RigidBody
 from jourdain_jax.scene.contact_points import Ball, Ellipsoid, Shape, Wheel
 from jourdain_jax.scene.visuals import Visual
@@ -37,7 +38,7 @@ def _of_contact(body: RigidBody, shape: Shape) -> list[Visual]:
         return [Visual.ellipsoid(shape.semi_axes, at=at, turn=to_body @ np.asarray(shape.orientation))]
     assert isinstance(shape, Wheel)
     width = 0.1 * shape.radius if shape.tyre is None else 2 * shape.tyre
-    return [Visual.wheel(shape.radius, width, axis="z", at=at, turn=across(to_body @ np.asarray(shape.axle)))]
+    return [Visual.wheel(shape.radius, width, axis="z", at=at, turn=onto_axis(to_body @ np.asarray(shape.axle)))]
 
 
 def _of_inertia(body: RigidBody) -> list[Visual]:
@@ -50,11 +51,3 @@ def _of_inertia(body: RigidBody) -> list[Visual]:
     sides = np.sqrt(np.maximum(squares, 0.0025 * squares.max()))
     axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
     return [Visual.box(sides, turn=axes)]
-
-
-def across(axis: np.ndarray) -> np.ndarray:
-    """A rotation matrix whose last column is the direction `axis`."""
-    z = axis / np.linalg.norm(axis)
-    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)

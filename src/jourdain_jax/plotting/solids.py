@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int
 
-from jourdain_jax.plotting.guesses import across
+from jourdain_jax.calculus.rotations import onto_axis
 from jourdain_jax.scene.visuals import Visual
 
 Quads = Float[np.ndarray, "faces 4 3"]  # m; corners anticlockwise, seen from outside
@@ -82,7 +82,7 @@ def _box() -> Quads:
 def _bar(a: np.ndarray, b: np.ndarray, radius: float) -> Quads:
     """A bar of round section from a to b."""
     length = float(np.linalg.norm(b - a))
-    return quads(revolved(_cylinder(radius, length), 8)) @ across(b - a).T + (a + b) / 2
+    return quads(revolved(_cylinder(radius, length), 8)) @ onto_axis(b - a).T + (a + b) / 2
 
 
 def split(faces: Quads, longest: float) -> tuple[Float[np.ndarray, "parts 4 3"], Int[np.ndarray, "parts"]]:

@@ -301,10 +301,9 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
         point = _chosen(motions, what)
         special = _special(motions, point)
     numbers, w, condition, code = _solution(special, scene)
-    none = jnp.zeros(())
     q, u, varied = equations.split(numbers)
-    state = State(jnp.asarray(equations.t), q, u, none, none, none, (scene.coordinate_names, scene.speed_names))
-    return CriticalPoint(state, varied, jax.lax.complex(*((0 * w, w) if point.kind == PAIR else (w, 0 * w))), condition, code, point.kind, equations.vary)
+    eigenvalue = jax.lax.complex(*((0 * w, w) if point.kind == PAIR else (w, 0 * w)))
+    return CriticalPoint(State.of(scene, equations.t, q, u), varied, eigenvalue, condition, code, point.kind, equations.vary)
 
 
 def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:

@@ -129,9 +129,7 @@ class Family(Printed):
         """A point of the curve with its state and eigenvalues."""
         q, u, value = self.equations.split(self.equations.at(point.z))
         near = min(self.points, key=lambda p: largest(p.z - point.z))
-        left, none = jnp.asarray(largest(point.look.R)), jnp.zeros(())
-        scene = self.equations.scene
-        state = State(jnp.asarray(self.equations.t), jnp.asarray(q), jnp.asarray(u), none, none, left, (scene.coordinate_names, scene.speed_names))
+        state = State.of(self.equations.scene, self.equations.t, jnp.asarray(q), jnp.asarray(u), residual=largest(point.look.R))
         modes = point.modes if len(point.modes) else matched(near.modes, self.by.spectrum(point))
         return FamilyPoint(kind, state, modes, tuple(self.mode_names[k] for k in columns), self.equations.vary, value, point.tangent * self.equations.size)
 

@@ -169,8 +169,8 @@ class _Shooting(eqx.Module):
 
     def motion(self, t0, z: States, ts: Float[Array, "times"]):
         """The motion from a state."""
-        n, none = len(self.scene.coordinate_names.entries), jnp.zeros(())
-        start = State(t0, z[:n], z[n:], none, none, none, (self.scene.coordinate_names, self.scene.speed_names))
+        n = len(self.scene.coordinate_names.entries)
+        start = State.of(self.scene, t0, z[:n], z[n:])
         fields = {name: value for name, value in vars(self.options).items() if name in OptionFields.__annotations__}
         return simulate(self.scene, start, t0=t0, ts=ts, inputs=self.inputs, **{**fields, "events": False, "work": False}).nan_if_failed()
 
@@ -288,5 +288,5 @@ def _found(problem: _Shooting, start: State, period: Scalar) -> PeriodicMotion:
         goes_on = jnp.all(values[:, np.array(others)] >= 0)
     n, names = len(start.q), problem.scene.coordinate_names.entries
     shifts = {name: ends[-1, k] - zs[0, k] for k, name in enumerate(names) if k not in problem.kept or name in problem.shifted}
-    state = State(t, zs[0, :n], zs[0, n:], start.moved_q, start.moved_u, residual, (problem.scene.coordinate_names, problem.scene.speed_names))
+    state = State.of(problem.scene, t, zs[0, :n], zs[0, n:], start.moved_q, start.moved_u, residual)
     return PeriodicMotion(state, period, shifts, problem.multipliers(t, x, D, ends), residual, (residual < 1e-8) & goes_on)
