@@ -29,7 +29,7 @@ from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.sensors import FEWEST_INTERVALS, latest
 from jourdain_jax.calculus.reals import Number, checked_real, checked_whole
 from jourdain_jax.motion.inputs import Inputs, Sampled
-from jourdain_jax.motion.put_on_rows import State
+from jourdain_jax.motion.put_on_rows import state_of
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.scene import Scene
 
@@ -41,7 +41,7 @@ def begin(scene: Scene, start: dict, t0):
     """What `simulate` begins from: the start of a run; of a later piece its node, which `simulate` puts onto the constraints."""
     if NODE in start:
         q, u, _ = jnp.split(start[NODE], np.cumsum([len(scene.coordinate_names), len(scene.speed_names)]))
-        return State.of(scene, t0, q, u)
+        return state_of(scene, t0, q, u)
     return {name: value for name, value in start.items() if name != LAST}
 
 

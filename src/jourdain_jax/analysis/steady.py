@@ -22,7 +22,7 @@ from jourdain_jax.analysis.tangent import privileged_speeds
 from jourdain_jax.calculus.reals import RUN_SELDOM, Flag, Number, Numbers, Scalar, compiled, described, largest, real_type
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
-from jourdain_jax.motion.put_on_rows import State
+from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, shown_from_users_lines
 from jourdain_jax.scene.names import as_names, check_names
 from jourdain_jax.scene.printing import Printed
@@ -142,7 +142,7 @@ def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], most_steps: i
     n = len(q)
     moved_q, moved_u = (largest(a - b) for a, b in ((z[:n], q), (z[n:], u)))
     residual = jnp.maximum(of_rows, jnp.maximum(first, second))
-    state = State.of(problem.scene, problem.t, z[:n], z[n:], moved_q, moved_u, of_rows)
+    state = state_of(problem.scene, problem.t, z[:n], z[n:], moved_q, moved_u, of_rows)
     return SteadyMotion(state, first, residual, residual < _round_off_root(z.dtype))
 
 

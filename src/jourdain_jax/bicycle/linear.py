@@ -15,7 +15,7 @@ from jourdain_jax.analysis.linearize import linearize
 from jourdain_jax.bicycle.stability import BicycleMatrices
 from jourdain_jax.calculus.reals import RUN_SELDOM, Scalar, compiled
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
-from jourdain_jax.motion.put_on_rows import State
+from jourdain_jax.motion.put_on_rows import State, state_of
 
 _SPEED = 4.0  # m/s, of the second linearisation
 _DEPENDENT = ("pitch",)
@@ -24,7 +24,7 @@ _DEPENDENT = ("pitch",)
 def upright_running(bicycle: WhippleBicycle, speed) -> State:
     """Running straight and upright at `speed` (m/s): an exact steady motion, on the constraints as it stands."""
     q, u, _ = bicycle.named(**bicycle.upright(speed))
-    return State.of(bicycle, 0.0, q, u)
+    return state_of(bicycle, 0.0, q, u)
 
 
 def linear_matrices(values: Mapping[str, float | Scalar]) -> BicycleMatrices:

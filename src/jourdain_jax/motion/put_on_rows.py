@@ -58,12 +58,6 @@ class State(Printed, eqx.Module):
     # that led here: 0, what was given; then others (`start`). A floating-point number, so that a loss can be differentiated with respect to a whole state
     guess: Float[Array, ""] = eqx.field(default=0, converter=lambda k: jnp.asarray(k, real_type()))
 
-    @staticmethod
-    def of(scene: Scene, t, q, u, moved_q=0.0, moved_u=0.0, residual=0.0) -> "State":
-        """Return a state of a scene that nothing else has put onto the constraints."""
-        t, *judged = (jnp.asarray(x, real_type()) for x in (t, moved_q, moved_u, residual))
-        return State(t, q, u, *judged, (scene.coordinate_names, scene.speed_names))
-
     def __getitem__(self, name: str):
         """A coordinate, speed, quaternion or angular velocity by name."""
         coordinates, speeds = (names.view(x) for names, x in zip(self.names, (self.q, self.u), strict=True))
@@ -81,6 +75,12 @@ class State(Printed, eqx.Module):
         if int(self.guess):
             moved += f"; from guess {int(self.guess)}: coordinates that were not given begin elsewhere in the domain, those near the reference lead nowhere"
         return f"State at t = {self.t:.6g} s: " + ", ".join(pairs) + f"\n{moved}"
+
+
+def state_of(scene: Scene, t, q, u, moved_q=0.0, moved_u=0.0, residual=0.0) -> State:
+    """Return a state of a scene that nothing else has put onto the constraints."""
+    t, moved_q, moved_u, residual = (jnp.asarray(x, real_type()) for x in (t, moved_q, moved_u, residual))
+    return State(t, q, u, moved_q, moved_u, residual, (scene.coordinate_names, scene.speed_names))
 
 
 class Usual(eqx.Module):

@@ -26,7 +26,7 @@ from jourdain_jax.analysis.families.spectrum import null_space
 from jourdain_jax.analysis.instant import ByProgram, Sloped, differentiable
 from jourdain_jax.analysis.table import complex_numbers, table
 from jourdain_jax.calculus.reals import RUN_SELDOM, compiled, largest
-from jourdain_jax.motion.put_on_rows import State
+from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers, shown_from_users_lines
 from jourdain_jax.scene.identity import once_per_class
@@ -303,7 +303,7 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
     numbers, w, condition, code = _solution(special, scene)
     q, u, varied = equations.split(numbers)
     eigenvalue = jax.lax.complex(*((0 * w, w) if point.kind == PAIR else (w, 0 * w)))
-    return CriticalPoint(State.of(scene, equations.t, q, u), varied, eigenvalue, condition, code, point.kind, equations.vary)
+    return CriticalPoint(state_of(scene, equations.t, q, u), varied, eigenvalue, condition, code, point.kind, equations.vary)
 
 
 def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:

@@ -17,7 +17,7 @@ from jourdain_jax.analysis.steady import guessed
 from jourdain_jax.analysis.table import complex_numbers, table
 from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.calculus.reals import Numbers, largest
-from jourdain_jax.motion.put_on_rows import State
+from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, of_known_numbers, shown_from_users_lines
 from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
 from jourdain_jax.scene.printing import Printed, in_digits
@@ -129,7 +129,7 @@ class Family(Printed):
         """A point of the curve with its state and eigenvalues."""
         q, u, value = self.equations.split(self.equations.at(point.z))
         near = min(self.points, key=lambda p: largest(p.z - point.z))
-        state = State.of(self.equations.scene, self.equations.t, jnp.asarray(q), jnp.asarray(u), residual=largest(point.look.R))
+        state = state_of(self.equations.scene, self.equations.t, jnp.asarray(q), jnp.asarray(u), residual=largest(point.look.R))
         modes = point.modes if len(point.modes) else matched(near.modes, self.by.spectrum(point))
         return FamilyPoint(kind, state, modes, tuple(self.mode_names[k] for k in columns), self.equations.vary, value, point.tangent * self.equations.size)
 

@@ -64,7 +64,7 @@ class Followed:
         if self.targets:
             for k, (_, target) in self.targets.items() if len(points) > 1 else ():
                 past = lambda p, k=k, target=target: p.z[k] - target  # noqa: E731
-                if past(points[-2]) * past(points[-1]) < 0 and (end := located(self.looked, *points[-2:], past)):
+                if past(points[-2]) * past(points[-1]) < 0 and (end := located(self.looked, points[-2], points[-1], past)):
                     points[-1] = replace(end, modes=matched(points[-1].modes, self.spectrum(end)))
             return points, ("the start", last)
         back, first = traced(self.looked, self.spectrum, reversed_at(begin), self.ended(reversed_at(begin)), most)

@@ -41,7 +41,7 @@ from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.model import modelled
 from jourdain_jax.motion.options import SPAN, AllOptions, MotionFields, OptionFields, Options, as_options
-from jourdain_jax.motion.put_on_rows import State
+from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.motion.simulate import as_state, simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.names import as_names, check_name, check_names
@@ -170,7 +170,7 @@ class _Shooting(eqx.Module):
     def motion(self, t0, z: States, ts: Float[Array, "times"]):
         """The motion from a state."""
         n = len(self.scene.coordinate_names.entries)
-        start = State.of(self.scene, t0, z[:n], z[n:])
+        start = state_of(self.scene, t0, z[:n], z[n:])
         fields = {name: value for name, value in vars(self.options).items() if name in OptionFields.__annotations__}
         return simulate(self.scene, start, t0=t0, ts=ts, inputs=self.inputs, **{**fields, "events": False, "work": False}).nan_if_failed()
 
@@ -288,5 +288,5 @@ def _found(problem: _Shooting, start: State, period: Scalar) -> PeriodicMotion:
         goes_on = jnp.all(values[:, np.array(others)] >= 0)
     n, names = len(start.q), problem.scene.coordinate_names.entries
     shifts = {name: ends[-1, k] - zs[0, k] for k, name in enumerate(names) if k not in problem.kept or name in problem.shifted}
-    state = State.of(problem.scene, t, zs[0, :n], zs[0, n:], start.moved_q, start.moved_u, residual)
+    state = state_of(problem.scene, t, zs[0, :n], zs[0, n:], start.moved_q, start.moved_u, residual)
     return PeriodicMotion(state, period, shifts, problem.multipliers(t, x, D, ends), residual, (residual < 1e-8) & goes_on)
