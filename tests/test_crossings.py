@@ -216,7 +216,7 @@ def test_both_loops_take_the_same_steps_in_lanes_and_under_jit_and_back_in_time(
     lanes = [jj.rollout(FREE, starts, ts=[-3.0], max_step=0.3, backend=backend, progress=False).lanes for backend in ("native", "xla")]
     one = jax.jit(lambda longest: jj.simulate(FREE, BEGIN, ts=[-3.0], max_step=longest).accepted)(0.3)
     for motion in lanes:
-        np.testing.assert_array_equal(motion.accepted, int(one))
+        assert_array_equal(motion.accepted, int(one))
 
 
 @pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])

@@ -198,7 +198,7 @@ def test_a_short_window_is_met(kind):
         assert motion.event_names[int(motion.event)] == "met"
         assert abs(motion.t_end - KINDS[kind][1]) < 1e-9
     lanes = jj.rollout(scene, {"x": 0.0, "x_rate": jnp.linspace(0.5, 1.5, 7)}, ts=[4.0], progress=False).lanes
-    np.testing.assert_array_equal(lanes.result, results.EVENT)
+    assert_array_equal(lanes.result, results.EVENT)
 
 
 @pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
@@ -455,8 +455,8 @@ def test_lanes_and_jit_start_at_an_event():
     starts = {"x": 0.0, "z": 0.0, "z_rate": jnp.array([3.0, 1e-3, 0.0, -1.0]), "x_rate": 0.1}
     for backend in BACKENDS:
         lanes = jj.rollout(Ball(), starts, ts=[2.0], backend=backend, progress=False).lanes
-        np.testing.assert_array_equal(lanes.result, results.EVENT)
-        np.testing.assert_allclose(lanes.t_end, [6 / GRAVITY, 2e-3 / GRAVITY, 0.0, 0.0], atol=1e-9)
+        assert_array_equal(lanes.result, results.EVENT)
+        assert_allclose(lanes.t_end, [6 / GRAVITY, 2e-3 / GRAVITY, 0.0, 0.0], atol=1e-9)
         assert jnp.sum(lanes.accepted[2:]) == 0
     one = jax.jit(lambda rate: jj.simulate(Ball(), {"z": 0.0, "z_rate": rate}, ts=[2.0]).t_end)(2.0)
     assert abs(float(one) - 4 / GRAVITY) < 1e-9

@@ -157,7 +157,7 @@ def test_a_loop_that_equality_closes_moves_as_its_closed_form(way):
     scene = jj.from_mjcf(LINKAGE.format(option="", equality=CLOSED[way]))()
     theta = 0.4
     start = jj.start(scene, a=theta, a_rate=0.7)
-    np.testing.assert_allclose([start["b"], start["c"], start["b_rate"]], [-theta, theta, -0.7], atol=1e-9)
+    assert_allclose([start["b"], start["c"], start["b_rate"]], [-theta, theta, -0.7], atol=1e-9)
     own = float(scene.first_inertia[1]) + 0.2 * 0.15**2
     expected = -9.81 * (0.2 * 0.3 + 0.4 * 0.3) * np.sin(theta) / (2 * own + 0.4 * 0.3**2)
     assert jj.accelerations(scene, 0.0, start.q, start.u).udot[0] == pytest.approx(expected, rel=1e-9)
@@ -169,12 +169,12 @@ def test_a_weld_holds_a_body_in_the_stated_pose():
     weld = '<weld body1="coupler" body2="second" anchor="0 0 -0.3"/><joint joint1="a" polycoef="0.2"/>'
     scene = jj.from_mjcf(LINKAGE.format(option="", equality=f'{weld}<connect body1="first" anchor="1 2 3" active="false"/>'))()
     rows = scene.geometric_constraints(jj.pose_at(scene, 0.0, [0.2, -0.1, 0.3]))
-    np.testing.assert_allclose(rows["a is held"], 0.0, atol=1e-15)
+    assert_allclose(rows["a is held"], 0.0, atol=1e-15)
     # the coupler is turned by a + b = 0.1, the second crank by 0.3
-    np.testing.assert_allclose(rows["weld 1 of `equality`, attitude"], [0.0, -2 * np.sin(0.2), 0.0], atol=1e-12)
+    assert_allclose(rows["weld 1 of `equality`, attitude"], [0.0, -2 * np.sin(0.2), 0.0], atol=1e-12)
     tip = np.array([0.5 - 0.3 * np.sin(0.3), 0.0, -0.3 * np.cos(0.3)])
     pin = np.array([-0.3 * np.sin(0.2) + 0.5 * np.cos(0.1), 0.0, -0.3 * np.cos(0.2) - 0.5 * np.sin(0.1)])
-    np.testing.assert_allclose(rows["weld 1 of `equality`"], tip - pin, atol=1e-12)
+    assert_allclose(rows["weld 1 of `equality`"], tip - pin, atol=1e-12)
 
 
 def test_files_are_included_once_and_gravity_may_be_off(tmp_path):

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import result_codes as results
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import OnLine
 from tolerances import tolerance
 
@@ -175,7 +175,7 @@ def test_an_inertia_is_impossible_where_an_eigenvalue_is_negative():
     moments *= 10.0 ** generator.uniform(-9, 9, (300, 1))
     inertias = np.einsum("kij,kj,klj->kil", turns, moments, turns)
     lanes = jj.rollout(Tumbling(), {"attitude_omega_x": 1e-3}, parameters={"inertia": (inertias + inertias.mT) / 2}, ts=[1e-6], progress=False)
-    np.testing.assert_array_equal(lanes.result == results.BAD_PARAMETER, moments.min(axis=1) < 0)
+    assert_array_equal(lanes.result == results.BAD_PARAMETER, moments.min(axis=1) < 0)
 
 
 class Rolling(jj.Scene):

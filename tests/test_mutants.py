@@ -362,7 +362,7 @@ MUTANTS = [
     Mutant("stages at the first time", erk_step, "stages", "t + c * h, treedef", "t + 0 * c * h, treedef", STEPS, "closed form"),
     Mutant("every step accepted", erk_step, "judged", "(error <= 1.0)", "(error <= 1e30)", STEPS, "closed form"),
     Mutant("a rejected step takes time", erk_step, "taken", 'w.where(accept, aim.t_1, p["t"])', "aim.t_1", STEPS, "closed form"),
-    Mutant("the state of the time before", erk_loop, "_motion", "return end, (end.y,", "return end, (progress.y,", STEPS, "closed form"),
+    Mutant("the state of the time before", erk_loop, "_motion", "(ys, k, y), ys, p.y)", "(ys, k, y), ys, carry[0].y)", STEPS, "closed form"),
     Mutant("no projection", erk_step, "_tried", "problem.project(t1, y1, problem.args)", "y1", projected_steps_stay_on_a_circle, "circle"),
     Mutant(
         "no step ends at a knot",
@@ -397,9 +397,7 @@ MUTANTS = [
     Mutant("the first time forgotten", step_adjoint, "step_vjp", "StepCotangents(by_t - by_h,", "StepCotangents(-by_h,", TIMES, "derivative"),
     Mutant("a projection not gone back over", step_adjoint, "step_vjp", "by_t_1, g, by_shared = jax.vjp", "by_t_1, _, by_shared = jax.vjp", TIMES, "by y0"),
     Mutant("saved times forgotten", VJP, "fn_bwd", "jnp.where(asked, at_end, 0))", "0 * at_end)", TIMES, "by goals"),
-    Mutant(
-        "saved states forgotten", VJP, "fn_bwd", "lambda total, g: total + _at(g, k - 1), y, g_ys)", "lambda total, g: total, y, g_ys)", TIMES, "derivative"
-    ),
+    Mutant("saved states forgotten", VJP, "fn_bwd", "y + jnp.where(k > first,", "y + 0 * jnp.where(k > first,", TIMES, "derivative"),
     Mutant(
         "an earlier window left out",
         VJP,

@@ -230,7 +230,7 @@ def test_an_object_and_its_fields_by_name_ask_for_the_same_and_names_replace_fie
     by_name = jj.simulate(SLEIGH, START, ts=TS, rtol=1e-4, atol=1e-4, max_step=np.inf)
     mixed = jj.simulate(SLEIGH, START, ts=TS, options=jj.Options(rtol=1e-4, atol=1e-9), atol=1e-4, max_step=np.inf)
     for motion in (jj.simulate(SLEIGH, START, ts=TS, options=coarse), mixed):
-        np.testing.assert_array_equal(motion.q, by_name.q)
+        assert_array_equal(motion.q, by_name.q)
         assert motion.accepted == int(by_name.accepted)
     lanes = jj.rollout(SLEIGH, START | {"x_rate": np.array([0.6, 0.7])}, ts=TS, options=coarse)
     assert lanes.lane(0).accepted == int(by_name.accepted)
@@ -242,7 +242,7 @@ def test_options_are_a_tree_whose_numbers_may_be_traced():
         return jj.simulate(SLEIGH, START, ts=TS, options=options, solver=jj.RadauIIA()).q_end
 
     options = jj.Options(rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(jax.jit(end)(options), end(options), rtol=0, atol=1e-12)
+    assert_allclose(jax.jit(end)(options), end(options), rtol=0, atol=1e-12)
     assert len(jax.tree.leaves(jax.tree.map(jnp.asarray, options))) == 2
 
 

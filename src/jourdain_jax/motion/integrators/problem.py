@@ -41,12 +41,21 @@ class Problem(eqx.Module):
         """The time of the `knot` ahead of t, infinity with the sign of the motion where there is none."""
         if self.knots is None:
             return direction * jnp.full_like(t, jnp.inf)
-        return jnp.take_along_axis(self.knots, knot[None], axis=0)[0]
+        return in_lanes(self.knots, knot)
 
     def knots_passed(self, t: Float[Array, "*lanes"], direction) -> Int[Array, "*lanes"]:
         """How many knots lie at `t` or before it."""
-        zero = jnp.zeros(jnp.shape(t), jnp.int32)
-        return zero if self.knots is None else zero + jnp.sum((self.knots - t) * direction <= 0, axis=0, dtype=jnp.int32)
+        return jnp.zeros(jnp.shape(t), jnp.int32) if self.knots is None else passed(self.knots, t, direction)
+
+
+def passed(times: Float[Array, "times *lanes"], t: Float[Array, "*lanes"], direction) -> Int[Array, "*lanes"]:
+    """Return how many of these times lie at `t` or before it."""
+    return jnp.sum((times - t) * direction <= 0, axis=0, dtype=jnp.int32)
+
+
+def in_lanes(x: Float[Array, "rows *shape"], k: Int[Array, "*lanes"]) -> Float[Array, "*shape"]:
+    """Return row k of x, a row for each lane; the last one where there are not so many."""
+    return jnp.take_along_axis(x, k[(None,) * (x.ndim - k.ndim)], 0, mode="clip")[0]
 
 
 def as_in(x, like) -> Array:

@@ -9,11 +9,13 @@ beyond, where derivatives may not exist, is never met.
 Memory holds a window of steps with their states; when it is full, the state and step size there are kept and the next window begins. Going back, the
 last window is there already. An earlier one is integrated again, from the state at its beginning to end exactly where the next begins: whatever steps
 round-off makes it take then, they are steps of the motion. Where that does not succeed, or there were more windows than memory allows, the derivative
-is NaN. What lanes in lockstep have in common, numbers of steps and windows, stays common under `vmap`.
+is NaN. What lanes in lockstep have in common, numbers of steps and windows, stays common under `vmap`; how many goals
+they have reached differs.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
 import equinox.internal as eqxi
@@ -23,11 +25,11 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.calculus.reals import with_usual_promotion
 from jourdain_jax.motion.integrators import step_adjoint
-from jourdain_jax.motion.integrators.erk_step import Progress, advanced, begun, running, standing
+from jourdain_jax.motion.integrators.erk_step import Progress
 from jourdain_jax.motion.integrators.event_search import LOCATING, MOST_STEPS, OnArrays, chosen, is_flat
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
-from jourdain_jax.motion.integrators.problem import Problem
+from jourdain_jax.motion.integrators.problem import Problem, in_lanes
 from jourdain_jax.motion.trajectories import results
 
 STEPS_ALONE, STEPS_TOGETHER = 2048, 512  # of a window: for one motion, for lanes in lockstep
@@ -41,22 +43,18 @@ class _Window(eqx.Module):
 
     t: Float[Array, "states *lanes"]
     y: PyTree
-    goal: Int[Array, "states"]
+    goal: Int[Array, "states *lanes"]
     last: Int[Array, ""]  # number of the last state
 
-    def added(self, p: Progress, goal, restart=False) -> "_Window":
+    def added(self, p: "Progress | _Beginnings", goal, restart=False) -> "_Window":
         """The window with the state after a try of a step, which is a new one where time has passed for any lane; the first one at a `restart`."""
         i = jnp.where(restart, 0, self.last + self.passed(p)).astype(jnp.int32)
         t, y, goals = _put((self.t, self.y, self.goal), i, (p.t, p.y, goal))
         return _Window(t, y, goals, i)
 
-    def passed(self, p: Progress) -> Bool[Array, ""]:
+    def passed(self, p: "Progress | _Beginnings") -> Bool[Array, ""]:
         """Whether time has passed since the last state."""
         return eqxi.unvmap_any(p.t != _at(self.t, self.last))
-
-    def towards(self, goal) -> "_Window":
-        """This window, its last state on the way to the goal with this number."""
-        return replace(self, goal=_put(self.goal, self.last, goal))
 
 
 class _Beginnings(eqx.Module):
@@ -107,7 +105,7 @@ def _problem(moving, control) -> Problem:
 @eqx.filter_custom_vjp
 def _motion(moving, control, forward, method):
     *_, y0, t0, goals = moving
-    ys, reached, end = forward(_problem(moving, control), method, y0, t0, goals, control[1])
+    ys, reached, end, _ = forward(_problem(moving, control), method, y0, t0, goals, control[1])
     return ys, reached, replace(end, search=None)
 
 
@@ -116,63 +114,43 @@ def _motion(moving, control, forward, method):
 def _recorded(perturbed, moving, control, forward, method):
     *_, y0, t0, goals = moving
     problem = _problem(moving, control)
-    direction = jnp.sign(goals[-1] - t0)
-    start = begun(problem, y0, t0, control[1], direction)
-    empty = _empty(start, problem.max_steps, problem.memory)
-    full = len(empty.window.t) - 1 - len(empty.window.t) // SPARE
-    places = len(empty.beginnings.t)
 
-    def to_goal(carry, k):
-        p, kept, record = carry
-        goal = goals[k]
+    def noted(carry, p, goal):
+        kept, record = carry
+        # lanes that are searching for an event are still at the last state before it
+        t, y = _where(p.code == LOCATING, (kept.t, kept.y), (p.t, p.y))
+        kept, window = replace(p, t=t, y=y), record.window
+        ended = window.last + window.passed(kept) == len(window.t) - 1 - len(window.t) // SPARE
+        spare = len(record.beginnings.t) - 1
+        number = jnp.minimum(record.number + ended, spare)
+        beginnings = _put(record.beginnings, jnp.where(ended, number, spare), _Beginnings(t, y, p.h, goal))
+        return kept, _Record(window.added(kept, goal, restart=ended), beginnings, number)
 
-        def step(carry):
-            p, kept, record = carry
-            p = advanced(problem, method, p, goal, goals[-1], direction)
-            kept = _before_event(p, kept)
-            ended = record.window.last + record.window.passed(kept) == full
-            number = jnp.minimum(record.number + ended, places - 1)
-            place = jnp.where(ended, number, places - 1)
-            beginnings = _put(record.beginnings, place, _Beginnings(kept.t, kept.y, kept.h, k))
-            return p, kept, _Record(record.window.added(kept, k, restart=ended), beginnings, number)
-
-        record = replace(record, window=record.window.towards(k))
-        p, kept, record = jax.lax.while_loop(lambda carry: eqxi.unvmap_any(running(carry[0], goal)), step, (p, kept, record))
-        return (p, kept, record), (p.y, p.t == goal)
-
-    (end, _, record), (ys, reached) = jax.lax.scan(to_goal, (start, start, empty), jnp.arange(len(goals), dtype=jnp.int32))
-    record = replace(record, window=record.window.towards(jnp.asarray(len(goals), jnp.int32)))
+    begin = partial(_begun, problem)
+    ys, reached, end, (_, record) = forward(problem, method, y0, t0, goals, control[1], begin, noted)
     slope = None if end.search is None else chosen(OnArrays(end.t), end.event, end.search.slope)
     end = replace(end, search=None)
-    return (ys, reached, end), (record, reached, end, slope)
-
-
-def _before_event(p: Progress, kept: Progress) -> Progress:
-    """`p`, but lanes that are searching for an event still at the last state before it, which is `kept`."""
-    if p.search is None:
-        return p
-    t, y = _where(p.code == LOCATING, (kept.t, kept.y), (p.t, p.y))
-    return replace(p, t=t, y=y)
+    return (ys, reached, end), (record, end, slope)
 
 
 @_motion.def_bwd
 @with_usual_promotion
 def _vjp(residuals, cotangents, perturbed, moving, control, forward, method):
-    record, reached, end, slope = residuals
+    record, end, slope = residuals
     shared, events, knots, y0, t0, goals = moving
     problem, direction = _problem(moving, control), jnp.sign(goals[-1] - t0)
     g_ys, _, g_end = cotangents
     g_ys, g_t, g_y = (_filled(g, x) for g, x in ((g_ys, _room(len(goals), y0)), (g_end.t, end.t), (g_end.y, end.y)))
+    # from the end on, all goals have the state there
+    behind = (goals - end.t) * direction < 0
+    g_y = jax.tree.map(lambda y, g: y + jnp.sum(_on_states(~behind, g), axis=0), g_y, g_ys)
+    g_ys = jax.tree.map(partial(_on_states, behind), g_ys)
     differentiable, fixed = eqx.partition(shared, perturbed[0])
     by_events, fixed_events = eqx.partition(events, perturbed[1])
     g_events = jax.tree.map(jnp.zeros_like, by_events)
     g = _Cotangents(g_t, g_y, jax.tree.map(jnp.zeros_like, differentiable), jnp.zeros_like(goals), None if knots is None else jnp.zeros_like(knots))
     located = (end.code == results.EVENT) & (end.accepted > 0)
     if events is not None:
-        # what was not reached repeats the state at the event
-        repeats = located & ~reached
-        g = replace(g, y=jax.tree.map(lambda y, at: y + jnp.sum(_on_states(repeats, at), axis=0), g.y, g_ys))
-        g_ys = jax.tree.map(lambda at: _on_states(~repeats, at), g_ys)
         g, g_events = _back_from_event(end, located, slope, g, (differentiable, by_events), (fixed, fixed_events))
 
     def problem_of(differentiable):
@@ -184,70 +162,51 @@ def _vjp(residuals, cotangents, perturbed, moving, control, forward, method):
 
         def add(carry):
             y, k = carry
-            return jax.tree.map(lambda total, g: total + _at(g, k - 1), y, g_ys), k - 1
+            y = jax.tree.map(lambda y, g: y + jnp.where(k > first, in_lanes(g, k - 1), 0), y, g_ys)
+            return y, k - 1
 
-        return replace(g, y=jax.lax.while_loop(lambda carry: carry[1] > first, add, (g.y, count))[0])
+        some = lambda carry: eqxi.unvmap_any(carry[1] > first)  # noqa: E731
+        return replace(g, y=jax.lax.while_loop(some, add, (g.y, count))[0])
 
     def step_back(carry):
         i, window, g = carry
-        k = window.goal[i - 1]
-        g = past_goals(g, k, window.goal[i])
-        t_0, t_1, y = _at(window.t, i - 1), _at(window.t, i), _at(window.y, i - 1)
+        t_0, y, k = _at((window.t, window.y, window.goal), i - 1)
+        t_1, count = _at((window.t, window.goal), i)
+        g = past_goals(g, k, count)
         idle = t_0 == t_1
-        moving = _where(idle, jax.tree.map(jnp.zeros_like, g.y), g.y)
+        moving = jax.tree.map(lambda y: jnp.where(idle, 0.0, y), g.y)
         gone = step_adjoint.step_vjp(problem_of, differentiable, method, t_0, t_1, y, moving)
         at_end = jnp.where(idle, g.t, g.t + gone.t_1)
         # the end of a step is a number, but where it is a time that was asked for, or a knot
         not_event = ~(located & (t_1 == end.t))
-        asked = (t_1 == goals[k]) & not_event
-        by_goals = g.goals.at[k].add(jnp.where(asked, at_end, 0))
+        asked = (t_1 == in_lanes(goals, k)) & not_event
+        by_goals = _added(g.goals, k, jnp.where(asked, at_end, 0))
         t, by_knots = jnp.where(idle, jnp.where(asked, 0, at_end), gone.t_0), g.knots
         if by_knots is not None:
-            last = (jnp.maximum(problem.knots_passed(t_1, direction) - 1, 0), *jnp.indices(t_1.shape))
-            at_knot = (knots[last] == t_1) & not_event & ~asked & ~idle
-            by_knots = by_knots.at[last].add(jnp.where(at_knot, at_end, 0))
+            last = jnp.maximum(problem.knots_passed(t_1, direction) - 1, 0)
+            at_knot = (in_lanes(knots, last) == t_1) & not_event & ~asked & ~idle
+            by_knots = _added(by_knots, last, jnp.where(at_knot, at_end, 0))
         return i - 1, window, _Cotangents(t, _where(idle, g.y, gone.y), jax.tree.map(jnp.add, g.shared, gone.shared), by_goals, by_knots)
 
     def window_back(carry):
         number, window, g = carry
         _, _, g = jax.lax.while_loop(lambda carry: carry[0] > 0, step_back, (window.last, window, g))
-        g = past_goals(g, record.beginnings.goal[number], window.goal[0])
-        window, arrived = _again(replace(problem, events=None), method, record.beginnings, number - 1, window, goals, direction)
-        return number - 1, window, replace(g, y=_where(arrived, g.y, jax.tree.map(lambda y: jnp.full_like(y, jnp.nan), g.y)))
+        # the window before, if there is one, to where this one begins
+        first, until = _at(record.beginnings, jnp.maximum(number - 1, 0)), _at(record.beginnings, number)
+        ahead = jnp.where((goals - until.t) * direction > 0, until.t, goals)
+        begin = lambda *_: window.added(first, first.goal, restart=True)  # noqa: E731
+        noted = lambda window, p, k: window.added(p, jnp.minimum(k, until.goal))  # noqa: E731
+        without = replace(problem, events=None)
+        *_, p, window = forward(without, method, first.y, first.t, ahead, first.h, begin, noted)
+        arrived = (p.t == until.t) & (window.last < len(window.t))
+        return number - 1, window, replace(g, y=jax.tree.map(lambda y: jnp.where(arrived, y, jnp.nan), g.y))
 
     lost = record.number == len(record.beginnings.t) - 1
-    g = replace(g, y=_where(lost, jax.tree.map(lambda y: jnp.full_like(y, jnp.nan), g.y), g.y))
+    g = replace(g, y=jax.tree.map(lambda y: jnp.where(lost, jnp.nan, y), g.y))
     number = jnp.where(lost, 0, record.number)
     _, _, g = jax.lax.while_loop(lambda carry: carry[0] >= 0, window_back, (number, record.window, g))
+    g = past_goals(g, jnp.zeros_like(end.accepted), record.beginnings.goal[0])
     return g.shared, g_events, g.knots, g.y, g.t, g.goals
-
-
-def _again(
-    problem: Problem, method: Method | ImplicitMethod, beginnings: _Beginnings, number, window: _Window, goals, direction
-) -> tuple[_Window, Bool[Array, "*lanes"]]:
-    """The window with this number, integrated to where the next one begins, and which lanes arrived there; nothing where the number is negative."""
-    first = _at(beginnings, jnp.maximum(number, 0))
-    target, last_goal = _at((beginnings.t, beginnings.goal), number + 1)
-    start = standing(problem, first.y, first.t, first.h, direction)
-    room = len(window.t) - 1
-
-    def to_goal(carry):
-        p, window, k = carry
-        # a lane may have ended before the goal, and then went back to an event from beyond
-        goal = jnp.where((goals[k] - target) * direction > 0, target, goals[k])
-
-        def step(carry):
-            p, window = carry
-            p = advanced(problem, method, p, goal, target, jnp.sign(goal - p.t))
-            return p, window.added(p, k)
-
-        p, window = jax.lax.while_loop(lambda carry: eqxi.unvmap_any(running(carry[0], goal)) & (carry[1].last < room), step, (p, window.towards(k)))
-        return p, window, k + 1
-
-    exists = number >= 0
-    window = window.added(start, first.goal, restart=True)
-    p, window, _ = jax.lax.while_loop(lambda carry: exists & (carry[2] <= last_goal), to_goal, (start, window, first.goal))
-    return window, (p.t == target) | ~exists
 
 
 def _back_from_event(end: Progress, located, slope, g: _Cotangents, differentiable, fixed) -> tuple[_Cotangents, PyTree]:
@@ -274,19 +233,21 @@ def _back_from_event(end: Progress, located, slope, g: _Cotangents, differentiab
     return replace(g, t=jnp.where(located, 0, g.t), y=y, shared=jax.tree.map(jnp.add, g.shared, by_shared)), by_events
 
 
-def _empty(start: Progress, max_steps: int, memory: int) -> _Record:
-    """A record with the start as its only state."""
-    state_bytes = sum(jnp.size(x) * jnp.result_type(x).itemsize for x in jax.tree.leaves((start.t, start.y)))
-    fitting = [memory // (share * state_bytes) for share in _SHARES]
-    length = max(_FEWEST[0], min(STEPS_TOGETHER if start.t.ndim else STEPS_ALONE, fitting[0], max_steps + MOST_STEPS + 2))
-    windows = -(-(max_steps + MOST_STEPS) // (length - length // SPARE)) + 1
+def _begun(problem: Problem, start: Progress, goal: Int[Array, "*lanes"]) -> tuple[Progress, _Record]:
+    """The start, and a record with it as its only state; `goal`: how many were reached there."""
+    state = start.t, start.y, goal
+    state_bytes = sum(x.nbytes for x in jax.tree.leaves(state))
+    fitting = [problem.memory // (share * state_bytes) for share in _SHARES]
+    most = problem.max_steps + MOST_STEPS
+    length = max(_FEWEST[0], min(STEPS_TOGETHER if start.t.ndim else STEPS_ALONE, fitting[0], most + 2))
+    windows = -(-most // (length - length // SPARE)) + 1
     windows = min(windows, max(_FEWEST[1], fitting[1]))
 
     zero = jnp.zeros((), jnp.int32)
-    t, y, goal = _room(length, (start.t, start.y, zero))
-    window = _Window(t, y, goal, zero).added(start, zero, restart=True)
-    beginning = _Beginnings(start.t, start.y, start.h, zero)
-    return _Record(window, _put(_room(windows + 1, beginning), 0, beginning), zero)
+    t, y, goals = _room(length, state)
+    window = _Window(t, y, goals, zero).added(start, goal, restart=True)
+    beginning = _Beginnings(start.t, start.y, start.h, goal)
+    return start, _Record(window, _put(_room(windows + 1, beginning), zero, beginning), zero)
 
 
 def _at(tree, i):
@@ -297,9 +258,14 @@ def _put(tree, i, values):
     return jax.tree.map(lambda x, value: jax.lax.dynamic_update_index_in_dim(x, jnp.asarray(value, x.dtype), i, 0), tree, values)
 
 
+def _added(x, k, more):
+    """x with more at its number k, which each lane has."""
+    return x + jax.vmap(lambda i: jnp.where(i == k, more, 0))(jnp.arange(len(x)))
+
+
 def _on_states(chosen: Bool[Array, "times *lanes"], x: Float[Array, "times *shape"]):
     """x of those that are chosen, zero elsewhere."""
-    return jnp.where(jnp.expand_dims(chosen, tuple(range(1, 1 + x.ndim - chosen.ndim))), x, 0)
+    return jax.vmap(jnp.where, (0, 0, None))(chosen, x, 0.0)
 
 
 def _where(chosen, a, b):
