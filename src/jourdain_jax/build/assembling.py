@@ -1,4 +1,4 @@
-"""Configurations put on the geometric rows, to round-off and within the domain; on NumPy, all at once.
+"""Random states of the domain, and configurations put on the geometric rows, to round-off and within the domain; on NumPy, all at once.
 
     q <- q - G+ g(q),   G = dg/dq          Gauss-Newton, which keeps what is near
 
@@ -120,6 +120,17 @@ def coordinate_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 def speed_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper bound of every speed."""
     return _bounds(scene, scene.speed_names.entries, SPEED_DOMAIN)
+
+
+def random_states(scene: Scene, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States from the domain, not yet on the rows."""
+    q_low, q_high = coordinate_bounds(scene)
+    u_low, u_high = speed_bounds(scene)
+    q = generator.uniform(q_low, q_high, (count, len(q_low)))
+    for first, _ in scene.coordinates.quaternions:
+        wxyz = generator.normal(size=(count, 4))
+        q[:, first : first + 4] = wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)
+    return generator.uniform(0, 1, count), q, generator.uniform(u_low, u_high, (count, len(u_low)))
 
 
 def _bounds(scene: Scene, names, default) -> tuple[np.ndarray, np.ndarray]:

@@ -4,11 +4,12 @@ m >= 0,   I = I' >= 0,   R' R = 1,   det R = 1
 n.n = 1,   e.e = 1 of gravity,   gap = 0 where the coordinates keep a body on the ground,   0 < r of what rolls and of its ground,   0 <= tyre < r
 d[n.(p - o)]/dt at a fixed point p = - n.(v + w x (p - o))        a plane's motion, stated twice: by o(t, q), n(t, q) and by v, w
 
-They are one table, `CHECKS`, of functions of numbers. What one state shows has a `label`: it is looked at where a scene is probed, where a fault is an error
-with its text, and at the start of each motion, in the compiled program, where it is a result code. What is without is looked at where a scene is probed:
-
 dg/dt along the motion of the other bodies = 0  or  v, w != 0      g: all that says where the ground of a contact is
 I_3 <= I_1 + I_2
+
+They are one table, `CHECKS`, of functions of numbers at some states. It is looked at where a scene is probed, where a fault is an error with its text. What
+has a `label` is looked at by each motion too, in the compiled program, where it is a result code: at the start, and what a start may hide also at random
+states of the domain (`also_elsewhere`).
 """
 
 from collections.abc import Callable
@@ -22,9 +23,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.build.assembling import random_states
 from jourdain_jax.calculus.reals import Flag, Scalar, largest
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import motion_at, pose_at
+from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contact_points import Ball, Ellipsoid, Wheel
 from jourdain_jax.scene.contacts import Contact
@@ -88,12 +91,14 @@ def _lengths(contact: Contact) -> dict[str, Scalar]:
         found["the smallest semi-axis"] = jnp.min(shape.semi_axes)
     if isinstance(ground, Cylinder | Sphere):
         found["the radius of the ground"] = ground.radius
+        if ground.side == "inside" and isinstance(shape, Ball):
+            found["the radius of the ground less that of the ball"] = ground.radius - shape.radius
     return found
 
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the table: the kind of numbers, the test (axes of states first), the sentence for one state, and a label where one state shows it."""
+    """One line of the table: the kind of numbers, the test (axis of states first), the sentence for one state, and a label where it ends a motion."""
 
     of: str
     wrong: Callable
@@ -160,6 +165,20 @@ def _unit(kind: str, group: str) -> Check:
     )
 
 
+def _stated_twice(kind: str) -> Check:
+    return Check(
+        kind,
+        lambda x: abs(x[..., 0] - x[..., 1]) > TOLERANCE * x[..., 2],
+        lambda x: (
+            f"moves along its normal at {x[0]:.4g} m/s by `origin` and `tilt`, but at {x[1]:.4g} m/s by `velocity` and `angular_velocity`; state the motion "
+            "in both: velocity = d origin/dt, angular_velocity = (0, d tilt/dt, 0); where coordinates move it, omit the contact and "
+            f"{_ROWS_INSTEAD}"
+        ),
+        "a plane that moves in another way than is stated",
+        "grounds",
+    )
+
+
 CHECKS = (
     *(Check(piece, _nowhere, _says_nothing(piece)) for piece in ("mass", "inertia", "orientation", "position")),
     Check(
@@ -219,24 +238,15 @@ CHECKS = (
     _unit("gravity", "gravity"),
     Check(
         "ground",
-        lambda x: (x[:, 0] > TOLERANCE * x[:, 1] + 1e-12) & ~np.any(x[:, 2] > 0),
+        lambda x: (x[..., 0] > TOLERANCE * x[..., 1] + 1e-12) & ~(x[..., 2] > 0).any(0),
         lambda _: (
             "moves with another body, but its `velocity` and `angular_velocity` are zero; where it is a body of the scene, omit the contact and "
             f"{_ROWS_INSTEAD}"
         ),
-        group="grounds",
+        "a ground that another body carries",
+        "grounds",
     ),
-    Check(
-        "plane",
-        lambda x: abs(x[..., 0] - x[..., 1]) > TOLERANCE * x[..., 2],
-        lambda x: (
-            f"moves along its normal at {x[0]:.4g} m/s by `origin` and `tilt`, but at {x[1]:.4g} m/s by `velocity` and `angular_velocity`; state the motion "
-            "in both: velocity = d origin/dt, angular_velocity = (0, d tilt/dt, 0); where coordinates move it, omit the contact and "
-            f"{_ROWS_INSTEAD}"
-        ),
-        label="a plane that moves in another way than is stated",
-        group="grounds",
-    ),
+    *(_stated_twice(kind) for kind in ("plane", "own plane")),
     Check(
         "inertia",
         _exceeds_the_others,
@@ -249,28 +259,43 @@ CHECKS = (
 )
 
 
+def also_elsewhere(scene: Scene) -> tuple[str, ...]:
+    """Return the kinds of numbers of which the state at the start says too little; those that hold on geometric rows alone, where there are none."""
+    return "ground", "plane", *(() if names_of_position_rows(scene) else ("gap", "own plane"))
+
+
+def elsewhere(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return three random states t, q, u of the domain, as a scene is probed at; not on the geometric rows."""
+    return random_states(scene, 3, np.random.default_rng(0))
+
+
 def faults_at(scene: Scene, t, q, u, inputs) -> dict[str, Flag]:
-    """Return fault -> whether the scene has it at this state; also under jit and vmap. NaN is no fault."""
-    numbers = numbers_of(scene, motion_at(scene, t, q, u, inputs))
-    return {f"{check.label}: {name}": check.wrong(x) for check in CHECKS if check.label for name, x in numbers[check.of].items()}
+    """Return fault -> whether the scene has it at this state, or elsewhere; also under jit and vmap. NaN is no fault."""
+    states = jax.tree.map(lambda x, others: jnp.concatenate([x[None], others.astype(x.dtype)]), tuple(map(jnp.asarray, (t, q, u))), elsewhere(scene))
+    # loads may be callbacks, which need not know batches
+    numbers, kinds = jax.lax.map(lambda state: numbers_of(scene, motion_at(scene, state[0], state[1], state[2], inputs)), states), also_elsewhere(scene)
+    seen = {(check, name): x if check.of in kinds else x[:1] for check in CHECKS if check.label for name, x in numbers[check.of].items()}
+    return {f"{check.label}: {name}": jnp.any(check.wrong(x)) for (check, name), x in seen.items()}
 
 
 known_faults_at = eval_numpy(faults_at)
 
 
 def any_wrong(stacked: dict[str, Array]) -> Flag:
-    """Return whether one state shows a fault in numbers stacked along a first axis, by their kinds."""
-    return jnp.any(jnp.concatenate([jnp.zeros(1, bool), *(check.wrong(stacked[check.of]) for check in CHECKS if check.label and check.of in stacked)]))
+    """Return whether numbers show a fault, by their kinds, with a first axis of states and a second of those that have them."""
+    found = [check.wrong(stacked[check.of]).ravel() for check in CHECKS if check.label and check.of in stacked]
+    return jnp.any(jnp.concatenate([jnp.zeros(1, bool), *found]))
 
 
 def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
     """Velocities (m/s) of the ground of every contact.
 
     "plane": of its plane along the normal at the contact point, by origin and tilt, and by velocity and angular velocity; and how large either could be. A
-    plane that is tangent to a ground at rest has none, wherever on it the contact moves.
+    plane that is tangent to a ground at rest has none, wherever on it the contact moves. "own plane": of a `Contact` whose point a user states, which may be
+    on its ground on the rows alone.
     "ground": rates of all that says where it is, along the motion of bodies other than the one that rolls on it; how fast these move, and it is said to move.
     """
-    found: Numbers = {"plane": {}, "ground": {}}
+    found: Numbers = {"plane": {}, "own plane": {}, "ground": {}}
     pose, contacts = motion.pose(), contacts_of(scene, motion.pose())
     moving = {name: body.rate_of_pose() for name, body in motion.bodies.items()}
     size = lambda *parts: sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(parts))  # noqa: E731
@@ -291,7 +316,7 @@ def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
         twice = plane.normal @ origin_rate - normal_rate @ arm, plane.normal @ plane.velocity_at(contact.point)
         could = size(origin_rate, plane.velocity) + size(arm) * size(normal_rate, plane.angular_velocity)
         could += _round_off(pose)  # of rates of 1 m/s that vanish at this state
-        found["plane"][f"the plane of contact `{name}`"] = jnp.stack([*twice, could])
+        found["own plane" if contact.shape is None else "plane"][f"the plane of contact `{name}`"] = jnp.stack([*twice, could])
         if contact.ground is not None:
             others = {body: rate if body != contact.body else jax.tree.map(jnp.zeros_like, rate) for body, rate in moving.items()}
             carried = rates(name, jnp.zeros_like(motion.t), jnp.zeros_like(motion.q.array), others)[2]

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.build.plausibility import CHECKS, any_wrong
+from jourdain_jax.build.plausibility import CHECKS, also_elsewhere, any_wrong, elsewhere
 from jourdain_jax.build.probed_on_graph import LookedAt, looked_at
 from jourdain_jax.build.trace import TracedScene
 from jourdain_jax.program.analyticity import depend_on
@@ -77,17 +77,21 @@ def row_program(scene: Scene) -> RowProgram | None:
 def _right(scene: Scene, traced: TracedScene) -> int:
     """Return the node of a truth value: every parameter is finite and has its sign, and `plausibility.CHECKS` finds no fault that parameters decide.
 
-    Numbers that no parameter decides, and numbers that speeds or inputs decide, are judged where the scene is probed.
+    Numbers that no parameter decides are judged where the scene is probed.
     """
-    g, known = traced.graph, [n for part in (traced.u, traced.inputs) for n in part.tolist()]
+    g, kinds = traced.graph, also_elsewhere(scene)
     of_parameters = [n for leaf in traced.parameters for n in leaf.ravel().tolist()]
+    varying = [traced.t, *traced.q.tolist(), *traced.u.tolist()]
+    others = [dict(zip(varying, map(g.const, [t, *q, *u]), strict=True)) for t, q, u in zip(*elsewhere(scene), strict=True)]
 
-    def decided(of: np.ndarray) -> bool:
-        return any(depend_on(g, of.ravel().tolist(), of_parameters)) and not any(depend_on(g, of.ravel().tolist(), known))
+    def at_states(kind: str, nodes: np.ndarray) -> np.ndarray:
+        flat = nodes.ravel().tolist()
+        return np.array([flat, *(g.substituted(flat, other) for other in others if kind in kinds)]).reshape(-1, *nodes.shape)
 
     judged = dict.fromkeys(check.of for check in CHECKS if check.label)
-    kept = {kind: [x for x in map(np.asarray, traced.particulars.numbers[kind].values()) if decided(x)] for kind in judged}
-    stacked = {name: np.stack(of) for name, of in kept.items() if of}
+    every = {kind: list(map(np.asarray, traced.particulars.numbers[kind].values())) for kind in judged}
+    kept = {kind: [x for x in of if any(depend_on(g, x.ravel().tolist(), of_parameters))] for kind, of in every.items()}
+    stacked = {kind: np.stack([at_states(kind, x) for x in of], 1) for kind, of in kept.items() if of}
     nodes = [*traced.parameters, *stacked.values()]
     treedef, count = jax.tree.structure(scene), len(traced.parameters)
 

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.build.assembling import Assembled, coordinate_bounds, speed_bounds
+from jourdain_jax.build.assembling import Assembled, coordinate_bounds, random_states
 from jourdain_jax.build.probed_on_graph import Probed, sampled_on_graph
 from jourdain_jax.calculus.reals import array_module, checked_whole
 from jourdain_jax.scene.arguments import as_scene, of_known_numbers
@@ -55,17 +55,6 @@ def no_numbers(scene: Scene, count: int) -> NoStateFoundError:
         "there, such as the square root of a negative number; state a `domain` inside which they are numbers, "
         'as in `domain = {"x": (-0.1, 0.1)}`'
     )
-
-
-def random_states(scene: Scene, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States from the domain, not yet on the rows."""
-    q_low, q_high = coordinate_bounds(scene)
-    u_low, u_high = speed_bounds(scene)
-    q = generator.uniform(q_low, q_high, (count, len(q_low)))
-    for first, _ in scene.coordinates.quaternions:
-        wxyz = generator.normal(size=(count, 4))
-        q[:, first : first + 4] = wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)
-    return generator.uniform(0, 1, count), q, generator.uniform(u_low, u_high, (count, len(u_low)))
 
 
 def drawn_states(scene: Scene, count: int, generator: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.build.sampling import random_states
+from jourdain_jax.build.assembling import random_states
 from jourdain_jax.build.structure import Structure, structure_of, structure_whatever_its_faults
 from jourdain_jax.build.trace import TracedScene, Variables, named_values, traced_scene
 from jourdain_jax.lowering.appell import AppellOnGraph, Strategy

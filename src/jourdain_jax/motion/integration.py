@@ -191,12 +191,12 @@ def _step_errors(setup: Setup, free: Integrated, y: Integrated) -> Scalar:
 
 def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
     """Return whether parameters, bodies and contacts are right, and the start: NaN where they are not, so that such a lane ends at once."""
-    scene, t0, field = setup.scene, setup.t0, setup.field
+    scene, field, at = setup.scene, setup.field, (setup.t0, start.q, start.u, setup.inputs(setup.t0))
     program = row_program(scene) if isinstance(field, ByProgram) and field.native else None
     if program is None or unsupported(program.graph, [program.right]):
-        right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *faults_at(scene, t0, start.q, start.u, setup.inputs(t0)).values()]))
+        right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *faults_at(scene, *at).values()]))
     else:
-        right = values.is_right(program, scene, t0, start.q)
+        right = values.is_right(program, scene, *at)
     return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u)))
 
 

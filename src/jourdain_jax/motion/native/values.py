@@ -22,12 +22,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.derivatives import OtherDeviceError, Rules, differentiated_as, filled, is_zero, with_rules
 from jourdain_jax.calculus.markers import entries_of, with_lanes_first
-from jourdain_jax.calculus.reals import real_type
+from jourdain_jax.calculus.reals import Flag, real_type
 from jourdain_jax.lowering.lowered import Lowered, smallest_pivot
 from jourdain_jax.native import ffi, gpu, host, nvidia
 from jourdain_jax.native.ffi import write_rows
@@ -310,8 +310,9 @@ def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
     return own.at_states.numbers(fixed, t, q, y, inputs)[-2:]
 
 
-def is_right(program: RowProgram, scene: Scene, t, q) -> Bool[Array, ""]:
-    """Whether parameters are right, and the masses and inertias that they make; as `parameter_faults` and `body_faults`."""
-    parts = [*entries(scene, program.parameters), jnp.asarray(t)[None], q]
-    run = nodes_called(program.graph, [program.right], [*(n for leaf in program.parameters for n in leaf if n >= 0), program.t, *program.q])
+def is_right(program: RowProgram, scene: Scene, t, q, u, inputs) -> Flag:
+    """Whether parameters are right, and the bodies and contacts that they make; as `parameter_faults` and `faults_at`."""
+    parts = [*entries(scene, program.parameters), jnp.asarray(t)[None], q, u, inputs]
+    parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
+    run = nodes_called(program.graph, [program.right], [*parameters, program.t, *program.q, *program.u, *program.inputs])
     return run(jax.lax.stop_gradient(jnp.concatenate([jnp.asarray(x, real_type()) for x in parts])))[0] > 0
