@@ -85,11 +85,15 @@ _put.defjvp(lambda given, along: (_put(*given), _put(along[0], given[1], along[2
 
 
 @_put_one.def_vmap
-def _put_each(count: int, batched: list[bool], *given: Array) -> tuple[Array, bool]:
-    x, k, row = (a if lanes else jnp.broadcast_to(a, (count, *a.shape)) for a, lanes in zip(given, batched, strict=True))
+def _put_each(count, batched, *given):
+    arrays = [a if one else jnp.broadcast_to(a, (count, *a.shape)) for a, one in zip(given, batched, strict=True)]
     # with a scatter XLA makes no function of the loop around it on a CPU
-    if jax.default_backend() != "cpu":
-        return jax.vmap(_row)(x, k, row), True
-    flat, places = x.reshape(-1, *x.shape[2:]), jnp.arange(count) * x.shape[1] + k
-    flat = jax.lax.fori_loop(0, count, lambda i, flat: _row(flat, places[i], row[i]), flat)
-    return flat.reshape(x.shape), True
+    return jax.lax.platform_dependent(*arrays, cpu=_put_in_turn, default=jax.vmap(_row)), True
+
+
+def _put_in_turn(x, k, row):
+    """Return x, which has lanes first, with the row k of each."""
+    count, length, *shape = x.shape
+    places = jnp.arange(count) * length + k
+    flat = jax.lax.fori_loop(0, count, lambda i, flat: _row(flat, places[i], row[i]), x.reshape(count * length, *shape))
+    return flat.reshape(x.shape)
