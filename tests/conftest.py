@@ -1,4 +1,4 @@
-"""Session set-up: run-time shape checks, a headless plot backend, a compile cache; no precision is set here.
+"""Session set-up: run-time shape checks, a headless plot backend; no precision is set here.
 
 `JOURDAIN_JAX_NO_TYPE_CHECKS=1` switches the jaxtyping/beartype checks off (faster, for timing only).
 """
@@ -57,13 +57,20 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     gc.enable()
 
 
-@pytest.fixture(autouse=True, scope="session")
+@pytest.fixture(autouse=True, scope="module")
 def _less_effort():
-    """Machine code of our own is made with less effort, which changes no bit of a number."""
+    """Machine code of our own is made with less effort, which changes no bit of a number, and XLA's programs of a file share a context of MLIR.
+
+    JAX makes one for each, at 3 ms and a megabyte. A program that is lowered while another is gets its own.
+    """
+    from jax._src.interpreters import mlir
+
     from jourdain_jax.native import host
 
+    make, shared = mlir.make_ir_context, mlir.make_ir_context()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(host, "EFFORT", 0)
+        patch.setattr(mlir, "make_ir_context", lambda: make() if mlir.ir.Context.current else shared)
         yield
 
 
@@ -119,7 +126,10 @@ def compilations() -> list:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """In a process that runs tests: run-time checks, and compiled programs kept in pytest's cache, so that a second run does not compile again."""
+    """In a process that runs tests: run-time checks; machine code of our own is kept in pytest's cache, so that a second run does not make it again.
+
+    Programs that XLA compiles are not kept: working out the key of each takes a tenth of its compilation.
+    """
     config.option.loadscopereorder = False  # pytest-xdist would hand out files by their number of tests, and not in the order above
     if config.getoption("dist", "no") != "no" and not hasattr(config, "workerinput"):
         return  # this process hands out tests: workers start seconds sooner if it does not import JAX first
@@ -127,6 +137,9 @@ def pytest_configure(config: pytest.Config) -> None:
     import jax
     from jaxtyping import _import_hook, install_import_hook
 
+    jax.config.update("jax_enable_compilation_cache", False)
+    if config.pluginmanager.hasplugin("cacheprovider"):
+        jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("machine_code")))
     visit = _import_hook.JaxtypingTransformer.visit_FunctionDef
 
     def without_inner_functions(transformer, node):
@@ -139,10 +152,6 @@ def pytest_configure(config: pytest.Config) -> None:
     if os.environ.get("JOURDAIN_JAX_NO_TYPE_CHECKS") != "1":
         _import_hook.JaxtypingTransformer.visit_FunctionDef = without_inner_functions
         install_import_hook([f"jourdain_jax.{layer}" for layer in LAYERS], "beartype.beartype")  # before any import of the package
-    if not config.pluginmanager.hasplugin("cacheprovider"):
-        return
-    jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("jax_compilation")))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
