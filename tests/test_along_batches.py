@@ -29,7 +29,7 @@ def moved(request):
 @pytest.fixture(scope="module", params=SCENES, ids=SCENES)
 def lanes(request):
     scene, start, inputs = SCENES[request.param]
-    return jj.rollout(scene, start, parameters={"mass" if inputs else "gravity": np.array([9.7, 9.9])}, ts=TS, inputs=inputs, progress=False)
+    return jj.rollout(scene, start, parameters={"mass" if inputs else "gravity": np.array([9.7, 9.9])}, ts=TS, inputs=inputs)
 
 
 def test_points_of_bodies_along_a_motion_are_those_at_each_time(moved):

@@ -124,7 +124,7 @@ def test_a_model_whose_numbers_decide_otherwise_than_the_defaults_of_its_class_s
 
 
 def batch(scene, ts, start) -> list:
-    return jj.rollout(scene, {**start, "x": jnp.array([0.1, 0.2])}, ts=ts, progress=False)["y"].tolist()
+    return jj.rollout(scene, {**start, "x": jnp.array([0.1, 0.2])}, ts=ts)["y"].tolist()
 
 
 def alone(scene, ts, start) -> list:

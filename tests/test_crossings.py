@@ -98,7 +98,7 @@ def test_a_load_that_is_passed_in_one_step_is_named():
     scene = STRIP.replace(width=1e-5)
     assert np.isfinite(motion(scene).together)
     assert "changed in the one step" in " ".join(motion(scene).warnings)
-    lanes = jj.rollout(scene, {"x": np.zeros(3), "x_rate": np.array([1.0, 0.1, -1.0])}, ts=[SPAN], rtol=1e-3, atol=1e-3, progress=False)
+    lanes = jj.rollout(scene, {"x": np.zeros(3), "x_rate": np.array([1.0, 0.1, -1.0])}, ts=[SPAN], rtol=1e-3, atol=1e-3)
     assert_array_equal(lanes.crossed_together, [0])
     assert "1 crossed two or more relations in one step" in str(lanes)
 
@@ -213,7 +213,7 @@ def test_steps_are_no_longer_than_a_part_of_the_span(way):
 
 def test_both_loops_take_the_same_steps_in_lanes_and_under_jit_and_back_in_time():
     starts = {"x": 1.0, "x_rate": jnp.linspace(-1.0, 2.0, 5)}
-    lanes = [jj.rollout(FREE, starts, ts=[-3.0], max_step=0.3, backend=backend, progress=False).lanes for backend in ("native", "xla")]
+    lanes = [jj.rollout(FREE, starts, ts=[-3.0], max_step=0.3, backend=backend).lanes for backend in ("native", "xla")]
     one = jax.jit(lambda longest: jj.simulate(FREE, BEGIN, ts=[-3.0], max_step=longest).accepted)(0.3)
     for motion in lanes:
         assert_array_equal(motion.accepted, int(one))

@@ -24,9 +24,9 @@ from jourdain_jax.motion.integrators.explicit_steps import DOPRI5, DOPRI8, TSIT5
 GRAVITY = 9.81
 
 
-def stopped(y0, value, *, rates, longest=2.0, solver=None, kind="forward", lanes=(), max_steps=500):
-    """Where a motion from `y0` at t = 0 stopped; `value(t, y)` of the one event."""
-    real = lambda x: jnp.full(lanes, x)  # noqa: E731
+def stopped(y0, value, *, rates, longest=2.0, solver=None, kind="forward", goals=None, max_steps=500):
+    """Where a motion from `y0` at t = 0 stopped; `value(t, y)` of the one event; states at the `goals` where there are some."""
+    real = lambda x: jnp.full(y0.shape[1:], x)  # noqa: E731
     problem = erk_loop.Problem(
         rates=lambda t, y, args: rates(t, y),
         args=None,
@@ -40,13 +40,24 @@ def stopped(y0, value, *, rates, longest=2.0, solver=None, kind="forward", lanes
         span=real(longest),
         max_steps=max_steps,
     )
-    goals = jnp.stack([real(0.5 * longest), real(longest)])
+    times = jnp.stack([real(0.5 * longest), real(longest)]) if goals is None else goals
     method = method_of(diffrax.Dopri8() if solver is None else solver)
-    return erk_loop.integrate(problem, method, y0, real(0.0), goals, 1e-2, kind)[2]
+    return erk_loop.integrate(problem, method, y0, real(0.0), times, 1e-2, kind)[2 if goals is None else 0]
 
 
 def falling(t, y):
     return jnp.stack([y[1], -GRAVITY * jnp.ones_like(y[1])])
+
+
+def test_lanes_have_saved_times_of_their_own():
+    def saved(heights, goals):
+        return stopped(jnp.stack([heights, 0.0 * heights]), lambda t, y: y[0], rates=falling, kind="reverse", goals=goals)[:, 0]
+
+    heights, goals = jnp.array([0.5, 9.0]), jnp.array([[0.0, 0.0, 0.1, 1.0, 1.0], [0.1, 0.2, 0.3, 0.4, 0.5]])
+    fallen = np.maximum(heights[:, None] - GRAVITY * goals**2 / 2, 0.0)
+    for run in (lambda heights: saved(heights, goals.T).T, lambda heights: jax.vmap(saved)(heights, goals)):
+        assert_allclose(run(heights), fallen, atol=1e-9)
+        assert_allclose(jnp.sum(jax.jacrev(run)(heights), axis=2), fallen > 0, atol=1e-9)
 
 
 @pytest.mark.parametrize("solver", [pytest.param(diffrax.Dopri8(), id="Dopri8", marks=pytest.mark.slow), pytest.param(diffrax.Tsit5(), id="Tsit5")])
@@ -197,7 +208,7 @@ def test_a_short_window_is_met(kind):
         motion = jj.simulate(scene, start, ts=[2.0], backend=backend)
         assert motion.event_names[int(motion.event)] == "met"
         assert abs(motion.t_end - KINDS[kind][1]) < 1e-9
-    lanes = jj.rollout(scene, {"x": 0.0, "x_rate": jnp.linspace(0.5, 1.5, 7)}, ts=[4.0], progress=False).lanes
+    lanes = jj.rollout(scene, {"x": 0.0, "x_rate": jnp.linspace(0.5, 1.5, 7)}, ts=[4.0]).lanes
     assert_array_equal(lanes.result, results.EVENT)
 
 
@@ -274,7 +285,7 @@ def test_the_first_of_several_events_in_one_long_step_ends_the_motion(options):
         throws[:, 4] = 100.0  # a hump over the roof is found by our explicit Runge-Kutta loop; by diffrax not where it is over at the end of a step
     starts = {"x": np.zeros(len(throws)), "z": np.ones(len(throws)), "x_rate": throws[:, 0], "z_rate": throws[:, 1]}
     walls = dict(zip(("floor", "wall", "roof", "slope"), throws[:, 2:].T, strict=True))
-    lanes = jj.rollout(Thrown(), starts, parameters=walls, ts=[5.0], max_step=np.inf, progress=False, **options).lanes  # some step is beyond all of them
+    lanes = jj.rollout(Thrown(), starts, parameters=walls, ts=[5.0], max_step=np.inf, **options).lanes  # some step is beyond all of them
     expected = [first_crossing(*throw) for throw in throws]
     assert_array_equal(lanes.event, [event for event, _ in expected])
     assert_allclose(lanes.t_end, [t for _, t in expected], rtol=1e-12)
@@ -333,7 +344,7 @@ class Bounded(OnLine):
 def test_an_event_that_is_no_number_beyond_its_boundary_stops_the_motion_there():
     edges, kinds = (x.ravel() for x in np.meshgrid([0.3, 1.0, 1.7], [0, 1, 2, 3]))
     own = {name: np.where(kinds == k, edges, 1e3) for k, name in enumerate(("arc", "root", "jump", "positive"))}
-    lanes = jj.rollout(Bounded(), {"x_rate": np.full(12, 1.3)}, parameters=own, ts=[5.0], progress=False).lanes
+    lanes = jj.rollout(Bounded(), {"x_rate": np.full(12, 1.3)}, parameters=own, ts=[5.0]).lanes
     assert np.all(np.asarray(lanes.result) == results.EVENT)
     assert_array_equal(lanes.event, np.array([0, 3, 1, 2])[kinds])  # in the order of the alphabet
     assert_allclose(lanes.q_end[:, 0], edges, rtol=1e-13)
@@ -361,7 +372,7 @@ def test_a_value_that_falls_below_zero_and_rises_again_within_a_step_is_an_event
     top = 1.0 + 5.0**2 / (2 * GRAVITY)
     starts = {"z": np.ones(3), "z_rate": np.full(3, 5.0)}
     scene = Thrown(floor=-100.0, wall=100.0, slope=100.0)
-    lanes = jj.rollout(scene, starts, parameters={"roof": top - passes}, ts=[longest], max_step=np.inf, progress=False).lanes
+    lanes = jj.rollout(scene, starts, parameters={"roof": top - passes}, ts=[longest], max_step=np.inf).lanes
     expected = 5.0 / GRAVITY - np.sqrt(2 * passes / GRAVITY)
     assert_array_equal(lanes.event, np.full(3, 2))
     assert_allclose(lanes.t_end, expected, rtol=1e-9)
@@ -454,7 +465,7 @@ def test_bounces_go_on_from_the_end(backend, level):
 def test_lanes_and_jit_start_at_an_event():
     starts = {"x": 0.0, "z": 0.0, "z_rate": jnp.array([3.0, 1e-3, 0.0, -1.0]), "x_rate": 0.1}
     for backend in BACKENDS:
-        lanes = jj.rollout(Ball(), starts, ts=[2.0], backend=backend, progress=False).lanes
+        lanes = jj.rollout(Ball(), starts, ts=[2.0], backend=backend).lanes
         assert_array_equal(lanes.result, results.EVENT)
         assert_allclose(lanes.t_end, [6 / GRAVITY, 2e-3 / GRAVITY, 0.0, 0.0], atol=1e-9)
         assert jnp.sum(lanes.accepted[2:]) == 0
@@ -482,7 +493,7 @@ def test_a_bounce_that_is_over_has_happened(backend):
     """Whatever round-off is left of the height, and of the speed."""
     height, rate = (x.ravel() for x in np.meshgrid([0.0, -1e-13, 1e-13], [0.0, 1e-14, 1e-12]))
     starts = {"z": np.append(height, -1e-3), "z_rate": np.append(rate, 5.0)}
-    lanes = jj.rollout(Ball(), starts, ts=[1.0], backend=backend, progress=False).lanes
+    lanes = jj.rollout(Ball(), starts, ts=[1.0], backend=backend).lanes
     assert {lanes.event_names[event] for event in np.asarray(lanes.event)} == {"floor"}
     assert np.all(lanes.t_end < 1e-6)
     assert lanes.t_end[-1] == 0.0
@@ -493,4 +504,3 @@ def test_solvers_of_diffrax_start_at_an_event_too():
         motion = jj.simulate(Ball(), {"z": 0.0, "z_rate": 3.0}, ts=[2.0], solver=solver)
         assert abs(motion.t_end - 6 / GRAVITY) < 1e-6
         assert float(jj.simulate(Ball(), {"z": 0.0, "z_rate": -3.0}, ts=[2.0], solver=solver).t_end) == 0.0
-

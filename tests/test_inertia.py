@@ -125,7 +125,7 @@ def test_a_motion_that_starts_without_inertia_says_so_instead_of_inventing_an_ac
 
 
 def test_a_lane_without_mass_says_so_and_harms_no_other():
-    lanes = jj.rollout(Geared(), {}, parameters={"mass": np.array([2.0, 0.0])}, t1=2.0, progress=False)
+    lanes = jj.rollout(Geared(), {}, parameters={"mass": np.array([2.0, 0.0])}, t1=2.0)
     assert lanes.result.tolist() == [results.SUCCESS, results.NOT_FINITE]
     assert_allclose(lanes.lane(0).q_end[0], 5.0, rtol=1e-7)
 
@@ -174,7 +174,7 @@ def test_an_inertia_is_impossible_where_an_eigenvalue_is_negative():
     moments = generator.uniform(0.01, 1.0, size=(300, 3)) * np.where(generator.uniform(size=(300, 3)) < 0.25, -1.0, 1.0)
     moments *= 10.0 ** generator.uniform(-9, 9, (300, 1))
     inertias = np.einsum("kij,kj,klj->kil", turns, moments, turns)
-    lanes = jj.rollout(Tumbling(), {"attitude_omega_x": 1e-3}, parameters={"inertia": (inertias + inertias.mT) / 2}, ts=[1e-6], progress=False)
+    lanes = jj.rollout(Tumbling(), {"attitude_omega_x": 1e-3}, parameters={"inertia": (inertias + inertias.mT) / 2}, ts=[1e-6])
     assert_array_equal(lanes.result == results.BAD_PARAMETER, moments.min(axis=1) < 0)
 
 
@@ -257,7 +257,7 @@ def test_what_a_single_motion_refuses_is_a_code_in_lanes_and_inside_jit(kind, ba
     with pytest.raises(ValueError, match=text):
         jj.simulate(wrong, ts=[0.1])
     both = {name: jnp.stack([getattr(wrong, name), getattr(sound, name)]) for name in Rolling.__annotations__}  # one program for all kinds
-    lanes = jj.rollout(sound, {}, parameters=both, ts=[0.1], backend=backend, progress=False)
+    lanes = jj.rollout(sound, {}, parameters=both, ts=[0.1], backend=backend)
     assert lanes.result.tolist() == [results.BAD_PARAMETER, results.SUCCESS]
     assert fault in str(lanes)
     assert fault in lanes.lane(0).message

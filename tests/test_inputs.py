@@ -68,7 +68,7 @@ def test_named_starts_of_simulate_rollout_and_linearize_meet_rows_that_depend_on
     assert alone.moved_u == 0.0
     assert_allclose(alone.q_end, [4.5 * 0.5, 0.5], rtol=1e-12)
     starts = {"y": np.array([0.5, 0.2]), "x_rate": np.array([4.5, 3.6])}
-    lanes = jj.rollout(scene, starts, ts=[0.0, 0.5], inputs=inputs, progress=False)
+    lanes = jj.rollout(scene, starts, ts=[0.0, 0.5], inputs=inputs)
     assert lanes.failed.size == 0
     assert_allclose(lanes["x"][:, -1], [4.5 * 0.5, 3.6 * 0.5], rtol=1e-12)
     assert jj.linearize(scene, values, (), inputs=inputs).A.shape[0] > 0
@@ -164,7 +164,7 @@ def test_an_input_that_jumps_does_the_work_of_moving_the_spring_at_once():
 def test_lanes_and_gradients_carry_the_work_of_inputs():
     inputs = {"hand": jj.Sampled(KNOTS, PLACES), "push": 0.7}
     options = {"ts": SPAN, "rtol": 1e-11, "atol": 1e-11, "inputs": inputs}
-    lanes = jj.rollout(PulledBead(), parameters={"mass": np.array([2.0, 3.0])}, progress=False, **options)
+    lanes = jj.rollout(PulledBead(), parameters={"mass": np.array([2.0, 3.0])}, **options)
     work = work_by_quadrature()
     assert_allclose(lanes.lane(0).work, work, atol=1e-8 * np.max(np.abs(work)))
 
@@ -210,7 +210,7 @@ def test_rates_of_inputs_in_rows_accelerate_and_do_work(options):
 
 def test_rates_of_samples_in_rows_are_their_slopes():
     ramp = {"speed": jj.Sampled([0.0, 2.0], [0.0, 4.0])}
-    lanes = jj.rollout(Towed(), {"x_rate": np.array([1.0, 2.0])}, t1=2.0, inputs=ramp, progress=False).lanes
+    lanes = jj.rollout(Towed(), {"x_rate": np.array([1.0, 2.0])}, t1=2.0, inputs=ramp).lanes
     assert_allclose(lanes.u_end, [[-1.0, 3.0], [0.0, 4.0]], atol=1e-7)
 
 
@@ -310,7 +310,7 @@ def test_lanes_feel_blows_of_their_own_forwards_and_backwards():
 
 
 def test_lanes_of_a_rollout_feel_a_blow_that_they_share():
-    lanes = jj.rollout(Struck(), parameters={"mass": np.array([1.0, 2.0, 4.0])}, ts=[10.0], inputs={"force": BLOW}, work=False, progress=False).lanes
+    lanes = jj.rollout(Struck(), parameters={"mass": np.array([1.0, 2.0, 4.0])}, ts=[10.0], inputs={"force": BLOW}, work=False).lanes
     assert_allclose(lanes.u_end[:, 0], [1.0, 0.5, 0.25], rtol=1e-9)
 
 
