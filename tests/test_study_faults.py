@@ -56,6 +56,12 @@ def whole(tmp_path_factory, small_blocks):
 
 
 @pytest.fixture
+def path(whole, tmp_path):
+    """A folder of the whole study, to be harmed."""
+    return shutil.copytree(whole.store.path, tmp_path / "discs.zarr")
+
+
+@pytest.fixture
 def computed(monkeypatch):
     """Numbers of the blocks that are computed, in order."""
     numbers, before = [], Runner.run_block
@@ -105,9 +111,7 @@ def test_a_second_run_computes_nothing_whatever_clocks_say(whole, tmp_path, comp
 
 
 @pytest.mark.parametrize("harm", ["cut short", "one bit", "gone", "receipt cut short", "of another chunk"])
-def test_a_damaged_chunk_is_found_and_computed_again(harm, whole, tmp_path, computed):
-    path = tmp_path / "discs.zarr"
-    run(path)
+def test_a_damaged_chunk_is_found_and_computed_again(harm, whole, path, computed):
     held = path / "lean at the end" / "c" / "1"
     content = held.read_bytes()
     if harm == "cut short":
@@ -124,7 +128,6 @@ def test_a_damaged_chunk_is_found_and_computed_again(harm, whole, tmp_path, comp
     if harm == "one bit":
         with pytest.raises(ValueError, match="checksum"):  # Zarr sees it too
             jj.load_study(path).to_xarray()["lean at the end"].load()
-    computed.clear()
     with pytest.warns(UserWarning, match="1 chunks of .* are damaged and are computed again: 1"):
         found = run(path)
     assert sorted(computed) == [0, 1]
@@ -132,12 +135,11 @@ def test_a_damaged_chunk_is_found_and_computed_again(harm, whole, tmp_path, comp
 
 
 @pytest.mark.parametrize("harm", [Path.unlink, lambda file: file.write_text("{"), lambda file: file.write_text("{}")])
-def test_a_damaged_grid_of_a_whole_study_is_found_again(harm, whole, tmp_path, computed):
-    shutil.copytree(whole.store.path, tmp_path / "discs.zarr")
-    harm(tmp_path / "discs.zarr" / "run" / "grid.json")
+def test_a_damaged_grid_of_a_whole_study_is_found_again(harm, whole, path, computed):
+    harm(path / "run" / "grid.json")
     with pytest.raises(ValueError, match=r"`run/grid.json` is damaged; run the study first"):
-        jj.load_study(tmp_path / "discs.zarr").mean("lean at the end")
-    assert_same(run(tmp_path / "discs.zarr"), whole)
+        jj.load_study(path).mean("lean at the end")
+    assert_same(run(path), whole)
     assert computed == [0]
 
 
@@ -259,9 +261,7 @@ def _changed(path, name, **entries):
     store._write_manifest(path, digests)
 
 
-def test_another_format_is_refused(whole, tmp_path):
-    path = tmp_path / "discs.zarr"
-    shutil.copytree(whole.store.path, path)
+def test_another_format_is_refused(path):
     _changed(path, "study.json", format=3)
     for read in (run, jj.load_study):
         with pytest.raises(ValueError, match="has format 3, this version of jourdain-jax reads 2; use the version that wrote it"):
@@ -274,26 +274,21 @@ def test_another_format_is_refused(whole, tmp_path):
 
 @pytest.mark.parametrize("entry", ["samples", "chunk", "block"])
 @pytest.mark.parametrize("value", [10**18, 10**30, 1e18, 0, -1, 90.0, True, "90", None, [90]])
-def test_numbers_of_a_study_are_within_their_ranges(entry, value, whole, tmp_path):
-    path = tmp_path / "discs.zarr"
-    shutil.copytree(whole.store.path, path)
+def test_numbers_of_a_study_are_within_their_ranges(entry, value, path):
     _changed(path, "study.json", **{entry: value})
     with pytest.raises(ValueError, match=rf"study.json` is damaged \(`{entry}` is .*, expected a whole number from 1 to"):
         jj.load_study(path)
 
 
-def test_a_study_has_not_more_chunks_than_can_be_counted(whole, tmp_path):
-    shutil.copytree(whole.store.path, tmp_path / "discs.zarr")
-    _changed(tmp_path / "discs.zarr", "study.json", samples=2**52)
+def test_a_study_has_not_more_chunks_than_can_be_counted(path):
+    _changed(path, "study.json", samples=2**52)
     with pytest.raises(ValueError, match="samples are more than 16777216 chunks of 32"):
-        jj.load_study(tmp_path / "discs.zarr")
+        jj.load_study(path)
 
 
 @pytest.mark.parametrize("grid", [{"centre": [math.nan]}, {"low": [1.0], "high": [-1.0]}, {"centre": [math.inf]}, {"low": []}, {"centre": [[0.0]]}])
-def test_numbers_of_a_grid_are_within_their_ranges(grid, whole, tmp_path):
-    path, count = tmp_path / "discs.zarr", len(whole.outputs)
-    shutil.copytree(whole.store.path, path)
-    _changed(path, "grid.json", **{name: values * count for name, values in grid.items()})
+def test_numbers_of_a_grid_are_within_their_ranges(grid, whole, path):
+    _changed(path, "grid.json", **{name: values * len(whole.outputs) for name, values in grid.items()})
     _with_receipts_of(path)
     with pytest.raises(ValueError, match=r"grid of the statistics is .*, expected finite numbers in order"):
         jj.load_study(path).mean(whole.outputs[0])
@@ -308,10 +303,8 @@ def _with_receipts_of(path):
         file.write_bytes(replace(found, of=(opened.identity, opened._digests["run/grid.json"])).packed())
 
 
-def test_chunks_of_another_grid_do_not_count(whole, tmp_path, computed):
+def test_chunks_of_another_grid_do_not_count(whole, path, computed):
     """As where two machines whose numbers differ found the grid at the same time: sums about another centre would give another mean."""
-    path = tmp_path / "discs.zarr"
-    shutil.copytree(whole.store.path, path)
     _changed(path, "grid.json", centre=whole.store.read_grid()["high"])
     with pytest.warns(UserWarning, match=r"lanes 0 to 31, 32 to 63, 64 to 89 of .* are left out"):
         found = jj.load_study(path)
@@ -321,9 +314,7 @@ def test_chunks_of_another_grid_do_not_count(whole, tmp_path, computed):
     assert sorted(set(computed)) == [0, 1, 2]
 
 
-def test_other_versions_are_said(whole, tmp_path):
-    path = tmp_path / "discs.zarr"
-    shutil.copytree(whole.store.path, path)
+def test_other_versions_are_said(whole, path):
     _changed(path, "study.json", versions=whole.store.study["versions"] | {"jax": "0.1.2"})
     with pytest.warns(UserWarning, match=r"other versions: jax 0.1.2 \(now "):
         run(path)
