@@ -91,7 +91,8 @@ class XmlFile:
             elif child.tag in holds.listed.split():
                 self.leave_out(child.tag)
             elif child.tag not in holds.idle.split():
-                self.refuse(tag, f"`{tag}`{f' `{name}`' if name else ''} in {what}", valid=f"{holds.one} {holds.many}")
+                valid = f"{holds.one} {holds.many}" if tag == child.tag else ""  # one of a namespace is never what it is called
+                self.refuse(tag, f"`{child.tag}`{f' `{name}`' if name else ''} in {what}", valid=valid)
 
     def check_text(self, element: Element, what: str) -> None:
         """A ValueError for text in an element, unless `text` is to be ignored."""
