@@ -238,7 +238,7 @@ CHECKS = (
     _unit("gravity", "gravity"),
     Check(
         "ground",
-        lambda x: (x[..., 0] > TOLERANCE * x[..., 1] + 1e-12) & ~(x[..., 2] > 0).any(0),
+        lambda x: (x[..., 0] > TOLERANCE) & ~(x[..., 1] > 0).any(0),
         lambda _: (
             "moves with another body, but its `velocity` and `angular_velocity` are zero; where it is a body of the scene, omit the contact and "
             f"{_ROWS_INSTEAD}"
@@ -293,7 +293,7 @@ def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
     "plane": of its plane along the normal at the contact point, by origin and tilt, and by velocity and angular velocity; and how large either could be. A
     plane that is tangent to a ground at rest has none, wherever on it the contact moves. "own plane": of a `Contact` whose point a user states, which may be
     on its ground on the rows alone.
-    "ground": rates of all that says where it is, along the motion of bodies other than the one that rolls on it; how fast these move, and it is said to move.
+    "ground": rates of all that says where it is, along the motion of bodies other than the one that rolls on it, to how fast these move; and it is said to.
     """
     found: Numbers = {"plane": {}, "own plane": {}, "ground": {}}
     pose, contacts = motion.pose(), contacts_of(scene, motion.pose())
@@ -322,7 +322,7 @@ def _of_grounds(scene: Scene, motion: Motion) -> Numbers:
             carried = rates(name, jnp.zeros_like(motion.t), jnp.zeros_like(motion.q.array), others)[2]
             speeds = [(body.velocity, body.angular_velocity) for other, body in motion.bodies.items() if other != contact.body]
             stated = plane.velocity, plane.angular_velocity
-            found["ground"][f"the ground of contact `{name}`"] = jnp.stack([size(carried), 0.0 * motion.t + size(speeds), size(stated)])
+            found["ground"][f"the ground of contact `{name}`"] = jnp.stack([size(carried) / (size(speeds) + 1e-8 + 0.0 * motion.t), size(stated)])
     return found
 
 
