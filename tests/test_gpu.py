@@ -10,9 +10,9 @@ import pytest
 from ends_of_models import end_of_model
 
 import jourdain_jax as jj
+from jourdain_jax.motion.native.writers import MachineWriter
 from jourdain_jax.native import ffi, gpu, host, nvidia
 from jourdain_jax.native.ffi import write_rows
-from jourdain_jax.native.ir import Writer
 from jourdain_jax.scene.parameters import parameters_of
 
 # Kernels of GPUs, checked without one: their twins on the CPU give the bits of machine code in wide registers, and their text is one for NVIDIA's
@@ -76,7 +76,7 @@ def test_second_derivatives_and_series_too(name):
 NUMBER = 77
 
 
-def _write_doubled(w: Writer) -> None:
+def _write_doubled(w: MachineWriter) -> None:
     with w.function("row", "void", {"state": "ptr", "found": "ptr"}) as (state, found):
         for k in range(2):
             w.store(w.load(state, k) * 2.0, found, k)
@@ -134,7 +134,7 @@ def _handler(fails: int, kernel: int):
 
 
 def _twin() -> int:
-    w = Writer(1, True, device=True)
+    w = MachineWriter(1, True, device=True)
     _write_doubled(w)
     return host.address(host.object_code(gpu_twin.twin_text(w.text), 2), "run")
 

@@ -15,8 +15,8 @@ from small_scenes import OnLine
 import jourdain_jax as jj
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.motion.native.taylor import Series
+from jourdain_jax.motion.native.writers import MachineWriter
 from jourdain_jax.native import ffi, host
-from jourdain_jax.native.ir import Writer
 from jourdain_jax.native.scalar_program import written
 from jourdain_jax.program.graph import Graph
 
@@ -29,7 +29,7 @@ UNARY = [name for name, f in TABLE.items() if f.kind in ("analytic", "flat") and
 def coefficients(graph: Graph, s: int, outputs, at, known=None) -> np.ndarray:
     """Taylor coefficients, (orders, outputs), of functions of s about a point, as machine code has them; `known`: values of other inputs."""
     assert not ffi.reason_against()
-    w = Writer(host.lanes(), host.fuses())
+    w = MachineWriter(host.lanes(), host.fuses())
 
     def block(arguments, found):
         # z' = f(s), s' = 1: coefficients of z are those of f over their order plus one

@@ -285,6 +285,10 @@ class Writer:
         """Whether two values are equal."""
         return a.equals(b)
 
+    def differs(self, a, b) -> Value:
+        """Whether two values are not equal."""
+        return a.differs(b)
+
     def smaller(self, a: Value, b) -> Value:
         """The smaller of two numbers, NaN if either is."""
         return self.intrinsic("minimum", a, b)

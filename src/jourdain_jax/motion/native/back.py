@@ -32,14 +32,16 @@ from jourdain_jax.motion.native.functions import write_pulled
 from jourdain_jax.motion.native.layout import Form, Lanes, arguments_of_samples, copied, each_row, pass_knot, set_goal
 from jourdain_jax.motion.native.loop import MOST_KERNELS, TIMES, Start, begin_lane, with_tangents, write_functions, write_job
 from jourdain_jax.motion.native.record import GOALS, TO_ENDS, TO_STATES, Slot, prepare, write_record
-from jourdain_jax.motion.native.step import near_rank_loss, put_near_rows, slope_is_flat, squares_of, weighted
+from jourdain_jax.motion.native.stages import near_rank_loss, put_near_rows, squares_of, weighted
+from jourdain_jax.motion.native.step import slope_is_flat
 from jourdain_jax.motion.native.values import called
+from jourdain_jax.motion.native.writers import MachineWriter
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native.ffi import taken_in, write_handler
-from jourdain_jax.native.ir import Value, Writer
+from jourdain_jax.native.ir import Value
 
 
-def write_back(w: Writer, form: Form, method: Method, asked: Sequence[int], memory: int) -> None:
+def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int], memory: int) -> None:
     """The module; `asked`: of which of the numbers that the rates are given cotangents are asked; `memory`: bytes that the records of all threads may take."""
     write_functions(w, form, method)
     write_pulled(w, form, asked)
@@ -47,6 +49,8 @@ def write_back(w: Writer, form: Form, method: Method, asked: Sequence[int], memo
     _write_begin(w, form)
     _write_note(w, form)
     _write_added(w, form)
+    if form.projects:
+        _write_project_back(w, form)
     _write_step_back(w, form, method, len(asked))
     if form.has_events:
         _write_event_back(w, form, len(asked))
@@ -56,14 +60,14 @@ def write_back(w: Writer, form: Form, method: Method, asked: Sequence[int], memo
     write_handler(w, 4 + arguments_of_samples(form), 1, lambda arguments, results: write_job(w, form, arguments, results))
 
 
-def _write_begin(w: Writer, form: Form) -> None:
+def _write_begin(w: MachineWriter, form: Form) -> None:
     """`begin(job, state, who, lane)`: the start of the lane of the batch that has this place."""
     with w.procedure("begin", "job state who lane:i64") as (job, state, who, lane):
         number = w.load(who, lane, "i64")
         begin_lane(w, form, job, w.load(job, GOALS, "ptr"), Lanes(w, form, state), lane, number, number >= 0)
 
 
-def _write_note(w: Writer, form: Form) -> None:
+def _write_note(w: MachineWriter, form: Form) -> None:
     """`note(job, state, who, saved)`: counts the times that were reached, sets the next one, and ends lanes that have reached all."""
     with w.procedure("note", "job state who saved") as (job, state, who, saved):
         lanes = Lanes(w, form, state)
@@ -86,7 +90,7 @@ def _write_note(w: Writer, form: Form) -> None:
                     set_goal(w, lanes, lane, w.load(goals, number * times + reached, "double"))
 
 
-def _write_added(w: Writer, form: Form) -> None:
+def _write_added(w: MachineWriter, form: Form) -> None:
     """`added(job, who, first, end, g)`: adds the cotangents of the states saved at the times number `first` to `end - 1`."""
     count = form.integrated
     with w.procedure("added", "job who first:real end:real g") as (job, who, first, end, g):
@@ -103,127 +107,149 @@ def _write_added(w: Writer, form: Form) -> None:
                     w.store(w.load(place, type="double") + more, place)
 
 
-def _write_step_back(w: Writer, form: Form, method: Method, asked: int) -> None:
+def _write_step_back(w: MachineWriter, form: Form, method: Method, asked: int) -> None:
     """`step_back(state, here, g, by_known)`: back over the step in the slot `here`, in lanes that went on in it."""
-    slot = Slot.of(form, method)
-    count = form.integrated
     with w.procedure("step_back", "state here g by_known") as (state, here, g, by_known):
-        h, t = w.load(here, slot.taken), w.load(here, slot.t)
-        took, k = h.differs(0.0), w.at(here, slot.y)
-        g1, v, at, G, added = (w.room(n) for n in (count, count, count, count * method.needed, max(asked, 1)))
-        copied(w, count, g, g1)
-        each_row(w, asked, added, lambda i: 0.0)
-        if form.projects:
-            each_row(w, count, at, lambda i: w.fma(h, weighted(w, method.b, k, form, i), w.load(here, i)))
-            _project_back(w, form, state, t + h, at, g1, added)
+        step_back(w, form, method, asked, state, here, g, by_known)
 
-        def state_at(stage: int, i: int | Value) -> Value:
-            start = w.load(here, i)
-            return w.fma(h, weighted(w, method.A[stage], k, form, i), start) if stage else start
 
-        def cotangent(stage: int, later: list[int], i: int | Value) -> Value:
-            total = w.load(g1, i) * float(method.b[stage])
-            for j in later:
-                total = w.fma(w.load(G, j * count + i), float(method.A[j][stage]), total)
+def _used(method: Method) -> list[int]:
+    """Return the stages that the end of a step depends on, the last one first."""
+    found: list[int] = []
+    for stage in reversed(range(method.needed)):
+        if method.b[stage] != 0 or any(method.A[j][stage] != 0 for j in found):
+            found.append(stage)
+    return found
+
+
+def step_back(w: MachineWriter, form: Form, method: Method, asked: int, state: Value, here: Value, g: Value, by_known: Value) -> None:
+    """Go back over the step in the slot `here`, in lanes that went on in it."""
+    slot, count, used, n = Slot.of(form, method), form.integrated, _used(method), method.needed
+    h, t = w.load(here, slot.taken), w.load(here, slot.t)
+    took, k = w.differs(h, 0.0), w.at(here, slot.y)
+    g1, v, at, G, added = (w.room(n) for n in (count, count, count, count * n, max(asked, 1)))
+    copied(w, count, g, g1)
+    each_row(w, asked, added, lambda i: 0.0)
+    if form.projects:
+        each_row(w, count, at, lambda i: w.fma(h, weighted(w, method.b, k, form, i), w.load(here, i)))
+        w.run("project_back", state, t + h, at, g1, added)
+    A, columns, b, c = (w.table(x) for x in (method.A[:n, :n], method.A[:n, :n].T, method.b[:n], method.c[:n]))
+    near = None
+    if form.squares:
+        pivots = w.room(len(form.monitored))
+        w.run("rates", state, t, here, v, pivots)
+        near = near_rank_loss(squares_of(w, form, pivots))
+
+    def stage(number, _: tuple) -> tuple:
+        stage = w.entry(used, number)
+        of_stage, time = w.at(G, stage * count), w.fma(h, c[stage], t)
+
+        def state_at(row: int | Value) -> Value:
+            start = w.load(here, row)
+            return start if w.is_first(stage) else w.fma(h, weighted(w, A[stage], k, form, row), start)
+
+        def cotangent(i: int | Value) -> Value:
+            total = w.load(g1, i) * b[stage]
+            for j in used:
+                if w.may_count(columns[stage], j):
+                    total = w.fma(w.load(G, i + j * count), columns[stage][j], total)
             return h * total
 
-        used: list[int] = []
-        near = None
-        if form.squares:
-            pivots = w.room(len(form.monitored))
-            w.run("rates", state, t, here, v, pivots)
-            near = near_rank_loss(squares_of(w, form, pivots))
-        for stage in reversed(range(method.needed)):
-            later = [j for j in used if method.A[j][stage] != 0]
-            if method.b[stage] == 0 and not later:
-                continue
-            of_stage, time = w.at(G, stage * count), w.fma(h, float(method.c[stage]), t)
-            each_row(w, count, at, partial(state_at, stage))
-            each_row(w, count, v, partial(cotangent, stage, later))
-            if near is not None and stage:
-                put_near_rows(w, form, state, near, time, at)
-            w.run("pull_rates", state, time, at, v, of_stage, added)
-            if near is not None and stage:
-                with w.when(w.any(near)):
-                    each_row(w, count, at, partial(state_at, stage))
-                    _project_back_where(w, form, near, (state, time, at), of_stage, added, asked)
-            used.append(stage)
+        def put_back(near) -> None:
+            each_row(w, count, at, state_at)
+            pulled, more = w.room(count), w.room(max(asked, 1))
+            copied(w, count, of_stage, pulled)
+            copied(w, asked, added, more)
+            w.run("project_back", state, time, at, pulled, more)
+            copied(w, count, pulled, of_stage, near)
+            copied(w, asked, more, added, near)
 
-        def total(i: int | Value) -> Value:
-            found = w.load(g1, i)
-            for stage in used:
-                found = found + w.load(G, stage * count + i)
-            return w.where(took, found, w.load(g, i))
+        each_row(w, count, at, state_at)
+        each_row(w, count, v, cotangent)
+        is_near = None if near is None or w.is_first(stage) else w.at_first(stage, w.literal(0, w.truth), near)
+        if is_near is not None:
+            put_near_rows(w, form, state, is_near, time, at)
+        w.run("pull_rates", state, time, at, v, of_stage, added)
+        if is_near is not None:
+            w.if_any(is_near, lambda: put_back(is_near))
+        return ()
 
-        each_row(w, count, g, total)
-        each_row(w, asked, by_known, lambda i: w.load(by_known, i) + w.where(took, w.load(added, i), 0.0))
+    w.over_stages(len(used), stage, ())
 
+    def total(i: int | Value) -> Value:
+        found = w.load(g1, i)
+        for stage in used:
+            found = found + w.load(G, i + stage * count)
+        return w.where(took, found, w.load(g, i))
 
-def _project_back_where(w: Writer, form: Form, near: Value, at: tuple[Value, Value, Value], g: Value, added: Value, asked: int) -> None:
-    """Cotangents `g` of a stage's state, put back onto the rows in lanes that are `near` a loss of rank; `at`: lanes, time, and the state before."""
-    count = form.integrated
-    pulled, more = w.room(count), w.room(max(asked, 1))
-    copied(w, count, g, pulled)
-    copied(w, asked, added, more)
-    _project_back(w, form, *at, pulled, more)
-    copied(w, count, pulled, g, near)
-    copied(w, asked, more, added, near)
+    each_row(w, count, g, total)
+    each_row(w, asked, by_known, lambda i: w.load(by_known, i) + w.where(took, w.load(added, i), 0.0))
 
 
-def _project_back(w: Writer, form: Form, state: Value, t1: Value, free: Value, g: Value, added: Value) -> None:
-    """Cotangents `g` of a state put back onto the rows become those of the state `free` before."""
-    moves = form.moves
-    count = form.integrated
-    before = w.room(count * len(moves))
-    for number, q_moves in enumerate(moves):
-        copied(w, count, free, w.at(before, number * count))
-        w.run("projected_once", state, t1, free, w.literal(q_moves, "i1"))
-    out = w.room(count)
-    for number, q_moves in reversed(list(enumerate(moves))):
-        w.run("pull_q" if q_moves else "pull_u", state, t1, w.at(before, number * count), g, out, added)
-        copied(w, count, out, g)
+def _write_project_back(w: MachineWriter, form: Form) -> None:
+    """`project_back(state, t, free, g, added)`: cotangents of a state put back onto the rows become those of the state `free` before."""
+    moves, count = form.moves, form.integrated
+    with w.procedure("project_back", "state t1:real free g added") as (state, t1, free, g, added):
+        before = w.room(count * len(moves))
+        for number, q_moves in enumerate(moves):
+            copied(w, count, free, w.at(before, number * count))
+            w.run("projected_once", state, t1, free, w.literal(q_moves, "i1"))
+        out = w.room(count)
+        for number, q_moves in reversed(list(enumerate(moves))):
+            w.run("pull_q" if q_moves else "pull_u", state, t1, w.at(before, number * count), g, out, added)
+            copied(w, count, out, g)
 
 
-def _write_event_back(w: Writer, form: Form, asked: int) -> None:
-    """`event_back(job, state, who, g, by_known)`: cotangents at the time and state of an event become those of a state at a number for a time."""
-    count = form.integrated
+def _write_event_back(w: MachineWriter, form: Form, asked: int) -> None:
+    """`event_back(job, state, who, g, by_known)`: as the function of this name, with cotangents of the time of the end from the job."""
     with w.procedure("event_back", "job state who g by_known") as (job, state, who, g, by_known):
-        lanes = Lanes(w, form, state)
-        located = lanes["code"].equals(results.EVENT) & (lanes["accepted"] > 0.0)
+        located = is_located(w, Lanes(w, form, state))
         with w.when(w.any(located)):
-            f, out, pivots, added = (w.room(max(n, 1)) for n in (count, count, len(form.monitored), asked + 1))
-            values, rates, weights = (w.room(form.events) for _ in range(3))
-            t, g_t = lanes["t"], w.room(1 + len(form.moving))
+            g_t = w.room(1 + len(form.moving))
             with w.counted(0, w.lanes) as lane:
                 number = w.load(who, lane, "i64")
-                end = w.at(w.load(job, TO_ENDS, "ptr"), w.where(number >= 0, number, 0) * form.ends + count, "double")
+                end = w.at(w.load(job, TO_ENDS, "ptr"), w.where(number >= 0, number, 0) * form.ends + form.integrated, "double")
                 taken_in(w, 1 + len(form.moving), end, g_t, lane)
-            w.run("rates", state, t, state, f, pivots)
-            if form.moving:  # the tangent, and its rates, at a number for a time
-                dy, dt = w.at(state, form.y), lanes["dt"]
-                each_row(w, form.y, dy, lambda i: w.load(dy, i) - w.where(dt.differs(0.0), dt * w.load(f, i), 0.0))
-                lanes["dt"] = w.number(0.0)
-                w.run("rates", state, t, state, f, pivots)
-            w.run("events", state, t, state, f, values, rates)
-            rate = chosen(w, lanes["event"], [w.load(rates, i) for i in range(form.events)])
-            usable = located & rate.differs(0.0) & (w.magnitude(rate) < math.inf)
-            each_row(w, asked + 1, added, lambda i: 0.0)
-            total = w.load(g_t)
-            if form.moving:
-                total = total + _moved_back(w, form, lanes, usable, (g, w.load(g_t, 1)), (out, added), asked)
-            for i in range(count):
-                total = w.fma(w.load(g, i), w.load(f, i), total)
-            flat = located & slope_is_flat(w, lanes, rate) & total.differs(0.0)
-            by_value = w.where(flat, math.nan, w.where(usable, -total / rate, 0.0))
-            usable = usable | flat
-            for i in range(form.events):
-                w.store(w.where(lanes["event"].equals(i), by_value, 0.0), weights, i)
-            w.run("pull_events", state, t, state, weights, out, added)
-            each_row(w, count, g, lambda i: w.load(g, i) + w.where(usable, w.load(out, i), 0.0))
-            each_row(w, asked, by_known, lambda i: w.load(by_known, i) + w.where(usable, w.load(added, i), 0.0))
+            event_back(w, form, asked, state, located, g_t, g, by_known)
 
 
-def _moved_back(w: Writer, form: Form, lanes: Lanes, usable: Value, cotangents: tuple[Value, Value], rooms: tuple[Value, Value], asked: int) -> Value:
+def is_located(w: MachineWriter, lanes: Lanes) -> Value:
+    """Return which lanes ended at an event that was searched for."""
+    return w.equal(lanes["code"], results.EVENT) & (lanes["accepted"] > 0.0)
+
+
+def event_back(w: MachineWriter, form: Form, asked: int, state: Value, located: Value, g_t: Value, g: Value, by_known: Value) -> None:
+    """Make cotangents at the time and state of an event those of a state at a number for a time."""
+    lanes, count = Lanes(w, form, state), form.integrated
+    f, out, pivots, added = (w.room(max(n, 1)) for n in (count, count, len(form.monitored), asked + 1))
+    values, rates, weights = (w.room(form.events) for _ in range(3))
+    t = lanes["t"]
+    w.run("rates", state, t, state, f, pivots)
+    if form.moving:  # the tangent, and its rates, at a number for a time
+        dy, dt = w.at(state, form.y), lanes["dt"]
+        each_row(w, form.y, dy, lambda i: w.load(dy, i) - w.where(w.differs(dt, 0.0), dt * w.load(f, i), 0.0))
+        lanes["dt"] = w.number(0.0)
+        w.run("rates", state, t, state, f, pivots)
+    w.run("events", state, t, state, f, values, rates)
+    rate = chosen(w, lanes["event"], [w.load(rates, i) for i in range(form.events)])
+    usable = located & w.differs(rate, 0.0) & (w.magnitude(rate) < math.inf)
+    each_row(w, asked + 1, added, lambda i: 0.0)
+    total = w.load(g_t)
+    if form.moving:
+        total = total + _moved_back(w, form, lanes, usable, (g, w.load(g_t, 1)), (out, added), asked)
+    for i in range(count):
+        total = w.fma(w.load(g, i), w.load(f, i), total)
+    flat = located & slope_is_flat(w, lanes, rate) & w.differs(total, 0.0)
+    by_value = w.where(flat, math.nan, w.where(usable, -total / rate, 0.0))
+    usable = usable | flat
+    for i in range(form.events):
+        w.store(w.where(w.equal(lanes["event"], i), by_value, 0.0), weights, i)
+    w.run("pull_events", state, t, state, weights, out, added)
+    each_row(w, count, g, lambda i: w.load(g, i) + w.where(usable, w.load(out, i), 0.0))
+    each_row(w, asked, by_known, lambda i: w.load(by_known, i) + w.where(usable, w.load(added, i), 0.0))
+
+
+def _moved_back(w: MachineWriter, form: Form, lanes: Lanes, usable: Value, cotangents: tuple, rooms: tuple, asked: int) -> Value:
     """The derivative along time of what an event adds to a tangent; changes the cotangents `g` of the state, the first of these, and adds to the others."""
     (g, g_dt), (out, added) = cotangents, rooms
     given, count = w.room(form.integrated + 2), form.integrated

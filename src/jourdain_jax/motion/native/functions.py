@@ -16,7 +16,8 @@ from typing import NamedTuple
 
 from jourdain_jax.calculus.derivatives import DifferentiationModeError
 from jourdain_jax.motion.native.layout import Form, Lanes, looked_up
-from jourdain_jax.native.ir import Value, Writer
+from jourdain_jax.motion.native.writers import MachineWriter
+from jourdain_jax.native.ir import Value
 from jourdain_jax.native.scalar_program import as_real, unsupported, written, written_in_turn
 from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
 from jourdain_jax.program.graph import Graph
@@ -60,7 +61,7 @@ def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
     return Outputs(graph, values, found[1:], variables, states, [n for part in known for n in part.values()], times, slopes)
 
 
-def _found(w: Writer, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value) -> tuple[list[Value], list[list[Value]]]:
+def _found(w: MachineWriter, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value) -> tuple[list[Value], list[list[Value]]]:
     """The values of outputs, and their tangents; `known`: as from `known_values`."""
     given = given_values(w, form, own, known, state, tau, y)
     found = [as_real(w, x) for x in written(w, own.graph, [*own.values, *(n for part in own.tangents for n in part)], given)]
@@ -68,7 +69,7 @@ def _found(w: Writer, form: Form, own: Outputs, known: dict[int, Value], state: 
     return found[: len(own.values)], [[next(tangents) for _ in part] for part in own.tangents]
 
 
-def given_values(w: Writer, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value) -> dict[int, Value]:
+def given_values(w: MachineWriter, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value) -> dict[int, Value]:
     """Values of all nodes of outputs that are given from outside; `known`: as from `known_values`."""
     given, lanes = dict(zip(own.variables, known.values(), strict=True)), Lanes(w, form, state)
     for k, states in enumerate(own.states):
@@ -79,7 +80,7 @@ def given_values(w: Writer, form: Form, own: Outputs, known: dict[int, Value], s
     return given
 
 
-def known_values(w: Writer, form: Form, state: Value, tau: Value, y: Value) -> dict[int, Value]:
+def known_values(w: MachineWriter, form: Form, state: Value, tau: Value, y: Value) -> dict[int, Value]:
     """Values of all nodes that are given from outside."""
     program, lanes = form.program, Lanes(w, form, state)
     states = [w.load(y, k) for k in range(form.q_and_v)]
@@ -89,7 +90,7 @@ def known_values(w: Writer, form: Form, state: Value, tau: Value, y: Value) -> d
     return dict(zip(program.variables, [*known[:fixed], t, *states, *inputs], strict=True))
 
 
-def write_rates(w: Writer, form: Form) -> None:
+def write_rates(w: MachineWriter, form: Form) -> None:
     """`rates(state, tau, y, k, pivots)`: the rates of the state `y` into `k`, and what is monitored, pivots first."""
     program = form.program
     # 120 operations: so few are written anew at each stage
@@ -107,7 +108,7 @@ def write_rates(w: Writer, form: Form) -> None:
         w.give()
 
 
-def write_projection(w: Writer, form: Form) -> None:
+def write_projection(w: MachineWriter, form: Form) -> None:
     """`project(state, tau, y)`: puts the state `y` back onto the rows."""
     program = form.program
     with w.procedure("projected_once", "state tau:real y q_moves:i1") as (state, tau, y, q_moves):
@@ -126,7 +127,7 @@ def write_projection(w: Writer, form: Form) -> None:
         _write_along(w, form)
 
 
-def _write_along(w: Writer, form: Form) -> None:
+def _write_along(w: MachineWriter, form: Form) -> None:
     """`along(state, tau, y)`: after a state `y` on the rows stands its error, which becomes the part of it along the rows: what a projection leaves."""
     program, moved = form.program, replace(form, moving=((),), time_moves=False)
     with w.procedure("along", "state tau:real y") as (state, tau, y):
@@ -137,7 +138,7 @@ def _write_along(w: Writer, form: Form) -> None:
                 w.store(x, y, form.y + first + i)
 
 
-def write_relations(w: Writer, form: Form) -> None:
+def write_relations(w: MachineWriter, form: Form) -> None:
     """`relations(state, tau, y, values)`: the numbers whose signs are watched, of the state `y`."""
     with w.procedure("relations", "state tau:real y values") as (state, tau, y, values):
         for i, x in written_in_turn(w, form.program.graph, form.watched, known_values(w, form, state, tau, y)):
@@ -157,7 +158,7 @@ def event_program(form: Form) -> Outputs:
     return Outputs(graph, events, [rates], variables, [slopes], [], [], [])
 
 
-def write_events(w: Writer, form: Form) -> None:
+def write_events(w: MachineWriter, form: Form) -> None:
     """`events(state, tau, y, slope, c, rate)`: the values of all stop events of the state `y`, and their rates where `y` changes at the rate `slope`."""
     program, own, count = form.program, event_program(form), form.events
     with w.procedure("events", "state tau:real y slope c rate") as (state, tau, y, slope, c, rate):
@@ -213,7 +214,7 @@ def reason_against_derivatives(form: Form, order: int) -> str:
     return ""
 
 
-def write_pulled(w: Writer, form: Form, asked: Sequence[int]) -> None:
+def write_pulled(w: MachineWriter, form: Form, asked: Sequence[int]) -> None:
     """`pull_rates`, `pull_q`, `pull_u` and `pull_events`, each `(state, tau, y, g, to_y, to_known)`; `asked`: which of the numbers known.
 
     Of a state with a tangent also `pull_moved`; events are then those of the state alone.
@@ -281,7 +282,7 @@ def _moved(form: Form, asked: Sequence[int]) -> Pulled:
     return Pulled(own, [*found[: len(found) - len(times)], by_time], dict(zip(rows, weights, strict=True)))
 
 
-def _write_one_pulled(w: Writer, form: Form, name: str, pulled: Pulled, work_stays: bool = False) -> None:
+def _write_one_pulled(w: MachineWriter, form: Form, name: str, pulled: Pulled, work_stays: bool = False) -> None:
     each = form.q_and_v
     end = each * (1 + len(form.moving))
     with w.procedure(name, "state tau:real y g to_y to_known") as (state, tau, y, g, to_y, to_known):

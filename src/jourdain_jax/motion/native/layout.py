@@ -23,8 +23,9 @@ from itertools import pairwise
 
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.lowering.relations import MOST_WATCHED
+from jourdain_jax.motion.native.writers import MachineWriter
 from jourdain_jax.native.ffi import Given, last_size, product
-from jourdain_jax.native.ir import Value, Writer
+from jourdain_jax.native.ir import Value
 
 PROGRESS = ("t", "h", "code", "accepted", "rejected", "event", "pivot", "crossings", "together")
 SAMPLES = ("table", "samples", "knot")
@@ -68,15 +69,19 @@ class Form:
         return [*self.program.pivots[: self.pivots], *self.program.directions, *self.squares]
 
     @property
+    def speeds(self) -> int:
+        """Numbers of speeds."""
+        return len(self.program.ydot)
+
+    @property
+    def turning(self) -> int:
+        """Numbers of all entries of directions of rows."""
+        return len(self.program.directions)
+
+    @property
     def squares(self) -> tuple[int, ...]:
         """What is left of rows beside those before them, and their sizes, by turns."""
         return self.program.squares if self.projects else ()
-
-    @property
-    def directions(self) -> list[range]:
-        """Which of these are the entries of a direction, one direction after the other."""
-        first, width = self.pivots, len(self.program.ydot)
-        return [range(k, k + width) for k in range(first, first + len(self.program.directions), max(width, 1))]
 
     @property
     def moves(self) -> list[int]:
@@ -105,7 +110,7 @@ class Form:
     @property
     def q_and_v(self) -> int:
         """Numbers of coordinates and speeds."""
-        return self.coordinates + len(self.program.ydot)
+        return self.coordinates + self.speeds
 
     @property
     def events(self) -> int:
@@ -167,7 +172,7 @@ class Form:
 class Lanes:
     """The rows of the lanes side by side, in memory at `pointer`."""
 
-    def __init__(self, w: Writer, form: Form, pointer: Value) -> None:
+    def __init__(self, w: MachineWriter, form: Form, pointer: Value) -> None:
         self.w, self.form, self.pointer, self.rows = w, form, pointer, form.rows
 
     def __getitem__(self, name: str) -> Value:
@@ -198,33 +203,14 @@ class Lanes:
         self.w.store(self.w.literal(value, "double"), self.place(name, lane))
 
 
-def for_rows(w: Writer, rows: range, body: Callable[[int | Value], object]) -> None:
-    """`body` for the number of every row."""
-    # 12 numbers of a state; more are gone through by loops, whose code is short
-    if len(rows) <= 12:
-        for i in rows:
-            body(i)
-    else:
-        with w.counted(rows.start, rows.stop) as i:
-            body(i)
-
-
-def each_row(w: Writer, rows: range | int, into: Value, value: Callable[[int | Value], Value | float]) -> None:
+def each_row(w: MachineWriter, rows: range | int, into: Value, value: Callable[[int | Value], Value | float]) -> None:
     """Sets rows of a state in memory, so many of them, or these."""
-    for_rows(w, range(rows) if isinstance(rows, int) else rows, lambda i: w.store(value(i), into, i))
+    w.each(range(rows) if isinstance(rows, int) else rows, lambda i: w.store(value(i), into, i))
 
 
-def copied(w: Writer, rows: int, source: Value, into: Value, where: Value | None = None) -> None:
+def copied(w: MachineWriter, rows: int, source: Value, into: Value, where: Value | None = None) -> None:
     """Sets so many rows to those from another place, in lanes `where` this holds."""
     each_row(w, rows, into, lambda i: w.load(source, i) if where is None else w.where(where, w.load(source, i), w.load(into, i)))
-
-
-def over_rows(w: Writer, rows: range, start: float, added: Callable[[Value, int | Value], Value]) -> Value:
-    """What `added(total, i)` makes of all rows one after the other."""
-    total = w.room()
-    w.store(start, total)
-    for_rows(w, rows, lambda i: w.store(added(w.load(total), i), total))
-    return w.load(total)
 
 
 WORDS_OF_SAMPLES = 6  # of a job: pointers to the tables and the knots, how many there are of each, samples of a table, knots of a row
@@ -236,7 +222,7 @@ def arguments_of_samples(form: Form) -> int:
     return 2 if form.sampled else 0
 
 
-def store_samples(w: Writer, words: Value, given: list[Given]) -> None:
+def store_samples(w: MachineWriter, words: Value, given: list[Given]) -> None:
     """The words of a job that say where samples are."""
     tables, knots = given
     for word, value in (
@@ -250,7 +236,7 @@ def store_samples(w: Writer, words: Value, given: list[Given]) -> None:
         w.store(value, words, word)
 
 
-def begin_samples(w: Writer, form: Form, words: Value, count: Value, lanes: Lanes, lane: Value, number: Value) -> None:
+def begin_samples(w: MachineWriter, form: Form, words: Value, count: Value, lanes: Lanes, lane: Value, number: Value) -> None:
     """A place takes the table and the knots of the lane with this number, of so many."""
     size = w.load(words, _SAMPLES, "i64")
 
@@ -263,7 +249,7 @@ def begin_samples(w: Writer, form: Form, words: Value, count: Value, lanes: Lane
         lanes.set(name, lane, value)
 
 
-def set_goal(w: Writer, lanes: Lanes, lane: Value, goal: Value) -> None:
+def set_goal(w: MachineWriter, lanes: Lanes, lane: Value, goal: Value) -> None:
     """A lane goes on to the goal, or to the next knot where that comes first."""
     if lanes.form.sampled:
         knot = w.load(lanes.of("knot", lane, "ptr"), type="double")
@@ -271,12 +257,12 @@ def set_goal(w: Writer, lanes: Lanes, lane: Value, goal: Value) -> None:
     lanes.set("goal", lane, goal)
 
 
-def pass_knot(w: Writer, lanes: Lanes, lane: Value) -> None:
+def pass_knot(w: MachineWriter, lanes: Lanes, lane: Value) -> None:
     """The next knot is behind."""
     lanes.set("knot", lane, w.at(lanes.of("knot", lane, "ptr"), 1, "double"))
 
 
-def write_sampled_inputs(w: Writer, form: Form, with_slopes: bool) -> None:
+def write_sampled_inputs(w: MachineWriter, form: Form, with_slopes: bool) -> None:
     """`sampled_inputs(state, t, values)`: the values of all inputs that are given by samples, at the time t since the start, of each lane; then df/dt."""
     with w.procedure("sampled_inputs", "state t:real values") as (state, t, values):
         lanes, times, low, high = Lanes(w, form, state), w.room(), w.room(type="i64"), w.room(type="i64")
@@ -305,7 +291,7 @@ def write_sampled_inputs(w: Writer, form: Form, with_slopes: bool) -> None:
                     w.store(w.where(there.equals(share), rise / span, 0.0), w.at(values, (len(form.sampled) + i) * w.lanes + lane, "double"))
 
 
-def looked_up(w: Writer, form: Form, state: Value, t: Value, with_slopes: bool) -> list[Value]:
+def looked_up(w: MachineWriter, form: Form, state: Value, t: Value, with_slopes: bool) -> list[Value]:
     """The values at the time t since the start of all inputs that are given by samples, then their slopes."""
     if not form.sampled:
         return []

@@ -37,8 +37,9 @@ from jourdain_jax.motion.native.layout import (
 from jourdain_jax.motion.native.step import IDLE, write_step
 from jourdain_jax.motion.native.taylor import TaylorSteps, products
 from jourdain_jax.motion.native.values import called
+from jourdain_jax.motion.native.writers import MachineWriter
 from jourdain_jax.native.ffi import Given, handed_out, last_size, next_lane, product, share, start_counting, taken_in, write_handler
-from jourdain_jax.native.ir import Value, Writer
+from jourdain_jax.native.ir import Value
 
 # words of a job, shared by all threads: the number of lanes, of times, and of the next lane, of doubles of a kernel's own memory (`ffi.py`), those of
 # samples, then pointers to the arrays
@@ -47,7 +48,7 @@ FIRST_ARRAY = FIRST_OF_SAMPLES + WORDS_OF_SAMPLES
 STARTS, _GOALS, _STATES, _ENDS = range(FIRST_ARRAY, FIRST_ARRAY + 4)
 
 
-def write_loop(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
+def write_loop(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> None:
     """The module."""
     write_functions(w, form, method)
     _write_begin(w, form)
@@ -58,7 +59,7 @@ def write_loop(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
     write_handler(w, 2 + arguments_of_samples(form), 2, lambda arguments, results: write_job(w, form, arguments, results))
 
 
-def write_functions(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
+def write_functions(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> None:
     """`step`, and what it calls."""
     if form.sampled:
         write_sampled_inputs(w, form, form.time_moves)
@@ -72,7 +73,7 @@ def write_functions(w: Writer, form: Form, method: Method | TaylorSteps) -> None
     write_step(w, form, method)
 
 
-def write_job(w: Writer, form: Form, arguments: list[Given], results: list[Value]) -> None:
+def write_job(w: MachineWriter, form: Form, arguments: list[Given], results: list[Value]) -> None:
     """All lanes, by this thread and by others that it starts and waits for; the last of the arguments is an array of lanes and times."""
     of_samples, arguments, times = arguments[: arguments_of_samples(form)], arguments[arguments_of_samples(form) :], arguments[-1]
     arrays = [*(x.data for x in arguments), *results]
@@ -91,14 +92,14 @@ def write_job(w: Writer, form: Form, arguments: list[Given], results: list[Value
     share(w, job, w.load(count, type="i64"))
 
 
-def _write_loop(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
+def _write_loop(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> None:
     """`loop(job)`: lanes side by side until none is left."""
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
         _write_lanes(w, form, method, job)
         w.give(Value(w, "ptr", "null"))
 
 
-def _write_lanes(w: Writer, form: Form, method: Method | TaylorSteps, job: Value) -> None:
+def _write_lanes(w: MachineWriter, form: Form, method: Method | TaylorSteps, job: Value) -> None:
     # of each place, which lane is there and how many of its times are saved; after them, at how many places there is one
     state, who, k = w.room(form.all), w.room(2 * w.lanes + 1, "i64"), w.room(form.integrated * method.needed)
     w.store(w.literal(w.lanes, "i64"), who, 2 * w.lanes)
@@ -119,7 +120,7 @@ def _write_lanes(w: Writer, form: Form, method: Method | TaylorSteps, job: Value
             w.run("serve", job, state, who, lane)
 
 
-def begin_lane(w: Writer, form: Form, job: Value, goals: Value, lanes: Lanes, lane: Value, number: Value, there: Value) -> None:
+def begin_lane(w: MachineWriter, form: Form, job: Value, goals: Value, lanes: Lanes, lane: Value, number: Value, there: Value) -> None:
     """The lane of the batch with this number takes a place; where it is not there, the place is idle, and goes by samples of the first one."""
     if form.sampled:
         begin_samples(w, form, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load(job, COUNT, "i64"), lanes, lane, w.where(there, number, 0))
@@ -135,7 +136,7 @@ def begin_lane(w: Writer, form: Form, job: Value, goals: Value, lanes: Lanes, la
         lanes.set("search_left", lane, 0.0)
 
 
-def _write_begin(w: Writer, form: Form) -> None:
+def _write_begin(w: MachineWriter, form: Form) -> None:
     """`begin(job, state, who, lane)`: the next lane of the batch takes this place."""
     with w.procedure("begin", "job state who lane:i64") as (job, state, who, lane):
         number = next_lane(w, job, NEXT)
@@ -148,7 +149,7 @@ def _write_begin(w: Writer, form: Form) -> None:
             w.store(w.load(who, 2 * w.lanes, "i64") - 1, who, 2 * w.lanes)
 
 
-def _write_serve(w: Writer, form: Form) -> None:
+def _write_serve(w: MachineWriter, form: Form) -> None:
     """`serve(job, state, who, lane)`: saves what is due, and where the lane has ended, hands it back and begins with the next one."""
     with w.procedure("serve", "job state who lane:i64") as (job, state, who, lane):
         lanes = Lanes(w, form, state)
@@ -169,7 +170,7 @@ def _write_serve(w: Writer, form: Form) -> None:
                 _save(w, form, job, who, lanes, lane, runs)
 
 
-def _write_save_within(w: Writer, form: Form, method: TaylorSteps) -> None:
+def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> None:
     """`save_within(job, state, who, k)`: saves what is due before the end of a step, by the Taylor coefficients `k` of its start."""
     with w.procedure("save_within", "job state who k") as (job, state, who, k):
         lanes = Lanes(w, form, state)
@@ -198,7 +199,7 @@ def _write_save_within(w: Writer, form: Form, method: TaylorSteps) -> None:
                     lanes.set("goal", lane, w.load(goals, place + 1, "double"))
 
 
-def _save(w: Writer, form: Form, job: Value, who: Value, lanes: Lanes, lane: Value, runs: Value) -> None:
+def _save(w: MachineWriter, form: Form, job: Value, who: Value, lanes: Lanes, lane: Value, runs: Value) -> None:
     """The state of a lane at a time to save at; or at the end, where it stands for all that is left, and the next lane begins."""
     times = w.load(job, TIMES, "i64")
     goals, states, ends = (w.load(job, word, "ptr") for word in (_GOALS, _STATES, _ENDS))

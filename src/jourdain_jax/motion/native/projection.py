@@ -21,12 +21,13 @@ from typing import Literal
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.roots import QUIET, ROUND_OFF
 from jourdain_jax.equations.projection import MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS
+from jourdain_jax.motion.native.writers import MachineWriter
 from jourdain_jax.native.ffi import write_rows
-from jourdain_jax.native.ir import Value, Writer
+from jourdain_jax.native.ir import Value
 from jourdain_jax.native.scalar_program import as_real, unsupported, written_in_turn
 
 
-def _product_of_rows(w: Writer, a: Value, b: Value, count) -> Value:
+def _product_of_rows(w: MachineWriter, a: Value, b: Value, count) -> Value:
     """The sum of products of so many numbers from two places on."""
     total = w.room()
     w.store(0.0, total)
@@ -35,13 +36,13 @@ def _product_of_rows(w: Writer, a: Value, b: Value, count) -> Value:
     return w.load(total)
 
 
-def cleared(w: Writer, place: Value, count: int) -> None:
+def cleared(w: MachineWriter, place: Value, count: int) -> None:
     """Zeros at so many places from one on."""
     with w.counted(0, count) as k:
         w.store(0.0, place, k)
 
 
-def write_rotated(w: Writer, rows: int, columns: int) -> None:
+def write_rotated(w: MachineWriter, rows: int, columns: int) -> None:
     """`rotated(B)`: the rows of B made orthogonal in their first `columns` entries; the `rows` entries behind them turn with them."""
     width = rows + columns
     with w.procedure("rotated", "B") as (B,):
@@ -67,7 +68,7 @@ def write_rotated(w: Writer, rows: int, columns: int) -> None:
             w.give_where(~w.load(turned, type="i1"))
 
 
-def write_inverted(w: Writer, rows: int, columns: int, cutoff: float) -> None:
+def write_inverted(w: MachineWriter, rows: int, columns: int, cutoff: float) -> None:
     """`inverted(B, weights)`: after `rotated`, the weights S^-2 of the rows; zero for rows shorter than `cutoff` times the longest."""
     with w.procedure("inverted", "B weights") as (B, weights):
         longest, width = w.room(), rows + columns
@@ -83,7 +84,7 @@ def write_inverted(w: Writer, rows: int, columns: int, cutoff: float) -> None:
             w.store(w.where(short, 0.0, w.number(1.0) / w.where(short, 1.0, length * length)), weights, i)
 
 
-def write_solved(w: Writer, rows: int, columns: int) -> None:
+def write_solved(w: MachineWriter, rows: int, columns: int) -> None:
     """`solved(B, weights, b, x)`: x = A+ b."""
     width = rows + columns
     with w.procedure("solved", "B weights b x") as (B, weights, b, x):
@@ -95,7 +96,7 @@ def write_solved(w: Writer, rows: int, columns: int) -> None:
                 w.store(w.fma(share, w.load(row, k), w.load(x, k)), x, k)
 
 
-def write_cholesky(w: Writer, n: int) -> None:
+def write_cholesky(w: MachineWriter, n: int) -> None:
     """`cholesky(M)`: L in place of the lower triangle of M; the identity where M is not positive definite to round-off, NaN where it is not finite."""
     with w.procedure("cholesky", "M") as (M,):
         finite, smallest = w.room(), w.room()
@@ -120,7 +121,7 @@ def write_cholesky(w: Writer, n: int) -> None:
             w.store(w.where(is_finite, w.where(definite, w.load(M, i * n + j), one), float("nan")), M, i * n + j)
 
 
-def write_triangular(w: Writer, n: int) -> None:
+def write_triangular(w: MachineWriter, n: int) -> None:
     """`forward(L, x)` and `backward(L, x)`: L^-1 x and L'^-1 x in place of x."""
     with w.procedure("forward", "L x") as (L, x), w.counted(0, n) as i:
         row = w.at(L, i * n)
@@ -189,7 +190,7 @@ class Rows:
         return unsupported(self.program.graph, nodes)
 
 
-def write(w: Writer, of: Rows, cutoff: float) -> None:
+def write(w: MachineWriter, of: Rows, cutoff: float) -> None:
     """The module: a lane is given `of.given`, what is free, and lengths, and returns what moved, and what is left of the rows.
 
     `cutoff`: singular values of rows below this share of the largest one count as zero.
@@ -211,7 +212,7 @@ def write(w: Writer, of: Rows, cutoff: float) -> None:
     write_rows(w, len(of.given) + columns + rows, columns + rows)
 
 
-def _write_values(w: Writer, of: Rows, name: str, nodes: dict[int, int]) -> None:
+def _write_values(w: MachineWriter, of: Rows, name: str, nodes: dict[int, int]) -> None:
     """`name(state, found)`: values of nodes, each at its place in `found`."""
     with w.procedure(name, "state found") as (state, found):
         known = {n: w.load(state, k) for k, n in enumerate(of.given)}
@@ -220,7 +221,7 @@ def _write_values(w: Writer, of: Rows, name: str, nodes: dict[int, int]) -> None
             w.store(as_real(w, value), found, places[k])
 
 
-def _write_metric(w: Writer, of: Rows) -> None:
+def _write_metric(w: MachineWriter, of: Rows) -> None:
     """`metric(state, L, c)`: scales of the speeds, and the Cholesky factor of the mass matrix in scaled speeds; the identity among speeds that are held."""
     n, first_free = len(of.moving), len(of.given)
     with w.procedure("metric", "state L c") as (state, L, c):
@@ -236,13 +237,13 @@ def _write_metric(w: Writer, of: Rows) -> None:
         w.run("cholesky", L)
 
 
-def _scale_of_speed(w: Writer, own: Value) -> Value:
+def _scale_of_speed(w: MachineWriter, own: Value) -> Value:
     """As `equations/scaling.speed_scale`, of an entry on the diagonal of the mass matrix."""
     heavy = own > 0.0
     return w.where(heavy, w.number(1.0) / w.root(w.where(heavy, own, 1.0)), 1.0)
 
 
-def _write_factored(w: Writer, of: Rows) -> None:
+def _write_factored(w: MachineWriter, of: Rows) -> None:
     """`factored(state, L, c, B, d, weights)`: the matrix of the rows, turned as by `rotated`, and the scales of the rows."""
     rows, columns, first_free = len(of.residuals), len(of.moving), len(of.given)
     width, first_typical = rows + columns, first_free + columns
@@ -272,7 +273,7 @@ def _write_factored(w: Writer, of: Rows) -> None:
         w.run("inverted", B, weights)
 
 
-def _write_moved(w: Writer, of: Rows) -> None:
+def _write_moved(w: MachineWriter, of: Rows) -> None:
     """`moved(state, L, c, B, d, weights, x)`: what moves after one step, by the matrix of the rows that was `factored`."""
     rows, columns, first_free = len(of.residuals), len(of.moving), len(of.given)
     first = of.given.index(of.moving[0])
@@ -291,7 +292,7 @@ def _write_moved(w: Writer, of: Rows) -> None:
             w.store(w.load(state, k + first) - w.where(moves, change, 0.0), x, k)
 
 
-def _write_row(w: Writer, of: Rows) -> None:
+def _write_row(w: MachineWriter, of: Rows) -> None:
     """`row(state, found)`: the lanes of a block, from what they are given to what they return."""
     rows, columns = len(of.residuals), len(of.moving)
     first = of.given.index(of.moving[0])
@@ -304,7 +305,7 @@ def _write_row(w: Writer, of: Rows) -> None:
         w.run("residuals", state, w.at(found, columns))
 
 
-def _write_putting(w: Writer, of: Rows, first: int, state: Value, factors: list[Value], x: Value) -> None:
+def _write_putting(w: MachineWriter, of: Rows, first: int, state: Value, factors: list[Value], x: Value) -> None:
     """What moves, put onto the rows in its place."""
     if of.metric is not None:
         w.run("metric", state, *factors[:2])
@@ -318,7 +319,7 @@ def _write_putting(w: Writer, of: Rows, first: int, state: Value, factors: list[
             w.store(w.load(x, k), state, k + first)
 
 
-def _write_iteration(w: Writer, of: Rows, first: int, places: tuple[Value, ...]) -> None:
+def _write_iteration(w: MachineWriter, of: Rows, first: int, places: tuple[Value, ...]) -> None:
     """Steps until they change nothing, as those of `calculus/roots.py`."""
     state, *factors, x = places
     columns, quiet, changed = len(of.moving), w.room(), w.room()

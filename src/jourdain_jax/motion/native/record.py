@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
 from jourdain_jax.motion.integrators.explicit_steps import Method
-from jourdain_jax.motion.native.layout import Form, Lanes, copied, each_row, for_rows
+from jourdain_jax.motion.native.layout import Form, Lanes, copied, each_row
 from jourdain_jax.motion.native.loop import COUNT, NEXT, OWN, STARTS, TIMES
+from jourdain_jax.motion.native.writers import MachineWriter
 from jourdain_jax.native.ffi import FIRST_OF_SCRATCH, handed_out, lanes_taken, next_lane, taken_in
-from jourdain_jax.native.ir import Value, Writer
+from jourdain_jax.native.ir import Value
 
 TO_STATES, TO_ENDS, GOALS, FOUND = range(STARTS + 1, STARTS + 5)
 FIRST_SLOTS = 64  # for which there is memory at first; then twice as many, and so on
@@ -46,7 +47,7 @@ class _Rooms(NamedTuple):
     tries: Value
 
     @staticmethod
-    def of(w: Writer, form: Form, asked: int) -> "_Rooms":
+    def of(w: MachineWriter, form: Form, asked: int) -> "_Rooms":
         rows = form.all, form.integrated, max(asked, 1)
         state, g, by_known = (w.room(count) for count in rows)
         return _Rooms(state, w.room(w.lanes, "i64"), w.room(), g, by_known, w.room(type="i64"))
@@ -62,7 +63,7 @@ class _Places(NamedTuple):
     lost: Callable[[], Value]  # whether memory has run out
 
 
-def write_record(w: Writer, form: Form, method: Method, asked: int, memory: int, job: Value) -> None:
+def write_record(w: MachineWriter, form: Form, method: Method, asked: int, memory: int, job: Value) -> None:
     """Lanes side by side, forth and back, until none is left; inside a function."""
     slot, rooms = Slot.of(form, method), _Rooms.of(w, form, asked)
     lanes, end, count = Lanes(w, form, rooms.state), w.room(type="i64"), rooms.tries
@@ -99,7 +100,7 @@ def write_record(w: Writer, form: Form, method: Method, asked: int, memory: int,
         w.external("free", "void", places.kept(w.literal(0, "i64")))
 
 
-def prepare(w: Writer, form: Form, method: Method) -> None:
+def prepare(w: MachineWriter, form: Form, method: Method) -> None:
     """What the record needs in the module."""
     if w.device:
         # 4096 of a thread of a GPU
@@ -108,7 +109,7 @@ def prepare(w: Writer, form: Form, method: Method) -> None:
         _write_more_room(w)
 
 
-def _write_more_room(w: Writer) -> None:
+def _write_more_room(w: MachineWriter) -> None:
     """`more_room(old, bytes)`: twice as many bytes, the first of them as before; null where there are none."""
     with w.function("more_room", "ptr", {"old": "ptr", "bytes": "i64"}, attributes="noinline") as (old, size):
         new = w.external("aligned_alloc", "ptr", w.literal(64, "i64"), size * 2)
@@ -119,7 +120,7 @@ def _write_more_room(w: Writer) -> None:
         w.give(new)
 
 
-def _on_cpu(w: Writer, slot: Slot, memory: int) -> _Places:
+def _on_cpu(w: MachineWriter, slot: Slot, memory: int) -> _Places:
     """As many slots as a third of the memory has for each thread: the record, of up to twice as many, is there beside half of itself while it grows."""
     size = slot.all * w.lanes * 8
     most = max(memory // (3 * size * w.threads), 1)
@@ -140,7 +141,7 @@ def _on_cpu(w: Writer, slot: Slot, memory: int) -> _Places:
     return _Places(slots, free, lambda number: None, kept, lambda: w.converted("ptrtoint", w.load(record, type="ptr"), "i64").equals(0))
 
 
-def _on_gpu(w: Writer, slot: Slot, job: Value) -> _Places:
+def _on_gpu(w: MachineWriter, slot: Slot, job: Value) -> _Places:
     """As many slots as a thread has memory for; the numbers of threads stand side by side."""
     here, (thread, threads) = w.room(slot.all), w.thread()
     record = w.at(w.load(job, NEXT, "ptr"), thread + FIRST_OF_SCRATCH)
@@ -150,23 +151,23 @@ def _on_gpu(w: Writer, slot: Slot, job: Value) -> _Places:
         return w.at(record, (w.binary("srem", number, slots) * slot.all + row) * threads)
 
     def keep(number: Value) -> None:
-        for_rows(w, range(slot.all), lambda row: w.store(w.load(here, row), place(number, row)))
+        w.each(range(slot.all), lambda row: w.store(w.load(here, row), place(number, row)))
 
     def kept(number: Value) -> Value:
-        for_rows(w, range(slot.all), lambda row: w.store(w.load(place(number, row)), here, row))
+        w.each(range(slot.all), lambda row: w.store(w.load(place(number, row)), here, row))
         return here
 
     return _Places(slots, lambda number: here, keep, kept, lambda: w.literal(0, "i1"))
 
 
-def _take(w: Writer, job: Value, who: Value) -> None:
+def _take(w: MachineWriter, job: Value, who: Value) -> None:
     """The next lanes of the batch; -1 where there is none."""
     with w.counted(0, w.lanes) as lane:
         number = next_lane(w, job, NEXT)
         w.store(w.where(number < w.load(job, COUNT, "i64"), number, -1), who, lane)
 
 
-def _write_start(w: Writer, form: Form, job: Value, rooms: "_Rooms") -> None:
+def _write_start(w: MachineWriter, form: Form, job: Value, rooms: "_Rooms") -> None:
     """All lanes at their starts."""
     with w.counted(0, form.all) as row:
         w.store(1.0, rooms.state, row)
@@ -177,7 +178,7 @@ def _write_start(w: Writer, form: Form, job: Value, rooms: "_Rooms") -> None:
     w.store(w.literal(0, "i64"), rooms.tries)
 
 
-def _write_try(w: Writer, form: Form, slot: Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
+def _write_try(w: MachineWriter, form: Form, slot: Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
     """A step that is tried, and its slot `here`."""
     lanes = Lanes(w, form, rooms.state)
     copied(w, form.integrated, rooms.state, here)
@@ -189,7 +190,7 @@ def _write_try(w: Writer, form: Form, slot: Slot, job: Value, rooms: "_Rooms", h
     w.store(w.load(rooms.tries, type="i64") + 1, rooms.tries)
 
 
-def _write_ends(w: Writer, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
+def _write_ends(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
     """Cotangents of the states at the end of a block."""
     g = rooms.g
     each_row(w, asked, rooms.by_known, lambda i: 0.0)
@@ -206,7 +207,7 @@ def _write_ends(w: Writer, form: Form, asked: int, job: Value, rooms: "_Rooms") 
         w.run("event_back", job, rooms.state, rooms.who, g, rooms.by_known)
 
 
-def _write_try_back(w: Writer, slot: Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
+def _write_try_back(w: MachineWriter, slot: Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
     """Back over the try in a slot."""
     before = w.load(here, slot.saved)
     w.run("added", job, rooms.who, before, w.load(rooms.saved), rooms.g)
@@ -216,7 +217,7 @@ def _write_try_back(w: Writer, slot: Slot, job: Value, rooms: "_Rooms", here: Va
     w.store(w.load(rooms.tries, type="i64") - 1, rooms.tries)
 
 
-def _write_found(w: Writer, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
+def _write_found(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_Rooms") -> None:
     """The results of a block."""
     g = rooms.g
     w.run("added", job, rooms.who, w.number(0.0), w.load(rooms.saved), g)
@@ -229,7 +230,7 @@ def _write_found(w: Writer, form: Form, asked: int, job: Value, rooms: "_Rooms")
             handed_out(w, asked, rooms.by_known, lane, w.at(place, form.integrated, "double"))
 
 
-def _give_nan(w: Writer, form: Form, asked: int, job: Value, who: Value) -> None:
+def _give_nan(w: MachineWriter, form: Form, asked: int, job: Value, who: Value) -> None:
     """Where no memory is left: NaN for this block and for all lanes that are left."""
     found, each = w.load(job, FOUND, "ptr"), form.integrated + asked
 

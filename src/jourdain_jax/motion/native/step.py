@@ -3,23 +3,20 @@
 """
 
 import math
-import operator
-from functools import partial, reduce
 from typing import NamedTuple
-
-import numpy as np
 
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.integrators.crossings import Crossings, Watched, noted, reach, unless_zero
 from jourdain_jax.motion.integrators.crossings import watched as watched_by
-from jourdain_jax.motion.integrators.erk_step import AMPLIFIED, LEAST_SHARE, NEAR_SINE, NOISE
-from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING, Search, advanced, any_of, chosen, decided, is_flat
+from jourdain_jax.motion.integrators.erk_step import AMPLIFIED, NOISE
+from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING, Search, advanced, chosen, decided, is_flat
 from jourdain_jax.motion.integrators.explicit_steps import Aim, Method, aimed, judged, taken
-from jourdain_jax.motion.native.layout import Form, Lanes, copied, each_row, for_rows, over_rows
+from jourdain_jax.motion.native.layout import Form, Lanes, copied, each_row
+from jourdain_jax.motion.native.stages import Rank, stages, turns_round, weighted
 from jourdain_jax.motion.native.taylor import TaylorSteps, at_time, jet, monitored_at, radius, slope
+from jourdain_jax.motion.native.writers import MachineWriter
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.math_functions import power
+from jourdain_jax.native.ir import Value
 
 
 def _crossings_of(p: Lanes) -> Crossings:
@@ -27,41 +24,47 @@ def _crossings_of(p: Lanes) -> Crossings:
     return Crossings(tuple(p.every("last")), p["crossing_by"], p["crossings"], p["together"])
 
 
-def _write_first_signs(w: Writer, form: Form, p: Lanes) -> None:
+def _write_first_signs(w: MachineWriter, form: Form, p: Lanes) -> None:
     """The signs at the start of a motion, in lanes that have tried no step."""
-    fresh = (p["accepted"] + p["rejected"]).equals(0.0)
-    with w.when(w.any(fresh)):
+    fresh = w.equal(p["accepted"] + p["rejected"], 0.0)
+
+    def begin() -> None:
         now = unless_zero(w, _relations(w, form, p, p["t"], p.pointer), [w.number(0.0)] * len(form.watched))
         p.put("last", [w.where(fresh, new, old) for new, old in zip(now, p.every("last"), strict=True)])
         p["crossing_by"] = w.where(fresh, p["direction"] * math.inf, p["crossing_by"])
 
+    w.if_any(fresh, begin)
 
-def _relations(w: Writer, form: Form, p: Lanes, t: Value, y: Value) -> list[Value]:
+
+def _relations(w: MachineWriter, form: Form, p: Lanes, t: Value, y: Value) -> list[Value]:
     values = w.room(len(form.watched))
     w.run("relations", p.pointer, t, y, values)
     return [w.load(values, i) for i in range(len(form.watched))]
 
 
-def _watched(w: Writer, form: Form, p: Lanes, t1: Value, step: Value, y1: Value, fits: Value) -> Watched:
+def _watched(w: MachineWriter, form: Form, p: Lanes, t1: Value, step: Value, y1: Value, fits: Value) -> Watched:
     """What a step to the state `y1` crosses; `fits`: it would be accepted."""
 
     def between(once: Value, share: Value, now: tuple[Value, ...]) -> list[Value]:
         found = w.room(len(now))
         for i, x in enumerate(now):
             w.store(x, found, i)
-        with w.when(w.any(once)):
+
+        def look() -> None:
             y, part = w.room(form.integrated), w.where(once, share, 0.0)
             for i in range(form.q_and_v):
                 start = w.load(p.pointer, i)
                 w.store(w.fma(part, w.load(y1, i) - start, start), y, i)
             for i, x in enumerate(unless_zero(w, _relations(w, form, p, w.fma(part, step, p["t"]), y), now)):
                 w.store(x, found, i)
+
+        w.if_any(once, look)
         return [w.load(found, i) for i in range(len(now))]
 
     return watched_by(w, _crossings_of(p), _relations(w, form, p, t1, y1), len(form.relations), between, fits, step, p["last_goal"])
 
 
-def _note_signs(w: Writer, p: Lanes, step: Watched, t1: Value, moving: Value, counts: Value) -> None:
+def _note_signs(w: MachineWriter, p: Lanes, step: Watched, t1: Value, moving: Value, counts: Value) -> None:
     """The signs after a step to `t1`, in lanes that are `moving`, and in which it `counts` or not."""
     old, new = _crossings_of(p), noted(w, _crossings_of(p), step, t1, p["direction"], counts)
     p.put("last", [w.where(moving, *pair) for pair in zip(new.last, old.last, strict=True)])
@@ -77,7 +80,7 @@ def _search_of(p: Lanes, count: int) -> Search:
     return Search(tuple(p.every("search_t")), c, step, left, shift, tuple(p.every("search_slope")))
 
 
-def _monitored(w: Writer, form: Form, p: Lanes, k: tuple[Value, Value], y1: Value, new: dict[str, Value], h: Value, accept: Value) -> dict[str, Value]:
+def _monitored(w: MachineWriter, form: Form, p: Lanes, k: tuple[Value, Value], y1: Value, new: dict[str, Value], h: Value, accept: Value) -> dict[str, Value]:
     """The step in which an event may have happened or is being located, or before which one has; changes the state `y1` after it.
 
     `k`: slopes at its ends; `accept`: it is a step of the motion.
@@ -95,7 +98,8 @@ def _monitored(w: Writer, form: Form, p: Lanes, k: tuple[Value, Value], y1: Valu
     def advance(begins: Value, changes: Value) -> tuple[Search, Value]:
         first = w.room()
         w.store(p["event"], first)
-        with w.when(w.any(changes)):
+
+        def follow() -> None:
             old = _search_of(p, count)
             found, event = advanced(w, old, begins, (t, c_0, rate_0), (new["t"], c_1))
             newton = w.where(event.usable & ~event.beyond, -chosen(w, event.first, c_1) / chosen(w, event.first, rate_0), 0.0)
@@ -104,10 +108,12 @@ def _monitored(w: Writer, form: Form, p: Lanes, k: tuple[Value, Value], y1: Valu
             for name, values in rows.items():
                 p.put(f"search_{name}", [w.where(changes, a, b) for a, b in zip(values, p.every(f"search_{name}"), strict=True)])
             w.store(w.literal(event.first, w.real), first)
+
+        w.if_any(changes, follow)
         return _search_of(p, count), w.load(first)
 
     # a motion that starts beyond an event has no motion at all
-    sound = over_rows(w, range(form.y), 0.0, lambda total, i: total + 0.0 * w.load(y, i)).equals(0.0)
+    sound = w.equal(w.sum_of_squares(range(form.y), lambda i: 0.0 * w.load(y, i)), 0.0)
     found = decided(w, p, new, h, (c_0, rate_0, c_1, rate_1), accept, sound, (_search_of(p, count), advance))
 
     def state(i: int | Value) -> Value:
@@ -120,12 +126,12 @@ def _monitored(w: Writer, form: Form, p: Lanes, k: tuple[Value, Value], y1: Valu
     return new | found.new | {"taken": w.where(found.stays, 0.0, new["taken"])}
 
 
-def slope_is_flat(w: Writer, p: Lanes, rate: Value) -> Value:
+def slope_is_flat(w: MachineWriter, p: Lanes, rate: Value) -> Value:
     """Whether the value of a lane's event has no slope where it falls through zero."""
     return is_flat(w, rate, chosen(w, p["event"], p.every("search_slope")))
 
 
-def _put_tangents(w: Writer, form: Form, p: Lanes, k: Value, found: Value, t: Value, rate: list[Value], y1: Value) -> None:
+def _put_tangents(w: MachineWriter, form: Form, p: Lanes, k: Value, found: Value, t: Value, rate: list[Value], y1: Value) -> None:
     """Where an event is found at the time t in the state `y1`, the tangents of that time, and those of the state there; `k`: the rates.
 
     Each tangent of time is found in turn, the state being moved by it, with e the directions taken together in it,
@@ -135,32 +141,36 @@ def _put_tangents(w: Writer, form: Form, p: Lanes, k: Value, found: Value, t: Va
     where values, tangents and rates are those before; dt is NaN where c has no slope there.
     """
     count, times = form.events, form.rows["dt"]
-    with w.when(w.any(found)):
+
+    def put() -> None:
+        k_now = k
         values, pivots = w.room(count * len(times)), w.room(max(len(form.monitored), 1))
         slope = chosen(w, p["event"], rate)
-        usable = found & slope.differs(0.0) & (w.magnitude(slope) < math.inf)
+        usable = found & w.differs(slope, 0.0) & (w.magnitude(slope) < math.inf)
         flat = found & slope_is_flat(w, p, slope)
         for part, row in enumerate(times, 1):
             if part > 1:  # what is known of the rates is of the state as it was
-                k = w.room(form.integrated)
-                w.run("rates", p.pointer, t, y1, k, pivots)
+                k_now = w.room(form.integrated)
+                w.run("rates", p.pointer, t, y1, k_now, pivots)
             w.run("event_tangents", p.pointer, t, y1, values)
             dc = chosen(w, p["event"], [w.load(values, (part - 1) * count + i) for i in range(count)])
             dt = w.where(flat, math.nan, w.where(usable, -dc / slope, 0.0))
             w.store(w.where(found, dt, w.load(p.pointer, row)), p.pointer, row)
             for other in range(len(times) + 1):
                 if not other & part:
-                    _move_rows(w, form, y1, k, (other | part) * form.y, other * form.y, dt, usable | flat)
+                    _move_rows(w, form, y1, k_now, (other | part) * form.y, other * form.y, dt, usable | flat)
+
+    w.if_any(found, put)
 
 
-def _move_rows(w: Writer, form: Form, y: Value, k: Value, rows: int, rates: int, dt: Value, moves: Value) -> None:
+def _move_rows(w: MachineWriter, form: Form, y: Value, k: Value, rows: int, rates: int, dt: Value, moves: Value) -> None:
     """Adds the rates that begin with row `rates` of `k`, times `dt`, to those that begin with row `rows` of `y`."""
 
     def moved(i: int | Value) -> Value:
         before = w.load(y, i + rows)
         return w.where(moves, w.fma(w.load(k, i + rates), dt, before), before)
 
-    for_rows(w, range(form.y), lambda i: w.store(moved(i), y, i + rows))
+    w.each(range(form.y), lambda i: w.store(moved(i), y, i + rows))
 
 
 IDLE = -9.0  # code of a place that has no lane
@@ -176,46 +186,49 @@ class Trial(NamedTuple):
     pivot: Value | None  # the smallest magnitude of a pivot that is monitored
 
 
-def write_step(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
+def write_step(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> None:
     """`step(state, k)`: one step, tried by all lanes that are on their way; `k`: room for the slopes of its stages, or for Taylor coefficients."""
     with w.procedure("step", "state:noalias k:noalias") as (state, k):
-        lanes = Lanes(w, form, state)
-        if form.relations:
-            _write_first_signs(w, form, lanes)
-        if isinstance(method, TaylorSteps):
-            _take(w, form, method, lanes, w.at(k, form.integrated), _tried_by_series(w, form, method, lanes, k))
-        else:
-            _take(w, form, method, lanes, k, _tried_by_stages(w, form, method, lanes, k))
+        step(w, form, method, state, k)
 
 
-def _tried_by_stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value) -> Trial:
+def step(w: MachineWriter, form: Form, method: Method | TaylorSteps, state, k) -> None:
+    """Try one step of all lanes that are on their way."""
+    lanes = Lanes(w, form, state)
+    if form.relations:
+        _write_first_signs(w, form, lanes)
+    if isinstance(method, TaylorSteps):
+        _take(w, form, method, lanes, w.at(k, form.integrated), _tried_by_series(w, form, method, lanes, k))
+    else:
+        _take(w, form, method, lanes, k, _tried_by_stages(w, form, method, lanes, k))
+
+
+def _tried_by_stages(w: MachineWriter, form: Form, method: Method, p: Lanes, k: Value) -> Trial:
     """A step of a Runge-Kutta method, which ends at the next time to save at, if not before."""
-    y = p.pointer  # the state comes first in the rows of a lane
     aim = aimed(w, p, p["goal"], _reach(w, form, p, p["h"]), p["search_shift"] if form.has_events else None)
     t1, step = aim.t_1, aim.h
-    smallest, changed_sign, rank = _stages(w, form, method, p, k, p["t"], step)
     y1, error = w.room(form.integrated), w.room(form.y)
-    each_row(w, form.integrated, y1, lambda i: w.fma(step, weighted(w, method.b, k, form, i), w.load(y, i)))
+    smallest, changed_sign, rank = stages(w, form, method, p, k, p["t"], step, y1)
     each_row(w, form.y, error, lambda i: step * weighted(w, method.b_error, k, form, i))
     if form.projects:
         _project(w, form, p, t1, y1, error, rank)
     size_of_error = _norm(w, form, p, error, y1)
-    if form.pivots or form.directions:
+    if form.pivots or form.turning:
         size_of_error = w.where(changed_sign & ~aim.locating, math.inf, size_of_error)
-    accept, next_h = judged(w, partial(power, w), p, aim, size_of_error, method.order)
+    accept, next_h = judged(w, w.power, p, aim, size_of_error, method.order)
     return Trial(aim, y1, accept, next_h, smallest if form.pivots else None)
 
 
-def _reach(w: Writer, form: Form, p: Lanes, h: Value) -> Value:
+def _reach(w: MachineWriter, form: Form, p: Lanes, h: Value) -> Value:
     """The step `h`, or as far as relations let one go."""
     return w.smaller(h, reach(w, _crossings_of(p), p["t"], p["direction"], p["last_goal"])) if form.relations else h
 
 
-def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Value) -> Trial:
+def _tried_by_series(w: MachineWriter, form: Form, method: TaylorSteps, p: Lanes, k: Value) -> Trial:
     """A step by Taylor series, which goes over the times to save at; puts the coefficients into `k`, and after them the slope at the end of the step."""
     count = form.integrated
     t, last_goal, direction = p["t"], p["last_goal"], p["direction"]
-    locating = p["code"].equals(LOCATING)
+    locating = w.equal(p["code"], LOCATING)
     rows, at_start = jet(w, form, p, t, method.order)
     for row, series in enumerate(rows):
         for j, x in enumerate(series):
@@ -241,7 +254,7 @@ def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Va
         least = w.smaller(w.magnitude(a), w.magnitude(b))
         pivot = least if pivot is None else w.smaller(pivot, least)
         accept = accept & ~(((a < 0.0) & (b > 0.0)) | ((a > 0.0) & (b < 0.0)))
-    accept = accept & ~_turns_round(w, form, at_start.values, at_end.values)
+    accept = accept & ~turns_round(w, form, *(x.values[form.pivots : form.pivots + form.turning] for x in (at_start, at_end)))
     if form.projects:
         error = w.room(form.y)
         each_row(w, form.y, error, lambda i: 0.0)
@@ -253,7 +266,7 @@ def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Va
     return Trial(Aim(t1, step, size, locating), y1, accept, w.where(accept, length, w.smaller(length, 0.5 * size)), pivot)
 
 
-def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Value, trial: Trial) -> None:
+def _take(w: MachineWriter, form: Form, method: Method | TaylorSteps, p: Lanes, k: Value, trial: Trial) -> None:
     """What becomes of the lanes after a step that was tried; `k`: slopes, the one at the start first."""
     y, count = p.pointer, form.integrated
     aim, y1, accept, next_h, smallest = trial
@@ -266,13 +279,13 @@ def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Valu
     each_row(w, count, y1, lambda i: w.where(accept, w.load(y1, i), w.load(y, i)))
     if form.has_events:
         ends = k, w.at(k, method.at_the_end * form.integrated)
-        new = _monitored(w, form, p, ends, y1, new, aim.h, accept & ~locating & new["code"].equals(RUNNING))
-    counts = accept & ~locating & new["code"].equals(RUNNING) & new["t"].equals(t1)
-    stays = counts | (locating & new["code"].equals(results.EVENT))
+        new = _monitored(w, form, p, ends, y1, new, aim.h, accept & ~locating & w.equal(new["code"], RUNNING))
+    counts = accept & ~locating & w.equal(new["code"], RUNNING) & w.equal(new["t"], t1)
+    stays = counts | (locating & w.equal(new["code"], results.EVENT))
     if smallest is not None:
         pivot = w.where(counts, w.smaller(p["pivot"], smallest), p["pivot"])
         new |= {"pivot": pivot, "code": w.where(counts & (pivot < SMALLEST_PIVOT), results.SINGULAR_PARTITION, new["code"])}
-    moving = locating | p["code"].equals(RUNNING)
+    moving = locating | w.equal(p["code"], RUNNING)
     if watched is not None:
         _note_signs(w, p, watched, t1, moving, stays)
     copied(w, count, y1, y, moving)
@@ -280,101 +293,24 @@ def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Valu
         p[name] = w.where(moving, value, w.number(0.0) if name == "taken" else p[name])
 
 
-class Rank(NamedTuple):
-    """How near to a loss of rank the rows are in a step."""
-
-    near: Value  # at its start
-    square: Value  # the smallest squared sine between a row and those before it, of all stages
-
-
-def _stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value, t: Value, step: Value) -> tuple[Value, Value, Rank | None]:
-    """The smallest magnitude of a pivot, whether any changed its sign, and how near rows are to losing rank; puts the slopes of all stages into `k`."""
-    count = form.pivots
-    every, turned = form.integrated, w.literal(0, w.truth)
-    first: list[Value] = []
-    at, pivots = w.room(every), w.room(max(len(form.monitored), 1))
-    rank, square = None, w.room()
-    low, high = [w.number(math.inf)] * count, [w.number(-math.inf)] * count
-
-    def next_state(i: int, row: int | Value) -> Value:
-        start = w.load(p.pointer, row)
-        return w.fma(step, weighted(w, method.A[i], k, form, row), start) if i else start
-
-    for i in range(method.needed):
-        time = w.fma(step, float(method.c[i]), t)
-        each_row(w, every, at, partial(next_state, i))
-        if rank is not None:
-            put_near_rows(w, form, p.pointer, rank.near, time, at)
-        w.run("rates", p.pointer, time, at, w.at(k, i * every), pivots)
-        now = [w.load(pivots, j) for j in range(len(form.monitored) - len(form.squares))]
-        if form.squares:
-            by_rows = squares_of(w, form, pivots)
-            if rank is None:
-                rank = Rank(near_rank_loss(by_rows), square)
-                w.store(math.inf, square)
-            with w.when(w.any(rank.near)):
-                w.store(reduce(w.smaller, [left / size for left, size in by_rows], w.load(square)), square)
-        first = first or now
-        turned = turned | _turns_round(w, form, first, now)
-        low, high = [w.smaller(a, b) for a, b in zip(low, now, strict=False)], [w.larger(a, b) for a, b in zip(high, now, strict=False)]
-    smallest, changed = w.number(math.inf), turned
-    for a, b in zip(low, high, strict=True):
-        smallest = w.smaller(smallest, w.smaller(w.magnitude(a), w.magnitude(b)))
-        changed = changed | ((a < 0.0) & (b > 0.0))
-    return smallest, changed, rank if rank is None else rank._replace(square=w.load(square))
-
-
-def squares_of(w: Writer, form: Form, monitored: Value) -> list[tuple[Value, Value]]:
-    """What is left of each row beside those before it, and its size, squared."""
-    found = [w.load(monitored, j) for j in range(len(form.monitored) - len(form.squares), len(form.monitored))]
-    return list(zip(found[::2], found[1::2], strict=True))
-
-
-def near_rank_loss(squares: list[tuple[Value, Value]]) -> Value:
-    """Whether some row is nearly one of those before it."""
-    return any_of([left < NEAR_SINE**2 * size for left, size in squares])
-
-
-def put_near_rows(w: Writer, form: Form, state: Value, near: Value, t: Value, y: Value) -> None:
-    """Puts the state `y` of a stage back onto the rows in lanes that are `near` a loss of rank."""
-    with w.when(w.any(near)):
-        put = w.room(form.integrated)
-        copied(w, form.integrated, y, put)
-        w.run("project", state, t, put)
-        copied(w, form.integrated, put, y, near)
-
-
-def _turns_round(w: Writer, form: Form, first: list[Value], now: list[Value]) -> Value:
-    """Return whether the part of a row's slope along its first one has fallen below its least share."""
-    along = lambda row, slope: reduce(operator.add, (first[k] * slope[k] for k in row))  # noqa: E731
-    lasting = [along(row, now) > LEAST_SHARE * along(row, first) for row in form.directions]
-    return ~reduce(operator.and_, lasting) if lasting else w.literal(0, w.truth)
-
-
-def weighted(w: Writer, weights: np.ndarray, k: Value, form: Form, row: int | Value) -> Value:
-    """sum_j w_j k_j of one number of the state."""
-    used = [j for j in range(len(weights)) if weights[j] != 0]
-    total = w.load(k, used[0] * form.integrated + row) * float(weights[used[0]])
-    for j in used[1:]:
-        total = w.fma(w.load(k, j * form.integrated + row), float(weights[j]), total)
-    return total
-
-
-def _project(w: Writer, form: Form, p: Lanes, t1: Value, y1: Value, error: Value, rank: Rank | None = None) -> None:
+def _project(w: MachineWriter, form: Form, p: Lanes, t1: Value, y1: Value, error: Value, rank: Rank | None = None) -> None:
     """Puts `y1` back onto the rows; the error is no smaller than how far that moved it, beyond noise."""
     free = w.room(form.y)
     copied(w, form.y, y1, free)
     w.run("project", p.pointer, t1, y1)
     amplified = None if rank is None else w.where(rank.near, w.smaller(AMPLIFIED * w.eps / rank.square, w.eps ** (1 - NOISE)), 0.0)
     if rank is not None:
-        with w.when(w.any(rank.near)):
+
+        def along_rows() -> None:
             both = w.room(2 * form.y)
             copied(w, form.y, y1, both)
             copied(w, form.y, error, w.at(both, form.y))
             w.run("along", p.pointer, t1, both)
             each_row(w, form.y, error, lambda i: w.where(rank.near, w.load(both, i + form.y), w.load(error, i)))
+
+        w.if_any(rank.near, along_rows)
     for part in form.parts:
-        largest = over_rows(w, part, 0.0, lambda largest, i: w.larger(largest, w.magnitude(w.load(y1, i))))
+        largest = w.largest(part, lambda i: w.magnitude(w.load(y1, i)))
         noise = (w.eps**NOISE if amplified is None else w.larger(amplified, w.eps**NOISE)) * largest
         by_rows = None if amplified is None else amplified * amplified * largest
 
@@ -386,14 +322,13 @@ def _project(w: Writer, form: Form, p: Lanes, t1: Value, y1: Value, error: Value
         each_row(w, part, error, larger_error)
 
 
-def _norm(w: Writer, form: Form, p: Lanes, error: Value, y1: Value) -> Value:
+def _norm(w: MachineWriter, form: Form, p: Lanes, error: Value, y1: Value) -> Value:
     """Root mean square of the errors of coordinates and speeds, relative to what is allowed; infinite where one is no number."""
     rtol, atol, count = p["rtol"], p["atol"], form.q_and_v
 
-    def added(total: Value, i: int | Value) -> Value:
+    def relative(i: int | Value) -> Value:
         size = w.larger(w.magnitude(w.load(p.pointer, i)), w.magnitude(w.load(y1, i)))
-        relative = w.load(error, i) / w.fma(rtol, size, atol)
-        return w.fma(relative, relative, total)
+        return w.load(error, i) / w.fma(rtol, size, atol)
 
-    total = over_rows(w, range(count), 0.0, added) / float(count)
+    total = w.sum_of_squares(range(count), relative) / float(count)
     return w.root(w.where(w.is_nan(total), math.inf, total))

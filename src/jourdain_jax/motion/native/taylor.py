@@ -25,7 +25,8 @@ from typing import NamedTuple
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.motion.native.functions import known_values, outputs_of
 from jourdain_jax.motion.native.layout import Form, Lanes
-from jourdain_jax.native.ir import Value, Writer
+from jourdain_jax.motion.native.writers import MachineWriter
+from jourdain_jax.native.ir import Value
 from jourdain_jax.native.math_functions import exponential, logarithm
 from jourdain_jax.native.scalar_program import as_real, unsupported, written
 from jourdain_jax.program.derivative import on_its_own
@@ -239,7 +240,7 @@ class Monitored(NamedTuple):
     values: list[Value]  # as `Form.monitored`
 
 
-def jet(w: Writer, form: Form, p: Lanes, t: Value, order: int) -> tuple[list[Coefficients], Monitored]:
+def jet(w: MachineWriter, form: Form, p: Lanes, t: Value, order: int) -> tuple[list[Coefficients], Monitored]:
     """The Taylor series of every number that is integrated, tangents too, at the time t, and what is monitored there."""
     y, rates = p.pointer, form.rates
     own = outputs_of(form, [*rates, *_monitored(form)], len(rates))
@@ -269,13 +270,13 @@ def _monitored(form: Form) -> list[int]:
     return [*form.program.guards, *form.monitored]
 
 
-def monitored_at(w: Writer, form: Form, p: Lanes, t: Value, y: Value) -> Monitored:
+def monitored_at(w: MachineWriter, form: Form, p: Lanes, t: Value, y: Value) -> Monitored:
     """What is monitored, at a state in memory."""
     known = known_values(w, form, p.pointer, t, y)
     return _judged(w, form, written(w, form.program.graph, _monitored(form), known))
 
 
-def _judged(w: Writer, form: Form, values: Sequence[Value]) -> Monitored:
+def _judged(w: MachineWriter, form: Form, values: Sequence[Value]) -> Monitored:
     found = [as_real(w, x) for x in values]
     count, holds = len(form.program.guards), w.literal(-1, w.truth)
     for guard in found[:count]:
@@ -283,7 +284,7 @@ def _judged(w: Writer, form: Form, values: Sequence[Value]) -> Monitored:
     return Monitored(holds, found[count:])
 
 
-def radius(w: Writer, form: Form, p: Lanes, rows: Sequence[Coefficients]) -> Value:
+def radius(w: MachineWriter, form: Form, p: Lanes, rows: Sequence[Coefficients]) -> Value:
     """How long a step may be; zero where a coefficient is no number."""
     rtol, atol, count = p["rtol"], p["atol"], form.q_and_v
     inverse = [1.0 / w.fma(rtol, w.magnitude(w.load(p.pointer, i)), atol) for i in range(count)]
@@ -298,7 +299,7 @@ def radius(w: Writer, form: Form, p: Lanes, rows: Sequence[Coefficients]) -> Val
     return 0.9 * w.where(w.is_nan(reach), 0.0, reach)
 
 
-def at_time(w: Writer, series: Coefficients, s: Value) -> Value:
+def at_time(w: MachineWriter, series: Coefficients, s: Value) -> Value:
     """sum_k x_k s^k"""
     total = series[-1]
     for x in reversed(series[:-1]):

@@ -29,9 +29,9 @@ from jourdain_jax.calculus.derivatives import OtherDeviceError, Rules, different
 from jourdain_jax.calculus.markers import entries_of, with_lanes_first
 from jourdain_jax.calculus.reals import Flag, real_type
 from jourdain_jax.lowering.lowered import Lowered, smallest_pivot
+from jourdain_jax.motion.native.writers import MachineWriter
 from jourdain_jax.native import ffi, gpu, host, nvidia
 from jourdain_jax.native.ffi import write_rows
-from jourdain_jax.native.ir import Writer
 from jourdain_jax.native.scalar_program import as_real, unsupported, written_in_turn
 from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
 from jourdain_jax.program.emit import run
@@ -39,7 +39,7 @@ from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.scene.scene import Scene
 
 
-def called(write: Callable[[Writer], None], shapes: Callable, of_samples: int = 0, effort: int = 2) -> Callable:
+def called(write: Callable[[MachineWriter], None], shapes: Callable, of_samples: int = 0, effort: int = 2) -> Callable:
     """A module of LLVM IR as a function of arrays without lanes; `shapes`: of its results, given the arguments.
 
     The first arguments are samples, which lanes may share; `effort`: as of `host.object_code`.
@@ -47,13 +47,13 @@ def called(write: Callable[[Writer], None], shapes: Callable, of_samples: int = 
 
     @cache
     def handler(lanes: int, threads: int) -> str:
-        w = Writer(lanes, host.fuses(), threads)
+        w = MachineWriter(lanes, host.fuses(), threads)
         write(w)
         return ffi.registered(w.text, effort)
 
     @cache
     def kernel() -> gpu.Kernel:
-        w = Writer(1, True, device=True)
+        w = MachineWriter(1, True, device=True)
         write(w)
         return gpu.registered(w.text, w.scratch)
 
@@ -121,7 +121,7 @@ batching.primitive_batchers[_call_p] = lambda values, axes, **how: (found := _ca
 def nodes_called(graph: Graph, nodes: Sequence[int], variables: Sequence[int], effort: int = 1) -> Callable[[Array], Array]:
     """Values of nodes of a graph as a function of the values of the variables."""
 
-    def write(w: Writer) -> None:
+    def write(w: MachineWriter) -> None:
         with w.procedure("row", "state found") as (state, found):
             known = {n: w.load(state, k) for k, n in enumerate(variables)}
             for k, value in written_in_turn(w, graph, nodes, known):
