@@ -13,7 +13,7 @@ PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 # A change that takes code away lowers these; one that adds some says in its commit what it replaces.
 CEILINGS = {
-    "code tokens of src": 437_724,
+    "code tokens of src": 436_044,
     "code tokens of docs": 11_441,
     "code tokens of notebooks": 7_444,
     "caches": 49,
@@ -24,7 +24,7 @@ CEILINGS = {
     "ways: state put back onto its constraints within a step": 1,
     "ways: rows and their slopes for a projection": 2,
     "ways: damped least squares": 2,
-    "code tokens of tests": 307_438,
+    "code tokens of tests": 307_216,
     "code tokens of bench": 99_978,
     "test files that reach private names": 36,
 }

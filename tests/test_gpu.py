@@ -10,7 +10,7 @@ import pytest
 from ends_of_models import end_of_model
 
 import jourdain_jax as jj
-from jourdain_jax.motion.native.writers import MachineWriter
+from jourdain_jax.motion.native.layout import MachineWriter
 from jourdain_jax.native import ffi, gpu, host, nvidia
 from jourdain_jax.native.ffi import write_rows
 from jourdain_jax.scene.parameters import parameters_of

@@ -14,8 +14,8 @@ from small_scenes import OnLine
 
 import jourdain_jax as jj
 from jourdain_jax.calculus.scalar_operations import TABLE
+from jourdain_jax.motion.native.layout import MachineWriter
 from jourdain_jax.motion.native.taylor import Series
-from jourdain_jax.motion.native.writers import MachineWriter
 from jourdain_jax.native import ffi, host
 from jourdain_jax.native.scalar_program import written
 from jourdain_jax.program.graph import Graph

@@ -28,14 +28,12 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.derivatives import filled
 from jourdain_jax.motion.integrators.event_search import RUNNING, chosen
 from jourdain_jax.motion.integrators.explicit_steps import Method
-from jourdain_jax.motion.native.functions import write_pulled
-from jourdain_jax.motion.native.layout import Form, Lanes, arguments_of_samples, copied, each_row, pass_knot, set_goal
+from jourdain_jax.motion.native.functions import slope_is_flat, write_pulled
+from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter, arguments_of_samples, copied, each_row, pass_knot, set_goal
 from jourdain_jax.motion.native.loop import MOST_KERNELS, TIMES, Start, begin_lane, with_tangents, write_functions, write_job
 from jourdain_jax.motion.native.record import GOALS, TO_ENDS, TO_STATES, Slot, prepare, write_record
-from jourdain_jax.motion.native.stages import near_rank_loss, put_near_rows, squares_of, weighted
-from jourdain_jax.motion.native.step import slope_is_flat
+from jourdain_jax.motion.native.step import near_rank_loss, put_near_rows, squares_of, weighted
 from jourdain_jax.motion.native.values import called
-from jourdain_jax.motion.native.writers import MachineWriter
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native.ffi import taken_in, write_handler
 from jourdain_jax.native.ir import Value

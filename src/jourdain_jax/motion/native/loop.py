@@ -27,6 +27,7 @@ from jourdain_jax.motion.native.layout import (
     WORDS_OF_SAMPLES,
     Form,
     Lanes,
+    MachineWriter,
     arguments_of_samples,
     begin_samples,
     pass_knot,
@@ -37,7 +38,6 @@ from jourdain_jax.motion.native.layout import (
 from jourdain_jax.motion.native.step import IDLE, write_step
 from jourdain_jax.motion.native.taylor import TaylorSteps, products
 from jourdain_jax.motion.native.values import called
-from jourdain_jax.motion.native.writers import MachineWriter
 from jourdain_jax.native.ffi import Given, handed_out, last_size, next_lane, product, share, start_counting, taken_in, write_handler
 from jourdain_jax.native.ir import Value
 

@@ -21,7 +21,7 @@ from typing import Literal
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.roots import QUIET, ROUND_OFF
 from jourdain_jax.equations.projection import MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS
-from jourdain_jax.motion.native.writers import MachineWriter
+from jourdain_jax.motion.native.layout import MachineWriter
 from jourdain_jax.native.ffi import write_rows
 from jourdain_jax.native.ir import Value
 from jourdain_jax.native.scalar_program import as_real, unsupported, written_in_turn

@@ -10,9 +10,8 @@ from typing import NamedTuple
 
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
 from jourdain_jax.motion.integrators.explicit_steps import Method
-from jourdain_jax.motion.native.layout import Form, Lanes, copied, each_row
+from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter, copied, each_row
 from jourdain_jax.motion.native.loop import COUNT, NEXT, OWN, STARTS, TIMES
-from jourdain_jax.motion.native.writers import MachineWriter
 from jourdain_jax.native.ffi import FIRST_OF_SCRATCH, handed_out, lanes_taken, next_lane, taken_in
 from jourdain_jax.native.ir import Value
 

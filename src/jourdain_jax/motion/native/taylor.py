@@ -24,8 +24,7 @@ from typing import NamedTuple
 
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.motion.native.functions import known_values, outputs_of
-from jourdain_jax.motion.native.layout import Form, Lanes
-from jourdain_jax.motion.native.writers import MachineWriter
+from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter
 from jourdain_jax.native.ir import Value
 from jourdain_jax.native.math_functions import exponential, logarithm
 from jourdain_jax.native.scalar_program import as_real, unsupported, written

@@ -29,7 +29,7 @@ from jourdain_jax.calculus.derivatives import OtherDeviceError, Rules, different
 from jourdain_jax.calculus.markers import entries_of, with_lanes_first
 from jourdain_jax.calculus.reals import Flag, real_type
 from jourdain_jax.lowering.lowered import Lowered, smallest_pivot
-from jourdain_jax.motion.native.writers import MachineWriter
+from jourdain_jax.motion.native.layout import MachineWriter
 from jourdain_jax.native import ffi, gpu, host, nvidia
 from jourdain_jax.native.ffi import write_rows
 from jourdain_jax.native.scalar_program import as_real, unsupported, written_in_turn
