@@ -1,6 +1,6 @@
 """A motion at one instant with its slopes: what small motions, steady ones and families of these are made of.
 
-    v = (dq/dt, du/dt, g, phi),    D = dv/d(t, q, u, f, p)        g: geometric rows and unit norms;  p: a parameter that varies, where one does
+    v = (dq/dt, du/dt, g, phi),    D = dv/d(t, q, u, f, p)        g: geometric rows and unit norms;  p: parameters that vary, where some do
 
 The scalar program of a class of scenes gives du/dt of its independent speeds and of those that are asked for; others are zero. It follows from t, q and the
 independent speeds alone: a dependent speed counts in phi only. Scenes without such a program have their dense matrices.
@@ -103,7 +103,7 @@ class Sloped:
 class ByProgram:
     """v, D and, unless it is too large, the mass matrix of a class of scenes as one scalar program of all numbers in a row: parameters, t, q, u, inputs."""
 
-    def __init__(self, scene: Scene, program: Lowered, asked: tuple[int, ...], varied: int | None) -> None:
+    def __init__(self, scene: Scene, program: Lowered, asked: tuple[int, ...], varied: tuple[int, ...] = ()) -> None:
         rows = row_program(scene)
         if rows is None:
             raise NotLowered(f"the rows of `{type(scene).__name__}` have no scalar program")
@@ -122,7 +122,7 @@ class ByProgram:
             udot |= dict(zip(asked, derivatives(graph, [dependent[k] for k in asked], motion), strict=True))
         self.graph, self.given, self.program, self.states = graph, given, program, (first + 1, n, m)
         self.v = [*qdot, *(udot.get(k, graph.zero) for k in range(m)), *g, *phi]
-        self.columns = [*given[first:], *([] if varied is None else [given[varied]])]
+        self.columns = [*given[first:], *(given[k] for k in varied)]
         matrix = (m, m), {key: node for (i, k), node in zip(M, of_masses, strict=True) for key in ((i, k), (k, i))}
         self.of = Sloped(graph, self.v, self.columns, given, self.guards, matrix)
 
@@ -171,7 +171,7 @@ def instant_of(scene: Scene | BuiltFor, constant: tuple[int, ...], masses: bool 
         return ByMatrices(constant)
     try:
         program = lower(scene)
-        found = by_program(as_scene(scene), program, tuple(k for k in constant if k not in program.independent), None)
+        found = by_program(as_scene(scene), program, tuple(k for k in constant if k not in program.independent))
     except NotLowered:
         return ByMatrices(constant)
     return found if found.of.is_made and (found.has_masses or not masses) else ByMatrices(constant)

@@ -71,7 +71,7 @@ class Sensitivities(Printed, eqx.Module):
 def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held: str | tuple[str, ...]) -> Sensitivities:
     """Derivatives of the eigenvalue s of small motions about a steady state, all by two reverse passes."""
     scene, state, f = small
-    equations = SteadyEquations(scene, (float(state.t), np.asarray(state.q), np.asarray(state.u)), np.asarray(f), None)
+    equations = SteadyEquations(scene, (float(state.t), np.asarray(state.q), np.asarray(state.u)), np.asarray(f))
     z = equations.start
     look = equations(z)
     if not largest(look.R) < 1e-6:
@@ -122,16 +122,15 @@ class CriticalPoint(Printed, eqx.Module):
     """A special point of a family; `point["lean"]`, `point.speed`. All is NaN unless `code` is 0."""
 
     state: State
-    parameter: Float[Array, "*batch"]  # the one that varies along the family; NaN where none does
+    parameters: dict[str, Float[Array, "*batch"]]  # those that vary along the family
     eigenvalue: Complex[Array, "*batch"]  # 1/s, that passes the axis or is double
     condition: Float[Array, "*batch"]  # least pivot of the equations over the largest; near zero, special points are close together
     code: Int[Array, "*batch"]
     kind: str = eqx.field(static=True)
-    vary: str | None = eqx.field(static=True)
 
     def __getitem__(self, name: str) -> Float[Array, "*batch"]:
         """A coordinate, a speed, or the parameter that varies."""
-        return self.parameter if name == self.vary else self.state[name]
+        return self.parameters[name] if name in self.parameters else self.state[name]
 
     @property
     def speed(self) -> Float[Array, "*batch"]:
@@ -146,7 +145,7 @@ class CriticalPoint(Printed, eqx.Module):
     def _text(self) -> str:
         if self.code.ndim:
             return f"{self.kind}: {int((self.code == FOUND).sum())} of {self.code.size} found"
-        varied = f", {self.vary} = {self.parameter:.6g}" if self.vary else ""
+        varied = "".join(f", {name} = {value:.6g}" for name, value in self.parameters.items())
         return f"{self.kind}{varied}: {self.message}; eigenvalue {complex_numbers(self.eigenvalue[None])[0]} 1/s\n{self.state}"
 
 
@@ -189,7 +188,6 @@ class _Special(eqx.Module):
 
     equations: SteadyEquations = eqx.field(static=True)
     program: _Program = eqx.field(static=True)
-    held: tuple[int, ...] = eqx.field(static=True)
     kind: str = eqx.field(static=True)
     goes_on: bool = eqx.field(static=True)  # whether steady motions do at the same parameters
     X: Unknowns
@@ -219,9 +217,8 @@ class _Special(eqx.Module):
         rows = {PAIR: [(a0, b0, 1.0), (-b0, a0, 0.0)], DOUBLE: [(a0, no[0], 1.0), (no[0], a0, 0.0)], ZERO: [(a0, no[0], 1.0)]}[self.kind]
         if self.kind == ZERO:
             rows += [(b0, no[0], 0.0), (no[0], a0, 0.0), (no[0], b0, b0 @ b0)] if self.goes_on else list(zip(no, one, jnp.zeros(m), strict=True))
-        held = np.array(self.held, int)
-        L = [jnp.eye(n, len(X))[held], *(jnp.concatenate([jnp.zeros(n), of_a, of_b, jnp.zeros(1)])[None] for of_a, of_b, _ in rows)]
-        c = [self.X[held], *(jnp.asarray(c)[None] for *_, c in rows)]
+        L = [jnp.eye(n, len(X))[self.equations.held], *(jnp.concatenate([jnp.zeros(n), of_a, of_b, jnp.zeros(1)])[None] for of_a, of_b, _ in rows)]
+        c = [self.X[self.equations.held], *(jnp.asarray(c)[None] for *_, c in rows)]
         if self.kind == ZERO:
             L, c = [*L, jnp.eye(len(X))[-1:]], [*c, jnp.zeros(1)]
         L, c = jnp.concatenate(L), jnp.concatenate(c)
@@ -303,7 +300,7 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
     numbers, w, condition, code = _solution(special, scene)
     q, u, varied = equations.split(numbers)
     eigenvalue = jax.lax.complex(*((0 * w, w) if point.kind == PAIR else (w, 0 * w)))
-    return CriticalPoint(state_of(scene, equations.t, q, u), varied, eigenvalue, condition, code, point.kind, equations.vary)
+    return CriticalPoint(state_of(scene, equations.t, q, u), varied, eigenvalue, condition, code, point.kind)
 
 
 def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:
@@ -319,12 +316,12 @@ def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:
 
 def _special(curve: Family, point: FamilyPoint) -> _Special:
     """The equations, with vectors a and b at the point of the family."""
-    equations, held = curve.equations, curve.by.held
+    equations = curve.equations
     z, s = equations.place(point), point.eigenvalues
     look = equations(z)
     E = null_space(look.C)
     A, w, b = E.T @ look.F @ E, 0.0, np.zeros(len(E))
-    freedoms = curve.by.freedoms(look)
+    freedoms = equations.freedoms(look)
     if point.kind == ZERO:
         if freedoms.shape[1] > 1:
             raise ValueError(f"steady motions go on in {freedoms.shape[1]} ways at the same parameters: there a zero eigenvalue is no special point")
@@ -341,4 +338,4 @@ def _special(curve: Family, point: FamilyPoint) -> _Special:
         a = np.linalg.svd(moved)[2][-1]
         a, b = E @ a, E @ np.linalg.lstsq(np.vstack([moved, a]), np.append(a, 0.0), rcond=None)[0]
     X = jnp.asarray(np.concatenate([z, a, b, [w]]))
-    return _Special(equations, _program(equations), tuple(equations.index(name) for name in held), point.kind, freedoms.shape[1] > 0, X)
+    return _Special(equations, _program(equations), point.kind, freedoms.shape[1] > 0, X)

@@ -10,13 +10,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from jourdain_jax.analysis.families.equations import Look, Vector
+from jourdain_jax.analysis.families.equations import Look, SteadyEquations, Vector
 from jourdain_jax.analysis.families.spectrum import Modes, matched, surely_matched
 from jourdain_jax.calculus.reals import largest
 
+Targets = list[tuple[int, float]]  # numbers of unknowns, and values at which a curve ends
+CLOSED = "the curve is closed"
 LONGEST, SHORTEST = 0.1, 1e-8  # steps, in sizes of the unknowns; the longest also relative to where the curve is, if that is far
-
-Equations = Callable[[Vector], Look]
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Point:
     modes: Modes = field(default_factory=lambda: np.zeros(0, complex))  # eigenvalues of small motions, in the columns of the points before
 
 
-def solved(equations: Equations, z: Vector, rows: Vector, target: float) -> tuple[Vector, Look, int] | None:
+def solved(equations: SteadyEquations, z: Vector, rows: Vector, target: float) -> tuple[Vector, Look, int] | None:
     """z with R = 0 and `rows . z = target`, the equations there and the number of corrections; None where Newton's method does not converge."""
     for k in range(8):
         look = equations(z)
@@ -50,7 +50,7 @@ def tangent_at(look: Look, before: Vector) -> Vector:
     return V[-1] * (1.0 if V[-1] @ before >= 0 else -1.0)
 
 
-def along(equations: Equations, point: Point, s: float, guess: Vector | None = None) -> Point | None:
+def along(equations: SteadyEquations, point: Point, s: float, guess: Vector | None = None) -> Point | None:
     """The point of the curve at a distance along the tangent of another one; None where none is found."""
     t = point.tangent
     found = solved(equations, point.z + s * t if guess is None else guess, t, t @ point.z + s)
@@ -60,24 +60,30 @@ def along(equations: Equations, point: Point, s: float, guess: Vector | None = N
     return Point(z, tangent_at(look, t), look, hardness)
 
 
-def traced(equations: Equations, spectrum: Callable[[Point], Modes], start: Point, ended: Callable[[Point, Point], str], most: int) -> tuple[list[Point], str]:
-    """Points of a curve from its start on, and why it ends.
+def traced(equations: SteadyEquations, start: Point, targets: Targets, most: int) -> tuple[list[Point], str]:
+    """Points of a curve from its start on, and why it ends: at a target, at its own start, or where no further point is found.
 
-    `spectrum`: eigenvalues at a point, in any order; `ended`: of the last two points, a reason or nothing. A step is halved where it turns sharply, takes
-    many corrections, or moves eigenvalues so far that it is open which is which.
+    A step is halved where it turns sharply, takes many corrections, or moves eigenvalues so far that it is open which is which.
     """
     points, step, easy = [start], LONGEST / 10, 3
     while len(points) < most:
         here = points[-1]
-        there = _next(equations, spectrum, here, step, easy + 1)
+        there = _next(equations, here, step, easy + 1)
         if there is None:
             step /= 2
             if step < SHORTEST:
                 return points, "no further point is found: the equations are undefined, or lose rank, beyond it"
             continue
         points.append(there)
-        if reason := ended(here, there):
-            return points, reason
+        for k, target in targets:
+            past = lambda point, k=k, target=target: point.z[k] - target  # noqa: E731
+            if past(here) * past(there) <= 0:
+                if past(here) * past(there) < 0 and (end := located(equations, here, there, past)):
+                    points[-1] = replace(end, modes=matched(there.modes, equations.eigenvalues(end.look, end.tangent)))
+                return points, f"{equations.unknowns[k]} is {target * equations.size[k]:g}"
+        if _closed(equations, start, here, there):
+            points.append(replace(start, modes=matched(there.modes, start.modes)))
+            return points, CLOSED
         reach = float(largest(there.z))
         if reach > 1e3:
             return points, "it goes on without bound"
@@ -86,14 +92,23 @@ def traced(equations: Equations, spectrum: Callable[[Point], Modes], start: Poin
     return points, f"{most} points"
 
 
-def _next(equations: Equations, spectrum: Callable[[Point], Modes], here: Point, step: float, hardest: int) -> Point | None:
+def _next(equations: SteadyEquations, here: Point, step: float, hardest: int) -> Point | None:
     """The point at the end of a step; None where the step must be halved."""
     there = along(equations, here, step)
     if there is None or there.hardness > hardest or here.tangent @ there.tangent < np.cos(np.deg2rad(10.0)):
         return None
-    there = replace(there, modes=matched(here.modes, spectrum(there)))
+    there = replace(there, modes=matched(here.modes, equations.eigenvalues(there.look, there.tangent)))
     sure = step < LONGEST / 1000 or surely_matched(here.modes, there.modes)  # those that meet are taken as they come
     return there if sure else None
+
+
+def _closed(equations: SteadyEquations, first: Point, here: Point, there: Point) -> bool:
+    """Whether a step comes past the start of the curve."""
+    s, step = here.tangent @ (first.z - here.z), np.linalg.norm(there.z - here.z)
+    if not (0 < s <= step and np.linalg.norm(first.z - here.z - s * here.tangent) < 0.1 * step):
+        return False
+    back = along(equations, here, s, first.z)
+    return back is not None and bool(largest(back.z - first.z) < 1e-7 and back.tangent @ first.tangent > 0)
 
 
 def reversed_at(point: Point) -> Point:
@@ -101,7 +116,7 @@ def reversed_at(point: Point) -> Point:
     return replace(point, tangent=-point.tangent)
 
 
-def located(equations: Equations, here: Point, there: Point, test: Callable[[Point], float]) -> Point | None:
+def located(equations: SteadyEquations, here: Point, there: Point, test: Callable[[Point], float]) -> Point | None:
     """The point between two neighbours at which a smooth `test` changes its sign; None where the curve is lost.
 
     By unequal halves down to a short piece, and on this along the chord: at a branch point itself the equations lose their rank, and for reasons of symmetry

@@ -1,6 +1,6 @@
 """Equations of steady motions as one scalar program, with their slopes.
 
-    R(z) = ( g,  phi,  dy/dt,  dq_j/dt ) = 0,      J = dR/dz        z: coordinates that matter, all speeds, and maybe one parameter of the scene
+    R(z) = ( g,  phi,  dy/dt,  dq_j/dt ) = 0,      J = dR/dz        z: coordinates that matter, all speeds, and parameters that vary
 
 y: the independent speeds of the scalar program; j: the coordinates that must rest. Coordinates on which nothing of this depends, a heading say, stay out.
 Unknowns are measured in units of their size, rows in SI units. Small motions about a steady one:
@@ -15,6 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jourdain_jax.analysis.families.spectrum import Modes, in_pairs, null_space
 from jourdain_jax.analysis.instant import by_program, numbers_of, on_rows, places_of
 from jourdain_jax.build.assembling import coordinate_bounds
 from jourdain_jax.lowering.lower import lower
@@ -29,61 +30,50 @@ Vector = Float[np.ndarray, "unknowns"]
 class Look:
     """The equations at one point, in units of rows and unknowns."""
 
-    R: Float[np.ndarray, "rows"]
+    R: Float[np.ndarray, "rows"]  # those of what keeps its value are the last
     J: Float[np.ndarray, "rows unknowns"]
     F: Float[np.ndarray, "states states"]  # of (q, y), SI units
     C: Float[np.ndarray, "rows_of_states states"]  # rows that (dq, dy) meet
 
 
 class SteadyEquations:
-    """R, J, F and the rows of (q, y) of one scene as functions of z."""
+    """R, J, F and the rows of (q, y) of one scene as functions of z; unknowns that are `held` keep their values at the guess."""
 
-    def __init__(self, scene: Scene, guess: tuple[float, np.ndarray, np.ndarray], inputs: np.ndarray, vary: str | None) -> None:
+    def __init__(
+        self, scene: Scene, guess: tuple[float, np.ndarray, np.ndarray], inputs: np.ndarray, vary: tuple[str, ...] = (), held: tuple[str, ...] = ()
+    ) -> None:
         self.scene, self.vary, (self.t, q, u) = scene, vary, guess
-        self.names, at, program = (*scene.coordinate_names.entries, *scene.speed_names.entries), places_of(scene), lower(scene)
+        names, at, program = (*scene.coordinate_names.entries, *scene.speed_names.entries), places_of(scene), lower(scene)
         self.given = np.asarray(numbers_of(scene, self.t, q, u, inputs), float)
-        first, varied = sum(np.size(leaf) for leaf in jax.tree.leaves(scene)), self._place_of(vary)
-        self.instant = by_program(scene, program, (), *(varied or (None,)))
+        first, varied = sum(np.size(leaf) for leaf in jax.tree.leaves(scene)), [_place_of(name, scene) for name in vary]
+        self.instant = by_program(scene, program, (), tuple(varied))
         matters, bound = np.array([name not in program.held for name in program.coordinates], bool), on_rows(scene)
         kept, y = np.flatnonzero(matters | bound), np.array(program.independent, int)
         columns = np.concatenate([at.q[kept], at.u])
         self.places = np.concatenate([first + columns, varied]).astype(int)
-        self.unknowns = (*(self.names[k] for k in kept), *scene.speed_names.entries, *([] if vary is None else [vary]))
+        self.unknowns = (*(names[k] for k in kept), *scene.speed_names.entries, *vary)
         self.size = np.append(sizes(scene, kept.tolist()), [abs(x) or 1.0 for x in self.given[varied]])
+        self.start = self.given[self.places] / self.size
+        self.held = np.array([self.index(name) for name in held], int)
+        self.rows_of_held = np.eye(len(self.start))[self.held]
+        self.by_name = dict(zip((*names, *vary), [*(self.instant.states[0] + np.arange(len(names))), *varied], strict=True))
         self.states_of_z = [*range(len(kept)), *(len(kept) + k for k in y)]
-        columns = np.concatenate([columns, [-1] if varied else []]).astype(int)
         self.rows = np.concatenate([at.g, at.phi, at.udot[y], at.qdot[matters]])
         self.rates, self.states = np.concatenate([at.qdot[kept], at.udot[y]]), np.concatenate([at.q[kept], at.u[y]])
         self.of_states = np.concatenate([at.g, at.phi if len(y) == len(at.u) else []]).astype(int)
+        columns = np.append(columns, np.arange(-len(vary), 0))
         self.slopes = np.ix_(self.rows, columns), np.ix_(self.rates, self.states), np.ix_(self.of_states, self.states)
-
-    @property
-    def start(self) -> Vector:
-        """The guess, in units of the unknowns' sizes."""
-        return self.given[self.places] / self.size
 
     def index(self, name: str) -> int:
         """Number of an unknown; a ValueError with the nearest names where there is none."""
         check_name(name, self.unknowns, f"`{name}` is no unknown of the steady motions of `{type(self.scene).__name__}`")
         return self.unknowns.index(name)
 
-    def _place_of(self, vary: str | None) -> list[int]:
-        """The place of a parameter among all numbers of the scene."""
-        if vary is None:
-            return []
-        place = 0
-        for path, leaf in jax.tree_util.tree_flatten_with_path(self.scene)[0]:
-            if path == (jax.tree_util.GetAttrKey(vary),) and np.ndim(leaf) == 0:
-                return [place]
-            place += np.size(leaf)
-        advice = nearest(vary, [name for name, value, _ in parameters_of(self.scene) if np.ndim(value) == 0])
-        raise ValueError(f"`vary` names `{vary}`, expected a parameter of `{type(self.scene).__name__}` that is one number; {advice}")
-
     def __call__(self, z: Vector) -> Look:
         """The equations at z."""
         v, D, _ = self.instant.of(self.at(z))
         J, F, C = (D[block] for block in self.slopes)
-        return Look(v[self.rows], J * self.size, F, C)
+        return Look(np.append(v[self.rows], (z - self.start)[self.held]), np.vstack([J * self.size, self.rows_of_held]), F, C)
 
     def at(self, z: Vector) -> np.ndarray:
         """All numbers, those of the unknowns by z."""
@@ -91,23 +81,49 @@ class SteadyEquations:
         given[self.places] = z * self.size
         return given
 
-    def in_states(self, directions: Float[np.ndarray, "unknowns directions"]) -> Float[np.ndarray, "states directions"]:
-        """Directions of z, without a parameter, as ones of (q, y) in SI units."""
+    def freedoms(self, look: Look) -> Float[np.ndarray, "states free"]:
+        """Directions of (q, y), in columns, along which steady motions go on at the same parameters, in SI units."""
+        count, states = 1 + len(self.held) - len(self.vary), len(self.start) - len(self.vary)
+        return self._in_states(np.linalg.svd(look.J[: len(self.rows), :states])[2][states - count :].T)
+
+    def _in_states(self, directions: Float[np.ndarray, "unknowns directions"]) -> Float[np.ndarray, "states directions"]:
         return (directions * self.size[: len(directions), None])[self.states_of_z]
 
-    def value_at_start(self, name: str) -> float:
-        """The value of a coordinate or speed that is no unknown."""
-        return float(self.given[self.instant.states[0] + self.names.index(name)])
+    def eigenvalues(self, look: Look, tangent: Vector) -> Modes:
+        """Eigenvalues of small motions in 1/s, in any order, without the zeros of going on along the family or along what is held.
+
+        Directions along which steady motions go on, T, belong to zeros by structure, and are taken out as a subspace, not by their size: with P orthonormal
+        and across T the others are those of P' A P.
+        """
+        freedoms = self.freedoms(look) if len(self.held) or self.vary else self._in_states(tangent[:, None])
+        E = null_space(look.C)
+        P = null_space(np.linalg.qr(E.T @ freedoms)[0].T)
+        return in_pairs(np.linalg.eigvals(P.T @ E.T @ look.F @ E @ P).astype(complex))
+
+    def values(self, z: Vector) -> dict[str, float]:
+        """Coordinates, speeds and what varies, by name."""
+        numbers = self.at(z)
+        return {name: float(numbers[k]) for name, k in self.by_name.items()}
 
     def place(self, point) -> Vector:
         """z of what has the values of the unknowns by name."""
         return np.array([point[name] for name in self.unknowns]) / self.size
 
     def split(self, numbers):
-        """q, u and the parameter that varies (or NaN)."""
+        """q, u and what varies, by name."""
         first, n, m = self.instant.states
-        q, u = numbers[first : first + n], numbers[first + n : first + n + m]
-        return q, u, numbers[self.places[-1]] if self.vary else 0 * numbers[0] + np.nan
+        return numbers[first : first + n], numbers[first + n : first + n + m], {name: numbers[self.by_name[name]] for name in self.vary}
+
+
+def _place_of(vary: str, scene: Scene) -> int:
+    """The place of a parameter among all numbers of a scene."""
+    place = 0
+    for path, leaf in jax.tree_util.tree_flatten_with_path(scene)[0]:
+        if path == (jax.tree_util.GetAttrKey(vary),) and np.ndim(leaf) == 0:
+            return place
+        place += np.size(leaf)
+    advice = nearest(vary, [name for name, value, _ in parameters_of(scene) if np.ndim(value) == 0])
+    raise ValueError(f"`vary` names `{vary}`, expected a parameter of `{type(scene).__name__}` that is one number; {advice}")
 
 
 def sizes(scene: Scene, kept: Sequence[int]) -> np.ndarray:

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from jourdain_jax.analysis.families.curve import Point, located
+from jourdain_jax.analysis.families.curve import CLOSED, Point, located
 from jourdain_jax.analysis.families.equations import SteadyEquations, Vector
-from jourdain_jax.analysis.families.followed import Followed, across, first_point, with_held
+from jourdain_jax.analysis.families.followed import across, first_point, followed, special
 from jourdain_jax.analysis.families.special import SURE
 from jourdain_jax.analysis.families.spectrum import Modes, matched, mode_names
 from jourdain_jax.analysis.steady import guessed
@@ -19,7 +19,7 @@ from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.calculus.reals import Numbers, largest
 from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, of_known_numbers, shown_from_users_lines
-from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
+from jourdain_jax.scene.names import UnknownNameError, as_names, check_name
 from jourdain_jax.scene.printing import Printed, in_digits
 from jourdain_jax.scene.scene import Scene
 
@@ -34,13 +34,12 @@ class FamilyPoint(Printed):
     state: State
     eigenvalues: Modes  # 1/s, in the columns of the family
     modes: tuple[str, ...]  # names of the modes concerned
-    vary: str | None
-    parameter: float  # the value of the parameter that varies; NaN where none does
+    values: dict[str, float]  # of coordinates, speeds, and the parameter that varies
     tangent: Vector  # of the curve, along its unknowns
 
     def __getitem__(self, name: str) -> float:
         """A coordinate, a speed, or the parameter that varies."""
-        return self.parameter if name == self.vary else float(self.state[name])
+        return self.values[name] if name in self.values else self.state[name]
 
     @property
     def differentiable(self) -> bool:
@@ -60,29 +59,20 @@ class Family(Printed):
     Eigenvalues keep their columns along the curve; the zeros that belong to going on along the family, or to what is held, are left out.
     """
 
-    by: Followed
+    equations: SteadyEquations
     points: tuple[Point, ...]
     ends: tuple[str, str]  # why the curve ends at its first and at its last point
     mode_names: tuple[str, ...]
     special: tuple[FamilyPoint, ...] = ()
-
-    @property
-    def equations(self) -> SteadyEquations:
-        """The equations of the steady motions, and their unknowns."""
-        return self.by.equations
 
     def __len__(self) -> int:
         return len(self.points)
 
     def __getitem__(self, name: str) -> Float[np.ndarray, "points"]:
         """Values of a coordinate, a speed, or the parameter that varies, at all points."""
-        known = self.equations
-        if name in known.unknowns:
-            k = known.index(name)
-            return np.array([point.z[k] for point in self.points]) * known.size[k]
-        if name in known.names:
-            return np.full(len(self), known.value_at_start(name))
-        raise UnknownNameError(f"a family of `{type(known.scene).__name__}` has no `{name}`; {nearest(name, dict.fromkeys((*known.names, *known.unknowns)))}")
+        what = f"a family of `{type(self.equations.scene).__name__}` has no `{name}`"
+        check_name(name, self.equations.by_name, what, UnknownNameError)
+        return np.array([self.equations.values(point.z)[name] for point in self.points])
 
     @property
     def eigenvalues(self) -> Complex[np.ndarray, "points modes"]:
@@ -119,19 +109,19 @@ class Family(Printed):
         for here, there in pairwise(self.points):
             if past(here) == 0.0:
                 found.append(self.point(here))
-            elif past(here) * past(there) < 0 and (point := located(self.by.looked, here, there, past)):
+            elif past(here) * past(there) < 0 and (point := located(self.equations, here, there, past)):
                 found.append(self.point(point))
-        if past(self.points[-1]) == 0.0 and self.ends[1] != "the curve is closed":
+        if past(self.points[-1]) == 0.0 and self.ends[1] != CLOSED:
             found.append(self.point(self.points[-1]))
         return tuple(found)
 
     def point(self, point: Point, kind: str = "", columns: tuple[int, ...] = ()) -> FamilyPoint:
         """A point of the curve with its state and eigenvalues."""
-        q, u, value = self.equations.split(self.equations.at(point.z))
-        near = min(self.points, key=lambda p: largest(p.z - point.z))
-        state = state_of(self.equations.scene, self.equations.t, jnp.asarray(q), jnp.asarray(u), residual=largest(point.look.R))
-        modes = point.modes if len(point.modes) else matched(near.modes, self.by.spectrum(point))
-        return FamilyPoint(kind, state, modes, tuple(self.mode_names[k] for k in columns), self.equations.vary, value, point.tangent * self.equations.size)
+        known, near = self.equations, min(self.points, key=lambda p: largest(p.z - point.z))
+        q, u, _ = known.split(known.at(point.z))
+        state = state_of(known.scene, known.t, jnp.asarray(q), jnp.asarray(u), residual=largest(point.look.R))
+        modes = point.modes if len(point.modes) else matched(near.modes, known.eigenvalues(point.look, point.tangent))
+        return FamilyPoint(kind, state, modes, tuple(self.mode_names[k] for k in columns), known.values(point.z), point.tangent * known.size)
 
     def to_xarray(self):
         """Points as an `xarray.Dataset`: every unknown, `stable`, and the eigenvalues with their names."""
@@ -194,29 +184,23 @@ def family(
     branch point itself; `NotLowered` where the scene has no scalar program. `DifferentiationModeError` inside `jit`: differentiate `steady` or `linearize`.
     """
     scene, until, held = as_scene(scene), dict(until or {}), as_names(held)
-    start = guess.state if isinstance(guess, FamilyPoint) else guess
-    t, q, u = (np.asarray(x, float) for x in guessed(scene, start, 0.0))
-    if vary is not None and isinstance(guess, FamilyPoint) and guess.vary == vary:
-        scene = scene.replace(**{vary: guess.parameter})
-    f = np.asarray(as_input_vector(scene, inputs), float)
-    equations = SteadyEquations(scene, (float(t), q, u), f, vary)
-    for name in (*held, *until):
-        equations.index(name)
-    looked = with_held(equations, held)
+    point, varied = guess if isinstance(guess, FamilyPoint) else None, () if vary is None else (vary,)
+    t, q, u = (np.asarray(x, float) for x in guessed(scene, point.state if point else guess, 0.0))
+    if point and vary in point.values:
+        scene = scene.replace(**{vary: point[vary]})
+    equations = SteadyEquations(scene, (float(t), q, u), np.asarray(as_input_vector(scene, inputs), float), varied, held)
+    targets = [(k := equations.index(name), float(value) / equations.size[k]) for name, value in until.items()]
     named = [name for name in (guess if isinstance(guess, Mapping) else ()) if name in equations.unknowns]
-    if isinstance(guess, FamilyPoint):
-        if guess.kind != "branch point" or len(guess.tangent) != len(equations.unknowns):
-            raise ValueError(f"`guess` is a point of a family ({guess.kind or 'not special'}), expected a branch point of one with the same unknowns")
-        begin = across(looked, equations.start, guess.tangent / equations.size)
+    if point is None:
+        begin = first_point(equations, named, [*held, *until])
+    elif point.kind == "branch point" and len(point.tangent) == len(equations.unknowns):
+        begin = across(equations, point.tangent / equations.size)
     else:
-        begin = first_point(looked, equations, named, [*held, *until])
-    targets = {equations.index(name): (name, float(value) / equations.size[equations.index(name)]) for name, value in until.items()}
-    by = Followed(equations, looked, held, targets)
-    points, ends = by.followed(begin, max_points)
+        raise ValueError(f"`guess` is a point of a family ({point.kind or 'not special'}), expected a branch point of one with the same unknowns")
+    points, ends = followed(equations, begin, targets, max_points)
     first = next(k for k, point in enumerate(points) if point.z is begin.z)
-    if isinstance(guess, FamilyPoint):  # between its neighbours the branch point is found as any other
+    if point:  # between its neighbours the branch point is found as any other
         del points[first]
-    found = Family(by, tuple(points), ends, mode_names(scene, names, points[min(first, len(points) - 1)].modes))
-    turning = {name: equations.index(name) for name in dict.fromkeys([*named, *until, *([vary] if vary else [])]) if name not in held}
-    special = [found.point(point, crossing.kind, crossing.columns) for crossing, point in by.special(points, turning)]
-    return replace(found, special=tuple(special))
+    found = Family(equations, tuple(points), ends, mode_names(scene, names, points[min(first, len(points) - 1)].modes))
+    turning = {name: equations.index(name) for name in dict.fromkeys([*named, *until, *varied]) if name not in held}
+    return replace(found, special=tuple(found.point(at, crossing.kind, crossing.columns) for crossing, at in special(equations, points, turning)))

@@ -1,111 +1,51 @@
 """Following a curve of steady motions: where it begins, its eigenvalues, where it ends, and what is special on the way."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
-from jourdain_jax.analysis.families.curve import Point, along, located, reversed_at, traced
-from jourdain_jax.analysis.families.equations import Look, SteadyEquations, Vector
+from jourdain_jax.analysis.families.curve import CLOSED, Point, Targets, located, reversed_at, traced
+from jourdain_jax.analysis.families.equations import SteadyEquations, Vector
 from jourdain_jax.analysis.families.special import Crossing, branches, changes, folds, tangents_across
-from jourdain_jax.analysis.families.spectrum import Modes, eigenvalues_at, matched
 from jourdain_jax.calculus.reals import largest
 
 
-@dataclass(frozen=True)
-class Followed:
-    """What a curve is followed by, and where it ends."""
-
-    equations: SteadyEquations
-    looked: Callable[[Vector], Look]  # with rows for what is held
-    held: tuple[str, ...]  # their names
-    targets: dict[int, tuple[str, float]]  # number of an unknown -> its name, and its value at the end in units of its size
-
-    def freedoms(self, look: Look) -> np.ndarray:
-        """Directions of (q, y) along which steady motions go on at the same parameters, in columns."""
-        state = look.J.shape[1] - (self.equations.vary is not None)
-        J, count = look.J[: len(self.equations.rows), :state], len(self.held) + (self.equations.vary is None)
-        return self.equations.in_states(np.linalg.svd(J)[2][state - count :].T)
-
-    def spectrum(self, point: Point) -> Modes:
-        """Eigenvalues at a point, in any order, without the zeros of going on along the family or along what is held."""
-        alone = not self.held and self.equations.vary is None
-        return eigenvalues_at(point.look, self.equations.in_states(point.tangent[:, None]) if alone else self.freedoms(point.look))
-
-    def ended(self, first: Point) -> Callable[[Point, Point], str]:
-        """Whether the curve has reached what it is followed to, or its own start."""
-        left = False  # whether it has gone away from its start
-
-        def ended(here: Point, there: Point) -> str:
-            nonlocal left
-            for k, (name, target) in self.targets.items():
-                if (here.z[k] - target) * (there.z[k] - target) <= 0:
-                    return f"{name} is {target * self.equations.size[k]:g}"
-            s, step = here.tangent @ (first.z - here.z), np.linalg.norm(there.z - here.z)
-            if left and 0 < s <= step and np.linalg.norm(first.z - here.z - s * here.tangent) < 0.1 * step:
-                back = along(self.looked, here, s, first.z)
-                if back is not None and largest(back.z - first.z) < 1e-7 and back.tangent @ first.tangent > 0:
-                    return "the curve is closed"
-            left = left or here is not first
-            return ""
-
-        return ended
-
-    def followed(self, begin: Point, most: int) -> tuple[list[Point], tuple[str, str]]:
-        """All points, in order, and why the curve ends at the first and at the last of them."""
-        ahead = [(target - begin.z[k]) * begin.tangent[k] for k, (_, target) in self.targets.items()]
-        if (ahead[0] if ahead else begin.tangent[np.argmax(np.abs(begin.tangent))]) < 0:
-            begin = reversed_at(begin)
-        begin = replace(begin, modes=self.spectrum(begin))
-        points, last = traced(self.looked, self.spectrum, begin, self.ended(begin), most)
-        if last == "the curve is closed":
-            return [*points, replace(begin, modes=matched(points[-1].modes, begin.modes))], (last, last)
-        if self.targets:
-            for k, (_, target) in self.targets.items() if len(points) > 1 else ():
-                past = lambda p, k=k, target=target: p.z[k] - target  # noqa: E731
-                if past(points[-2]) * past(points[-1]) < 0 and (end := located(self.looked, points[-2], points[-1], past)):
-                    points[-1] = replace(end, modes=matched(points[-1].modes, self.spectrum(end)))
-            return points, ("the start", last)
-        back, first = traced(self.looked, self.spectrum, reversed_at(begin), self.ended(reversed_at(begin)), most)
-        return [*(reversed_at(point) for point in reversed(back[1:])), *points], (first, last)
-
-    def special(self, points: list[Point], turning: dict[str, int]) -> Iterator[tuple[Crossing, Point]]:
-        """What is special between the points, in their order."""
-        for here, there in pairwise(points):
-            crossings = [*branches(here, there), *folds(here, there, turning), *changes(here, there, self.spectrum)]
-            found = []
-            for crossing in crossings:
-                point = located(self.looked, here, there, crossing.test)
-                found.append((crossing, point) if point else (replace(crossing, kind=f"{crossing.kind}, before this point"), there))
-            branch = next((point for crossing, point in found if crossing.kind == "branch point"), None)
-            if branch is not None:  # beside it tangents have few digits: what lies as close as this lies there
-                found = [(crossing, branch if largest(point.z - branch.z) < 1e-4 else point) for crossing, point in found]
-            yield from sorted(found, key=lambda pair: here.tangent @ (pair[1].z - here.z))
+def followed(equations: SteadyEquations, begin: Point, targets: Targets, most: int) -> tuple[list[Point], tuple[str, str]]:
+    """All points of a curve, in order, and why it ends at the first and at the last of them; towards the targets alone, where there are some."""
+    ahead = [(target - begin.z[k]) * begin.tangent[k] for k, target in targets]
+    if (ahead[0] if ahead else begin.tangent[np.argmax(np.abs(begin.tangent))]) < 0:
+        begin = reversed_at(begin)
+    begin = replace(begin, modes=equations.eigenvalues(begin.look, begin.tangent))
+    points, last = traced(equations, begin, targets, most)
+    if last == CLOSED or targets:
+        return points, (last if last == CLOSED else "the start", last)
+    back, first = traced(equations, reversed_at(begin), targets, most)
+    return [*(reversed_at(point) for point in reversed(back[1:])), *points], (first, last)
 
 
-def with_held(equations: SteadyEquations, held: tuple[str, ...]) -> Callable[[Vector], Look]:
-    """The equations with a row for every unknown that keeps its value."""
-    if not held:
-        return equations
-    places = [equations.index(name) for name in held]
-    rows, values = np.eye(len(equations.unknowns))[places], equations.start[places]
+def special(equations: SteadyEquations, points: list[Point], turning: dict[str, int]) -> Iterator[tuple[Crossing, Point]]:
+    """What is special between the points, in their order."""
+    for here, there in pairwise(points):
+        found = []
+        for crossing in (*branches(here, there), *folds(here, there, turning), *changes(equations, here, there)):
+            point = located(equations, here, there, crossing.test)
+            found.append((crossing, point) if point else (replace(crossing, kind=f"{crossing.kind}, before this point"), there))
+        branch = next((point for crossing, point in found if crossing.kind == "branch point"), None)
+        if branch is not None:  # beside it tangents have few digits: what lies as close as this lies there
+            found = [(crossing, branch if largest(point.z - branch.z) < 1e-4 else point) for crossing, point in found]
+        yield from sorted(found, key=lambda pair: here.tangent @ (pair[1].z - here.z))
 
-    def looked(z: Vector) -> Look:
-        look = equations(z)
-        return Look(np.append(look.R, z[places] - values), np.vstack([look.J, rows]), look.F, look.C)
 
-    return looked
-
-
-def first_point(looked: Callable, equations: SteadyEquations, named: list[str], kept: list[str]) -> Point:
+def first_point(equations: SteadyEquations, named: list[str], kept: list[str]) -> Point:
     """The steady motion near the guess: what is named keeps its value as long as the rest can be found, then what is held or followed alone."""
     z, scene = equations.start, type(equations.scene).__name__
     for fixed in ([*named, *kept], kept):
         free = np.ones(len(z), bool)
         free[[equations.index(name) for name in fixed]] = False
         for _ in range(30):
-            look = looked(z)
+            look = equations(z)
             if not (np.all(np.isfinite(look.R)) and np.all(np.isfinite(look.J))):
                 raise ValueError(f"the equations of `{scene}` are undefined near the guess; start at another state")
             step = np.zeros(len(z))
@@ -113,7 +53,7 @@ def first_point(looked: Callable, equations: SteadyEquations, named: list[str], 
             z = z + step * min(1.0, 0.25 / max(largest(step), 1e-300))
             if largest(step) < 1e-12 * (1 + largest(z)):
                 break
-    look = looked(z)
+    look = equations(z)
     if largest(look.R) > 1e-9:
         raise ValueError(f"no steady motion of `{scene}` is found near the guess (residual {largest(look.R):.1e}); `jj.steady` may find one from afar")
     sigma, V = np.linalg.svd(look.J)[1:]
@@ -130,7 +70,7 @@ def first_point(looked: Callable, equations: SteadyEquations, named: list[str], 
     return Point(z, V[-1], look)
 
 
-def across(looked: Callable[[Vector], Look], z: Vector, tangent: Vector) -> Point:
-    """The branch point z, with the tangent of the other curve through it."""
-    other = min(tangents_across(looked, z), key=lambda t: abs(t @ tangent) / np.linalg.norm(tangent))
-    return Point(z, other, looked(z))
+def across(equations: SteadyEquations, tangent: Vector) -> Point:
+    """The branch point at the guess, with the tangent of the other curve through it."""
+    other = min(tangents_across(equations, equations.start), key=lambda t: abs(t @ tangent) / np.linalg.norm(tangent))
+    return Point(equations.start, other, equations(equations.start))

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.analysis.families.curve import Equations, Point
-from jourdain_jax.analysis.families.equations import Look, Vector
+from jourdain_jax.analysis.families.curve import Point
+from jourdain_jax.analysis.families.equations import Look, SteadyEquations, Vector
 from jourdain_jax.analysis.families.spectrum import Modes, matched
 
 SURE = 1e-7  # relative to 1 + |s|: a real part, or a distance of two eigenvalues, that is not round-off
@@ -56,12 +56,12 @@ def _held(look: Look) -> tuple[Float[np.ndarray, "rows held"], float, Float[np.n
     return U[:, :held], float(sigma[held - 1]), V
 
 
-def changes(here: Point, there: Point, spectrum: Callable[[Point], Modes]) -> Iterator[Crossing]:
-    """Eigenvalues that pass zero or the imaginary axis, and pairs that meet; `spectrum`: eigenvalues at a point, in any order."""
+def changes(equations: SteadyEquations, here: Point, there: Point) -> Iterator[Crossing]:
+    """Eigenvalues that pass zero or the imaginary axis, and pairs that meet."""
     before, now = here.modes, there.modes
 
     def modes(point: Point) -> Modes:
-        return point.modes if len(point.modes) else matched((before + now) / 2, spectrum(point))
+        return point.modes if len(point.modes) else matched((before + now) / 2, equations.eigenvalues(point.look, point.tangent))
 
     for k, (a, b) in enumerate(zip(before, now, strict=True)):
         if a.real * b.real < 0 and min(abs(a.real), abs(b.real)) > SURE * (1 + abs(a)):
@@ -84,7 +84,7 @@ def _pairs(values: Modes) -> list[tuple[int, int]]:
     return [tuple(sorted((k, int(np.argmin(np.abs(values - np.conj(values[k]))))))) for k in up]  # type: ignore[misc]
 
 
-def tangents_across(equations: Equations, z: Vector) -> list[Vector]:
+def tangents_across(equations: SteadyEquations, z: Vector) -> list[Vector]:
     """Unit tangents of the two curves that cross at a branch point: a a' in its null space with l . R_zz a a = 0.
 
     R_zz by central differences of J; l: the left null vectors, of which only one has such a form that does not vanish.

@@ -1,13 +1,8 @@
-"""Small motions about the points of a family: their eigenvalues, each in its column all along the curve.
-
-Directions along which the steady motions themselves go on, at the same parameters, belong to eigenvalues that are zero by structure; they are taken out as
-a subspace, T, not by their size: with P orthonormal and across T the others are those of P' A P.
-"""
+"""Eigenvalues of small motions about the points of a family, each in its column all along the curve."""
 
 import numpy as np
 from jaxtyping import Complex, Float
 
-from jourdain_jax.analysis.families.equations import Look
 from jourdain_jax.calculus.on_first_use import module_on_first_use
 from jourdain_jax.calculus.reals import largest
 from jourdain_jax.scene.scene import Scene
@@ -25,16 +20,7 @@ def null_space(C: Float[np.ndarray, "rows states"]) -> Float[np.ndarray, "states
     return V[rank:].T
 
 
-def eigenvalues_at(look: Look, freedoms: Float[np.ndarray, "states free"]) -> Modes:
-    """Eigenvalues in 1/s without the structural zeros; `freedoms`: directions of (q, y) along which steady motions go on."""
-    E = null_space(look.C)
-    A = E.T @ look.F @ E
-    T = np.linalg.qr(E.T @ freedoms)[0]
-    P = null_space(T.T)
-    return _in_pairs(np.linalg.eigvals(P.T @ A @ P).astype(complex))
-
-
-def _in_pairs(values: Modes) -> Modes:
+def in_pairs(values: Modes) -> Modes:
     """Sort by ascending real part, of a pair the positive imaginary part first; what is real has no imaginary part."""
     return values[np.lexsort((-values.imag, values.real))]
 
