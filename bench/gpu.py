@@ -11,15 +11,11 @@ one time is saved, and the end, its code and the counts come back; the best of t
 """
 
 import re
-import shutil
 import signal
-import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -154,7 +150,7 @@ def twin(of: str, name: str, quick: bool) -> Figures:
 
     run = lambda: [np.asarray(x) for x in jax.tree.leaves(jax.jit(jax.vmap(KINDS[of][name][1]))(jnp.linspace(*SPREAD[of], 7)))]  # noqa: E731
     expected = run()
-    with gpu_twin.by_twins("at once", 9) as texts:
+    with gpu_twin.in_place_of_a_gpu("at once", memory=2**20) as texts:
         found = run()
     differ = sum(not np.array_equal(*x) for x in zip(found, expected, strict=True))
     yield figure(f"arrays that differ, threads of a GPU on the CPU, {name}", f"7 lanes of a {of}", differ, 0)
@@ -162,24 +158,9 @@ def twin(of: str, name: str, quick: bool) -> Figures:
     for architecture in ("sm_75", "sm_80", "sm_90", "sm_100"):
         ptx = nvidia.text_for(text, architecture)
         yield figure(f"undefined functions for {architecture}, {name}", of, len(re.findall(r"^\.extern", ptx, re.M)), 0)
-        if architecture == "sm_90" and (ptxas := _ptxas()):
-            said = _said_of(ptx, ptxas)
+        if architecture == "sm_90" and (said := gpu_twin.said_by_assembler(ptx)):
             for what, pattern in {"registers": r"Used (\d+) r", "bytes of stack": r"(\d+) bytes stack", "bytes spilled": r"(\d+) bytes spill st"}.items():
                 yield figure(f"{what} for sm_90, {name}", of, max(map(int, re.findall(pattern, said)), default=0))
-
-
-def _ptxas() -> str | None:
-    """Of the wheel `nvidia-cuda-nvcc`, or of a toolkit."""
-    found = [str(file) for folder in sys.path for file in Path(folder).glob("nvidia/*/bin/ptxas")]
-    return found[0] if found else shutil.which("ptxas")
-
-
-def _said_of(ptx: str, ptxas: str) -> str:
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "kernel.ptx"
-        file.write_text(ptx)
-        command = [ptxas, "-arch=sm_90", "-v", str(file), "-o", str(file.with_suffix(".cubin"))]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stderr
 
 
 def device(quick: bool) -> Figures:

@@ -1,54 +1,61 @@
-"""Kernels of GPUs without a GPU: the same LLVM IR compiled for the CPU, called once for each thread; and a driver that runs it."""
+"""A GPU that is not there: what JAX calls on one is called on the CPU, by the same lowering and handler; a driver made here runs the kernels' LLVM IR,
+compiled for the CPU, once for each thread."""
 
 import ctypes
 import functools
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from functools import partial
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
 import jax
-import numpy as np
 from jax.interpreters import mlir
 
 from jourdain_jax.motion.native import values
 from jourdain_jax.native import ffi, gpu, host, nvidia
 
-THREADS = 4
 _ENDS = """
 declare i32 @pthread_setspecific(i32, ptr)
 declare ptr @pthread_getspecific(i32)
-define i1 @twin_together(i32 %mask, i1 %x) {
+define i1 @twin.vote.any.sync(i32 %mask, i1 %x) {
   ret i1 %x
 }
-define i32 @twin_number() {
+define i32 @twin.ctaid.x() {
   %x = call ptr @pthread_getspecific(i32 KEY)
-  %n = ptrtoint ptr %x to i32
+  %both = ptrtoint ptr %x to i64
+  %n = trunc i64 %both to i32
   ret i32 %n
 }
-define i32 @twin_zero() {
+define i32 @twin.nctaid.x() {
+  %x = call ptr @pthread_getspecific(i32 KEY)
+  %both = ptrtoint ptr %x to i64
+  %high = lshr i64 %both, 32
+  %n = trunc i64 %high to i32
+  ret i32 %n
+}
+define i32 @twin.tid.x() {
   ret i32 0
 }
-define i32 @twin_one() {
+define i32 @twin.ntid.x() {
   ret i32 1
 }
-define i32 @twin_count() {
-  ret i32 COUNT
-}
-define void @run(ptr %words, i32 %number) {
-  %n = zext i32 %number to i64
-  %x = inttoptr i64 %n to ptr
-  call i32 @pthread_setspecific(i32 KEY, ptr %x)
-  call void @kernel(ptr byval([64 x i64]) align 8 %words)
+define void @run(ptr %words, ptr %number_and_count) {
+  call i32 @pthread_setspecific(i32 KEY, ptr %number_and_count)
+  call void @kernel(ptr byval([WORDS x i64]) align 8 %words)
   ret void
 }
 """
-_NAMES = {"vote.any.sync": "together", "ctaid.x": "number", "tid.x": "zero", "nctaid.x": "count", "ntid.x": "one"}
 
 
 @functools.cache
 def _key() -> int:
-    """Of what is a thread's own: its number."""
+    """Of what is a thread's own: its number, and how many there are."""
     key = ctypes.c_uint()
     assert ctypes.CDLL(None).pthread_key_create(ctypes.byref(key), None) == 0
     return key.value
@@ -56,97 +63,158 @@ def _key() -> int:
 
 def twin_text(text: str) -> str:
     """The kernel as a module for the CPU."""
-    text = text.replace("ptx_kernel ", "")
-    for name, ours in _NAMES.items():
-        for prefix in ("llvm.nvvm.", "llvm.nvvm.read.ptx.sreg."):
-            for result, arguments in (("i1", "i32, i1"), ("i32", "")):
-                text = text.replace(f"declare {result} @{prefix}{name}({arguments})\n", "")
-            text = text.replace(f"@{prefix}{name}(", f"@twin_{ours}(")
-    return text + _ENDS.replace("COUNT", str(THREADS)).replace("KEY", str(_key())).replace("[64", f"[{ffi.WORDS * ffi.MOST_BUFFERS}")
+    text = re.sub(r"declare .*llvm\.nvvm.*\n", "", text.replace("ptx_kernel ", ""))
+    text = re.sub(r"@llvm\.nvvm\.(read\.ptx\.sreg\.)?", "@twin.", text)
+    return text + _ENDS.replace("KEY", str(_key())).replace("WORDS", str(ffi.WORDS * ffi.MOST_BUFFERS))
 
 
-class Twin:
-    """The kernel's twin, as a function of arrays: from arguments and shapes of results to results."""
+INVALID_VALUE, OUT_OF_MEMORY, INVALID_HANDLE = 1, 2, 400  # of `CUresult`
+_SAID = {INVALID_VALUE: b"invalid argument", OUT_OF_MEMORY: b"out of memory", INVALID_HANDLE: b"invalid resource handle"}
+_C = ctypes.CFUNCTYPE
+_int, _long, _pointer = ctypes.c_uint32, ctypes.c_uint64, ctypes.c_void_p
 
-    def __init__(self, text: str, scratch: tuple[int, int]) -> None:
-        self.scratch = scratch
-        self.run = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int)(host.address(host.object_code(twin_text(text), 2), "run"))
 
-    def __call__(self, arguments, shapes, order: str, slots: int) -> list[np.ndarray]:
-        """`slots`: of memory for the adjoint."""
-        needed, most = self.scratch
-        scratch = np.zeros(ffi.FIRST_OF_SCRATCH + THREADS * needed * min(slots, most))
-        arrays = [*(np.ascontiguousarray(x, float) for x in arguments), *(np.full(shape, np.nan) for shape in shapes), scratch]
-        words = np.zeros(ffi.WORDS * ffi.MOST_BUFFERS, np.int64)
-        for k, x in enumerate(arrays):
-            words[ffi.WORDS * k :][: ffi.WORDS] = x.ctypes.data, x.shape[-1], np.prod(x.shape[:-1]), np.prod(x.shape[:-3])
-        threads = range(THREADS)
-        if order == "at once":
-            with ThreadPoolExecutor(THREADS) as pool:
-                list(pool.map(lambda number: self.run(words.ctypes.data, number), threads))
+class Driver:
+    """Those functions of `libcuda` that the handler calls, as they are declared in NVIDIA's `cuda.h`; `order`: of threads, `fails`: what a launch returns."""
+
+    order, fails = "in order", 0
+
+    def __init__(self) -> None:
+        self.loaded: list[str] = []
+        self.launched: dict[str, int] = {}
+        self.twins: dict[int, int] = {}
+        memset = _C(ctypes.c_int, _long, _int, ctypes.c_size_t, _pointer)
+        launch = _C(ctypes.c_int, _pointer, *[_int] * 7, _pointer, ctypes.POINTER(_pointer), _pointer)
+        error = _C(ctypes.c_int, ctypes.c_int, ctypes.POINTER(_pointer))
+        self.texts = {code: ctypes.create_string_buffer(text) for code, text in _SAID.items()}
+        self.library = SimpleNamespace(cuMemsetD32Async=memset(self._memset), cuLaunchKernel=launch(self._launch), cuGetErrorString=error(self._error))
+
+    def _memset(self, place, value, count, stream) -> int:
+        ctypes.memmove(place, (_int * count)(*[value] * count), 4 * count)
+        return 0
+
+    def _launch(self, function, across, y, z, threads, threads_y, threads_z, shared, stream, parameters, extra) -> int:
+        if (y, z, threads, threads_y, threads_z, shared, stream, extra) != (1, 1, nvidia.WARP, 1, 1, 0, 99, None) or not across:
+            return INVALID_VALUE  # of a grid without blocks, too
+        if not function or self.fails:
+            return self.fails or INVALID_HANDLE
+        self.launched[self.loaded[function - 1]] = across
+        run, count = _C(None, _pointer, _pointer)(self._twin(function)), across * threads
+        each = range(count) if self.order == "in order" else reversed(range(count))
+        call = lambda number: run(parameters[0], number | count << 32)  # noqa: E731
+        if self.order == "at once":
+            with ThreadPoolExecutor(4) as pool:
+                list(pool.map(call, each))
         else:
-            for number in threads if order == "in order" else reversed(threads):
-                self.run(words.ctypes.data, number)
-        return arrays[len(arguments) : -1]
+            for number in each:
+                call(number)
+        return 0
+
+    def load(self, text: bytes, name: str) -> nvidia.Loaded:
+        """A kernel, which is made when it is launched."""
+        self.loaded.append(text.decode())
+        return nvidia.Loaded(len(self.loaded), 1000, 255)
+
+    def _twin(self, number: int) -> int:
+        if number not in self.twins:
+            self.twins[number] = host.address(host.object_code(twin_text(self.loaded[number - 1]), 1), "run")
+        return self.twins[number]
+
+    def _error(self, code, place) -> int:
+        place[0] = ctypes.addressof(self.texts[code])
+        return 0
 
 
-@contextmanager
-def by_twins(order: str = "in order", slots: int = 64):
-    """Inside, machine code that JAX calls on the CPU is that of the twins; it is given a list of the text of each kernel."""
-    texts: list[str] = []
+DRIVER = Driver()
 
-    @functools.cache
-    def made(kernel) -> Twin:
-        def registered(text, scratch):
-            texts.append(text)
-            return gpu.Kernel(0, nvidia.Loaded(0, 0, 0), scratch)
-
-        kernel.cache_clear()
-        with mock.patch.object(gpu, "registered", registered):
-            scratch = kernel().scratch
-        kernel.cache_clear()
-        return Twin(texts[-1], scratch)
-
-    def lowered(ctx, *values, kernel, **_):
-        shapes = [x.shape for x in ctx.avals_out]
-
-        def run(*arguments):
-            found = made(kernel)(arguments, shapes, order, slots)
-            return [np.asarray(x, aval.dtype) for x, aval in zip(found, ctx.avals_out, strict=True)]
-
-        results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in ctx.avals_out]
-        return mlir.lower_fun(lambda *values: jax.pure_callback(run, results, *values))(ctx, *values)
-
-    register = partial(mlir.register_lowering, values._call_p, platform="cpu")
-    jax.clear_caches()
-    register(lowered)
-    try:
-        yield texts
-    finally:
-        register(values.on_cpu)
-        jax.clear_caches()
-
-
-_DRIVER = """
-define i32 @cuMemsetD32Async(i64 %to, i32 %value, i64 %count, ptr %stream) {
-  %at = inttoptr i64 %to to ptr
-  store i64 0, ptr %at
-  ret i32 FAILS
+# `handler`, which gives the stream 99 where XLA, on a CPU, has none
+_STREAM = """
+define ptr @stream(ptr %asked) {
+  %at = getelementptr i64, ptr %asked, i64 3
+  store i64 99, ptr %at
+  ret ptr null
 }
-define i32 @cuGetErrorString(i32 %code, ptr %to) {
-  store ptr @text, ptr %to
-  ret i32 0
+define ptr @handler(ptr %frame) {
+  %words = alloca i64, i64 21
+  %api = alloca i64, i64 11
+  call void @llvm.memcpy.p0.p0.i64(ptr %words, ptr %frame, i64 168, i1 0)
+  %extension_at = getelementptr ptr, ptr %frame, i64 1
+  %extension = load ptr, ptr %extension_at
+  %asked = icmp ne ptr %extension, null
+  br i1 %asked, label %on, label %with
+with:
+  %api_at = getelementptr ptr, ptr %frame, i64 2
+  %own = load ptr, ptr %api_at
+  call void @llvm.memcpy.p0.p0.i64(ptr %api, ptr %own, i64 88, i1 0)
+  %stream_at = getelementptr ptr, ptr %api, i64 10
+  store ptr @stream, ptr %stream_at
+  %place = getelementptr ptr, ptr %words, i64 2
+  store ptr %api, ptr %place
+  br label %on
+on:
+  %found = call ptr @served(ptr %words)
+  ret ptr %found
 }
-@text = constant [14 x i8] c"out of memory\\00"
-define i32 @cuLaunchKernel(ptr %f, i32 %gx, i32 %gy, i32 %gz, i32 %bx, i32 %by, i32 %bz, i32 %shared, ptr %stream, ptr %parameters, ptr %extra) {
-  %words = load ptr, ptr %parameters
-  call void %f(ptr %words, i32 0)
-  ret i32 0
-}
+declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)
 """
 
 
-def stub_driver(fails: int = 0) -> dict[str, int]:
-    """Addresses of functions of a driver that runs twins; `fails`: what clearing memory returns."""
-    code = host.object_code(_DRIVER.replace("FAILS", str(fails)), 2)
-    return {name: host.address(code, name) for name in ("cuMemsetD32Async", "cuLaunchKernel", "cuGetErrorString")}
+@contextmanager
+def in_place_of_a_gpu(order: str = "in order", memory: int = 2**40, fails: int = 0) -> Iterator[dict[str, int]]:
+    """Inside, machine code that JAX calls on the CPU is that of a GPU of so many bytes; it is given the texts of all kernels that run, with their blocks."""
+    register, launched = ffi.register, dict[str, int]()
+    changes = [
+        mock.patch.object(gpu, "_TARGET", "jourdain_jax_in_place_of_a_gpu"),
+        mock.patch.object(gpu, "handler_text", mock.Mock(return_value=gpu.handler_text().replace("@handler(", "@served(") + _STREAM)),
+        mock.patch.object(ffi, "register", lambda name, text, platform: register(name, text, "cpu")),
+        mock.patch.multiple(
+            nvidia,
+            reason_against=str,
+            driver=mock.Mock(return_value=DRIVER.library),
+            architecture=mock.Mock(return_value="the CPU"),
+            text_for=lambda text, architecture: text,
+            loaded=DRIVER.load,
+            memory=mock.Mock(return_value=memory),
+            _of_device={82: 65536, 81: 65536, 16: 1}.__getitem__,  # registers, cache, multiprocessors
+        ),
+        mock.patch.multiple(DRIVER, order=order, fails=fails, launched=launched),
+    ]
+    jax.clear_caches()
+    with ExitStack() as stack:
+        for change in changes:
+            stack.enter_context(change)
+        mlir.register_lowering(values._call_p, values._on_nvidia, platform="cpu")
+        try:
+            yield launched
+        finally:
+            mlir.register_lowering(values._call_p, values.on_cpu, platform="cpu")
+            jax.clear_caches()
+
+
+def driver_of_devices(capabilities: list[tuple[int, int]], fails: int = 0, missing: str = "") -> SimpleNamespace:
+    """Functions by which a driver describes its devices; `fails`: what its start returns, `missing`: a function that it has not."""
+
+    def said(code, place) -> int:
+        place._obj.value = b"no CUDA-capable device is detected"
+        return 0
+
+    def counted(place) -> int:
+        place._obj.value = len(capabilities)
+        return 0
+
+    def attribute(place, which, device) -> int:
+        place._obj.value = capabilities[device][which - 75]
+        return 0
+
+    names = {name: lambda *_: 0 for name in nvidia._CALLED if name != missing}
+    return SimpleNamespace(**names | {"cuInit": lambda _: fails, "cuDeviceGetCount": counted, "cuDeviceGetAttribute": attribute, "cuGetErrorString": said})
+
+
+def said_by_assembler(ptx: str) -> str:
+    """What NVIDIA's assembler, of the wheel `nvidia-cuda-nvcc` or of a toolkit, says of text for compute capability 9.0; empty where there is none."""
+    found = [str(file) for folder in sys.path for file in Path(folder).glob("nvidia/*/bin/ptxas")] + [shutil.which("ptxas")]
+    if not found[0]:
+        return ""
+    done = subprocess.run([found[0], "-arch=sm_90", "-v", "-o", "/dev/null", "-"], input=ptx, capture_output=True, text=True)
+    assert not done.returncode, done.stderr
+    return done.stderr

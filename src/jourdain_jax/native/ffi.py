@@ -234,15 +234,11 @@ def handed_out(w: Writer, count: int, rows: Value, lane: Value, numbers: Value) 
 def write_rows(w: Writer, given: int, returned: int) -> None:
     """A handler that takes rows of `given` numbers to rows of `returned` ones, lanes side by side, by the module's `row(given, returned)`.
 
-    On a GPU a pointer to the thread's own part of the call's memory (`Writer.scratch`) comes after what is given.
     Places for which no row is left work out the last one once more.
     """
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
-        state, found, who = w.room(given + w.device), w.room(returned), w.room(w.lanes, "i64")
+        state, found, who = w.room(given), w.room(returned), w.room(w.lanes, "i64")
         rows, results, count = w.load(job, IN, "ptr"), w.load(job, OUT, "ptr"), w.load(job, COUNT, "i64")
-        if w.device and w.scratch[0]:
-            own = w.at(w.load(job, NEXT, "ptr"), w.thread()[0] * w.scratch[0] + FIRST_OF_SCRATCH, "double")
-            w.store(own, state, given)
         with w.repeated() as leave:
             leave(~w.together(lanes_taken(w, job, NEXT) < count))
             with w.counted(0, w.lanes) as lane:

@@ -21,13 +21,13 @@ from jourdain_jax.native.ir import Value, Writer
 
 _TARGET = "jourdain_jax_on_gpu"
 MOST_KERNELS = 4096  # of a process
-MOST_SCRATCH = 4 << 30  # bytes of what threads use beyond what they need, and no more than an eighth of the device
+MOST_SLOTS = 4096  # of a thread
 _NUMBER, _FUNCTION, _WORDS = range(3)  # words of a kernel in the table; the number of words
 _BLOCKS, _KERNEL = range(2)  # attributes, in the order of their names
 
-_table = (ctypes.c_uint64 * (_WORDS * MOST_KERNELS))()
+_table = (ctypes.c_uint64 * (_WORDS * (MOST_KERNELS + 1)))()  # the last one is no kernel: where a program asks for one that this process has not
 _loading = threading.RLock()
-_kernels: dict[int, "Kernel"] = {}
+_kernels: dict[int, nvidia.Loaded] = {}
 
 
 class Kernel(NamedTuple):
@@ -59,8 +59,9 @@ def handler_text() -> str:
         w.declare("jourdain_jax_kernels", "@jourdain_jax_kernels = external global i64")
         w.store(w.literal(0, "i64"), entry)
         with w.repeated() as leave:
-            leave(w.load(table, w.load(entry, type="i64"), "i64").equals(number))
-            w.store(w.load(entry, type="i64") + _WORDS, entry)
+            place = w.load(entry, type="i64")
+            leave(w.load(table, place, "i64").equals(number) | place.equals(_WORDS * MOST_KERNELS))
+            w.store(place + _WORDS, entry)
         function = w.load(table, w.load(entry, type="i64") + _FUNCTION, "ptr")
         api, asked = w.load(frame, 2, "ptr"), w.room(4, "i64")
         for word, value in enumerate((w.literal(32, "i64"), w.literal(0, "i64"), w.load(frame, 3, "i64"), w.literal(0, "i64"))):
@@ -116,21 +117,21 @@ def registered(text: str, scratch: tuple[int, int]) -> Kernel:
             if len(_kernels) == MOST_KERNELS:
                 raise RuntimeError(f"this process has compiled {MOST_KERNELS} kernels for GPUs, the most that it can keep; start a new one")
             ptx = host.kept(f"jourdain_jax_{digest.hexdigest()[:24]}", made_by, lambda: nvidia.text_for(text, nvidia.architecture()).encode())
-            found = nvidia.loaded(ptx, ffi.KERNEL)
-            place = _WORDS * len(_kernels)
+            _kernels[number] = found = nvidia.loaded(ptx, ffi.KERNEL)
+            place = _WORDS * (len(_kernels) - 1)
             _table[place + _FUNCTION] = found.function
             _table[place + _NUMBER] = number
-            _kernels[number] = Kernel(number, found, scratch)
-    return _kernels[number]
+    return Kernel(number, _kernels[number], scratch)
 
 
 def lowered(ctx: mlir.LoweringRuleContext, arguments: Sequence, kernel: Kernel) -> list:
     """The call of a kernel."""
     lanes = int(np.prod(ctx.avals_in[-1].shape[:-1]))
-    needed, most = kernel.scratch
-    blocks = min(nvidia.blocks(lanes, kernel.loaded), max(1, MOST_SCRATCH // (8 * nvidia.WARP * max(needed, 1))))
-    each = 8 * blocks * nvidia.WARP * max(needed, 1)
-    times = min(most, max(1, min(MOST_SCRATCH, nvidia.memory() // 8) // max(each, 1)))
-    scratch = ctx.avals_out[0].update(shape=(ffi.FIRST_OF_SCRATCH + blocks * nvidia.WARP * needed * times,), dtype=np.dtype(np.float64), weak_type=False)
+    slot, allowed = kernel.scratch
+    # of all threads, and no more than an eighth of the device: so many slots
+    slots = max(1, min(allowed, nvidia.memory() // 8) // (8 * nvidia.WARP * max(slot, 1)))
+    blocks = min(nvidia.blocks(lanes, kernel.loaded), slots)
+    each = min(MOST_SLOTS, slots // max(blocks, 1))
+    scratch = ctx.avals_out[0].update(shape=(ffi.FIRST_OF_SCRATCH + blocks * nvidia.WARP * slot * each,), dtype=np.dtype(np.float64), weak_type=False)
     call = partial(jax.ffi.ffi_lowering(_handler()), blocks=np.int64(blocks), kernel=np.int64(kernel.number))
     return ffi.in_doubles(ctx, arguments, call, scratch)

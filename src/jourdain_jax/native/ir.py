@@ -87,15 +87,15 @@ class Value:
 class Writer:
     """A module of functions on vectors of `lanes` doubles; `fused`: products and sums are rounded once where `fma` asks for it.
 
-    `threads`: among which many lanes are shared on a CPU; `device`: whether the module is for a GPU. There `scratch` says how many doubles of memory outside
-    a thread each thread needs, and how many times as many it can use.
+    `threads`: among which many lanes are shared on a CPU; `device`: whether the module is for a GPU. There `scratch` says how many doubles a slot of a
+    thread's memory outside it takes (0: it needs none), and how many bytes those of all threads may.
     """
 
     eps = 2.0**-52
 
     def __init__(self, lanes: int, fused: bool, threads: int = 1, device: bool = False) -> None:
         self.lanes, self.fused, self.threads, self.device = lanes, fused, threads, device
-        self.scratch = (0, 1)
+        self.scratch = (0, 1 << 62)  # none, of any memory
         self.own: tuple[Value, Value]  # a kernel's own memory, the counter of lanes first, and how many doubles it has
         self.real, self.truth, self.whole = f"<{lanes} x double>", f"<{lanes} x i1>", f"<{lanes} x i64>"
         self._lines: list[str] = []

@@ -54,13 +54,13 @@ def reason_against() -> str:
         return f"NVIDIA's driver is not there ({error})"
     if missing := [name for name in _CALLED if not hasattr(library, name)]:
         return f"NVIDIA's driver is older than CUDA 12 (it has no {missing[0]})"
-    count = ctypes.c_int()
     try:
         _checked(library.cuInit(0))
-        _checked(library.cuDeviceGetCount(ctypes.byref(count)))
+        if not _devices():
+            return "NVIDIA's driver knows of no GPU"
     except RuntimeError as error:
         return str(error)
-    return "" if count.value else "NVIDIA's driver knows of no GPU"
+    return "" if _capabilities() else "it is made for NVIDIA GPUs of compute capability 7.5 and newer ones"
 
 
 def reason_against_text() -> str:
@@ -82,35 +82,37 @@ def _checked(code: int) -> None:
         raise RuntimeError(f"NVIDIA's driver says: {(text.value or b'error %d' % code).decode()}")
 
 
+def _said(function: str, *what, found=ctypes.c_int) -> int:
+    """The number that the driver puts where the first argument of a function points."""
+    number = found()
+    _checked(getattr(driver(), function)(ctypes.byref(number), *what))
+    return number.value
+
+
 def _devices() -> range:
-    count = ctypes.c_int()
-    _checked(driver().cuDeviceGetCount(ctypes.byref(count)))
-    return range(count.value)  # their handles are their numbers
-
-
-def _least(function: str, found, *what: int) -> int:
-    """The least of what the driver says of a device, of all devices."""
-    each = []
-    for device in _devices():
-        _checked(getattr(driver(), function)(ctypes.byref(found), *what, device))
-        each.append(found.value)
-    return min(each)
+    return range(_said("cuDeviceGetCount"))  # their handles are their numbers
 
 
 def _of_device(attribute: int) -> int:
-    return _least("cuDeviceGetAttribute", ctypes.c_int(), attribute)
+    """The least of all devices."""
+    return min(_said("cuDeviceGetAttribute", attribute, device) for device in _devices())
+
+
+def _capabilities() -> list[int]:
+    """Ten times the compute capabilities for which there is text that all devices take: a GPU takes that of older ones."""
+    major, minor = 75, 76  # attributes of a device
+    own = [10 * _said("cuDeviceGetAttribute", major, device) + _said("cuDeviceGetAttribute", minor, device) for device in _devices()]
+    return [known for known in (75, 80, 86, 89, 90, 100, 120) if known <= min(own)]
 
 
 def memory() -> int:
     """Bytes of the smallest device."""
-    return _least("cuDeviceTotalMem_v2", ctypes.c_size_t())
+    return min(_said("cuDeviceTotalMem_v2", device, found=ctypes.c_size_t) for device in _devices())
 
 
 def architecture() -> str:
     """What text is made for, such as `sm_90`."""
-    capability = 10 * _of_device(75) + _of_device(76)  # major and minor
-    # compute capabilities that text is made for; newer GPUs take that of older ones
-    return f"sm_{max((known for known in (80, 86, 89, 90, 100, 120) if known <= capability), default=75)}"
+    return f"sm_{max(_capabilities())}"
 
 
 def text_for(module: str, architecture: str) -> str:
@@ -142,14 +144,11 @@ def _in_context() -> Iterator[None]:
 def loaded(text: bytes, name: str) -> Loaded:
     """The kernel of this name in PTX."""
     with _in_context():
-        library, kernel, found = ctypes.c_void_p(), ctypes.c_void_p(), []
+        library, kernel = ctypes.c_void_p(), ctypes.c_void_p()
         _checked(driver().cuLibraryLoadData(ctypes.byref(library), ctypes.c_char_p(text + b"\0"), None, None, 0, None, None, 0))
         _checked(driver().cuLibraryGetKernel(ctypes.byref(kernel), library, name.encode()))
-        for attribute in (3, 4):  # bytes of local memory, registers
-            value = ctypes.c_int()
-            _checked(driver().cuKernelGetAttribute(ctypes.byref(value), attribute, kernel, 0))
-            found.append(value.value)
-    return Loaded(kernel.value or 0, *found)
+        # attributes of a kernel: 3 bytes of local memory, 4 registers
+        return Loaded(kernel.value or 0, *(_said("cuKernelGetAttribute", attribute, kernel, 0) for attribute in (3, 4)))
 
 
 def blocks(lanes: int, kernel: Loaded) -> int:

@@ -43,7 +43,7 @@ def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int
     """The module; `asked`: of which of the numbers that the rates are given cotangents are asked; `memory`: bytes that the records of all threads may take."""
     write_functions(w, form, method)
     write_pulled(w, form, asked)
-    prepare(w, form, method)
+    prepare(w, form, method, memory)
     _write_begin(w, form)
     _write_note(w, form)
     _write_added(w, form)

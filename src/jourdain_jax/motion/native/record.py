@@ -1,7 +1,7 @@
 """The record of steps of a motion's way forth, by which its cotangents go back (`back.py`): one slot for each try of a step, for all lanes of a block.
 
-The number of slots is bounded: on a CPU by the memory of the model, which all threads share, and up to which the record grows with the steps; on a GPU by the
-memory of each thread. If a motion takes more steps, its lanes run forward again for each window of slots, the last window first.
+The number of slots is bounded by the memory of the model, which all threads share; on a CPU the record grows up to it with the steps.
+If a motion takes more steps, its lanes run forward again for each window of slots, the last window first.
 """
 
 import math
@@ -99,11 +99,10 @@ def write_record(w: MachineWriter, form: Form, method: Method, asked: int, memor
         w.external("free", "void", places.kept(w.literal(0, "i64")))
 
 
-def prepare(w: MachineWriter, form: Form, method: Method) -> None:
-    """What the record needs in the module."""
+def prepare(w: MachineWriter, form: Form, method: Method, memory: int) -> None:
+    """What the record, of so many bytes of memory, needs in the module."""
     if w.device:
-        # 4096 of a thread of a GPU
-        w.scratch = Slot.of(form, method).all, 4096
+        w.scratch = Slot.of(form, method).all, memory
     else:
         _write_more_room(w)
 
