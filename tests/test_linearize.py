@@ -337,10 +337,7 @@ def test_an_upright_disc_is_stable_above_its_critical_spin():
 
 def test_steady_turns_of_a_disc_meet_their_closed_form():
     found = jj.family(jj.models.TiltingDisc(), {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, held="lean", until={"yaw_rate": 6.0})
-    lean, yaw, spin, R, g = found["lean"], found["yaw_rate"], found["spin_rate"], 0.5, 9.81
-    # moments about the contact point: (5/4) yaw^2 sin cos - (-3/2) yaw spin cos ... of a thin disc
-    left = 1.25 * R * yaw**2 * np.sin(lean) * np.cos(lean) + 1.5 * R * yaw * spin * np.cos(lean) + g * np.sin(lean)
-    assert_allclose(left, 0.0, atol=1e-9)
+    assert_allclose(found["spin_rate"], -rolling_disc.steady_circle(np.pi / 2 + 0.3, found["yaw_rate"], **DISC)["spin_rate"], atol=1e-9)
 
 
 class Bead(jj.Scene):
@@ -401,7 +398,6 @@ def test_a_family_in_arrays_and_in_text(turns):
     assert "the curve is closed" in text
     assert "fold in lean" in text
     assert "castering" in text
-    assert "hands" not in str(turns.folds[0])
 
 
 def test_a_family_is_drawn_against_its_own_values(turns, straight):
@@ -442,20 +438,10 @@ def test_a_motion_that_stands_alone_and_points_that_are_no_branch_points(turns, 
         turns["leam"]
 
 
-AT_5 = {  # of the eigenvalues of weave and capsize, of the weave and of the capsize speed, by Meijaard's formulas in 40 digits
-    "w": (0.5784301836667 + 11.04402541662j, 1.873378311812, -0.4776030485691, -4.393049781489),
-    "c": (12.18560145265 - 4.418538571895j, -9.374190592203, 11.47995745126, 28.88866886342),
-    "lam": (2.459557200396 - 13.16293523872j, -3.350671972655, 4.17667019102, 4.308855800463),
-    "IHxz": (6.303428046764 + 0.2400400242343j, -0.01621194815966, 3.543504519167, 0.0),
-    "rF": (5.201300621719 - 13.39003429778j, -4.130519197482, 5.060813989216, 10.27615086865),
-    "IFyy": (-6.103847637971 + 13.04502488696j, 4.513883751204, -5.797062739492, -11.41978760738),
-}
-
-
 def test_all_derivatives_of_eigenvalues_are_those_of_the_formulas(bicycle):
     small = jj.linearize(bicycle, jj.start(bicycle, **bicycle.upright(5.0)), ("lean", "steer"))
     weave, capsize = small.sensitivities("weave"), small.sensitivities("capsize")
-    for name, (of_weave, of_capsize, *_) in AT_5.items():
+    for name, (of_weave, of_capsize, *_) in whipple_bicycle.AT_5.items():
         assert weave[name] == pytest.approx(of_weave, rel=1e-10)
         assert capsize[name] == pytest.approx(of_capsize, rel=1e-10)
     assert weave.held == ("x_rate",)
@@ -502,7 +488,7 @@ def test_critical_speeds_are_the_published_ones(bicycle, straight, what, speed):
 def test_critical_speeds_have_derivatives_by_all_parameters(bicycle, straight):
     for what, k in (("weave", 2), ("capsize", 3)):
         by_all = jax.jit(jax.grad(lambda scene, what=what: jj.critical(scene, straight, what).speed))(bicycle)
-        for name, derivatives in AT_5.items():
+        for name, derivatives in whipple_bicycle.AT_5.items():
             assert float(getattr(by_all, name)) == pytest.approx(derivatives[k], rel=1e-10, abs=1e-10)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
+from small_scenes import OnLine
 
 import jourdain_jax as jj
 
@@ -28,12 +29,8 @@ class DrivenSleigh(jj.models.ChaplyginSleigh):
 def on_a_line(force):
     """A scene of one particle of 1 kg on a line, with the force as a function of the scene, its place, speed and the time, and `crossing` as an event."""
 
-    class Line(jj.Scene):
+    class Line(OnLine):
         size: float = jj.parameter(1.0)
-        coordinates = jj.coordinates("x")
-
-        def bodies(self, t, q):
-            return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0 * q.x, 0 * q.x]))}
 
         def loads(self, motion):
             return (jj.generalized_force(motion, x_rate=force(self.size, motion.q.x, motion.u.x_rate, motion.t)),)
@@ -161,3 +158,39 @@ def test_a_motion_that_is_none_says_so():
     pushed = on_a_line(lambda size, x, v, t: size * (1 + v**2))
     found = jax.jit(jax.vmap(lambda size: jj.periodic(pushed.replace(size=size), {"x_rate": 0.5}, 0.5, pieces=1).converged))
     assert not np.any(found(jnp.array([1.0, jnp.nan])))
+
+
+class Swaying(OnLine):
+    """A particle about the motion sin(t): y = x - sin(t) has y'' + drag y' + y^2 - push + wobble cos(t) (y - 1/8) = 0."""
+
+    push: float = jj.parameter(1 / 64)
+    drag: float = jj.parameter(0.05)
+    wobble: float = jj.parameter(0.0)
+
+    def loads(self, motion):
+        t = motion.t
+        y, rate = motion.q.x - jnp.sin(t), motion.u.x_rate - jnp.cos(t)
+        force = -self.drag * rate - y**2 + self.push - self.wobble * jnp.cos(t) * (y - 1 / 8) - jnp.sin(t)
+        return (jj.generalized_force(motion, x_rate=force),)
+
+
+@pytest.mark.parametrize(
+    ("changed", "x", "vary", "until", "kind", "value"),
+    [
+        ({}, 1 / 8, "push", {"x": -0.1}, "multiplier 1", 0.0),
+        ({"push": 1.0}, 1.0, "drag", {"drag": -0.05}, "pair on the unit circle", 0.0),
+        ({}, 1 / 8, "wobble", {"wobble": 0.3}, "multiplier -1", 0.050027335537217),
+    ],
+)
+def test_a_family_of_orbits_tells_how_each_of_them_loses_its_stability(changed, x, vary, until, kind, value):
+    """The last one: where (1 + m1)(1 + m2) of y'' + 0.05 y' + (1/4 + wobble cos(t)) y = 0 vanishes, by SciPy's DOP853 at 1e-12 and `brentq`."""
+    scene = Swaying(**changed)
+    found = jj.family(scene, jj.periodic(scene, {"x": x, "x_rate": 1.0}, 2 * np.pi, pieces=2), vary=vary, until=until)
+    (change,) = (point for point in found.changes if point.kind == kind)
+    assert change[vary] == pytest.approx(value, abs=1e-8)
+    assert found.stable[0]
+    assert not found.stable[-1]
+    assert [fold[vary] for fold in found.folds] == pytest.approx([0.0] * (vary == "push"), abs=1e-8)
+    assert "periodic motions of Swaying" in str(found)
+    with pytest.raises(ValueError, match="`critical` takes a family of steady motions"):
+        jj.critical(scene, found, kind)

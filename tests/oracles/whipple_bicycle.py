@@ -101,6 +101,16 @@ def matrices(p: dict, cos=np.cos, sin=np.sin) -> dict[str, list]:
     }
 
 
+AT_5 = {  # of the eigenvalues of weave and capsize, of the weave and of the capsize speed, by Meijaard's formulas in 40 digits
+    "w": (0.5784301836667 + 11.04402541662j, 1.873378311812, -0.4776030485691, -4.393049781489),
+    "c": (12.18560145265 - 4.418538571895j, -9.374190592203, 11.47995745126, 28.88866886342),
+    "lam": (2.459557200396 - 13.16293523872j, -3.350671972655, 4.17667019102, 4.308855800463),
+    "IHxz": (6.303428046764 + 0.2400400242343j, -0.01621194815966, 3.543504519167, 0.0),
+    "rF": (5.201300621719 - 13.39003429778j, -4.130519197482, 5.060813989216, 10.27615086865),
+    "IFyy": (-6.103847637971 + 13.04502488696j, 4.513883751204, -5.797062739492, -11.41978760738),
+}
+
+
 def state_matrix(v: float, m=M, c1=C1, k0=K0, k2=K2, gravity: float = 9.81) -> np.ndarray:
     """A of d/dt (roll, steer, roll rate, steer rate)."""
     lower = np.linalg.solve(m, -np.hstack([gravity * k0 + v**2 * k2, v * c1]))

@@ -135,24 +135,13 @@ class _Problem(eqx.Module):
 
 @partial(compiled, options=RUN_SELDOM)
 def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], most_steps: int) -> SteadyMotion:
-    z = _root(problem, jnp.concatenate([q, u]), free, most_steps)
+    guess, n, still = jnp.concatenate([q, u]), len(q), jax.lax.stop_gradient(problem)
+    size = jnp.where(free, jnp.asarray(sizes(problem.scene, range(n)), guess.dtype), 0.0)
+    eps = float(np.finfo(guess.dtype).eps)
+    round_off = float(np.sqrt(eps))
+    z = smooth_root(lambda z: still(z)[:2], lambda z: problem(z)[0], guess, guess, size, eps, round_off, most_steps)
     left, _, second = problem(z)
-    rows = len(left) - len(problem.privileged) - len(problem.resting)
-    of_rows, first, second = (largest(x) for x in (left[:rows], left[rows : rows + len(problem.privileged)], second))
-    n = len(q)
-    moved_q, moved_u = (largest(a - b) for a, b in ((z[:n], q), (z[n:], u)))
-    residual = jnp.maximum(of_rows, jnp.maximum(first, second))
-    state = state_of(problem.scene, problem.t, z[:n], z[n:], moved_q, moved_u, of_rows)
-    return SteadyMotion(state, first, residual, residual < _round_off_root(z.dtype))
-
-
-def _root(problem: _Problem, z: Float[Array, "unknowns"], free: Bool[Array, "unknowns"], most_steps: int) -> Float[Array, "unknowns"]:
-    """The root near z."""
-    still, guess, movable = jax.lax.stop_gradient((problem, z, free))
-    size = jnp.where(movable, jnp.asarray(sizes(problem.scene, range(len(places_of(problem.scene).q))), z.dtype), 0.0)
-    eps, cutoff = float(np.finfo(z.dtype).eps), _round_off_root(z.dtype)
-    return smooth_root(lambda z: still(z)[:2], lambda z: problem(z)[0], guess, z, size, eps, cutoff, most_steps)
-
-
-def _round_off_root(dtype) -> float:
-    return float(np.sqrt(np.finfo(dtype).eps))
+    of_rows, first, _ = (largest(x) for x in jnp.split(left, np.cumsum([len(left) - len(problem.privileged) - len(problem.resting), len(problem.privileged)])))
+    residual = jnp.maximum(of_rows, jnp.maximum(first, largest(second)))
+    state = state_of(problem.scene, problem.t, z[:n], z[n:], largest(z[:n] - q), largest(z[n:] - u), of_rows)
+    return SteadyMotion(state, first, residual, residual < round_off)

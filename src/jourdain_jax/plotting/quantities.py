@@ -121,7 +121,7 @@ def _plot_family(family: Family, names: tuple[str, ...], units, title: str | Non
         axis.set_ylabel(label[name])
     axes[-1].set_xlabel(label[names[0]])
     axes[0].legend(fontsize="x-small", loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False)
-    axes[0].set_title(title or f"steady motions of {type(scene).__name__}", pad=30)
+    axes[0].set_title(title or f"{family.equations.what} of {type(scene).__name__}", pad=30)
     return axes[0].figure, axes
 
 

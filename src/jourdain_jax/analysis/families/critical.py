@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from jourdain_jax.analysis.families.equations import Look, SteadyEquations
+from jourdain_jax.analysis.families.equations import DOUBLE, PAIR, ZERO, Look, SteadyEquations
 from jourdain_jax.analysis.families.family import Family, FamilyPoint
 from jourdain_jax.analysis.families.special import SURE
 from jourdain_jax.analysis.families.spectrum import null_space
@@ -43,7 +43,6 @@ MEANINGS = (
     "not found: there is none that the one of the family goes over into as parameters change to these",
     "no smooth function of the parameters here: eigenvalues meet, or several special points do",
 )
-PAIR, ZERO, DOUBLE = "pair on the imaginary axis", "zero eigenvalue", "double root"
 SHAPES = {PAIR: ((0, 1, -1, 0), (0, 0, 0, 0)), ZERO: ((0, 0, 0, 0),) * 2, DOUBLE: ((1, 0, 0, 1), (0, 1, 0, 0))}  # S = w (first) + (second), by rows
 
 
@@ -77,7 +76,7 @@ def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held
     if not largest(look.R) < 1e-6:
         raise ValueError(f"this motion of `{type(scene).__name__}` is not steady, and its eigenvalues have no derivatives; `jj.steady` finds one that is")
     fixed = _held(equations, look, as_names(held))
-    (values, right), (same, left) = np.linalg.eig(look.F), np.linalg.eig(look.F.T)
+    (values, right), (same, left) = np.linalg.eig(F := look.small[0]), np.linalg.eig(F.T)
     apart = np.abs(values - s)
     x, y = right[:, np.argmin(apart)], left[:, np.argmin(np.abs(same - s))]
     condition = float(np.abs(y @ x))
@@ -108,9 +107,9 @@ def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held
 def _held(equations: SteadyEquations, look: Look, named: tuple[str, ...]) -> list[int]:
     """Unknowns that tell a steady motion apart from those beside it: those named, otherwise speeds in their order, then coordinates."""
     beside = null_space(look.J)
-    count, first = beside.shape[1], len(equations.unknowns) - len(equations.scene.speed_names.entries)
+    count, speeds = beside.shape[1], equations.scene.speed_names.entries
     chosen: list[int] = []
-    for k in map(equations.index, named or (*equations.unknowns[first:], *equations.unknowns[:first])):
+    for k in map(equations.index, named or sorted(equations.unknowns, key=lambda name: name not in speeds)):
         if len(chosen) < count and np.linalg.matrix_rank(beside[[*chosen, k]], tol=1e-6) > len(chosen):
             chosen.append(k)
     if not len(chosen) == count >= len(named):
@@ -189,7 +188,6 @@ class _Special(eqx.Module):
     equations: SteadyEquations = eqx.field(static=True)
     program: _Program = eqx.field(static=True)
     kind: str = eqx.field(static=True)
-    goes_on: bool = eqx.field(static=True)  # whether steady motions do at the same parameters
     X: Unknowns
 
     def parts(self, X: Unknowns) -> list[Array]:
@@ -208,33 +206,37 @@ class _Special(eqx.Module):
         size = jnp.sqrt(a @ a + b @ b) if self.kind == PAIR else jnp.linalg.norm(a)
         return jnp.concatenate([z, a / size, b if self.kind == ZERO else b / size, w])
 
-    def equations_at(self, scene: Scene, X: Unknowns, near: Unknowns, sloped: bool) -> tuple[Array, Array | None]:
-        """G, with size and phase of a and b by a normal point near by, and G_X if asked for."""
+    def given(self, scene: Scene, X: Unknowns) -> Float[Array, "all_numbers"]:
+        """What the program takes: all numbers, a, b, and S(w) by rows."""
         _, a, b, w = self.parts(X)
+        of_w, fixed = np.array(SHAPES[self.kind])
+        return jnp.concatenate([self.numbers(scene, X), a, b, of_w * w + fixed])
+
+    def linear(self, near: Unknowns) -> tuple[Array, Array]:
+        """Rows L with L X = c: what keeps its value, size and phase of a and b by a normal point near by, and w where it is zero."""
         z, a0, b0, _ = self.parts(near)
-        n, m, (of_w, fixed) = len(z), len(a), np.array(SHAPES[self.kind])
-        no, one = jnp.zeros((m, m)), jnp.eye(m)
-        rows = {PAIR: [(a0, b0, 1.0), (-b0, a0, 0.0)], DOUBLE: [(a0, no[0], 1.0), (no[0], a0, 0.0)], ZERO: [(a0, no[0], 1.0)]}[self.kind]
-        if self.kind == ZERO:
-            rows += [(b0, no[0], 0.0), (no[0], a0, 0.0), (no[0], b0, b0 @ b0)] if self.goes_on else list(zip(no, one, jnp.zeros(m), strict=True))
-        L = [jnp.eye(n, len(X))[self.equations.held], *(jnp.concatenate([jnp.zeros(n), of_a, of_b, jnp.zeros(1)])[None] for of_a, of_b, _ in rows)]
-        c = [self.X[self.equations.held], *(jnp.asarray(c)[None] for *_, c in rows)]
-        if self.kind == ZERO:
-            L, c = [*L, jnp.eye(len(X))[-1:]], [*c, jnp.zeros(1)]
-        L, c = jnp.concatenate(L), jnp.concatenate(c)
-        given = jnp.concatenate([self.numbers(scene, X), a, b, of_w * w + fixed])
-        if not sloped:
-            return jnp.concatenate([self.program.values(given), L @ X - c]), None
-        G, D, _ = self.program.of(given)
-        size = np.concatenate([self.equations.size, np.ones(2 * m)])
-        return jnp.concatenate([G, L @ X - c]), jnp.concatenate([jnp.column_stack([D[:, :-4] * size, D[:, -4:] @ of_w]), L])
+        no, held = 0 * a0, self.equations.held
+        of_ab = {  # of a zero eigenvalue, b is zero unless steady motions go on at the same parameters
+            PAIR: [(a0, b0, 1.0), (-b0, a0, 0.0)],
+            DOUBLE: [(a0, no, 1.0), (no, a0, 0.0)],
+            ZERO: [(a0, no, 1.0), (b0, no, 0.0), (no, a0, 0.0), (no, b0, b0 @ b0)],
+        }[self.kind]
+        of_z, of_w = jnp.eye(len(z), len(near))[held], jnp.eye(len(near))[-1:] * (self.kind == ZERO)
+        L = jnp.concatenate([of_z, jnp.pad(jnp.stack([jnp.concatenate(row[:2]) for row in of_ab]), ((0, 0), (len(z), 1))), of_w])
+        return L, jnp.concatenate([self.X[held], jnp.stack([c for *_, c in of_ab]), jnp.zeros(1)])
+
+    def equations_at(self, scene: Scene, X: Unknowns, near: Unknowns) -> Array:
+        """G."""
+        L, c = self.linear(near)
+        return jnp.concatenate([self.program.values(self.given(scene, X)), L @ X - c])
 
     def correction(self, scene: Scene, X: Unknowns, near: Unknowns) -> tuple[Array, Array, Array]:
         """The step of Gauss and Newton, the pseudo-inverse of G_X, and its least pivot over the largest."""
-        G, slopes = self.equations_at(scene, X, near, sloped=True)
-        Q, T = jnp.linalg.qr(slopes)
+        (L, c), (G, D, _), of_w = self.linear(near), self.program.of(self.given(scene, X)), np.array(SHAPES[self.kind][0])
+        size = np.concatenate([self.equations.size, np.ones(2 * len(self.equations.states))])
+        Q, T = jnp.linalg.qr(jnp.concatenate([jnp.column_stack([D[:, :-4] * size, D[:, -4:] @ of_w]), L]))
         inverse, pivots = jax.scipy.linalg.solve_triangular(T, Q.T), jnp.abs(jnp.diagonal(T))
-        return inverse @ G, inverse, jnp.min(pivots) / jnp.max(pivots)
+        return inverse @ jnp.concatenate([G, L @ X - c]), inverse, jnp.min(pivots) / jnp.max(pivots)
 
 
 @partial(compiled, options=RUN_SELDOM)
@@ -243,7 +245,7 @@ def _solution(special: _Special, scene: Scene) -> tuple[Array, Array, Array, Arr
     X, inverse, condition, code = jax.lax.stop_gradient(_found(special, jax.lax.stop_gradient(scene)))
     near = X
     for _ in range(2):  # each carries one order of derivatives
-        X = X - inverse @ special.equations_at(scene, X, near, sloped=False)[0]
+        X = X - inverse @ special.equations_at(scene, X, near)
     X = X * jnp.where(code == FOUND, 1.0, jnp.nan)
     return special.numbers(scene, X), special.parts(X)[-1][0], condition, code
 
@@ -270,7 +272,7 @@ def _found(special: _Special, scene: Scene) -> tuple[Array, Array, Array, Array]
     start = special.normal(special.X), jnp.zeros(()), jnp.ones(()), jnp.zeros((), jnp.int32)
     X, done, *_ = jax.lax.while_loop(lambda c: (c[1] < 1) & (c[2] > 1e-3) & (c[3] < 100), once, start)
     change, inverse, condition = special.correction(scene, X, X)
-    left = largest(special.equations_at(scene, X - change, X, sloped=False)[0])
+    left = largest(special.equations_at(scene, X - change, X))
     return X - change, inverse, condition, jnp.where((done == 1) & (left < 1e-8), jnp.where(condition < 1e-6, SINGULAR, FOUND), NOT_FOUND)
 
 
@@ -292,11 +294,13 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
     **Raises** ValueError: no such point on the family, or one that is a fold or a branch point only; a scene of another class.
     """
     scene, equations = as_scene(scene), motions.equations
+    if not isinstance(equations, SteadyEquations):
+        raise ValueError("`critical` takes a family of steady motions, and this is one of periodic motions")
     if type(scene) is not type(equations.scene):
         raise ValueError(f"the family is one of `{type(equations.scene).__name__}`, and the scene a `{type(scene).__name__}`")
     with jax.ensure_compile_time_eval():
         point = _chosen(motions, what)
-        special = _special(motions, point)
+        special = _special(equations, point)
     numbers, w, condition, code = _solution(special, scene)
     q, u, varied = equations.split(numbers)
     eigenvalue = jax.lax.complex(*((0 * w, w) if point.kind == PAIR else (w, 0 * w)))
@@ -305,28 +309,27 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
 
 def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:
     """The point of a family that is meant."""
-    known = {point: {point.kind, *(point.modes if point.kind != DOUBLE else ())} for point in curve.changes if point.kind in (PAIR, ZERO, DOUBLE)}
+    known = {point: [point.kind, *(point.modes if point.kind != DOUBLE else ())] for point in curve.changes if point.kind in SHAPES}
     found = [point for point, names in known.items() if what is point or what in names]
     if not found:
-        names = ", ".join(sorted(set().union(*known.values())))
+        names = ", ".join(sorted({name for names in known.values() for name in names}))
         raise ValueError(f"the family of `{type(curve.equations.scene).__name__}` has no such special point; it has: {names or 'none'}")
     start = curve.equations.start
     return min(found, key=lambda point: largest(curve.equations.place(point) - start))
 
 
-def _special(curve: Family, point: FamilyPoint) -> _Special:
+def _special(equations: SteadyEquations, point: FamilyPoint) -> _Special:
     """The equations, with vectors a and b at the point of the family."""
-    equations = curve.equations
     z, s = equations.place(point), point.eigenvalues
     look = equations(z)
-    E = null_space(look.C)
-    A, w, b = E.T @ look.F @ E, 0.0, np.zeros(len(E))
+    F, C = look.small
+    E = null_space(C)
+    A, w, b = E.T @ F @ E, 0.0, np.zeros(len(E))
     freedoms = equations.freedoms(look)
     if point.kind == ZERO:
         if freedoms.shape[1] > 1:
             raise ValueError(f"steady motions go on in {freedoms.shape[1]} ways at the same parameters: there a zero eigenvalue is no special point")
-        if freedoms.shape[1]:
-            b = freedoms[:, 0] / np.linalg.norm(freedoms)
+        b = np.sum(freedoms, axis=1) / max(np.linalg.norm(freedoms), 1e-300)
         a = E @ np.linalg.svd(np.vstack([A, b @ E]))[2][-1]
     elif point.kind == PAIR:
         w = min((x for x in s if x.imag > 0), key=lambda x: abs(x.real)).imag
@@ -338,4 +341,4 @@ def _special(curve: Family, point: FamilyPoint) -> _Special:
         a = np.linalg.svd(moved)[2][-1]
         a, b = E @ a, E @ np.linalg.lstsq(np.vstack([moved, a]), np.append(a, 0.0), rcond=None)[0]
     X = jnp.asarray(np.concatenate([z, a, b, [w]]))
-    return _Special(equations, _program(equations), point.kind, freedoms.shape[1] > 0, X)
+    return _Special(equations, _program(equations), point.kind, X)

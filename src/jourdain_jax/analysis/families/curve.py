@@ -6,11 +6,12 @@ There are more rows than they hold independently, so every linear system is solv
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 
-from jourdain_jax.analysis.families.equations import Look, SteadyEquations, Vector
+from jourdain_jax.analysis.families.equations import Look, Motions, Vector
 from jourdain_jax.analysis.families.spectrum import Modes, matched, surely_matched
 from jourdain_jax.calculus.reals import largest
 
@@ -26,41 +27,39 @@ class Point:
     z: Vector
     tangent: Vector
     look: Look
+    modes: Modes  # eigenvalues of small motions, in the columns of the points before
     hardness: int = 0  # corrections that led here
-    modes: Modes = field(default_factory=lambda: np.zeros(0, complex))  # eigenvalues of small motions, in the columns of the points before
 
 
-def solved(equations: SteadyEquations, z: Vector, rows: Vector, target: float) -> tuple[Vector, Look, int] | None:
-    """z with R = 0 and `rows . z = target`, the equations there and the number of corrections; None where Newton's method does not converge."""
-    for k in range(8):
+def solved(
+    equations: Motions, z: Vector, rows: Float[np.ndarray, "fixed unknowns"], targets: Float[np.ndarray, "fixed"], most: int = 8, longest: float = np.inf
+) -> tuple[Vector, Look, int] | None:
+    """z with R = 0 and `rows z = targets`, the equations there and the number of corrections; None where Newton's method does not converge."""
+    for k in range(most):
         look = equations(z)
         if not (np.all(np.isfinite(look.R)) and np.all(np.isfinite(look.J))):
             return None
-        step = np.linalg.lstsq(np.vstack([look.J, rows]), -np.append(look.R, rows @ z - target), rcond=1e-9)[0]
+        step = np.linalg.lstsq(np.vstack([look.J, rows]), -np.append(look.R, rows @ z - targets), rcond=1e-9)[0]
         noise = 8 * np.finfo(float).eps * np.max(np.abs(look.J) @ np.abs(z))  # of R: at a branch point steps are this over a small number
-        z = z + step
+        z = z + step * min(1.0, longest / max(largest(step), 1e-300))
         if largest(step) < 1e-11 * (1 + largest(z)) or largest(look.R) < noise:
             return z, look, k
     return None
 
 
-def tangent_at(look: Look, before: Vector) -> Vector:
-    """The unit null vector of J that goes on from the one before."""
-    V = np.linalg.svd(look.J)[2]
-    return V[-1] * (1.0 if V[-1] @ before >= 0 else -1.0)
-
-
-def along(equations: SteadyEquations, point: Point, s: float, guess: Vector | None = None) -> Point | None:
+def along(equations: Motions, point: Point, s: float, guess: Vector | None = None) -> Point | None:
     """The point of the curve at a distance along the tangent of another one; None where none is found."""
     t = point.tangent
-    found = solved(equations, point.z + s * t if guess is None else guess, t, t @ point.z + s)
+    found = solved(equations, point.z + s * t if guess is None else guess, t[None], t[None] @ point.z + s)
     if found is None:
         return None
     z, look, hardness = found
-    return Point(z, tangent_at(look, t), look, hardness)
+    across = np.linalg.svd(look.J)[2][-1]
+    tangent = across * (1.0 if across @ t >= 0 else -1.0)
+    return Point(z, tangent, look, matched(point.modes, equations.eigenvalues(look, tangent)), hardness)
 
 
-def traced(equations: SteadyEquations, start: Point, targets: Targets, most: int) -> tuple[list[Point], str]:
+def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tuple[list[Point], str]:
     """Points of a curve from its start on, and why it ends: at a target, at its own start, or where no further point is found.
 
     A step is halved where it turns sharply, takes many corrections, or moves eigenvalues so far that it is open which is which.
@@ -79,7 +78,7 @@ def traced(equations: SteadyEquations, start: Point, targets: Targets, most: int
             past = lambda point, k=k, target=target: point.z[k] - target  # noqa: E731
             if past(here) * past(there) <= 0:
                 if past(here) * past(there) < 0 and (end := located(equations, here, there, past)):
-                    points[-1] = replace(end, modes=matched(there.modes, equations.eigenvalues(end.look, end.tangent)))
+                    points[-1] = end
                 return points, f"{equations.unknowns[k]} is {target * equations.size[k]:g}"
         if _closed(equations, start, here, there):
             points.append(replace(start, modes=matched(there.modes, start.modes)))
@@ -92,17 +91,16 @@ def traced(equations: SteadyEquations, start: Point, targets: Targets, most: int
     return points, f"{most} points"
 
 
-def _next(equations: SteadyEquations, here: Point, step: float, hardest: int) -> Point | None:
+def _next(equations: Motions, here: Point, step: float, hardest: int) -> Point | None:
     """The point at the end of a step; None where the step must be halved."""
     there = along(equations, here, step)
     if there is None or there.hardness > hardest or here.tangent @ there.tangent < np.cos(np.deg2rad(10.0)):
         return None
-    there = replace(there, modes=matched(here.modes, equations.eigenvalues(there.look, there.tangent)))
     sure = step < LONGEST / 1000 or surely_matched(here.modes, there.modes)  # those that meet are taken as they come
     return there if sure else None
 
 
-def _closed(equations: SteadyEquations, first: Point, here: Point, there: Point) -> bool:
+def _closed(equations: Motions, first: Point, here: Point, there: Point) -> bool:
     """Whether a step comes past the start of the curve."""
     s, step = here.tangent @ (first.z - here.z), np.linalg.norm(there.z - here.z)
     if not (0 < s <= step and np.linalg.norm(first.z - here.z - s * here.tangent) < 0.1 * step):
@@ -116,7 +114,7 @@ def reversed_at(point: Point) -> Point:
     return replace(point, tangent=-point.tangent)
 
 
-def located(equations: SteadyEquations, here: Point, there: Point, test: Callable[[Point], float]) -> Point | None:
+def located(equations: Motions, here: Point, there: Point, test: Callable[[Point], float]) -> Point | None:
     """The point between two neighbours at which a smooth `test` changes its sign; None where the curve is lost.
 
     By unequal halves down to a short piece, and on this along the chord: at a branch point itself the equations lose their rank, and for reasons of symmetry
@@ -137,4 +135,5 @@ def located(equations: SteadyEquations, here: Point, there: Point, test: Callabl
             high, b, at_b = middle, c, value
     part = at_a / (at_a - at_b)
     z, tangent = (getattr(low, name) + part * (getattr(high, name) - getattr(low, name)) for name in ("z", "tangent"))
-    return Point(z, tangent / np.linalg.norm(tangent), equations(z))
+    look, tangent = equations(z), tangent / np.linalg.norm(tangent)
+    return Point(z, tangent, look, matched(low.modes, equations.eigenvalues(look, tangent)))

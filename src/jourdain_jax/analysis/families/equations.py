@@ -8,22 +8,25 @@ Unknowns are measured in units of their size, rows in SI units. Small motions ab
     x = (dq, dy) = E s,   ds/dt = A s,   A = E' F E        E: orthonormal, spans the x that the rows allow, C x = 0;   F = d(dq/dt, dy/dt)/d(q, y)
 """
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jourdain_jax.analysis.families.spectrum import Modes, in_pairs, null_space
 from jourdain_jax.analysis.instant import by_program, numbers_of, on_rows, places_of
 from jourdain_jax.build.assembling import coordinate_bounds
+from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.lowering.lower import lower
 from jourdain_jax.scene.names import check_name, nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
 Vector = Float[np.ndarray, "unknowns"]
+PAIR, ZERO, DOUBLE = "pair on the imaginary axis", "zero eigenvalue", "double root"
 
 
 @dataclass(frozen=True)
@@ -32,12 +35,65 @@ class Look:
 
     R: Float[np.ndarray, "rows"]  # those of what keeps its value are the last
     J: Float[np.ndarray, "rows unknowns"]
-    F: Float[np.ndarray, "states states"]  # of (q, y), SI units
-    C: Float[np.ndarray, "rows_of_states states"]  # rows that (dq, dy) meet
+    small: tuple[np.ndarray, ...]  # what small motions follow from: F of (q, y), SI units, and C, rows that (dq, dy) meet; or multipliers
 
 
-class SteadyEquations:
+class Motions(ABC):
+    """Equations of a kind of motions, whose solutions make up families."""
+
+    what: str  # motions
+    modes: str  # what tells small motions apart, and its unit
+    growth: Callable[[np.ndarray], np.ndarray]  # how fast modes grow
+    crossing: Callable[[complex], str]  # what it is that a mode begins or ceases to grow
+    t: Scalar  # s, at the start
+    scene: Scene
+    vary: tuple[str, ...]  # parameters among the unknowns
+    given: np.ndarray  # all numbers, those of the unknowns at the guess
+    by_name: dict[str, int]  # where coordinates, speeds and what varies are among them
+    places: Int[np.ndarray, "unknowns"]  # where the unknowns are
+    unknowns: tuple[str, ...]
+    size: Vector
+    start: Vector  # the guess
+    held: Int[np.ndarray, "held"]  # numbers of unknowns that keep their values at the start
+
+    def index(self, name: str) -> int:
+        """Number of an unknown; a ValueError with the nearest names where there is none."""
+        check_name(name, self.unknowns, f"`{name}` is no unknown of the {self.what} of `{type(self.scene).__name__}`")
+        return self.unknowns.index(name)
+
+    def at(self, z: Vector) -> np.ndarray:
+        """All numbers, those of the unknowns by z."""
+        given = self.given.copy()
+        given[self.places] = z * self.size
+        return given
+
+    def values(self, z: Vector) -> dict[str, float]:
+        """Coordinates, speeds and what varies, by name."""
+        numbers = self.at(z)
+        return {name: float(numbers[k]) for name, k in self.by_name.items()}
+
+    def place(self, point) -> Vector:
+        """z of what has the values of the unknowns by name."""
+        return np.array([point[name] for name in self.unknowns]) / self.size
+
+    @abstractmethod
+    def __call__(self, z: Vector) -> Look:
+        """The equations at z."""
+
+    @abstractmethod
+    def eigenvalues(self, look: Look, tangent: Vector) -> Modes:
+        """What tells small motions apart, in any order, without what belongs to going on along the family."""
+
+    def with_held(self, R: np.ndarray, J: np.ndarray, z: Vector, small: tuple) -> Look:
+        """The equations, with a row for each unknown that keeps its value."""
+        return Look(np.append(R, (z - self.start)[self.held]), np.vstack([J * self.size, np.eye(len(z))[self.held]]), small)
+
+
+class SteadyEquations(Motions):
     """R, J, F and the rows of (q, y) of one scene as functions of z; unknowns that are `held` keep their values at the guess."""
+
+    what, modes = "steady motions", "eigenvalues, 1/s"
+    growth, crossing = staticmethod(np.real), staticmethod(lambda mode: PAIR if mode.imag else ZERO)
 
     def __init__(
         self, scene: Scene, guess: tuple[float, np.ndarray, np.ndarray], inputs: np.ndarray, vary: tuple[str, ...] = (), held: tuple[str, ...] = ()
@@ -55,7 +111,6 @@ class SteadyEquations:
         self.size = np.append(sizes(scene, kept.tolist()), [abs(x) or 1.0 for x in self.given[varied]])
         self.start = self.given[self.places] / self.size
         self.held = np.array([self.index(name) for name in held], int)
-        self.rows_of_held = np.eye(len(self.start))[self.held]
         self.by_name = dict(zip((*names, *vary), [*(self.instant.states[0] + np.arange(len(names))), *varied], strict=True))
         self.states_of_z = [*range(len(kept)), *(len(kept) + k for k in y)]
         self.rows = np.concatenate([at.g, at.phi, at.udot[y], at.qdot[matters]])
@@ -64,22 +119,11 @@ class SteadyEquations:
         columns = np.append(columns, np.arange(-len(vary), 0))
         self.slopes = np.ix_(self.rows, columns), np.ix_(self.rates, self.states), np.ix_(self.of_states, self.states)
 
-    def index(self, name: str) -> int:
-        """Number of an unknown; a ValueError with the nearest names where there is none."""
-        check_name(name, self.unknowns, f"`{name}` is no unknown of the steady motions of `{type(self.scene).__name__}`")
-        return self.unknowns.index(name)
-
     def __call__(self, z: Vector) -> Look:
         """The equations at z."""
         v, D, _ = self.instant.of(self.at(z))
         J, F, C = (D[block] for block in self.slopes)
-        return Look(np.append(v[self.rows], (z - self.start)[self.held]), np.vstack([J * self.size, self.rows_of_held]), F, C)
-
-    def at(self, z: Vector) -> np.ndarray:
-        """All numbers, those of the unknowns by z."""
-        given = self.given.copy()
-        given[self.places] = z * self.size
-        return given
+        return self.with_held(v[self.rows], J, z, (F, C))
 
     def freedoms(self, look: Look) -> Float[np.ndarray, "states free"]:
         """Directions of (q, y), in columns, along which steady motions go on at the same parameters, in SI units."""
@@ -96,18 +140,10 @@ class SteadyEquations:
         and across T the others are those of P' A P.
         """
         freedoms = self.freedoms(look) if len(self.held) or self.vary else self._in_states(tangent[:, None])
-        E = null_space(look.C)
+        F, C = look.small
+        E = null_space(C)
         P = null_space(np.linalg.qr(E.T @ freedoms)[0].T)
-        return in_pairs(np.linalg.eigvals(P.T @ E.T @ look.F @ E @ P).astype(complex))
-
-    def values(self, z: Vector) -> dict[str, float]:
-        """Coordinates, speeds and what varies, by name."""
-        numbers = self.at(z)
-        return {name: float(numbers[k]) for name, k in self.by_name.items()}
-
-    def place(self, point) -> Vector:
-        """z of what has the values of the unknowns by name."""
-        return np.array([point[name] for name in self.unknowns]) / self.size
+        return in_pairs(np.linalg.eigvals(P.T @ E.T @ F @ E @ P).astype(complex))
 
     def split(self, numbers):
         """q, u and what varies, by name."""

@@ -1,4 +1,4 @@
-"""Families of steady motions: the whole curve through one of them, with what is special on it."""
+"""Families of steady and of periodic motions: the whole curve through one of them, with what is special on it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from jourdain_jax.analysis.families.curve import CLOSED, Point, located
-from jourdain_jax.analysis.families.equations import SteadyEquations, Vector
+from jourdain_jax.analysis.families.equations import Motions, SteadyEquations, Vector
 from jourdain_jax.analysis.families.followed import across, first_point, followed, special
+from jourdain_jax.analysis.families.periodic import OrbitEquations, PeriodicMotion
 from jourdain_jax.analysis.families.special import SURE
-from jourdain_jax.analysis.families.spectrum import Modes, matched, mode_names
+from jourdain_jax.analysis.families.spectrum import Modes, mode_names
 from jourdain_jax.analysis.steady import guessed
 from jourdain_jax.analysis.table import complex_numbers, table
 from jourdain_jax.calculus.on_first_use import needed
@@ -32,10 +33,11 @@ class FamilyPoint(Printed):
 
     kind: str
     state: State
-    eigenvalues: Modes  # 1/s, in the columns of the family
+    eigenvalues: Modes  # 1/s, in the columns of the family; of a periodic motion multipliers
     modes: tuple[str, ...]  # names of the modes concerned
     values: dict[str, float]  # of coordinates, speeds, and the parameter that varies
     tangent: Vector  # of the curve, along its unknowns
+    about: str  # what the eigenvalues are
 
     def __getitem__(self, name: str) -> float:
         """A coordinate, a speed, or the parameter that varies."""
@@ -48,18 +50,18 @@ class FamilyPoint(Printed):
 
     def _text(self) -> str:
         concerned = f" ({', '.join(dict.fromkeys(self.modes))})" if self.modes else ""
-        eigenvalues = f"eigenvalues, 1/s: {', '.join(complex_numbers(self.eigenvalues))}"
-        return f"{self.kind or 'point of a family'}{concerned}\n{self.state}\n{eigenvalues}"
+        return f"{self.kind or 'point of a family'}{concerned}\n{self.state}\n{self.about}: {', '.join(complex_numbers(self.eigenvalues))}"
 
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Family(Printed):
-    """Steady motions along a curve, in its order; `family["lean"]`, `print(family)`.
+    """Steady or periodic motions along a curve, in its order; `family["lean"]`, `print(family)`. Of a periodic one, values are those where a period begins.
 
-    Eigenvalues keep their columns along the curve; the zeros that belong to going on along the family, or to what is held, are left out.
+    Eigenvalues keep their columns along the curve; the zeros that belong to going on along the family, or to what is held, are left out. Of periodic
+    motions they are multipliers, all of them.
     """
 
-    equations: SteadyEquations
+    equations: Motions
     points: tuple[Point, ...]
     ends: tuple[str, str]  # why the curve ends at its first and at its last point
     mode_names: tuple[str, ...]
@@ -70,19 +72,18 @@ class Family(Printed):
 
     def __getitem__(self, name: str) -> Float[np.ndarray, "points"]:
         """Values of a coordinate, a speed, or the parameter that varies, at all points."""
-        what = f"a family of `{type(self.equations.scene).__name__}` has no `{name}`"
-        check_name(name, self.equations.by_name, what, UnknownNameError)
+        check_name(name, self.equations.by_name, f"a family of `{type(self.equations.scene).__name__}` has no `{name}`", UnknownNameError)
         return np.array([self.equations.values(point.z)[name] for point in self.points])
 
     @property
     def eigenvalues(self) -> Complex[np.ndarray, "points modes"]:
-        """Eigenvalues of small motions in 1/s, each in its column, named by `mode_names`."""
+        """Eigenvalues of small motions in 1/s, or multipliers, each in its column, named by `mode_names`."""
         return np.array([point.modes for point in self.points])
 
     @property
     def stable(self) -> Bool[np.ndarray, "points"]:
         """Whether no small motion about a point grows."""
-        return np.all(self.eigenvalues.real <= SURE * (1 + np.abs(self.eigenvalues)), axis=1)
+        return np.all(self.equations.growth(self.eigenvalues) <= SURE * (1 + np.abs(self.eigenvalues)), axis=1)
 
     @property
     def folds(self) -> tuple[FamilyPoint, ...]:
@@ -96,7 +97,7 @@ class Family(Printed):
 
     @property
     def changes(self) -> tuple[FamilyPoint, ...]:
-        """Points at which an eigenvalue passes zero, a pair the imaginary axis, or two eigenvalues meet."""
+        """Points at which an eigenvalue passes zero, a pair the imaginary axis, or two meet; or a multiplier 1 or -1, a pair the unit circle."""
         return tuple(point for point in self.special if point.modes)
 
     def at(self, **named: float) -> tuple[FamilyPoint, ...]:
@@ -105,37 +106,32 @@ class Family(Printed):
             raise ValueError(f"`at` takes one name with its value, and {len(named)} were given: a curve has points for one value")
         ((name, value),) = named.items()
         k = self.equations.index(name)
-        past, found = lambda p: p.z[k] - float(value) / self.equations.size[k], []
-        for here, there in pairwise(self.points):
-            if past(here) == 0.0:
-                found.append(self.point(here))
-            elif past(here) * past(there) < 0 and (point := located(self.equations, here, there, past)):
-                found.append(self.point(point))
-        if past(self.points[-1]) == 0.0 and self.ends[1] != CLOSED:
-            found.append(self.point(self.points[-1]))
-        return tuple(found)
+        past = lambda p: p.z[k] - float(value) / self.equations.size[k]  # noqa: E731
+        found = [located(self.equations, here, there, past) for here, there in pairwise(self.points) if past(here) * past(there) < 0]
+        exact = [point for point in self.points[: -1 if self.ends[1] == CLOSED else None] if past(point) == 0.0]
+        return tuple(self.point(point) for point in (*exact, *found) if point)
 
     def point(self, point: Point, kind: str = "", columns: tuple[int, ...] = ()) -> FamilyPoint:
         """A point of the curve with its state and eigenvalues."""
-        known, near = self.equations, min(self.points, key=lambda p: largest(p.z - point.z))
-        q, u, _ = known.split(known.at(point.z))
-        state = state_of(known.scene, known.t, jnp.asarray(q), jnp.asarray(u), residual=largest(point.look.R))
-        modes = point.modes if len(point.modes) else matched(near.modes, known.eigenvalues(point.look, point.tangent))
-        return FamilyPoint(kind, state, modes, tuple(self.mode_names[k] for k in columns), known.values(point.z), point.tangent * known.size)
+        known = self.equations
+        values, entries = known.values(point.z), (known.scene.coordinate_names.entries, known.scene.speed_names.entries)
+        q, u = (jnp.array([values[name] for name in names]) for names in entries)
+        state = state_of(known.scene, known.t, q, u, residual=largest(point.look.R))
+        return FamilyPoint(kind, state, point.modes, tuple(self.mode_names[k] for k in columns), values, point.tangent * known.size, known.modes)
 
     def to_xarray(self):
         """Points as an `xarray.Dataset`: every unknown, `stable`, and the eigenvalues with their names."""
         xarray = needed("xarray", "a family as labelled arrays")
         values = {name: ("point", self[name]) for name in self.equations.unknowns}
-        about = {"long_name": "eigenvalue", "units": "1/s"}
+        about = dict(zip(("long_name", "units"), self.equations.modes.split(", "), strict=False))
         spectrum = {"eigenvalues": (("point", "mode"), self.eigenvalues, about), "stable": ("point", self.stable)}
         return xarray.Dataset(values | spectrum, {"mode": list(self.mode_names)}, {"scene": type(self.equations.scene).__name__})
 
     def _text(self) -> str:
         known, ends = self.equations, self.ends
         moved = {name: float(np.ptp(self[name])) / size for name, size in zip(known.unknowns, known.size, strict=True)}
-        shown = [name for name in known.unknowns if moved[name] > SHOWN][:8]
-        lines = [f"Family of steady motions of {type(known.scene).__name__}: {len(self)} points, {int(self.stable.sum())} of them stable"]
+        shown = [name for name in dict.fromkeys((*known.vary, *known.unknowns)) if moved[name] > SHOWN and " in piece " not in name][:8]
+        lines = [f"Family of {known.what} of {type(known.scene).__name__}: {len(self)} points, {int(self.stable.sum())} of them stable"]
         lines += ["  " + ends[0]] if ends[0] == ends[1] else [f"  begins: {ends[0]}", f"  ends: {ends[1]}"]
         rows = [("", *shown, "modes")]
         points = [self.point(self.points[0], "first point"), *self.special, self.point(self.points[-1], "last point")]
@@ -144,14 +140,20 @@ class Family(Printed):
             values = in_digits(np.array([0.0 if abs(point[name]) < least[name] else point[name] for name in shown]))
             rows.append((point.kind, *values, ", ".join(dict.fromkeys(point.modes))))
         eigenvalues = zip(self.mode_names, complex_numbers(self.points[0].modes), strict=True)
-        return "\n".join([*lines, *table(rows), f"  eigenvalues at the first point, 1/s: {', '.join(f'{name} {value}' for name, value in eigenvalues)}"])
+        return "\n".join(
+            [
+                *lines,
+                *table(rows),
+                f"  {known.modes}, at the first point: {', '.join(f'{name} {value}' for name, value in eigenvalues)}",
+            ]
+        )
 
 
 @of_known_numbers
 @shown_from_users_lines
 def family(
     scene: Scene | BuiltFor,
-    guess: "State | Mapping | FamilyPoint",
+    guess: "State | Mapping | FamilyPoint | PeriodicMotion",
     *,
     until: Mapping[str, float] | None = None,
     vary: str | None = None,
@@ -160,15 +162,17 @@ def family(
     inputs: Numbers | dict | None = None,
     max_points: int = 4000,
 ) -> Family:
-    """Follow the family of steady motions through the one near a guess: `g = 0, phi = 0, dy/dt = 0, dq_j/dt = 0` with one freedom left.
+    """Follow the family of steady motions through the one near a guess, `g = 0, phi = 0, dy/dt = 0, dq_j/dt = 0` with one freedom left, or of periodic ones.
 
         turns = jj.family(bicycle, {"rear_spin_rate": 20.0, "lean": 1e-3}, until={"lean": 1.5})
         print(turns)                                  # folds, branch points, changes of stability, why the curve ends
         turns["lean"], turns.eigenvalues, turns.at(lean=0.4)
         straight = jj.family(bicycle, turns.branches[0])
+        jj.family(sleigh, jj.periodic(sleigh, guess, jnp.pi, inputs=torque), vary="drag")     # multipliers in place of eigenvalues
 
     **Arguments**
-    - `guess`: as of `steady`; or a branch point of another family, whose other curve is followed.
+    - `guess`: as of `steady`; or a branch point of another family of steady motions, whose other curve is followed; or a `PeriodicMotion` of this class of
+      scenes, with the inputs, the event and what is held of its search.
     - `until`: name -> value at which the curve ends. It is followed towards it from the guess, whose value of that name is kept at the start; without
       `until` in both directions. A curve that closes ends there.
     - `vary`: a parameter of the scene, one number, that changes along the curve.
@@ -185,10 +189,14 @@ def family(
     """
     scene, until, held = as_scene(scene), dict(until or {}), as_names(held)
     point, varied = guess if isinstance(guess, FamilyPoint) else None, () if vary is None else (vary,)
-    t, q, u = (np.asarray(x, float) for x in guessed(scene, point.state if point else guess, 0.0))
-    if point and vary in point.values:
-        scene = scene.replace(**{vary: point[vary]})
-    equations = SteadyEquations(scene, (float(t), q, u), np.asarray(as_input_vector(scene, inputs), float), varied, held)
+    equations: Motions
+    if isinstance(guess, PeriodicMotion):
+        equations = OrbitEquations(scene, guess, varied, held)
+    else:
+        t, q, u = (np.asarray(x, float) for x in guessed(scene, point.state if point else guess, 0.0))
+        if point and vary in point.values:
+            scene = scene.replace(**{vary: point[vary]})
+        equations = SteadyEquations(scene, (float(t), q, u), np.asarray(as_input_vector(scene, inputs), float), varied, held)
     targets = [(k := equations.index(name), float(value) / equations.size[k]) for name, value in until.items()]
     named = [name for name in (guess if isinstance(guess, Mapping) else ()) if name in equations.unknowns]
     if point is None:

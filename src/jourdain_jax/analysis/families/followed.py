@@ -6,18 +6,17 @@ from itertools import pairwise
 
 import numpy as np
 
-from jourdain_jax.analysis.families.curve import CLOSED, Point, Targets, located, reversed_at, traced
-from jourdain_jax.analysis.families.equations import SteadyEquations, Vector
+from jourdain_jax.analysis.families.curve import CLOSED, Point, Targets, located, reversed_at, solved, traced
+from jourdain_jax.analysis.families.equations import Motions, Vector
 from jourdain_jax.analysis.families.special import Crossing, branches, changes, folds, tangents_across
 from jourdain_jax.calculus.reals import largest
 
 
-def followed(equations: SteadyEquations, begin: Point, targets: Targets, most: int) -> tuple[list[Point], tuple[str, str]]:
+def followed(equations: Motions, begin: Point, targets: Targets, most: int) -> tuple[list[Point], tuple[str, str]]:
     """All points of a curve, in order, and why it ends at the first and at the last of them; towards the targets alone, where there are some."""
     ahead = [(target - begin.z[k]) * begin.tangent[k] for k, target in targets]
     if (ahead[0] if ahead else begin.tangent[np.argmax(np.abs(begin.tangent))]) < 0:
         begin = reversed_at(begin)
-    begin = replace(begin, modes=equations.eigenvalues(begin.look, begin.tangent))
     points, last = traced(equations, begin, targets, most)
     if last == CLOSED or targets:
         return points, (last if last == CLOSED else "the start", last)
@@ -25,7 +24,7 @@ def followed(equations: SteadyEquations, begin: Point, targets: Targets, most: i
     return [*(reversed_at(point) for point in reversed(back[1:])), *points], (first, last)
 
 
-def special(equations: SteadyEquations, points: list[Point], turning: dict[str, int]) -> Iterator[tuple[Crossing, Point]]:
+def special(equations: Motions, points: list[Point], turning: dict[str, int]) -> Iterator[tuple[Crossing, Point]]:
     """What is special between the points, in their order."""
     for here, there in pairwise(points):
         found = []
@@ -38,39 +37,34 @@ def special(equations: SteadyEquations, points: list[Point], turning: dict[str, 
         yield from sorted(found, key=lambda pair: here.tangent @ (pair[1].z - here.z))
 
 
-def first_point(equations: SteadyEquations, named: list[str], kept: list[str]) -> Point:
+def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
     """The steady motion near the guess: what is named keeps its value as long as the rest can be found, then what is held or followed alone."""
-    z, scene = equations.start, type(equations.scene).__name__
+    z, scene, look = equations.start, type(equations.scene).__name__, equations(equations.start)
+    if not np.all(np.isfinite(look.R)):
+        raise ValueError(f"the equations of `{scene}` are undefined near the guess; start at another state")
     for fixed in ([*named, *kept], kept):
-        free = np.ones(len(z), bool)
-        free[[equations.index(name) for name in fixed]] = False
-        for _ in range(30):
-            look = equations(z)
-            if not (np.all(np.isfinite(look.R)) and np.all(np.isfinite(look.J))):
-                raise ValueError(f"the equations of `{scene}` are undefined near the guess; start at another state")
-            step = np.zeros(len(z))
-            step[free] = np.linalg.lstsq(look.J[:, free], -look.R, rcond=1e-7)[0]
-            z = z + step * min(1.0, 0.25 / max(largest(step), 1e-300))
-            if largest(step) < 1e-12 * (1 + largest(z)):
-                break
-    look = equations(z)
-    if largest(look.R) > 1e-9:
-        raise ValueError(f"no steady motion of `{scene}` is found near the guess (residual {largest(look.R):.1e}); `jj.steady` may find one from afar")
+        rows = np.eye(len(z))[[equations.index(name) for name in fixed]]
+        found = solved(equations, z, rows, rows @ z, 30, 0.25)
+        if found and largest(found[1].R) < 1e-9:
+            break
+    else:
+        raise ValueError(f"no {equations.what[:-1]} of `{scene}` is found near the guess; `jj.steady` may find one from afar")
+    z, look, _ = found
     sigma, V = np.linalg.svd(look.J)[1:]
     sigma = np.append(sigma, np.zeros(len(z) - len(sigma)))
     count = int(np.sum(sigma < 1e-8 * sigma[0]))
     if count == 0:
-        raise ValueError(f"this steady motion of `{scene}` stands alone: no freedom is left; hold less, or name a parameter by `vary`")
+        raise ValueError(f"this {equations.what[:-1]} of `{scene}` stands alone: no freedom is left; hold less, or name a parameter by `vary`")
     if count > 1:
         free = [f"`{name}`" for name, share in zip(equations.unknowns, np.linalg.norm(V[-count:], axis=0), strict=True) if share > 1e-3]
         raise ValueError(
-            f"the steady motions of `{scene}` near this one have {count} freedoms, and a family has one: name {count - 1} of {', '.join(free)} in `held`, "
+            f"the {equations.what} of `{scene}` near this one have {count} freedoms, and a family has one: name {count - 1} of {', '.join(free)} in `held`, "
             "or start beside a branch point"
         )
-    return Point(z, V[-1], look)
+    return Point(z, V[-1], look, equations.eigenvalues(look, V[-1]))
 
 
-def across(equations: SteadyEquations, tangent: Vector) -> Point:
+def across(equations: Motions, tangent: Vector) -> Point:
     """The branch point at the guess, with the tangent of the other curve through it."""
-    other = min(tangents_across(equations, equations.start), key=lambda t: abs(t @ tangent) / np.linalg.norm(tangent))
-    return Point(equations.start, other, equations(equations.start))
+    other, look = min(tangents_across(equations, equations.start), key=lambda t: abs(t @ tangent) / np.linalg.norm(tangent)), equations(equations.start)
+    return Point(equations.start, other, look, equations.eigenvalues(look, other))

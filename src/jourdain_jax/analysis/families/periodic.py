@@ -24,15 +24,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float
 
-from jourdain_jax.analysis.families.equations import sizes
+from jourdain_jax.analysis.families.equations import Look, Motions, Vector, sizes
 from jourdain_jax.analysis.families.special import SURE
+from jourdain_jax.analysis.families.spectrum import Modes
 from jourdain_jax.analysis.instant import ByMatrices, ByProgram, instant_of, places_of, unseen
 from jourdain_jax.analysis.table import complex_numbers
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.build.trace import event_values
-from jourdain_jax.calculus.matrices import pseudo_inverse
+from jourdain_jax.calculus.matrices import null_space_svd
 from jourdain_jax.calculus.reals import RUN_SELDOM, Flag, Number, Scalar, checked_whole, compiled, known_numbers, largest
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.equations.kinematics import motion_at
@@ -40,7 +41,7 @@ from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.model import modelled
-from jourdain_jax.motion.options import SPAN, AllOptions, MotionFields, OptionFields, Options, as_options
+from jourdain_jax.motion.options import SPAN, AllOptions, MotionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.motion.simulate import as_state, simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
@@ -65,6 +66,8 @@ class PeriodicMotion(Printed, eqx.Module):
     multipliers: Complex[Array, "multipliers"]  # factors by which small motions grow in a period, the largest first
     residual: Scalar  # largest difference after one period, in units of the unknowns' sizes
     converged: Flag
+    by: "_Shooting"  # the equations it solves
+    unknowns: Unknowns  # states at which pieces begin, and the period
 
     def __getitem__(self, name: str) -> Scalar:
         """A coordinate or speed at the start, by name."""
@@ -125,7 +128,7 @@ def periodic(
     tolerances = {"rtol": 1e-12, "atol": 1e-12} if options is None else {}
     beside = "it finds a motion whose length is `period`, which no stop event ends, by runs without work and retries"
     options = as_options(options, {**tolerances, **by_name}, "periodic", dict.fromkeys((*SPAN, "events", "work", "retry"), beside), built)
-    options = replace(options, solver=options.solver or diffrax.Dopri8())  # tolerances are traced below
+    options = replace(options, solver=options.solver or diffrax.Dopri8(), events=False, work=False)  # tolerances are traced below
     if not np.all(known_numbers(period) > 0) or not np.all(np.isfinite(known_numbers(period))):
         raise ValueError(f"`period` is {period}, expected a positive time in s")
     checked_whole(pieces, "`pieces`", 1, expected="of at least 1")
@@ -167,12 +170,17 @@ class _Shooting(eqx.Module):
         """Sizes of coordinates and speeds."""
         return sizes(self.scene, range(len(self.scene.coordinate_names.entries)))
 
+    @property
+    def is_unknown(self) -> Bool[np.ndarray, "all_unknowns"]:
+        """Which of the states at which pieces begin, and the period, are solved for."""
+        at_start = [k in self.free for k in range(len(self.sizes))]
+        return np.array([*at_start, *[True] * len(self.sizes) * (self.pieces - 1), self.until is not None])
+
     def motion(self, t0, z: States, ts: Float[Array, "times"]):
         """The motion from a state."""
         n = len(self.scene.coordinate_names.entries)
         start = state_of(self.scene, t0, z[:n], z[n:])
-        fields = {name: value for name, value in vars(self.options).items() if name in OptionFields.__annotations__}
-        return simulate(self.scene, start, t0=t0, ts=ts, inputs=self.inputs, **{**fields, "events": False, "work": False}).nan_if_failed()
+        return simulate(self.scene, start, t0=t0, ts=ts, inputs=self.inputs, options=self.options).nan_if_failed()
 
     def moved(self, k, z: States, t, period) -> States:
         """f_k."""
@@ -229,15 +237,15 @@ class _Shooting(eqx.Module):
 
         return jax.vmap(of_piece)(jnp.arange(self.pieces), zs)
 
-    def look(self, t, x: Unknowns) -> tuple[Array, Array]:
-        """R and dR/dx."""
+    def look(self, t, x: Unknowns) -> tuple[Array, Array, tuple[Array, Array]]:
+        """R, dR/dx, and df_k/dz_k with f_k."""
         D, of_period, ends = self.slopes(t, x)
 
         def linear(change):
             dz, dT = self.pieces_of(change)
             return self.rows(t, x + change, ends + jnp.einsum("kij,kj->ki", D, dz) + of_period * dT)
 
-        return self.rows(t, x, ends), jax.jacfwd(linear)(jnp.zeros_like(x))
+        return self.rows(t, x, ends), jax.jacfwd(linear)(jnp.zeros_like(x)), (D, ends)
 
     def multipliers(self, t, x: Unknowns, D: Float[Array, "pieces states states"], ends) -> Complex[Array, "multipliers"]:
         """Eigenvalues of M_n .. M_1 by df_k/dz_k and f_k, the largest first, without the one of going on along the motion where the period is unknown."""
@@ -249,8 +257,8 @@ class _Shooting(eqx.Module):
         signs = jax.vmap(jax.jacfwd(self.aligned))(ends, there)
         D = (signs @ D)[:, kept][:, :, kept]
         C = jax.vmap(lambda k, z: self.constraints(t + k * period / n, z)[1])(jnp.arange(n), zs)[:, :, kept]
-        L = jnp.linalg.svd(jax.lax.stop_gradient(C))[2][:, len(kept) - count :]  # a basis of what the constraints leave
-        B = jax.vmap(lambda C, L: L.T - pseudo_inverse(C, 1e-9) @ (C @ L.T))(C, L)
+        B = jax.vmap(null_space_svd)(C)[:, :, len(kept) - count :]
+        L = jax.lax.stop_gradient(jnp.swapaxes(B, 1, 2))
         L, following = jnp.roll(L, -1, axis=0), jnp.roll(B, -1, axis=0)
         M = jnp.linalg.solve(L @ following, L @ D @ B)
         cyclic = jnp.zeros((n, count, n, count), M.dtype).at[(np.arange(n) + 1) % n, :, np.arange(n)].set(M)
@@ -271,12 +279,9 @@ def _found(problem: _Shooting, start: State, period: Scalar) -> PeriodicMotion:
     motion = still.motion(t, z, t + given * np.arange(1, problem.pieces + 1) / problem.pieces)
     zs = jnp.concatenate([z[None], jnp.concatenate([motion.q, motion.u], axis=1)[:-1]])
     guess, held = jnp.append(jnp.ravel(zs), given), jnp.append(jnp.tile(begun, problem.pieces), period)
-    count = len(problem.sizes)
-    free = np.ones((problem.pieces, count))
-    free[0] = [k in problem.free for k in range(count)]
-    size = jnp.append(jnp.asarray(np.ravel(free * problem.sizes)), given if problem.until is not None else 0.0)
+    size = jnp.where(problem.is_unknown, jnp.append(jnp.tile(problem.sizes, problem.pieces), given), 0.0)
     rows, tolerance = lambda x: problem.rows(t, x, problem.ends(t, x)), 10.0 * jnp.asarray(problem.options.rtol)
-    x = smooth_root(partial(still.look, t), rows, guess, held, size, tolerance, 1e-9)
+    x = smooth_root(lambda x: still.look(t, x)[:2], rows, guess, held, size, tolerance, 1e-9)
     zs, period = problem.pieces_of(x)
     D, _, ends = problem.slopes(t, x)
     residual = largest(problem.rows(t, x, ends))
@@ -289,4 +294,45 @@ def _found(problem: _Shooting, start: State, period: Scalar) -> PeriodicMotion:
     n, names = len(start.q), problem.scene.coordinate_names.entries
     shifts = {name: ends[-1, k] - zs[0, k] for k, name in enumerate(names) if k not in problem.kept or name in problem.shifted}
     state = state_of(problem.scene, t, zs[0, :n], zs[0, n:], start.moved_q, start.moved_u, residual)
-    return PeriodicMotion(state, period, shifts, problem.multipliers(t, x, D, ends), residual, (residual < 1e-8) & goes_on)
+    return PeriodicMotion(state, period, shifts, problem.multipliers(t, x, D, ends), residual, (residual < 1e-8) & goes_on, problem, x)
+
+
+class OrbitEquations(Motions):
+    """R with its slopes, and multipliers, of one scene as functions of z: what is unknown of a periodic motion, and a parameter that varies."""
+
+    what, modes = "periodic motions", "multipliers"
+    growth = staticmethod(lambda modes: np.abs(modes) - 1)
+    crossing = staticmethod(lambda mode: "pair on the unit circle" if mode.imag else f"multiplier {np.sign(mode.real):.0f}")
+
+    def __init__(self, scene: Scene, orbit: PeriodicMotion, vary: tuple[str, ...], held: tuple[str, ...]) -> None:
+        self.scene, self.vary, self.problem, self.t = scene, vary, replace(orbit.by, scene=scene), orbit.state.t
+        names = (*scene.coordinate_names.entries, *scene.speed_names.entries)
+        pieces = [f"{name} in piece {k + 1}" if k else name for k in range(orbit.by.pieces) for name in names]
+        self.given = np.append(np.asarray(orbit.unknowns), [float(getattr(scene, name)) for name in vary])
+        self.by_name = {name: k for k, name in enumerate((*pieces, "period", *vary))}
+        self.places = np.flatnonzero(np.append(orbit.by.is_unknown, np.ones(len(vary), bool)))
+        self.unknowns = tuple(np.array([*self.by_name], object)[self.places])
+        all_sizes = np.append(np.tile(orbit.by.sizes, orbit.by.pieces), np.abs(self.given[len(pieces) :]))
+        self.size = np.where(all_sizes == 0, 1.0, all_sizes)[self.places]
+        self.start = self.given[self.places] / self.size
+        self.held = np.array([self.index(name) for name in held], int)
+
+    def __call__(self, z: Vector) -> Look:
+        """The equations at z."""
+        R, J, multipliers = map(np.asarray, _looked(self.problem, self.vary, self.t, self.at(z)))
+        return self.with_held(R, J[:, self.places], z, (multipliers,))
+
+    @staticmethod
+    def eigenvalues(look: Look, tangent: Vector) -> Modes:
+        """Multipliers."""
+        return look.small[0]
+
+
+@partial(compiled, options=RUN_SELDOM)
+def _looked(problem: _Shooting, vary: tuple[str, ...], t, numbers: Unknowns) -> tuple[Array, Array, Array]:
+    """R, its slopes by all numbers, and the multipliers."""
+    x, parameters = jnp.split(numbers, [len(numbers) - len(vary)])
+    moved = lambda values: replace(problem, scene=problem.scene.replace(**dict(zip(vary, values, strict=True))))  # noqa: E731
+    R, J, (D, ends) = moved(parameters).look(t, x)
+    by_parameters = jax.jacfwd(lambda values: moved(values).rows(t, x, moved(values).ends(t, x)))(parameters)
+    return R, jnp.concatenate([J, by_parameters], axis=1), moved(parameters).multipliers(t, x, D, ends)

@@ -9,13 +9,14 @@ double root                 (s_a - s_b)^2 = 0             a pair of real ones be
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.analysis.families.curve import Point
-from jourdain_jax.analysis.families.equations import Look, SteadyEquations, Vector
-from jourdain_jax.analysis.families.spectrum import Modes, matched
+from jourdain_jax.analysis.families.equations import DOUBLE, Motions, Vector
+from jourdain_jax.analysis.families.spectrum import are_partners
 
 SURE = 1e-7  # relative to 1 + |s|: a real part, or a distance of two eigenvalues, that is not round-off
 
@@ -38,53 +39,33 @@ def folds(here: Point, there: Point, unknowns: dict[str, int]) -> Iterator[Cross
 
 def branches(here: Point, there: Point) -> Iterator[Crossing]:
     """A branch point."""
-    U = _held(here.look)[0]
+    held = len(here.z) - 1
+    U = np.linalg.svd(here.look.J)[0][:, :held]
 
     def test(point: Point) -> float:
-        own, sigma, V = _held(point.look)
-        side = np.linalg.slogdet(U.T @ own)[0] * np.linalg.slogdet(V)[0] * np.sign(V[-1] @ point.tangent)
-        return float(side * sigma)
+        side = np.linalg.slogdet(np.vstack([U.T @ point.look.J, point.tangent]))[0]
+        return float(side * np.linalg.svd(point.look.J, compute_uv=False)[held - 1])
 
     if test(here) * test(there) < 0:
         yield Crossing("branch point", test)
 
 
-def _held(look: Look) -> tuple[Float[np.ndarray, "rows held"], float, Float[np.ndarray, "unknowns unknowns"]]:
-    """A basis of the rows that J holds independently, the smallest singular value of these, and the right singular vectors."""
-    U, sigma, V = np.linalg.svd(look.J)
-    held = look.J.shape[1] - 1
-    return U[:, :held], float(sigma[held - 1]), V
-
-
-def changes(equations: SteadyEquations, here: Point, there: Point) -> Iterator[Crossing]:
+def changes(equations: Motions, here: Point, there: Point) -> Iterator[Crossing]:
     """Eigenvalues that pass zero or the imaginary axis, and pairs that meet."""
     before, now = here.modes, there.modes
-
-    def modes(point: Point) -> Modes:
-        return point.modes if len(point.modes) else matched((before + now) / 2, equations.eigenvalues(point.look, point.tangent))
-
-    for k, (a, b) in enumerate(zip(before, now, strict=True)):
-        if a.real * b.real < 0 and min(abs(a.real), abs(b.real)) > SURE * (1 + abs(a)):
-            if a.imag == 0 and b.imag == 0:
-                yield Crossing("zero eigenvalue", lambda point, k=k: float(modes(point)[k].real), (k,))
-            if a.imag > 0 and b.imag != 0:
-                columns = tuple(np.flatnonzero(np.isin(before, (a, np.conj(a)))).tolist())
-                yield Crossing("pair on the imaginary axis", lambda point, k=k: float(modes(point)[k].real), columns)
-    for a, b in {pair for v in (before, now) for pair in _pairs(v)}:
-        test = lambda point, a=a, b=b: float(((modes(point)[a] - modes(point)[b]) ** 2).real)  # noqa: E731
+    for k, (a, b) in enumerate(zip(equations.growth(before), equations.growth(now), strict=True)):
+        if a * b < 0 and min(abs(a), abs(b)) > SURE * (1 + abs(before[k])) and before[k].imag >= 0 and (before[k].imag == 0) == (now[k].imag == 0):
+            columns = tuple(np.flatnonzero(np.isin(before, (before[k], np.conj(before[k])))).tolist())
+            yield Crossing(equations.crossing(before[k]), lambda point, k=k: float(equations.growth(point.modes)[k]), columns)
+    for a, b in combinations(range(len(before)), 2):
+        test = lambda point, a=a, b=b: float(((point.modes[a] - point.modes[b]) ** 2).real)  # noqa: E731
         values = test(here), test(there)
         least = (SURE * (1 + abs(before[a]))) ** 2
-        if values[0] * values[1] < 0 and min(map(abs, values)) > least:
-            yield Crossing("double root", test, (a, b))
+        if are_partners(before, now, a, b) and values[0] * values[1] < 0 and min(map(abs, values)) > least:
+            yield Crossing(DOUBLE, test, (a, b))
 
 
-def _pairs(values: Modes) -> list[tuple[int, int]]:
-    """Columns of complex pairs."""
-    up = [k for k, s in enumerate(values) if s.imag > 0]
-    return [tuple(sorted((k, int(np.argmin(np.abs(values - np.conj(values[k]))))))) for k in up]  # type: ignore[misc]
-
-
-def tangents_across(equations: SteadyEquations, z: Vector) -> list[Vector]:
+def tangents_across(equations: Motions, z: Vector) -> list[Vector]:
     """Unit tangents of the two curves that cross at a branch point: a a' in its null space with l . R_zz a a = 0.
 
     R_zz by central differences of J; l: the left null vectors, of which only one has such a form that does not vanish.

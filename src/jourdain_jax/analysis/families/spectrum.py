@@ -13,11 +13,8 @@ Modes = Complex[np.ndarray, "modes"]
 
 def null_space(C: Float[np.ndarray, "rows states"]) -> Float[np.ndarray, "states free"]:
     """An orthonormal basis of the x with C x = 0."""
-    if not len(C):
-        return np.eye(C.shape[1])
     _, sigma, V = np.linalg.svd(C)
-    rank = int(np.sum(sigma > 1e-9 * max(sigma[0], 1e-300)))
-    return V[rank:].T
+    return V[np.sum(sigma > 1e-9 * np.max(sigma, initial=1e-300)) :].T
 
 
 def in_pairs(values: Modes) -> Modes:
@@ -34,13 +31,13 @@ def matched(before: Modes, now: Modes) -> Modes:
 def surely_matched(before: Modes, now: Modes) -> bool:
     """Whether every eigenvalue moved by less than half of what separates it from others that are no partner of it."""
     for k, (a, b) in enumerate(zip(before, now, strict=True)):
-        others = [x for j, x in enumerate(before) if j != k and not _partners(before, now, k, j)]
+        others = [x for j, x in enumerate(before) if j != k and not are_partners(before, now, k, j)]
         if others and abs(b - a) > 0.5 * min(abs(a - x) for x in others):
             return False
     return True
 
 
-def _partners(before, now, k: int, j: int) -> bool:
+def are_partners(before, now, k: int, j: int) -> bool:
     """Whether two columns are a complex pair at one end at least."""
     return any(v[k].imag != 0 and v[j] == np.conj(v[k]) for v in (before, now))
 
