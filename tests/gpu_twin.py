@@ -7,7 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -194,20 +194,16 @@ def in_place_of_a_gpu(order: str = "in order", memory: int = 2**40, fails: int =
 def driver_of_devices(capabilities: list[tuple[int, int]], fails: int = 0, missing: str = "") -> SimpleNamespace:
     """Functions by which a driver describes its devices; `fails`: what its start returns, `missing`: a function that it has not."""
 
-    def said(code, place) -> int:
-        place._obj.value = b"no CUDA-capable device is detected"
-        return 0
+    def says(what: Callable) -> Callable:
+        return lambda *given: setattr(next(x for x in given if hasattr(x, "_obj"))._obj, "value", what(*given)) or 0
 
-    def counted(place) -> int:
-        place._obj.value = len(capabilities)
-        return 0
-
-    def attribute(place, which, device) -> int:
-        place._obj.value = capabilities[device][which - 75]
-        return 0
-
-    names = {name: lambda *_: 0 for name in nvidia._CALLED if name != missing}
-    return SimpleNamespace(**names | {"cuInit": lambda _: fails, "cuDeviceGetCount": counted, "cuDeviceGetAttribute": attribute, "cuGetErrorString": said})
+    own = {
+        "cuInit": lambda _: fails,
+        "cuDeviceGetCount": says(lambda _: len(capabilities)),
+        "cuDeviceGetAttribute": says(lambda _, which, device: capabilities[device][which - 75]),
+        "cuGetErrorString": says(lambda *_: b"no CUDA-capable device is detected"),
+    }
+    return SimpleNamespace(**dict.fromkeys(set(nvidia._CALLED) - {missing}) | own)
 
 
 def said_by_assembler(ptx: str) -> str:

@@ -88,14 +88,8 @@ def test_what_the_driver_refuses_is_an_error_of_xla_with_the_drivers_text():
 
 
 def test_a_kernel_that_this_process_has_not_loaded_is_an_error():
-    with gpu_twin.in_place_of_a_gpu():
-        run = jax.jit(_end).lower(0.4).compile()
-        table, gpu._table[:] = list(gpu._table), [0] * len(gpu._table)
-        try:
-            with pytest.raises(jax.errors.JaxRuntimeError, match="INTERNAL: invalid resource handle"):
-                run(0.4)
-        finally:
-            gpu._table[:] = table
+    with gpu_twin.in_place_of_a_gpu(), mock.patch.object(gpu.Kernel, "number", 5), pytest.raises(jax.errors.JaxRuntimeError, match="invalid resource handle"):
+        jax.jit(_end)(0.4)
 
 
 def test_the_record_of_steps_keeps_to_the_memory_of_the_model():
@@ -121,3 +115,11 @@ def test_without_a_gpu_that_serves_it_is_said_why(monkeypatch):
     assert "older than CUDA 12" in _reason(monkeypatch, capabilities=[], missing="cuLibraryLoadData")
     monkeypatch.setattr(nvidia, "driver", mock.Mock(side_effect=OSError("libcuda.so.1: no such file")))
     assert "libcuda.so.1" in nvidia.reason_against.__wrapped__()
+
+
+def test_a_model_says_on_which_devices_it_is_integrated(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(nvidia, "architecture", lambda: "sm_90")
+    for reason, said in (("", "machine code: CPU; NVIDIA GPU (sm_90)"), ("no driver", "XLA: no driver")):
+        monkeypatch.setattr(nvidia, "reason_against", lambda reason=reason: reason)
+        assert said in str(jj.build(jj.models.ChaplyginSleigh()))

@@ -132,7 +132,13 @@ def test_it_is_said_why_machine_code_is_not_taken(monkeypatch):
 
 @pytest.mark.parametrize(
     ("old", "new"),
-    [("API_MAJOR 0", "API_MAJOR 1"), ("API_MINOR", "API_LESSER"), ("void** args;", "void** args; int more;"), ("int64_t* dims;", "int64_t* sizes;")],
+    [
+        ("API_MAJOR 0", "API_MAJOR 1"),
+        ("API_MINOR", "API_LESSER"),
+        ("void** args;", "void** args; int more;"),
+        ("int64_t* dims;", "int64_t* sizes;"),
+        ("(XLA_FFI_Error_Destroy)", "(XLA_FFI_Lost)"),
+    ],
 )
 def test_an_interface_with_another_layout_is_not_known(old, new, tmp_path, monkeypatch):
     header = Path(jax.ffi.include_dir(), "xla/ffi/api/c_api.h").read_text()

@@ -3,8 +3,6 @@
 import textwrap
 from dataclasses import asdict, dataclass
 
-import jax
-
 from jourdain_jax.analysis.integrability import frobenius_violations, growth_vector, integrable_below, reachable
 from jourdain_jax.build.assembling import COORDINATE_DOMAIN, SPEED_DOMAIN
 from jourdain_jax.build.structure import structure_of
@@ -15,7 +13,7 @@ from jourdain_jax.motion.model import Model, build, modelled
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.simulate import as_state
-from jourdain_jax.native import nvidia
+from jourdain_jax.native import ffi
 from jourdain_jax.scene.arguments import BuiltFor, of_known_numbers, shown_from_users_lines
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
@@ -198,7 +196,5 @@ def _lowering(built: Model) -> str:
         return f"not lowered: {built.not_lowered}"
     calls = "".join(f"; {reason} has no scalar form: kept as a call" for reason in found.calls)
     reason = native_motion.reason_against(modelled(built.scene).field(), built.scene, as_inputs(built.scene, None), bool(built.events))
-    where = f"not to machine code: {reason}" if reason else "to machine code"
-    if not reason and jax.default_backend() == "gpu":
-        where += f" of the CPU and of NVIDIA GPUs ({nvidia.architecture()})"
+    where = f"not to machine code: {reason}" if reason else f"to machine code{ffi.devices()}"
     return f"a scalar program of {found.operations} operations{calls}; {where}"

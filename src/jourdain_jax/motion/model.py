@@ -28,6 +28,7 @@ from jourdain_jax.motion.options import bytes_of
 from jourdain_jax.motion.put_on_rows import Usual, usual_sizes
 from jourdain_jax.motion.vector_fields.by_matrices import FullByMatrices, MinimalByMatrices, usual_lengths
 from jourdain_jax.motion.vector_fields.field import ByProgram, Formulation, VectorField, as_formulation, reason_for_matrices
+from jourdain_jax.native import ffi
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines
 from jourdain_jax.scene.identity import found_before, once_per_values
 from jourdain_jax.scene.names import check_name
@@ -156,7 +157,7 @@ class Model(BuiltFor, Printed):
         if field.lowered is None:
             return f"dense matrices: {self.not_lowered or 'as asked'}"
         reason = "as asked" if self.backend == "xla" else native_motion.reason_against(field, scene, as_inputs(scene, None), bool(self.events))
-        return f"XLA: {reason}" if reason else "machine code"
+        return f"XLA: {reason}" if reason else f"machine code{ffi.devices()}"
 
     @property
     def warnings(self) -> tuple[str, ...]:

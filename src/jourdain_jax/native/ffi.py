@@ -26,9 +26,16 @@ from jourdain_jax.native.ir import Value, Writer
 HANDLER, KERNEL = "handler", "kernel"
 WORDS, MOST_BUFFERS = 4, 16  # what a kernel of a GPU is told of each array (`gpu.py`), and of how many arrays at most
 FIRST_OF_SCRATCH = 8  # double of a kernel's own memory that is not the counter
-_FRAME = "struct_size extension_start api ctx stage args rets attrs future"
-_BUFFER = "struct_size extension_start dtype data rank dims"
-_LISTS = "struct_size extension_start size types"
+_LAYOUTS = {
+    "CallFrame": "api ctx stage args rets attrs future",
+    "Buffer": "dtype data rank dims",
+    "Args": "size types args",
+    "Rets": "size types rets",
+    "Attrs": "size types names attrs",
+    "Error_Create_Args": "message errc",
+    "Stream_Get_Args": "ctx stream",
+}
+_FUNCTIONS = "Error_Create Error_GetMessage Error_Destroy Handler_Register Stream_Get"  # the first ones
 # places, in words of 8 bytes
 ARGS, RETS = 9, 14  # of a frame: its lists of pointers to arguments and results
 
@@ -56,15 +63,20 @@ def reason_against() -> str:
     return ""
 
 
+def devices() -> str:
+    """What is said of the devices of machine code, where there are others than the CPU."""
+    return f": CPU; NVIDIA GPU ({nvidia.architecture()})" if jax.default_backend() == "gpu" else ""
+
+
 def _stated_version() -> tuple[int, int] | None:
     try:
         header = (Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h").read_text(encoding="utf-8")
     except OSError:
         return None
     numbers = [re.search(rf"#define XLA_FFI_API_{part} (\d+)", header) for part in ("MAJOR", "MINOR")]
-    same = _members(header, "CallFrame") == _FRAME and _members(header, "Buffer") == _BUFFER
-    same = same and _members(header, "Args") == f"{_LISTS} args" and _members(header, "Rets") == f"{_LISTS} rets"
-    if not same or None in numbers:
+    same = all(_members(header, struct) == f"struct_size extension_start {rest}" for struct, rest in _LAYOUTS.items())
+    functions = re.findall(r"_FIELD\(XLA_FFI_(\w+)\);", header)[: len(_FUNCTIONS.split())]
+    if not same or functions != _FUNCTIONS.split() or None in numbers:
         return None
     major, minor = (int(number[1]) for number in numbers if number)
     return (major, minor) if major == 0 else None
