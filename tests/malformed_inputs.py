@@ -459,7 +459,7 @@ FILES: dict[str, Case] = {
     "read_bicycle('.')": ".: cannot be read",
     "read_bicycle('empty.npz')": "empty.npz: the file is empty. Expected lines `name = value`",
     "read_bicycle('run.npz')": "run.npz: not UTF-8 text",
-    "read_bicycle(bicycle('wheel = 1\\n'))": "unknown parameter `wheel`; the nearest valid name is",
+    "read_bicycle(bicycle('wheel = 1\\n'))": "unknown parameter `wheel`; Valid names",
     "read_bicycle(bicycle(w='long'))": "value of `w` is `long`, expected a number",
     "read_bicycle(bicycle(w='1.0+/-nan'))": "sigma of `w` is `nan`, expected a finite number",
     "read_bicycle(bicycle(rF='-0.3'))": "degenerate bicycle: `rF`",

@@ -101,7 +101,7 @@ def test_comments_blank_lines_spaces_and_plus_minus_signs_are_read(tmp_path):
     [
         ("lam = 0.39", "Lam = 0.39", ["line 15", "`Lam`", "`lam`"]),
         ("IBxx = ", "IBxxx = ", ["line 1", "`IBxxx`", "`IBxx`"]),
-        ("w = 1.121", "wheelbase = 1.121", ["line 22", "unknown", "nearest"]),
+        ("w = 1.121", "wheelbase = 1.121", ["line 22", "unknown", "Valid names"]),
         ("w = 1.121+/-0.002\n", "", ["missing `w`", "Add a line"]),
         ("w = 1.121", "w = 1,121", ["line 22", "`w`", "decimal point"]),
         ("w = 1.121", "w = long", ["line 22", "`w`", "`long`", "expected a number"]),
@@ -157,8 +157,8 @@ def test_an_odd_value_is_a_warning_not_a_refusal(tmp_path, old, new, expected):
 def test_samples_have_the_measured_mean_and_sigma():
     bicycle = shipped("Browser")
     samples = sample_parameters(bicycle, jax.random.key(0), 4000)
-    values = np.array([bicycle.values[name] for name in samples.names])
-    sigmas = np.array([bicycle.sigmas[name] for name in samples.names])
+    values = np.array([bicycle.values[name] for name in PARAMETER_NAMES])
+    sigmas = np.array([bicycle.sigmas[name] for name in PARAMETER_NAMES])
     standard = (samples.values - values) / sigmas
     assert np.abs(standard.mean(0)).max() < 5 / np.sqrt(4000)
     assert np.abs(standard.std(0) - 1).max() < 5 / np.sqrt(2 * 4000)
@@ -229,7 +229,7 @@ def test_a_set_in_yaml_is_read(tmp_path, text, ending):
     ("old", "new", "expected"),
     [
         ("parameterization: benchmark", "parameterization: principal", "line 1: parameterization `principal`, expected that of the benchmark"),
-        ("  c: ", "  cc: ", "unknown parameter `cc`; the nearest valid name is `c`"),
+        ("  c: ", "  cc: ", "unknown parameter `cc`; did you mean `c`"),
         ("  c: ", "  c = ", "expected `name: value`"),
         ("values:\n", "values:\n  c: 0.1\n", "`c` was already given in line 6"),
         ("  w: 1.121", "  w: wide", "value of `w` is `wide`, expected a number"),

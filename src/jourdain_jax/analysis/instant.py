@@ -6,7 +6,7 @@ The scalar program of a class of scenes gives du/dt of its independent speeds an
 independent speeds alone: a dependent speed counts in phi only. Scenes without such a program have their dense matrices.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import NamedTuple
@@ -179,9 +179,13 @@ def instant_of(scene: Scene | BuiltFor, constant: tuple[int, ...], masses: bool 
 
 def unseen(instant: "ByProgram | ByMatrices", scene: Scene) -> set[str]:
     """Names of the coordinates on which no acceleration depends, of a quaternion those of its parts."""
+    return entries_of(scene, instant.program.held if isinstance(instant, ByProgram) else ignorable_coordinates(scene))
+
+
+def entries_of(scene: Scene, names: Iterable[str]) -> set[str]:
+    """Names of coordinates, of a quaternion or an angular velocity those of its parts."""
     groups = {group: scene.coordinate_names.entries[first : first + length] for group, first, length in scene.coordinate_names.groups}
-    found = instant.program.held if isinstance(instant, ByProgram) else ignorable_coordinates(scene)
-    return {entry for name in found for entry in groups.get(name, (name,))}
+    return {entry for name in names for entry in groups.get(name, (name,))}
 
 
 @once_per_class

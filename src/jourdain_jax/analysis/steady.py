@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.analysis.families.equations import sizes
-from jourdain_jax.analysis.instant import ByMatrices, ByProgram, instant_of, on_rows, places_of, unseen
+from jourdain_jax.analysis.instant import ByMatrices, ByProgram, entries_of, instant_of, on_rows, places_of, unseen
 from jourdain_jax.analysis.tangent import privileged_speeds
 from jourdain_jax.calculus.reals import RUN_SELDOM, Flag, Number, Numbers, Scalar, compiled, described, largest, real_type
 from jourdain_jax.calculus.roots import smooth_root
@@ -91,11 +91,9 @@ def steady(
     unknown = f"`{type(scene).__name__}` has no `{{}}` to hold or to move"
     check_names(held, names, unknown)
     instant = instant_of(built, y := privileged_speeds(scene, privileged))
-    groups = {group: entries[first : first + length] for group, first, length in scene.coordinate_names.groups}
     ignorable = unseen(instant, scene)
     moving = ignorable if moving is None else as_names(moving)
-    check_names(moving, (*entries, *groups), unknown)
-    carried = {entry for name in moving for entry in groups.get(name, (name,))}
+    check_names(carried := entries_of(scene, moving), entries, unknown)
     resting = tuple(i for i, name in enumerate(entries) if name not in carried)
     # nothing that vanishes changes with them: they keep the guess's value, and no step runs away along them
     idle = ignorable - set(np.array(entries)[on_rows(scene)])

@@ -21,9 +21,9 @@ _SPEED = 4.0  # m/s, of the second linearisation
 _DEPENDENT = ("pitch",)
 
 
-def upright_running(bicycle: WhippleBicycle, speed) -> State:
-    """Running straight and upright at `speed` (m/s): an exact steady motion, on the constraints as it stands."""
-    q, u, _ = bicycle.named(**bicycle.upright(speed))
+def upright_running(bicycle: WhippleBicycle, speed, lean_rate=0.0) -> State:
+    """Running straight and upright at `speed` (m/s): an exact steady motion; or with a kick in `lean_rate` (rad/s). Both meet the constraints as they stand."""
+    q, u, _ = bicycle.named(**bicycle.upright(speed), lean_rate=lean_rate)
     return state_of(bicycle, 0.0, q, u)
 
 

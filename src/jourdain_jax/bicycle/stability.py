@@ -28,7 +28,7 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Complex, Float
 
-from jourdain_jax.calculus.reals import RUN_SELDOM, Flag, Scalar, compiled
+from jourdain_jax.calculus.reals import RUN_SELDOM, Flag, Scalar, compiled, real_type
 
 Given = Float[ArrayLike, "2 2"]
 Square = Float[Array, "2 2"]
@@ -72,13 +72,14 @@ def eigenvalues(
     real eigenvalues on either side of a pair the lower is castering, the higher capsize, and the pair is weave. A pair
     has its negative frequency first.
     """
-    matrices = _as_matrices(M, C1, K0, K2, g)
-    speeds = jnp.asarray(speeds, matrices.M.dtype)[:, None, None]
-    # d/dt (q, q') = [[0, I], [-M^-1 (g K0 + v^2 K2), -M^-1 v C1]] (q, q')
-    stiffness = matrices.g * matrices.K0 + speeds**2 * matrices.K2
-    lower = -jnp.linalg.solve(matrices.M, jnp.concatenate([stiffness, speeds * matrices.C1], axis=-1))
-    upper = jnp.broadcast_to(jnp.eye(2, 4, 2, dtype=lower.dtype), lower.shape)
-    return jax.vmap(_name_modes)(jnp.linalg.eigvals(jnp.concatenate([upper, lower], axis=-2)))
+    M, C1, K0, K2, g = _as_matrices(M, C1, K0, K2, g)
+
+    def at(v):
+        # d/dt (q, q') = [[0, I], [-M^-1 (g K0 + v^2 K2), -M^-1 v C1]] (q, q')
+        lower = -jnp.linalg.solve(M, jnp.hstack([g * K0 + v**2 * K2, v * C1]))
+        return _name_modes(jnp.linalg.eigvals(jnp.vstack([jnp.eye(2, 4, 2, dtype=lower.dtype), lower])))
+
+    return jax.vmap(at)(jnp.asarray(speeds, g.dtype))
 
 
 def stability_speeds(
@@ -150,9 +151,8 @@ def _name_modes(values: Complex[Array, " 4"]) -> Complex[Array, " 4"]:
 
 
 def _as_matrices(M, C1, K0, K2, g) -> BicycleMatrices:
-    """The matrices as arrays of one floating-point type."""
-    dtype = jnp.result_type(float, *(jnp.asarray(matrix).dtype for matrix in (M, C1, K0, K2)))
-    return BicycleMatrices(*(jnp.asarray(value, dtype) for value in (M, C1, K0, K2, g)))
+    """The matrices as arrays."""
+    return BicycleMatrices(*(jnp.asarray(value, real_type()) for value in (M, C1, K0, K2, g)))
 
 
 def _coefficients(matrices: BicycleMatrices) -> tuple[Polynomial, ...]:

@@ -22,14 +22,13 @@ from .parameters import PARAMETER_NAMES, violations
 class ParameterSamples(eqx.Module):
     """Sampled parameters of one bicycle, in SI units, and which samples are bicycles at all."""
 
-    values: Float[Array, "samples parameters"]  # columns in the order of `names`
+    values: Float[Array, "samples parameters"]  # columns in the order of `PARAMETER_NAMES`
     physical: Bool[Array, " samples"]  # False where a sample has, say, a negative radius
     refused: dict[str, Array]  # condition that some samples break, as a sentence -> how many break it
-    names: tuple[str, ...] = eqx.field(static=True)
 
     def by_name(self) -> dict[str, Float[Array, " samples"]]:
         """One array of samples per parameter, for `jax.vmap` over a function of a dict of parameters."""
-        return dict(zip(self.names, self.values.T, strict=True))
+        return dict(zip(PARAMETER_NAMES, self.values.T, strict=True))
 
 
 class Interval(eqx.Module):
@@ -61,7 +60,6 @@ def sample_parameters(bicycle: MeasuredBicycle, key: Key[Array, ""] | UInt32[Arr
         values=values,
         physical=~jnp.any(jnp.stack(list(broken.values())), axis=0),
         refused={sentence: jnp.sum(where) for sentence, where in broken.items() if jnp.any(where)},
-        names=PARAMETER_NAMES,
     )
 
 

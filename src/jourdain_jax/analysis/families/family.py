@@ -206,9 +206,7 @@ def family(
     else:
         raise ValueError(f"`guess` is a point of a family ({point.kind or 'not special'}), expected a branch point of one with the same unknowns")
     points, ends = followed(equations, begin, targets, max_points)
-    first = next(k for k, point in enumerate(points) if point.z is begin.z)
-    if point:  # between its neighbours the branch point is found as any other
-        del points[first]
-    found = Family(equations, tuple(points), ends, mode_names(scene, names, points[min(first, len(points) - 1)].modes))
+    # between its neighbours a branch point is found as any other
+    found = Family(equations, tuple(p for p in points if not (point and p.z is begin.z)), ends, mode_names(scene, names, begin.modes))
     turning = {name: equations.index(name) for name in dict.fromkeys([*named, *until, *varied]) if name not in held}
-    return replace(found, special=tuple(found.point(at, crossing.kind, crossing.columns) for crossing, at in special(equations, points, turning)))
+    return replace(found, special=tuple(found.point(at, crossing.kind, crossing.columns) for crossing, at in special(equations, found.points, turning)))

@@ -1,6 +1,6 @@
 """Following a curve of steady motions: where it begins, its eigenvalues, where it ends, and what is special on the way."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -24,7 +24,7 @@ def followed(equations: Motions, begin: Point, targets: Targets, most: int) -> t
     return [*(reversed_at(point) for point in reversed(back[1:])), *points], (first, last)
 
 
-def special(equations: Motions, points: list[Point], turning: dict[str, int]) -> Iterator[tuple[Crossing, Point]]:
+def special(equations: Motions, points: Sequence[Point], turning: dict[str, int]) -> Iterator[tuple[Crossing, Point]]:
     """What is special between the points, in their order."""
     for here, there in pairwise(points):
         found = []

@@ -30,11 +30,10 @@ def matched(before: Modes, now: Modes) -> Modes:
 
 def surely_matched(before: Modes, now: Modes) -> bool:
     """Whether every eigenvalue moved by less than half of what separates it from others that are no partner of it."""
-    for k, (a, b) in enumerate(zip(before, now, strict=True)):
-        others = [x for j, x in enumerate(before) if j != k and not are_partners(before, now, k, j)]
-        if others and abs(b - a) > 0.5 * min(abs(a - x) for x in others):
-            return False
-    return True
+    columns = range(len(now))
+    beside = np.array([[k == j or are_partners(before, now, k, j) for j in columns] for k in columns])
+    apart = np.where(beside, np.inf, np.abs(before[:, None] - before))
+    return bool(np.all(np.abs(now - before) <= 0.5 * np.min(apart, axis=1, initial=np.inf)))
 
 
 def are_partners(before, now, k: int, j: int) -> bool:
