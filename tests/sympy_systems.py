@@ -26,11 +26,11 @@ def pendulum(**changes):
 
 def pendulum_with(load):
     """The pendulum with another load on its particle, `load(q, N)`."""
-    q, N = dynamicsymbols("q"), ReferenceFrame("N")
-    A, O = N.orientnew("A", "Axis", [q, N.y]), Point("O")
+    q, u = dynamicsymbols("q u")
+    N, O = ReferenceFrame("N"), Point("O")
+    A = N.orientnew("A", "Axis", [q, N.y])
     P = O.locatenew("P", -length * A.z)
     O.set_vel(N, 0)
-    u = dynamicsymbols("u")
     return KanesMethod(N, [q], [u], [q.diff() - u], bodies=[Particle("bob", P, m)], forcelist=[(P, load(q, N))]), O, of(m, length)
 
 
@@ -68,6 +68,10 @@ def _leaning(q1, q2):
     return N, Y, Y.orientnew("L", "Axis", [q2, Y.x])
 
 
+def _disc(G, R, L):
+    return RigidBody("disc", G, R, m, (inertia(L, m * r**2 / 4, m * r**2 / 2, m * r**2 / 4), G))
+
+
 def rolling_disc():
     """A disc whose contact point has no velocity and no coordinates; the speeds are components of its angular velocity."""
     q1, q2, q3, u1, u2, u3 = dynamicsymbols("q1 q2 q3 u1 u2 u3")
@@ -79,9 +83,8 @@ def rolling_disc():
     C.set_vel(N, 0)
     G = C.locatenew("G", r * L.z)
     G.v2pt_theory(C, N, R)
-    disc = RigidBody("disc", G, R, m, (inertia(L, m * r**2 / 4, m * r**2 / 2, m * r**2 / 4), G))
     kinematic = [dot(by_angles - R.ang_vel_in(N), axis) for axis in L]
-    return KanesMethod(N, [q1, q2, q3], [u1, u2, u3], kinematic, bodies=[disc], forcelist=[(G, -m * g * Y.z)]), C, of(m, g, r)
+    return KanesMethod(N, [q1, q2, q3], [u1, u2, u3], kinematic, bodies=[_disc(G, R, L)], forcelist=[(G, -m * g * Y.z)]), C, of(m, g, r)
 
 
 def slipping_disc():
@@ -94,10 +97,9 @@ def slipping_disc():
     C.set_vel(N, u4 * Y.x + u5 * cross(Y.z, L.x))
     G = C.locatenew("G", r * L.z)
     G.set_vel(N, C.vel(N) + cross(R.ang_vel_in(N), r * L.z))
-    disc = RigidBody("disc", G, R, m, (inertia(L, m * r**2 / 4, m * r**2 / 2, m * r**2 / 4), G))
     kinematic = [q1.diff() - u1, q2.diff() - u2]
     rows = [C.vel(N).dot(Y.x), C.vel(N).dot(Y.y)]
-    options = {"u_dependent": [u4, u5], "velocity_constraints": rows, "bodies": [disc], "forcelist": [(G, -m * g * Y.z)]}
+    options = {"u_dependent": [u4, u5], "velocity_constraints": rows, "bodies": [_disc(G, R, L)], "forcelist": [(G, -m * g * Y.z)]}
     return KanesMethod(N, [q1, q2], [u1, u2, u3], kinematic, **options), C, of(m, g, r)
 
 

@@ -155,13 +155,13 @@ def test_derivatives_through_two_steps_are_those_of_differences_in_both_modes(na
     check_both_modes(derivatives_of(name))
 
 
+some_models = pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in sorted(MODELS)])
+
+
 @natively
-@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in sorted(MODELS)])
+@some_models
 def test_derivatives_through_a_start_and_two_steps_are_those_of_differences_in_both_modes(name):
     check_both_modes(derivatives_of(name, with_start=True))
-
-
-some_models = pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in sorted(MODELS)])
 
 
 @some_models

@@ -5,20 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from small_scenes import OnLine
+from small_scenes import Cart, OnLine
 
 import jourdain_jax as jj
 
 TS, SIGMA = np.linspace(0.0, 40.0, 201), 0.01
 
 
-class Oscillator(OnLine):
-    mass: object = jj.parameter(2.0, positive=True)
+class Oscillator(Cart):
     damping: object = jj.parameter(0.1, positive=True)
     stiffness: object = jj.parameter(18.0, positive=True)
-
-    def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=-self.stiffness * motion.q.x - self.damping * motion.u.x_rate),)
 
 
 def exact(t):

@@ -15,26 +15,6 @@ def upright(angle):
     return jj.rot_y(jnp.pi / 2 - angle)
 
 
-class BodyPendulum(jj.Scene):
-    """A rod in the plane, free in its coordinates and pinned at one end."""
-
-    mass: float = jj.parameter(1.2, unit="kg", positive=True)
-    length: float = jj.parameter(0.8, unit="m", positive=True)
-    coordinates = jj.coordinates("x z angle")
-    domain = {"x": (-0.4, 0.4), "z": (-0.4, 0.4), "angle": (-1.2, 1.2)}
-
-    def bodies(self, t, q):
-        place = jnp.stack([q.x, 0.0, q.z])
-        return {"rod": jj.RigidBody.rod(self.mass, self.length, axis="x", position=place, orientation=upright(q.angle))}
-
-    def loads(self, motion):
-        return (jj.gravity(motion, GRAVITY),)
-
-    def geometric_constraints(self, pose):
-        end = pose["rod"].place([-0.5 * self.length, 0.0, 0.0])
-        return {"hinge": jj.pin(jnp.zeros(3), end, axes="xz")}
-
-
 class PendulumInAngle(jj.Scene):
     """A pendulum in its one angle."""
 
@@ -48,6 +28,21 @@ class PendulumInAngle(jj.Scene):
 
     def loads(self, motion):
         return (jj.gravity(motion, GRAVITY),)
+
+
+class BodyPendulum(PendulumInAngle):
+    """A rod in the plane, free in its coordinates and pinned at one end."""
+
+    coordinates = jj.coordinates("x z angle")
+    domain = {"x": (-0.4, 0.4), "z": (-0.4, 0.4), "angle": (-1.2, 1.2)}
+
+    def bodies(self, t, q):
+        place = jnp.stack([q.x, 0.0, q.z])
+        return {"rod": jj.RigidBody.rod(self.mass, self.length, axis="x", position=place, orientation=upright(q.angle))}
+
+    def geometric_constraints(self, pose):
+        end = pose["rod"].place([-0.5 * self.length, 0.0, 0.0])
+        return {"hinge": jj.pin(jnp.zeros(3), end, axes="xz")}
 
 
 def test_a_pinned_rod_is_the_pendulum_in_its_angle_and_the_pin_carries_newtons_force():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.signal import lfilter
-from small_scenes import OnLine
+from small_scenes import Cart
 
 import jourdain_jax as jj
 
@@ -24,14 +24,9 @@ def pendulum(span, seed=0, off=0.5):
     return guess, truth, jj.Experiment(ts, values, sigma, start=begin, unknown_start=tuple(begin))
 
 
-class Oscillator(OnLine):
-    mass: object = jj.parameter(2.0, positive=True)
+class Oscillator(Cart):
     damping: object = jj.parameter(0.1, positive=True)
     stiffness: object = jj.parameter(18.0, positive=True)
-    inputs = jj.inputs("force")
-
-    def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=motion.inputs.force - self.stiffness * motion.q.x - self.damping * motion.u.x_rate),)
 
 
 def oscillations(channel="x", sigma=0.01, **options):
@@ -40,10 +35,10 @@ def oscillations(channel="x", sigma=0.01, **options):
     force = options.pop("force", jj.Sampled(np.linspace(-1.0, 5.0, 61), generator.normal(size=61)))
     command, found = force.command if isinstance(force, jj.Actuator) else force, []
     for count, x, guess in ((41, 0.5, 0.4), (31, -0.2, -0.3), (23, 0.3, 0.3)):
-        motion = jj.simulate(Oscillator(), {"x": x, "x_rate": 0.3}, ts=ts[:count], inputs={"force": command})
+        motion = jj.simulate(Oscillator(), {"x": x, "x_rate": 0.3}, ts=ts[:count], inputs={"push": command})
         values = {channel: np.asarray(motion["x"]) + 0.01 * generator.normal(size=count)}
         start, unknown = {"x": guess, "x_rate": 0.3}, () if x == guess else ("x", "x_rate")
-        found.append(jj.Experiment(ts[:count], values, sigma, start=start, unknown_start=unknown, inputs={"force": force}, **options))
+        found.append(jj.Experiment(ts[:count], values, sigma, start=start, unknown_start=unknown, inputs={"push": force}, **options))
     return found
 
 
@@ -130,7 +125,7 @@ def shown_late(scene, start, ts, t0, true, sensors, guess, sigma=0.005, **inputs
 
 def late_oscillations(true, sensors, counts):
     """Runs of so many samples that begin half a second after their start."""
-    start, guess, force = {"x": 0.5, "x_rate": 0.3}, {"x": 0.45}, {"force": 1.0}
+    start, guess, force = {"x": 0.5, "x_rate": 0.3}, {"x": 0.45}, {"push": 1.0}
     return [shown_late(Oscillator(), start, 0.05 * np.arange(n), -0.5, true, sensors, guess, inputs=force) for n in counts]
 
 

@@ -169,13 +169,20 @@ def test_a_memory_needs_neighbours():
         jj.fit(Bead(), runs)
 
 
-def test_limits_at_a_bound_and_profiles_from_it_are_those_of_students_t_where_sigmas_are_estimated():
-    # of a straight line whose slope may not be less than it is found to be without a bound
+def line_with_slope():
+    """Times and a noisy straight line, the slope that fits it best, and its standard error for each sigma that may be stated."""
     ts, y = lines()
     X = np.stack([np.ones(6), ts], axis=1)
     (_, slope), (rss,), *_ = np.linalg.lstsq(X, y)
-    error = np.sqrt(rss / 4 * np.linalg.inv(X.T @ X)[1, 1])
-    for sigma, reach in ((None, stdtrit(4, 0.975) * error), (0.1, 1.959964 * error * 0.1 / np.sqrt(rss / 4))):
+    unit = np.sqrt(np.linalg.inv(X.T @ X)[1, 1])
+    return ts, y, slope, {None: np.sqrt(rss / 4) * unit, 0.1: 0.1 * unit}
+
+
+def test_limits_at_a_bound_and_profiles_from_it_are_those_of_students_t_where_sigmas_are_estimated():
+    # of a straight line whose slope may not be less than it is found to be without a bound
+    ts, y, slope, errors = line_with_slope()
+    error = errors[None]
+    for sigma, reach in ((None, stdtrit(4, 0.975) * error), (0.1, 1.959964 * errors[0.1])):
         data = run(ts, {"x": y}, sigma, {"x": None, "x_rate": jj.bounds(slope + 1e-3 * error, 9.0)})
         found = jj.fit(Bead(), data)
         assert found.at_bound.tolist() == [False, True]
@@ -186,10 +193,8 @@ def test_limits_at_a_bound_and_profiles_from_it_are_those_of_students_t_where_si
 
 
 def test_a_bound_that_decides_is_named_where_its_misfit_counts_as_noise():
-    ts, y = lines()
-    X = np.stack([np.ones(6), ts], axis=1)
-    (_, slope), (rss,), *_ = np.linalg.lstsq(X, y)
-    for sigma, error in ((None, np.sqrt(rss / 4 * np.linalg.inv(X.T @ X)[1, 1])), (0.1, 0.1 * np.sqrt(np.linalg.inv(X.T @ X)[1, 1]))):
+    ts, y, slope, errors = line_with_slope()
+    for sigma, error in errors.items():
         for far in (2.0, 8.0):
             bounded = jj.Estimate(slope + 10 * error, range=jj.bounds(slope + far * error, 90.0))
             found = jj.fit(Bead(), run(ts, {"x": y}, sigma, {"x": None, "x_rate": bounded}))

@@ -48,10 +48,14 @@ def test_forces_by_row_and_body_have_the_virtual_power_of_the_multipliers(scene)
     assert jnp.max(jnp.abs(by_body - expected)) <= tolerance("round_off") * jnp.max(jnp.abs(expected))
 
 
-def test_the_forces_of_a_blade_act_sideways_at_the_blade():
-    scene = ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)
+def at_a_state(scene):
+    """Coordinates, and what rows exert there."""
     t, q, u = (jnp.asarray(x[0]) for x in jj.sample_states(scene, 1))
-    rows = row_reactions(scene, t, q, u, jj.accelerations(scene, t, q, u))
+    return q, row_reactions(scene, t, q, u, jj.accelerations(scene, t, q, u))
+
+
+def test_the_forces_of_a_blade_act_sideways_at_the_blade():
+    q, rows = at_a_state(ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25))
     force, torque = rows.forces_on("sleigh")["blade"], rows.torques_on("sleigh")["blade"]
     heading = q[2]
     sideways, forward = (
@@ -64,9 +68,7 @@ def test_the_forces_of_a_blade_act_sideways_at_the_blade():
 
 
 def test_multipliers_of_dependent_rows_are_marked_as_not_determined():
-    scene = TwoWheelAxleRedundant()
-    t, q, u = (jnp.asarray(x[0]) for x in jj.sample_states(scene, 1))
-    rows = row_reactions(scene, t, q, u, jj.accelerations(scene, t, q, u))
+    _, rows = at_a_state(TwoWheelAxleRedundant())
     unique = dict(zip(rows.row_names, rows.determined.tolist(), strict=True))
     # across the axle wheels and axle share the load as they like; the heights and the common heading are each their own
     assert {row for row, alone in unique.items() if alone} == {"one heading", "wheel1 height", "wheel2 height"}

@@ -355,6 +355,11 @@ def speeds_of_held(knots, command, ts, lag=0.0):
     return np.array(found)
 
 
+def fitted(actuator, ts, speeds):
+    data = jj.Experiment(ts, {"x_rate": speeds}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs={"push": actuator})
+    return jj.fit(Mass(), data, (), rtol=1e-9, atol=1e-9)
+
+
 def test_a_command_that_holds_keeps_each_value_until_the_next():
     knots, command, ts = np.linspace(0.0, 2.0, 11), np.random.default_rng(0).normal(size=11), np.linspace(0.0, 2.0, 41)
     delay = 0.03
@@ -363,8 +368,7 @@ def test_a_command_that_holds_keeps_each_value_until_the_next():
     linear = np.array([np.trapezoid(np.interp(np.linspace(0, t, 2001), knots + delay, command), np.linspace(0, t, 2001)) for t in ts])
     assert np.max(np.abs(exact - linear)) > 0.05
     actuator = jj.Actuator(jj.Sampled(knots, command), delay=jj.Estimate(0.05, range=jj.bounds(0.0, 0.1)), gain=GAIN, hold=True)
-    data = jj.Experiment(ts, {"x_rate": 1.3 * exact}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs={"push": actuator})
-    found = jj.fit(Mass(), data, (), rtol=1e-9, atol=1e-9)
+    found = fitted(actuator, ts, 1.3 * exact)
     assert found.converged
     assert_allclose([found["push.delay"].value, found["push.gain"].value], [delay, 1.3], atol=1e-6)
     assert max(np.abs(found.residuals[0]["x_rate"])) < 0.05  # of a sigma: samples within half a passage see it
@@ -374,8 +378,7 @@ def test_a_lag_after_a_command_that_holds():
     knots, command, ts = np.linspace(0.0, 2.0, 41), np.random.default_rng(0).normal(size=41), np.linspace(0.0, 2.0, 41)
     exact = speeds_of_held(knots, command, ts, lag=0.1)
     actuator = jj.Actuator(jj.Sampled(knots, command), lag=jj.Estimate(0.05), hold=True)
-    data = jj.Experiment(ts, {"x_rate": exact}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs={"push": actuator})
-    found = jj.fit(Mass(), data, (), rtol=1e-9, atol=1e-9)
+    found = fitted(actuator, ts, exact)
     assert_allclose(found["push.lag"].value, 0.1, rtol=0.03)  # linear between samples, of half a lag
 
 
