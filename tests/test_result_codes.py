@@ -38,13 +38,22 @@ def belts(off):
     return {"first": lambda t: jnp.sin(t), "second": lambda t: jnp.sin(t) + off * t}
 
 
-@pytest.mark.parametrize("way", [{}, {"formulation": jj.Formulation("full")}])
-def test_rows_that_contradict_each_other_later_are_told(way):
-    run = lambda off: jj.simulate(TwoBelts(), {"y_rate": 1.0}, ts=[0.5, 1.0], inputs=belts(off), **way)  # noqa: E731
-    codes = [int(run(off).result) for off in (0.0, 0.5)]
-    inside = jax.jit(jax.vmap(lambda off: run(off).result))(np.array([0.0, 0.5])).tolist()
-    assert codes == inside == [results.SUCCESS, results.CONTRADICTORY_ROWS]
-    assert_allclose(run(0.0).q_end, [1.0 - np.cos(1.0), 1.0], rtol=1e-7)
+def driven(off, speed=1.0, **way):
+    return jj.simulate(TwoBelts(), {"y_rate": speed}, ts=[0.5, 1.0], inputs=belts(off), **way)
+
+
+def test_rows_that_contradict_each_other_later_are_told_and_derivatives_are_as_without_the_check():
+    def squared(speed, off):
+        motion = driven(off, speed)
+        return motion.q_end[1] ** 2, motion.result
+
+    offs = np.array([0.0, 0.0, 0.5])
+    alone = [driven(off) for off in offs]
+    full = jax.jit(jax.vmap(lambda off: driven(off, formulation=jj.Formulation("full")).result))(offs)
+    slopes, codes = jax.jit(jax.vmap(jax.grad(squared, has_aux=True)))(np.array([1.0, 2.0, 1.0]), offs)
+    assert [int(motion.result) for motion in alone] == full.tolist() == codes.tolist() == [results.SUCCESS, results.SUCCESS, results.CONTRADICTORY_ROWS]
+    assert_allclose(alone[0].q_end, [1.0 - np.cos(1.0), 1.0], rtol=1e-7)
+    assert_allclose(slopes[:2], [2.0, 4.0], rtol=1e-7)
 
 
 def test_lanes_are_told_each_by_itself():
@@ -55,9 +64,9 @@ def test_lanes_are_told_each_by_itself():
 
 
 def test_nonlinear_rows_are_told_as_well():
-    run = lambda speed: jj.simulate(Circling(), {"x_rate": 1.0}, ts=[1.0], inputs={"speed": speed})  # noqa: E731
-    assert run(lambda t: 1.0 + 0.0 * t).result == results.SUCCESS
-    assert int(run(lambda t: 1.0 + t).result) != results.SUCCESS
+    run = lambda gain: jj.simulate(Circling(), {"x_rate": 1.0}, ts=[1.0], inputs={"speed": lambda t: 1.0 + gain * t})  # noqa: E731
+    assert run(0.0).result == results.SUCCESS
+    assert int(run(1.0).result) != results.SUCCESS
 
 
 def test_what_long_steps_violate_is_no_contradiction():
@@ -66,11 +75,6 @@ def test_what_long_steps_violate_is_no_contradiction():
     motion = jj.simulate(TwoBelts(), {"y_rate": 1.0}, ts=[1.0], inputs=belts(0.0), formulation=formulation, **long)
     assert jnp.max(jnp.abs(motion.residuals()[1])) > 0.3  # of 10 sin(1)
     assert motion.result == results.SUCCESS
-
-
-def test_derivatives_are_as_without_the_check():
-    end = lambda speed: jj.simulate(TwoBelts(), {"y_rate": speed}, ts=[1.0], inputs=belts(0.0)).q_end[1] ** 2  # noqa: E731
-    assert_allclose(jax.jit(jax.vmap(jax.grad(end)))(np.array([1.0, 2.0])), [2.0, 4.0], rtol=1e-7)
 
 
 # A motion whose energy changes by more than its steps explain has a result code, inside `jit` and in every lane; right motions never have it.
