@@ -9,6 +9,7 @@ import importlib.metadata
 import os
 import sys
 from collections.abc import Iterator
+from functools import partial, wraps
 from pathlib import Path
 
 import psutil
@@ -74,6 +75,14 @@ def _less_effort():
         yield
 
 
+CHECKED: set = set()  # annotated functions that the test has called
+
+
+def pytest_runtest_setup() -> None:
+    """Types are checked in the first call of each function in each test: in every call, checks took a tenth of the time of all tests."""
+    CHECKED.clear()
+
+
 MOST_RESIDENT = 1.9e9  # bytes of a process between files: two workers, with what a file adds, stay below 5 GB
 
 
@@ -135,6 +144,7 @@ def pytest_configure(config: pytest.Config) -> None:
         return  # this process hands out tests: workers start seconds sooner if it does not import JAX first
     gc.disable()  # until all tests are collected: what imports make is there for good
     import jax
+    import jaxtyping
     from jaxtyping import _import_hook, install_import_hook
 
     jax.config.update("jax_enable_compilation_cache", False)
@@ -149,7 +159,26 @@ def pytest_configure(config: pytest.Config) -> None:
         node.body = body
         return node
 
+    jaxtyped = jaxtyping.jaxtyped
+
+    def checked_first(function, typechecker):
+        """The function, checked the first time that a test calls it; a class with its fields checked, each time that one is made."""
+        checked = jaxtyped(function, typechecker=typechecker)
+        if isinstance(function, type):
+            return checked
+
+        @wraps(function)
+        def call(*args, **kwargs):
+            if function in CHECKED:
+                return function(*args, **kwargs)
+            CHECKED.add(function)
+            return checked(*args, **kwargs)
+
+        call.__code__ = call.__code__.replace(co_filename=checked.__code__.co_filename)  # in tracebacks no line of a user
+        return call
+
     if os.environ.get("JOURDAIN_JAX_NO_TYPE_CHECKS") != "1":
+        jaxtyping.jaxtyped = lambda typechecker: partial(checked_first, typechecker=typechecker)
         _import_hook.JaxtypingTransformer.visit_FunctionDef = without_inner_functions
         install_import_hook([f"jourdain_jax.{layer}" for layer in LAYERS], "beartype.beartype")  # before any import of the package
 
