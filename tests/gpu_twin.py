@@ -7,9 +7,10 @@ import re
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
@@ -68,8 +69,7 @@ def twin_text(text: str) -> str:
     return text + _ENDS.replace("KEY", str(_key())).replace("WORDS", str(ffi.WORDS * ffi.MOST_BUFFERS))
 
 
-INVALID_VALUE, OUT_OF_MEMORY, INVALID_HANDLE = 1, 2, 400  # of `CUresult`
-_SAID = {INVALID_VALUE: b"invalid argument", OUT_OF_MEMORY: b"out of memory", INVALID_HANDLE: b"invalid resource handle"}
+_SAID = {1: b"invalid argument", 2: b"out of memory", 400: b"invalid resource handle"}  # of values of `CUresult`
 _C = ctypes.CFUNCTYPE
 _int, _long, _pointer = ctypes.c_uint32, ctypes.c_uint64, ctypes.c_void_p
 
@@ -81,12 +81,11 @@ class Driver:
 
     def __init__(self) -> None:
         self.loaded: list[str] = []
-        self.launched: dict[str, int] = {}
+        self.launched = Counter[str]()
         self.twins: dict[int, int] = {}
         memset = _C(ctypes.c_int, _long, _int, ctypes.c_size_t, _pointer)
         launch = _C(ctypes.c_int, _pointer, *[_int] * 7, _pointer, ctypes.POINTER(_pointer), _pointer)
-        error = _C(ctypes.c_int, ctypes.c_int, ctypes.POINTER(_pointer))
-        self.texts = {code: ctypes.create_string_buffer(text) for code, text in _SAID.items()}
+        error = _C(ctypes.c_int, ctypes.c_int, ctypes.POINTER(ctypes.c_char_p))
         self.library = SimpleNamespace(cuMemsetD32Async=memset(self._memset), cuLaunchKernel=launch(self._launch), cuGetErrorString=error(self._error))
 
     def _memset(self, place, value, count, stream) -> int:
@@ -95,10 +94,10 @@ class Driver:
 
     def _launch(self, function, across, y, z, threads, threads_y, threads_z, shared, stream, parameters, extra) -> int:
         if (y, z, threads, threads_y, threads_z, shared, stream, extra) != (1, 1, nvidia.WARP, 1, 1, 0, 99, None) or not across:
-            return INVALID_VALUE  # of a grid without blocks, too
+            return 1  # of a grid without blocks, too
         if not function or self.fails:
-            return self.fails or INVALID_HANDLE
-        self.launched[self.loaded[function - 1]] = across
+            return self.fails or 400
+        self.launched[self.loaded[function - 1]] += 1
         run, count = _C(None, _pointer, _pointer)(self._twin(function)), across * threads
         each = range(count) if self.order == "in order" else reversed(range(count))
         call = lambda number: run(parameters[0], number | count << 32)  # noqa: E731
@@ -121,7 +120,7 @@ class Driver:
         return self.twins[number]
 
     def _error(self, code, place) -> int:
-        place[0] = ctypes.addressof(self.texts[code])
+        place[0] = _SAID[code]
         return 0
 
 
@@ -160,29 +159,26 @@ declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)
 
 
 @contextmanager
-def in_place_of_a_gpu(order: str = "in order", memory: int = 2**40, fails: int = 0) -> Iterator[dict[str, int]]:
-    """Inside, machine code that JAX calls on the CPU is that of a GPU of so many bytes; it is given the texts of all kernels that run, with their blocks."""
-    register, launched = ffi.register, dict[str, int]()
-    changes = [
-        mock.patch.object(gpu, "_TARGET", "jourdain_jax_in_place_of_a_gpu"),
-        mock.patch.object(gpu, "handler_text", mock.Mock(return_value=gpu.handler_text().replace("@handler(", "@served(") + _STREAM)),
-        mock.patch.object(ffi, "register", lambda name, text, platform: register(name, text, "cpu")),
+def in_place_of_a_gpu(order: str = "in order", memory: int = 2**40, fails: int = 0) -> Iterator[Counter[str]]:
+    """Inside, machine code that JAX calls on the CPU is that of a GPU of so many bytes; it is given the texts of all kernels, each with how often it ran."""
+    register, launched, text = ffi.register, Counter[str](), gpu.handler_text().replace("@handler(", "@served(") + _STREAM
+    jax.clear_caches()
+    with (
+        mock.patch.multiple(jax, default_backend=lambda: "gpu"),
+        mock.patch.multiple(gpu, _TARGET="jourdain_jax_in_place_of_a_gpu", handler_text=lambda: text),
+        mock.patch.multiple(ffi, register=lambda name, text, platform: register(name, text, "cpu")),
         mock.patch.multiple(
             nvidia,
             reason_against=str,
-            driver=mock.Mock(return_value=DRIVER.library),
-            architecture=mock.Mock(return_value="the CPU"),
+            driver=lambda: DRIVER.library,
+            architecture=lambda: "sm_90 on the CPU",
             text_for=lambda text, architecture: text,
             loaded=DRIVER.load,
-            memory=mock.Mock(return_value=memory),
+            memory=lambda: memory,
             _of_device={82: 65536, 81: 65536, 16: 1}.__getitem__,  # registers, cache, multiprocessors
         ),
         mock.patch.multiple(DRIVER, order=order, fails=fails, launched=launched),
-    ]
-    jax.clear_caches()
-    with ExitStack() as stack:
-        for change in changes:
-            stack.enter_context(change)
+    ):
         mlir.register_lowering(values._call_p, values._on_nvidia, platform="cpu")
         try:
             yield launched

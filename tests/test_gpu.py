@@ -30,14 +30,14 @@ def _numbers(name: str, kinds, **options) -> dict[str, np.ndarray]:
 FEW = 2**19  # bytes of a device, of which an eighth is for the steps of all its motions: some slots for each thread, or one
 
 
-def _check(name: str, kinds, orders, **options) -> list[str]:
-    expected, texts = _numbers(name, kinds, **options), dict[str, int]()
+def _check(name: str, kinds, orders, **options) -> set[str]:
+    expected, texts = _numbers(name, kinds, **options), set[str]()
     for order, memory in orders:
         with gpu_twin.in_place_of_a_gpu(order, memory) as made:
             for kind, found in _numbers(name, kinds, **options).items():
                 np.testing.assert_array_equal(found, expected[kind], err_msg=f"{name}, {kind}, threads {order}")
-        texts |= made
-    return list(texts)
+        texts.update(made)
+    return texts
 
 
 def _check_text(texts, architectures) -> None:
@@ -53,7 +53,7 @@ def _check_text(texts, architectures) -> None:
 def test_threads_of_a_gpu_give_the_bits_of_wide_registers():
     texts = _check("chaplygin-sleigh", ["values", "gradients"], [("reversed", FEW)])
     assert len(texts) > 2
-    _check_text(texts[:1], ARCHITECTURES)
+    _check_text([max(texts, key=len)], ["sm_75"])
 
 
 @pytest.mark.slow
@@ -80,7 +80,7 @@ def _end(speed, model=jj.models.ChaplyginSleigh()):  # noqa: B008
 def test_what_the_driver_refuses_is_an_error_of_xla_with_the_drivers_text():
     run = lambda: jax.jit(jax.vmap(_end))(np.linspace(0.4, 0.6, 3))  # noqa: E731
     expected = run()
-    for code, said in ((gpu_twin.OUT_OF_MEMORY, "RESOURCE_EXHAUSTED: out of memory"), (gpu_twin.INVALID_VALUE, "INTERNAL: invalid argument")):
+    for code, said in ((2, "RESOURCE_EXHAUSTED: out of memory"), (1, "INTERNAL: invalid argument")):
         with gpu_twin.in_place_of_a_gpu(fails=code), pytest.raises(jax.errors.JaxRuntimeError, match=said):
             run()
     with gpu_twin.in_place_of_a_gpu():  # all goes on
@@ -118,8 +118,15 @@ def test_without_a_gpu_that_serves_it_is_said_why(monkeypatch):
 
 
 def test_a_model_says_on_which_devices_it_is_integrated(monkeypatch):
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(nvidia, "architecture", lambda: "sm_90")
-    for reason, said in (("", "machine code: CPU; NVIDIA GPU (sm_90)"), ("no driver", "XLA: no driver")):
-        monkeypatch.setattr(nvidia, "reason_against", lambda reason=reason: reason)
-        assert said in str(jj.build(jj.models.ChaplyginSleigh()))
+    with gpu_twin.in_place_of_a_gpu():
+        for reason, said in (("", "machine code: CPU; NVIDIA GPU (sm_90 on the CPU)"), ("no driver", "XLA: no driver")):
+            monkeypatch.setattr(nvidia, "reason_against", lambda reason=reason: reason)
+            assert said in str(jj.build(jj.models.ChaplyginSleigh()))
+
+
+def test_many_lanes_run_at_once_on_a_gpu():
+    scene = jj.models.ChaplyginSleigh()
+    with gpu_twin.in_place_of_a_gpu() as launched:
+        jj.rollout(scene, {"x_rate": np.ones(1000)}, ts=[0.1])
+        assert min(launched.values()) == 1
+        assert jj.Study(scene, start={"x_rate": jj.Uniform(0.4, 0.6)}, samples=20_000).task(t1=0.1).block == 2**15

@@ -43,7 +43,8 @@ class Task:
     options: AllOptions
     save: str
     every: int
-    largest_block: int = field(default_factory=lambda: LARGEST_BLOCK)  # lanes; the same in all processes
+    # lanes; the same in all processes. A GPU takes some ten thousand at once
+    largest_block: int = field(default_factory=lambda: LARGEST_BLOCK if jax.default_backend() == "cpu" else 2**17)
     memory: int | None = None  # bytes that each process which computes may hold
 
     @property

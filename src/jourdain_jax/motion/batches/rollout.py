@@ -155,7 +155,7 @@ def rollout(
 
     - `starts`: name -> number or array of shape (lanes,) (as in `jj.start`; the rest is solved for), or a `State` with a leading axis of lanes.
     - `parameters`: parameter name -> array with a leading axis of lanes, where lanes differ in parameters.
-    - `chunk`: lanes that run together (default: 512), fewer where they would pass the `memory` that `jj.build` was given (default: 4 GiB);
+    - `chunk`: lanes that run together (default: on a CPU 512, otherwise all), fewer where they would pass the `memory` that `jj.build` was given (4 GiB);
       `progress`: a bar (default: with several chunks).
     - `options`: a `jj.Options`; `by_name`: its fields, and `t0`, `t1`, `ts`, `inputs`, as in `simulate`. All lanes have the same inputs; where they are to
       differ, use `jax.vmap` of `simulate`.
@@ -282,8 +282,9 @@ def _common_length(lengths: dict) -> int:
 
 
 def _chunk(scene: Scene, count: int, chunk: int | None, ts, memory: int) -> int:
-    chunk = 512 if chunk is None else checked_whole(chunk, "`chunk`", 1, expected="of at least one lane")
+    usual = 512 if jax.default_backend() == "cpu" else count
+    chunk = usual if chunk is None else checked_whole(chunk, "`chunk`", 1, expected="of at least one lane")
     times = DEFAULT_SAMPLES if ts is None else np.shape(ts)[0]
     per_lane = 8 * times * (len(scene.coordinate_names) + len(scene.speed_names) + 2)
-    # the stages of 512 lanes fit the cache of a core; of the saved states of a chunk four copies are there at once
+    # the stages of 512 lanes fit the cache of a core, and a GPU takes some ten thousand at once; of the saved states of a chunk four copies are there at once
     return max(1, min(count, chunk, memory // (4 * per_lane)))
