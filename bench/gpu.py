@@ -13,6 +13,7 @@ one time is saved, and the end, its code and the counts come back; the best of t
 import re
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from functools import partial
@@ -141,7 +142,23 @@ def failures(quick: bool) -> Figures:
     except Exception as error:
         said = "RESOURCE_EXHAUSTED" if "RESOURCE_EXHAUSTED" in str(error) else str(error)[:200]
     yield figure("too many lanes are refused", "disc", said)
-    yield figure("lanes that changed after that", "1000 discs", int(jnp.sum(jnp.any(run(x)[0] != good[0], axis=1))), 0)
+    yield figure("numbers that changed after that", "1000 discs", jnp.sum(run(x)[0] != good[0]), 0)
+
+
+def interrupted(quick: bool) -> Figures:
+    """Ctrl-C while the device works; then all goes on."""
+    x = jnp.linspace(-6.0, -3.0, 3_000_000)
+    run = jax.jit(jax.vmap(DISCS["values"][1]))
+    good = jax.block_until_ready(run(x))
+    timer, said = threading.Timer(0.02, signal.raise_signal, [signal.SIGINT]), "nothing"
+    try:
+        timer.start()
+        jax.block_until_ready(run(x))
+        timer.join()
+    except KeyboardInterrupt:
+        said = "KeyboardInterrupt"
+    yield figure("Ctrl-C ends in", "3e6 discs", said)
+    yield figure("numbers that changed after that", "3e6 discs", jnp.sum(run(x)[0] != good[0]), 0)
 
 
 def twin(of: str, name: str, quick: bool) -> Figures:
@@ -150,10 +167,10 @@ def twin(of: str, name: str, quick: bool) -> Figures:
 
     run = lambda: [np.asarray(x) for x in jax.tree.leaves(jax.jit(jax.vmap(KINDS[of][name][1]))(jnp.linspace(*SPREAD[of], 7)))]  # noqa: E731
     expected = run()
-    with gpu_twin.in_place_of_a_gpu("at once", memory=2**20) as texts:
-        found = run()
-    differ = sum(not np.array_equal(*x) for x in zip(found, expected, strict=True))
-    yield figure(f"arrays that differ, threads of a GPU on the CPU, {name}", f"7 lanes of a {of}", differ, 0)
+    for order in ("in order", "reversed", "at once"):
+        with gpu_twin.in_place_of_a_gpu(order, memory=2**20) as texts:
+            differ = sum(not np.array_equal(*x) for x in zip(run(), expected, strict=True))
+        yield figure(f"arrays that differ, threads of a GPU on the CPU {order}, {name}", f"7 lanes of a {of}", differ, 0)
     text = max(texts, key=len)
     for architecture in ("sm_75", "sm_80", "sm_90", "sm_100"):
         ptx = nvidia.text_for(text, architecture)
@@ -184,7 +201,7 @@ def with_gpu() -> tuple[dict, list[str]]:
     parts |= {"one disc, values": partial(alone, "disc", "values", -4.0, 1.0, 3.0), "one disc, gradient": partial(alone, "disc", "gradient", -4.0, 3.0, None)}
     parts |= {f"speed, disc, {lanes:g}": partial(speed, "disc", "values", lanes) for lanes in (10**6, 10**7)}
     parts |= {f"speed, disc, {name}": partial(speed, "disc", name, 10**6) for name in list(DISCS)[1:]}
-    parts |= {"failures": failures} | {f"speed, bicycle, {name}": partial(speed, "bicycle", name, 10**5) for name in BICYCLES}
+    parts |= {"failures": failures, "interrupted": interrupted} | {f"speed, bicycle, {name}": partial(speed, "bicycle", name, 10**5) for name in BICYCLES}
     parts["one bicycle, values"] = partial(alone, "bicycle", "values", 0.3, None, 8.0)
     return parts, [name for name in parts if name not in ("bits, bicycle, tangent", "bits, bicycle, gradient")]
 
