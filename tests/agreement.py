@@ -6,12 +6,12 @@ from solved_states import over_states
 import jourdain_jax as jj
 
 
-def admissible_states(scene: jj.Scene, count: int, seed: int = 0) -> list[tuple]:
+def admissible_states(scene: jj.Scene, count, seed=0):
     """Random states (t, q, u) on the constraints."""
     return list(zip(*jj.sample_states(scene, count, seed), strict=True))
 
 
-def disagreement(scene: jj.Scene, count: int = 20, seed: int = 0) -> dict[str, float]:
+def disagreement(scene: jj.Scene, count=20, seed=0):
     """Largest difference of accelerations and constraint forces from those by QR, relative to the largest at each state.
 
     The size of forces is the largest of constraint, impressed and inertia forces, for scenes without constraints. Reductions that
@@ -36,5 +36,5 @@ def disagreement(scene: jj.Scene, count: int = 20, seed: int = 0) -> dict[str, f
     }
 
 
-def _relative(values, expected, size) -> float:
+def _relative(values, expected, size):
     return float(np.max(np.max(np.abs(values - expected), axis=1) / np.where(size > 0, size, 1.0)))

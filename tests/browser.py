@@ -4,7 +4,6 @@ import os
 import shutil
 import subprocess
 import tempfile
-from pathlib import Path
 
 import matplotlib.image
 import numpy as np
@@ -16,7 +15,7 @@ needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this
 _FLAGS = "--headless=new --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --hide-scrollbars --no-first-run --disable-extensions"
 
 
-def _run(url: str, *flags: str, budget: int = 4000) -> str:
+def _run(url, *flags: str, budget=4000):
     with tempfile.TemporaryDirectory() as profile:
         hosts = "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE localhost"
         command = [str(CHROMIUM), *_FLAGS.split(), hosts, f"--user-data-dir={profile}", f"--virtual-time-budget={budget}", *flags, url]
@@ -24,12 +23,12 @@ def _run(url: str, *flags: str, budget: int = 4000) -> str:
     return done.stdout
 
 
-def screenshot(url: str, path: Path, size: tuple[int, int] = (500, 350), budget: int = 4000) -> np.ndarray:
+def screenshot(url, path, size=(500, 350), budget=4000) -> np.ndarray:
     """Pixels (height, width, 3), 0 to 1, of the page at `url`; the picture is kept at `path`."""
     _run(url, f"--screenshot={path}", f"--window-size={size[0]},{size[1]}", budget=budget)
     return np.asarray(matplotlib.image.imread(path))[..., :3]
 
 
-def dom(url: str, budget: int = 4000) -> str:
+def dom(url, budget=4000):
     """The page at `url` as it is when its scripts have run."""
     return _run(url, "--dump-dom", budget=budget)

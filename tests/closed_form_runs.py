@@ -9,7 +9,7 @@ from tolerances import relative_error
 import jourdain_jax as jj
 
 
-def end_error(scene: jj.Scene, start: dict, motion: Callable[..., dict], run: dict, same: str = "", **columns: str) -> float:
+def end_error(scene: jj.Scene, start, motion: Callable[..., dict], run, same="", **columns: str):
     """Largest error at the end of a run, of each quantity relative to the largest value that it takes during the run.
 
     **Arguments:** `start`, values by name; `motion(times, **run)`, true values by name, to `run["t_end"]` in s; names of coordinates and speeds that are

@@ -8,7 +8,6 @@ import gc
 import importlib.metadata
 import os
 import sys
-from collections.abc import Iterator
 from functools import partial, wraps
 from pathlib import Path
 
@@ -41,7 +40,7 @@ SLOW = frozenset(line for line in (Path(__file__).parent / "slow.txt").read_text
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest looks at marks
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     """Marks what `slow.txt` names; the longest files first."""
     for item in items:
         if item.nodeid.removeprefix("tests/") in SLOW:
@@ -50,7 +49,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 
 
-def pytest_collection_finish(session: pytest.Session) -> None:
+def pytest_collection_finish(session):
     """Tracing makes millions of objects that live for a moment: what is there for good is not looked through again and again for garbage among it."""
     gc.collect()
     gc.freeze()
@@ -78,7 +77,7 @@ def _less_effort():
 CHECKED: set = set()  # annotated functions that the test has called
 
 
-def pytest_runtest_setup() -> None:
+def pytest_runtest_setup():
     """Types are checked in the first call of each function in each test: in every call, checks took a tenth of the time of all tests."""
     CHECKED.clear()
 
@@ -105,7 +104,7 @@ def _compiled_programs_are_dropped():
 
 
 @pytest.fixture(scope="module")
-def small_blocks() -> Iterator[None]:
+def small_blocks():
     """Blocks of a study are of 32 lanes, so that few lanes make several."""
     from jourdain_jax.ensembles import task
 
@@ -115,7 +114,7 @@ def small_blocks() -> Iterator[None]:
 
 
 @pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list:
+def drawn(monkeypatch):
     """All figures of matplotlib that are written."""
     from matplotlib.figure import Figure
 
@@ -125,7 +124,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list:
 
 
 @pytest.fixture
-def compilations() -> list:
+def compilations():
     """Programs that JAX compiles during a test, one entry each."""
     import jax
 
@@ -134,7 +133,7 @@ def compilations() -> list:
     return found
 
 
-def pytest_configure(config: pytest.Config) -> None:
+def pytest_configure(config):
     """In a process that runs tests: run-time checks; machine code of our own is kept in pytest's cache, so that a second run does not make it again.
 
     Programs that XLA compiles are not kept: working out the key of each takes a tenth of its compilation.
@@ -183,7 +182,7 @@ def pytest_configure(config: pytest.Config) -> None:
         install_import_hook([f"jourdain_jax.{layer}" for layer in LAYERS], "beartype.beartype")  # before any import of the package
 
 
-def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+def pytest_sessionfinish(session, exitstatus):
     """A run in which every test was skipped has tested nothing: fail it as pytest fails an empty run."""
     reporter = session.config.pluginmanager.get_plugin("terminalreporter")
     on_worker = "PYTEST_XDIST_WORKER" in os.environ

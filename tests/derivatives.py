@@ -3,7 +3,7 @@
 import jax
 
 
-def derivatives(f, x, directions) -> dict:
+def derivatives(f, x, directions):
     """Of a scalar `f` at the vector `x`, along the two rows of `directions`.
 
     Forwards: `f' d0` and `d1' f'' d0` by jvp of jvp. Backwards: `f'` and `f'' d0` by vjp of vjp.

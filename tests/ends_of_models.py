@@ -8,7 +8,7 @@ import numpy as np
 import jourdain_jax as jj
 
 
-def end_of_model(name: str, start, parameters: list[str], **options) -> tuple[Callable, jnp.ndarray]:
+def end_of_model(name, start, parameters, **options) -> tuple[Callable, jnp.ndarray]:
     """A number made of saved states and the end of a motion, as a function of parameters and two directions of the start; and where to look."""
     scene = jj.models.MODELS[name]()
     begun = jj.start(scene, **(scene.example if start is None else start))

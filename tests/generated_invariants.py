@@ -32,7 +32,7 @@ PUSH = 0.7  # value of the input, where a scene has one
 NEAR = 0.03  # smallest singular values of the rows, and of M, below which an instance counts as near a loss of rank and is left out
 
 
-def instances(recipe: Recipe, parameters: int, states: int, seed: int):
+def instances(recipe: Recipe, parameters, states, seed):
     """Scenes with random parameters as one batch, the first of them alone, and states off the rows: (t, q, u), `states` of them for each scene."""
     scenes = [generated(recipe, seed + k) for k in range(parameters)]
     draw = np.random.default_rng([recipe.seed, seed, 7])
@@ -45,7 +45,7 @@ def instances(recipe: Recipe, parameters: int, states: int, seed: int):
     return stacked, scene, draw.uniform(0, 2, count), q, u
 
 
-def dimensions(recipe: Recipe) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
+def dimensions(recipe: Recipe):
     """Which coordinates, and which speeds, are lengths and their rates."""
     q, u = [], []
     for _, stem, _ in coordinate_list(recipe):
@@ -54,7 +54,7 @@ def dimensions(recipe: Recipe) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
     return tuple(q), tuple(u)
 
 
-def evaluated(recipe: Recipe, *, parameters: int, states: int, seed: int = 0, compiled: bool = False, looks: bool = True) -> dict:
+def evaluated(recipe: Recipe, *, parameters, states, seed=0, compiled=False, looks=True):
     """Everything at all instances, as NumPy arrays with a leading axis of instances; `looks`: also seen differently."""
     stacked, scene, t, q, u = instances(recipe, parameters, states, seed)
     run = jax.jit if compiled else partial(uncompiled_lanes, shared=None)
@@ -85,7 +85,7 @@ def evaluated(recipe: Recipe, *, parameters: int, states: int, seed: int = 0, co
 
 
 @eqx.filter_jit
-def _solved(ways: dict, equations, rows) -> dict:
+def _solved(ways, equations, rows):
     """Accelerations by every reduction of equations and rows; traced once for each shape."""
     return {name: reduce(way, equations, rows) for name, way in ways.items()}
 
@@ -96,7 +96,7 @@ def _diagnosed(found, equations, rows):
 
 
 @eqx.filter_jit
-def _bases(independent: tuple[int, ...], equations, rows) -> dict:
+def _bases(independent, equations, rows):
     """Null spaces of the scaled rows, and accelerations by other bases Z R of them."""
     problem = scaled(equations, rows)
     n = problem.M.shape[0]
@@ -121,7 +121,7 @@ def _accelerations(scene, ways, t, q, u, inputs):
     return found | {name: way.accelerations(scene, t, q, u, equations, rows) for name, way in gibbs.items()}, equations, rows
 
 
-def _seen(recipe: Recipe, scene, view, t, q, u, rate) -> dict:
+def _seen(recipe: Recipe, scene, view, t, q, u, rate):
     """Accelerations of the same motion, seen differently."""
     inputs = PUSH * jnp.ones(len(scene.inputs))
     lengths, paces = dimensions(recipe)
@@ -140,7 +140,7 @@ def _seen(recipe: Recipe, scene, view, t, q, u, rate) -> dict:
     }
 
 
-def _plain(scene, t, q, u, sign) -> dict:
+def _plain(scene, t, q, u, sign):
     """Everything at one state near (q, u), with the speeds of the given sign."""
     inputs = PUSH * jnp.ones(len(scene.inputs))
     q = project_positions(scene, t, q)
@@ -204,13 +204,13 @@ def _plain(scene, t, q, u, sign) -> dict:
     }
 
 
-def admitted(found: dict) -> np.ndarray:
+def admitted(found) -> np.ndarray:
     """Which instances lie on the rows, away from a loss of rank (of the rows, or of M)."""
     rank = found["rank"]
     return (found["miss"] < 1e-10) & (found["sigma"] > NEAR) & (found["sigma of M"] > NEAR**2) & (rank == rank.max())
 
 
-def residuals(recipe: Recipe, found: dict) -> dict[str, np.ndarray]:
+def residuals(recipe: Recipe, found) -> dict[str, np.ndarray]:
     """Residual of every invariant at the admitted instances, each an array over them."""
     good = admitted(found)
     found = jax.tree.map(lambda x: x[good], found)
@@ -249,7 +249,7 @@ def residuals(recipe: Recipe, found: dict) -> dict[str, np.ndarray]:
     return out | (_of_views(found) if "seen" in found else {})
 
 
-def _of_views(found: dict) -> dict[str, np.ndarray]:
+def _of_views(found) -> dict[str, np.ndarray]:
     """One motion, seen differently, by every reduction."""
     seen = found["seen"]
     names, _ = views(1, 1)

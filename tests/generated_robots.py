@@ -122,7 +122,7 @@ class BeadOnCurve(jj.Scene):
         return {"x": float(self.a * c), "y": float(self.a * s), "s_rate": speed}
 
 
-def drawn(seed: int):
+def drawn(seed):
     """The scene with this number."""
     draw = np.random.default_rng(seed)
     turned = float(draw.uniform(-3, 3))

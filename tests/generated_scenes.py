@@ -35,24 +35,24 @@ class Recipe:
     loads: tuple[Part, ...]
     own_speeds: str  # "", "homogeneous" or "affine" quasi-velocities
 
-    def __str__(self) -> str:
+    def __str__(self):
         rows = ", ".join(f"{p.kind}{list(p.on)}" for p in self.rows)
         loads = ", ".join(f"{p.kind}{list(p.on)}" for p in self.loads)
         own = self.own_speeds or "none"
         return f"structure {self.seed}: bodies {', '.join(self.bodies)}; rows {rows or 'none'}; loads {loads or 'none'}; own speeds: {own}"
 
-    def kinds(self) -> set[str]:
+    def kinds(self):
         """Everything that occurs in it."""
         own = {f"{self.own_speeds} quasi-velocities"} if self.own_speeds else set()
         return {*self.bodies, *(p.kind for p in self.rows), *(p.kind for p in self.loads)} | own
 
     @property
-    def scleronomic(self) -> bool:
+    def scleronomic(self):
         """Whether nothing depends on time, and bodies rest when the speeds vanish."""
         return self.kinds().isdisjoint(TIMED | MOVING)
 
     @property
-    def reversible(self) -> bool:
+    def reversible(self):
         """Whether motions may be run backwards: nothing depends on time, and no force is odd in the speeds."""
         return self.scleronomic and self.kinds().isdisjoint(ODD)
 
@@ -83,22 +83,22 @@ GEOMETRIC = {"rod", "pin", "flat pin", "curve"}
 LENGTHS = {"x", "y", "z"}
 
 
-def coordinates_of(kind: str):
+def coordinates_of(kind):
     """Stems and middles of the coordinates of a body of this kind; methods of scenes may not read the dictionary itself."""
     return KINDS[kind]
 
 
-def coordinate_list(recipe: Recipe) -> list[tuple[int, str, float]]:
+def coordinate_list(recipe: Recipe):
     """Body, stem and middle of every coordinate; a quaternion counts once."""
     return [(i, stem, middle + (1.1 * i if stem == "x" else 0.0)) for i, kind in enumerate(recipe.bodies) for stem, middle in KINDS[kind]]
 
 
-def speed_count(kind: str) -> int:
+def speed_count(kind):
     """Number of speeds of a kind of body."""
     return sum(3 if stem == "*" else 1 for stem, _ in KINDS[kind])
 
 
-def plain_coordinates(recipe: Recipe) -> list[int]:
+def plain_coordinates(recipe: Recipe):
     """Positions, among all speeds, of coordinates that are no quaternions."""
     found, at = [], 0
     for _, stem, _ in coordinate_list(recipe):
@@ -107,7 +107,7 @@ def plain_coordinates(recipe: Recipe) -> list[int]:
     return found
 
 
-def body_name(i: int) -> str:
+def body_name(i):
     """Names out of order, so that the engine's own order differs from that of the recipe."""
     return f"{'khbsc'[i]}{i}"
 
@@ -149,7 +149,7 @@ class Generated(jj.Scene):
             made.append(self._body(i, kind, t, q, made[-1] if made else None))
         return {body_name(i): body for i, body in enumerate(made)}
 
-    def _body(self, i: int, kind: str, t, q, parent):
+    def _body(self, i, kind, t, q, parent):
         m, size, o = self.masses[i], self.sizes[i], 0.0 * t
         value = {stem: q[f"{stem}{i}"] for stem, _ in coordinates_of(kind) if stem != "*"}
         if kind == "swing":
@@ -179,7 +179,7 @@ class Generated(jj.Scene):
         centre = position if kind == "wheel" else position + frame @ jnp.stack([o, o, size])
         return jj.RigidBody.thin_disc(m, size, axis="y", position=centre, orientation=whole)
 
-    def _moments(self, i: int):
+    def _moments(self, i):
         squares = self.masses[i] * self.sides[i] ** 2 / 12
         products = 0.05 * (jnp.ones((3, 3)) - jnp.eye(3)) * jnp.min(squares)
         return jnp.diag(jnp.sum(squares) - squares) + products
@@ -198,11 +198,11 @@ class Generated(jj.Scene):
                 made[f"ground {i}"] = jj.ball_contact(pose[name], size, ground=plane)
         return made
 
-    def place(self, pose, i: int, local):
+    def place(self, pose, i, local):
         """A point of body i, or of the ground."""
         return local if i == GROUND else pose[body_name(i)].place(local)
 
-    def _geometric(self, s: int, pose):
+    def _geometric(self, s, pose):
         """Value of geometric row s; None where the row is of another kind."""
         part, hold, factor = self.recipe.rows[s], self.anchors[s], self.factors[s]
         if part.kind in ("rod", "pin", "flat pin"):
@@ -222,7 +222,7 @@ class Generated(jj.Scene):
         values = {f"{part.kind} {s}": self._geometric(s, pose) for s, part in enumerate(self.recipe.rows)}
         return {name: value for name, value in values.items() if value is not None}
 
-    def _velocity(self, s: int, motion):
+    def _velocity(self, s, motion):
         """Value of velocity row s; None where the row is of another kind."""
         part, factor, t = self.recipe.rows[s], self.factors[s], motion.t
         if part.kind == "edge":
@@ -321,7 +321,7 @@ class GeneratedWithOwnSpeeds(Generated):
         return self._rates(motion.q.array, motion.u.array)
 
 
-def recipe(seed: int) -> Recipe:
+def recipe(seed) -> Recipe:
     """The structure with this number: first body and first row go through all kinds in turn, the rest is drawn."""
     draw = np.random.default_rng(1000 + seed)
     names = list(KINDS)
@@ -374,7 +374,7 @@ def _drawn_rows(made: Recipe, draw) -> tuple[Part, ...]:
     return tuple(rows)
 
 
-def _coordinate_index(made: Recipe, number: int) -> int:
+def _coordinate_index(made: Recipe, number):
     """Position among the entries of q of a coordinate given by its place in the list."""
     return sum(4 if stem == "*" else 1 for _, stem, _ in coordinate_list(made)[:number])
 
@@ -404,7 +404,7 @@ def _drawn_loads(made: Recipe, draw) -> tuple[Part, ...]:
     return tuple(Part(kind, on) for kind in dict.fromkeys(wanted) if (on := choices[kind]) is not None)
 
 
-def generated(recipe: Recipe, seed: int) -> Scene:
+def generated(recipe: Recipe, seed) -> Scene:
     """A scene of this structure with random parameters, assembled at its reference configuration."""
     draw = np.random.default_rng([recipe.seed, seed])
     n, rows = len(recipe.bodies), len(recipe.rows)

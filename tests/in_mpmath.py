@@ -24,7 +24,7 @@ NUMBERS: dict[str, Callable] = {
 }
 
 
-def in_mpmath(op: str) -> Callable:
+def in_mpmath(op):
     """A function of numbers, by its name in the table."""
     return NUMBERS.get(op) or getattr(mpmath, op)
 
@@ -36,7 +36,7 @@ class Known(NamedTuple):
     error: mpmath.mpf
 
 
-def found(op: str, arguments: list, round_off: float) -> Known | bool | None:
+def found(op, arguments, round_off) -> Known | bool | None:
     """What an operation makes of numbers that are known so well, given its own round-off, relative; None where that is not settled.
 
     Nothing is settled by an argument that is not, near a jump or a bound of the domain, or where a number is no usual one.

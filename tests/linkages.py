@@ -77,7 +77,7 @@ class Loop(jj.Scene):
         return {"place": r, "attitude": (R - jnp.eye(3)).ravel()}
 
 
-def bennett(twist: float, other: float, length: float = 1.0) -> Loop:
+def bennett(twist, other, length=1.0) -> Loop:
     """Bennett's four-bar linkage: opposite links are equal, `sin(twist)/length` is the same for all."""
     lengths = (length, float(length * np.sin(other) / np.sin(twist)))
     return Loop(lengths * 2, (twist, other) * 2)

@@ -17,7 +17,7 @@ def end_of(body, distance) -> Float[Array, "3"]:
     return body.place(jnp.stack([distance, 0 * distance, 0 * distance]))
 
 
-def pinned(name: str, first: Float[Array, "3"], second: Float[Array, "3"]) -> dict:
+def pinned(name, first: Float[Array, "3"], second: Float[Array, "3"]):
     """Two rows that hold two points of the plane together."""
     return {f"{name} x": first[0] - second[0], f"{name} z": first[2] - second[2]}
 
@@ -70,7 +70,7 @@ class SliderCrank(jj.Scene):
         return pinned("pin", end_of(pose["rod"], jnp.asarray(0.5)), pose["slider"].position)
 
 
-def slider_crank_motion(a_0: float, rate: float, ts, slider: float = 0.5) -> np.ndarray:
+def slider_crank_motion(a_0, rate, ts, slider=0.5) -> np.ndarray:
     """Angle a (rad) of `SliderCrank` at times `ts` on its branch b = -a, by quadrature of the energy.
 
     T = I(a) a'^2/2 with I = 2/12 + 1/4 (crank) + |d centre of rod/da|^2 + 4 slider sin^2 a; centre of the rod: (3/2 cos a, 1/2 sin a).

@@ -33,7 +33,7 @@ class View(eqx.Module):
     mix: object  # b_k, per speed
 
 
-def views(coordinates: int, speeds: int) -> tuple[tuple[str, ...], View]:
+def views(coordinates, speeds) -> tuple[tuple[str, ...], View]:
     """Names of the ways of looking, and all of them as one batch."""
     q, u = np.zeros(coordinates), np.zeros(speeds)
     plain = View(np.eye(3), np.zeros(3), np.zeros(3), np.array(1.0), np.array(1.0), np.array(1.0), q, u)
@@ -49,7 +49,7 @@ def views(coordinates: int, speeds: int) -> tuple[tuple[str, ...], View]:
     return tuple(made), jax.tree.map(lambda *x: np.stack(x), *made.values())
 
 
-def other_names(names) -> tuple[tuple[str, str], ...]:
+def other_names(names):
     """New names of the bodies, in the opposite order."""
     return tuple((name, f"body {chr(ord('z') - i)}") for i, name in enumerate(sorted(names)))
 
@@ -167,7 +167,7 @@ class Seen(jj.Scene):
             )
         return tuple(made[::-1])
 
-    def _new_forces(self, seen, generalized) -> dict:
+    def _new_forces(self, seen, generalized):
         """Forces on the new speeds with the same virtual power."""
         if not generalized:
             return {}

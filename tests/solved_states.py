@@ -11,7 +11,7 @@ def over_states(f, *states):
     return jax.tree.map(lambda *found: np.stack(found), *(f(*state) for state in zip(*states, strict=True)))
 
 
-def solved_at_random_states(scene: jj.Scene, count: int = 20):
+def solved_at_random_states(scene: jj.Scene, count=20):
     """Coordinates, speeds and accelerations by name, each an array over the states, and the whole result."""
     t, q, u = jj.sample_states(scene, count)
     solved = over_states(lambda *state: jj.accelerations(scene, *state), t, q, u)

@@ -189,14 +189,14 @@ from baselines import count, dense, disc_run, flat, heyoka_disc, heyoka_lowered 
 STATES = 20
 
 
-def _with_random_parameters(name: str) -> jj.Scene:
+def _with_random_parameters(name) -> jj.Scene:
     """A model whose parameters differ from the defaults by up to 20 %, angles that are zero excepted: they become 0.2."""
     scene, generator = jj.models.MODELS[name](), np.random.default_rng(7)
     return scene.replace(**{key: (value or 0.2) * generator.uniform(0.8, 1.2) for key, value in _parameters(scene).items()})
 
 
 @functools.cache
-def _solved(name: str):
+def _solved(name):
     """A scene, states of it, and the engine's rates there."""
     scene = _with_random_parameters(name)
     t, q, u = jj.sample_states(scene, STATES)
@@ -210,11 +210,11 @@ def _assert_equal(found, expected, among=None):
     assert np.max(np.max(np.abs(found - expected), axis=1) / largest) < tolerance("round_off")
 
 
-def _columns(states) -> tuple:
+def _columns(states):
     return tuple(np.asarray(states).T)
 
 
-def _parameters(scene: jj.Scene) -> dict:
+def _parameters(scene: jj.Scene):
     return {field.name: float(getattr(scene, field.name)) for field in dataclasses.fields(scene) if field.metadata}
 
 

@@ -58,7 +58,7 @@ def test_rows_stated_twice_hide_no_singular_partition():
     assert motion.result == results.SINGULAR_PARTITION
 
 
-def _parallelograms(count: int, **options):
+def _parallelograms(count, **options):
     w, a_0, ts = np.linspace(0.5, 8.0, count), 0.7, np.linspace(0.0, 3.0, 201)
     starts = {"a": np.full(count, a_0), "b": np.zeros(count), "c": np.full(count, a_0), "a_rate": w, "b_rate": 0 * w, "c_rate": w}
     found = jj.rollout(Parallelogram(), starts, ts=ts, **options)

@@ -123,16 +123,16 @@ def test_a_model_whose_numbers_decide_otherwise_than_the_defaults_of_its_class_s
     assert any(told)
 
 
-def batch(scene, ts, start) -> list:
+def batch(scene, ts, start):
     return jj.rollout(scene, {**start, "x": jnp.array([0.1, 0.2])}, ts=ts)["y"].tolist()
 
 
-def alone(scene, ts, start) -> list:
+def alone(scene, ts, start):
     motion = jj.simulate(scene, start, ts=ts)
     return [int(motion.result), int(motion.fallback), float(motion.smallest_pivot), *motion.q_end.tolist(), *motion.u_end.tolist()]
 
 
-def fitted(scene, ts, start) -> list:
+def fitted(scene, ts, start):
     data = jj.Experiment(ts, {"x": 0.1 + ts, "z": 0.02 * ts}, 0.01, start=start)
     return jj.fit(scene, data, free={"arm": None}, max_iterations=2).values.tolist()
 

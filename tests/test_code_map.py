@@ -84,7 +84,7 @@ def test_the_drawing_of_the_packages_shows_the_steps_that_the_page_tells():
     assert [steps for steps in told if steps] == [[room for room, _ in steps] for _, _, steps in drawing["CALLS"]]
 
 
-def names_in(file: str) -> set[str]:
+def names_in(file):
     """Functions and classes of a file, methods as `Class.method`."""
     body = ast.parse((code_map.SOURCE / file).read_text(encoding="utf-8")).body
     defined = [node for node in body if isinstance(node, ast.FunctionDef | ast.ClassDef)]

@@ -18,7 +18,7 @@ UP = np.array([0.0, 0.0, 1.0])
 SHAPES = ("ball", "ellipsoid", "disc", "wheel")
 
 
-def poses(scene, count: int):
+def poses(scene, count):
     """Random coordinates of a free body; near the ground, but not on it."""
     random = np.random.default_rng(7)
     place = random.uniform(-1, 1, (count, 3))
@@ -36,7 +36,7 @@ def poses(scene, count: int):
     return np.hstack([place, random.normal(size=(count, 4))])
 
 
-def rolling(ground: str, shape: str) -> Rolls:
+def rolling(ground, shape) -> Rolls:
     scene = Rolls(make_ground=GROUNDS[ground], shape=shape, moments=(0.3, 0.4, 0.35))
     object.__setattr__(scene, "shape_of_ground", ground)
     return scene

@@ -22,7 +22,7 @@ def coloured(generator, ts, tau, shape=()) -> np.ndarray:
     return generator.normal(size=(*shape, len(ts))) @ factor.T
 
 
-def sleigh_run(seed: int, correlation_time, sigma=SIGMA, ts=TS, repeats=(), missing=()) -> jj.Experiment:
+def sleigh_run(seed, correlation_time, sigma=SIGMA, ts=TS, repeats=(), missing=()) -> jj.Experiment:
     motion = sleigh_oracle.motion(ts, mass=1.3, inertia=0.4, a=0.25, v0=-0.6, w0=0.9)
     generator = np.random.default_rng(seed)
     values = {name: motion[key] + SIGMA * coloured(generator, ts, TAU, repeats) for name, key in (("x", "x"), ("y", "y"), ("heading", "th"))}

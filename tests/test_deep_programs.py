@@ -12,7 +12,7 @@ from jourdain_jax.program.graph import Graph
 LINKS = 30
 
 
-def chain(links: int):
+def chain(links):
     """A recursion outwards, one back inwards over its results, and a sum over both; every link has its own length and angle.
 
     v_i = v_{i-1} cos(a_i - a_{i-1}) + l_i sin(v_{i-1}),   w_i = (v_i - w_{i+1})/(2 + w_{i+1}^2),   s = sum v_i w_i

@@ -51,7 +51,7 @@ def _methods(owner: type):
             yield name, getattr(owner, name)
 
 
-def _unsaid(function) -> list[str]:
+def _unsaid(function):
     """Parameters that a docstring does not name."""
     text = inspect.getdoc(function) or ""
     return [name for name in inspect.signature(function).parameters if name not in SELF_EVIDENT and not re.search(rf"\b{name}\b", text)]

@@ -53,12 +53,12 @@ def test_anchors_of_links_are_seen():
     assert anchors(text) == {"some-heading-two"}
 
 
-def links(text: str) -> list[tuple[str, str]]:
+def links(text):
     """Targets of the links of a page and the anchors on them, those in code left out."""
     return re.findall(r"\]\(([^)#\s]*)#?([^)\s]*)[^)]*\)", _CODE.sub("", text))
 
 
-def anchors(text: str) -> set[str]:
+def anchors(text):
     """Of the headings of a page, as GitHub and MyST name them: small letters and hyphens."""
     headings = re.findall(r"^#+ +(.+)$", _CODE.sub("", text), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in headings}

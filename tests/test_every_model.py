@@ -31,7 +31,7 @@ QUICK = {"skate", "chaplygin-sleigh"}  # a full state with projection, a minimal
 natively = machine_code.needed
 
 
-def other_parameters(name: str, seed: int) -> jj.Scene:
+def other_parameters(name, seed) -> jj.Scene:
     """The model with all parameters changed by up to a tenth; those that are zero, by up to 0.1, unless they must not be negative."""
     scene, generator = MODELS[name](), np.random.default_rng(seed)
     shift = lambda x: generator.uniform(-0.1, 0.1, x.shape) * np.where(np.asarray(x) == 0, 1.0, np.asarray(x))  # noqa: E731
@@ -97,7 +97,7 @@ class OfAMotion(NamedTuple):
     direction: np.ndarray  # d
 
 
-def end_of_two_steps(name: str, *, with_start: bool):
+def end_of_two_steps(name, *, with_start):
     """`x -> q, u at the end of two steps`, where x holds all parameters and the state at the start; and x.
 
     Every step is accepted, whatever its error, and the first is shorter than half of the span: so the derivatives are those of the steps to round-off.
@@ -124,7 +124,7 @@ def end_of_two_steps(name: str, *, with_start: bool):
     return end, np.where(flat == 0, 0.01, flat)
 
 
-def derivatives_of(name: str, *, with_start: bool = False) -> OfAMotion:
+def derivatives_of(name, *, with_start=False) -> OfAMotion:
     """Both modes, by the machine code that a user gets; the operations around it run on NumPy, in a third of the time that XLA takes to compile them."""
     end, x = end_of_two_steps(name, with_start=with_start)
     generator = np.random.default_rng(0)
@@ -140,7 +140,7 @@ def derivatives_of(name: str, *, with_start: bool = False) -> OfAMotion:
     return OfAMotion(along, better, left, gradient, weights, direction)
 
 
-def check_both_modes(found: OfAMotion) -> None:
+def check_both_modes(found: OfAMotion):
     """Forward mode against central differences, and against reverse mode: w'(J d) = (J'w)'d."""
     size = np.max(np.abs(found.forwards))
     assert np.max(found.left) <= 1e-8 * size

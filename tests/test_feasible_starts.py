@@ -270,14 +270,14 @@ def test_a_state_that_newtons_method_does_not_bring_onto_the_rows_is_searched_fo
 STEP = 2e-3
 
 
-def _slope(function, s: float = 0.0) -> np.ndarray:
+def _slope(function, s=0.0) -> np.ndarray:
     """The derivative by Richardson's extrapolation of central differences, of order 6."""
     D = [(np.asarray(function(s + h)) - np.asarray(function(s - h))) / (2 * h) for h in (STEP, STEP / 2, STEP / 4)]
     D = [(4 * b - a) / 3 for a, b in pairwise(D)]
     return (16 * D[1] - D[0]) / 15
 
 
-def _along(scene: jj.Scene, held: tuple[str, ...], off: float):
+def _along(scene: jj.Scene, held, off):
     """What is put onto the rows as a function of one number, on which parameters, time, coordinates and speeds depend."""
     generator = np.random.default_rng(2)
     _, q, u = jj.sample_states(scene, 1)

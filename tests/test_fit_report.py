@@ -3,7 +3,6 @@
 import pickle
 import re
 import sys
-from pathlib import Path
 from xml.etree import ElementTree
 
 import jax.numpy as jnp
@@ -22,7 +21,7 @@ TS = jnp.linspace(0.0, 4.0, 41)
 TRUTH = jj.models.ChaplyginSleigh(offset=0.25)
 
 
-def measured(seed: int, start=START, ts=TS) -> jj.Experiment:
+def measured(seed, start=START, ts=TS) -> jj.Experiment:
     motion, noise = jj.simulate(TRUTH, start, ts=ts), np.random.default_rng(seed)
     values = {name: np.asarray(motion[name]) + 0.01 * noise.normal(size=len(ts)) for name in ("x", "heading")}
     values["x"][3] = np.nan
@@ -51,11 +50,11 @@ def test_measurements_that_count_twice_are_named(fitted):
     assert jj.fit(TRUTH, both, free=("offset",)).warning.startswith("`odometer` of run 0 and `x` of run 0 hold the same numbers")
 
 
-def page(path: Path) -> ElementTree.Element:
+def page(path) -> ElementTree.Element:
     return ElementTree.fromstring(path.read_text(encoding="utf-8").removeprefix("<!DOCTYPE html>").replace('<meta charset="utf-8">', ""))
 
 
-def sections(path: Path) -> dict[str, dict[str, list[str]]]:
+def sections(path):
     """Title -> first cell -> the other cells of lines; cells stand two blanks apart. The text of the fit itself comes first, without a title."""
     found, title = {}, ""
     for part in page(path).iter():
@@ -66,7 +65,7 @@ def sections(path: Path) -> dict[str, dict[str, list[str]]]:
     return found
 
 
-def captions(path: Path) -> list[str | None]:
+def captions(path):
     """Those of all figures."""
     return [figure.findtext("figcaption") for figure in page(path).iter("figure")]
 
@@ -310,7 +309,7 @@ def test_a_share_is_by_how_much_the_variance_falls_with_the_weight_of_the_sample
     """d log C_ii / d log w, by central differences of fits to exact data with changed sigmas."""
     other = {"x_rate": -0.8, "heading_rate": 0.4}
 
-    def fitted(change: float, where: str):
+    def fitted(change, where):
         sigma = [{"x": np.full(41, 0.01), "heading": np.full(41, 0.02)} for _ in range(2)]
         slower = np.exp(-change / 2)  # sigma = w^(-1/2)
         if where == "run 1":
@@ -360,7 +359,7 @@ def test_the_span_that_holds_half_of_the_information_is_the_shortest_one():
 def test_a_run_held_out_is_predicted_with_its_own_start_fitted_to_it():
     gyro = jj.Sensor("heading_rate", gain=jj.Estimate(1.0), bias=jj.Estimate(0.0, per_run=True))
 
-    def with_gyro(start, bias: float, seed: int):
+    def with_gyro(start, bias, seed):
         motion, noise = jj.simulate(TRUTH, start, ts=TS), np.random.default_rng(seed)
         values = {"x": np.asarray(motion["x"]) + 0.01 * noise.normal(size=41)}
         values["gyro"] = 1.1 * np.asarray(motion["heading_rate"]) + bias + 0.01 * noise.normal(size=41)

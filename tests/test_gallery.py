@@ -26,7 +26,7 @@ def _gallery_can_be_imported():
         sys.path.remove(str(path))
 
 
-def scene_of(name: str, **parameters) -> jj.Scene:
+def scene_of(name, **parameters) -> jj.Scene:
     """The scene in the file of this name."""
     module = importlib.import_module(f"scenes.{name}")
     kinds = [kind for kind in vars(module).values() if isinstance(kind, type) and issubclass(kind, jj.Scene) and kind.__module__ == module.__name__]
@@ -34,7 +34,7 @@ def scene_of(name: str, **parameters) -> jj.Scene:
     return kinds[0](**parameters)
 
 
-def among(expected, found) -> None:
+def among(expected, found):
     """Every expected eigenvalue (1/s) is found."""
     for value in expected:
         assert np.abs(np.asarray(found) - value).min() < 1e-8 * max(1.0, abs(value)), (value, found)
@@ -143,7 +143,7 @@ def maker():
     return importlib.import_module("make_gallery")
 
 
-def ink(path: Path) -> float:
+def ink(path):
     """The part of a picture's pixels that are not white."""
     import matplotlib.image
 
@@ -167,7 +167,7 @@ def test_every_page_draws_the_picture_that_it_shows(tmp_path):
         assert (tmp_path / re.search(r"Source: \[.*\]\((.*)\)", text)[1]).resolve() == entry.source
 
 
-def written(tmp_path, *names: str) -> None:
+def written(tmp_path, *names: str):
     """Pages and index of these names are there, with pictures that show something."""
     maker().main(["--out", str(tmp_path), *names])
     index = (tmp_path / "index.md").read_text()

@@ -26,7 +26,7 @@ MANY_PARAMETERS, MANY_STATES, MANY = 12, 20, 200  # 5,000 in all
 QUICKLY_LOWERED = (13, 16, 22)
 
 
-def broken(made: Recipe, found: dict) -> dict[str, float]:
+def broken(made: Recipe, found):
     """The invariants that do not hold to round-off, with their largest residuals."""
     largest = {name: float(np.max(values, initial=0.0)) for name, values in residuals(made, found).items()}
     return {name: value for name, value in largest.items() if not value <= tolerance("round_off")}
@@ -35,7 +35,7 @@ def broken(made: Recipe, found: dict) -> dict[str, float]:
 _EVALUATED: dict[int, dict] = {}  # what the first tests have worked out, for those of the scalar programs
 
 
-def check(number: int, *, parameters: int, states: int, least: int, seed: int, compiled: bool, looks: bool = True) -> None:
+def check(number, *, parameters, states, least, seed, compiled, looks=True):
     """All invariants of one structure."""
     made = recipe(number)
     found = evaluated(made, parameters=parameters, states=states, seed=seed, compiled=compiled, looks=looks)
@@ -75,7 +75,7 @@ def test_the_structures_contain_everything_that_can_be_generated():
     assert sum(r.scleronomic for r in made) >= 8
 
 
-def check_lowered(number: int, every_speed: bool) -> bool:
+def check_lowered(number, every_speed):
     """The scalar program of a structure against the dense path; False where it is not lowered. `every_speed`: by multipliers, not by elimination."""
     made = recipe(number)
     stacked, scene, t, *_ = instances(made, PARAMETERS, STATES, 0)

@@ -37,7 +37,7 @@ def test_importing_computes_nothing_and_a_motion_imports_what_it_needs():
     assert done.returncode == 0, done.stderr
 
 
-def _imports(package) -> dict[str, str]:
+def _imports(package):
     """The module of each name that the source of a package imports, for the interpreter or for static tools."""
     nodes = ast.walk(ast.parse(Path(package.__file__).read_text()))
     froms = [node for node in nodes if isinstance(node, ast.ImportFrom) and node.module.startswith("jourdain_jax")]

@@ -60,13 +60,13 @@ class Import(NamedTuple):
     star: bool
 
 
-def _modules(root: Path, package: str) -> dict[str, Path]:
+def _modules(root, package):
     """Dotted module name -> file, a package's `__init__.py` under the package's own name."""
     parts = {path: path.relative_to(root).with_suffix("").parts for path in sorted(root.rglob("*.py"))}
     return {".".join((package, *(part for part in names if part != "__init__"))): path for path, names in parts.items()}
 
 
-def _imports(module: str, path: Path, known: dict[str, Path]) -> Iterator[Import]:
+def _imports(module, path, known) -> Iterator[Import]:
     tree = ast.parse(path.read_text())
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
     inside = {inner for node in functions for inner in ast.walk(node)}
@@ -80,17 +80,17 @@ def _imports(module: str, path: Path, known: dict[str, Path]) -> Iterator[Import
                 yield Import(target, node.lineno, node in inside, name == "*")
 
 
-def _rank(module: str, package: str) -> int | None:
+def _rank(module, package) -> int | None:
     """Place of a module's layer in the table, the first name below the package; None where it has none."""
     layer = module.removeprefix(package).lstrip(".").split(".")[0] or "__init__"
     return len(LAYERS) if layer in ENTRY_MODULES else LAYERS.index(layer) if layer in LAYERS else None
 
 
-def _cycles(edges: dict[str, set[str]]) -> list[str]:
+def _cycles(edges):
     """One line per cycle of modules, found by depth-first search."""
     found, done = [], set()
 
-    def walk(module: str, path: list[str]) -> None:
+    def walk(module, path):
         if module in path:
             found.append("cycle: " + " -> ".join([*path[path.index(module) :], module]))
         elif module not in done:
@@ -103,7 +103,7 @@ def _cycles(edges: dict[str, set[str]]) -> list[str]:
     return found
 
 
-def violations(root: Path, package: str) -> list[str]:
+def violations(root, package):
     """Every breach of the rules in the tree at `root`, one sentence each."""
     known = _modules(root, package)
     found: list[str] = []

@@ -18,7 +18,7 @@ from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.identity_test import identity_probes
 
 
-def links(count: int) -> tuple[Pattern, np.ndarray]:
+def links(count) -> tuple[Pattern, np.ndarray]:
     """Rods in a row whose ends are points of a plane, and points on a zigzag: their rows in an order of no use."""
     order = np.random.default_rng(0).permutation(count)
     entries = [(int(order[i]), 2 * j + axis) for i in range(count) for j in (i, i + 1) for axis in range(2)]

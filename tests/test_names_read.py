@@ -33,7 +33,7 @@ PLANETS = "class Planet(enum.Enum):\n    moon = 1.0\n    earth = 4.0\n    def __
 WRAPPER = "class Own:\n    def __init__(self, f): functools.update_wrapper(self, f).k = 1.0\n    def __call__(self): return self.k\n"
 
 
-def cell(text: str, read: str, before: str = "pass") -> dict:
+def cell(text, read, before="pass"):
     """What a cell of a notebook defines, and a spring below it whose stiffness in N/m is what it reads; `before`: a line of the method before that."""
     names = {"jj": jj, "jnp": jnp, "np": np, "__name__": "__main__"}
     modules = ("argparse", "array", "collections", "contextvars", "dataclasses", "enum", "fractions", "functools", "itertools", "logging", "random", "types")
@@ -43,7 +43,7 @@ def cell(text: str, read: str, before: str = "pass") -> dict:
     return names
 
 
-def stiffness(scene, way: str) -> float:
+def stiffness(scene, way):
     """By the acceleration at x = 1 m, or the motion to 1 s, in N/m."""
     if way == "accelerations":
         return -float(jj.accelerations(scene, 0.0, jnp.ones(1), jnp.zeros(1)).udot[0])

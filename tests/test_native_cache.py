@@ -165,7 +165,7 @@ for name in sys.argv[1:]:
 """
 
 
-def _kept_by_a_process(folder, seed, names) -> set[str]:
+def _kept_by_a_process(folder, seed, names):
     environment = os.environ | {"PYTHONHASHSEED": str(seed), "JOURDAIN_JAX_CACHE": str(folder)}
     subprocess.run([sys.executable, "-W", "ignore", "-c", PROGRAM, *names], env=environment, check=True)
     return {file.name for file in folder.iterdir()}
@@ -197,7 +197,7 @@ def test_code_for_another_program_effort_machine_or_compiler_has_another_name(mo
     def asked(name, made_by, make):
         raise Asked(f"{name} {made_by}")
 
-    def name(text="a program", effort=2) -> str:
+    def name(text="a program", effort=2):
         with pytest.raises(Asked) as found:
             ffi.registered(text, effort)
         return str(found.value)

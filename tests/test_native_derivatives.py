@@ -159,7 +159,7 @@ def _counted(alignment, size):
 _taken = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_size_t, ctypes.c_size_t)(("aligned_alloc", ctypes.CDLL(None)))
 
 
-def _largest_record(memory: int, lanes: int):
+def _largest_record(memory, lanes):
     """Gradients of motions of some hundred steps, and how many bytes their largest record takes."""
     model = jj.build(jj.models.TiltingDisc(), backend="native", memory=memory)
 

@@ -1,7 +1,6 @@
 """Single operations by machine code against XLA, the functions of C and mpmath, also of numbers that are no usual ones."""
 
 import functools
-from collections.abc import Callable
 
 import evaluated_natively
 import jax.numpy as jnp
@@ -102,7 +101,7 @@ OWN = ["sin", "cos", *BY_POLYNOMIALS]
 
 
 @functools.cache
-def _functions(fused: bool) -> Callable:
+def _functions(fused):
     """Of points (x, y); for machines that round products and sums together, or for others."""
     graph = Graph()
     inputs = [graph.input("x", True), graph.input("y", True)]
@@ -110,7 +109,7 @@ def _functions(fused: bool) -> Callable:
     return evaluated_natively.function(graph, [*nodes, graph.call("pow", inputs[0], graph.const(1.5))], inputs)
 
 
-def _our_own(lanes: int, fused: bool, x, y) -> dict:
+def _our_own(lanes, fused, x, y):
     """Values of our own functions by machine code of other machines."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(host, "lanes", lambda: lanes)
@@ -119,7 +118,7 @@ def _our_own(lanes: int, fused: bool, x, y) -> dict:
     return dict(zip([*OWN, "x^1.5"], found.T, strict=True))
 
 
-def _arguments(op: str) -> tuple[np.ndarray, np.ndarray]:
+def _arguments(op) -> tuple[np.ndarray, np.ndarray]:
     """Over the range in use, and near what a function does differently on either side."""
     random = np.random.default_rng(1)
     uniform = lambda low, high: random.uniform(low, high, 500)  # noqa: E731

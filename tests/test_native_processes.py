@@ -46,12 +46,12 @@ for child, reading in children:
 """
 
 
-def _resident() -> int:
+def _resident():
     """Bytes of this process in memory."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-def _calls(kind: str) -> tuple[Callable, jax.Array]:
+def _calls(kind) -> tuple[Callable, jax.Array]:
     """A compiled function that calls machine code, and its argument."""
     if kind == "single precision":  # converted where the call begins and ends
         graph = Graph()
@@ -86,7 +86,7 @@ def test_threads_of_python_may_call_at_once():
     leans = [jnp.linspace(0.1 * k, 0.1 * k + 0.3, 200) for k in range(4)]
     expected, found = [np.asarray(run(x)) for x in leans], {}
 
-    def work(k: int) -> None:
+    def work(k):
         for _ in range(20):
             found[k] = [np.asarray(run(x)) for x in leans]
 

@@ -26,7 +26,7 @@ POINTS, INPUTS, EACH = 8, 4, 6
 Step = tuple[str, tuple[int, ...]]
 
 
-def drawn(seed: int) -> list[Step]:
+def drawn(seed) -> list[Step]:
     """Operations in any order, each so many times, of numbers and truth values that are there: of inputs as often as of what was made of them."""
     random = np.random.default_rng(seed)
     numbers, truths, steps = list(range(INPUTS)), [], []
@@ -45,12 +45,12 @@ def drawn(seed: int) -> list[Step]:
     return steps
 
 
-def own_round_off(op: str, of_functions: float) -> float:
+def own_round_off(op, of_functions):
     """Relative; `of_functions`: of those that are not rounded to the nearest double."""
     return 0.0 if op in EXACT else EPS if op in ROUNDED else of_functions
 
 
-def true_values(steps: list[Step], point: np.ndarray, of_functions: float) -> list[Known | bool | None]:
+def true_values(steps: list[Step], point: np.ndarray, of_functions) -> list[Known | bool | None]:
     """Of all steps."""
     known: list = [Known(mpmath.mpf(float(x)), mpmath.mpf(0)) for x in point]
     for op, args in steps:
@@ -60,7 +60,7 @@ def true_values(steps: list[Step], point: np.ndarray, of_functions: float) -> li
 
 
 @functools.cache
-def programs(seed: int) -> tuple[list[Step], np.ndarray, np.ndarray, np.ndarray]:
+def programs(seed) -> tuple[list[Step], np.ndarray, np.ndarray, np.ndarray]:
     """Steps of a program, points, and its values at these by machine code and by XLA."""
     steps, points = drawn(seed), np.random.default_rng(100 + seed).normal(size=(POINTS, INPUTS)) * [1.0, 2.0, 0.5, 5.0]
     graph = Graph()

@@ -21,7 +21,7 @@ BICYCLE = jj.models.WhippleBicycle()
 BACKENDS = "xla", "auto"
 
 
-def _near_rows(scene: jj.Scene, count: int) -> tuple[jax.Array, jax.Array]:
+def _near_rows(scene: jj.Scene, count) -> tuple[jax.Array, jax.Array]:
     """Coordinates and speeds a little off the rows."""
     _, q, u = jj.sample_states(scene, count)
     generator = np.random.default_rng(1)
@@ -29,7 +29,7 @@ def _near_rows(scene: jj.Scene, count: int) -> tuple[jax.Array, jax.Array]:
     return q + 1e-2 * generator.standard_normal(q.shape), u + 0.3 * generator.standard_normal(u.shape)
 
 
-def _put(native: bool, held=()):
+def _put(native, held=()):
     """`(scene, q, u)` -> the nearest state on the rows."""
     return lambda scene, q, u: jj.consistent(modelled(scene, None, BACKENDS[native]), 0.2, q, u, jnp.full(len(scene.inputs), 0.3), held=held)
 

@@ -45,7 +45,7 @@ TIMES = jnp.array([0.2, 0.45, 0.71, 1.3])  # start, two that are saved, end
 BACK = jnp.array([2.0, 1.9, 1.2, 0.6])
 
 
-def _seen(name: str, times, backend: str = "native", **options):
+def _seen(name, times, backend="native", **options):
     """What a motion from the first of the times to the last shows: states at those between, the end with its time and the work done until then."""
     scene, start, given = CASES[name]
     options = {"rtol": 1e-11, "atol": 1e-11} | given | options

@@ -12,7 +12,7 @@ START = {"x": 1.0, "x_rate": 2.0, "y": 0.0, "y_rate": 0.0}
 BOTH = ("x", "x_rate")
 
 
-def lines(count: int = 6, seed: int = 0, sigma: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
+def lines(count=6, seed=0, sigma=0.1) -> tuple[np.ndarray, np.ndarray]:
     """Times, and a noisy straight line."""
     ts = np.linspace(0.0, 1.0, count)
     return ts, 1.0 + 2.0 * ts + sigma * np.random.default_rng(seed).normal(size=count)

@@ -39,13 +39,13 @@ DIFFERENCE = 1e-9  # a derivative of a degree-40 interpolant loses about three d
 class Interpolant:
     """Chebyshev interpolation on [0, span], to differentiate a motion that is known at any times."""
 
-    def __init__(self, span: float, degree: int = 40):
+    def __init__(self, span, degree=40):
         self.degree, self.span = degree, span
         nodes = np.cos(np.pi * (np.arange(degree, -1, -1)) / degree)
         self.times = (nodes + 1) * span / 2
         self._nodes = nodes
 
-    def derivative(self, values, order: int = 1) -> np.ndarray:
+    def derivative(self, values, order=1) -> np.ndarray:
         """Time derivative of values (times, ...) at the same times."""
         cheb = np.polynomial.chebyshev
         flat = np.asarray(values, float).reshape(len(self.times), -1)
@@ -54,11 +54,11 @@ class Interpolant:
         return slopes.reshape(np.shape(values))
 
 
-def columns(motion: dict, *names: str) -> np.ndarray:
+def columns(motion, *names: str) -> np.ndarray:
     return np.stack([motion[name] for name in names], -1)
 
 
-def assert_same(value, expected, limit: float = ORACLE):
+def assert_same(value, expected, limit=ORACLE):
     value, expected = np.asarray(value), np.asarray(expected)
     assert value.shape == expected.shape
     error = np.max(np.abs(value - expected)) / max(1.0, np.max(np.abs(expected)))

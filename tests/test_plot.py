@@ -29,7 +29,7 @@ def _closed():
     plt.close("all")
 
 
-def overlap(figure, *artists) -> bool:
+def overlap(figure, *artists):
     """Whether any two of these are drawn over one another."""
     figure.draw_without_rendering()
     boxes = [artist.get_window_extent() for artist in artists]

@@ -19,7 +19,7 @@ SINGULAR = {
 UNITS = (1.0, 1e6, 1e-6)
 
 
-def _near(name: str, distance: float, unit: float = 1.0):
+def _near(name, distance, unit=1.0):
     """Accelerations at a distance from the singular configuration, along the linkage's motion."""
     make, at, towards = SINGULAR[name]
     scene = make(unit=unit)
@@ -155,7 +155,7 @@ def _swinging():
     return jj.build(FourBars(), jj.Formulation(state="full"))
 
 
-def _start(rate) -> dict:
+def _start(rate):
     upright = {f"x{i}": float(i) for i in range(3)} | {f"z{i}": 1.0 for i in range(3)}
     return {name: jnp.broadcast_to(value, jnp.shape(rate)) for name, value in upright.items()} | {f"x{i}_rate": rate for i in range(3)}
 

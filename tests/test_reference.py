@@ -17,7 +17,7 @@ PAGES = sorted(page for page in (Path(__file__).parents[1] / "docs" / "reference
 NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|nan|inf)", re.IGNORECASE)
 
 
-def blocks(page: Path) -> list[tuple[str, str]]:
+def blocks(page):
     """Code, and what it prints."""
     return re.findall(r"```python\n(.*?)```\n(?:\n```text\n(.*?)```\n)?", page.read_text(encoding="utf-8"), re.DOTALL)
 
@@ -30,7 +30,7 @@ def test_every_name_has_an_example(page):
         assert re.search(rf"\b{name}\b", code) or re.search(r"^    \S", documented, re.MULTILINE), name
 
 
-def assert_alike(printed: str, told: str):
+def assert_alike(printed, told):
     """Words are equal, and numbers but for round-off and what other machines print otherwise."""
     assert NUMBER.sub("#", printed).split() == NUMBER.sub("#", told).split()
     found, expected = ([float(x) for x in NUMBER.findall(text)] for text in (printed, told))

@@ -78,7 +78,7 @@ def at(root, place):
     return root
 
 
-def neighbours(form: str):
+def neighbours(form):
     """Files that differ from the right one in one place, and what must be named."""
     reader, text = FILES[form]
     whole = ElementTree.fromstring(text)
@@ -277,7 +277,7 @@ BODY = '<body name="a{0}"><joint name="j{0}" type="hinge"/><inertial pos="0 0 0"
 DEFAULT = '<default><general ctrlrange="-0.4 0.3" forcerange="-0.2 5"/></default>'
 
 
-def swinging(motors, compiler="", sections="") -> str:
+def swinging(motors, compiler="", sections=""):
     """Bodies of 1 kg m^2, each on a hinge with one motor."""
     bodies, pushes = (BODY.format(k) for k in range(len(motors))), (f'<motor name="m{k}" joint="j{k}" {motor}/>' for k, motor in enumerate(motors))
     head = f'<mujoco><compiler {compiler} inertiafromgeom="false"/><option gravity="0 0 0"/>{sections}'

@@ -14,19 +14,19 @@ BONE = np.array([[3e-5, 5e-5, 0.0], [5e-5, 4e-4, 0.0], [0.0, 0.0, 4.1e-4]])  # k
 START, SPAN = {"j00": 0.3, "j01_rate": 0.7}, {"t1": 0.2, "ts": [0.0, 0.2]}
 
 
-def inertial(mass: float, centre, I) -> str:
+def inertial(mass, centre, I):
     moments = " ".join(f'i{"xyz"[i]}{"xyz"[j]}="{I[i, j]}"' for i in range(3) for j in range(i, 3))
     return f'<inertial><origin xyz="{centre[0]} {centre[1]} {centre[2]}"/><mass value="{mass}"/><inertia {moments}/></inertial>'
 
 
-def possible_tensor(draw: np.random.Generator, thin: float) -> np.ndarray:
+def possible_tensor(draw: np.random.Generator, thin) -> np.ndarray:
     """I = tr(S) 1 - S of a body turned at random, whose second moment S about one axis is `thin` beside the largest."""
     turn, size = np.linalg.qr(draw.normal(size=(3, 3)))[0], 10.0 ** draw.uniform(-6, -2)
     S = turn @ np.diag(size * np.array([1.0, draw.uniform(0.01, 1.0), thin])) @ turn.T
     return np.trace(S) * np.eye(3) - S
 
 
-def tree(seed: int, legs: int, joints: int, tensor) -> str:
+def tree(seed, legs, joints, tensor):
     """A trunk with legs, each a chain of revolute joints, its links with what `tensor` draws."""
     draw = np.random.default_rng(seed)
     parts = [f'<link name="trunk">{inertial(4.0, (0.01, 0.0, 0.0), np.array([[0.01, 1e-4, 2e-4], [1e-4, 0.03, 1e-5], [2e-4, 1e-5, 0.035]]))}</link>']
@@ -40,7 +40,7 @@ def tree(seed: int, legs: int, joints: int, tensor) -> str:
     return f'<robot name="walker">{"".join(parts)}</robot>'
 
 
-def drawn(seed: int):
+def drawn(seed):
     """A tree by its number: thin links down to flat ones, and bones as a quadruped has them."""
     draw = np.random.default_rng([7, seed])
     thin = [1e-2, 1e-4, 1e-8, 0.0][seed % 4]
@@ -147,7 +147,7 @@ def test_moments_that_no_body_has_are_taken_on_purpose():
     assert_array_equal(jj.from_urdf(text, ignore="inertia")().arm_inertia, (1.0, 1.0, 3.0))
 
 
-def _pendulum(form: str, moments):
+def _pendulum(form, moments):
     if form == "urdf":
         return jj.from_urdf(PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), np.diag(moments))))
     stated = f'<inertial pos="0 0.3 0" mass="1" diaginertia="{moments[0]} {moments[1]} {moments[2]}"/>'

@@ -296,7 +296,7 @@ def test_priors_of_starts_and_of_numbers_of_single_runs():
 # What cannot be told. -----------------------------------------------------------------------------------------------------
 
 
-def pushed(sensor: dict, actuator: dict, ts=TS) -> jj.Experiment:
+def pushed(sensor, actuator, ts=TS) -> jj.Experiment:
     """The cart at rest, pushed: place and speed as simulated."""
     knots = np.linspace(0.0, 4.0, 41)
     command = np.sin(2 * knots) + np.where(knots > 1, 0.3, 0.0)
@@ -321,7 +321,7 @@ def test_a_gain_and_the_parameters_that_scale_alike_are_named_and_a_prior_tells_
 # Actuators. ---------------------------------------------------------------------------------------------------------------
 
 
-def driven(truth: dict, **asked) -> jj.Experiment:
+def driven(truth, **asked) -> jj.Experiment:
     """The cart under a command through an actuator with the numbers `truth`, of which some are asked for."""
     knots = np.linspace(0.0, 4.0, 41)
     command = jj.Sampled(knots, np.sin(2 * knots) + np.where(knots > 1, 0.3, 0.0))

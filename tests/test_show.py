@@ -52,7 +52,7 @@ def shown(motion):
     return jj.show(motion, title="Ball & rope", colours={"ball": RED})
 
 
-def contents(page: str):
+def contents(page):
     """Description and numbers of a page."""
     held = dict(re.findall(r'<script id="(\w+)"[^>]*>(.*?)</script>', page, re.DOTALL))
     floats = np.frombuffer(zlib.decompress(base64.b64decode(held["numbers"])), "<f4")

@@ -142,7 +142,7 @@ def test_steps_that_shrink_towards_a_singularity_are_named():
     assert_allclose(motion.t_end, np.pi / np.sqrt(8), rtol=1e-3)
 
 
-def said(derivative, x) -> list[str]:
+def said(derivative, x):
     """What a derivative warns of."""
     with warnings.catch_warnings(record=True) as given:
         warnings.simplefilter("always")

@@ -156,7 +156,7 @@ class WrongName(Slider):
         return motion.q.z * jnp.ones(3)  # the mistake
 
 
-def lines(error) -> list[str]:
+def lines(error):
     """The lines of the traceback below the one that called, without those of what wraps public functions (in tests, jaxtyping too)."""
     wrappers = (str(Path("scene", "arguments.py")), str(Path("jaxtyping", "_decorator.py")))
     return [frame.line for frame in traceback.extract_tb(error.__traceback__)[1:] if not frame.filename.endswith(wrappers)]

@@ -21,7 +21,7 @@ MIDPOINT, DLA, GRADIENT = jj.ImplicitMidpoint, jj.DiscreteLagrangeDAlembert, jj.
 TRAPEZOIDAL = partial(DLA, "trapezoidal")
 
 
-def named(method) -> str:
+def named(method):
     solver = method(step=0.1)
     return f"{solver.name} {getattr(solver, 'rule', '')}".strip()
 
@@ -32,7 +32,7 @@ def run(scene, start, method, *, t1, step, t0=0.0):
     return motion.raise_if_failed() if not isinstance(motion.result, jax.core.Tracer) else motion
 
 
-def order(errors) -> float:
+def order(errors):
     """Measured from the last halving of the step."""
     return float(np.log2(errors[-2] / errors[-1]))
 
@@ -85,7 +85,7 @@ def test_rows_that_depend_on_each_other_are_left_out():
 # What is kept. ---------------------------------------------------------------------------------------------------------
 
 
-def change(scene, solver, quantity, step) -> float:
+def change(scene, solver, quantity, step):
     """Largest relative change of `quantity(q, u)` after 300, 700 and 1000 steps."""
     start = jj.start(scene, **scene.example)
     ends = [run(scene, start, solver, t1=steps * step, step=jnp.array(step)) for steps in (300, 700, 1000)]

@@ -77,7 +77,7 @@ def _after(monkeypatch, count, error):
     """The files of a store are written until so many have been; then `error` is raised, in the middle of the next."""
     left = [count]
 
-    def write(path: Path, content, **how):
+    def write(path, content, **how):
         left[0] -= 1
         if left[0] < 0:
             path.with_name(f".{path.name}.half").write_bytes(content[: len(content) // 2])
@@ -358,7 +358,7 @@ def _harms(content: bytes, generator, count) -> Iterator[tuple[str, bytes]]:
     yield "more", content + content[-7:] + b" "
 
 
-def _answers(path) -> dict:
+def _answers(path):
     """All that a folder says, read without its scene."""
     found = jj.load_study(path)
     numbers = {name: (found.mean(name), found.deviation(name), found.quantile(name, 0.5)) for name in found.outputs}
@@ -366,7 +366,7 @@ def _answers(path) -> dict:
     return {"complete": found.complete, "counts": found.counts, "failed": found.failed.tolist(), "numbers": repr(numbers), "arrays": arrays}
 
 
-def _is_right_or_said(path, right) -> bool:
+def _is_right_or_said(path, right):
     """Whether the answers are right (True), or an error or a warning names the folder (False); an AssertionError otherwise."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")

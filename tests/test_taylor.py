@@ -26,7 +26,7 @@ ORDER = 9
 UNARY = [name for name, f in TABLE.items() if f.kind in ("analytic", "flat") and name not in ("add", "sub", "mul", "div", "pow", "atan2")]
 
 
-def coefficients(graph: Graph, s: int, outputs, at, known=None) -> np.ndarray:
+def coefficients(graph: Graph, s, outputs, at, known=None) -> np.ndarray:
     """Taylor coefficients, (orders, outputs), of functions of s about a point, as machine code has them; `known`: values of other inputs."""
     assert not ffi.reason_against()
     w = MachineWriter(host.lanes(), host.fuses())

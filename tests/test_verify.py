@@ -59,14 +59,14 @@ def statements(scene: jj.Scene, state: jj.State) -> jj.Verification:
     return Verification("Wrong", tuple(statement_checks(scene, state.t, state.q, state.u, jnp.zeros(0), Z, 0)), ())
 
 
-def refused(found: jj.Verification, check: str, culprit: str) -> None:
+def refused(found: jj.Verification, check, culprit):
     """The verification failed in the named check, on the named culprit, and its text says so."""
     assert not found.passed
     lines = [line for line in str(found).splitlines() if line.startswith(f"  {check} ") and "FAILED" in line]
     assert culprit in "\n".join(lines), str(found)
 
 
-def failed(found: jj.Verification) -> set[str]:
+def failed(found: jj.Verification):
     """Names of the checks that did not pass."""
     return {check.name for check in found.checks if not check.passed}
 

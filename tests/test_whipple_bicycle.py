@@ -28,7 +28,7 @@ def state(bicycle, lean, steer, lean_rate, steer_rate, speed):
     return q, minimal_kinematics(bicycle, STRUCTURE.independent, STRUCTURE.kept_rows, 0.0, q, y).u
 
 
-def other_bicycle() -> dict[str, float]:
+def other_bicycle():
     """Parameters 5 to 20 % from the benchmark's, so that nothing cancels by chance."""
     factors = 1 + np.random.default_rng(7).uniform(0.05, 0.2, len(oracle.BENCHMARK))
     return {name: value * factor for (name, value), factor in zip(oracle.BENCHMARK.items(), factors, strict=True)}

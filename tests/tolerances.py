@@ -36,7 +36,7 @@ TOLERANCES: dict[str, dict[str, float]] = {
 }
 
 
-def tolerance(name: str, dtype=np.float64) -> float:
+def tolerance(name, dtype=np.float64):
     """The tolerance called `name` for numbers of type `dtype`.
 
     **Arguments:** `name`, a key of the table; `dtype`, float64 or float32 in any spelling numpy takes.
@@ -48,7 +48,7 @@ def tolerance(name: str, dtype=np.float64) -> float:
     return table[name]
 
 
-def relative_error(value, expected, size: float | None = None) -> float:
+def relative_error(value, expected, size: float | None = None):
     """Largest |value - expected| divided by `size` (default: the largest |expected|, or 1 where that is zero)."""
     value, expected = np.asarray(value), np.asarray(expected)
     scale = np.max(np.abs(expected), initial=0.0) if size is None else size
