@@ -27,7 +27,7 @@ GUESS = TRUTH.replace(inertia=0.6, offset=0.35)
 SLEIGH_START = {"x_rate": -0.6, "heading_rate": 0.9}
 
 
-def sleigh_data(seed: int, repeats: tuple[int, ...] = ()) -> Experiment:
+def sleigh_data(seed, repeats=()) -> Experiment:
     """Position of the mass centre and heading of the default sleigh at 41 times over 8 s."""
     ts = np.linspace(0.0, 8.0, 41)
     parameters = {"mass": 1.3, "inertia": 0.4, "a": 0.25, "v0": -0.6, "w0": 0.9}
@@ -47,7 +47,7 @@ def sleigh_batch():
     return fit_batch(GUESS, sleigh_data(1, (REPEATS,)), ("inertia", "offset"))
 
 
-def near(estimate, truth: float, errors: float = 4.0) -> bool:
+def near(estimate, truth, errors=4.0):
     """Within so many standard errors."""
     return abs(float(estimate.value) - truth) <= errors * float(estimate.standard_error)
 
@@ -191,7 +191,7 @@ def test_a_parameter_at_its_bound_is_said_to_be_there():
     assert np.isnan(found["mass"].standard_error)
 
 
-def released(push: float) -> Experiment:
+def released(push) -> Experiment:
     """A run without damping from rest, x = x0 cos(w t), with noise that asks for less than none where `push` is not zero."""
     w = np.sqrt(5.0 / 2.0)
     return cart_run(values={"x": 0.3 * np.cos(w * TS) * (1 + push * TS), "x_rate": -0.3 * w * np.sin(w * TS) * (1 + push * TS)}, inputs=None)
@@ -311,8 +311,7 @@ def test_a_gap_in_a_logged_input_is_named():
     gap = (ts > 1.0) & (ts < 1.9)
     log = lambda some: {"push": jj.Sampled(ts[some], np.sin(ts[some]))}  # noqa: E731
     with pytest.warns(UserWarning, match=r"`push` of run 0 is sampled every 0.05 s, but not from 1 to 1.9 s, where it is a straight line"):
-        found = fit(Cart(mass=1.7), cart_run(inputs=log(~gap)), ("mass",))
-    assert "not from 1 to 1.9 s" in found.warning
+        log_likelihood(CART, cart_run(inputs=log(~gap)))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         steps = {"push": jj.Sampled([0.0, 1.0, 1.001, 4.0], [0.0, 0.0, 1.0, 1.0])}
@@ -344,7 +343,7 @@ def test_inputs_that_are_not_sampled_over_all_of_a_run_are_warned_of():
 THREE = ("mass", "damping", "stiffness")
 
 
-def noisy(seed: int, sigma=(0.01, 0.02), outlier=0.0, ts=TS, memory=0.0, **options) -> Experiment:
+def noisy(seed, sigma=(0.01, 0.02), outlier=0.0, ts=TS, memory=0.0, **options) -> Experiment:
     """A run of the cart with noise; `memory`: correlation of neighbouring samples of it; one sample of x is far out by `outlier` sigmas."""
     generator = np.random.default_rng(seed)
     x0 = options.pop("x0", 0.3)
