@@ -45,10 +45,19 @@ def test_code_is_made_once_and_again_where_its_file_is_torn(folder):
     assert [f.name for f in folder.iterdir()] == ["a.o"]
 
 
-def test_a_folder_that_cannot_be_used_or_is_switched_off_is_no_error(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("JOURDAIN_JAX_CACHE", str(tmp_path / "file"))
-    assert host.kept("a", "llvm 20", lambda: b"code") == b"code"
+@pytest.mark.parametrize("place", ["file", "file/kept"])
+def test_a_file_in_place_of_the_folder_is_left_alone_with_one_warning(tmp_path, monkeypatch, place):
+    (tmp_path / "file").write_text("mine")
+    monkeypatch.setenv("JOURDAIN_JAX_CACHE", str(tmp_path / place))
+    host._warn.cache_clear()
+    words = f"{tmp_path / place}` is not used .*a file.*JOURDAIN_JAX_CACHE"
+    with pytest.warns(UserWarning, match=words) as said:
+        assert [host.kept(name, "llvm 20", lambda: b"code") for name in "ab"] == [b"code", b"code"]
+    assert len(said) == 1
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_folder_that_is_switched_off_is_no_error(monkeypatch):
     monkeypatch.setenv("JOURDAIN_JAX_CACHE", "0")
     assert host.folder() is None
     assert host.kept("a", "llvm 20", lambda: b"code") == b"code"

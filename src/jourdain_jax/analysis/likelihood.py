@@ -295,8 +295,8 @@ def planned_information(
     unknowns = unknowns_of(with_reference_parameters(scene), numbers, free)
     places = unknowns.estimated
     ready = tuple(run_of(run, array_module((run.values, run.sigma))) for run in runs)
-    theta = _values(scene, runs, unknowns)
-    F, J = _sensitivities(scene, ready, theta, settled, unknowns.layout, tuple(places.tolist()), Reference(scene))
+    theta, reference = _values(scene, runs, unknowns), Reference(scene, unknowns.layout.parameters)
+    F, J = _sensitivities(scene, ready, theta, settled, unknowns.layout, tuple(places.tolist()), reference)
     prior = unknowns.prior_rows
     return PlannedInformation(F + prior.T @ prior, theta[places], J, unknowns.labels, unknowns.units)
 

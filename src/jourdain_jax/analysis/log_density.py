@@ -65,7 +65,7 @@ class LogDensity(eqx.Module):
 
     def __call__(self, z: Point) -> Scalar:
         """The logarithm of the density; -inf where the motion fails."""
-        return _density(self, self._checked(z), Reference(self.scene))
+        return _density(self, self._checked(z), Reference(self.scene, self.layout.parameters))
 
     def _at(self, z: Point, reference: Reference) -> Scalar:
         x = self._spread(z)
@@ -206,7 +206,7 @@ def log_density(
     intervals = np.array([low / SHORTEST for low, _ in limits])
     angles = [Range("memory", *(float(np.arcsin(np.exp(-h / tau))) for tau in ends), interval=float(h)) for h, ends in zip(intervals, limits, strict=True)]
     unknowns = unknowns_of(scene, runs, free)
-    with reference_parameters(scene):
+    with reference_parameters(scene, unknowns.layout.parameters):
         if not is_traced((scene, [(run.start, run.t0, run.inputs) for run in runs])):
             check_starts(scene, runs, unknowns)
         grouped = equal_runs(runs)

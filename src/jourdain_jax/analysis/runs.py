@@ -208,7 +208,7 @@ class Group:
         self._rows = np.stack([_rows(run, of_members) for run in filled])
         leaves, treedef = jax.tree.flatten(((scene, options), first))
         shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if is_array(x) else x for x in leaves)
-        self._run = _program(Reference(scene), treedef, shapes, layout)
+        self._run = _program(Reference(scene, layout.parameters), treedef, shapes, layout)
         saved = times if first.grid is None else first.grid.shape[0]
         states = saved * (len(scene.coordinate_names) + len(scene.speed_names)) * 8 * (1 + sum(layout.sizes))
         # bytes of saved states with their tangents in one loop: far below what XLA compiles into one function (see `jourdain_jax`)

@@ -5,7 +5,7 @@ well at random states are singular; all are projected onto the geometric rows. P
 parameters are traced (numbers near the class's defaults stand in), so that the choice is static.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
@@ -343,16 +343,21 @@ class Reference:
 
     Two are equal where their scenes lead to the same decisions (`Structure.decisions`): then one program serves both. So what a call runs is decided by its own
     arguments, and not by which call was the first. Of parameters that are traced already, the class's defaults stand in.
+
+    `varied`: names of parameters that differ between lanes; other numbers near by stand in for these, so
+    that what holds by chance does not count; None: all.
     """
 
-    def __init__(self, scene: Scene):
+    def __init__(self, scene: Scene, varied: Iterable[str] | None = None):
         self.scene = with_reference_parameters(scene)
-        self._key = jax.tree.structure(scene), structure_whatever_its_faults(self.scene).decisions, jax.config.jax_enable_x64
+        self._varied = None if varied is None else frozenset(varied)
+        decisions = structure_whatever_its_faults(self.scene).decisions
+        self._key = jax.tree.structure(scene), self._varied, decisions, jax.config.jax_enable_x64
 
     @contextmanager
     def stands_in(self) -> Iterator[None]:
         """Inside, its numbers stand in."""
-        with reference_parameters(self.scene):
+        with reference_parameters(self.scene, self._varied):
             yield
 
     def __hash__(self):

@@ -168,7 +168,7 @@ class StudyResult(Printed):
     def to_xarray(self):
         """All arrays as an `xarray.Dataset` with names and units, read where they are used; lanes that are not done are NaN, their result is -1.
 
-        Raises ValueError where arrays are not those that were written, here or, where their values are damaged, when they are read.
+        Raises ValueError where arrays are not those that were written; for this all are read once here.
         """
         self.store.check_arrays(self.store.receipts())
         return self._opened()

@@ -277,28 +277,27 @@ class Store:
 
     def is_whole(self, number: int) -> bool:
         """Whether a chunk has its receipt and all its arrays, and all of them are as they were written."""
-        return self._wrong(number, whole=True) is None
+        return self._wrong(number) is None
 
-    def _wrong(self, number: int, *, whole: bool) -> str | None:
-        """An array of a chunk whose file has not the length and the checksum of its receipt; whether values go with that is seen only with `whole`."""
+    def _wrong(self, number: int) -> str | None:
+        """An array of a chunk whose file has not the length or the checksum of its receipt."""
         receipt = self.receipt(number)
         for name, column in self.columns.items():
             size = np.dtype(column.dtype).itemsize * (self.chunk // column.every) * math.prod(length for _, length in column.more)
             try:
                 with open(self._file(name, number), "rb") as file:
-                    content = file.read(size) if whole else file.seek(size)
-                    stated = file.read(5)
+                    content, stated = file.read(size), file.read(5)
             except OSError:
                 return name
             known = receipt and receipt.checksums[name]
-            if (int.from_bytes(stated, "little"), len(stated)) != (known, 4) or (whole and _crc32c(content) != known):
+            if (int.from_bytes(stated, "little"), len(stated)) != (known, 4) or _crc32c(content) != known:
                 return name
         return "receipt" if receipt is None else None
 
     def check_arrays(self, numbers: Iterable[int]) -> None:
-        """ValueError where arrays of chunks are not those of their receipts; whether values go with their checksums is seen when Zarr reads them."""
+        """ValueError where arrays of chunks are not those of their receipts."""
         for number in numbers:
-            if self.columns and (wrong := self._wrong(number, whole=False)):
+            if self.columns and (wrong := self._wrong(number)):
                 text = f"`{wrong}` is damaged in {self.lanes_of([number])}: its file, or the receipt of the chunk, is not what was written"
                 raise ValueError(f"{text}; run the study again, which computes them anew")
 

@@ -186,10 +186,12 @@ def kept(name: str, made_by: str, make: Callable[[], bytes]) -> bytes:
 
 
 def _is_ours(place: Path) -> bool:
-    """Whether the folder, made where there is none, can be used; a warning where others may put code into it."""
+    """Whether the folder, made where there is none, can be used; a warning that says why it cannot."""
     try:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
         against = _against(os.stat(place))
+    except (FileExistsError, NotADirectoryError):
+        against = "it is a file, or lies in one"
     except OSError:
         return False
     if against:
@@ -200,15 +202,17 @@ def _is_ours(place: Path) -> bool:
 def _against(found: os.stat_result) -> str:
     """Why a folder or a file is not believed; empty where it is."""
     if found.st_uid != os.geteuid():
-        return f"it belongs to user {found.st_uid}, and this process runs as {os.geteuid()}"
-    return "others may write to it" if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH) else ""
+        return f"it belongs to user {found.st_uid}, and what lies there would run as {os.geteuid()}"
+    if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        return "others may write to it, and what lies there runs in your process (chmod go-w ends that)"
+    return ""
 
 
 @functools.cache
 def _warn(place: Path, against: str) -> None:
     warnings.warn(
-        f"the folder `{place}` is not used for machine code, which is compiled anew in each process: {against}, and what lies there runs in your process; "
-        "take away that right (chmod go-w), or name a folder of your own in JOURDAIN_JAX_CACHE (0: none)",
+        f"the folder `{place}` is not used for machine code, which is compiled anew in each process: "
+        f"{against}; name a folder of your own in JOURDAIN_JAX_CACHE (0: none)",
         stacklevel=2,
     )
 

@@ -10,7 +10,7 @@ compiled. It is found by evaluating the scene at a few states, which takes numbe
 """
 
 import sys
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import MISSING, fields
@@ -187,13 +187,16 @@ def _asked_about_before(leaves: list, treedef) -> Values | None:
 
 vars(_asked_about_before)["cache_clear"] = _latest.clear
 
-_STAND_IN: ContextVar[Any] = ContextVar("stand_in", default=None)
+_STAND_IN: ContextVar[tuple] = ContextVar("stand_in", default=(None, None))
 
 
 @contextmanager
-def reference_parameters(scene) -> Iterator[None]:
-    """Inside, numbers near those of `scene` stand in for the parameters of scenes of its class that are traced (as far as it has numbers)."""
-    token = _STAND_IN.set(scene)
+def reference_parameters(scene, varied: Collection[str] | None = None) -> Iterator[None]:
+    """Inside, numbers of `scene`, as far as it has them, stand in for parameters of its class that are traced.
+
+    For those that are `varied` (names; None: all), generic ones near them.
+    """
+    token = _STAND_IN.set((scene, varied))
     try:
         yield
     finally:
@@ -209,12 +212,16 @@ def with_reference_parameters(scene):
     unknown = [is_traced_type(type(x)) for x in leaves]
     if not any(unknown):
         return scene
-    near = _defaults(scene)
-    known = _STAND_IN.get()
+    near, vary = _defaults(scene), [True] * len(leaves)
+    known, varied = _STAND_IN.get()
     if known is not None and jax.tree.structure(known) == treedef:
-        near = [y if not is_traced_type(type(y)) and np.shape(y) == np.shape(x) else d for x, y, d in zip(leaves, jax.tree.leaves(known), near, strict=True)]
-    numbers = [_generic(x, y, place) if unknown[place] else x for place, (x, y) in enumerate(zip(leaves, near, strict=True))]
-    return jax.tree.unflatten(treedef, numbers)
+        for place, (path, y) in enumerate(jax.tree_util.tree_leaves_with_path(known)):
+            if not is_traced_type(type(y)) and np.shape(y) == np.shape(leaves[place]):
+                near[place], vary[place] = y, varied is None or path[0].name in varied
+    for place in np.flatnonzero(unknown):
+        x, y = leaves[place], near[place]
+        leaves[place] = _generic(x, y, place) if vary[place] else np.asarray(y, x.dtype)
+    return jax.tree.unflatten(treedef, leaves)
 
 
 def _defaults(scene) -> list:

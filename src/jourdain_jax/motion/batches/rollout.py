@@ -187,8 +187,11 @@ def rollout(
     _check_times_of_lanes(scene, starts, span)
     times = {name: None if span[name] is None else checked_real(span[name], f"`{name}`").astype(real_type()) for name in ("t0", "t1", "ts")}
 
+    reference = Reference(model.reference.scene, parameters)
+
     def run(options: AllOptions, varied, parameters) -> Trajectory:
-        return _compiled(span["inputs"].programs)(model.reference, scene, fixed, span | times, _with_arrays(options), varied, parameters)
+        program = _compiled(span["inputs"].programs)
+        return program(reference, scene, fixed, span | times, _with_arrays(options), varied, parameters)
 
     def form(options: AllOptions) -> VectorField:
         return modelled(model, options.formulation, options.backend).field(span["inputs"].constant, bool(options.work))

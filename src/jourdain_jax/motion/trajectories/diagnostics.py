@@ -76,20 +76,20 @@ def diagnose(trajectory: Record) -> Diagnostics:
     if not hasattr(trajectory, "scene"):
         raise ValueError(f"`diagnose` was given a {type(trajectory).__name__}, expected a `Trajectory`; of a rollout take one lane, as `rollout.lane(0)`")
     checks = Checks(jax.device_put(usual_rows(trajectory.scene)))
-    return _diagnosed(trajectory, map_over_times(checks, trajectory, by_inputs=True))
+    return _diagnosed(trajectory, map_over_times(checks, trajectory, by_inputs=True), _lacks_work(trajectory))
 
 
 DRIFTED = 1e-2  # of the energy that moves
 
 
 @eager_if_concrete
-def _diagnosed(trajectory: Record, found: Checked) -> Diagnostics:
+def _diagnosed(trajectory: Record, found: Checked, lacks_work: bool) -> Diagnostics:
     energy = Energies(*found.energies, trajectory.work)
     geometric, rows = found.residuals
     reached = jnp.all(jnp.isfinite(trajectory.q), axis=-1)
     return Diagnostics(
         energy_drift=_span(energy.balance),
-        energy_kind=energy.kind + (", which the work changes that was left out" if _lacks_work(trajectory) else ""),
+        energy_kind=energy.kind + (", which the work changes that was left out" if lacks_work else ""),
         # of the whole energy: where less than that moves, as at rest, nothing is said of its drift
         energy_size=jnp.nanmax(energy.kinetic) + _span(energy.potential) + 1e-6 * jnp.nanmax(jnp.abs(energy.balance)),
         position_residual=_largest(geometric),
