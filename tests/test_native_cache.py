@@ -45,16 +45,12 @@ def test_code_is_made_once_and_again_where_its_file_is_torn(folder):
     assert [f.name for f in folder.iterdir()] == ["a.o"]
 
 
-@pytest.mark.parametrize("place", ["file", "file/kept"])
-def test_a_file_in_place_of_the_folder_is_left_alone_with_one_warning(tmp_path, monkeypatch, place):
-    (tmp_path / "file").write_text("mine")
-    monkeypatch.setenv("JOURDAIN_JAX_CACHE", str(tmp_path / place))
-    host._warn.cache_clear()
-    words = f"{tmp_path / place}` is not used .*a file.*JOURDAIN_JAX_CACHE"
-    with pytest.warns(UserWarning, match=words) as said:
-        assert [host.kept(name, "llvm 20", lambda: b"code") for name in "ab"] == [b"code", b"code"]
+def test_a_file_in_place_of_the_folder_is_left_alone_with_one_warning(folder):
+    folder.write_text("mine")
+    with pytest.warns(UserWarning, match=f"{folder}` is not used .*a file.*JOURDAIN_JAX_CACHE") as said:
+        assert _all_kept("a", "a") == [b"code of a"] * 2
     assert len(said) == 1
-    assert (tmp_path / "file").read_text() == "mine"
+    assert folder.read_text() == "mine"
 
 
 def test_a_folder_that_is_switched_off_is_no_error(monkeypatch):
