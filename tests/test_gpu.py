@@ -1,6 +1,10 @@
 """Kernels of GPUs, checked without one: programs are lowered as for a GPU, and a driver runs the kernels' text on the CPU; their bits are machine code's."""
 
+import os
 import re
+import subprocess
+import sys
+from pathlib import Path
 from unittest import mock
 
 import gpu_twin
@@ -130,3 +134,25 @@ def test_many_lanes_run_at_once_on_a_gpu():
         jj.rollout(scene, {"x_rate": np.ones(1000)}, ts=[0.1])
         assert min(launched.values()) == 1
         assert jj.Study(scene, start={"x_rate": jj.Uniform(0.4, 0.6)}, samples=20_000).task(t1=0.1).block == 2**15
+
+
+OF_TWO_DEVICES = """
+import gpu_twin, jax, numpy as np, jourdain_jax as jj
+scene, lanes = jj.models.ChaplyginSleigh(), jax.sharding.PartitionSpec("lanes")
+end = lambda speed: jj.simulate(scene, {"x_rate": speed}, ts=[0.1]).q_end[0]
+one, speeds = jax.vmap(jax.value_and_grad(end)), np.linspace(0.4, 0.6, 6)
+expected = jax.jit(one)(speeds)
+mesh = jax.sharding.Mesh(np.array(jax.devices()), ("lanes",))
+with gpu_twin.in_place_of_a_gpu() as launched:
+    found = jax.jit(jax.shard_map(one, mesh=mesh, in_specs=lanes, out_specs=lanes, check_vma=False))(speeds)
+    second = jax.jit(one)(jax.device_put(speeds, jax.devices()[1]))
+    assert len(found[0].devices()) == 2 and second[0].devices() == {jax.devices()[1]} and 3 in launched.values()
+np.testing.assert_array_equal(found, expected)
+np.testing.assert_array_equal(second, expected)
+"""
+
+
+@pytest.mark.slow
+def test_several_gpus_share_lanes():
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "PYTHONPATH": os.pathsep.join(sys.path)}
+    subprocess.run([sys.executable, "-c", OF_TWO_DEVICES], env=environment, cwd=Path(__file__).parent, check=True)
