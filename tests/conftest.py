@@ -57,6 +57,15 @@ def pytest_collection_finish(session):
     gc.enable()
 
 
+CHECKED: set = set()  # annotated functions that the file has called
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _types_are_checked():
+    """In the first call of each function in each file: in every call, checks took a tenth of the time of all tests."""
+    CHECKED.clear()
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _less_effort():
     """Machine code of our own is made with less effort, which changes no bit of a number, and XLA's programs of a file share a context of MLIR.
@@ -72,14 +81,6 @@ def _less_effort():
         patch.setattr(host, "EFFORT", 0)
         patch.setattr(mlir, "make_ir_context", lambda: make() if mlir.ir.Context.current else shared)
         yield
-
-
-CHECKED: set = set()  # annotated functions that the test has called
-
-
-def pytest_runtest_setup():
-    """Types are checked in the first call of each function in each test: in every call, checks took a tenth of the time of all tests."""
-    CHECKED.clear()
 
 
 MOST_RESIDENT = 1.9e9  # bytes of a process between files: two workers, with what a file adds, stay below 5 GB
@@ -161,7 +162,7 @@ def pytest_configure(config):
     jaxtyped = jaxtyping.jaxtyped
 
     def checked_first(function, typechecker):
-        """The function, checked the first time that a test calls it; a class with its fields checked, each time that one is made."""
+        """The function, checked the first time that a file of tests calls it; a class with its fields checked, each time that one is made."""
         checked = jaxtyped(function, typechecker=typechecker)
         if isinstance(function, type):
             return checked
