@@ -501,6 +501,16 @@ def test_a_batch_says_which_bicycles_have_no_such_speed(bicycle, straight):
         assert_allclose(found.speed[k], linear.capsize_speed, rtol=1e-9)
 
 
+def test_a_chart_has_the_speeds_of_stability_of_every_trail_as_its_boundaries(bicycle):
+    chart = jj.stability_chart(bicycle, {"c": (0.02, 0.12), "rear_spin_rate": (5.0, 35.0)}, points=3)
+    assert [mode for mode, _ in chart.boundaries] == ["weave", "capsize"]
+    assert chart.middle.stable.any()
+    for k, c in enumerate(chart.values):
+        linear = stability_speeds(*linear_matrices({name: c if name == "c" else getattr(bicycle, name) for name in PARAMETER_NAMES}))
+        assert_allclose([curve.speed[k] for _, curve in chart.boundaries], [linear.weave_speed, linear.capsize_speed], rtol=1e-12)
+    assert "capsize, zero eigenvalue: 3 of 3 found" in str(chart)
+
+
 class Fluttering(OnLine):
     """A particle on a stiffening spring under a constant push, with a drag and a gain that feeds its speed back."""
 

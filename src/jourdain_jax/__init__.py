@@ -81,6 +81,7 @@ if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
     from jourdain_jax.analysis.estimate import Estimate, bounds, joint_normal, positive, unbounded
     from jourdain_jax.analysis.experiment import Experiment
+    from jourdain_jax.analysis.families.chart import stability_chart
     from jourdain_jax.analysis.families.critical import critical
     from jourdain_jax.analysis.families.family import family
     from jourdain_jax.analysis.families.periodic import periodic
@@ -128,6 +129,7 @@ _ON_FIRST_USE = {
     "analysis.energy": "Energy EnergyBalance energy energy_balance",
     "analysis.estimate": "Estimate bounds joint_normal positive unbounded",
     "analysis.experiment": "Experiment",
+    "analysis.families.chart": "stability_chart",
     "analysis.families.critical": "critical",
     "analysis.families.family": "family",
     "analysis.families.periodic": "periodic",
@@ -337,6 +339,7 @@ __all__ = [
     "sobol_indices",
     "speeds",
     "spring",
+    "stability_chart",
     "start",
     "steady",
     "structure_of",

@@ -188,10 +188,7 @@ def entries_of(scene: Scene, names: Iterable[str]) -> set[str]:
     return {entry for name in names for entry in groups.get(name, (name,))}
 
 
-@once_per_class
-def by_program(scene: Scene, *parts) -> ByProgram:
-    """The program of a class of scenes; `parts`: as of `ByProgram`. `NotLowered` where there is none."""
-    return ByProgram(scene, *parts)
+by_program = once_per_class(ByProgram)  # of a class of scenes; `NotLowered` where there is none
 
 
 def on_rows(scene: Scene) -> np.ndarray:

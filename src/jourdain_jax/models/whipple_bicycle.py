@@ -137,10 +137,10 @@ class WhippleBicycle(Scene):
 
     def mode_names(self, eigenvalues: np.ndarray) -> tuple[str, ...]:
         """Names of the four modes: weave is the complex pair, or where all are real the two of one sign that meet at a higher speed, which grow when
-        riding forward; of the others castering is the faster one, capsize the slower.
+        riding forward; of the others castering is the faster one, capsize the slower. None of another number of modes.
         """
         if len(eigenvalues) != 4:
-            return tuple(f"mode {k + 1}" for k in range(len(eigenvalues)))
+            return ()
         order = np.argsort(-np.abs(eigenvalues.imag) if np.any(eigenvalues.imag) else -eigenvalues.real)
         fast, slow = sorted(order[2:], key=lambda k: -abs(eigenvalues[k]))
         return tuple("castering" if k == fast else "capsize" if k == slow else "weave" for k in range(4))

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
-from jourdain_jax.analysis.families.equations import DOUBLE, PAIR, ZERO, Look, SteadyEquations
+from jourdain_jax.analysis.families.equations import DOUBLE, PAIR, ZERO, Look, SteadyEquations, numbered
 from jourdain_jax.analysis.families.family import Family, FamilyPoint
 from jourdain_jax.analysis.families.special import SURE
 from jourdain_jax.analysis.families.spectrum import null_space
@@ -97,10 +97,8 @@ def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held
     by_all = by_all + pulled(-(by_all[equations.places] * equations.size) @ inverse[:, : len(look.R)], 0 * y)
     if not single:
         by_all = by_all * np.nan
-    leaves, treedef = jax.tree.flatten(scene)
-    parts = np.split(by_all, np.cumsum([np.size(leaf) for leaf in leaves]))
-    shaped = [np.reshape(part, np.shape(leaf)) for part, leaf in zip(parts, leaves, strict=False)]
-    by_parameter = {name: value for name, value, _ in parameters_of(jax.tree.unflatten(treedef, shaped))}
+    at = numbered(scene)
+    by_parameter = {name: np.reshape(by_all[getattr(at, name) :][: np.size(value)], np.shape(value)) for name, value, _ in parameters_of(scene)}
     return Sensitivities(mode, s, condition, by_parameter, FOUND if single else SINGULAR, tuple(equations.unknowns[k] for k in fixed))
 
 
@@ -177,9 +175,7 @@ def _program(equations: SteadyEquations) -> _Program:
     return _program_of(equations.scene, equations.instant, tuple(tuple(part.tolist()) for part in of))
 
 
-@once_per_class
-def _program_of(scene: Scene, *parts) -> _Program:
-    return _Program(scene, *parts)
+_program_of = once_per_class(_Program)
 
 
 class _Special(eqx.Module):
@@ -197,8 +193,9 @@ class _Special(eqx.Module):
 
     def numbers(self, scene: Scene, X: Unknowns) -> Float[Array, "numbers"]:
         """Parameters, t, q, u and inputs in a row."""
-        of, parameters = self.equations, jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(scene)])
-        return jnp.concatenate([parameters, of.given[len(parameters) :]]).at[of.places].set(self.parts(X)[0] * of.size)
+        of = self.equations
+        known = [*map(jnp.ravel, jax.tree.leaves(scene)), of.given[of.instant.states[0] - 1 :]]
+        return jnp.concatenate(known).at[of.places].set(self.parts(X)[0] * of.size)
 
     def normal(self, X: Unknowns) -> Unknowns:
         """X with a of unit length; of a pair a + i b."""

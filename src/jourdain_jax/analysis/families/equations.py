@@ -16,13 +16,12 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jourdain_jax.analysis.families.spectrum import Modes, in_pairs, null_space
+from jourdain_jax.analysis.families.spectrum import Modes, null_space
 from jourdain_jax.analysis.instant import by_program, numbers_of, on_rows, places_of
 from jourdain_jax.build.assembling import coordinate_bounds
 from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.lowering.lower import lower
-from jourdain_jax.scene.names import check_name, nearest
-from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.scene import Scene
 
 Vector = Float[np.ndarray, "unknowns"]
@@ -101,12 +100,12 @@ class SteadyEquations(Motions):
         self.scene, self.vary, (self.t, q, u) = scene, vary, guess
         names, at, program = (*scene.coordinate_names.entries, *scene.speed_names.entries), places_of(scene), lower(scene)
         self.given = np.asarray(numbers_of(scene, self.t, q, u, inputs), float)
-        first, varied = sum(np.size(leaf) for leaf in jax.tree.leaves(scene)), [_place_of(name, scene) for name in vary]
+        varied = [getattr(numbered(scene), name) for name in vary]
         self.instant = by_program(scene, program, (), tuple(varied))
         matters, bound = np.array([name not in program.held for name in program.coordinates], bool), on_rows(scene)
         kept, y = np.flatnonzero(matters | bound), np.array(program.independent, int)
         columns = np.concatenate([at.q[kept], at.u])
-        self.places = np.concatenate([first + columns, varied]).astype(int)
+        self.places = np.concatenate([self.instant.states[0] - 1 + columns, varied]).astype(int)
         self.unknowns = (*(names[k] for k in kept), *scene.speed_names.entries, *vary)
         self.size = np.append(sizes(scene, kept.tolist()), [abs(x) or 1.0 for x in self.given[varied]])
         self.start = self.given[self.places] / self.size
@@ -134,7 +133,7 @@ class SteadyEquations(Motions):
         return (directions * self.size[: len(directions), None])[self.states_of_z]
 
     def eigenvalues(self, look: Look, tangent: Vector) -> Modes:
-        """Eigenvalues of small motions in 1/s, in any order, without the zeros of going on along the family or along what is held.
+        """Eigenvalues of small motions in 1/s, by ascending real part, without the zeros of going on along the family or along what is held.
 
         Directions along which steady motions go on, T, belong to zeros by structure, and are taken out as a subspace, not by their size: with P orthonormal
         and across T the others are those of P' A P.
@@ -143,7 +142,8 @@ class SteadyEquations(Motions):
         F, C = look.small
         E = null_space(C)
         P = null_space(np.linalg.qr(E.T @ freedoms)[0].T)
-        return in_pairs(np.linalg.eigvals(P.T @ E.T @ F @ E @ P).astype(complex))
+        values = np.linalg.eigvals(P.T @ E.T @ F @ E @ P).astype(complex)
+        return values[np.lexsort((-values.imag, values.real))]
 
     def split(self, numbers):
         """q, u and what varies, by name."""
@@ -151,15 +151,10 @@ class SteadyEquations(Motions):
         return numbers[first : first + n], numbers[first + n : first + n + m], {name: numbers[self.by_name[name]] for name in self.vary}
 
 
-def _place_of(vary: str, scene: Scene) -> int:
-    """The place of a parameter among all numbers of a scene."""
-    place = 0
-    for path, leaf in jax.tree_util.tree_flatten_with_path(scene)[0]:
-        if path == (jax.tree_util.GetAttrKey(vary),) and np.ndim(leaf) == 0:
-            return place
-        place += np.size(leaf)
-    advice = nearest(vary, [name for name, value, _ in parameters_of(scene) if np.ndim(value) == 0])
-    raise ValueError(f"`vary` names `{vary}`, expected a parameter of `{type(scene).__name__}` that is one number; {advice}")
+def numbered(scene: Scene) -> Scene:
+    """A scene with the place of its first number among all numbers in each parameter."""
+    leaves, treedef = jax.tree.flatten(scene)
+    return jax.tree.unflatten(treedef, np.cumsum([0, *map(np.size, leaves[:-1])]).tolist())
 
 
 def sizes(scene: Scene, kept: Sequence[int]) -> np.ndarray:

@@ -20,7 +20,8 @@ from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.calculus.reals import Numbers, largest
 from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, of_known_numbers, shown_from_users_lines
-from jourdain_jax.scene.names import UnknownNameError, as_names, check_name
+from jourdain_jax.scene.names import UnknownNameError, as_names, check_name, check_names
+from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed, in_digits
 from jourdain_jax.scene.scene import Scene
 
@@ -189,18 +190,19 @@ def family(
     """
     scene, until, held = as_scene(scene), dict(until or {}), as_names(held)
     point, varied = guess if isinstance(guess, FamilyPoint) else None, () if vary is None else (vary,)
+    numbers = [name for name, value, _ in parameters_of(scene) if np.ndim(value) == 0]
+    check_names(varied, numbers, f"`vary` names `{{}}`, expected a parameter of `{type(scene).__name__}` that is one number")
     equations: Motions
     if isinstance(guess, PeriodicMotion):
         equations = OrbitEquations(scene, guess, varied, held)
     else:
         t, q, u = (np.asarray(x, float) for x in guessed(scene, point.state if point else guess, 0.0))
-        if point and vary in point.values:
-            scene = scene.replace(**{vary: point[vary]})
+        scene = scene.replace(**{name: point[name] for name in varied if point and name in point.values})
         equations = SteadyEquations(scene, (float(t), q, u), np.asarray(as_input_vector(scene, inputs), float), varied, held)
     targets = [(k := equations.index(name), float(value) / equations.size[k]) for name, value in until.items()]
     named = [name for name in (guess if isinstance(guess, Mapping) else ()) if name in equations.unknowns]
     if point is None:
-        begin = first_point(equations, named, [*held, *until])
+        begin = first_point(equations, named, [*until])
     elif point.kind == "branch point" and len(point.tangent) == len(equations.unknowns):
         begin = across(equations, point.tangent / equations.size)
     else:
@@ -208,5 +210,5 @@ def family(
     points, ends = followed(equations, begin, targets, max_points)
     # between its neighbours a branch point is found as any other
     found = Family(equations, tuple(p for p in points if not (point and p.z is begin.z)), ends, mode_names(scene, names, begin.modes))
-    turning = {name: equations.index(name) for name in dict.fromkeys([*named, *until, *varied]) if name not in held}
+    turning = {name: equations.index(name) for name in dict.fromkeys([*named, *until, *varied])}
     return replace(found, special=tuple(found.point(at, crossing.kind, crossing.columns) for crossing, at in special(equations, found.points, turning)))

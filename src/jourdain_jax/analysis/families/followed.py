@@ -51,8 +51,7 @@ def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
         raise ValueError(f"no {equations.what[:-1]} of `{scene}` is found near the guess; `jj.steady` may find one from afar")
     z, look, _ = found
     sigma, V = np.linalg.svd(look.J)[1:]
-    sigma = np.append(sigma, np.zeros(len(z) - len(sigma)))
-    count = int(np.sum(sigma < 1e-8 * sigma[0]))
+    count = len(z) - int(np.sum(sigma >= 1e-8 * sigma[0]))
     if count == 0:
         raise ValueError(f"this {equations.what[:-1]} of `{scene}` stands alone: no freedom is left; hold less, or name a parameter by `vary`")
     if count > 1:

@@ -176,10 +176,14 @@ class _Shooting(eqx.Module):
         at_start = [k in self.free for k in range(len(self.sizes))]
         return np.array([*at_start, *[True] * len(self.sizes) * (self.pieces - 1), self.until is not None])
 
+    def split(self, z: States) -> tuple[Array, Array]:
+        """q and u."""
+        n = len(self.scene.coordinate_names.entries)
+        return z[:n], z[n:]
+
     def motion(self, t0, z: States, ts: Float[Array, "times"]):
         """The motion from a state."""
-        n = len(self.scene.coordinate_names.entries)
-        start = state_of(self.scene, t0, z[:n], z[n:])
+        start = state_of(self.scene, t0, *self.split(z))
         return simulate(self.scene, start, t0=t0, ts=ts, inputs=self.inputs, options=self.options).nan_if_failed()
 
     def moved(self, k, z: States, t, period) -> States:
@@ -190,13 +194,12 @@ class _Shooting(eqx.Module):
 
     def events(self, t, z: States) -> Float[Array, "events"]:
         """Values of the stop events, c among them."""
-        n = len(self.scene.coordinate_names.entries)
-        return event_values(self.scene, motion_at(self.scene, t, z[:n], z[n:], inputs_at(self.inputs, t)))
+        return event_values(self.scene, motion_at(self.scene, t, *self.split(z), inputs_at(self.inputs, t)))
 
     def constraints(self, t, z: States) -> tuple[Array, Array]:
         """g and phi with their slopes by z."""
-        at, n = places_of(self.scene), len(self.scene.coordinate_names.entries)
-        v, D, _ = self.instant(self.scene, t, z[:n], z[n:], inputs_at(self.inputs, t))
+        at = places_of(self.scene)
+        v, D, _ = self.instant(self.scene, t, *self.split(z), inputs_at(self.inputs, t))
         rows = np.concatenate([at.g, at.phi])
         return v[rows], D[rows][:, np.concatenate([at.q, at.u])]
 
@@ -291,9 +294,9 @@ def _found(problem: _Shooting, start: State, period: Scalar) -> PeriodicMotion:
         whole = jax.lax.stop_gradient(problem).motion(t, zs[0], t + period * np.linspace(0.01, 1.0, 100))
         values = jax.vmap(problem.events)(whole.ts, jnp.concatenate([whole.q, whole.u], axis=1))
         goes_on = jnp.all(values[:, np.array(others)] >= 0)
-    n, names = len(start.q), problem.scene.coordinate_names.entries
+    names = problem.scene.coordinate_names.entries
     shifts = {name: ends[-1, k] - zs[0, k] for k, name in enumerate(names) if k not in problem.kept or name in problem.shifted}
-    state = state_of(problem.scene, t, zs[0, :n], zs[0, n:], start.moved_q, start.moved_u, residual)
+    state = state_of(problem.scene, t, *problem.split(zs[0]), start.moved_q, start.moved_u, residual)
     return PeriodicMotion(state, period, shifts, problem.multipliers(t, x, D, ends), residual, (residual < 1e-8) & goes_on, problem, x)
 
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Float
 
 from jourdain_jax.analysis.families.curve import Point
 from jourdain_jax.analysis.families.equations import DOUBLE, Motions, Vector
@@ -72,21 +71,10 @@ def tangents_across(equations: Motions, z: Vector) -> list[Vector]:
     """
     look = equations(z)
     U, _, V = np.linalg.svd(look.J)
-    a, b = V[-1], V[-2]
-    left = U[:, look.J.shape[1] - 2 :]
-
-    h = 1e-4  # sizes of the unknowns
-
-    def bent(v: Vector) -> Float[np.ndarray, "rows unknowns"]:
-        return (equations(z + h * v).J - equations(z - h * v).J) / (2 * h)
-
-    of_a, of_b = bent(a), bent(b)
-    forms = left.T @ np.column_stack([of_a @ a, of_a @ b, of_b @ b])
-    aa, ab, bb = np.linalg.svd(forms)[2][0]
-    if abs(aa) < abs(bb):  # solve for the smaller share
-        (a, b), (aa, bb) = (b, a), (bb, aa)
-    inside = ab * ab - aa * bb
-    if inside <= 0 or aa == 0.0:
-        return [V[-1], V[-2]]
-    roots = [(-ab + side * np.sqrt(inside)) / aa for side in (1, -1)]
-    return [(r * a + b) / np.linalg.norm(r * a + b) for r in roots]
+    left, null, h = U[:, look.J.shape[1] - 2 :], V[:-3:-1].T, 1e-4  # h: sizes of the unknowns
+    of_a, of_b = ((equations(z + h * v).J - equations(z - h * v).J) @ null / (2 * h) for v in null.T)
+    aa, ab, bb = np.linalg.svd(left.T @ np.column_stack([of_a, of_b[:, 1]]))[2][0]
+    (low, high), axes = np.linalg.eigh([[aa, ab], [ab, bb]])
+    if low * high >= 0:
+        return [*null.T]
+    return [null @ axes @ [np.sqrt(high), side * np.sqrt(-low)] / np.sqrt(high - low) for side in (1, -1)]

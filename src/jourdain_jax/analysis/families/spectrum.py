@@ -17,11 +17,6 @@ def null_space(C: Float[np.ndarray, "rows states"]) -> Float[np.ndarray, "states
     return V[np.sum(sigma > 1e-9 * np.max(sigma, initial=1e-300)) :].T
 
 
-def in_pairs(values: Modes) -> Modes:
-    """Sort by ascending real part, of a pair the positive imaginary part first; what is real has no imaginary part."""
-    return values[np.lexsort((-values.imag, values.real))]
-
-
 def matched(before: Modes, now: Modes) -> Modes:
     """The eigenvalues in the columns of those before: in the order that moves them least, of equals the first."""
     apart, place = np.abs(before[:, None] - now), np.arange(len(now))
@@ -44,7 +39,7 @@ def are_partners(before, now, k: int, j: int) -> bool:
 def mode_names(scene: Scene, names: tuple[str, ...] | None, values: Modes) -> tuple[str, ...]:
     """Names of the columns: as stated by the user, by the scene, or by number."""
     named = getattr(scene, "mode_names", None)
-    names = tuple(names) if names is not None else named(values) if named else tuple(f"mode {k + 1}" for k in range(len(values)))
+    names = tuple(names) if names is not None else (named and named(values)) or tuple(f"mode {k + 1}" for k in range(len(values)))
     if len(names) != len(values):
         raise ValueError(f"`names` holds {len(names)} names, expected one for each of the {len(values)} modes")
     return names

@@ -1,0 +1,58 @@
+"""Charts of stability: where in a plane of two numbers modes of a steady motion pass the axis, as curves of critical points."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from jourdain_jax.analysis.families.critical import CriticalPoint, critical
+from jourdain_jax.analysis.families.equations import DOUBLE
+from jourdain_jax.analysis.families.family import Family, family
+from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers
+from jourdain_jax.scene.printing import Printed
+from jourdain_jax.scene.scene import Scene
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class StabilityChart(Printed):
+    """Curves on which modes pass the axis of stability; `mode, curve = chart.boundaries[0]`, `curve["rear_spin_rate"]`."""
+
+    values: jax.Array  # of the first number, even ones
+    boundaries: tuple[tuple[str, CriticalPoint], ...]  # mode, and a point for each value: NaN, with a code, where the curve has none
+    middle: Family  # along the second number, in the middle of the first: it tells which side is stable
+
+    def _text(self) -> str:
+        return "\n".join(f"{mode}, {curve}" for mode, curve in self.boundaries)
+
+
+@of_known_numbers
+def stability_chart(
+    scene: Scene | BuiltFor, axes: Mapping[str, tuple[float, float]], *, guess: Mapping[str, float] | None = None, points: int = 101, **asked
+) -> StabilityChart:
+    """Find the boundaries of stability of steady motions in a plane of two numbers.
+
+        chart = jj.stability_chart(bicycle, {"c": (0.02, 0.12), "rear_spin_rate": (5.0, 35.0)})
+        for mode, curve in chart.boundaries:
+            print(mode, curve["rear_spin_rate"], curve.speed)
+
+    **Arguments**
+    - `axes`: a parameter of the scene, and a coordinate or a speed, each with its first and its last value.
+    - `guess`: named values of one of the motions (the rest zero); `points`: number of values of the first parameter, at least 3.
+    - `asked`: what `family` takes: `held`, `inputs`, `names`.
+
+    A family along the second number, in the middle of the first, tells which boundaries there are; each is a `critical` point as a function of the first
+    number, found to round-off. A boundary that does not pass the middle is not seen, and one that turns back along the first number has gaps.
+
+    **Returns** a `StabilityChart`. **Raises** as `family`.
+    """
+    (first, ends), (second, (begin, end)) = axes.items()
+    values = jnp.linspace(*ends, points)
+    scene = as_scene(scene).replace(**{first: values[points // 2]})
+    middle = family(scene, {**(guess or {}), second: begin}, until={second: end}, **asked)
+    boundaries = []
+    for change in middle.changes:
+        if change.kind != DOUBLE:
+            curve = [critical(scene.replace(**{first: x}), middle, change) for x in values]  # compiled in less time than a batch
+            boundaries.append((change.modes[0], jax.tree.map(lambda *x: jnp.stack(x), *curve)))
+    return StabilityChart(values, tuple(boundaries), middle)
