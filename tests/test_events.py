@@ -1,6 +1,7 @@
 """Stop events: found in their step to round-off, the first of several, in short windows, and again from where they stopped; with derivatives."""
 
 import itertools
+from collections.abc import Callable
 from functools import cache
 
 import diffrax
@@ -15,7 +16,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from small_scenes import OnLine, Upright
 
 import jourdain_jax as jj
-from jourdain_jax.motion.integrators import erk_loop
 from jourdain_jax.motion.integrators.explicit_steps import DOPRI5, DOPRI8, TSIT5, method_of
 
 # Stop events located inside the loop over steps: to round-off, with derivatives up to the third, and never outside of the step they lie in.
@@ -24,46 +24,38 @@ from jourdain_jax.motion.integrators.explicit_steps import DOPRI5, DOPRI8, TSIT5
 GRAVITY = 9.81
 
 
-def stopped(y0, value, *, rates, longest=2.0, solver=None, kind="forward", goals=None, max_steps=500):
-    """Where a motion from `y0` at t = 0 stopped; `value(t, y)` of the one event; states at the `goals` where there are some."""
-    real = lambda x: jnp.full(y0.shape[1:], x)  # noqa: E731
-    problem = erk_loop.Problem(
-        rates=lambda t, y, args: rates(t, y),
-        args=None,
-        project=None,
-        events=lambda t, y, args: value(t, y)[None],
-        norm=lambda y: jnp.sqrt(jnp.mean(y**2, axis=0)),
-        rtol=real(1e-9),
-        atol=real(1e-9),
-        shortest=real(1e-14),
-        longest=real(jnp.inf),
-        span=real(longest),
-        max_steps=max_steps,
-    )
-    times = jnp.stack([real(0.5 * longest), real(longest)]) if goals is None else goals
-    method = method_of(diffrax.Dopri8() if solver is None else solver)
-    return erk_loop.integrate(problem, method, y0, real(0.0), times, 1e-2, kind)[2 if goals is None else 0]
+class Falling(OnLine):
+    """A mass above the ground, which may push it."""
+
+    depth: float = jj.parameter(0.05)
+    stiffness: float = jj.parameter(0.0)
+
+    def push(self, x):  # k x^9.5 above -depth, zero below it, where reverse mode divides by sqrt(0)
+        return self.stiffness * x**9 * jnp.sqrt(jnp.maximum(x, 0.0))
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=-GRAVITY + self.push(motion.q.x + self.depth)),)
+
+    def events(self, motion):
+        return {"ground": motion.q.x}
 
 
-def falling(t, y):
-    return jnp.stack([y[1], -GRAVITY * jnp.ones_like(y[1])])
+def fallen(height, scene=None, **options):
+    return jj.simulate(scene or Falling(), {"x": height}, **({"t1": 2.0, "backend": "xla", "rtol": 1e-9, "atol": 1e-9} | options))
 
 
 def test_lanes_have_saved_times_of_their_own():
-    def saved(heights, goals):
-        return stopped(jnp.stack([heights, 0.0 * heights]), lambda t, y: y[0], rates=falling, kind="reverse", goals=goals)[:, 0]
-
-    heights, goals = jnp.array([0.5, 9.0]), jnp.array([[0.0, 0.0, 0.1, 1.0, 1.0], [0.1, 0.2, 0.3, 0.4, 0.5]])
-    fallen = np.maximum(heights[:, None] - GRAVITY * goals**2 / 2, 0.0)
-    for run in (lambda heights: saved(heights, goals.T).T, lambda heights: jax.vmap(saved)(heights, goals)):
-        assert_allclose(run(heights), fallen, atol=1e-9)
-        assert_allclose(jnp.sum(jax.jacrev(run)(heights), axis=2), fallen > 0, atol=1e-9)
+    heights, ts = jnp.array([0.5, 9.0]), jnp.array([[0.0, 0.1, 0.2, 1.0, 1.1], [0.1, 0.2, 0.3, 0.4, 0.5]])
+    expected = np.maximum(heights[:, None] - GRAVITY * ts**2 / 2, 0.0)
+    run = jax.vmap(lambda height, ts: fallen(height, ts=ts).q[:, 0])
+    assert_allclose(np.nan_to_num(run(heights, ts)), expected, atol=1e-9)
+    assert_allclose(np.nan_to_num(jnp.sum(jax.jacrev(lambda heights: run(heights, ts))(heights), axis=2)), expected > 0, atol=1e-9)
 
 
 @pytest.mark.parametrize("solver", [pytest.param(diffrax.Dopri8(), id="Dopri8", marks=pytest.mark.slow), pytest.param(diffrax.Tsit5(), id="Tsit5")])
 def test_a_fall_is_located_with_derivatives_up_to_the_third(solver):
     def fall_time(height):
-        return stopped(jnp.stack([height, 0.0 * height]), lambda t, y: y[0], rates=falling, solver=solver).t
+        return fallen(height, solver=solver).t_end
 
     height = 2.0
     exact = np.sqrt(2 * height / GRAVITY)
@@ -73,45 +65,45 @@ def test_a_fall_is_located_with_derivatives_up_to_the_third(solver):
 
 
 def test_reverse_mode_to_an_event_does_not_depend_on_derivatives_beyond_it():
-    depth, stiffness, height = 0.05, 5e-3, 2.0
-    beyond = []
-
-    def push(x):  # k x^9.5 above -depth, zero below it, where reverse mode divides by sqrt(0)
-        return stiffness * x**9 * jnp.sqrt(jnp.maximum(x, 0.0))
-
-    def rates(t, y):
-        jax.debug.callback(lambda y: beyond.append(y < -depth), y[0])
-        return jnp.stack([y[1], -GRAVITY + push(y[0] + depth)])
+    scene, height = Falling(stiffness=5e-3), 2.0
 
     def landing_speed(height):
-        return stopped(jnp.stack([height, 0.0 * height]), lambda t, y: y[0], rates=rates, kind="reverse", solver=diffrax.Tsit5()).y[1]
+        return fallen(height, scene, solver=diffrax.Tsit5()).u_end[0]
 
     # v^2/2 + g z - k (z + d)^10.5/10.5 is constant
-    work = lambda z: GRAVITY * z - stiffness * (z + depth) ** 10.5 / 10.5  # noqa: E731
+    work = lambda z: GRAVITY * z - scene.stiffness * (z + scene.depth) ** 10.5 / 10.5  # noqa: E731
     speed = np.sqrt(2 * (work(height) - work(0.0)))
-    assert np.isnan(jax.grad(push)(-depth))
+    assert np.isnan(jax.grad(scene.push)(-scene.depth))
     assert_allclose(landing_speed(height), -speed, rtol=1e-9)
-    assert any(beyond)
-    assert_allclose(jax.grad(landing_speed)(height), -(GRAVITY - push(height + depth)) / speed, rtol=1e-7)
+    assert_allclose(jax.grad(landing_speed)(height), -(GRAVITY - scene.push(height + scene.depth)) / speed, rtol=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("value", "digits"),
-    [
-        (lambda t, y: 0.7 - y[0], 1e-14),
-        (lambda t, y: jnp.tanh(40 * (0.7 - y[0])), 1e-14),
-        (lambda t, y: jnp.expm1(30 * (0.7 - y[0])), 1e-14),
-        (lambda t, y: jnp.where(y[0] < 0.7, 1e3, 1.0) * (0.7 - y[0]), 1e-14),
-        (lambda t, y: (0.7 - y[0]) ** 3, 1e-2),  # its slope vanishes there
-        (lambda t, y: jnp.where(y[0] < 0.7, 1.0, -1.0), 1e-2),  # a jump has no slope at all
-    ],
-    ids=["straight", "saturated", "steep", "kinked", "flat", "jump"],
-)
-def test_an_event_is_found_in_its_step_whatever_its_shape(value, digits):
-    end = stopped(jnp.array([0.0]), value, rates=lambda t, y: jnp.ones_like(y))
-    assert end.code == results.EVENT
-    assert_allclose(end.t, 0.7, atol=digits)
-    assert_allclose(end.y[0], end.t, rtol=1e-13)
+SHAPES = {
+    "straight": (lambda x: 0.7 - x, 1e-14),
+    "saturated": (lambda x: jnp.tanh(40 * (0.7 - x)), 1e-14),
+    "steep": (lambda x: jnp.expm1(30 * (0.7 - x)), 1e-14),
+    "kinked": (lambda x: jnp.where(x < 0.7, 1e3, 1.0) * (0.7 - x), 1e-14),
+    "flat": (lambda x: (0.7 - x) ** 3, 1e-2),  # its slope vanishes there
+    "jump": (lambda x: jnp.where(x < 0.7, 1.0, -1.0), 1e-2),  # a jump has no slope at all
+}
+
+
+class Shaped(OnLine):
+    """A particle that meets a wall, by values of many shapes."""
+
+    value: Callable = eqx.field(static=True, default=abs)
+
+    def events(self, motion):
+        return {"wall": self.value(motion.q.x)}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_an_event_is_found_in_its_step_whatever_its_shape(shape):
+    value, digits = SHAPES[shape]
+    end = jj.simulate(Shaped(value=value), {"x_rate": 1.0}, t1=2.0, backend="xla")
+    assert end.result == results.EVENT
+    assert_allclose(end.t_end, 0.7, atol=digits)
+    assert_allclose(end.q_end[0], end.t_end, rtol=1e-13)
 
 
 class Flat(OnLine):

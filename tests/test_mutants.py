@@ -9,6 +9,7 @@ import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from types import SimpleNamespace
 
 import diffrax
 import jax
@@ -27,8 +28,18 @@ from jourdain_jax.dynamics.power import power
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.lowering import appell, kept_rows, lower
 from jourdain_jax.models import MODELS
-from jourdain_jax.motion.integrators import crossings, erk_loop, erk_step, event_search, recorded_adjoint, step_adjoint
+from jourdain_jax.motion.arrays import back as backwards
+from jourdain_jax.motion.arrays import functions
+from jourdain_jax.motion.arrays import loop as on_arrays
+from jourdain_jax.motion.arrays import motion as motions
+from jourdain_jax.motion.arrays.loop import Loop
+from jourdain_jax.motion.arrays.writer import ArrayWriter
+from jourdain_jax.motion.integrators import event_search
 from jourdain_jax.motion.integrators.explicit_steps import method_of
+from jourdain_jax.motion.native import native_motion, step
+from jourdain_jax.motion.native.loop import Start
+from jourdain_jax.motion.setup import Solved
+from jourdain_jax.motion.vector_fields.field import Integrated
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 
@@ -117,100 +128,98 @@ def a_program_knows_where_rows_are_parallel():
 # Steps
 
 
-def loop(
-    kind: str, rates: Callable, *, rtol: float, project=None, events=None, knots=None, solver=None, dt0: float = 1.0, longest=np.inf, relations=None
-) -> Callable:
-    """`(y0, t0, goals, args)` -> saved states and the loop's own account."""
+def loop(rates: Callable, *, rtol: float, project=None, events=None, knots=None, relations=None, dt0: float = 1.0, longest=np.inf) -> Callable:
+    """`(y0, goals, k)` -> (loop on arrays, its start); functions are of (t, y, k), the state is one of coordinates."""
+    state = lambda y: Integrated(y, jnp.zeros(0), None)  # noqa: E731
+    given = SimpleNamespace(
+        rates=lambda t, y, k: state(rates(t, y.q, k)),
+        project=lambda t, y, k: state(project(t, y.q, k)),
+        events=lambda t, y, k: events(t, y.q, k),
+        within=lambda middle, k: k,
+    )
+    functions.integrands = given
+    several, watched = range(2 if relations else 0), relations and (lambda k, t, y: relations(t))
 
-    def run(y0, t0, goals, args):
-        one = jnp.ones(())
-        problem = erk_step.Problem(
-            rates=rates,
-            args=args,
-            project=project,
-            events=events,
-            norm=lambda y: jnp.sqrt(jnp.mean(y**2, axis=0)),
-            rtol=rtol * one,
-            atol=rtol * one,
-            shortest=1e-14 * one,
-            longest=longest * one,
-            max_steps=2000,
-            knots=None if knots is None else jnp.asarray(knots),
-            relations=relations,
-            relation_count=0 if relations is None else 2,
-            span=2.0 * one,
+    def run(y0, goals, k=1.0):
+        known, rest = functions.split(jnp.asarray(k))
+        form = functions.ArrayForm(
+            None, False, bool(project), True, bool(events), 0, coordinates=len(y0), events=1 if events else 0, relations=several, watched=several
         )
-        ys, _, end = erk_loop.integrate(problem, method_of(solver or diffrax.Dopri8()), y0, t0, goals, dt0, kind)
-        return ys, end
+        control = tuple(map(jnp.asarray, (rtol, rtol, 1e-14, longest, dt0, 2000.0)))
+        start = Start(() if knots is None else (jnp.asarray(knots),), control, goals, jnp.zeros(()), (y0,), (known,))
+        return Loop(form, method_of(diffrax.Dopri8()), watched, rest, 2000), start
 
     return run
 
 
+def motion(run: Callable) -> Callable:
+    """What a loop finds, by its arguments; states at all goals but the last."""
+
+    @jax.jit
+    def found(*arguments):
+        of, start = run(*arguments)
+        return native_motion.solved(of.form, start.goals, motions.flow(of, 0)(start))
+
+    return found
+
+
 def steps_follow_a_closed_form():
-    goals = jnp.array([0.5, 1.1, 2.0])
-    ys, end = jax.jit(loop("forward", lambda t, y, args: -2 * t * y, rtol=1e-10))(jnp.ones(1), jnp.array(0.0), goals, None)
+    goals = np.array([0.5, 1.1, 2.0, 2.1])
+    end = motion(loop(lambda t, y, k: -2 * t * y, rtol=1e-10))(jnp.ones(1), goals)
     assert int(end.accepted + end.rejected) < 60, f"{end.accepted} steps and {end.rejected} rejected ones, too many for the order of the method"
-    assert_allclose(ys[:, 0], np.exp(-(np.asarray(goals) ** 2)), atol=1e-8, err_msg="closed form")
+    assert_allclose(end.ys.q[:, 0], np.exp(-(goals[:-1] ** 2)), atol=1e-8, err_msg="closed form")
     assert int(end.rejected) > 0, "no step was rejected, as this check needs it"
 
 
 def projected_steps_stay_on_a_circle():
-    def turning(t, y, args):
+    def turning(t, y, k):
         return (1 + t) * jnp.stack([-y[1], y[0]])
 
-    run = loop("forward", turning, rtol=1e-4, project=lambda t, y, args: y / jnp.sqrt(jnp.sum(y**2)), dt0=0.1)
-    ys, _ = jax.jit(run)(jnp.array([1.0, 0.0]), jnp.array(0.0), jnp.array([1.0, 2.0]), None)
-    assert_allclose(np.sum(np.asarray(ys) ** 2, axis=1), 1.0, atol=1e-14, err_msg="circle")
+    run = loop(turning, rtol=1e-4, project=lambda t, y, k: y / jnp.sqrt(jnp.sum(y**2)), dt0=0.1)
+    assert_allclose(np.sum(motion(run)(jnp.array([1.0, 0.0]), np.array([1.0, 2.0, 2.1])).ys.q ** 2, axis=1), 1.0, atol=1e-14, err_msg="circle")
 
 
 def steps_end_at_knots():
-    run = loop("forward", lambda t, y, args: 2 * jnp.abs(t - 0.3)[None], rtol=1e-3, knots=[0.3, np.inf])
-    ys, _ = jax.jit(run)(jnp.zeros(1), jnp.array(0.0), jnp.array([1.0]), None)
-    assert_allclose(ys[0, 0], 0.3**2 + 0.7**2, atol=1e-14, err_msg="knot")
+    run = loop(lambda t, y, k: 2 * jnp.abs(t - 0.3)[None], rtol=1e-3, knots=[0.3, np.inf])
+    assert_allclose(motion(run)(jnp.zeros(1), np.ones(1)).y_end.q[0], 0.3**2 + 0.7**2, atol=1e-14, err_msg="knot")
 
 
 def an_event_within_a_step_ends_the_motion():
-    run = loop("forward", lambda t, y, args: jnp.ones(1), rtol=1e-3, events=lambda t, y, args: (y - 0.52) ** 2 - 1e-4)
-    _, end = jax.jit(run)(jnp.zeros(1), jnp.array(0.0), jnp.array([2.0]), None)
+    end = motion(loop(lambda t, y, k: jnp.ones(1), rtol=1e-3, events=lambda t, y, k: (y - 0.52) ** 2 - 1e-4))(jnp.zeros(1), np.full(1, 2.0))
     assert end.code == results.EVENT, "an event was passed over"
-    assert_allclose(end.t, 0.51, atol=1e-10, err_msg="event")
+    assert_allclose(end.t_end, 0.51, atol=1e-10, err_msg="event")
 
 
 def steps_are_no_longer_than_allowed():
-    run = loop("forward", lambda t, y, args: jnp.ones(1), rtol=1e-3, longest=0.25)
-    _, end = jax.jit(run)(jnp.zeros(1), jnp.array(0.0), jnp.array([2.0]), None)
-    assert end.accepted == 8, "the longest step"
+    assert motion(loop(lambda t, y, k: jnp.ones(1), rtol=1e-3, longest=0.25))(jnp.zeros(1), np.full(1, 2.0)).accepted == 8, "the longest step"
 
 
 def a_motion_leaves_an_event_at_which_it_starts():
-    run = jax.jit(loop("forward", lambda t, y, args: jnp.array([1.0 - t]), rtol=1e-8, dt0=1e-3, events=lambda t, y, args: y))
+    run = motion(loop(lambda t, y, k: jnp.array([1.0 - t]), rtol=1e-8, dt0=1e-3, events=lambda t, y, k: y))
     for start, expected in ((0.0, 2.0), (-1e-5, 0.0)):
-        _, end = run(jnp.full(1, start), jnp.array(0.0), jnp.array([4.0]), None)
-        assert_allclose(end.t, expected, atol=1e-8, err_msg="leaves")
+        assert_allclose(run(jnp.full(1, start), np.full(1, 4.0)).t_end, expected, atol=1e-8, err_msg="leaves")
 
 
 def a_pulse_is_met():
     def within(t):
         return (jnp.abs(t - 0.7) < 0.01) * 1.0
 
-    def watched(args, t, y):
+    def watched(t):
         return jnp.stack([t - 0.7, 0.01 - jnp.abs(t - 0.7)])
 
-    run = loop("forward", lambda t, y, args: within(t)[None], rtol=1e-6, longest=0.5, relations=watched)
-    _, end = jax.jit(run)(jnp.zeros(1), jnp.array(0.0), jnp.array([2.0]), None)
-    assert end.crossings.count == 3, "crossings"
-    assert_allclose(end.y, 0.02, atol=1e-4, err_msg="pulse")
+    end = motion(loop(lambda t, y, k: within(t)[None], rtol=1e-6, longest=0.5, relations=watched))(jnp.zeros(1), np.full(1, 2.0))
+    assert end.crossings == 3, "crossings"
+    assert_allclose(end.y_end.q, 0.02, atol=1e-4, err_msg="pulse")
     assert int(end.rejected) < 80, f"too many refused steps, {end.rejected}"
     assert int(end.accepted) < 100, "too many steps"
 
 
 def a_pulse_within_a_step_is_named():
-    run = loop("forward", lambda t, y, args: 0 * y, rtol=1e-6, longest=0.5, relations=lambda args, t, y: jnp.stack([t - 0.7, 1e-5 - jnp.abs(t - 0.7)]))
-    _, end = jax.jit(run)(jnp.zeros(1), jnp.array(0.0), jnp.array([2.0]), None)
-    assert abs(end.crossings.together - 0.7) < 3e-3, "not named"
+    run = loop(lambda t, y, k: 0 * y, rtol=1e-6, longest=0.5, relations=lambda t: jnp.stack([t - 0.7, 1e-5 - jnp.abs(t - 0.7)]))
+    assert abs(motion(run)(jnp.zeros(1), np.full(1, 2.0)).together - 0.7) < 3e-3, "not named"
 
 
-# Their derivatives in reverse mode
+# Their derivatives in both modes
 
 
 def driven(t, y, k):
@@ -228,49 +237,56 @@ def falls(t, y, k):
 
 # each saved time is one step, of whatever error, so that the states are a smooth function of all arguments, also off the circle; and a precise motion
 CASES = {"saved times": {"project": onto_circle, "rtol": 1e3, "dt0": 100.0}, "an event": {"events": falls, "rtol": 1e-12, "dt0": 0.1}}
-GOALS = {"saved times": 0.3 + 0.2 * np.arange(24.0), "an event": np.array([0.5, 1.5, 4.0])}
+GOALS = {"saved times": 0.2 * np.arange(25.0), "an event": np.array([0.0, 0.5, 1.5, 4.0])}
+START = {"y0": jnp.array([0.8, 0.6, 0.4]), "k": jnp.array(1.1)}
 
 
-def arguments(case: str) -> dict:
-    return {"y0": jnp.array([0.8, 0.6, 0.4]), "t0": jnp.array(0.1), "goals": jnp.asarray(GOALS[case]), "k": jnp.array(1.1)}
+def given(case: str, start: dict = START) -> tuple:
+    """What a loop is given."""
+    return start["y0"], jnp.asarray(GOALS[case]), start["k"]
 
 
-def weighed(kind: str, case: str) -> Callable:
-    """One number of all that a motion gives, by its arguments."""
-    run = loop(kind, driven, **CASES[case])
+def weighed(end: Solved):
+    """One number of all that a motion gives."""
+    states = jnp.concatenate([jnp.ravel(end.ys.q), end.y_end.q])
+    return jnp.sum(jnp.cos(1.0 + jnp.arange(float(states.size))) * states) + 0.7 * end.t_end
 
-    def value(x):
-        ys, end = run(x["y0"], x["t0"], x["goals"], x["k"])
-        return jnp.sum(jnp.cos(1.0 + jnp.arange(float(ys.size))).reshape(ys.shape) * ys) + jnp.sum(
-            jnp.sin(2.0 + jnp.arange(3.0)) * end.y
-        ) + 0.7 * end.t, end.code
 
-    return value
+def backwards_through(of: Loop, start: Start, end: Solved) -> tuple:
+    """Its derivatives by the start and by k, in reverse mode."""
+    g = jax.grad(weighed, allow_int=True)(end)
+    by_y0, (by_k,) = jax.jit(motions.flow_back(of, 0, (0,), 2**20))(start, native_motion.cotangents_of_states(g), g.y_end.rows, g.t_end)
+    return by_y0, by_k
 
 
 @lru_cache
 def differences(case: str) -> dict:
     """Its derivatives by central differences of fourth order."""
-    flat, unravel = jax.flatten_util.ravel_pytree(arguments(case))
-    h = 1e-3
+    flat, unravel = jax.flatten_util.ravel_pytree(START)
+    run, h = motion(loop(driven, **CASES[case])), 1e-3
     points = jnp.stack([flat + step * h * jnp.eye(len(flat)) for step in (-2, -1, 1, 2)])
-    found, codes = jax.jit(jax.vmap(jax.vmap(lambda x: weighed("forward", case)(unravel(x)))))(points)
-    assert np.all((np.asarray(codes) == results.EVENT) == (case == "an event"))
+    ends = jax.vmap(jax.vmap(lambda x: run(*given(case, unravel(x)))))(points)
+    assert np.all((np.asarray(ends.code) == results.EVENT) == (case == "an event"))
+    found = jax.vmap(jax.vmap(weighed))(ends)
     return unravel((found[0] - 8 * found[1] + 8 * found[2] - found[3]) / (12 * h))
 
 
-def reverse_mode_agrees_with_differences(case: str) -> None:
-    found, _ = jax.jit(jax.grad(weighed("reverse", case), has_aux=True))(arguments(case))
-    for name, expected in differences(case).items():
-        assert_allclose(found[name], expected, atol=1e-7, err_msg=f"derivative by {name}")
+def modes_agree_with_differences(case: str) -> None:
+    expected, run = differences(case), loop(driven, **CASES[case])
+    found = motion(run)
+    along = jax.jvp(lambda x: weighed(found(*given(case, x))), (START,), (START,))[1]
+    assert_allclose(along, sum(np.sum(expected[name] * START[name]) for name in START), atol=1e-6, err_msg="derivative forward")
+    arguments = given(case)
+    for name, by in zip(START, backwards_through(*run(*arguments), found(*arguments)), strict=True):
+        assert_allclose(by, expected[name], atol=1e-7, err_msg=f"derivative by {name}")
 
 
-def reverse_mode_through_saved_times():
-    reverse_mode_agrees_with_differences("saved times")
+def derivatives_through_saved_times():
+    modes_agree_with_differences("saved times")
 
 
-def reverse_mode_to_an_event():
-    reverse_mode_agrees_with_differences("an event")
+def derivatives_to_an_event():
+    modes_agree_with_differences("an event")
 
 
 # The mutants
@@ -302,10 +318,10 @@ class Mutant:
 
 
 DENSE = "differs from the dense path"
-BUILD, KINEMATICS, VJP = appell.AppellOnGraph, appell._Kinematics, recorded_adjoint._motion
+BUILD, KINEMATICS = appell.AppellOnGraph, appell._Kinematics
 DISC, BOARD = a_tilting_disc_accelerates_as_by_dense_matrices, a_snakeboard_accelerates_as_by_dense_matrices
 LONGEST, LEAVES = steps_are_no_longer_than_allowed, a_motion_leaves_an_event_at_which_it_starts
-STEPS, TIMES, EVENT = steps_follow_a_closed_form, reverse_mode_through_saved_times, reverse_mode_to_an_event
+STEPS, TIMES, EVENT = steps_follow_a_closed_form, derivatives_through_saved_times, derivatives_to_an_event
 DIVISORS = rates_of_coordinates_have_their_divisors
 MUTANTS = [
     Mutant("no divisors of rates", lower, "_divisors", '== "div"]', '== "none"]', DIVISORS, "differs"),
@@ -356,75 +372,45 @@ MUTANTS = [
         a_program_knows_where_rows_are_parallel,
         "margins",
     ),
-    Mutant("a wrong weight", erk_step, "stages", "method.A[1:count], method.b]", "method.A[1:count], method.b * (1 + 1e-6)]", STEPS, "closed form"),
-    Mutant("rows of the tableau too small", erk_step, "stages", "method.A[1:count], method.b]", "0.999 * method.A[1:count], method.b]", STEPS, "closed form"),
-    Mutant("the whole step for its error", erk_step, "_tried", "weighted(method.b_error, k)", "weighted(method.b, k)", STEPS, "too many for the order"),
-    Mutant("stages at the first time", erk_step, "stages", "t + c * h, treedef", "t + 0 * c * h, treedef", STEPS, "closed form"),
-    Mutant("every step accepted", erk_step, "judged", "(error <= 1.0)", "(error <= 1e30)", STEPS, "closed form"),
-    Mutant("a rejected step takes time", erk_step, "taken", 'w.where(accept, aim.t_1, p["t"])', "aim.t_1", STEPS, "closed form"),
-    Mutant("the state of the time before", erk_loop, "_motion", "(ys, k, y), ys, p.y)", "(ys, k, y), ys, carry[0].y)", STEPS, "closed form"),
-    Mutant("no projection", erk_step, "_tried", "problem.project(t1, y1, problem.args)", "y1", projected_steps_stay_on_a_circle, "circle"),
-    Mutant(
-        "no step ends at a knot",
-        erk_step,
-        "_tried",
-        "target = jnp.where((knot - goal) * direction < 0, knot, goal)",
-        "target = goal",
-        steps_end_at_knots,
-        "knot",
-    ),
-    Mutant("no dips", event_search, "decided", "((share < 1.0) | again)", "again", an_event_within_a_step_ends_the_motion, "passed over"),
-    Mutant("the first step without a bound", erk_loop, "begun", "jnp.minimum(jnp.abs(dt0), problem.longest)", "jnp.abs(dt0)", LONGEST, "the longest step"),
-    Mutant("no bound of steps", erk_step, "judged", ', p["longest"])', ", math.inf)", LONGEST, "the longest step"),
+    Mutant("a wrong weight", step, "stages", "method.b[:n]]", "(1 + 1e-6) * method.b[:n]]", STEPS, "closed form"),
+    Mutant("rows of the tableau too small", step, "stages", "*method.A[1:n, :n]", "*0.999 * method.A[1:n, :n]", STEPS, "closed form"),
+    Mutant("the whole step for its error", on_arrays, "tried_by_stages", "method.b_error", "method.b", STEPS, "too many for the order"),
+    Mutant("stages at the first time", step, "stages", "w.fma(step, c[i], t)", "w.fma(0 * step, c[i], t)", STEPS, "closed form"),
+    Mutant("every step accepted", step, "judged", "(error <= 1.0)", "(error <= 1e30)", STEPS, "closed form"),
+    Mutant("a rejected step takes time", step, "taken", 'w.where(accept, aim.t_1, p["t"])', "aim.t_1", STEPS, "closed form"),
+    Mutant("other states are saved", Loop, "saving", "update_index_in_dim(ys, y,", "update_index_in_dim(ys, 0.99 * y,", STEPS, "closed form"),
+    Mutant("one stage fewer", ArrayWriter, "over_stages", "fori_loop(0, stages,", "fori_loop(0, stages - 1,", STEPS, "closed form|too many"),
+    Mutant("no branch is taken", ArrayWriter, "if_any", "(rooms, arrays, body)[0]", "(rooms, arrays, lambda: None)[0]", EVENT, "derivative|assert"),
+    Mutant("no projection", step, "project", 'w.run("project", p.pointer, t1, y1)', "None", projected_steps_stay_on_a_circle, "circle"),
+    Mutant("no step ends at a knot", Loop, "saving", "jnp.minimum(goal * direction, jnp.min(ahead, axis=0))", "goal * direction", steps_end_at_knots, "knot"),
+    Mutant("no dips", step, "monitored", "((share < 1.0) | again)", "again", an_event_within_a_step_ends_the_motion, "passed over"),
+    Mutant("the first step without a bound", Start, "rows", "jnp.minimum(jnp.abs(first), longest)", "jnp.abs(first)", LONGEST, "the longest step"),
+    Mutant("no bound of steps", step, "judged", ', p["longest"])', ", math.inf)", LONGEST, "the longest step"),
     Mutant("no start at an event", event_search, "at_start", "rises = (rate > 0.0)", "rises = (rate > 1e9)", LEAVES, "leaves"),
     Mutant("every start at an event", event_search, "at_start", "reach_of_noise(w, span) * rate", "rate", LEAVES, "leaves"),
-    Mutant("no step refused", crossings, "watched", "(fits & (count > 0.0) & (", "(fits & (count < 0.0) & (", a_pulse_is_met, "pulse"),
-    Mutant("steps as long as the way that is left", crossings, "reach", "w.larger(0.5 * (", "w.larger(1.0 * (", a_pulse_is_met, "too many|crossings"),
-    Mutant("signs of the first state", crossings, "noted", "w.where(counts, new, old)", "old", a_pulse_is_met, "crossings"),
-    Mutant("a change never behind", crossings, "noted", "passed = counts & (", "passed = ~counts & counts & (", a_pulse_is_met, "too many|crossings"),
-    Mutant("only the ends of a step", crossings, "watched", "2.0, 0.0)", "0.0, 0.0)", a_pulse_within_a_step_is_named, "not named"),
-    Mutant("no cotangents of later stages", step_adjoint, "step_vjp", "as_in(b, g) * g + weighted(column, G)", "as_in(b, g) * g", TIMES, "derivative"),
-    Mutant(
-        "one stage without parameters",
-        step_adjoint,
-        "step_vjp",
-        "jnp.add, by_shared, more)",
-        "lambda x, y: x + jnp.where(i == 2, 0, y), by_shared, more)",
-        TIMES,
-        "by k",
-    ),
-    Mutant("no c tau", step_adjoint, "step_vjp", "+ c * tau", "", TIMES, "by goals"),
-    Mutant("the first time forgotten", step_adjoint, "step_vjp", "StepCotangents(by_t - by_h,", "StepCotangents(-by_h,", TIMES, "derivative"),
-    Mutant("a projection not gone back over", step_adjoint, "step_vjp", "by_t_1, g, by_shared = jax.vjp", "by_t_1, _, by_shared = jax.vjp", TIMES, "by y0"),
-    Mutant("saved times forgotten", VJP, "fn_bwd", "jnp.where(asked, at_end, 0))", "0 * at_end)", TIMES, "by goals"),
-    Mutant("saved states forgotten", VJP, "fn_bwd", "y + jnp.where(k > first,", "y + 0 * jnp.where(k > first,", TIMES, "derivative"),
-    Mutant(
-        "an earlier window left out",
-        VJP,
-        "fn_bwd",
-        "return number - 1, window, replace(g,",
-        "return jnp.full_like(number, -1), window, replace(g,",
-        TIMES,
-        "derivative",
-    ),
-    Mutant("time of an event forgotten", recorded_adjoint, "_back_from_event", "= g.t + step_adjoint", "= 0 * g.t + step_adjoint", EVENT, "derivative"),
-    Mutant(
-        "an event by parameters forgotten",
-        recorded_adjoint,
-        "_back_from_event",
-        "jnp.add, g.shared, by_shared)",
-        "lambda x, y: x, g.shared, by_shared)",
-        EVENT,
-        "by k",
-    ),
+    Mutant("no step refused", step, "watched", "(fits & (count > 0.0) & (", "(fits & (count < 0.0) & (", a_pulse_is_met, "pulse"),
+    Mutant("steps as long as the way that is left", step, "reach", "w.larger(0.5 * (", "w.larger(1.0 * (", a_pulse_is_met, "too many|crossings"),
+    Mutant("signs of the first state", step, "note_signs", "w.where(moving & counts, new, old)", "old", a_pulse_is_met, "crossings"),
+    Mutant("a change never behind", step, "note_signs", "passed = counts & (", "passed = ~counts & counts & (", a_pulse_is_met, "too many|crossings"),
+    Mutant("only the ends of a step", step, "watched", "2.0, 0.0)", "0.0, 0.0)", a_pulse_within_a_step_is_named, "not named"),
+    Mutant("no cotangents of later stages", backwards, "step_back", "columns[stage][j], total)", "0 * columns[stage][j], total)", TIMES, "derivative"),
+    Mutant("one stage without parameters", backwards, "step_back", "at, v, of_stage, added)", "at, v, of_stage, w.room(max(asked, 1)))", TIMES, "by k"),
+    Mutant("a projection not gone back over", backwards, "step_back", "at, g1, added)", "at, w.room(count), added)", TIMES, "by y0"),
+    Mutant("saved states forgotten", motions, "cotangents", "(index < last), g_ys", "(index < last), 0 * g_ys", TIMES, "derivative"),
+    Mutant("an earlier window left out", motions, "cotangents", "(x, number, 0, keepdims=False)", "(x, 0 * number, 0, keepdims=False)", TIMES, "derivative"),
+    Mutant("tangents of times forgotten", event_search, "put_tangents", "-dc / slope", "0 * dc", EVENT, "forward"),
+    Mutant("time of an event forgotten", backwards, "event_back", "total = w.load(g_t)", "total = 0 * w.load(g_t)", EVENT, "derivative"),
+    Mutant("tangents of parameters forgotten", functions.Functions, "_parts", "part.get, of[0]", "lambda i: None if k else part[i], of[0]", EVENT, "forward"),
+    Mutant("an event by parameters forgotten", backwards, "event_back", "w.where(usable, w.load(added, i), 0.0)", "0.0", EVENT, "by k"),
 ]
 CHECKS = list(dict.fromkeys(mutant.check for mutant in MUTANTS))
 
 
 @pytest.fixture(autouse=True)
 def _nothing_kept(monkeypatch):
-    """Programs are built in each test, and none of them afterwards; short windows, so that a motion has several."""
-    monkeypatch.setattr(recorded_adjoint, "STEPS_ALONE", 16)
+    """Programs are built in each test, and none of them afterwards; short windows, so that a motion has several; functions of a test's own."""
+    monkeypatch.setattr(backwards, "SLOTS", 8)
+    monkeypatch.setattr(functions, "integrands", None)
     lower._lowered.cache_clear()
     yield
     lower._lowered.cache_clear()
@@ -442,14 +428,13 @@ def test_a_mutant_is_caught(mutant, monkeypatch):
         mutant.check()
 
 
-def test_a_derivative_is_no_number_where_memory_does_not_hold_the_motion(monkeypatch):
-    monkeypatch.setattr(recorded_adjoint, "_SHARES", (32, 2**62))
-    for windows, held in ((1, False), (40, True)):
-        monkeypatch.setattr(recorded_adjoint, "_FEWEST", (16, windows))
-        found, _ = jax.jit(jax.grad(weighed("reverse", "saved times"), has_aux=True))(arguments("saved times"))
-        assert bool(np.isfinite(found["k"])) == held
+@pytest.mark.parametrize("slots", [16, 48])
+def test_a_record_goes_back_over_more_steps_than_it_has_room_for(slots, monkeypatch):
+    monkeypatch.setattr(backwards, "SLOTS", slots)
+    run, arguments = loop(driven, **CASES["saved times"]), given("saved times")
+    assert_allclose(backwards_through(*run(*arguments), motion(run)(*arguments))[1], differences("saved times")["k"], atol=1e-7)
 
 
 def test_a_mutant_of_a_line_that_is_gone_is_no_mutant():
     with pytest.raises(AssertionError, match="must follow the code"):
-        rewritten(erk_step.weighted, "a line that is not there", "")
+        rewritten(step.weighted, "a line that is not there", "")

@@ -298,7 +298,7 @@ LONGEST, SERIES_LONGEST = steps_are_no_longer_than_allowed, series_are_no_longer
 LEAVES, LEAVES_BELOW = a_motion_leaves_an_event_at_which_it_starts, a_motion_below_an_event_has_none
 STRIP, NAMED, WINDOW = a_strip_is_met, a_strip_within_a_step_is_named, an_event_where_a_relation_changes_is_found
 PROJECTED_BACK = reverse_mode_back_over_projections
-TRIED, WRONG = "_tried_by_stages", "derivative with respect to"
+TRIED, WRONG = "tried_by_stages", "derivative with respect to"
 MUTANTS = [
     Mutant("a wrong weight", step, "stages", "method.b[:n]])", "method.b[:n] * (1 + 1e-6)])", FORM, "closed form"),
     Mutant("the whole step for its error", step, TRIED, "weighted(w, method.b_error, k", "weighted(w, method.b, k", FORM, "too many|closed form"),
@@ -306,7 +306,7 @@ MUTANTS = [
     Mutant("rows of the tableau too small", step, "stages", "*method.A[1:n, :n],", "*(0.999 * method.A[1:n, :n]),", FORM, "closed form|too many"),
     Mutant("stages at the first time", step, "stages", "w.fma(step, c[i], t)", "t", FORM, "closed form|too many"),
     Mutant("a rejected step takes time", step, "taken", '"t": w.where(accept, aim.t_1, p["t"])', '"t": aim.t_1', FORM, "closed form"),
-    Mutant("a rejected step is taken", step, "_take", "w.where(accept, w.load(y1, i), w.load(y, i))", "w.load(y1, i)", FORM, "closed"),
+    Mutant("a rejected step is taken", step, "take", "w.where(accept, w.load(y1, i), w.load(y, i))", "w.load(y1, i)", FORM, "closed"),
     Mutant("a goal that stays", loop, "_save", "number * times + last,", "number * times + saved,", FORM, "closed form"),
     Mutant("starts of another lane", loop, "begin_lane", "number * given,", "0 * given,", LANES, "lanes"),
     Mutant("goals of another lane", loop, "begin_lane", "number * w.load(job, TIMES", "0 * w.load(job, TIMES", LANES, "lanes"),
@@ -315,16 +315,16 @@ MUTANTS = [
     Mutant("no bound of series", step, "_tried_by_series", 'rows), p["longest"])', "rows), math.inf)", SERIES_LONGEST, "the longest step"),
     Mutant("no start at an event", event_search, "at_start", "rises = (rate > 0.0)", "rises = (rate > 1e9)", LEAVES, "leaves"),
     Mutant("every start at an event", event_search, "at_start", "& (w.magnitude(a) <= reach_of_noise(w, span) * rate)", "", LEAVES_BELOW, "below"),
-    Mutant("no step refused", step, "watched_by", "(fits & (count > 0.0) & (", "(fits & (count < 0.0) & (", STRIP, "strip"),
+    Mutant("no step refused", step, "watched", "(fits & (count > 0.0) & (", "(fits & (count < 0.0) & (", STRIP, "strip"),
     Mutant("steps as long as the way that is left", step, "reach", "w.larger(0.5 * (", "w.larger(1.0 * (", STRIP, "too many|crossings"),
-    Mutant("signs of the first state", step, "noted", "w.where(counts, new, old)", "w.where(counts, old, old)", STRIP, "crossings"),
-    Mutant("a change that is never behind", step, "noted", "passed = counts & (", "passed = counts & ~counts & (", STRIP, "too many|crossings|strip"),
-    Mutant("only the ends of a step", step, "watched_by", "2.0, 0.0)", "0.0, 0.0)", NAMED, "not named"),
-    Mutant("no event between the ends of a step", step, "watched_by", "hidden[relations:]) > 0.0", "hidden[relations:]) > 9.0", WINDOW, "passed over"),
-    Mutant("no projection", step, "_project", 'w.run("project", p.pointer, t1, y1)', "None", CIRCLE, "circle"),
-    Mutant("no events", step, "decided", "~no_event(c_1)", "~no_event(c_0)", EVENT, "event"),
-    Mutant("no dips", step, "decided", "((share < 1.0) | again)", "again", DIP, "passed over"),
-    Mutant("a bracket with the wrong end", step, "advanced", "w.where(same, old.t[1], old.t[0])", "old.t[0]", EVENT, "event"),
+    Mutant("signs of the first state", step, "note_signs", "w.where(moving & counts, new, old)", "w.where(moving & counts, old, old)", STRIP, "crossings"),
+    Mutant("a change that is never behind", step, "note_signs", "passed = counts & (", "passed = counts & ~counts & (", STRIP, "too many|crossings|strip"),
+    Mutant("only the ends of a step", step, "watched", "2.0, 0.0)", "0.0, 0.0)", NAMED, "not named"),
+    Mutant("no event between the ends of a step", step, "watched", "hidden[relations:]) > 0.0", "hidden[relations:]) > 9.0", WINDOW, "passed over"),
+    Mutant("no projection", step, "project", 'w.run("project", p.pointer, t1, y1)', "None", CIRCLE, "circle"),
+    Mutant("no events", step, "monitored", "~no_event(c_1)", "~no_event(c_0)", EVENT, "event"),
+    Mutant("no dips", step, "monitored", "((share < 1.0) | again)", "again", DIP, "passed over"),
+    Mutant("a bracket with the wrong end", event_search, "_follow", "w.where(same, old.t[1], old.t[0])", "old.t[0]", EVENT, "event"),
     Mutant("rows by half", projection, "_write_moved", "- w.where(moves, change, 0.0)", "- 0.5 * w.where(moves, change, 0.0)", ROWS, "coordinates|speeds"),
     Mutant(
         "rows that are not scaled",
@@ -353,9 +353,9 @@ MUTANTS = [
     Mutant("an event at a number for a time", back, "event_back", "-total / rate", "total / rate", EVENT_BACK, WRONG),
     Mutant("the level of an event forgotten", back, "event_back", "w.where(usable, w.load(out, i), 0.0)", "w.number(0.0)", EVENT_BACK, WRONG),
     Mutant("tangents of states alone", functions, "outputs_of", "| {len(y) + i: n for i, n in known[k].items()}", "", ALONG, WRONG),
-    Mutant("the time of an event fixed", step, "put_tangents", "-dc / slope", "0.0 * dc", EVENT_ALONG, WRONG),
-    Mutant("the wrong way from an event", functions, "_move_rows", "w.fma(w.load(k, i + rates), dt, before)", "before", EVENT_ALONG, WRONG),
-    Mutant("tangents of an event by rates of before it moved", step, "put_tangents", "if part > 1:", "if part > 9:", EVENT_TWICE, WRONG),
+    Mutant("the time of an event fixed", event_search, "put_tangents", "-dc / slope", "0.0 * dc", EVENT_ALONG, WRONG),
+    Mutant("the wrong way from an event", event_search, "_move_rows", "w.fma(w.load(k, i + rates), dt, before)", "before", EVENT_ALONG, WRONG),
+    Mutant("tangents of an event by rates of before it moved", event_search, "put_tangents", "if part > 1:", "if part > 9:", EVENT_TWICE, WRONG),
     Mutant("the tangent at the time of an event", back, "event_back", "dt * w.load(f, i)", "0.0 * dt", BENT, WRONG),
     Mutant("the tangent of an event forgotten", back, "_moved_back", "w.where(usable, w.load(out, i), 0.0)", "w.number(0.0)", BENT, WRONG),
     Mutant("an event that stays while its tangent moves", back, "_moved_back", "w.load(added, asked)", "0.0 * g_dt", BENT, WRONG),

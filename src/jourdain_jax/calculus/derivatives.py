@@ -245,7 +245,7 @@ def _parted(arguments: tuple) -> tuple[list, _Leaves]:
 
 def is_zero(tangent) -> bool:
     """Return whether nothing changes, as a rule with symbolic zeros is told."""
-    return isinstance(tangent, SymbolicZero)
+    return isinstance(tangent, SymbolicZero) or tangent.dtype == jax.dtypes.float0
 
 
 def filled(tangent):

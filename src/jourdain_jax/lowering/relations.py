@@ -1,4 +1,4 @@
-"""Relations that decide between branches of rates and stop events, as numbers whose signs decide: what steps watch (`motion/integrators/erk_step.py`).
+"""Relations that decide between branches of rates and stop events, as numbers whose signs decide: what steps watch (`motion/integrators/crossings.py`).
 
     a < b, max(a, b), ...    a - b          sign(x), |x|    x          floor(x)    sin(pi x)          round(x)    cos(pi x)
 

@@ -18,6 +18,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, PyTree
 
 from jourdain_jax.calculus.derivatives import SECOND_ORDER_MESSAGE, by_modes
+from jourdain_jax.motion.arrays.writer import ArrayWriter
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.integrators import event_search, integrands
 from jourdain_jax.motion.model import modelled
@@ -166,7 +167,7 @@ def _over_at_start(begun: Begun, t0, t1) -> Bool[Array, "events"]:
     """Return which events have happened at the start, which diffrax does not check."""
     rates = integrands.rates(t0, begun.y0, begun.args)
     values, along = jax.jvp(lambda t, y: integrands.events(t, y, begun.args), (t0, begun.y0), (jnp.ones_like(t0), rates))
-    return jnp.stack(event_search.at_start(event_search.OnArrays(t0), values, along, values, jnp.sign(t1 - t0), t1 - t0)[0])
+    return jnp.stack(event_search.at_start(ArrayWriter(t0), values, along, values, jnp.sign(t1 - t0), t1 - t0)[0])
 
 
 def _lowest(t, y: PyTree, args, *, terms, **kwargs):

@@ -65,7 +65,7 @@ class AllOptions(Options):
     solver: "diffrax.AbstractSolver | ImplicitMethod | Taylor | Method | None" = None
     formulation: "Formulation | None" = None
     backend: str = "auto"
-    memory: int | None = None  # of a model: bytes that batches and reverse mode may take; None: those of `integrators.problem`
+    memory: int | None = None  # of a model: bytes that batches and reverse mode may take; None: `setup.MEMORY`
     alongside: bool = False  # whether one run gives values and tangents: for derivatives by `jvp` and `jacfwd` alone
 
 

@@ -1,41 +1,40 @@
-"""Our own loop over steps as an integrator, with its derivatives: machine code where it serves, otherwise a loop of XLA.
+"""Our own loop over steps as an integrator, with its derivatives: machine code where it serves, otherwise on arrays of JAX.
 
-One motion, or lanes side by side: those of a scalar program in blocks of `width`.
+There lanes of a scalar program run side by side in blocks of `width`.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import compress
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.derivatives import SECOND_ORDER_MESSAGE, DifferentiationModeError, Rules, by_modes, pushed_by_jax, with_rules
+from jourdain_jax.calculus.derivatives import SECOND_ORDER_MESSAGE, DifferentiationModeError, Rules, pushed_by_jax, with_rules
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.lowering.kinks import loads_have_relations, loads_may_jump
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.lowering.relations import MOST_WATCHED
+from jourdain_jax.motion.arrays import motion as on_arrays
+from jourdain_jax.motion.arrays.functions import joined
+from jourdain_jax.motion.arrays.loop import Loop
 from jourdain_jax.motion.inputs import FunctionOfTime, Inputs, Sampled
-from jourdain_jax.motion.integrators import erk_loop, integrands
 from jourdain_jax.motion.integrators.explicit_steps import Method, method_of
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
-from jourdain_jax.motion.integrators.problem import Problem
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.native.functions import reason_against_derivatives
 from jourdain_jax.motion.native.layout import Form
-from jourdain_jax.motion.native.loop import OF_SAMPLES, flow
+from jourdain_jax.motion.native.loop import OF_SAMPLES, Start, flow
 from jourdain_jax.motion.native.native_motion import driven, numbers_of
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.motion.vector_fields.field import VectorField
+from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.scene.scene import Scene
-
-Mode = Literal["forward", "reverse"]
 
 
 @jax.tree_util.register_static
@@ -65,56 +64,34 @@ class OwnSteps(Integrator):
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
         if setup.reason_against_machine_code:
-            return self._in_modes(lambda mode, setup, begun: self._by_xla(mode, setup, begun.y0, begun.args, setup.ts, setup.knots))(setup, begun)
-        run, form = self._by_machine_code, self._form(setup)
-        rules = Rules(pushed_by_jax(run), self._pulled, lambda *_: reason_against_derivatives(form, 2))
-        return _on_times(run if self.alongside else with_rules(run, rules), form, setup, begun)
+            run, pull, moved, reason = self._on_arrays, self._pulled_on_arrays, on_arrays.mover(begun.args), lambda: SECOND_ORDER_MESSAGE
+        else:
+            form = self._form(setup)
+            run, pull, moved = self._by_machine_code, self._pulled, native_motion.mover(begun.args, form)
+            reason = lambda: reason_against_derivatives(form, 2)  # noqa: E731
+        rules = Rules(pushed_by_jax(run), pull, lambda *_: reason())
+        return _on_times(run if self.alongside else with_rules(run, rules), moved, setup, begun)
 
-    def lanes_solved(self, setups: Setup, begun: Begun) -> Solved:
-        serves = not setups.reason_against_machine_code
-        if (program := setups.field.lowered) is None or serves or not isinstance(self.solver, Method):
-            return super().lanes_solved(setups, begun)
-        return self._in_modes(lambda mode, *lanes: in_blocks(partial(self._lanes_by_xla, mode), width(program), *lanes))(setups, begun)
+    def _loop(self, setup: Setup, begun: Begun) -> tuple[Loop, Start, int]:
+        """The loop on arrays, what it is given, and how many lanes run side by side."""
+        program, relations = setup.field.lowered, watched(setup.field, setup.inputs, bool(self.event_names))
+        at_once = 0 if program is None or not isinstance(self.solver, Method) else width(program)
+        return *on_arrays.loop_of(self.solver, setup, begun, relations), at_once
 
-    def _in_modes(self, by_xla: Callable) -> Callable:
-        """Return a function of a mode, a setup and its beginning as a function of these two that serves both modes."""
-        forward = partial(by_xla, "forward")
-        return forward if self.alongside else by_modes(forward, partial(by_xla, "reverse"), SECOND_ORDER_MESSAGE)
+    def _on_arrays(self, setup: Setup, begun: Begun) -> Solved:
+        of, start, at_once = self._loop(setup, begun)
+        return native_motion.solved(of.form, start.goals, on_arrays.flow(of, at_once)(start))
 
-    def _lanes_by_xla(self, mode: Mode, setups: Setup, begun: Begun) -> Solved:
-        """Lanes in lockstep: their axis comes first outside and last inside."""
-        y0, ts, knots = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), (begun.y0, setups.ts, eqx.filter_vmap(lambda s: s.knots)(setups)))
-        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), self._by_xla(mode, setups, y0, begun.args, ts, knots))
-
-    def _by_xla(self, mode: Mode, setup: Setup, y0, args, ts, knots) -> Solved:
-        field, goals = setup.field, setup.goals(ts)
-        args = args if knots is None else integrands.within(jnp.full_like(setup.t0, jnp.inf), args)
-        relations, relation_count = watched(field, setup.inputs, bool(self.event_names))
-        rtol, atol, longest = (jnp.broadcast_to(x, setup.t0.shape) for x in (*setup.tolerances, setup.longest))
-        problem = Problem(
-            rates=integrands.rates,
-            args=args,
-            project=integrands.project if field.projects else None,
-            events=integrands.events if self.event_names else None,
-            norm=integrands.state_norm,
-            rtol=rtol,
-            atol=atol,
-            shortest=setup.shortest,
-            longest=longest,
-            max_steps=setup.most_steps(knots),
-            knots=knots,
-            rates_and_pivots=integrands.rates_and_pivots if field.has_pivots else None,
-            near_rank_loss=field.near_rank_loss,
-            relations=relations,
-            relation_count=relation_count,
-            span=jnp.abs(goals[-1]),
-            within=None if knots is None else integrands.within,
-            memory=self.memory,
-        )
-        ys, reached, end = erk_loop.integrate(problem, self.solver, y0, jnp.zeros_like(setup.t0), goals, setup.dt0, mode)
-        ys = jax.tree.map(lambda x: x[:-1], ys)
-        counted = (jnp.zeros_like(end.accepted), jnp.full_like(end.t, jnp.inf)) if end.crossings is None else (end.crossings.count, end.crossings.together)
-        return Solved(goals[:-1], ys, reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, end.pivot, *counted)
+    def _pulled_on_arrays(self, perturbed: tuple, arguments: tuple[Setup, Begun], found: Solved, g: Solved) -> tuple:
+        """Cotangents of what varies, from those of the motion that was found."""
+        setup, begun = arguments
+        of, start, at_once = self._loop(setup, begun)
+        varies = [v for v, x in zip(jax.tree.leaves(perturbed[1].args), jax.tree.leaves(begun.args), strict=True) if eqx.is_array(x)]
+        asked = tuple(i for i, v in enumerate(varies) if v)
+        states = native_motion.cotangents_of_states(g)
+        by_y, by_known = on_arrays.flow_back(of, at_once, asked, self.memory)(start, states, g.y_end.rows, g.t_end)
+        args = joined(of.rest, [dict(zip(asked, by_known, strict=True)).get(i) for i in range(len(varies))])
+        return _by_start(perturbed, arguments, native_motion.state(of.form, by_y), lambda by_args: args)
 
     def _form(self, setup: Setup) -> Form:
         return native_motion.form_of(setup.field, setup.inputs, bool(self.event_names))
@@ -134,11 +111,19 @@ class OwnSteps(Integrator):
         assert isinstance(self.solver, Method)
         start = native_motion.start_of(setup, begun)
         by_start, by_known = native_motion.cotangents(self._form(setup), self.solver, start, asked, self.memory, g)
-        by_setup, by_begun = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, (setup, begun))
-        field, scene, inputs, fixed, origin = by_begun.args
-        y0 = jax.tree.map(lambda varies, by: by if varies else None, perturbed[1].y0, by_start)
-        args = field, scene, native_motion.with_known(inputs, by_known[len(fixed) :]), tuple(by_known[: len(fixed)]), origin
-        return by_setup, eqx.tree_at(lambda b: (b.y0, b.args), by_begun, (y0, args), is_leaf=lambda x: x is None)
+
+        def args(by_args: tuple) -> tuple:
+            field, scene, inputs, fixed, origin = by_args
+            return field, scene, native_motion.with_known(inputs, by_known[len(fixed) :]), tuple(by_known[: len(fixed)]), origin
+
+        return _by_start(perturbed, arguments, by_start, args)
+
+
+def _by_start(perturbed: tuple, arguments: tuple[Setup, Begun], by_y0: Integrated, by_args: Callable[[tuple], tuple]) -> tuple:
+    """Return cotangents of a setup and a beginning from those of the state and of the arguments of rates."""
+    by_setup, by_begun = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, arguments)
+    return by_setup, eqx.tree_at(lambda b: (b.y0, b.args), by_begun, (by_y0, by_args(by_begun.args)), is_leaf=lambda x: x is None)
+
 
 def own_steps(solver, **static) -> OwnSteps | None:
     """Return our own loop where it has the solver; None for solvers of diffrax."""
@@ -150,14 +135,13 @@ def own_steps(solver, **static) -> OwnSteps | None:
     return OwnSteps(method, **static)
 
 
-def _on_times(run: Callable[[Setup, Begun], Solved], form: Form, setup: Setup, begun: Begun) -> Solved:
+def _on_times(run: Callable[[Setup, Begun], Solved], moved: Callable, setup: Setup, begun: Begun) -> Solved:
     """The motion that `run` finds from a number to others, its start and states moved to the times of the setup.
 
     A time is the goal where that was reached, is found by the loop itself where a stop event ended the motion before, and lies at a number after the start
     otherwise.
     """
     numbers, (field, scene, inputs, fixed, start) = jax.lax.stop_gradient, begun.args
-    moved = native_motion.mover(begun.args, form)
     goals, later = setup.goals(setup.ts), start - numbers(start)
     y0 = moved(begun.y0, start, -later)
     setup = setup._replace(**{name: numbers(getattr(setup, name)) for name in ("ts", "t0", "t1")})
@@ -240,18 +224,6 @@ def _given(count: int, inputs: Inputs, t) -> Float[Array, "given"]:
 
 
 TOGETHER = 8  # lanes, where the loop is one function
-
-
-def in_blocks(function: Callable, lanes_at_once: int, *trees: PyTree) -> PyTree:
-    """`function` of trees whose arrays have a leading axis of lanes, some lanes at a time; the last block is filled up with copies."""
-    arrays, rest = eqx.partition(trees, eqx.is_array)
-    count = jax.tree.leaves(arrays)[0].shape[0]
-    blocks = -(-count // lanes_at_once)
-    if blocks == 1:
-        return function(*trees)
-    index = jnp.minimum(jnp.arange(blocks * lanes_at_once), count - 1).reshape(blocks, lanes_at_once)
-    found = jax.lax.map(lambda arrays: function(*eqx.combine(arrays, rest)), jax.tree.map(lambda x: x[index], arrays))
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], found)
 
 
 def width(program: Lowered) -> int:

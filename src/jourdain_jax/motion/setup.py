@@ -23,6 +23,7 @@ from jourdain_jax.motion.put_on_rows import State, Usual
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
+MEMORY = 2**32  # bytes, where no model states others
 LONGEST = 1 / 16  # of the span: the longest step, by default
 _SHORT = 1e-9  # s, a span for motions that are not asked for
 

@@ -20,7 +20,6 @@ from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.explicit_steps import DOPRI8, TSIT5, Method
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
-from jourdain_jax.motion.integrators.problem import MEMORY
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.model import Model, modelled
@@ -29,7 +28,7 @@ from jourdain_jax.motion.own_steps import own_steps
 from jourdain_jax.motion.put_on_rows import State, Usual
 from jourdain_jax.motion.retries import retried
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
-from jourdain_jax.motion.setup import LONGEST, Setup, times_fit
+from jourdain_jax.motion.setup import LONGEST, MEMORY, Setup, times_fit
 from jourdain_jax.motion.start import named_start
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory

@@ -18,7 +18,6 @@ from jourdain_jax.build.structure import Reference
 from jourdain_jax.calculus.reals import checked_real, checked_whole, described, is_traced, known_numbers, real_type
 from jourdain_jax.motion.inputs import as_inputs, check_inputs_in_rows, for_programs
 from jourdain_jax.motion.integration import integrate_lanes
-from jourdain_jax.motion.integrators.problem import MEMORY
 from jourdain_jax.motion.integrators.taylor import Taylor
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.model import modelled
@@ -26,6 +25,7 @@ from jourdain_jax.motion.options import SPAN, AllOptions, MotionFields, Options,
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.retries import RERUN_FIELDS, lanes_retried
 from jourdain_jax.motion.sensitivity import warn_of_jumps
+from jourdain_jax.motion.setup import MEMORY
 from jourdain_jax.motion.simulate import DEFAULT_SAMPLES, saved_times, set_up, solver_of, span_and_times
 from jourdain_jax.motion.trajectories import labelled, results
 from jourdain_jax.motion.trajectories.sketch import sketch_of_lanes

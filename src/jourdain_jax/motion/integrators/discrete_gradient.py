@@ -23,7 +23,6 @@ from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, Solution, sizes
-from jourdain_jax.motion.integrators.problem import Problem
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
@@ -54,9 +53,9 @@ class DiscreteGradient(FixedStepMethod):
             raise ValueError(f"`DiscreteGradient` does not apply to `{type(scene).__name__}`: {fault}; use solver=jj.ImplicitMidpoint(step=...)")
         return field
 
-    def solve(self, problem: Problem, t, y: Integrated, h) -> Solution:
-        """Return the change of the state `y` at `t` by a step `h` (s) of a `problem`."""
-        return _solved(problem.args, problem.args[4] + t + h / 2, jnp.asarray(h, y.q.dtype), y)
+    def solve(self, args: tuple, t, y: Integrated, h) -> Solution:
+        """Return the change of the state `y` at `t` by a step `h` (s); `args`: as in `integrands.py`."""
+        return _solved(args, args[4] + t + h / 2, jnp.asarray(h, y.q.dtype), y)
 
 
 @eqx.filter_jit  # traced once

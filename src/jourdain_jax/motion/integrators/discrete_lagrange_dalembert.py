@@ -30,7 +30,6 @@ from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.rows import position_residual, velocity_residual
 from jourdain_jax.equations.virtual_power import energies_at, resultants
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, Solution, sizes
-from jourdain_jax.motion.integrators.problem import Problem
 from jourdain_jax.motion.vector_fields.by_matrices import full_without_projection
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.names import nearest
@@ -148,9 +147,9 @@ class DiscreteLagrangeDAlembert(FixedStepMethod):
         equations = f"discrete Lagrange-d'Alembert equations, {self.rule} rule"
         return full_without_projection(field, scene, equations)
 
-    def solve(self, problem: Problem, t, y: Integrated, h) -> Solution:
-        """Return the change of the state `y` at `t` by a step `h` (s) of a `problem`."""
-        return _solved(problem.args, Interval(problem.args[4] + t, h, self.rule), y)
+    def solve(self, args: tuple, t, y: Integrated, h) -> Solution:
+        """Return the change of the state `y` at `t` by a step `h` (s); `args`: as in `integrands.py`."""
+        return _solved(args, Interval(args[4] + t, h, self.rule), y)
 
 
 @eqx.filter_jit  # traced once

@@ -1,6 +1,7 @@
 """Which stop event of a step came first, and when: trials of shorter steps from the last state before it.
 
-The formulas are those of arrays of JAX and of values of machine code: `w` is `OnArrays`, or a `Writer`. Values of events are lists, one for each event.
+The formulas are those of arrays of JAX and of values of machine code, as `w`, the writer of a step, has them (`motion/native/step.py`). Values of events
+are lists, one for each event.
 
 An event happens where its value falls through zero. A motion that starts with a value of zero, as round-off has it, and a rate that raises it goes on
 
@@ -28,14 +29,10 @@ Source: T. R. Chandrupatla, Advances in Engineering Software 28 (1997) 145-149.
 
 import math
 import operator
-from collections.abc import Callable, Mapping
 from functools import reduce
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
-
+from jourdain_jax.motion.native.layout import Form, Lanes, Number, StepWriter, each_row
 from jourdain_jax.motion.trajectories import results
 
 RUNNING, LOCATING = -1, -2  # codes of a motion on its way, and of one that searches for an event
@@ -46,15 +43,6 @@ LEAVES = 0.6  # exponent of round-off
 LATE = 0.98  # of a step: a dip that is later is left to the next one
 
 Values = Any  # one for each event
-
-
-class OnArrays:
-    """What the formulas of a step take of a `Writer` of machine code, for arrays of JAX."""
-
-    where, magnitude, larger, smaller, root, equal, is_nan = map(staticmethod, (jnp.where, jnp.abs, jnp.maximum, jnp.minimum, jnp.sqrt, jnp.equal, jnp.isnan))
-
-    def __init__(self, like) -> None:
-        self.eps = float(jnp.finfo(like.dtype).eps)
 
 
 def any_of(found: Values):
@@ -152,28 +140,27 @@ class Search(NamedTuple):
         return self.left > DIFFERENTIABLE + 1.0
 
 
-class Followed(NamedTuple):
-    """The event that a search follows."""
+def search_of(form: Form, p: Lanes) -> Search:
+    """Return the search in the rows of lanes."""
+    values, count = p.every("search_c"), form.events
+    c = tuple(values[i * count : (i + 1) * count] for i in range(3))
+    step, left, shift = (p[f"search_{name}"] for name in ("step", "left", "shift"))
+    return Search(p.every("search_t"), c, step, left, shift, p.every("search_slope"))
 
-    first: Any  # its index
-    trying: Any  # whether the next shift is a trial
-    usable: Any  # whether Newton's shift says something
-    beyond: Any  # whether its value is no number after the event
 
+def _follow(w: StepWriter, form: Form, p: Lanes, begins: Number, changes: Number, start: tuple, end: tuple) -> Number:
+    """Advance the search by a step, its `start` (time, values of all events, rates) and `end` (time, values), in lanes where it `changes`.
 
-def advanced(w, old: Search, begins, start: tuple, end: tuple) -> tuple[Search, Followed]:
-    """Return the search after a step, its `start` (time, values of all events, rates) and `end` (time, values); `begins`: it is the step of the event.
-
-    The next shift is that of a trial; Newton's is the caller's.
+    `begins`: it is the step of the event. Returns the index of the event that is followed.
     """
-    (t_0, c_0, rate_0), (t_1, c_1) = start, end
+    old, (t_0, c_0, rate_0), (t_1, c_1) = search_of(form, p), start, end
     # narrowed: the time tried, one on the other side of the event, and one that was either before
     same = ~(no_event(c_1) ^ no_event(old.c[0]))
     narrowed_t = t_1, w.where(same, old.t[1], old.t[0]), w.where(same, old.t[0], old.t[1])
     narrowed_c = c_1, _each(w, same, old.c[1], old.c[0]), _each(w, same, old.c[0], old.c[1])
-    t = tuple(w.where(begins, a, w.where(old.trying, b, kept)) for a, b, kept in zip((t_1, t_0, math.inf), narrowed_t, old.t, strict=True))
+    t = _each(w, begins, (t_1, t_0, math.inf), _each(w, old.trying, narrowed_t, old.t))
     fresh_c = c_1, c_0, [math.nan] * len(c_1)
-    c = tuple(_each(w, begins, a, _each(w, old.trying, b, kept)) for a, b, kept in zip(fresh_c, narrowed_c, old.c, strict=True))
+    c = [_each(w, begins, a, _each(w, old.trying, b, kept)) for a, b, kept in zip(fresh_c, narrowed_c, old.c, strict=True)]
     step = w.where(begins, w.magnitude(t_1 - t_0), old.step)
     left = w.where(begins, float(MOST_STEPS), w.larger(old.left - 1.0, 0.0))
     is_before = no_event(c[0])
@@ -189,8 +176,12 @@ def advanced(w, old: Search, begins, start: tuple, end: tuple) -> tuple[Search, 
     for a, b, kept in zip(c_0, c_1, old.slope, strict=True):
         mean = w.magnitude((b - a) / (t_1 - t_0))
         slope.append(w.where(begins, w.where(mean < math.inf, mean, 0.0), kept))
-    new = Search(t, c, step, left, w.where(near, 0.0, tried - t_0), tuple(slope))
-    return new, Followed(first, trying, usable, w.is_nan(chosen(w, first, after)))
+    newton = w.where(usable & ~w.is_nan(chosen(w, first, after)), -value / rate, 0.0)  # beyond the event its value may be no number
+    shift = w.where(trying, w.where(near, 0.0, tried - t_0), newton)
+    rows = {"t": t, "c": [x for part in c for x in part], "step": [step], "left": [left], "shift": [shift], "slope": slope}
+    for name, values in rows.items():
+        p.put(f"search_{name}", _each(w, changes, values, p.every(f"search_{name}")))
+    return first
 
 
 def is_flat(w, c_dot, slope):
@@ -216,81 +207,109 @@ def lowest(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values):
     return share
 
 
-class Decided(NamedTuple):
-    """What becomes of a step in which an event may have happened or is being located, or before which one has."""
+def monitored(
+    w: StepWriter, form: Form, p: Lanes, k: tuple[Number, Number], y1: Number, new: dict[str, Number], h: Number, accept: Number
+) -> dict[str, Number]:
+    """Return what becomes of a step `h` in which an event may have happened or is being located, or before which one has; changes the state `y1` after it.
 
-    new: dict[str, Any]  # time, step size, code, counts and event
-    found: Any  # whether the event is found: the state moves by the search's shift, along the rates at the start of the step
-    stays: Any  # whether the state is that before the step
-    undone: Any  # whether the step was none
-    search: Search
-
-
-def decided(w, p, new: Mapping, h, known: tuple, accept, sound, following: tuple[Search, Callable]) -> Decided:
-    """Return what becomes of a step `h` from the progress `p` to `new`.
-
-    `known`: values and rates of all events at its start, then at its end. `accept`: whether it is a step of the motion. `sound`: whether the state before it
-    is one; a state that is lost is no event. `following`: the search so far, and (which lanes begin one, which have one) -> the search, and its event.
+    `k`: slopes at its ends; `new`: time, step size, code and counts after it; `accept`: it is a step of the motion.
     """
-    (c_0, rate_0, c_1, rate_1), (search, advance) = known, following
+    count, y, t = form.events, p.pointer, p["t"]
+
+    def events(t: Number, y: Number, slope: Number) -> list[list[Number]]:
+        values, rates = w.room(count), w.room(count)
+        w.run("events", p.pointer, t, y, slope, values, rates)
+        return [[w.load(place, i) for i in range(count)] for place in (values, rates)]
+
+    c_0, rate_0 = events(t, y, k[0])
+    c_1, rate_1 = events(new["t"], y1, k[1])
     locating = w.equal(p["code"], LOCATING)
+    # a motion that starts beyond an event has no motion at all; a state that is lost is no event
+    sound = w.equal(w.sum_of_squares(range(form.y), lambda i: 0.0 * w.load(y, i)), 0.0)
     fresh = w.equal(p["accepted"] + p["rejected"], 0.0) & sound
     share = lowest(w, h, c_0, rate_0, c_1, rate_1)
     sunk, sinks = at_start(w, c_0, rate_0, c_1, p["direction"], p["last_goal"])
     again = any_of(sinks) & (w.magnitude(h) > reach_of_noise(w, p["last_goal"]))
     dips, share = accept & ((share < 1.0) | again), w.where(again, 0.5, share)
     happened = accept & ~dips & ~no_event(c_1)
-    was_trying, changes = search.trying, happened | locating
-    search, first = advance(happened, changes)
+    was_trying, changes, first = search_of(form, p).trying, happened | locating, w.room()
+    w.store(p["event"], first)
+
+    def follow() -> None:
+        w.store(w.literal(_follow(w, form, p, happened, changes, (t, c_0, rate_0), (new["t"], c_1)), w.real), first)
+
+    w.if_any(changes, follow)
+    search = search_of(form, p)
     # trials start at the last state before the event; a step that passes over a dip is tried again to its bottom
     found, back = locating & w.equal(search.left, 0.0), changes & search.trying
     over = (fresh & any_of(sunk)) | (accept & ~again & any_of(sinks))  # at the start
-    stays, undone = back | dips | over, dips | over
-    which = float(len(c_0) - 1)
-    for i in reversed(range(len(c_0) - 1)):
+    stays = back | dips | over
+
+    def state(i: int | Number) -> Number:
+        after = w.load(y1, i)
+        return w.where(stays, w.load(y, i), w.where(found, w.fma(search.shift, w.load(k[0], i), after), after))
+
+    each_row(w, form.integrated, y1, state)
+    if form.moving:
+        put_tangents(w, form, p, k[0], found, new["t"], rate_0, y1)
+    which = float(count - 1)
+    for i in reversed(range(count - 1)):
         which = w.where(sunk[i] | sinks[i], i, which)
     code = w.where(happened, LOCATING, w.where(found, results.EVENT, w.where(locating, LOCATING, new["code"])))
     tried = w.where(dips, 1.0, 0.0)
-    after = {
+    return new | {
         "t": w.where(found, new["t"] + search.shift, w.where(stays, p["t"], new["t"])),
         "h": w.where(over, p["h"], w.where(dips, share * w.magnitude(h), w.where(locating, p["h"], new["h"]))),
         "code": w.where(over, results.EVENT, code),
         "accepted": w.where(over, p["accepted"], new["accepted"] - tried),
         "rejected": w.where(over, p["rejected"], new["rejected"] + tried),
-        "event": w.where(over, which, w.where(happened | (locating & was_trying), first, p["event"])),
+        "event": w.where(over, which, w.where(happened | (locating & was_trying), w.load(first), p["event"])),
+        "taken": w.where(stays, 0.0, new["taken"]),
     }
-    return Decided(after, found, stays, undone, search)
 
 
-# Of arrays of JAX alone: derivatives.
+def slope_is_flat(w: StepWriter, p: Lanes, rate: Number) -> Number:
+    """Whether the value of a lane's event has no slope where it falls through zero."""
+    return is_flat(w, rate, chosen(w, p["event"], p.every("search_slope")))
 
 
-def none(t: Float[Array, "*lanes"], values: Float[Array, "events *lanes"]) -> Search:
-    """Return a search for nothing."""
-    t, c = jax.lax.stop_gradient((t, values))
-    times, values, zero = jnp.stack([t, t, jnp.full_like(t, jnp.inf)]), jnp.stack([c, c, jnp.full_like(c, jnp.nan)]), jnp.zeros_like(t)
-    return Search(times, values, zero, zero, zero, jnp.zeros_like(c))
+def put_tangents(w: StepWriter, form: Form, p: Lanes, k: Number, found: Number, t: Number, rate: list[Number], y1: Number) -> None:
+    """Where an event is found at the time t in the state `y1`, the tangents of that time, and those of the state there; `k`: the rates.
+
+    Each tangent of time is found in turn, the state being moved by it, with e the directions taken together in it,
+
+        dt = -(dc/dt dt + dc/dy dy + dc/dp dp)/cdot,   y <- y + e dt f(t, y),   t <- t + e dt,   e^2 = 0
+
+    where values, tangents and rates are those before; dt is NaN where c has no slope there.
+    """
+    count, times = form.events, form.rows["dt"]
+
+    def put() -> None:
+        k_now = k
+        values, pivots = w.room(count * len(times)), w.room(max(len(form.monitored), 1))
+        slope = chosen(w, p["event"], rate)
+        usable = found & w.differs(slope, 0.0) & (w.magnitude(slope) < math.inf)
+        flat = found & slope_is_flat(w, p, slope)
+        for part, row in enumerate(times, 1):
+            if part > 1:  # what is known of the rates is of the state as it was
+                k_now = w.room(form.integrated)
+                w.run("rates", p.pointer, t, y1, k_now, pivots)
+            w.run("event_tangents", p.pointer, t, y1, values)
+            dc = chosen(w, p["event"], [w.load(values, (part - 1) * count + i) for i in range(count)])
+            dt = w.where(flat, math.nan, w.where(usable, -dc / slope, 0.0))
+            w.store(w.where(found, dt, w.load(p.pointer, row)), p.pointer, row)
+            for other in range(len(times) + 1):
+                if not other & part:
+                    _move_rows(w, form, y1, k_now, (other | part) * form.y, other * form.y, dt, usable | flat)
+
+    w.if_any(found, put)
 
 
-def advanced_arrays(w: OnArrays, old: Search, begins: Bool[Array, "*lanes"], start: tuple, end: tuple) -> tuple[Search, Array]:
-    """Return the search after a step, and the index of the event it follows. The times tried are numbers to differentiation, Newton's shifts are not."""
-    new, event = jax.lax.stop_gradient(advanced(w, *jax.lax.stop_gradient((old, begins, start, end))))
-    c, c_dot = chosen(w, event.first, end[1]), chosen(w, event.first, start[2])
-    flat = (old.left == 1) & jax.lax.stop_gradient(is_flat(w, c_dot, chosen(w, event.first, new.slope)))
-    c_dot = jnp.where(event.beyond, jax.lax.stop_gradient(c_dot), c_dot)
-    newton = jnp.where(event.usable, -c / jnp.where(event.usable, c_dot, 1.0), 0.0)
-    newton = without_slope(jnp.where(event.beyond, newton - jax.lax.stop_gradient(newton), newton), c, flat)
-    stacked = {"t": jnp.stack(new.t), "c": jnp.stack([jnp.stack(c) for c in new.c]), "slope": jnp.stack(new.slope)}
-    return new._replace(shift=jnp.where(event.trying, new.shift, newton), **stacked), event.first
+def _move_rows(w: StepWriter, form: Form, y: Number, k: Number, rows: int, rates: int, dt: Number, moves: Number) -> None:
+    """Adds the rates that begin with row `rates` of `k`, times `dt`, to those that begin with row `rows` of `y`."""
 
+    def moved(i: int | Number) -> Number:
+        before = w.load(y, i + rows)
+        return w.where(moves, w.fma(w.load(k, i + rates), dt, before), before)
 
-@jax.custom_jvp
-def without_slope(shift, c, flat: Bool[Array, "*lanes"]) -> Float[Array, "*lanes"]:
-    """The shift to c = 0, whose derivative is not a number where the value is flat: the time of such an event has none that could be told."""
-    return shift
-
-
-@without_slope.defjvp
-def _without_slope_jvp(primals, tangents):
-    (shift, _, flat), (d_shift, dc, _) = primals, tangents
-    return shift, jnp.where(flat, 0.0, 1.0) * d_shift + jnp.where(flat, jnp.nan, 0.0) * dc
+    w.each(range(form.y), lambda i: w.store(moved(i), y, i + rows))

@@ -10,7 +10,7 @@ They bear the names of diffrax's solvers, and have their coefficients to the las
 no diffrax. The weights of the solution stand as the last row of A too: the last stage of a step is the first of the next one.
 
 The formulas for the length of steps, those of implicit methods among them, are those of arrays of JAX and of values of machine code: `w` is
-`event_search.OnArrays`, or a `Writer`.
+the writer of a step (`motion/native/step.py`).
 """
 
 import math

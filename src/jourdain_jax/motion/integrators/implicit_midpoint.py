@@ -6,7 +6,7 @@ from jaxtyping import PyTree
 
 from jourdain_jax.calculus.roots import newton_root
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, Solution, sizes
-from jourdain_jax.motion.integrators.problem import Problem
+from jourdain_jax.motion.integrators.integrands import rates
 
 
 class ImplicitMidpoint(FixedStepMethod):
@@ -23,13 +23,13 @@ class ImplicitMidpoint(FixedStepMethod):
     Source: Hairer, Lubich and Wanner, Geometric Numerical Integration (2006), sections II.1.2 and IV.2.
     """
 
-    def solve(self, problem: Problem, t, y: PyTree, h) -> Solution:
-        """Return the change of the state `y` at `t` by a step `h` (s) of a `problem`."""
+    def solve(self, args: tuple, t, y: PyTree, h) -> Solution:
+        """Return the change of the state `y` at `t` by a step `h` (s); `args`: as in `integrands.py`."""
         y0, unravel = ravel_pytree(y)
         middle, h = t + h / 2, jnp.asarray(h, y0.dtype)
 
         def f(t, x):
-            return ravel_pytree(problem.rates(t, unravel(x), problem.args))[0]
+            return ravel_pytree(rates(t, unravel(x), args))[0]
 
         # the unknown is the difference, which has more digits than the state
         guess = h * f(t, y0)

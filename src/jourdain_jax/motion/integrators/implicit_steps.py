@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jourdain_jax.calculus.reals import Number, checked_unless_traced
-from jourdain_jax.motion.integrators.problem import Problem
 from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.scene import Scene
 
@@ -33,6 +32,8 @@ class ImplicitMethod(eqx.Module):
 
     order: ClassVar[int]  # a step of h has an error of about h^order
     even: ClassVar[bool] = False  # whether it takes steps of one length
+    needed: ClassVar[int] = 3  # slopes that are kept of a step: at its start, its middle and its end
+    at_the_end: ClassVar[int] = 2
 
     @property
     def name(self) -> str:
@@ -40,8 +41,8 @@ class ImplicitMethod(eqx.Module):
         return type(self).__name__
 
     @abc.abstractmethod
-    def solve(self, problem: Problem, t: Float[Array, ""], y: PyTree, h: Float[Array, ""]) -> Solution:
-        """Return the change of the state by a step from `y` at `t` by `h` (s, negative backwards) of a `problem`, whose times count from `problem.args[4]`."""
+    def solve(self, args: tuple, t: Float[Array, ""], y: PyTree, h: Float[Array, ""]) -> Solution:
+        """Return the change of the state by a step from `y` at `t` by `h` (s, negative backwards); `args`: as in `integrands.py`."""
 
     def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
         """The form of the state that is integrated in place of `field`.

@@ -17,7 +17,7 @@ from jaxtyping import PyTree
 
 from jourdain_jax.calculus.roots import newton_root
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod, Solution, sizes
-from jourdain_jax.motion.integrators.problem import Problem
+from jourdain_jax.motion.integrators.integrands import rates
 
 _NODES = np.array([(4 - np.sqrt(6)) / 10, (4 + np.sqrt(6)) / 10, 1.0])
 _POWERS = np.arange(1, 4)
@@ -40,20 +40,23 @@ class RadauIIA(ImplicitMethod):
 
     order: ClassVar[int] = 4  # of the embedded estimate
 
-    def solve(self, problem: Problem, t, y: PyTree, h) -> Solution:
-        """Return the change of the state `y` at `t` by a step `h` (s) of a `problem`, with an infinite error where its equations were not solved."""
+    def solve(self, args: tuple, t, y: PyTree, h) -> Solution:
+        """Return the change of the state `y` at `t` by a step `h` (s), with an infinite error where its equations were not solved.
+
+        `args`: as in `integrands.py`.
+        """
         x0, unravel = ravel_pytree(y)
         h = jnp.asarray(h, x0.dtype)
         n, A, estimate = x0.shape[0], jnp.asarray(_A, x0.dtype), jnp.asarray(_ESTIMATE, x0.dtype)
         times = t + jnp.asarray(_NODES, jnp.result_type(t)) * h
 
         def f(t, x):
-            return jnp.asarray(ravel_pytree(problem.rates(t, unravel(x), problem.args))[0], x0.dtype)
+            return jnp.asarray(ravel_pytree(rates(t, unravel(x), args))[0], x0.dtype)
 
         def equations(z):
             z = z.reshape(3, n)
-            rates = jax.lax.map(lambda stage: f(stage[0], x0 + stage[1]), (times, z))  # a loop: one copy of the rates to compile
-            return (z - h * A @ rates).reshape(-1)
+            slopes = jax.lax.map(lambda stage: f(stage[0], x0 + stage[1]), (times, z))  # a loop: one copy of the rates to compile
+            return (z - h * A @ slopes).reshape(-1)
 
         slope, along = jax.linearize(lambda x: f(t, x), x0)
         found = newton_root(equations, jnp.zeros(3 * n, x0.dtype), sizes(3 * n, x0, h * slope))

@@ -1,1 +1,1 @@
-"""Our explicit Runge-Kutta loop as machine code: the same steps as `motion/integrators/erk_step.py`, for lanes side by side."""
+"""Steps of a motion, and the loop over them as machine code, for lanes side by side."""

@@ -10,7 +10,7 @@ and where a motion ended at a stop event, at its time t_e = t - c(t, y)/cdot and
 
     s = -(g_t + g_y . f)/cdot,   g_y += s dc/dy,   g_p += s dc/dp
 
-As `motion/integrators/recorded_adjoint.py` and `step_adjoint.py` have it. JAX differentiates this once more, by cotangents of the motion with a tangent.
+On arrays the same source goes back (`motion/arrays/back.py`). JAX differentiates this once more, by cotangents of the motion with a tangent.
 Let S be the sum of all states, each times its cotangent g, and g' what S' changes by along a tangent. The result is dS/dx, where x is the start's state and the
 numbers known. It changes by d(dS)/dx, where dS is the sum of the states times g' and of their tangents times g: cotangents are g' of the states and g of
 their tangents.
@@ -26,10 +26,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.derivatives import filled
-from jourdain_jax.motion.integrators.event_search import RUNNING, chosen
+from jourdain_jax.motion.integrators.event_search import RUNNING, chosen, slope_is_flat
 from jourdain_jax.motion.integrators.explicit_steps import Method
-from jourdain_jax.motion.native.functions import slope_is_flat, write_pulled
-from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter, arguments_of_samples, copied, each_row, pass_knot, set_goal
+from jourdain_jax.motion.native.functions import write_pulled
+from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter, Number, StepWriter, arguments_of_samples, copied, each_row, pass_knot, set_goal
 from jourdain_jax.motion.native.loop import MOST_KERNELS, TIMES, Start, begin_lane, with_tangents, write_functions, write_job
 from jourdain_jax.motion.native.record import GOALS, TO_ENDS, TO_STATES, Slot, prepare, write_record
 from jourdain_jax.motion.native.step import near_rank_loss, put_near_rows, squares_of, weighted
@@ -120,18 +120,19 @@ def _used(method: Method) -> list[int]:
     return found
 
 
-def step_back(w: MachineWriter, form: Form, method: Method, asked: int, state: Value, here: Value, g: Value, by_known: Value) -> None:
+def step_back(w: StepWriter, form: Form, method: Method, asked: int, state: Number, here: Number, g: Number, by_known: Number) -> None:
     """Go back over the step in the slot `here`, in lanes that went on in it."""
     slot, count, used, n = Slot.of(form, method), form.integrated, _used(method), method.needed
     h, t = w.load(here, slot.taken), w.load(here, slot.t)
     took, k = w.differs(h, 0.0), w.at(here, slot.y)
+    w.in_step(t, h)
     g1, v, at, G, added = (w.room(n) for n in (count, count, count, count * n, max(asked, 1)))
     copied(w, count, g, g1)
     each_row(w, asked, added, lambda i: 0.0)
     if form.projects:
         each_row(w, count, at, lambda i: w.fma(h, weighted(w, method.b, k, form, i), w.load(here, i)))
         w.run("project_back", state, t + h, at, g1, added)
-    A, columns, b, c = (w.table(x) for x in (method.A[:n, :n], method.A[:n, :n].T, method.b[:n], method.c[:n]))
+    A, columns, b, c, order = (w.table(x) for x in (method.A[:n, :n], method.A[:n, :n].T, method.b[:n], method.c[:n], used))
     near = None
     if form.squares:
         pivots = w.room(len(form.monitored))
@@ -139,14 +140,14 @@ def step_back(w: MachineWriter, form: Form, method: Method, asked: int, state: V
         near = near_rank_loss(squares_of(w, form, pivots))
 
     def stage(number, _: tuple) -> tuple:
-        stage = w.entry(used, number)
+        stage = order[number]
         of_stage, time = w.at(G, stage * count), w.fma(h, c[stage], t)
 
-        def state_at(row: int | Value) -> Value:
+        def state_at(row: int | Number) -> Number:
             start = w.load(here, row)
             return start if w.is_first(stage) else w.fma(h, weighted(w, A[stage], k, form, row), start)
 
-        def cotangent(i: int | Value) -> Value:
+        def cotangent(i: int | Number) -> Number:
             total = w.load(g1, i) * b[stage]
             for j in used:
                 if w.may_count(columns[stage], j):
@@ -174,7 +175,7 @@ def step_back(w: MachineWriter, form: Form, method: Method, asked: int, state: V
 
     w.over_stages(len(used), stage, ())
 
-    def total(i: int | Value) -> Value:
+    def total(i: int | Number) -> Number:
         found = w.load(g1, i)
         for stage in used:
             found = found + w.load(G, i + stage * count)
@@ -211,12 +212,12 @@ def _write_event_back(w: MachineWriter, form: Form, asked: int) -> None:
             event_back(w, form, asked, state, located, g_t, g, by_known)
 
 
-def is_located(w: MachineWriter, lanes: Lanes) -> Value:
+def is_located(w: StepWriter, lanes: Lanes) -> Number:
     """Return which lanes ended at an event that was searched for."""
     return w.equal(lanes["code"], results.EVENT) & (lanes["accepted"] > 0.0)
 
 
-def event_back(w: MachineWriter, form: Form, asked: int, state: Value, located: Value, g_t: Value, g: Value, by_known: Value) -> None:
+def event_back(w: StepWriter, form: Form, asked: int, state: Number, located: Number, g_t: Number, g: Number, by_known: Number) -> None:
     """Make cotangents at the time and state of an event those of a state at a number for a time."""
     lanes, count = Lanes(w, form, state), form.integrated
     f, out, pivots, added = (w.room(max(n, 1)) for n in (count, count, len(form.monitored), asked + 1))
@@ -247,7 +248,7 @@ def event_back(w: MachineWriter, form: Form, asked: int, state: Value, located: 
     each_row(w, asked, by_known, lambda i: w.load(by_known, i) + w.where(usable, w.load(added, i), 0.0))
 
 
-def _moved_back(w: MachineWriter, form: Form, lanes: Lanes, usable: Value, cotangents: tuple, rooms: tuple, asked: int) -> Value:
+def _moved_back(w: StepWriter, form: Form, lanes: Lanes, usable: Number, cotangents: tuple, rooms: tuple, asked: int) -> Number:
     """The derivative along time of what an event adds to a tangent; changes the cotangents `g` of the state, the first of these, and adds to the others."""
     (g, g_dt), (out, added) = cotangents, rooms
     given, count = w.room(form.integrated + 2), form.integrated

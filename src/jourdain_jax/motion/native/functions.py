@@ -9,14 +9,12 @@ and, of derivatives of higher order, the tangents of these along the next direct
 motion with its tangent are what second derivatives consist of.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
 from jourdain_jax.calculus.derivatives import DifferentiationModeError
-from jourdain_jax.motion.integrators.event_search import chosen, is_flat
 from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter, looked_up
 from jourdain_jax.native.ir import Value
 from jourdain_jax.native.scalar_program import as_real, unsupported, written, written_in_turn
@@ -174,53 +172,6 @@ def write_events(w: MachineWriter, form: Form) -> None:
             _, tangents = _found(w, form, outputs_of(form, program.events, count), known_values(w, form, state, tau, y), state, tau, y)
             for i, x in enumerate(x for part in tangents for x in part):
                 w.store(x, dc, i)
-
-
-def slope_is_flat(w: MachineWriter, p: Lanes, rate: Value) -> Value:
-    """Whether the value of a lane's event has no slope where it falls through zero."""
-    return is_flat(w, rate, chosen(w, p["event"], p.every("search_slope")))
-
-
-def put_tangents(w: MachineWriter, form: Form, p: Lanes, k: Value, found: Value, t: Value, rate: list[Value], y1: Value) -> None:
-    """Where an event is found at the time t in the state `y1`, the tangents of that time, and those of the state there; `k`: the rates.
-
-    Each tangent of time is found in turn, the state being moved by it, with e the directions taken together in it,
-
-        dt = -(dc/dt dt + dc/dy dy + dc/dp dp)/cdot,   y <- y + e dt f(t, y),   t <- t + e dt,   e^2 = 0
-
-    where values, tangents and rates are those before; dt is NaN where c has no slope there.
-    """
-    count, times = form.events, form.rows["dt"]
-
-    def put() -> None:
-        k_now = k
-        values, pivots = w.room(count * len(times)), w.room(max(len(form.monitored), 1))
-        slope = chosen(w, p["event"], rate)
-        usable = found & w.differs(slope, 0.0) & (w.magnitude(slope) < math.inf)
-        flat = found & slope_is_flat(w, p, slope)
-        for part, row in enumerate(times, 1):
-            if part > 1:  # what is known of the rates is of the state as it was
-                k_now = w.room(form.integrated)
-                w.run("rates", p.pointer, t, y1, k_now, pivots)
-            w.run("event_tangents", p.pointer, t, y1, values)
-            dc = chosen(w, p["event"], [w.load(values, (part - 1) * count + i) for i in range(count)])
-            dt = w.where(flat, math.nan, w.where(usable, -dc / slope, 0.0))
-            w.store(w.where(found, dt, w.load(p.pointer, row)), p.pointer, row)
-            for other in range(len(times) + 1):
-                if not other & part:
-                    _move_rows(w, form, y1, k_now, (other | part) * form.y, other * form.y, dt, usable | flat)
-
-    w.if_any(found, put)
-
-
-def _move_rows(w: MachineWriter, form: Form, y: Value, k: Value, rows: int, rates: int, dt: Value, moves: Value) -> None:
-    """Adds the rates that begin with row `rates` of `k`, times `dt`, to those that begin with row `rows` of `y`."""
-
-    def moved(i: int | Value) -> Value:
-        before = w.load(y, i + rows)
-        return w.where(moves, w.fma(w.load(k, i + rates), dt, before), before)
-
-    w.each(range(form.y), lambda i: w.store(moved(i), y, i + rows))
 
 
 # Operations of a derivative of the first order, of which reverse mode keeps some on the stack, and of the second.

@@ -17,11 +17,8 @@ Tables have the shape (tables, inputs, 2, samples): times since the start, then 
 times. Knots (`motion/inputs.py`) have the shape (rows, knots). Lanes that share them have one of each: of T tables, lane i of N has number i T / N.
 """
 
-import math
-import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import reduce
 from itertools import pairwise
 from typing import Any
 
@@ -49,6 +46,7 @@ class Form:
     moving: tuple[tuple[int, ...], ...] = ()  # of every tangent, which of the numbers known have it
     sampled: tuple[int, ...] = ()  # which of the inputs are given by samples
     time_moves: bool = False  # whether time has tangents
+    compensated: bool = False  # whether the state is summed with what rounding leaves off, as in single precision
 
     @property
     def rates(self) -> list[int]:
@@ -81,6 +79,11 @@ class Form:
     def turning(self) -> int:
         """Numbers of all entries of directions of rows."""
         return len(self.program.directions)
+
+    @property
+    def known(self) -> dict[str, int]:
+        """Rows of the numbers known beside time and the state, and of their tangents."""
+        return {"known": len(self.program.fixed) + len(self.program.inputs), "dknown": sum(map(len, self.moving))}
 
     @property
     def squares(self) -> tuple[int, ...]:
@@ -146,11 +149,19 @@ class Form:
     def rows(self) -> dict[str, range]:
         """Name -> rows."""
         search = {"search_t": 3, "search_c": 3 * self.events, "search_step": 1, "search_left": 1, "search_shift": 1, "search_slope": self.events}
-        program, watched = self.program, len(self.watched)
+        watched = len(self.watched)
         counts = {"y": self.integrated, **dict.fromkeys(PROGRESS, 1), "dt": len(self.moving), **dict.fromkeys(CONTROL, 1)}
-        counts |= {"known": len(program.fixed) + len(program.inputs), "dknown": sum(map(len, self.moving))}
-        counts |= {"goal": 1, "taken": 1, "before": 1, "bound": 1, **(search if self.events else {}), **dict.fromkeys(SAMPLES if self.sampled else (), 1)}
+        counts |= {
+            **self.known,
+            "goal": 1,
+            "taken": 1,
+            "before": 1,
+            "bound": 1,
+            **(search if self.events else {}),
+            **dict.fromkeys(SAMPLES if self.sampled else (), 1),
+        }
         counts |= {"last": watched, "crossing_by": 1} if watched else {}
+        counts |= dict.fromkeys(("rest", "next_rest"), self.y) if self.compensated else {}
         found, first = {}, 0
         for name, count in counts.items():
             found[name] = range(first, first + count)
@@ -171,6 +182,10 @@ class Form:
     def all(self) -> int:
         """How many rows there are."""
         return max(rows.stop for rows in self.rows.values())
+
+
+Number = Any  # of a step: a value of machine code, an array, or a pointer to memory of either
+StepWriter = Any  # `MachineWriter`, or `ArrayWriter`, by which the source runs on arrays of JAX
 
 
 class MachineWriter(Writer):
@@ -198,6 +213,9 @@ class MachineWriter(Writer):
             found = body(i, found)
         return found
 
+    def in_step(self, t: Value, h: Value) -> None:
+        """Begin with the stages of a step: what samples say is looked up by the time alone."""
+
     def is_first(self, i: int) -> bool:
         """Return whether this is known to be the first stage."""
         return i == 0
@@ -209,22 +227,6 @@ class MachineWriter(Writer):
     def table(self, numbers: Any) -> Any:
         """Return numbers that stages look up."""
         return numbers
-
-    def every(self, pointer: Value, rows: range) -> list[Value]:
-        """Return what is in rows of memory: as many values as there are rows."""
-        return [self.load(pointer, row) for row in rows]
-
-    def least(self, values: list[Value]) -> Value:
-        """Return the least of all rows of the values, infinity where there are none."""
-        return reduce(self.smaller, values, self.number(math.inf))
-
-    def in_any(self, truths: list[Value]) -> Value:
-        """Return whether one of all rows of the truth values holds."""
-        return reduce(operator.or_, truths, self.literal(0, self.truth))
-
-    def entry(self, stages: list[int], number: int) -> int:
-        """Return the stage with this number."""
-        return stages[number]
 
     def may_count(self, weights: Any, j: int) -> bool:
         """Return whether a weight may be other than zero."""
@@ -258,43 +260,43 @@ class MachineWriter(Writer):
 class Lanes:
     """The rows of the lanes side by side, in memory at `pointer`."""
 
-    def __init__(self, w: MachineWriter, form: Form, pointer: Value) -> None:
+    def __init__(self, w: StepWriter, form: Form, pointer: Number) -> None:
         self.w, self.form, self.pointer, self.rows = w, form, pointer, form.rows
 
-    def __getitem__(self, name: str) -> Value:
+    def __getitem__(self, name: str) -> Number:
         return self.every(name)[0]
 
-    def __setitem__(self, name: str, value: Value) -> None:
+    def __setitem__(self, name: str, value: Number) -> None:
         self.put(name, [value])
 
-    def every(self, name: str) -> list[Value]:
+    def every(self, name: str) -> list[Number]:
         """The vectors of all rows of this name."""
         return [self.w.load(self.pointer, row) for row in self.rows[name]]
 
-    def put(self, name: str, values: list[Value]) -> None:
+    def put(self, name: str, values: Sequence[Number]) -> None:
         """Sets all rows of this name."""
         for row, value in zip(self.rows[name], values, strict=True):
             self.w.store(value, self.pointer, row)
 
-    def place(self, name: str, lane: Value) -> Value:
+    def place(self, name: str, lane: Number) -> Number:
         """Where the number of one lane is."""
         return self.w.at(self.pointer, lane + self.rows[name].start * self.w.lanes, "double")
 
-    def of(self, name: str, lane: Value, type: str = "double") -> Value:
+    def of(self, name: str, lane: Number, type: str = "double") -> Number:
         """The number of one lane."""
         return self.w.load(self.place(name, lane), type=type)
 
-    def set(self, name: str, lane: Value, value) -> None:
+    def set(self, name: str, lane: Number, value) -> None:
         """Sets the number of one lane."""
         self.w.store(self.w.literal(value, "double"), self.place(name, lane))
 
 
-def each_row(w: MachineWriter, rows: range | int, into: Value, value: Callable[[int | Value], Value | float]) -> None:
+def each_row(w: StepWriter, rows: range | int, into: Number, value: Callable[[int | Number], Number | float]) -> None:
     """Sets rows of a state in memory, so many of them, or these."""
     w.each(range(rows) if isinstance(rows, int) else rows, lambda i: w.store(value(i), into, i))
 
 
-def copied(w: MachineWriter, rows: int, source: Value, into: Value, where: Value | None = None) -> None:
+def copied(w: StepWriter, rows: int, source: Number, into: Number, where: Number | None = None) -> None:
     """Sets so many rows to those from another place, in lanes `where` this holds."""
     each_row(w, rows, into, lambda i: w.load(source, i) if where is None else w.where(where, w.load(source, i), w.load(into, i)))
 

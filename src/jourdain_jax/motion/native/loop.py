@@ -221,19 +221,19 @@ MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the pro
 
 
 class Start(NamedTuple):
-    """A motion as a kernel is given it; the state and what is known are followed by their tangents (`Form`)."""
+    """A motion as a loop is given it; the state and what is known are followed by their tangents (`Form`)."""
 
-    of_samples: tuple[Array, ...]  # as `layout.py` has them
-    control: tuple[Float[Array, ""], ...]  # rtol, atol, shortest, longest and first step, most steps
-    goals: Float[Array, "times"]  # since the start
-    origin: Float[Array, ""]  # the time of the start
-    y: tuple[Float[Array, "y"], ...]
-    known: tuple[tuple[Float[Array, ""], ...], ...]
+    of_samples: tuple[Array, ...]  # as `layout.py` has them; of a loop on arrays the knots alone
+    control: tuple[Float[Array, "*lanes"], ...]  # rtol, atol, shortest, longest and first step, most steps
+    goals: Float[Array, "times *lanes"]  # since the start
+    origin: Float[Array, "*lanes"]  # the time of the start
+    y: tuple[Float[Array, "y *lanes"], ...]
+    known: tuple[tuple[Array, ...], ...]  # numbers; of a loop on arrays those in which the arguments of rates are stored, with their lanes first
 
-    def rows(self, dt: Sequence) -> Float[Array, "given"]:
+    def rows(self, dt: Sequence) -> Float[Array, "given *lanes"]:
         """The rows of a lane at the start, whose time has tangents."""
         rtol, atol, shortest, longest, first, most = self.control
-        zero, one = jnp.zeros(()), jnp.ones(())
+        zero, one = jnp.zeros_like(self.goals[0]), jnp.ones_like(self.goals[0])
         progress = [zero, jnp.minimum(jnp.abs(first), longest), RUNNING * one, zero, zero, -one, jnp.inf * one, zero, jnp.inf * one, *dt]
         limits = [jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, longest, most, self.origin]
         known = [jnp.stack(part) for part in self.known if part]  # each tangent by itself: values may have no lanes where tangents have
@@ -241,20 +241,29 @@ class Start(NamedTuple):
 
 
 class Found(NamedTuple):
-    """A motion as a kernel returns it; each with its tangents."""
+    """A motion as a loop returns it; each with its tangents."""
 
-    y: tuple[Float[Array, "times y"], ...]  # at the goals
-    end: tuple[Float[Array, "y"], ...]
-    t: tuple[Float[Array, ""], ...]  # of the end, since the start
-    rest: Float[Array, "rest"]  # rows of the progress after its time, and the number of goals that were reached one after the other
+    y: tuple[Float[Array, "times y *lanes"], ...]  # at the goals
+    end: tuple[Float[Array, "y *lanes"], ...]
+    t: tuple[Float[Array, "*lanes"], ...]  # of the end, since the start
+    rest: Float[Array, "rest *lanes"]  # rows of the progress after its time, and the number of goals that were reached one after the other
+
+    def shared(self, given: Start) -> tuple["Found", "Found"]:
+        """Return what `vmap` finds, without lanes in the parts that have none, and which have them; `given`: what of the start has.
+
+        A tangent has lanes where anything has that it depends on: all directions share the values of one motion.
+        """
+        parts = range(len(self.y))
+        base = any(jax.tree.leaves(given._replace(y=(), known=())))
+        own = [any(jax.tree.leaves((given.y[k], given.known[k]))) for k in parts]
+        of_parts = tuple(base or any(own[other] for other in range(k + 1) if other & k == other) for k in parts)
+        lanes = Found(of_parts, of_parts, of_parts, of_parts[0])
+        return jax.tree.map(lambda x, has_lanes: x if has_lanes else x[0], self, lanes), lanes
 
 
 @lru_cache(maxsize=MOST_KERNELS)
 def kernel(form: Form, method: Method, order: int | None = None) -> Callable[[Start], Found]:
-    """The motion of what is integrated, by a tableau, or by Taylor series up to an order.
-
-    A tangent has lanes where anything has that it depends on: all directions share the values of one motion.
-    """
+    """The motion of what is integrated, by a tableau, or by Taylor series up to an order."""
     steps = method if order is None else TaylorSteps(order)
     n, parts = form.y, 1 + len(form.moving)
 
@@ -279,11 +288,7 @@ def kernel(form: Form, method: Method, order: int | None = None) -> Callable[[St
     def motions(count, batched: Sequence, start: Start):
         (given,) = batched
         found = jax.vmap(motion.fun, [jax.tree.map(lambda has_axis: 0 if has_axis else None, given)], axis_size=count)(start)
-        base = any(jax.tree.leaves(given._replace(y=(), known=())))
-        own = [any(jax.tree.leaves((given.y[k], given.known[k]))) for k in range(parts)]
-        lanes = tuple(base or any(own[other] for other in range(k + 1) if other & k == other) for k in range(parts))
-        lanes = Found(lanes, lanes, lanes, lanes[0])
-        return jax.tree.map(lambda x, has_lanes: x if has_lanes else x[0], found, lanes), lanes
+        return found.shared(given)
 
     return motion
 
@@ -293,18 +298,30 @@ OF_SAMPLES = 'machine code does not differentiate with respect to samples of an 
 
 def flow(form: Form, method: Method, order: int | None) -> Callable[[Start], Found]:
     """The motion by a kernel; `order`: of Taylor series, in the place of the tableau."""
-    # 36_000 of coefficients in a step by Taylor series of second derivatives; where there are more, steps are those of the tableau
-    order = None if order is not None and len(form.moving) > 1 and products(form, order) > 36_000 else order
-    own = jax.custom_jvp(kernel(form, method, order))
+
+    def motion(form: Form) -> Callable[[Start], Found]:
+        # 36_000 of coefficients in a step by Taylor series of second derivatives; where there are more, steps are those of the tableau
+        too_many = order is not None and len(form.moving) > 1 and products(form, order) > 36_000
+        return kernel(form, method, None if too_many else order)
+
+    def check(form: Form, along: Start) -> None:
+        if not all(map(is_zero, along.of_samples[:1])):
+            raise DifferentiationModeError(OF_SAMPLES)
+        check_derivatives(replace(form, moving=(), time_moves=False), (len(form.moving) + 1).bit_length())
+
+    return differentiated(motion, form, check)
+
+
+def differentiated(motion: Callable[[Form], Callable[[Start], Found]], form: Form, check: Callable[[Form, Start], None]) -> Callable[[Start], Found]:
+    """The motion of a form, whose derivative is the motion of the state with one more tangent of each part; `check`: whether there is such a one."""
+    own = jax.custom_jvp(motion(form))
 
     @partial(own.defjvp, symbolic_zeros=True)
     def rule(primals, tangents):
         (start,), (along,) = primals, tangents
-        if not all(map(is_zero, along.of_samples[:1])):
-            raise DifferentiationModeError(OF_SAMPLES)
-        check_derivatives(replace(form, moving=(), time_moves=False), (len(form.moving) + 1).bit_length())
+        check(form, along)
         raised, more = with_tangents(form, start, along)
-        both = flow(replace(raised, time_moves=form.has_events and len(start.y) > 1), method, order)(more)
+        both = differentiated(motion, replace(raised, time_moves=form.has_events and len(start.y) > 1), check)(more)
         found, d = (Found(*(part[half] for part in both[:3]), both.rest) for half in (slice(len(start.y)), slice(len(start.y), None)))
         return found, d._replace(rest=jnp.zeros_like(found.rest))
 

@@ -127,12 +127,8 @@ def _each(part, shape: tuple[int, ...]) -> list:
     return list(jnp.reshape(part, -1)) if hasattr(part, "shape") else [part] * math.prod(shape)
 
 
-def moved(form: Form) -> Callable[[Float[Array, "z"], Float[Array, ""]], Float[Array, "z"]]:
-    """Return z itself as a function of z and of the time by which it is moved, which is zero.
-
-    z: the state, time, the numbers known, and how fast those of them change that samples give.
-    """
-    rates = _rates(form)
+def moved(rates: Callable[[Float[Array, "z"]], Float[Array, "z"]]) -> Callable[[Float[Array, "z"], Float[Array, ""]], Float[Array, "z"]]:
+    """Return z itself as a function of z and of the time by which it is moved along its `rates`, which is zero."""
 
     def moving_with_time(slope: Callable) -> Callable:
         @jax.custom_jvp
@@ -163,7 +159,7 @@ def moved(form: Form) -> Callable[[Float[Array, "z"], Float[Array, ""]], Float[A
 
 
 def _rates(form: Form) -> Callable[[Float[Array, "z"]], Float[Array, "z"]]:
-    """G(z), which is zero but for the state, time and what samples give."""
+    """Rates of z: the state, time, the numbers known, and how fast those of them change that samples give; zero but for the first two and what samples give."""
     graph, rates, variables = on_its_own(form.program.graph, form.rates, form.program.variables)
     fixed, t, y, inputs = form.split(variables)
     work = [graph.input("work", True)] if form.with_work else []
@@ -261,24 +257,28 @@ def cotangents(form: Form, method: Method, start: Start, asked: Sequence[bool], 
     """
     which = tuple(i for i, is_asked in enumerate(asked) if is_asked)
     check_derivatives(form, 1)
-    states = jax.vmap(_packed)(g.ys)
-    states = jnp.concatenate([states, jnp.zeros_like(states[:1])])  # nobody asks for the last one: it is that of the end
-    found = flow_back(form, method, which, memory)(start, states, jnp.concatenate([_packed(g.y_end), g.t_end[None]]))
+    found = flow_back(form, method, which, memory)(start, cotangents_of_states(g), jnp.concatenate([g.y_end.rows, g.t_end[None]]))
     known = dict(zip(which, entries_of(found[form.y :]), strict=True))
-    return _state(form, found[: form.y]), [known.get(i) for i in range(len(asked))]
+    return state(form, found[: form.y]), [known.get(i) for i in range(len(asked))]
+
+
+def cotangents_of_states(g: Solved) -> Float[Array, "times y"]:
+    """Cotangents of the states at all times to go to, from those of what was found."""
+    states = jax.vmap(lambda y: y.rows)(g.ys)
+    return jnp.concatenate([states, jnp.zeros_like(states[:1])])  # nobody asks for the last one: it is that of the end
 
 
 def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integrated]:
     """The state at a time t, as a function of it, of t, and of a time d that is zero, by which it is moved along its rates."""
-    others, fixed, along_rates = _others(args[2]), len(form.program.fixed), moved(form)
+    others, fixed, along_rates = _others(args[2]), len(form.program.fixed), moved(_rates(form))
 
     def moved_by(y, t, d):
         known = known_of(args)
         values, slopes = zip(*(jax.jvp(others[i], (t,), (jnp.ones_like(t),)) for i in form.sampled), strict=True) if form.sampled else ((), ())
         for i, value in zip(form.sampled, values, strict=True):
             known[fixed + i] = value
-        z = jnp.concatenate([_packed(y), jnp.stack([jnp.asarray(x, real_type()) for x in (t, *known, *slopes)])])
-        return _state(form, along_rates(z, d)[: form.y])
+        z = jnp.concatenate([y.rows, jnp.stack([jnp.asarray(x, real_type()) for x in (t, *known, *slopes)])])
+        return state(form, along_rates(z, d)[: form.y])
 
     return moved_by
 
@@ -286,10 +286,14 @@ def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integ
 def start_of(setup: Setup, begun: Begun) -> Start:
     """What a kernel is given of a motion."""
     knots, goals = setup.knots, setup.goals(setup.ts)
-    known = tuple(jnp.zeros(()) if x is None else x for x in known_of(begun.args))  # what samples say is looked up
+    known = tuple(jnp.asarray(0.0 if x is None else x, real_type()) for x in known_of(begun.args))  # what samples say is looked up
+    return Start(_samples(begun.args, goals, knots), control_of(setup, knots), goals, jnp.asarray(begun.args[-1], real_type()), (begun.y0.rows,), (known,))
+
+
+def control_of(setup: Setup, knots: Float[Array, "knots"] | None) -> tuple[Float[Array, ""], ...]:
+    """Tolerances and limits of steps, as a `Start` has them."""
     control = *setup.tolerances, setup.shortest, setup.longest, setup.dt0, setup.most_steps(knots)
-    control, origin, known = jax.tree.map(lambda x: jnp.asarray(x, real_type()), (control, begun.args[-1], known))
-    return Start(_samples(begun.args, goals, knots), control, goals, origin, (_packed(begun.y0),), (known,))
+    return tuple(jnp.asarray(x, real_type()) for x in control)
 
 
 def known_of(args: tuple) -> list:
@@ -334,20 +338,16 @@ def _samples(args: tuple, goals: Float[Array, "times"], knots: Float[Array, "kno
     return tables, jnp.full(1, jnp.sign(goals[-1]) * jnp.inf) if knots is None else knots
 
 
-def _packed(y: Integrated) -> Float[Array, "y"]:
-    return jnp.concatenate([y.q, y.v, *([] if y.work is None else [y.work[None]])])
+def state(form: Form, rows: Float[Array, "rows *lanes"]) -> Integrated:
+    """The integrated state with these rows."""
+    return Integrated.of(rows, form.coordinates, form.speeds)
 
 
 def solved(form: Form, goals: Float[Array, "times"], found: Found) -> Solved:
-    """What a kernel found, in words."""
+    """What a loop found, in words."""
     h, code, accepted, rejected, event, pivot, crossings, together, count = found.rest
     (states,), (end,), (t,) = found[:3]
     code, accepted, rejected, event, crossings = (x.astype(jnp.int32) for x in (code, accepted, rejected, event, crossings))
     reached = (jnp.arange(len(goals)) < count) | (goals == t)
-    ys, code = jax.vmap(lambda y: _state(form, y))(states[:-1]), code_at_end(code, h, accepted, t)
-    return Solved(goals[:-1], ys, reached[:-1], t, _state(form, end), code, event, accepted, rejected, h, pivot, crossings, together)
-
-
-def _state(form: Form, y: Float[Array, "y"]) -> Integrated:
-    n = form.coordinates
-    return Integrated(y[:n], y[n : form.q_and_v], y[-1] if form.with_work else None)
+    ys, code = jax.vmap(partial(state, form))(states[:-1]), code_at_end(code, h, accepted, t)
+    return Solved(goals[:-1], ys, reached[:-1], t, state(form, end), code, event, accepted, rejected, h, pivot, crossings, together)

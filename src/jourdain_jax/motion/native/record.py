@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
 from jourdain_jax.motion.integrators.explicit_steps import Method
+from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
 from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter, copied, each_row
 from jourdain_jax.motion.native.loop import COUNT, NEXT, OWN, STARTS, TIMES
 from jourdain_jax.native.ffi import FIRST_OF_SCRATCH, handed_out, lanes_taken, next_lane, taken_in
@@ -29,7 +30,7 @@ class Slot(NamedTuple):
     all: int
 
     @staticmethod
-    def of(form: Form, method: Method) -> "Slot":
+    def of(form: Form, method: Method | ImplicitMethod) -> "Slot":
         y = form.integrated
         t = y * (1 + method.needed)
         return Slot(y, t, t + 1, t + 2, t + 3)

@@ -96,6 +96,17 @@ class Integrated(eqx.Module):
     v: Float[Array, "integrated_speeds *lanes"]
     work: PerLane | None
 
+    @property
+    def rows(self) -> Float[Array, "rows *lanes"]:
+        """All of it, one after the other."""
+        return jnp.concatenate([self.q, self.v, *([] if self.work is None else [self.work[None]])])
+
+    @staticmethod
+    def of(rows: Float[Array, "rows *lanes"], coordinates: int, speeds: int) -> "Integrated":
+        """Return the state with these rows."""
+        end = coordinates + speeds
+        return Integrated(rows[:coordinates], rows[coordinates:end], rows[end] if len(rows) > end else None)
+
 
 class Watched(NamedTuple):
     """Rates; pivots that must keep their signs; directions of rows nonlinear in the speeds, which must not turn round; a sine, small near a loss of rank."""

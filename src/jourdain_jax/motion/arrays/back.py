@@ -1,0 +1,115 @@
+"""The loop on arrays gone through once more and then back: cotangents of the start from those of the states and the end (`motion/native/back.py`).
+
+Tries of steps are recorded in a window of bounded memory. All but the last window are gone through again, by the same steps to the last bit, from the nearest
+beginning of a window that is kept. Of these there is bounded room, too: where it is full, every second one is dropped.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PyTree
+
+from jourdain_jax.motion.arrays.loop import Going, Loop, numbers
+from jourdain_jax.motion.integrators.event_search import MOST_STEPS
+from jourdain_jax.motion.integrators.explicit_steps import Method
+from jourdain_jax.motion.native.back import event_back, is_located, step_back
+from jourdain_jax.motion.native.layout import Lanes
+from jourdain_jax.motion.native.loop import Start
+from jourdain_jax.motion.native.record import Slot
+
+SLOTS = 256  # tries of steps in a window, where memory holds them; a sixteenth at least, as of beginnings
+
+
+class _Record(NamedTuple):
+    """A motion on its way, how many steps it has tried, the window of these, and beginnings of windows, every so many of them."""
+
+    going: Going
+    tries: Int[Array, ""]
+    window: Float[Array, "slots rows *lanes"]
+    beginnings: PyTree
+    every: Int[Array, ""]
+
+
+def cotangents(of: Loop, asked: Sequence[int], memory: int, start: Start, g_ys: Array, g_end: Array, g_t: Array) -> tuple[Array, list[Array]]:
+    """Cotangents of the state at the start and of the `asked` among what is known, from those of the saved states, of the end and of its time.
+
+    `memory`: bytes, of which the window and the beginnings take a quarter each at most.
+    """
+    form, slot = of.form, Slot.of(of.form, of.method)
+    begun, fixed = of.begun(start)
+    begun, _ = of.saving(start, begun, None)
+    lanes, most = begun.passed.shape, of.most + MOST_STEPS + 2
+    t, taken = form.rows["t"].start, form.rows["taken"].start
+
+    def room(rows: int, most: int) -> int:
+        return max(SLOTS // 16, min(most, memory // (32 * rows * math.prod(lanes))))
+
+    slots = min(room(slot.all, SLOTS), most)
+    kept = 2 * room(2 * form.all, most // (2 * slots) + 1)
+
+    def thinned(beginnings: PyTree) -> PyTree:
+        return jax.tree.map(lambda x: jnp.concatenate([x[:-1:2], x[kept // 2 :]]), beginnings)
+
+    def recorded(record: _Record) -> _Record:
+        going, tries, window, beginnings, every = record
+        is_full = tries == kept * slots * every
+        beginnings = jax.lax.cond(is_full, thinned, lambda x: x, beginnings)
+        every = jnp.where(is_full, 2 * every, every)
+        place = jnp.where(tries % (slots * every) == 0, tries // (slots * every), kept)
+        beginnings = jax.tree.map(lambda kept, x: jax.lax.dynamic_update_index_in_dim(kept, x, place, 0), beginnings, going)
+        new, k = of.tried(going, fixed, start)
+        rows = jnp.concatenate([going.y, k, jnp.stack([going.rows[t], new.rows[taken], going.passed.astype(going.y.dtype)])])
+        window = jax.lax.dynamic_update_index_in_dim(window, rows, tries % slots, 0)
+        return _Record(of.saving(start, new, None)[0], tries + 1, window, beginnings, every)
+
+    one = jnp.ones((), jnp.int32)
+    beginnings = jax.tree.map(lambda x: jnp.zeros((kept + 1, *x.shape), x.dtype), begun)
+    record = _Record(begun, 0 * one, jnp.zeros((slots, slot.all, *lanes), begun.y.dtype), beginnings, one)
+    record = jax.lax.while_loop(lambda record: of.on_its_way(record.going), recorded, record)
+    end, index = record.going, numbers(len(start.goals), begun.y)
+
+    def added(g, first, last):
+        """Cotangents with those of the states at the saved times number `first` to `last - 1`."""
+        more = lambda: g + jnp.sum(jnp.where((index >= first) & (index < last), g_ys, 0.0), axis=0)  # noqa: E731
+        return jax.lax.cond(eqxi.unvmap_any(jnp.any(first < last)), more, lambda: g)
+
+    w = of.writer(start, asked)
+    known = sum(w.functions.sizes())
+    g, by_known = w.holding(added(g_end, end.passed, jnp.full(lanes, len(start.goals), jnp.int32))), w.room(max(known, 1))
+    if form.has_events:
+        state = of.rows_in(w, end, fixed)
+        located = is_located(w, Lanes(w, form, state))
+        w.if_any(located, lambda: event_back(w, form, known, state, located, w.holding(g_t[None]), g, by_known))
+
+    def step_of(carry):
+        last, saved, g, by_known, window = carry
+        w = of.writer(start, asked)
+        here = jax.lax.dynamic_index_in_dim(window, last % slots, 0, keepdims=False)
+        before = here[slot.saved].astype(jnp.int32)
+        at, g, by_known = w.holding(here), w.holding(added(g, before, saved)), w.holding(by_known)
+        if isinstance(of.method, Method):
+            step_back(w, form, of.method, known, of.rows_in(w, end, fixed), at, g, by_known)
+        else:
+            w.in_step(here[slot.t], here[slot.taken])
+            w.run("pull_step", at, here[slot.t], here[slot.taken], at, g, by_known)
+        return last - 1, before, w.whole(g.room), w.whole(by_known.room), window
+
+    def window_of(carry):
+        first = carry[0] // slots * slots
+        last, *found, window = jax.lax.while_loop(lambda carry: carry[0] >= first, step_of, carry)
+
+        def again():
+            number = last // (slots * record.every)
+            begin = jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, number, 0, keepdims=False), record.beginnings)
+            passing = record._replace(going=begin, tries=number * slots * record.every, window=window)
+            return jax.lax.while_loop(lambda record: record.tries < first, recorded, passing).window
+
+        return last, *found, jax.lax.cond(last >= 0, again, lambda: window)
+
+    carry = record.tries - 1, end.passed, w.whole(g.room), w.whole(by_known.room), record.window
+    _, saved, found, by_known, _ = jax.lax.while_loop(lambda carry: carry[0] >= 0, window_of, carry)
+    return added(found, jnp.zeros(lanes, jnp.int32), saved), w.functions.leaves(by_known)

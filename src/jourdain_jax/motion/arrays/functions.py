@@ -1,0 +1,251 @@
+"""Functions of JAX in the place of those that machine code has of a scalar program, and a form by its numbers alone.
+
+Derivatives of a step are those of its source; what JAX finds are those of the functions themselves. A state is followed by its tangents (`layout.py`), and so
+is what all steps share: `pushed` gives values of a function with its tangents, by nested `jvp`.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from jourdain_jax.motion.arrays.writer import ArrayWriter, Pointer, Rows
+from jourdain_jax.motion.integrators import integrands
+from jourdain_jax.motion.native.layout import Form, copied, each_row
+from jourdain_jax.motion.vector_fields.field import Integrated
+
+
+@dataclass(frozen=True)
+class ArrayForm(Form):
+    """A form by its numbers alone: what has no program is known to its functions."""
+
+    program: None  # type: ignore[assignment]
+    coordinates: int = 0  # type: ignore[assignment]
+    speeds: int = 0  # type: ignore[assignment]
+    events: int = 0  # type: ignore[assignment]
+    turning: int = 0  # type: ignore[assignment]
+    squares: range = range(0)  # type: ignore[assignment]
+    relations: range = range(0)  # type: ignore[assignment]
+    watched: range = range(0)  # type: ignore[assignment]
+
+    @property
+    def monitored(self) -> range:  # type: ignore[override]
+        """Return what is watched at all stages of a step, as of a program."""
+        return range(self.pivots + self.turning + len(self.squares))
+
+    @property
+    def known(self) -> dict[str, int]:
+        """Return nothing: what is known are arrays that all steps share."""
+        return {}
+
+
+def pushed(f: Callable, parts: Sequence[Sequence]) -> list:
+    """Return values of `f` of the arrays of the first part, then their tangents, in the order of the parts; None stands for a tangent of zero."""
+    if len(parts) == 1:
+        return [f(*parts[0])]
+    half = len(parts) // 2
+    places = [(i, k) for i, part in enumerate(parts[half:]) for k, x in enumerate(part) if x is not None]
+    along = [parts[half + i][k] for i, k in places]
+
+    def moved(*arrays):
+        new = [list(part) for part in parts[:half]]
+        for (i, k), x in zip(places, arrays, strict=True):
+            new[i][k] = x
+        return pushed(f, new)
+
+    at = [jnp.zeros_like(dx) if (x := parts[i][k]) is None else x for (i, k), dx in zip(places, along, strict=True)]
+    found, tangents = jax.jvp(moved, at, along)
+    return found + tangents
+
+
+@dataclass
+class Functions:
+    """Functions of rates and rows in the place of those that machine code has of a program, on rows in memory."""
+
+    w: ArrayWriter
+    form: Form
+    watched: Callable | None  # (args, tau, y) -> numbers whose signs are
+    rest: tuple  # of the arguments of rates, without arrays
+    shared: tuple[Sequence, ...]  # these arrays, then tangents of them
+    asked: tuple[int, ...]  # of which of them cotangents are asked
+    method: Any
+    middle: Array | None = None  # of the step whose stages are worked out
+
+    def __post_init__(self) -> None:
+        self.y, self.count = Rows(0, self.form.y), self.form.y
+
+    def in_step(self, t, h) -> None:
+        """Take the rates as within this step: samples have one slope there."""
+        self.middle = t + 0.5 * h
+
+    def _args(self, shared: Sequence, middle: Array | None = None) -> PyTree:
+        return integrands.within(self.w.number(math.inf) if middle is None else middle, joined(self.rest, shared))
+
+    def _state(self, rows: Float[Array, "y *lanes"]) -> Integrated:
+        return Integrated.of(rows, self.form.coordinates, self.form.speeds)
+
+    def _rates(self, t, y, *shared) -> Float[Array, "y *lanes"]:
+        return integrands.rates(t, self._state(y), self._args(shared, self.middle)).rows
+
+    def _projected(self, t, y, *shared) -> Float[Array, "y *lanes"]:
+        return integrands.project(t, self._state(y), self._args(shared)).rows
+
+    def _events(self, t, y, *shared) -> Float[Array, "events *lanes"]:
+        return integrands.events(t, self._state(y), self._args(shared))
+
+    def _solved(self, t, h, y, *shared) -> tuple:
+        """The end of a step of an implicit method, an estimate of its error, and whether its equations were solved."""
+        before = self._state(y)
+        found = self.method.solve(self._args(shared, self.middle), t, before, h)
+        return jax.tree.map(jnp.add, before, found.change), found.error, found.solved
+
+    def _parts(self, state: Pointer, t, y: Pointer) -> list[list]:
+        """Time, the state in memory and what is shared, each with its tangents."""
+        times = [t, *(self.w.load(state, row) if self.form.time_moves else None for row in self.form.rows["dt"])]
+        of = [range(len(self.shared[0])), *self.form.moving]
+        shared = [dict(zip(which, part, strict=True)) for which, part in zip(of, self.shared, strict=True)]
+        return [[time, self.w.load(y, self.y + k * self.count), *map(part.get, of[0])] for k, (time, part) in enumerate(zip(times, shared, strict=True))]
+
+    def _store(self, found: Sequence, place: Pointer, rows: int) -> None:
+        for k, x in enumerate(found):
+            self.w.store(x, place, Rows(k * rows, rows))
+
+    # as machine code has them (`functions.py`, `projection.py`)
+
+    def rates(self, state: Pointer, t, y: Pointer, k: Pointer, monitored: Pointer) -> None:
+        """Slopes, and what is monitored."""
+        watching = Rows(0, len(self.form.monitored))
+
+        def watched(t, y, *shared):
+            found, pivots, directions, sine = integrands.rates_and_pivots(t, self._state(y), self._args(shared, self.middle))
+            seen = [jnp.reshape(x, (-1, *self.w.lanes)) for x in (pivots, directions)]
+            seen += [jnp.stack([sine**2, jnp.ones_like(sine)])] if self.form.squares else []
+            return found.rows, jax.lax.stop_gradient(jnp.concatenate(seen))
+
+        found = pushed(watched if watching.many else self._rates, self._parts(state, t, y))
+        if watching.many:
+            self.w.store(found[0][1][: watching.many], monitored, watching)
+            found = [slopes for slopes, _ in found]
+        self._store(found, k, self.count)
+
+    def project(self, state: Pointer, t, y: Pointer) -> None:
+        """Put a state back onto its rows."""
+        self._store(pushed(self._projected, self._parts(state, t, y)), y, self.count)
+
+    def along(self, state: Pointer, t, y: Pointer) -> None:
+        """Put the part along the rows in the place of an error after a state."""
+        at, error = self.w.load(y, self.y), self.w.load(y, self.y + self.count)
+        self.w.store(jax.jvp(lambda y: self._projected(t, y, *self.shared[0]), (at,), (error,))[1], y, self.y + self.count)
+
+    def events(self, state: Pointer, t, y: Pointer, slope: Pointer, c: Pointer, rate: Pointer) -> None:
+        """Values of stop events, and their rates along a slope of the state."""
+        at, along = (t, self.w.load(y, self.y)), (jnp.ones_like(t), self.w.load(slope, self.y))
+        for place, found in zip((c, rate), jax.jvp(lambda t, y: self._events(t, y, *self.shared[0]), at, along), strict=True):
+            self._store([found], place, self.form.events)
+
+    def event_tangents(self, state: Pointer, t, y: Pointer, dc: Pointer) -> None:
+        """Tangents of their values."""
+        self._store(pushed(self._events, self._parts(state, t, y))[1:], dc, self.form.events)
+
+    def relations(self, state: Pointer, t, y: Pointer, values: Pointer) -> None:
+        """Numbers whose signs are watched."""
+        found = self.watched(self._args(self.shared[0]), t, self._state(self.w.load(y, self.y)))  # type: ignore[misc]
+        self._store([found], values, len(self.form.watched))
+
+    # of implicit methods
+
+    def solve(self, state: Pointer, t, h, y1: Pointer, error: Pointer, told: Pointer) -> None:
+        """A step from the state of the lanes, its error where there is an estimate, and whether its equations were solved."""
+
+        def f(t, y, *shared):
+            after, estimate, solved = self._solved(t, h, y, *shared)
+            return after.rows, jax.lax.stop_gradient((jnp.zeros_like(after.rows) if estimate is None else estimate.rows, solved))
+
+        found = pushed(f, self._parts(state, t, state))
+        self._store([after for after, _ in found], y1, self.count)
+        (_, (estimate, solved)), *_ = found
+        self.w.store(estimate, error, self.y)
+        self.w.store(solved, told)
+
+    def onto_rows(self, state: Pointer, t, y: Pointer, told: Pointer) -> None:
+        """Put a state back onto its rows; how far that moved it, relative to the change by the step, is the second of the numbers `told`."""
+        free = self.w.load(y, self.y)
+        self.project(state, t, y)
+        rows = jax.lax.stop_gradient((self.w.load(state, self.y), free, self.w.load(y, self.y)))
+        ratios = []
+        for before, given, after in zip(*(jax.tree.leaves(self._state(x)) for x in rows), strict=True):
+            # 1e-6 of the size of the state: a step that changes less counts as one that changes so much
+            change = jnp.max(jnp.abs(after - before), initial=0.0) + 1e-6 * (1 + jnp.max(jnp.abs(after), initial=0.0))
+            ratios.append(jnp.max(jnp.abs(after - given), initial=0.0) / change)
+        self.w.store(jnp.max(jnp.stack(ratios)), told, 1)
+
+    # cotangents, of motions without tangents
+
+    def _pull(self, f: Callable, y: Pointer, g: Pointer, rows: int, to_y: Pointer, to_known: Pointer) -> None:
+        """Cotangents of what `f` finds become those of the state, and are added to those of what is asked for."""
+
+        def of(y, asked):
+            return f(y, *(dict(enumerate(self.shared[0])) | dict(zip(self.asked, asked, strict=True))).values())
+
+        by_y, by_shared = jax.vjp(of, self.w.load(y, self.y), self._asked())[1](self.w.load(g, Rows(0, rows)))
+        self.w.store(by_y, to_y, self.y)
+        if known := sum(self.sizes()):
+            lanes = len(self.w.lanes)
+            flat = [jnp.reshape(jnp.moveaxis(x, range(lanes), range(-lanes, 0)), (-1, *self.w.lanes)) for x in by_shared]
+            self.w.store(self.w.load(to_known, Rows(0, known)) + jnp.concatenate(flat), to_known, Rows(0, known))
+
+    def _asked(self) -> list[Array]:
+        return [self.shared[0][i] for i in self.asked]
+
+    def sizes(self) -> list[int]:
+        """Numbers of a lane in each array of which cotangents are asked."""
+        return [math.prod(x.shape[len(self.w.lanes) :]) for x in self._asked()]
+
+    def leaves(self, by_known: Array) -> list[Array]:
+        """Cotangents of each array that is asked for, its lanes first."""
+        lanes = len(self.w.lanes)
+        parts = jnp.split(by_known, [sum(self.sizes()[: k + 1]) for k in range(len(self.asked))])
+        return [jnp.reshape(jnp.moveaxis(part, range(-lanes, 0), range(lanes)), x.shape) for part, x in zip(parts, self._asked(), strict=False)]
+
+    def pull_rates(self, state: Pointer, t, y: Pointer, g: Pointer, to_y: Pointer, to_known: Pointer) -> None:
+        """Through slopes."""
+        self._pull(partial(self._rates, t), y, g, self.count, to_y, to_known)
+
+    def project_back(self, state: Pointer, t, free: Pointer, g: Pointer, added: Pointer) -> None:
+        """Through a projection."""
+        self._pull(partial(self._projected, t), free, g, self.count, g, added)
+
+    def pull_events(self, state: Pointer, t, y: Pointer, g: Pointer, to_y: Pointer, to_known: Pointer) -> None:
+        """Through values of stop events."""
+        self._pull(partial(self._events, t), y, g, self.form.events, to_y, to_known)
+
+    def pull_step(self, state: Pointer, t, h, y: Pointer, g: Pointer, added: Pointer) -> None:
+        """Through a step of an implicit method and its projection, where it was one."""
+
+        def f(y, *shared):
+            end = self._solved(t, h, y, *shared)[0].rows
+            return self._projected(t + h, end, *shared) if self.form.projects else end
+
+        took, known = h != 0.0, sum(self.sizes())
+        before, more = self.w.room(self.count), self.w.room(max(known, 1))
+        self._pull(f, y, g, self.count, before, more)
+        copied(self.w, self.count, before, g, took)
+        each_row(self.w, known, added, lambda i: self.w.load(added, i) + self.w.where(took, self.w.load(more, i), 0.0))
+
+
+def split(args: PyTree) -> tuple[tuple, tuple]:
+    """Return the arrays of a tree, and the tree with None in their place."""
+    leaves, treedef = jax.tree.flatten(args)
+    return tuple(filter(eqx.is_array, leaves)), (treedef, [None if eqx.is_array(x) else x for x in leaves])
+
+
+def joined(rest: tuple, arrays: Sequence) -> PyTree:
+    """Return the tree of which `split` made these."""
+    (treedef, leaves), left = rest, iter(arrays)
+    return treedef.unflatten([next(left) if x is None else x for x in leaves])

@@ -1,0 +1,67 @@
+"""A step of an implicit method (`implicit_steps.py`) on arrays, which run under `vmap` where there are lanes.
+
+Trials of the search for an event are steps of the method too; its last shifts, which are tiny, are steps of Tsit5, whose derivatives are those of the
+motion. A step whose equations are not solved has an infinite error. Methods of equal steps cannot try one again: what would refuse it ends the motion with a
+code of its own.
+"""
+
+import math
+from functools import partial
+
+from jourdain_jax.motion.arrays.writer import ArrayWriter, Pointer
+from jourdain_jax.motion.integrators.event_search import RUNNING, search_of
+from jourdain_jax.motion.integrators.explicit_steps import TSIT5, aimed, judged
+from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod, even_step
+from jourdain_jax.motion.native.layout import Lanes, copied, each_row
+from jourdain_jax.motion.native.step import Trial, norm, project, reach_of, seen, stages, unseen, worst
+from jourdain_jax.motion.trajectories import results
+
+
+def tried_by_equations(w: ArrayWriter, form, method: ImplicitMethod, p: Lanes, k: Pointer) -> Trial:
+    """Return a step; puts slopes at its start, its middle and its end into `k` where events or pivots need them."""
+    reach, y = reach_of(w, form, p, p["h"]), p.pointer
+    if method.even:
+        reach = w.smaller(reach, even_step(p["longest"], w.magnitude(p["goal"] - p["t"])))
+    aim = aimed(w, p, p["goal"], reach, p["search_shift"] if form.has_events else None)
+    y1, error, told = w.room(form.integrated), w.room(form.y), w.room(2)
+    w.in_step(p["t"], aim.h)
+    w.run("solve", y, p["t"], aim.h, y1, error, told)
+    solved = w.load(told) > 0.0
+    if form.has_events:
+        near = w.room(form.integrated)
+        stages(w, form, TSIT5, p, w.room(form.integrated * TSIT5.needed), p["t"], aim.h, near)
+        shifts = aim.locating & ~search_of(form, p).trying
+        copied(w, form.integrated, near, y1, shifts)
+        solved = solved | shifts
+    smallest, changed = w.number(math.inf), False
+    if form.monitored or form.has_events:
+        smallest, changed = _watched_within(w, form, p, k, y1, aim.h)
+    fault = w.where(solved, RUNNING * 1.0, float(results.UNSOLVED_STEP))
+    if form.projects and method.even:
+        w.run("onto_rows", y, aim.t_1, y1, told)
+        fault = w.where(solved & (w.load(told, 1) > results.MOST_PROJECTED), float(results.OFF_CONSTRAINTS), fault)
+    elif form.projects:
+        project(w, form, p, aim.t_1, y1, error)
+    size = w.number(0.0) if method.even else norm(w, form, p, error, y1)
+    if form.monitored:
+        fault = w.where(solved & changed, float(results.SINGULAR_PARTITION), fault)
+    size = w.where(w.differs(fault, RUNNING) & ~aim.locating, math.inf, size)
+    accept, next_h = judged(w, w.power, p, aim, size, method.order)
+    fails = ~accept if method.even else aim.locating & w.equal(fault, results.UNSOLVED_STEP)
+    return Trial(aim, y1, accept, next_h, smallest if form.pivots else None, fails, fault, method.even)
+
+
+def _watched_within(w: ArrayWriter, form, p: Lanes, k: Pointer, y1: Pointer, h) -> tuple:
+    """Return the smallest magnitude of a pivot at the ends and the middle of a step, and whether one changed its sign, or a row turned round."""
+    at, pivots, halves, every = w.room(form.integrated), w.room(max(len(form.monitored), 1)), w.table([0.0, 0.5, 1.0]), form.integrated
+
+    def state(i, row):
+        start = w.load(p.pointer, row)
+        return w.fma(halves[i], w.load(y1, row) - start, start)
+
+    def look(i, known: tuple) -> tuple:
+        each_row(w, every, at, partial(state, i))
+        w.run("rates", p.pointer, w.fma(halves[i], h, p["t"]), at, w.at(k, i * every), pivots)
+        return seen(w, form, i, pivots, known)
+
+    return worst(w, w.over_stages(3, look, unseen(w, form)))

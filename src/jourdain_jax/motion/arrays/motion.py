@@ -1,0 +1,122 @@
+"""The loop on arrays (`loop.py`) as a function of JAX, with its derivatives: in forward mode a motion with tangents, in reverse mode one gone back over.
+
+Lanes that `vmap` makes run side by side, some at a time, where the rates take lanes.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, PyTree
+
+from jourdain_jax.motion.arrays.back import cotangents
+from jourdain_jax.motion.arrays.functions import ArrayForm, split
+from jourdain_jax.motion.arrays.loop import Loop
+from jourdain_jax.motion.integrators import integrands
+from jourdain_jax.motion.integrators.explicit_steps import Method
+from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
+from jourdain_jax.motion.native.loop import Found, Start, differentiated
+from jourdain_jax.motion.native.native_motion import control_of, moved
+from jourdain_jax.motion.setup import Begun, Setup
+from jourdain_jax.motion.vector_fields.field import Integrated
+
+
+def loop_of(method: Method | ImplicitMethod, setup: Setup, begun: Begun, relations: tuple[Callable | None, int]) -> tuple[Loop, Start]:
+    """The loop, and the start of one motion; `relations`: the numbers whose signs are watched, and how many are those of relations."""
+    goals, knots, field, y0, names = setup.goals(setup.ts), setup.knots, setup.field, begun.y0, setup.integrator.event_names
+    args, most, eps = integrands.within(goals[0], begun.args), setup.most_steps(knots), float(jnp.finfo(y0.q.dtype).eps)
+    count = lambda f: len(jax.eval_shape(f, goals[0], y0, args))  # noqa: E731
+    seen = jax.eval_shape(integrands.rates_and_pivots, goals[0], y0, args) if field.has_pivots else None
+    watched, several = relations
+    form = ArrayForm(
+        None,
+        field.with_work,
+        field.projects,
+        True,
+        bool(names),
+        len(seen.pivots) if seen else 0,
+        coordinates=len(y0.q),
+        speeds=len(y0.v),
+        events=count(integrands.events) if names else 0,
+        turning=seen.directions.size if seen else 0,
+        squares=range(2 * field.near_rank_loss),
+        relations=range(several),
+        watched=range(count(lambda t, y, args: watched(args, t, y)) if watched else 0),
+        compensated=most * eps > eps**0.5,  # what is rounded off in so many steps may be more than half of the digits
+    )
+    known, rest = split(begun.args)
+    numbers = jax.lax.stop_gradient((() if knots is None else (knots,), control_of(setup, knots), goals, jnp.zeros_like(goals[0])))
+    return Loop(form, method, watched, rest, most), Start(*numbers, y=(y0.rows,), known=(known,))
+
+
+def flow(of: Loop, at_once: int) -> Callable[[Start], Found]:
+    """The motion of a start; `at_once`: how many lanes run side by side, 0: those of `vmap`."""
+    return differentiated(lambda form: _motion(of._replace(form=form), at_once), of.form, lambda form, along: None)
+
+
+def _motion(of: Loop, at_once: int) -> Callable[[Start], Found]:
+    if not at_once:
+        return of.run
+    motion = jax.custom_batching.custom_vmap(of.run)
+
+    @motion.def_vmap
+    def motions(count: int, batched: Sequence, start: Start):
+        return _in_blocks(count, at_once, of.run, batched, start).shared(*batched)
+
+    return motion
+
+
+def flow_back(of: Loop, at_once: int, asked: Sequence[int], memory: int) -> Callable:
+    """Return a function of a start and cotangents (of the states, the end, its time): those of the start's state and of the `asked` among what is known."""
+    back = partial(cotangents, of, asked, memory)
+    if not at_once:
+        return back
+    motion = jax.custom_batching.custom_vmap(back)
+
+    @motion.def_vmap
+    def motions(count: int, batched: Sequence, *given):
+        def lanes_last(*given):
+            by_y, by_known = back(*given)
+            return by_y, [jnp.moveaxis(x, 0, -1) for x in by_known]
+
+        found = _in_blocks(count, at_once, lanes_last, batched, *given)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return motion
+
+
+def _in_blocks(count: int, at_once: int, run: Callable, batched: Sequence, *given):
+    """`run` of so many lanes at once: their axis comes first outside and last inside, but in what is known."""
+    given = jax.tree.map(lambda x, has: x if has else jnp.broadcast_to(x, (count, *x.shape)), given, tuple(batched))
+    blocks = -(-count // at_once)
+    last = lambda tree: jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), tree)  # noqa: E731
+
+    def block(given):
+        start, *others = given
+        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), run(last(start)._replace(known=start.known), *last(others)))
+
+    if blocks == 1:
+        return block(given)
+    index = jnp.minimum(jnp.arange(blocks * at_once), count - 1).reshape(blocks, at_once)
+    found = jax.lax.map(block, jax.tree.map(lambda x: x[index], given))
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], found)
+
+
+def mover(args: PyTree) -> Callable[[Integrated, Array, Array], Integrated]:
+    """The state at a time t, as a function of it, of t, and of a time d that is zero, by which it is moved along its rates."""
+    known, others = eqx.partition(args, eqx.is_inexact_array)
+
+    def moved_by(y, t, d):
+        z, unravel = ravel_pytree((y, t, known))
+
+        def rates(z):
+            y, t, known = unravel(z)
+            found = integrands.rates(t, y, integrands.within(jnp.full_like(t, jnp.inf), eqx.combine(known, others)))
+            return ravel_pytree((found, jnp.ones_like(t), jax.tree.map(jnp.zeros_like, known)))[0]
+
+        return unravel(moved(rates)(z, d))[0]
+
+    return moved_by

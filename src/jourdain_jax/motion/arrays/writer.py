@@ -1,0 +1,195 @@
+"""The writer by which the source of a step (`motion/native/step.py`) runs on arrays of JAX.
+
+Lanes are the last axes of arrays, stages are one loop with one copy of the rates to compile, and a branch is `lax.cond`. What a branch or a loop stores to
+is found by tracing it first.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import count
+from typing import Any, NamedTuple
+
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+
+class Rows(NamedTuple):
+    """Many rows in the place of one."""
+
+    first: Any
+    many: int
+
+    def __add__(self, by) -> "Rows":
+        """Return as many rows, so many further on."""
+        return Rows(self.first + by, self.many)
+
+
+@dataclass(eq=False)
+class Room:
+    """Rows in memory: each an array by itself, or (an array of several, its place there)."""
+
+    rows: list
+    number: int  # of the rooms that a writer has made
+
+
+class Pointer(NamedTuple):
+    """A row of a room."""
+
+    room: Room
+    first: Any
+
+
+class ArrayWriter:
+    """The source on arrays of JAX. `functions`: what `run` calls, by name."""
+
+    real, truth = "real", "truth"
+    where, magnitude, larger, smaller, root = map(staticmethod, (jnp.where, jnp.abs, jnp.maximum, jnp.minimum, jnp.sqrt))
+    equal, differs, is_nan, power = map(staticmethod, (jnp.equal, jnp.not_equal, jnp.isnan, jnp.power))
+
+    def __init__(self, like: Array, functions: Any = None) -> None:
+        self.functions, self._numbers = functions, count()
+        self.lanes, self.dtype, self.eps = like.shape, like.dtype, float(jnp.finfo(like.dtype).eps)
+        self._stored: dict[Room, list] = {}  # rooms that were stored to, as they were before
+
+    def number(self, value: float) -> Array:
+        """Return a number in all lanes."""
+        return jnp.full(self.lanes, value, self.dtype)
+
+    def literal(self, value: Any, type: str) -> Any:
+        """Return a number, or a truth value."""
+        return bool(value) if type == self.truth else value
+
+    def fma(self, a, b, c):
+        """Return a b + c."""
+        return a * b + c
+
+    def run(self, function: str, *arguments) -> None:
+        """Call the function of this name."""
+        getattr(self.functions, function)(*arguments)
+
+    # memory
+
+    def _holding(self, rows: list) -> Pointer:
+        return Pointer(Room(rows, next(self._numbers)), 0)
+
+    def room(self, rows: int = 1) -> Pointer:
+        """Return memory for some rows, zero at first."""
+        return self._holding([jnp.zeros(self.lanes, self.dtype)] * rows)
+
+    def holding(self, *parts: Array) -> Pointer:
+        """Return memory that holds arrays of rows, one after the other."""
+        return self._holding([(part, i) for part in parts for i in range(len(part))])
+
+    def at(self, pointer: Pointer, index) -> Pointer:
+        """Return the place of the row with this index."""
+        return Pointer(pointer.room, pointer.first + index)
+
+    def _place(self, pointer: Pointer, index) -> tuple[Any, int]:
+        """The first row, and how many."""
+        return (pointer.first + index.first, index.many) if isinstance(index, Rows) else (pointer.first + index, 1)
+
+    def load(self, pointer: Pointer, index=0) -> Array:
+        """Return a row, or rows as one array."""
+        first, count = self._place(pointer, index)
+        if isinstance(first, jax.Array):
+            found = jax.lax.dynamic_slice_in_dim(self.whole(pointer.room), first, count)
+            return found if isinstance(index, Rows) else found[0]
+        rows = pointer.room.rows
+        return self._of(rows[first : first + count]) if isinstance(index, Rows) else self._row(rows[first])
+
+    def store(self, value, pointer: Pointer, index=0) -> None:
+        """Put a row, or several, into memory."""
+        (first, rows), room = self._place(pointer, index), pointer.room
+        value = jnp.broadcast_to(jnp.asarray(value, self.dtype), (rows, *self.lanes))
+        self._stored.setdefault(room, list(room.rows))
+        if isinstance(first, jax.Array):
+            value, first = jax.lax.dynamic_update_slice_in_dim(self.whole(room), value, first, 0), 0
+        room.rows[first : first + len(value)] = [(value, i) for i in range(len(value))]
+
+    def _row(self, row) -> Array:
+        return row[0][row[1]] if isinstance(row, tuple) else row
+
+    def _of(self, rows: list) -> Array:
+        array, first = rows[0] if rows and isinstance(rows[0], tuple) else (None, 0)
+        if array is not None and all(isinstance(row, tuple) and row[0] is array and row[1] == first + i for i, row in enumerate(rows)):
+            return array if len(rows) == len(array) else array[first : first + len(rows)]
+        return jnp.stack([self._row(row) for row in rows])
+
+    def whole(self, room: Room) -> Array:
+        """Return all rows of a room."""
+        return self._of(room.rows)
+
+    # branches and loops
+
+    def _traced(self, body: Callable) -> tuple[list[Room], Any]:
+        """Return the rooms there are that the body stores to, which are then as before, and the shapes of what it returns."""
+        outer, self._stored = self._stored, {}
+        newest, shapes = next(self._numbers), jax.eval_shape(body)
+        stored, self._stored = self._stored, outer
+        for room, rows in stored.items():
+            room.rows = rows
+        return [room for room in stored if room.number < newest], shapes
+
+    def _within(self, rooms: list[Room], arrays: list[Array], body: Callable) -> tuple[list[Array], Any]:
+        """Return the rooms after the body, and what it returns."""
+        for room, array in zip(rooms, arrays, strict=True):
+            self._stored.setdefault(room, list(room.rows))
+            room.rows = [(array, i) for i in range(len(array))]
+        found = body()
+        return [self.whole(room) for room in rooms], found
+
+    def if_any(self, condition: Array | bool, body: Callable[[], object]) -> None:
+        """Run the body where the condition holds in any lane."""
+        rooms, _ = self._traced(lambda: body() and None)
+        arrays = [self.whole(room) for room in rooms]
+        yes = eqxi.unvmap_any(jnp.any(condition))
+        found = jax.lax.cond(yes, lambda arrays: self._within(rooms, arrays, body)[0], lambda arrays: arrays, arrays)
+        self._within(rooms, found, lambda: None)
+
+    def over_stages(self, stages: int, body: Callable[[Any, Any], Any], found: Any) -> Any:
+        """Return what the body makes of what was found, stage by stage."""
+        rooms, shapes = self._traced(lambda: body(jnp.zeros((), jnp.int32), found))
+        found = jax.tree.map(lambda x, like: jnp.broadcast_to(jnp.asarray(x, like.dtype), like.shape), found, shapes)
+        begin = [self.whole(room) for room in rooms], found
+        arrays, found = jax.lax.fori_loop(0, stages, lambda i, carry: self._within(rooms, carry[0], lambda: body(i, carry[1])), begin)
+        self._within(rooms, arrays, lambda: None)
+        return found
+
+    def each(self, rows: range, body: Callable[[Rows], object]) -> None:
+        """Call the body for all rows at once."""
+        if rows:
+            body(Rows(rows.start, len(rows)))
+
+    def in_step(self, t: Array, h: Array) -> None:
+        """Begin with the stages of a step."""
+        self.functions.in_step(t, h)
+
+    # what the source of a step asks of stages and rows
+
+    def is_first(self, i) -> bool:
+        """Return whether this is known to be the first stage."""
+        return False
+
+    def at_first(self, i, first, otherwise):
+        """Return `first` in the first stage, otherwise the other."""
+        return jnp.where(i == 0, first, otherwise)
+
+    def table(self, numbers) -> Array:
+        """Return numbers that stages look up, whole ones as such."""
+        found = np.asarray(numbers)
+        return jnp.asarray(found, self.dtype if found.dtype.kind == "f" else jnp.int32)
+
+    def may_count(self, weights, j: int) -> bool:
+        """Return whether a weight may be other than zero."""
+        return isinstance(weights, jax.Array) or bool(weights[j] != 0)
+
+    def sum_of_squares(self, rows: range, value: Callable[[Rows], Array]) -> Array:
+        """Return the sum of the squares of the values of all rows."""
+        return jnp.sum(value(Rows(rows.start, len(rows))) ** 2, axis=0)
+
+    def largest(self, rows: range, value: Callable[[Rows], Array]) -> Array:
+        """Return the largest of the values of all rows, none of which is negative."""
+        return jnp.max(value(Rows(rows.start, len(rows))), axis=0, initial=0.0)
