@@ -134,6 +134,13 @@ def test_a_damaged_chunk_is_found_and_computed_again(harm, whole, path, computed
     assert_same(found, whole)
 
 
+def test_a_study_of_which_no_receipt_is_left_has_no_numbers(path):
+    for receipt in (path / "run" / "chunks").iterdir():
+        receipt.write_bytes(b"torn")
+    with pytest.raises(ValueError, match=f"no chunk of `{path}` is done yet"):
+        jj.load_study(path).statistics  # noqa: B018
+
+
 @pytest.mark.parametrize("harm", [Path.unlink, lambda file: file.write_text("{"), lambda file: file.write_text("{}")])
 def test_a_damaged_grid_of_a_whole_study_is_found_again(harm, whole, path, computed):
     harm(path / "run" / "grid.json")

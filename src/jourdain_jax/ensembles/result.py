@@ -110,7 +110,7 @@ class StudyResult(Printed):
     def statistics(self) -> Statistics:
         """Means, covariances, histograms and extremes of the outputs over the lanes that have them."""
         grid = self.store.read_grid()
-        if grid is None:
+        if grid is None or not self._done:
             raise ValueError(f"no chunk of `{self.store.path}` is done yet, or `run/grid.json` is damaged; run the study first, which finds it again")
         return combined(self.outputs, Grid.from_dict(grid, len(self.outputs)), self._tally)
 
