@@ -134,6 +134,7 @@ def _arguments(op) -> tuple[np.ndarray, np.ndarray]:
         y = np.where(np.abs(y * np.log(x)) < 700, y, 0.5)
     domain = {"log": x > 0, "log1p": x > -1, "asin": np.abs(x) <= 1, "acos": np.abs(x) <= 1, "x^1.5": (x < 1e200) & (x > 1e-180)}
     domain |= {"atan2": np.abs(x) > 1e-290 * np.abs(y)} | dict.fromkeys(GROWING, np.abs(x) < 709)
+    domain |= {"acosh": x >= 1, "atanh": np.abs(x) < 1, "rem": (y != 0) & (np.abs(x) < 1e40 * np.abs(y))}
     inside = domain.get(op, np.isfinite(x))
     return x[inside], y[inside]
 

@@ -7,7 +7,6 @@ Code from others would run in this process: a folder or a file that somebody els
 
 import contextlib
 import ctypes
-import ctypes.util
 import functools
 import hashlib
 import os
@@ -21,7 +20,6 @@ from typing import Any
 import jax
 
 from jourdain_jax.calculus.files import whole_number, write_whole
-from jourdain_jax.native.math_functions import LIBM, PREFIX
 
 llvm: Any = None
 _NOT_IMPORTED = "llvmlite is not installed"
@@ -45,7 +43,7 @@ _lock = threading.Lock()
 _engines: list = []  # what machine code lives in: as long as the process, which may call it
 
 
-# Functions of C that machine code calls besides those of libm. LLVM ends the process where it finds one of them missing.
+# Functions of C that machine code calls. LLVM ends the process where it finds one of them missing.
 _CALLED = ("aligned_alloc", "free", "memcpy", "memset", "pthread_attr_init", "pthread_attr_setstacksize", "pthread_create", "pthread_join")
 # A module with what llvmlite must be able to read: those of LLVM 15 and older are not.
 _TRIAL = "define <2 x double> @trial(ptr %at) {\n  %x = load <2 x double>, ptr %at\n  %y = fadd <2 x double> %x, splat (double 1.0)\n  ret <2 x double> %y\n}\n"
@@ -61,11 +59,9 @@ def reason_against() -> str:
     try:
         llvm.initialize_native_target()
         llvm.initialize_native_asmprinter()
-        process, libm = ctypes.CDLL(None), ctypes.CDLL(ctypes.util.find_library("m"))
+        process = ctypes.CDLL(None)
         for name in _CALLED:
             getattr(process, name)
-        for name in LIBM.values():
-            llvm.add_symbol(PREFIX + name, ctypes.cast(getattr(libm, name), ctypes.c_void_p).value)
         address(object_code(_TRIAL, 0), "trial")
     except Exception as error:  # whatever a system lacks: motions are integrated by XLA there
         version, said = ".".join(map(str, llvm.llvm_version_info)), str(error).split("\n")[0]

@@ -7,7 +7,7 @@
     sinh x = (d + d/(1 + d))/2,  d = e^x - 1;   cosh x = (e^x + e^-x)/2;   1/(1 + e^-x) = e^x/(1 + e^x)
 
 p and log x come in two parts, the second to some 70 bits below the first's leading one, as powers need. The polynomials P are mpmath's `chebyfit` of 11 and 7
-terms; a test finds them again. Errors are below 0.9 ulp. What is seldom used is called in C's library, lane by lane.
+terms; a test finds them again. Errors are below 0.9 ulp.
 """
 
 import math
@@ -15,7 +15,7 @@ import struct
 from collections.abc import Callable
 from functools import partial
 
-from jourdain_jax.calculus.scalar_operations import COMPARISONS, TABLE
+from jourdain_jax.calculus.scalar_operations import COMPARISONS
 from jourdain_jax.native import angles
 from jourdain_jax.native.angles import WHOLE, polynomial, product_less, quotient, two_product, two_sum
 from jourdain_jax.native.ir import Value, Writer
@@ -136,14 +136,82 @@ def logarithm(w: Writer, x: Value) -> Value:
     return w.where(x >= 0.0, value, math.nan)
 
 
-def logarithm_of_more_than_one(w: Writer, x: Value) -> Value:
-    """log(1 + x)"""
+def _logarithm_of_more(w: Writer, x: Value, more: Value | float = 0.0, plus: Value | float = 0.0) -> Value:
+    """log(1 + x + more) + plus, where `more` is small beside x, and `plus` is no larger than the logarithm."""
     near = 1.0 + x
     head, less = _logarithm(w, near)
-    found = head + (less + w.where(x < 1.0, (1.0 - near) + x, (x - near) + 1.0) / near)
+    found = head + ((less + (w.where(x < 1.0, (1.0 - near) + x, (x - near) + 1.0) + more) / near) + plus)
     found = w.where((near > 0.0) & (near < math.inf), found, head)
-    found = w.where(near >= 0.0, found, math.nan)
-    return w.where(w.magnitude(x) < 2.0**-54, x, found)
+    return w.where(near >= 0.0, found, math.nan)
+
+
+def logarithm_of_more_than_one(w: Writer, x: Value) -> Value:
+    """log(1 + x)"""
+    return w.where(w.magnitude(x) < 2.0**-54, x, _logarithm_of_more(w, x))
+
+
+def _sum(w: Writer, a: Value, b: Value | float) -> tuple[Value, Value]:
+    """a + b, of which either may be the larger one; none is negative."""
+    return two_sum(w.larger(a, w.literal(b, a.type)), w.smaller(a, w.literal(b, a.type)))
+
+
+def _root(w: Writer, head: Value, less: Value) -> tuple[Value, Value]:
+    root = w.root(head)
+    return root, w.where(root > 0.0, 0.5 * (less - product_less(w, root, root, head)) / root, 0.0)
+
+
+def _logarithm_with(w: Writer, a: Value, x: Value, more: Value) -> Value:
+    """log(1 + x + more), which is log 2a where a is large"""
+    large = a > 2.0**30
+    return _logarithm_of_more(w, w.where(large, a - 1.0, x), w.where(large, 0.0, more), w.where(large, math.log(2.0), w.number(0.0)))
+
+
+def hyperbolic_arcsine(w: Writer, x: Value) -> Value:
+    """asinh x = log(1 + a + a^2/(1 + sqrt(1 + a^2))), where a = |x|"""
+    a = w.magnitude(x)
+    square, less = two_product(w, a, a)
+    total, rest = _sum(w, square, 1.0)
+    q, over = quotient(w, (square, less), _plus(1.0, *_root(w, total, rest + less)))
+    head, rest = two_sum(a, q)
+    return w.where(a < 2.0**-28, x, w.intrinsic("copysign", _logarithm_with(w, a, head, rest - over), x))
+
+
+def hyperbolic_arccosine(w: Writer, x: Value) -> Value:
+    """acosh x = log(1 + t + sqrt(t^2 + 2t)), where t = x - 1"""
+    t = x - 1.0
+    square, less = two_product(w, t, t)
+    total, rest = _sum(w, square, t + t)
+    root, more = _root(w, total, rest + less)
+    head, rest = two_sum(root, t)
+    return w.where(x >= 1.0, _logarithm_with(w, x, head, rest + more), math.nan)
+
+
+def hyperbolic_arctangent(w: Writer, x: Value) -> Value:
+    """atanh x = log(1 + 2a/(1 - a))/2, where a = |x|"""
+    a = w.magnitude(x)
+    q, over = quotient(w, (a + a, w.number(0.0)), two_sum(1.0, -a))
+    return w.where(a < 2.0**-28, x, w.intrinsic("copysign", 0.5 * _logarithm_of_more(w, q, -over), x))
+
+
+def cube_root(w: Writer, x: Value) -> Value:
+    """x^(1/3)"""
+    return w.intrinsic("copysign", _raised(w, w.magnitude(x), w.number(_THIRD[0]), _THIRD[1]), x)
+
+
+def remainder(w: Writer, x: Value, y: Value) -> Value:
+    """x less as many whole y as take it towards zero, without round-off: 50 bits of how many at a time."""
+    a, b = w.room(), w.magnitude(y)
+    w.store(w.magnitude(x), a)
+    right = (b > 0.0) & (w.load(a) < math.inf)
+    with w.repeated() as leave:
+        left = w.load(a)
+        more = right & (left >= b)
+        leave(~w.any(more))
+        shift = w.larger(_mantissa(w, left)[0] - _mantissa(w, b)[0] - 50.0, w.number(0.0))
+        part = _scaled(w, b, w.converted("fptosi", w.where(more, shift, 0.0), w.whole))
+        rest = -product_less(w, w.intrinsic("floor", left / part), part, left)
+        w.store(w.where(more, w.where(rest < 0.0, rest + part, rest), left), a)
+    return w.where(right, w.intrinsic("copysign", w.load(a), x), math.nan)
 
 
 def half_power(w: Writer, x: Value) -> Value:
@@ -161,14 +229,17 @@ def three_halves_power(w: Writer, x: Value) -> Value:
     return w.where((x < 2.0**650) & (x > 2.0**-600), head + rest, w.where(x.equals(-math.inf), math.inf, head))
 
 
-def real_power(w: Writer, x: Value, y: Value) -> Value:
-    """x^y"""
-    a, exponent = w.magnitude(x), _within(w, y, -(2.0**100), 2.0**100)
+def _raised(w: Writer, a: Value, exponent: Value, more: float = 0.0) -> Value:
+    """a^(exponent + more), for an a that is not negative."""
     log, less = _logarithm(w, a)
     head = exponent * log
-    near = w.magnitude(head) < 800.0
-    rest = w.where(near, w.fma(exponent, less, product_less(w, exponent, log, head)), 0.0)
-    found = _exponential(w, _within(w, head, -800.0, 800.0), rest)
+    rest = w.fma(exponent, less, product_less(w, exponent, log, head)) + more * log
+    return _exponential(w, _within(w, head, -800.0, 800.0), w.where(w.magnitude(head) < 800.0, rest, 0.0))
+
+
+def real_power(w: Writer, x: Value, y: Value) -> Value:
+    """x^y"""
+    found = _raised(w, w.magnitude(x), _within(w, y, -(2.0**100), 2.0**100))
     whole, half = w.intrinsic("roundeven", y).equals(y), 0.5 * y
     odd = whole & w.intrinsic("roundeven", half).differs(half)
     found = w.where(odd, w.intrinsic("copysign", found, x), found)
@@ -246,19 +317,6 @@ def logistic(w: Writer, x: Value) -> Value:
     return q - over
 
 
-PREFIX = "jourdain_libm_"  # of libm's functions in a module
-
-
-def by_libm(name: str, w: Writer, *args: Value) -> Value:
-    """A function of libm, lane by lane."""
-    result = w.number(math.nan)
-    for lane in range(w.lanes):
-        ones = [w.instruction("double", f"extractelement {a.type} {a.name}, i64 {lane}") for a in args]
-        one = w.external(PREFIX + name, "double", *ones)
-        result = w.instruction(result.type, f"insertelement {result.type} {result.name}, double {one.name}, i64 {lane}")
-    return result
-
-
 def _sign(w: Writer, x: Value) -> Value:
     return w.where(x > 0.0, 1.0, w.where(x < 0.0, -1.0, 0.0 * x))  # NaN stays; what compares as zero is zero
 
@@ -296,6 +354,11 @@ BY_POLYNOMIALS: dict[str, Callable[..., Value]] = {
     "cosh": hyperbolic_cosine,
     "tanh": hyperbolic_tangent,
     "logistic": logistic,
+    "asinh": hyperbolic_arcsine,
+    "acosh": hyperbolic_arccosine,
+    "atanh": hyperbolic_arctangent,
+    "cbrt": cube_root,
+    "rem": remainder,
 }
 
 
@@ -310,8 +373,4 @@ def _power(w: Writer, x: Value, y: Value) -> Value:
     return _shared("pow", w, x, y)
 
 
-# Those of C's library, by the names that they have there; of sines, cosines, tangents and arcs beyond the range of the polynomials.
-LIBM = {name: operation.c or name for name, operation in TABLE.items() if operation.is_number and name not in _BY_INSTRUCTIONS and "{" not in operation.c}
-ONLY_IN_C = frozenset(LIBM) - frozenset(BY_POLYNOMIALS) - {"sin", "cos"}  # which a GPU has not
-FUNCTIONS = {name: partial(by_libm, in_c) for name, in_c in LIBM.items()} | {name: partial(_shared, name) for name in BY_POLYNOMIALS}
-FUNCTIONS |= {"pow": _power} | _BY_INSTRUCTIONS
+FUNCTIONS: dict[str, Callable[..., Value]] = {name: partial(_shared, name) for name in BY_POLYNOMIALS} | {"pow": _power} | _BY_INSTRUCTIONS

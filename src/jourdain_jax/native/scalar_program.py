@@ -13,12 +13,10 @@ from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Any
 
-import jax
-
 from jourdain_jax.native import host
 from jourdain_jax.native.angles import sine_and_cosine
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.math_functions import FUNCTIONS, ONLY_IN_C
+from jourdain_jax.native.math_functions import FUNCTIONS
 from jourdain_jax.program.graph import ARRAYS, Graph
 
 
@@ -80,7 +78,7 @@ _TRUTHS = {"and": "and", "or": "or"}
 
 def unsupported(graph: Graph, nodes: Iterable[int]) -> str:
     """Why the nodes cannot be written as machine code; empty where they can."""
-    known = {*FUNCTIONS, *_TRUTHS, *ARRAYS, "not", "select", "const", "input"} - (ONLY_IN_C if jax.default_backend() == "gpu" else set())
+    known = {*FUNCTIONS, *_TRUTHS, *ARRAYS, "sin", "cos", "not", "select", "const", "input"}
     for node in graph.reachable(nodes):
         if graph.op[node] in ARRAYS or graph.op[node] == "entry":
             return "a part of it is kept as a call of JAX"
