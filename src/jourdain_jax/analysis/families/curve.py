@@ -47,8 +47,8 @@ def solved(
     return None
 
 
-def along(equations: Motions, point: Point, s: float, guess: Vector | None = None) -> Point | None:
-    """The point of the curve at a distance along the tangent of another one; None where none is found."""
+def along(equations: Motions, point: Point, s: float, guess: Vector | None = None, with_modes: bool = True) -> Point | None:
+    """The point of the curve at a distance along the tangent of another one; None where none is found. Without modes it has those of the other one."""
     t = point.tangent
     found = solved(equations, point.z + s * t if guess is None else guess, t[None], t[None] @ point.z + s)
     if found is None:
@@ -56,7 +56,8 @@ def along(equations: Motions, point: Point, s: float, guess: Vector | None = Non
     z, look, hardness = found
     across = np.linalg.svd(look.J)[2][-1]
     tangent = across * (1.0 if across @ t >= 0 else -1.0)
-    return Point(z, tangent, look, matched(point.modes, equations.eigenvalues(look, tangent)), hardness)
+    modes = matched(point.modes, equations.eigenvalues(look, tangent)) if with_modes else point.modes
+    return Point(z, tangent, look, modes, hardness)
 
 
 def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tuple[list[Point], str]:
@@ -114,8 +115,8 @@ def reversed_at(point: Point) -> Point:
     return replace(point, tangent=-point.tangent)
 
 
-def located(equations: Motions, here: Point, there: Point, test: Callable[[Point], float]) -> Point | None:
-    """The point between two neighbours at which a smooth `test` changes its sign; None where the curve is lost.
+def located(equations: Motions, here: Point, there: Point, test: Callable[[Point], float], with_modes: bool = False) -> Point | None:
+    """The point between two neighbours at which a smooth `test`, of modes or not, changes its sign; None where the curve is lost.
 
     By unequal halves down to a short piece, and on this along the chord: at a branch point itself the equations lose their rank, and for reasons of symmetry
     it often lies in the middle.
@@ -125,7 +126,7 @@ def located(equations: Motions, here: Point, there: Point, test: Callable[[Point
     at_a, at_b = test(low), test(high)
     while b - a > short:
         c = a + share * (b - a)
-        middle = along(equations, here, c, low.z + share * (high.z - low.z))  # a better guess than the tangent: another branch may be close
+        middle = along(equations, here, c, low.z + share * (high.z - low.z), with_modes)  # a better guess than the tangent: another branch may be close
         if middle is None:
             return None
         value = test(middle)

@@ -85,6 +85,8 @@ class Motions(ABC):
 
     def with_held(self, R: np.ndarray, J: np.ndarray, z: Vector, small: tuple) -> Look:
         """The equations, with a row for each unknown that keeps its value."""
+        if not len(self.held):
+            return Look(R, J * self.size, small)
         return Look(np.append(R, (z - self.start)[self.held]), np.vstack([J * self.size, np.eye(len(z))[self.held]]), small)
 
 

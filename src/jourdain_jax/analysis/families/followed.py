@@ -29,7 +29,7 @@ def special(equations: Motions, points: Sequence[Point], turning: dict[str, int]
     for here, there in pairwise(points):
         found = []
         for crossing in (*branches(here, there), *folds(here, there, turning), *changes(equations, here, there)):
-            point = located(equations, here, there, crossing.test)
+            point = located(equations, here, there, crossing.test, bool(crossing.columns))
             found.append((crossing, point) if point else (replace(crossing, kind=f"{crossing.kind}, before this point"), there))
         branch = next((point for crossing, point in found if crossing.kind == "branch point"), None)
         if branch is not None:  # beside it tangents have few digits: what lies as close as this lies there
