@@ -91,7 +91,7 @@ class OwnSteps(Integrator):
         states = native_motion.cotangents_of_states(g)
         by_y, by_known = on_arrays.flow_back(of, at_once, asked, self.memory)(start, states, g.y_end.rows, g.t_end)
         args = joined(of.rest, [dict(zip(asked, by_known, strict=True)).get(i) for i in range(len(varies))])
-        return _by_start(perturbed, arguments, native_motion.state(of.form, by_y), lambda by_args: args)
+        return _by_start(perturbed, arguments, Integrated.of(by_y, of.form), lambda by_args: args)
 
     def _form(self, setup: Setup) -> Form:
         return native_motion.form_of(setup.field, setup.inputs, bool(self.event_names))

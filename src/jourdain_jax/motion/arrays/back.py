@@ -48,17 +48,11 @@ def cotangents(of: Loop, asked: Sequence[int], memory: int, start: Start, g_ys: 
     def room(rows: int, most: int) -> int:
         return max(SLOTS // 16, min(most, memory // (32 * rows * math.prod(lanes))))
 
-    slots = min(room(slot.all, SLOTS), most)
+    slots = room(slot.all, SLOTS)
     kept = 2 * room(2 * form.all, most // (2 * slots) + 1)
-
-    def thinned(beginnings: PyTree) -> PyTree:
-        return jax.tree.map(lambda x: jnp.concatenate([x[:-1:2], x[kept // 2 :]]), beginnings)
 
     def recorded(record: _Record) -> _Record:
         going, tries, window, beginnings, every = record
-        is_full = tries == kept * slots * every
-        beginnings = jax.lax.cond(is_full, thinned, lambda x: x, beginnings)
-        every = jnp.where(is_full, 2 * every, every)
         place = jnp.where(tries % (slots * every) == 0, tries // (slots * every), kept)
         beginnings = jax.tree.map(lambda kept, x: jax.lax.dynamic_update_index_in_dim(kept, x, place, 0), beginnings, going)
         new, k = of.tried(going, fixed, start)
@@ -66,10 +60,16 @@ def cotangents(of: Loop, asked: Sequence[int], memory: int, start: Start, g_ys: 
         window = jax.lax.dynamic_update_index_in_dim(window, rows, tries % slots, 0)
         return _Record(of.saving(start, new, None)[0], tries + 1, window, beginnings, every)
 
-    one = jnp.ones((), jnp.int32)
+    def filled(record: _Record) -> _Record:
+        full = kept * slots * record.every
+        record = jax.lax.while_loop(lambda record: of.on_its_way(record.going) & (record.tries < full), recorded, record)
+        is_full = record.tries == full
+        rest = jax.tree.map(lambda x: jnp.where(is_full, jnp.concatenate([x[:-1:2], x[kept // 2 :]]), x), record.beginnings)
+        return record._replace(beginnings=rest, every=jnp.where(is_full, 2 * record.every, record.every))
+
     beginnings = jax.tree.map(lambda x: jnp.zeros((kept + 1, *x.shape), x.dtype), begun)
-    record = _Record(begun, 0 * one, jnp.zeros((slots, slot.all, *lanes), begun.y.dtype), beginnings, one)
-    record = jax.lax.while_loop(lambda record: of.on_its_way(record.going), recorded, record)
+    record = _Record(begun, jnp.int32(0), jnp.zeros((slots, slot.all, *lanes), begun.y.dtype), beginnings, jnp.int32(1))
+    record = jax.lax.while_loop(lambda record: of.on_its_way(record.going), filled, record)
     end, index = record.going, numbers(len(start.goals), begun.y)
 
     def added(g, first, last):

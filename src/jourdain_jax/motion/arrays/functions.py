@@ -88,7 +88,7 @@ class Functions:
         return integrands.within(self.w.number(math.inf) if middle is None else middle, joined(self.rest, shared))
 
     def _state(self, rows: Float[Array, "y *lanes"]) -> Integrated:
-        return Integrated.of(rows, self.form.coordinates, self.form.speeds)
+        return Integrated.of(rows, self.form)
 
     def _rates(self, t, y, *shared) -> Float[Array, "y *lanes"]:
         return integrands.rates(t, self._state(y), self._args(shared, self.middle)).rows

@@ -259,7 +259,7 @@ def cotangents(form: Form, method: Method, start: Start, asked: Sequence[bool], 
     check_derivatives(form, 1)
     found = flow_back(form, method, which, memory)(start, cotangents_of_states(g), jnp.concatenate([g.y_end.rows, g.t_end[None]]))
     known = dict(zip(which, entries_of(found[form.y :]), strict=True))
-    return state(form, found[: form.y]), [known.get(i) for i in range(len(asked))]
+    return Integrated.of(found[: form.y], form), [known.get(i) for i in range(len(asked))]
 
 
 def cotangents_of_states(g: Solved) -> Float[Array, "times y"]:
@@ -278,7 +278,7 @@ def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integ
         for i, value in zip(form.sampled, values, strict=True):
             known[fixed + i] = value
         z = jnp.concatenate([y.rows, jnp.stack([jnp.asarray(x, real_type()) for x in (t, *known, *slopes)])])
-        return state(form, along_rates(z, d)[: form.y])
+        return Integrated.of(along_rates(z, d)[: form.y], form)
 
     return moved_by
 
@@ -338,16 +338,11 @@ def _samples(args: tuple, goals: Float[Array, "times"], knots: Float[Array, "kno
     return tables, jnp.full(1, jnp.sign(goals[-1]) * jnp.inf) if knots is None else knots
 
 
-def state(form: Form, rows: Float[Array, "rows *lanes"]) -> Integrated:
-    """The integrated state with these rows."""
-    return Integrated.of(rows, form.coordinates, form.speeds)
-
-
 def solved(form: Form, goals: Float[Array, "times"], found: Found) -> Solved:
     """What a loop found, in words."""
     h, code, accepted, rejected, event, pivot, crossings, together, count = found.rest
     (states,), (end,), (t,) = found[:3]
     code, accepted, rejected, event, crossings = (x.astype(jnp.int32) for x in (code, accepted, rejected, event, crossings))
     reached = (jnp.arange(len(goals)) < count) | (goals == t)
-    ys, code = jax.vmap(partial(state, form))(states[:-1]), code_at_end(code, h, accepted, t)
-    return Solved(goals[:-1], ys, reached[:-1], t, state(form, end), code, event, accepted, rejected, h, pivot, crossings, together)
+    ys, code = jax.vmap(lambda rows: Integrated.of(rows, form))(states[:-1]), code_at_end(code, h, accepted, t)
+    return Solved(goals[:-1], ys, reached[:-1], t, Integrated.of(end, form), code, event, accepted, rejected, h, pivot, crossings, together)

@@ -102,10 +102,10 @@ class Integrated(eqx.Module):
         return jnp.concatenate([self.q, self.v, *([] if self.work is None else [self.work[None]])])
 
     @staticmethod
-    def of(rows: Float[Array, "rows *lanes"], coordinates: int, speeds: int) -> "Integrated":
-        """Return the state with these rows."""
-        end = coordinates + speeds
-        return Integrated(rows[:coordinates], rows[coordinates:end], rows[end] if len(rows) > end else None)
+    def of(rows: Float[Array, "rows *lanes"], form) -> "Integrated":
+        """Return the state with these rows; `form`: with so many `coordinates` and, with them, `q_and_v`."""
+        n, end = form.coordinates, form.q_and_v
+        return Integrated(rows[:n], rows[n:end], rows[end] if len(rows) > end else None)
 
 
 class Watched(NamedTuple):
