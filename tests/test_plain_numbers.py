@@ -169,4 +169,4 @@ def test_a_function_of_time_that_closes_over_a_number_of_less_precision_acts_as_
 
     given = precision(1.3)
     assert float(end(given)) == pytest.approx(float(given) / 24, rel=1e-6)  # 4 kg, pushed by `rate t`: x = rate t^3 / 24
-    assert jax.grad(end)(given) == pytest.approx(1 / 24, rel=float(jnp.finfo(precision).eps) + 1e-6)
+    assert float(jax.grad(end)(given)) == pytest.approx(1 / 24, rel=float(jnp.finfo(precision).eps) + 1e-6)

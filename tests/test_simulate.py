@@ -284,6 +284,6 @@ class Tied(jj.Scene):
 
 
 def test_a_batch_is_probed_near_its_own_parameters():
-    lanes = jj.rollout(Tied(length=6.0), {"x": np.array([4.0, 5.2]), "z_rate": 1.0}, parameters={"length": np.array([5.0, 6.0])}, t1=0.5)
+    lanes = jj.rollout(Tied(length=6.0), {"x": np.sqrt([16.0, 27.0]), "z_rate": 1.0}, parameters={"length": np.array([5.0, 6.0])}, t1=0.5)
     assert list(lanes.result) == [results.SUCCESS, results.SUCCESS]
     assert_allclose(lanes.lanes.q_end, [[4.0, 3.0, 0.5], [np.sqrt(27.0), 3.0, 0.5]], atol=1e-9)

@@ -63,7 +63,7 @@ def _motion(of: Loop, at_once: int) -> Callable[[Start], Found]:
     motion = jax.custom_batching.custom_vmap(of.run)
 
     @motion.def_vmap
-    def motions(count: int, batched: Sequence, start: Start):
+    def motions(count, batched: Sequence, start: Start):
         return _in_blocks(count, at_once, of.run, batched, start).shared(*batched)
 
     return motion
@@ -77,7 +77,7 @@ def flow_back(of: Loop, at_once: int, asked: Sequence[int], memory: int) -> Call
     motion = jax.custom_batching.custom_vmap(back)
 
     @motion.def_vmap
-    def motions(count: int, batched: Sequence, *given):
+    def motions(count, batched: Sequence, *given):
         def lanes_last(*given):
             by_y, by_known = back(*given)
             return by_y, [jnp.moveaxis(x, 0, -1) for x in by_known]
@@ -88,7 +88,7 @@ def flow_back(of: Loop, at_once: int, asked: Sequence[int], memory: int) -> Call
     return motion
 
 
-def _in_blocks(count: int, at_once: int, run: Callable, batched: Sequence, *given):
+def _in_blocks(count, at_once: int, run: Callable, batched: Sequence, *given):
     """`run` of so many lanes at once: their axis comes first outside and last inside, but in what is known."""
     given = jax.tree.map(lambda x, has: x if has else jnp.broadcast_to(x, (count, *x.shape)), given, tuple(batched))
     blocks = -(-count // at_once)
