@@ -379,7 +379,7 @@ MUTANTS = [
     Mutant("every step accepted", step, "judged", "(error <= 1.0)", "(error <= 1e30)", STEPS, "closed form"),
     Mutant("a rejected step takes time", step, "taken", 'w.where(accept, aim.t_1, p["t"])', "aim.t_1", STEPS, "closed form"),
     Mutant("other states are saved", Loop, "saving", "update_index_in_dim(ys, y,", "update_index_in_dim(ys, 0.99 * y,", STEPS, "closed form"),
-    Mutant("one stage fewer", ArrayWriter, "over_stages", "fori_loop(0, stages,", "fori_loop(0, stages - 1,", STEPS, "closed form|too many"),
+    Mutant("stages twice", ArrayWriter, "over_stages", "body(i, carry[1])", "body(i // 2, carry[1])", STEPS, "closed form|too many"),
     Mutant("no branch is taken", ArrayWriter, "if_any", "(rooms, arrays, body)[0]", "(rooms, arrays, lambda: None)[0]", EVENT, "derivative|assert"),
     Mutant("no projection", step, "project", 'w.run("project", p.pointer, t1, y1)', "None", projected_steps_stay_on_a_circle, "circle"),
     Mutant("no step ends at a knot", Loop, "saving", "jnp.minimum(goal * direction, jnp.min(ahead, axis=0))", "goal * direction", steps_end_at_knots, "knot"),

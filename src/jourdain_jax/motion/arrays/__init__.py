@@ -1,1 +1,1 @@
-"""The source of a step (`motion/native/step.py`) run on arrays of JAX: motions of what has no scalar program, or no machine code."""
+"""Motions on arrays of JAX, by the source of a step (`motion/native/step.py`), where there is no machine code."""

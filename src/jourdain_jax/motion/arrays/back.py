@@ -1,7 +1,9 @@
-"""The loop on arrays gone through once more and then back: cotangents of the start from those of the states and the end (`motion/native/back.py`).
+"""Reverse mode of the loop on arrays, by the source of machine code (`motion/native/back.py`).
 
-Tries of steps are recorded in a window of bounded memory. All but the last window are gone through again, by the same steps to the last bit, from the nearest
-beginning of a window that is kept. Of these there is bounded room, too: where it is full, every second one is dropped.
+The motion is integrated once more, and each try of a step is recorded in a window of bounded length. When
+the last window has been traversed backwards, each earlier one is integrated again, with the same bits,
+from the nearest checkpoint: a state at the beginning of a window. The number of checkpoints is bounded,
+too; when there is no room for another one, every second one is dropped.
 """
 
 import math
@@ -21,23 +23,28 @@ from jourdain_jax.motion.native.layout import Lanes
 from jourdain_jax.motion.native.loop import Start
 from jourdain_jax.motion.native.record import Slot
 
-SLOTS = 256  # tries of steps in a window, where memory holds them; a sixteenth at least, as of beginnings
+SLOTS = (
+    256  # tries of steps in a window, or fewer where memory is short: at least a sixteenth, as of checkpoints
+)
 
 
 class _Record(NamedTuple):
-    """A motion on its way, how many steps it has tried, the window of these, and beginnings of windows, every so many of them."""
+    """Hold a motion on its way, the number of tries, their window, and a checkpoint for `every` so many windows."""
 
     going: Going
     tries: Int[Array, ""]
     window: Float[Array, "slots rows *lanes"]
-    beginnings: PyTree
+    checkpoints: PyTree
     every: Int[Array, ""]
 
 
-def cotangents(of: Loop, asked: Sequence[int], memory: int, start: Start, g_ys: Array, g_end: Array, g_t: Array) -> tuple[Array, list[Array]]:
-    """Cotangents of the state at the start and of the `asked` among what is known, from those of the saved states, of the end and of its time.
+def cotangents(
+    of: Loop, asked: Sequence[int], memory: int, start: Start, g_ys: Array, g_end: Array, g_t: Array
+) -> tuple[Array, list[Array]]:
+    """Return cotangents of the initial state, and of the known arrays with the numbers `asked`.
 
-    `memory`: bytes, of which the window and the beginnings take a quarter each at most.
+    `g_ys`, `g_end`, `g_t`: cotangents of the saved states, of the final state and of its time.
+    `memory`: bytes, of which the window and the checkpoints take at most a quarter each.
     """
     form, slot = of.form, Slot.of(of.form, of.method)
     begun, fixed = of.begun(start)
@@ -52,38 +59,53 @@ def cotangents(of: Loop, asked: Sequence[int], memory: int, start: Start, g_ys: 
     kept = 2 * room(2 * form.all, most // (2 * slots) + 1)
 
     def recorded(record: _Record) -> _Record:
-        going, tries, window, beginnings, every = record
+        going, tries, window, checkpoints, every = record
         place = jnp.where(tries % (slots * every) == 0, tries // (slots * every), kept)
-        beginnings = jax.tree.map(lambda kept, x: jax.lax.dynamic_update_index_in_dim(kept, x, place, 0), beginnings, going)
+        checkpoints = jax.tree.map(
+            lambda kept, x: jax.lax.dynamic_update_index_in_dim(kept, x, place, 0), checkpoints, going
+        )
         new, k = of.tried(going, fixed, start)
-        rows = jnp.concatenate([going.y, k, jnp.stack([going.rows[t], new.rows[taken], going.passed.astype(going.y.dtype)])])
+        rows = jnp.concatenate(
+            [going.y, k, jnp.stack([going.rows[t], new.rows[taken], going.passed.astype(going.y.dtype)])]
+        )
         window = jax.lax.dynamic_update_index_in_dim(window, rows, tries % slots, 0)
-        return _Record(of.saving(start, new, None)[0], tries + 1, window, beginnings, every)
+        return _Record(of.saving(start, new, None)[0], tries + 1, window, checkpoints, every)
 
     def filled(record: _Record) -> _Record:
         full = kept * slots * record.every
-        record = jax.lax.while_loop(lambda record: of.on_its_way(record.going) & (record.tries < full), recorded, record)
+        record = jax.lax.while_loop(
+            lambda record: of.on_its_way(record.going) & (record.tries < full), recorded, record
+        )
         is_full = record.tries == full
-        rest = jax.tree.map(lambda x: jnp.where(is_full, jnp.concatenate([x[:-1:2], x[kept // 2 :]]), x), record.beginnings)
-        return record._replace(beginnings=rest, every=jnp.where(is_full, 2 * record.every, record.every))
+        rest = jax.tree.map(
+            lambda x: jnp.where(is_full, jnp.concatenate([x[:-1:2], x[kept // 2 :]]), x), record.checkpoints
+        )
+        return record._replace(checkpoints=rest, every=jnp.where(is_full, 2 * record.every, record.every))
 
-    beginnings = jax.tree.map(lambda x: jnp.zeros((kept + 1, *x.shape), x.dtype), begun)
-    record = _Record(begun, jnp.int32(0), jnp.zeros((slots, slot.all, *lanes), begun.y.dtype), beginnings, jnp.int32(1))
+    checkpoints = jax.tree.map(lambda x: jnp.zeros((kept + 1, *x.shape), x.dtype), begun)
+    record = _Record(
+        begun, jnp.int32(0), jnp.zeros((slots, slot.all, *lanes), begun.y.dtype), checkpoints, jnp.int32(1)
+    )
     record = jax.lax.while_loop(lambda record: of.on_its_way(record.going), filled, record)
     end, index = record.going, numbers(len(start.goals), begun.y)
 
     def added(g, first, last):
-        """Cotangents with those of the states at the saved times number `first` to `last - 1`."""
+        """Add the cotangents of the states saved at the times number `first` to `last - 1`."""
         more = lambda: g + jnp.sum(jnp.where((index >= first) & (index < last), g_ys, 0.0), axis=0)  # noqa: E731
         return jax.lax.cond(eqxi.unvmap_any(jnp.any(first < last)), more, lambda: g)
 
     w = of.writer(start, asked)
     known = sum(w.functions.sizes())
-    g, by_known = w.holding(added(g_end, end.passed, jnp.full(lanes, len(start.goals), jnp.int32))), w.room(max(known, 1))
+    g, by_known = (
+        w.holding(added(g_end, end.passed, jnp.full(lanes, len(start.goals), jnp.int32))),
+        w.room(max(known, 1)),
+    )
     if form.has_events:
         state = of.rows_in(w, end, fixed)
         located = is_located(w, Lanes(w, form, state))
-        w.if_any(located, lambda: event_back(w, form, known, state, located, w.holding(g_t[None]), g, by_known))
+        w.if_any(
+            located, lambda: event_back(w, form, known, state, located, w.holding(g_t[None]), g, by_known)
+        )
 
     def step_of(carry):
         last, saved, g, by_known, window = carry
@@ -104,7 +126,9 @@ def cotangents(of: Loop, asked: Sequence[int], memory: int, start: Start, g_ys: 
 
         def again():
             number = last // (slots * record.every)
-            begin = jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, number, 0, keepdims=False), record.beginnings)
+            begin = jax.tree.map(
+                lambda x: jax.lax.dynamic_index_in_dim(x, number, 0, keepdims=False), record.checkpoints
+            )
             passing = record._replace(going=begin, tries=number * slots * record.every, window=window)
             return jax.lax.while_loop(lambda record: record.tries < first, recorded, passing).window
 

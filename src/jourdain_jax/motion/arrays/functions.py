@@ -1,7 +1,8 @@
-"""Functions of JAX in the place of those that machine code has of a scalar program, and a form by its numbers alone.
+"""Rates, projection and stop events as JAX functions, where machine code has a scalar program.
 
-Derivatives of a step are those of its source; what JAX finds are those of the functions themselves. A state is followed by its tangents (`layout.py`), and so
-is what all steps share: `pushed` gives values of a function with its tangents, by nested `jvp`.
+The source of a step differentiates the step; JAX differentiates only these functions. A state is followed by
+its tangents (`motion/native/layout.py`), and so are the arrays that all steps share: `pushed` returns the
+values of a function with all its tangents, by nested `jvp`.
 """
 
 import math
@@ -23,7 +24,7 @@ from jourdain_jax.motion.vector_fields.field import Integrated
 
 @dataclass(frozen=True)
 class ArrayForm(Form):
-    """A form by its numbers alone: what has no program is known to its functions."""
+    """Hold the sizes of what is integrated, where there is no scalar program to count them in."""
 
     program: None  # type: ignore[assignment]
     coordinates: int = 0  # type: ignore[assignment]
@@ -46,7 +47,7 @@ class ArrayForm(Form):
 
 
 def pushed(f: Callable, parts: Sequence[Sequence]) -> list:
-    """Return values of `f` of the arrays of the first part, then their tangents, in the order of the parts; None stands for a tangent of zero."""
+    """Return the values of `f` at the first part, then their tangents, in the order of the parts (None: zero)."""
     if len(parts) == 1:
         return [f(*parts[0])]
     half = len(parts) // 2
@@ -59,14 +60,17 @@ def pushed(f: Callable, parts: Sequence[Sequence]) -> list:
             new[i][k] = x
         return pushed(f, new)
 
-    at = [jnp.zeros_like(dx) if (x := parts[i][k]) is None else x for (i, k), dx in zip(places, along, strict=True)]
+    at = [
+        jnp.zeros_like(dx) if (x := parts[i][k]) is None else x
+        for (i, k), dx in zip(places, along, strict=True)
+    ]
     found, tangents = jax.jvp(moved, at, along)
     return found + tangents
 
 
 @dataclass
 class Functions:
-    """Functions of rates and rows in the place of those that machine code has of a program, on rows in memory."""
+    """Evaluate rates, projection, events and their cotangents on rows in memory, as a step calls them."""
 
     w: ArrayWriter
     form: Form
@@ -85,7 +89,9 @@ class Functions:
         self.middle = t + 0.5 * h
 
     def _args(self, shared: Sequence, middle: Array | None = None) -> PyTree:
-        return integrands.within(self.w.number(math.inf) if middle is None else middle, joined(self.rest, shared))
+        return integrands.within(
+            self.w.number(math.inf) if middle is None else middle, joined(self.rest, shared)
+        )
 
     def _state(self, rows: Float[Array, "y *lanes"]) -> Integrated:
         return Integrated.of(rows, self.form)
@@ -100,30 +106,38 @@ class Functions:
         return integrands.events(t, self._state(y), self._args(shared))
 
     def _solved(self, t, h, y, *shared) -> tuple:
-        """The end of a step of an implicit method, an estimate of its error, and whether its equations were solved."""
+        """Return the end of an implicit step, its error estimate, and whether its equations were solved."""
         before = self._state(y)
         found = self.method.solve(self._args(shared, self.middle), t, before, h)
         return jax.tree.map(jnp.add, before, found.change), found.error, found.solved
 
     def _parts(self, state: Pointer, t, y: Pointer) -> list[list]:
-        """Time, the state in memory and what is shared, each with its tangents."""
-        times = [t, *(self.w.load(state, row) if self.form.time_moves else None for row in self.form.rows["dt"])]
+        """Return time, the state in memory and the shared arrays, each with its tangents."""
+        times = [
+            t,
+            *(self.w.load(state, row) if self.form.time_moves else None for row in self.form.rows["dt"]),
+        ]
         of = [range(len(self.shared[0])), *self.form.moving]
         shared = [dict(zip(which, part, strict=True)) for which, part in zip(of, self.shared, strict=True)]
-        return [[time, self.w.load(y, self.y + k * self.count), *map(part.get, of[0])] for k, (time, part) in enumerate(zip(times, shared, strict=True))]
+        return [
+            [time, self.w.load(y, self.y + k * self.count), *map(part.get, of[0])]
+            for k, (time, part) in enumerate(zip(times, shared, strict=True))
+        ]
 
     def _store(self, found: Sequence, place: Pointer, rows: int) -> None:
         for k, x in enumerate(found):
             self.w.store(x, place, Rows(k * rows, rows))
 
-    # as machine code has them (`functions.py`, `projection.py`)
+    # the counterparts of `motion/native/functions.py` and `projection.py`
 
     def rates(self, state: Pointer, t, y: Pointer, k: Pointer, monitored: Pointer) -> None:
-        """Slopes, and what is monitored."""
+        """Store the rates of the state, and the monitored numbers."""
         watching = Rows(0, len(self.form.monitored))
 
         def watched(t, y, *shared):
-            found, pivots, directions, sine = integrands.rates_and_pivots(t, self._state(y), self._args(shared, self.middle))
+            found, pivots, directions, sine = integrands.rates_and_pivots(
+                t, self._state(y), self._args(shared, self.middle)
+            )
             seen = [jnp.reshape(x, (-1, *self.w.lanes)) for x in (pivots, directions)]
             seen += [jnp.stack([sine**2, jnp.ones_like(sine)])] if self.form.squares else []
             return found.rows, jax.lax.stop_gradient(jnp.concatenate(seen))
@@ -139,33 +153,41 @@ class Functions:
         self._store(pushed(self._projected, self._parts(state, t, y)), y, self.count)
 
     def along(self, state: Pointer, t, y: Pointer) -> None:
-        """Put the part along the rows in the place of an error after a state."""
+        """Project an error, stored after its state, onto the directions along the rows."""
         at, error = self.w.load(y, self.y), self.w.load(y, self.y + self.count)
-        self.w.store(jax.jvp(lambda y: self._projected(t, y, *self.shared[0]), (at,), (error,))[1], y, self.y + self.count)
+        self.w.store(
+            jax.jvp(lambda y: self._projected(t, y, *self.shared[0]), (at,), (error,))[1],
+            y,
+            self.y + self.count,
+        )
 
     def events(self, state: Pointer, t, y: Pointer, slope: Pointer, c: Pointer, rate: Pointer) -> None:
-        """Values of stop events, and their rates along a slope of the state."""
+        """Store values of stop events, and their rates along a slope of the state."""
         at, along = (t, self.w.load(y, self.y)), (jnp.ones_like(t), self.w.load(slope, self.y))
-        for place, found in zip((c, rate), jax.jvp(lambda t, y: self._events(t, y, *self.shared[0]), at, along), strict=True):
+        for place, found in zip(
+            (c, rate), jax.jvp(lambda t, y: self._events(t, y, *self.shared[0]), at, along), strict=True
+        ):
             self._store([found], place, self.form.events)
 
     def event_tangents(self, state: Pointer, t, y: Pointer, dc: Pointer) -> None:
-        """Tangents of their values."""
+        """Store the tangents of the values of stop events."""
         self._store(pushed(self._events, self._parts(state, t, y))[1:], dc, self.form.events)
 
     def relations(self, state: Pointer, t, y: Pointer, values: Pointer) -> None:
-        """Numbers whose signs are watched."""
+        """Store the numbers whose signs are watched."""
         found = self.watched(self._args(self.shared[0]), t, self._state(self.w.load(y, self.y)))  # type: ignore[misc]
         self._store([found], values, len(self.form.watched))
 
     # of implicit methods
 
     def solve(self, state: Pointer, t, h, y1: Pointer, error: Pointer, told: Pointer) -> None:
-        """A step from the state of the lanes, its error where there is an estimate, and whether its equations were solved."""
+        """Take an implicit step; store its end, its error estimate if any, and whether its equations were solved."""
 
         def f(t, y, *shared):
             after, estimate, solved = self._solved(t, h, y, *shared)
-            return after.rows, jax.lax.stop_gradient((jnp.zeros_like(after.rows) if estimate is None else estimate.rows, solved))
+            return after.rows, jax.lax.stop_gradient(
+                (jnp.zeros_like(after.rows) if estimate is None else estimate.rows, solved)
+            )
 
         found = pushed(f, self._parts(state, t, state))
         self._store([after for after, _ in found], y1, self.count)
@@ -174,59 +196,73 @@ class Functions:
         self.w.store(solved, told)
 
     def onto_rows(self, state: Pointer, t, y: Pointer, told: Pointer) -> None:
-        """Put a state back onto its rows; how far that moved it, relative to the change by the step, is the second of the numbers `told`."""
+        """Put a state back onto its rows; store how far that moved it, relative to the step, as `told[1]`."""
         free = self.w.load(y, self.y)
         self.project(state, t, y)
         rows = jax.lax.stop_gradient((self.w.load(state, self.y), free, self.w.load(y, self.y)))
         ratios = []
         for before, given, after in zip(*(jax.tree.leaves(self._state(x)) for x in rows), strict=True):
             # 1e-6 of the size of the state: a step that changes less counts as one that changes so much
-            change = jnp.max(jnp.abs(after - before), initial=0.0) + 1e-6 * (1 + jnp.max(jnp.abs(after), initial=0.0))
+            change = jnp.max(jnp.abs(after - before), initial=0.0) + 1e-6 * (
+                1 + jnp.max(jnp.abs(after), initial=0.0)
+            )
             ratios.append(jnp.max(jnp.abs(after - given), initial=0.0) / change)
         self.w.store(jnp.max(jnp.stack(ratios)), told, 1)
 
     # cotangents, of motions without tangents
 
     def _pull(self, f: Callable, y: Pointer, g: Pointer, rows: int, to_y: Pointer, to_known: Pointer) -> None:
-        """Cotangents of what `f` finds become those of the state, and are added to those of what is asked for."""
+        """Store the cotangent of the state under `f`, and add those of the requested arrays to `to_known`."""
 
         def of(y, asked):
-            return f(y, *(dict(enumerate(self.shared[0])) | dict(zip(self.asked, asked, strict=True))).values())
+            return f(
+                y, *(dict(enumerate(self.shared[0])) | dict(zip(self.asked, asked, strict=True))).values()
+            )
 
         by_y, by_shared = jax.vjp(of, self.w.load(y, self.y), self._asked())[1](self.w.load(g, Rows(0, rows)))
         self.w.store(by_y, to_y, self.y)
         if known := sum(self.sizes()):
             lanes = len(self.w.lanes)
-            flat = [jnp.reshape(jnp.moveaxis(x, range(lanes), range(-lanes, 0)), (-1, *self.w.lanes)) for x in by_shared]
-            self.w.store(self.w.load(to_known, Rows(0, known)) + jnp.concatenate(flat), to_known, Rows(0, known))
+            flat = [
+                jnp.reshape(jnp.moveaxis(x, range(lanes), range(-lanes, 0)), (-1, *self.w.lanes))
+                for x in by_shared
+            ]
+            self.w.store(
+                self.w.load(to_known, Rows(0, known)) + jnp.concatenate(flat), to_known, Rows(0, known)
+            )
 
     def _asked(self) -> list[Array]:
         return [self.shared[0][i] for i in self.asked]
 
     def sizes(self) -> list[int]:
-        """Numbers of a lane in each array of which cotangents are asked."""
+        """Return how many numbers a lane has in each array whose cotangent is requested."""
         return [math.prod(x.shape[len(self.w.lanes) :]) for x in self._asked()]
 
     def leaves(self, by_known: Array) -> list[Array]:
-        """Cotangents of each array that is asked for, its lanes first."""
+        """Return the cotangents of the requested arrays, with the axis of lanes first."""
         lanes = len(self.w.lanes)
         parts = jnp.split(by_known, [sum(self.sizes()[: k + 1]) for k in range(len(self.asked))])
-        return [jnp.reshape(jnp.moveaxis(part, range(-lanes, 0), range(lanes)), x.shape) for part, x in zip(parts, self._asked(), strict=False)]
+        return [
+            jnp.reshape(jnp.moveaxis(part, range(-lanes, 0), range(lanes)), x.shape)
+            for part, x in zip(parts, self._asked(), strict=False)
+        ]
 
     def pull_rates(self, state: Pointer, t, y: Pointer, g: Pointer, to_y: Pointer, to_known: Pointer) -> None:
-        """Through slopes."""
+        """Pull cotangents back through the rates."""
         self._pull(partial(self._rates, t), y, g, self.count, to_y, to_known)
 
     def project_back(self, state: Pointer, t, free: Pointer, g: Pointer, added: Pointer) -> None:
-        """Through a projection."""
+        """Pull cotangents back through a projection."""
         self._pull(partial(self._projected, t), free, g, self.count, g, added)
 
-    def pull_events(self, state: Pointer, t, y: Pointer, g: Pointer, to_y: Pointer, to_known: Pointer) -> None:
-        """Through values of stop events."""
+    def pull_events(
+        self, state: Pointer, t, y: Pointer, g: Pointer, to_y: Pointer, to_known: Pointer
+    ) -> None:
+        """Pull cotangents back through the values of stop events."""
         self._pull(partial(self._events, t), y, g, self.form.events, to_y, to_known)
 
     def pull_step(self, state: Pointer, t, h, y: Pointer, g: Pointer, added: Pointer) -> None:
-        """Through a step of an implicit method and its projection, where it was one."""
+        """Pull cotangents back through an implicit step and its projection, in lanes that took it."""
 
         def f(y, *shared):
             end = self._solved(t, h, y, *shared)[0].rows
@@ -236,7 +272,12 @@ class Functions:
         before, more = self.w.room(self.count), self.w.room(max(known, 1))
         self._pull(f, y, g, self.count, before, more)
         copied(self.w, self.count, before, g, took)
-        each_row(self.w, known, added, lambda i: self.w.load(added, i) + self.w.where(took, self.w.load(more, i), 0.0))
+        each_row(
+            self.w,
+            known,
+            added,
+            lambda i: self.w.load(added, i) + self.w.where(took, self.w.load(more, i), 0.0),
+        )
 
 
 def split(args: PyTree) -> tuple[tuple, tuple]:

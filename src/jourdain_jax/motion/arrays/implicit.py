@@ -1,8 +1,8 @@
 """A step of an implicit method (`implicit_steps.py`) on arrays, which run under `vmap` where there are lanes.
 
-Trials of the search for an event are steps of the method too; its last shifts, which are tiny, are steps of Tsit5, whose derivatives are those of the
-motion. A step whose equations are not solved has an infinite error. Methods of equal steps cannot try one again: what would refuse it ends the motion with a
-code of its own.
+Trials of the search for an event are steps of the method too; its last shifts, which are tiny, are steps of
+Tsit5, with the derivatives of the motion. A step whose equations are not solved has an infinite error. Methods
+with equal steps cannot try one again: whatever would refuse it ends the motion with a result code.
 """
 
 import math
@@ -18,7 +18,7 @@ from jourdain_jax.motion.trajectories import results
 
 
 def tried_by_equations(w: ArrayWriter, form, method: ImplicitMethod, p: Lanes, k: Pointer) -> Trial:
-    """Return a step; puts slopes at its start, its middle and its end into `k` where events or pivots need them."""
+    """Try a step; put slopes at its start, middle and end into `k` where events or pivots need them."""
     reach, y = reach_of(w, form, p, p["h"]), p.pointer
     if method.even:
         reach = w.smaller(reach, even_step(p["longest"], w.magnitude(p["goal"] - p["t"])))
@@ -39,7 +39,9 @@ def tried_by_equations(w: ArrayWriter, form, method: ImplicitMethod, p: Lanes, k
     fault = w.where(solved, RUNNING * 1.0, float(results.UNSOLVED_STEP))
     if form.projects and method.even:
         w.run("onto_rows", y, aim.t_1, y1, told)
-        fault = w.where(solved & (w.load(told, 1) > results.MOST_PROJECTED), float(results.OFF_CONSTRAINTS), fault)
+        fault = w.where(
+            solved & (w.load(told, 1) > results.MOST_PROJECTED), float(results.OFF_CONSTRAINTS), fault
+        )
     elif form.projects:
         project(w, form, p, aim.t_1, y1, error)
     size = w.number(0.0) if method.even else norm(w, form, p, error, y1)
@@ -52,8 +54,13 @@ def tried_by_equations(w: ArrayWriter, form, method: ImplicitMethod, p: Lanes, k
 
 
 def _watched_within(w: ArrayWriter, form, p: Lanes, k: Pointer, y1: Pointer, h) -> tuple:
-    """Return the smallest magnitude of a pivot at the ends and the middle of a step, and whether one changed its sign, or a row turned round."""
-    at, pivots, halves, every = w.room(form.integrated), w.room(max(len(form.monitored), 1)), w.table([0.0, 0.5, 1.0]), form.integrated
+    """Return the smallest pivot at the ends and the middle of a step, and whether one changed sign or a row turned."""
+    at, pivots, halves, every = (
+        w.room(form.integrated),
+        w.room(max(len(form.monitored), 1)),
+        w.table([0.0, 0.5, 1.0]),
+        form.integrated,
+    )
 
     def state(i, row):
         start = w.load(p.pointer, row)

@@ -1,7 +1,8 @@
-"""The loop over steps on arrays of JAX: the source of machine code (`motion/native/step.py`), with rates, projection and events that JAX has.
+"""The loop over steps on arrays of JAX: the source of machine code (`motion/native/step.py`) with JAX functions.
 
-Lanes side by side are the last axes of arrays. All try a step in each pass of one loop, each towards the next time to save at that it has not passed; one
-that has ended stands still. Derivatives are those of the source: tangents go along with the state, found by JAX of the rates alone,
+Lanes are the last axes of arrays. In each pass of one loop all of them try a step, each towards its own next
+time; a lane that has ended stands still. Tangents are integrated with the state, and JAX differentiates only
+the rates,
 
     (y, dy)' = (f(y, p), df/dy dy + df/dp dp)
 
@@ -28,7 +29,7 @@ from jourdain_jax.motion.native.step import IDLE, step, tried_by_stages
 
 
 class Going(NamedTuple):
-    """A motion on its way."""
+    """Hold a motion on its way."""
 
     y: Float[Array, "y *lanes"]  # with its tangents
     rows: dict[int, Float[Array, "*lanes"]]  # the others that steps change
@@ -36,7 +37,7 @@ class Going(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """A loop over tries of steps; all arrays stand in a `Start`."""
+    """Integrate a motion step by step; a `Start` holds all arrays."""
 
     form: Form
     method: Method | ImplicitMethod
@@ -45,52 +46,78 @@ class Loop(NamedTuple):
     most: int  # steps
 
     def begun(self, start: Start) -> tuple[Going, dict[int, Array]]:
-        """The start, and the rows that steps do not change."""
+        """Return the start, and the rows that steps do not change."""
         t, form = start.goals[0], self.form
         given = start._replace(known=()).rows([jnp.zeros_like(t)] * len(form.moving))
         fixed = {row: given[row] for name in CONTROL for row in form.rows[name]}
-        moving = {row: given[row] if row < len(given) else jnp.zeros_like(t) for row in range(form.integrated, form.all) if row not in fixed}
+        moving = {
+            row: given[row] if row < len(given) else jnp.zeros_like(t)
+            for row in range(form.integrated, form.all)
+            if row not in fixed
+        }
         return Going(given[: form.integrated], moving, jnp.zeros(t.shape, jnp.int32)), fixed
 
     def writer(self, start: Start, asked: Sequence[int] = ()) -> ArrayWriter:
-        """A writer with the functions that a step calls."""
+        """Return a writer with the functions that a step calls."""
         w = ArrayWriter(start.goals[0])
         w.functions = Functions(w, self.form, self.watched, self.rest, start.known, tuple(asked), self.method)
         return w
 
     def rows_in(self, w: ArrayWriter, going: Going, fixed: dict) -> Pointer:
-        """The rows of lanes in memory."""
+        """Put the rows of all lanes into memory."""
         state = w.holding(going.y)
-        state.room.rows.extend((going.rows | fixed)[row] for row in range(self.form.integrated, self.form.all))
+        state.room.rows.extend(
+            (going.rows | fixed)[row] for row in range(self.form.integrated, self.form.all)
+        )
         return state
 
     def tried(self, going: Going, fixed: dict, start: Start) -> tuple[Going, Array]:
-        """A step, tried by all lanes that are on their way, and the slopes of its stages."""
+        """Try a step in all lanes that are on their way; return also the slopes of its stages."""
         w = self.writer(start)
         state, k = self.rows_in(w, going, fixed), w.room(self.form.integrated * self.method.needed)
-        step(w, self.form, self.method, Lanes(w, self.form, state), k, tried_by_stages if isinstance(self.method, Method) else tried_by_equations)
-        return going._replace(y=w.load(state, Rows(0, self.form.integrated)), rows={row: w.load(state, row) for row in going.rows}), w.whole(k.room)
+        step(
+            w,
+            self.form,
+            self.method,
+            Lanes(w, self.form, state),
+            k,
+            tried_by_stages if isinstance(self.method, Method) else tried_by_equations,
+        )
+        return going._replace(
+            y=w.load(state, Rows(0, self.form.integrated)),
+            rows={row: w.load(state, row) for row in going.rows},
+        ), w.whole(k.room)
 
     def _row(self, name: str) -> int:
         return self.form.rows[name].start
 
     def saving(self, start: Start, going: Going, ys: Array | None) -> tuple[Going, Array | None]:
-        """Passes the times that are reached, saves the states there where there is room for them, and sets the next time to go to."""
+        """Pass the times reached, save the states there (with `ys`), and set the next time to go to."""
         code_, t_, goal_ = map(self._row, ("code", "t", "goal"))
         times, y = len(start.goals), going.y
 
         def due(code, passed):
-            return (code == RUNNING) & (going.rows[t_] == at_number(start.goals, jnp.minimum(passed, times - 1)))
+            return (code == RUNNING) & (
+                going.rows[t_] == at_number(start.goals, jnp.minimum(passed, times - 1))
+            )
 
         def save(carry):
             code, passed, ys = carry
             here = due(code, passed)
             if ys is not None:
-                ys = jnp.where((numbers(times, y) == passed) & here, y, ys) if y.ndim > 1 else jax.lax.dynamic_update_index_in_dim(ys, y, passed, 0)
+                ys = (
+                    jnp.where((numbers(times, y) == passed) & here, y, ys)
+                    if y.ndim > 1
+                    else jax.lax.dynamic_update_index_in_dim(ys, y, passed, 0)
+                )
             passed = passed + here
             return jnp.where(here & (passed >= times), IDLE, code), passed, ys
 
-        code, passed, ys = jax.lax.while_loop(lambda carry: eqxi.unvmap_any(jnp.any(due(*carry[:2]))), save, (going.rows[code_], going.passed, ys))
+        code, passed, ys = jax.lax.while_loop(
+            lambda carry: eqxi.unvmap_any(jnp.any(due(*carry[:2]))),
+            save,
+            (going.rows[code_], going.passed, ys),
+        )
         goal = at_number(start.goals, jnp.minimum(passed, times - 1))
         for knots in start.of_samples:
             direction = jnp.sign(start.goals[-1])
@@ -99,12 +126,12 @@ class Loop(NamedTuple):
         return going._replace(rows=going.rows | {code_: code, goal_: goal}, passed=passed), ys
 
     def on_its_way(self, going: Going) -> Array:
-        """Whether any lane is."""
+        """Return whether any lane is on its way."""
         code = going.rows[self._row("code")]
         return eqxi.unvmap_any(jnp.any((code == RUNNING) | (code == LOCATING)))
 
     def run(self, start: Start) -> Found:
-        """The motion to its end."""
+        """Integrate the motion to its end."""
         begun, fixed = self.begun(start)
         ys = jnp.zeros((len(start.goals), *begun.y.shape), begun.y.dtype)
 
@@ -112,21 +139,28 @@ class Loop(NamedTuple):
             going, ys = carry
             return self.saving(start, self.tried(going, fixed, start)[0], ys)
 
-        going, ys = jax.lax.while_loop(lambda carry: self.on_its_way(carry[0]), tried, self.saving(start, begun, ys))
+        going, ys = jax.lax.while_loop(
+            lambda carry: self.on_its_way(carry[0]), tried, self.saving(start, begun, ys)
+        )
         ys = jnp.where(numbers(len(ys), going.y) >= going.passed, going.y, ys)
         code, form, parts = self._row("code"), self.form, range(1 + len(self.form.moving))
         rows = going.rows | {code: jnp.where(going.rows[code] == IDLE, RUNNING * 1.0, going.rows[code])}
         t, *progress = (rows[row] for row in range(form.integrated, form.returned))
         rest = jnp.stack([*progress[: len(progress) - len(form.moving)], going.passed.astype(t.dtype)])
         each = [slice(k * form.y, (k + 1) * form.y) for k in parts]
-        return Found(tuple(ys[:, part] for part in each), tuple(going.y[part] for part in each), (t, *progress[len(progress) - len(form.moving) :]), rest)
+        return Found(
+            tuple(ys[:, part] for part in each),
+            tuple(going.y[part] for part in each),
+            (t, *progress[len(progress) - len(form.moving) :]),
+            rest,
+        )
 
 
 def at_number(x: Float[Array, "times *lanes"], i) -> Float[Array, "*lanes"]:
-    """One time of each lane."""
+    """Return the time number `i` of each lane."""
     return x[i] if x.ndim == 1 else jnp.take_along_axis(x, i[None], 0)[0]
 
 
 def numbers(times: int, y: Float[Array, "y *lanes"]) -> Int[Array, "times *ones"]:
-    """The numbers of the times, before the axes of a state."""
+    """Return the numbers of the times, shaped to broadcast against states `y`."""
     return jnp.reshape(jnp.arange(times), (-1, *[1] * y.ndim))

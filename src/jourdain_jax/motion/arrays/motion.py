@@ -1,4 +1,4 @@
-"""The loop on arrays (`loop.py`) as a function of JAX, with its derivatives: in forward mode a motion with tangents, in reverse mode one gone back over.
+"""The loop on arrays (`loop.py`) as a JAX function, with derivatives in forward and reverse mode.
 
 Lanes that `vmap` makes run side by side, some at a time, where the rates take lanes.
 """
@@ -24,10 +24,25 @@ from jourdain_jax.motion.setup import Begun, Setup
 from jourdain_jax.motion.vector_fields.field import Integrated
 
 
-def loop_of(method: Method | ImplicitMethod, setup: Setup, begun: Begun, relations: tuple[Callable | None, int]) -> tuple[Loop, Start]:
-    """The loop, and the start of one motion; `relations`: the numbers whose signs are watched, and how many are those of relations."""
-    goals, knots, field, y0, names = setup.goals(setup.ts), setup.knots, setup.field, begun.y0, setup.integrator.event_names
-    args, most, eps = integrands.within(goals[0], begun.args), setup.most_steps(knots), float(jnp.finfo(y0.q.dtype).eps)
+def loop_of(
+    method: Method | ImplicitMethod, setup: Setup, begun: Begun, relations: tuple[Callable | None, int]
+) -> tuple[Loop, Start]:
+    """Return the loop, and the start of one motion.
+
+    `relations`: a function for the numbers whose signs are watched, and how many of them are relations.
+    """
+    goals, knots, field, y0, names = (
+        setup.goals(setup.ts),
+        setup.knots,
+        setup.field,
+        begun.y0,
+        setup.integrator.event_names,
+    )
+    args, most, eps = (
+        integrands.within(goals[0], begun.args),
+        setup.most_steps(knots),
+        float(jnp.finfo(y0.q.dtype).eps),
+    )
     count = lambda f: len(jax.eval_shape(f, goals[0], y0, args))  # noqa: E731
     seen = jax.eval_shape(integrands.rates_and_pivots, goals[0], y0, args) if field.has_pivots else None
     watched, several = relations
@@ -45,16 +60,21 @@ def loop_of(method: Method | ImplicitMethod, setup: Setup, begun: Begun, relatio
         squares=range(2 * field.near_rank_loss),
         relations=range(several),
         watched=range(count(lambda t, y, args: watched(args, t, y)) if watched else 0),
-        compensated=most * eps > eps**0.5,  # what is rounded off in so many steps may be more than half of the digits
+        compensated=most * eps
+        > eps**0.5,  # what is rounded off in so many steps may be more than half of the digits
     )
     known, rest = split(begun.args)
-    numbers = jax.lax.stop_gradient((() if knots is None else (knots,), control_of(setup, knots), goals, jnp.zeros_like(goals[0])))
+    numbers = jax.lax.stop_gradient(
+        (() if knots is None else (knots,), control_of(setup, knots), goals, jnp.zeros_like(goals[0]))
+    )
     return Loop(form, method, watched, rest, most), Start(*numbers, y=(y0.rows,), known=(known,))
 
 
 def flow(of: Loop, at_once: int) -> Callable[[Start], Found]:
-    """The motion of a start; `at_once`: how many lanes run side by side, 0: those of `vmap`."""
-    return differentiated(lambda form: _motion(of._replace(form=form), at_once), of.form, lambda form, along: None)
+    """Return the motion as a function of its start; `at_once`: lanes of a block (0: all lanes of `vmap`)."""
+    return differentiated(
+        lambda form: _motion(of._replace(form=form), at_once), of.form, lambda form, along: None
+    )
 
 
 def _motion(of: Loop, at_once: int) -> Callable[[Start], Found]:
@@ -70,7 +90,7 @@ def _motion(of: Loop, at_once: int) -> Callable[[Start], Found]:
 
 
 def flow_back(of: Loop, at_once: int, asked: Sequence[int], memory: int) -> Callable:
-    """Return a function of a start and cotangents (of the states, the end, its time): those of the start's state and of the `asked` among what is known."""
+    """Return the reverse mode of `flow`, `cotangents` of `back.py`, as a function of start and cotangents."""
     back = partial(cotangents, of, asked, memory)
     if not at_once:
         return back
@@ -89,14 +109,18 @@ def flow_back(of: Loop, at_once: int, asked: Sequence[int], memory: int) -> Call
 
 
 def _in_blocks(count, at_once: int, run: Callable, batched: Sequence, *given):
-    """`run` of so many lanes at once: their axis comes first outside and last inside, but in what is known."""
-    given = jax.tree.map(lambda x, has: x if has else jnp.broadcast_to(x, (count, *x.shape)), given, tuple(batched))
+    """Run blocks of lanes one after another; their axis is first outside, last inside (known arrays: first)."""
+    given = jax.tree.map(
+        lambda x, has: x if has else jnp.broadcast_to(x, (count, *x.shape)), given, tuple(batched)
+    )
     blocks = -(-count // at_once)
     last = lambda tree: jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), tree)  # noqa: E731
 
     def block(given):
         start, *others = given
-        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), run(last(start)._replace(known=start.known), *last(others)))
+        return jax.tree.map(
+            lambda x: jnp.moveaxis(x, -1, 0), run(last(start)._replace(known=start.known), *last(others))
+        )
 
     if blocks == 1:
         return block(given)
@@ -106,7 +130,7 @@ def _in_blocks(count, at_once: int, run: Callable, batched: Sequence, *given):
 
 
 def mover(args: PyTree) -> Callable[[Integrated, Array, Array], Integrated]:
-    """The state at a time t, as a function of it, of t, and of a time d that is zero, by which it is moved along its rates."""
+    """Return a function (state, time t, time d) -> state, moved along its rates by d, which is zero."""
     known, others = eqx.partition(args, eqx.is_inexact_array)
 
     def moved_by(y, t, d):
@@ -114,7 +138,9 @@ def mover(args: PyTree) -> Callable[[Integrated, Array, Array], Integrated]:
 
         def rates(z):
             y, t, known = unravel(z)
-            found = integrands.rates(t, y, integrands.within(jnp.full_like(t, jnp.inf), eqx.combine(known, others)))
+            found = integrands.rates(
+                t, y, integrands.within(jnp.full_like(t, jnp.inf), eqx.combine(known, others))
+            )
             return ravel_pytree((found, jnp.ones_like(t), jax.tree.map(jnp.zeros_like, known)))[0]
 
         return unravel(moved(rates)(z, d))[0]

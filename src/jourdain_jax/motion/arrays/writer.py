@@ -1,7 +1,7 @@
 """The writer by which the source of a step (`motion/native/step.py`) runs on arrays of JAX.
 
-Lanes are the last axes of arrays, stages are one loop with one copy of the rates to compile, and a branch is `lax.cond`. What a branch or a loop stores to
-is found by tracing it first.
+Lanes are the last axes of arrays, stages are one loop with one copy of the rates to compile, and a branch is
+`lax.cond`. What a branch or a loop stores to is found by tracing it first.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from jaxtyping import Array
 
 
 class Rows(NamedTuple):
-    """Many rows in the place of one."""
+    """Stand for many rows where one is expected."""
 
     first: Any
     many: int
@@ -29,24 +29,26 @@ class Rows(NamedTuple):
 
 @dataclass(eq=False)
 class Room:
-    """Rows in memory: each an array by itself, or (an array of several, its place there)."""
+    """Hold rows: each an array of its own, or (an array of several rows, the index in it)."""
 
     rows: list
     number: int  # of the rooms that a writer has made
 
 
 class Pointer(NamedTuple):
-    """A row of a room."""
+    """Point to a row of a room."""
 
     room: Room
     first: Any
 
 
 class ArrayWriter:
-    """The source on arrays of JAX. `functions`: what `run` calls, by name."""
+    """Run the source of a step on arrays of JAX. `functions`: the object whose methods `run` calls."""
 
     real, truth = "real", "truth"
-    where, magnitude, larger, smaller, root = map(staticmethod, (jnp.where, jnp.abs, jnp.maximum, jnp.minimum, jnp.sqrt))
+    where, magnitude, larger, smaller, root = map(
+        staticmethod, (jnp.where, jnp.abs, jnp.maximum, jnp.minimum, jnp.sqrt)
+    )
     equal, differs, is_nan, power = map(staticmethod, (jnp.equal, jnp.not_equal, jnp.isnan, jnp.power))
 
     def __init__(self, like: Array, functions: Any = None) -> None:
@@ -88,8 +90,12 @@ class ArrayWriter:
         return Pointer(pointer.room, pointer.first + index)
 
     def _place(self, pointer: Pointer, index) -> tuple[Any, int]:
-        """The first row, and how many."""
-        return (pointer.first + index.first, index.many) if isinstance(index, Rows) else (pointer.first + index, 1)
+        """Return the first row, and how many."""
+        return (
+            (pointer.first + index.first, index.many)
+            if isinstance(index, Rows)
+            else (pointer.first + index, 1)
+        )
 
     def load(self, pointer: Pointer, index=0) -> Array:
         """Return a row, or rows as one array."""
@@ -114,7 +120,9 @@ class ArrayWriter:
 
     def _of(self, rows: list) -> Array:
         array, first = rows[0] if rows and isinstance(rows[0], tuple) else (None, 0)
-        if array is not None and all(isinstance(row, tuple) and row[0] is array and row[1] == first + i for i, row in enumerate(rows)):
+        if array is not None and all(
+            isinstance(row, tuple) and row[0] is array and row[1] == first + i for i, row in enumerate(rows)
+        ):
             return array if len(rows) == len(array) else array[first : first + len(rows)]
         return jnp.stack([self._row(row) for row in rows])
 
@@ -125,7 +133,7 @@ class ArrayWriter:
     # branches and loops
 
     def _traced(self, body: Callable) -> tuple[list[Room], Any]:
-        """Return the rooms there are that the body stores to, which are then as before, and the shapes of what it returns."""
+        """Return which existing rooms the body stores to, and the shapes of its results; restore the rooms."""
         outer, self._stored = self._stored, {}
         newest, shapes = next(self._numbers), jax.eval_shape(body)
         stored, self._stored = self._stored, outer
@@ -146,15 +154,21 @@ class ArrayWriter:
         rooms, _ = self._traced(lambda: body() and None)
         arrays = [self.whole(room) for room in rooms]
         yes = eqxi.unvmap_any(jnp.any(condition))
-        found = jax.lax.cond(yes, lambda arrays: self._within(rooms, arrays, body)[0], lambda arrays: arrays, arrays)
+        found = jax.lax.cond(
+            yes, lambda arrays: self._within(rooms, arrays, body)[0], lambda arrays: arrays, arrays
+        )
         self._within(rooms, found, lambda: None)
 
     def over_stages(self, stages: int, body: Callable[[Any, Any], Any], found: Any) -> Any:
         """Return what the body makes of what was found, stage by stage."""
         rooms, shapes = self._traced(lambda: body(jnp.zeros((), jnp.int32), found))
-        found = jax.tree.map(lambda x, like: jnp.broadcast_to(jnp.asarray(x, like.dtype), like.shape), found, shapes)
+        found = jax.tree.map(
+            lambda x, like: jnp.broadcast_to(jnp.asarray(x, like.dtype), like.shape), found, shapes
+        )
         begin = [self.whole(room) for room in rooms], found
-        arrays, found = jax.lax.fori_loop(0, stages, lambda i, carry: self._within(rooms, carry[0], lambda: body(i, carry[1])), begin)
+        arrays, found = jax.lax.fori_loop(
+            0, stages, lambda i, carry: self._within(rooms, carry[0], lambda: body(i, carry[1])), begin
+        )
         self._within(rooms, arrays, lambda: None)
         return found
 

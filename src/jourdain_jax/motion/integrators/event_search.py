@@ -16,13 +16,12 @@ and t_a, is by Chandrupatla's method (inverse quadratic interpolation where it i
 is after it no longer counts: so the event that is found has no other before it, as far as values were seen. A value of zero may be one that stays zero
 beyond the event: it is an end of the bracket like a negative one, which is then halved.
 
-The times tried are numbers to differentiation. Near the event, shifts of Newton's method follow,
+The times tried are constants to differentiation. Near the event, shifts of Newton's method follow,
 
     t <- t - c/cdot,   y <- y + (shift of t) f
 
-whose last ones are zero in value and carry the derivatives of the event time and of the state at the event (the saltation term): each is
-an honest step, and Newton's method doubles the order at which it is right, so that they give derivatives up to the third. Where c is not a number beyond
-the event, only values before it are known: then cdot, which may be infinite there, is a number too, and first derivatives are right.
+Once the event is found, `put_tangents` sets the tangents of its time and of the state there (the saltation term). Where c is not a number beyond the event,
+no Newton shift is taken.
 
 Source: T. R. Chandrupatla, Advances in Engineering Software 28 (1997) 145-149.
 """
