@@ -36,10 +36,10 @@ from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
 from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.program.calls import Call
-from jourdain_jax.scene.identity import now_read_by, once_per_values
+from jourdain_jax.scene.identity import once_per_values
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import check_name, nearest
-from jourdain_jax.scene.names_read import is_function
+from jourdain_jax.scene.names_read import now_read_by
 from jourdain_jax.scene.scene import Scene
 
 OverTimes = Float[Array, "times 3"]
@@ -59,7 +59,7 @@ class Channel(eqx.Module):
 
 def channel(function: Callable, scene: Scene) -> Channel:
     """A function of a motion of this scene as a channel; it is traced again where it is new, or what it reads has changed."""
-    now = now_read_by(function) if is_function(function) else None
+    now = now_read_by(function)
     if now is None:
         return _traced(function, scene)
     kept, key = _kept(function), (now, _kind(scene))

@@ -36,9 +36,8 @@ from jourdain_jax.eager.lanes import uncompiled_lanes
 from jourdain_jax.program.analyticity import depend_on
 from jourdain_jax.program.calls import description
 from jourdain_jax.scene.arguments import ChangingInputs
-from jourdain_jax.scene.identity import now_read_by
 from jourdain_jax.scene.names import check_names
-from jourdain_jax.scene.names_read import is_function
+from jourdain_jax.scene.names_read import now_read_by
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.spline import checked_samples
 
@@ -120,8 +119,8 @@ def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
         kept = _trace(function)
     except TypeError:  # it cannot be hashed
         kept = _Trace()
-    now = (now_read_by(function), real) if kept.again and is_function(function) else None
-    if now is not None and now[0] is not None and kept.now == now:
+    now = (now_read_by(function), real) if kept.again else (None,)
+    if now[0] is not None and kept.now == now:
         return kept.found
     closed, shape = jax.make_jaxpr(lambda t: function(t), return_shape=True)(jax.ShapeDtypeStruct((), real))  # of a new function JAX keeps no trace
     found = None

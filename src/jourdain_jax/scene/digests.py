@@ -16,7 +16,7 @@ from types import CodeType, FunctionType, MethodType, ModuleType
 import jax
 import numpy as np
 
-from jourdain_jax.scene.names_read import is_installed, names_in, spaces
+from jourdain_jax.scene.names_read import is_installed, names_in, names_of
 from jourdain_jax.scene.scene import Scene
 
 
@@ -114,7 +114,7 @@ def _function(f: FunctionType, of) -> object:
             return of(y)
         return of(y), tuple((name, read(vars(y)[name], *outer, y)) for name in attributes if name in vars(y))
 
-    named, around = (tuple((name, read(get(name))) for name in names) for get, names in spaces(f))
+    named, around = (tuple(zip(names, map(read, look()), strict=True)) for names, look in names_of(f))
     if installed:
         return "function", name, around
     return "function", of(f.__code__), of(f.__defaults__), of(f.__kwdefaults__), around, named

@@ -1,8 +1,4 @@
-"""What tells a scene from another: what its methods read, its structure, and the values of its parameters.
-
-As everywhere in JAX, a method is traced once, and what it reads that is no field of the scene is a constant
-of the trace (`names_read.py`): a part of the structure of the scene, looked at when its class is made and
-again at each call. What helpers read is not followed. `clear_caches` makes every scene be traced anew.
+"""What is found of a scene once: by its class, what its methods read (`names_read.py`) and the shapes of its parameters, or by their values, too.
 
 Reference parameters are numbers that stand in for parameters that JAX traces. What holds of a scene at every
 state, such as the rank of its rows and which speeds are independent, must be known before anything is
@@ -15,7 +11,6 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import MISSING, fields
 from functools import lru_cache, wraps
-from itertools import repeat
 from operator import is_
 from threading import Lock
 from types import MappingProxyType
@@ -26,10 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.calculus.reals import is_traced_type, largest
-from jourdain_jax.scene.names_read import StatefulError, functions_in, key_or_refusal, member_key, own_classes, spaces
 from jourdain_jax.scene.parameters import stacked_parameters
-
-_UNSET = object()
 
 
 def clear_caches() -> None:
@@ -44,88 +36,6 @@ def clear_caches() -> None:
                 if callable(value) and hasattr(value, "cache_clear"):  # no module: one that is imported on first use would be
                     value.cache_clear()
     jax.clear_caches()
-
-
-class NamesRead:
-    """Names that methods or functions read; a pytree without leaves, whose structure changes with what they stand for."""
-
-    def __init__(self, watch: "_Watch"):
-        self._watch = watch
-
-    def now(self) -> tuple["_Watch", int]:
-        """Return the watch and a version: equal contents have equal versions. ValueError where a name has come to stand for an object with state."""
-        return self._watch, self._watch.version()
-
-    def __reduce__(self):
-        return names_read, self._watch.roots
-
-
-jax.tree_util.register_pytree_node(NamesRead, lambda read: ((), read.now()), lambda now, _: NamesRead(now[0]))
-
-
-def names_read(*roots: type | Callable) -> NamesRead:
-    """Return the names that the methods of classes, and functions, read. ValueError where one of a method stands for an array, a container or an object with
-    state; of a function in a field such an object is a constant.
-    """
-    return NamesRead(_watch(*roots))
-
-
-def now_read_by(function: Callable) -> Hashable | None:
-    """What the names that a function reads stand for now; None where one has state, so that a trace of the function cannot be kept."""
-    try:
-        return _watch(function, strict=True).version(), function
-    except (StatefulError, TypeError):  # the second: it cannot be hashed
-        return None
-
-
-class _Watch:
-    """Compares what names stand for with what they stood for when they were last looked up."""
-
-    def __init__(self, roots: tuple, strict: bool):
-        self.roots, self._strict = roots, strict
-        self._numbers: dict[Hashable, int] = {}
-        self._look()
-
-    def __reduce__(self):
-        return _watch, self.roots
-
-    def version(self) -> int:
-        """The number of the present content."""
-        same = all(len(members) == size for members, size in self._sizes)
-        if not same or not all(all(map(is_, map(get, names, repeat(_UNSET)), before)) for get, names, before in self._before):
-            self._look()
-        return self._number
-
-    def _look(self) -> None:
-        content: list[tuple] = []
-        before: list[tuple] = []
-        sizes: list[tuple] = []
-
-        def noted(get: Callable, names: tuple[str, ...]) -> tuple:
-            before.append((get, names, tuple(map(get, names, repeat(_UNSET)))))
-            return before[-1][-1]
-
-        for root in self.roots:
-            classes = own_classes(root) if isinstance(root, type) else ()
-            members = [(name, x) for kind in classes for name, x in vars(kind).items()] or [("", root)]
-            for kind in classes:
-                noted(vars(kind).get, tuple(vars(kind)))
-                sizes.append((vars(kind), len(vars(kind))))
-            told = key_or_refusal if classes or self._strict else lambda x, *_: member_key(x)
-            for name, member in members:
-                content.append((name, member_key(member)))
-                for f in () if name.startswith("__") and name != "__call__" else functions_in(member):
-                    where = f"`{root.__name__}.{name}`" if name else f"the function `{f.__qualname__}`"
-                    for get, names in spaces(f):
-                        found = noted(get, names)
-                        content += [(n, told(x, n, where)) for n, x in zip(names, found, strict=True)]
-        self._number = self._numbers.setdefault(tuple(content), len(self._numbers))
-        self._before, self._sizes = before, sizes  # last: what is refused now is refused at the next call, too
-
-
-@lru_cache(maxsize=1024)
-def _watch(*roots, strict: bool = False) -> _Watch:
-    return _Watch(roots, strict)
 
 
 def once_per_values(probe, of_traced: Callable | None = None):
@@ -290,14 +200,13 @@ def once_per_class(describe: Callable, most: int = 1024) -> Callable:
     def of(scene, *case: Hashable):
         leaves, treedef = jax.tree.flatten(scene)
         key = (treedef, tuple(np.shape(x) for x in leaves), jax.config.jax_enable_x64, case)
-        found = known.get(key, _UNSET)
-        if found is _UNSET:
-            found = _described(describe, scene, case)
+        if (found := known.get(key)) is None:
+            found = (_described(describe, scene, case),)
             with keeping:
                 known[key] = found
                 if len(known) > most:
                     known.pop(next(iter(known)))  # the oldest
-        return found
+        return found[0]
 
     vars(of)["cache_clear"] = known.clear
     return of

@@ -1,59 +1,105 @@
 """Names that methods read besides their arguments.
 
-Looked at are the global names and the variables of enclosing functions that a method loads itself:
+As everywhere in JAX, a method is traced once, and what it reads that is no field of the scene is a constant of the trace: a part of the structure of the
+scene, looked at when its class is made and again at each call. Looked at are the members of the class, and the global names and the variables of enclosing
+functions that a method loads itself:
 
 - numbers, texts and tuples of them are compared by type and value, functions by identity, so that `g = 1.62` in the next cell of a notebook is noticed;
 - modules and classes are constants, as are their attributes; so is a function that Python, JAX or another package has wrapped, by identity;
 - arrays, containers and objects with state are refused by name: what changes in them could not be seen.
 
-`identity.py` compares them.
+What helpers read is not followed. `clear_caches` makes every scene be traced anew.
 """
 
 import dis
 import enum
-import functools
 import re
 import sys
 from collections.abc import Callable, Hashable
 from dataclasses import fields, is_dataclass
 from decimal import Decimal
 from fractions import Fraction
+from functools import lru_cache, partial
+from operator import is_
 from pathlib import PurePath
 from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.reals import is_traced
 
-_BASE = f"{__name__.rpartition('.')[0]}.scene"  # the module of the base class, below which nothing of a user's stands
 _VALUES = (bool, int, float, complex, str, bytes, type(None), type(...), range, Fraction, Decimal, re.Pattern, np.dtype)
+_CONSTANTS = (ModuleType, type, FunctionType, np.ufunc, jnp.ufunc, eqx.filter_custom_jvp)
 
 
 class StatefulError(ValueError):
     """A name stands for something whose changes cannot be seen."""
 
 
+class NamesRead:
+    """Names that the methods of classes, or functions, read; a pytree without leaves, whose structure changes with what they stand for."""
+
+    def __init__(self, roots: tuple[type | Callable, ...], strict: bool):
+        self._roots, self._strict = roots, strict
+        self._versions: dict[tuple, int] = {}
+        self._look()
+
+    def __reduce__(self):
+        return names_read, self._roots
+
+    def now(self) -> tuple["NamesRead", int]:
+        """Return itself and a version: equal contents have equal versions. ValueError where a name has come to stand for an object with state."""
+        for look, before in self._seen:
+            found = look()
+            if len(found) != len(before) or not all(map(is_, found, before)):
+                self._look()
+                break
+        return self, self._version
+
+    def _look(self) -> None:
+        content: list[tuple] = []
+        seen: list[tuple] = []
+        for root in self._roots:
+            members = vars(root) if isinstance(root, type) else {"": root}
+            seen.append((members.values, tuple(members.values())))
+            for name, member in list(members.items()):
+                content.append((name, _key_of(member)))
+                for f in () if name.startswith("__") and name != "__call__" else functions_in(member):
+                    where = f"`{root.__name__}.{name}`" if name else f"the function `{f.__qualname__}`" if self._strict else ""
+                    for names, look in names_of(f):
+                        found = look()
+                        seen.append((look, found))
+                        content += [(n, _key_of(x, n, where)) for n, x in zip(names, found, strict=True)]
+        self._version = self._versions.setdefault(tuple(content), len(self._versions))
+        self._seen = seen  # last: what is refused now is refused at the next call, too
+
+
+jax.tree_util.register_pytree_node(NamesRead, lambda read: ((), read.now()), lambda now, _: now[0])
+
+
+@lru_cache(maxsize=1024)
+def names_read(*roots: type | Callable, strict: bool = False) -> NamesRead:
+    """Return the names that the methods of classes, and functions, read. ValueError where one of a method stands for an array, a container or an object with
+    state; of a function such an object is a constant, unless `strict`.
+    """
+    return NamesRead(roots, strict)
+
+
+def now_read_by(function: Callable) -> Hashable | None:
+    """What the names that a function reads stand for now; None where one has state, or it is no function, so that a trace of it cannot be kept."""
+    try:
+        return names_read(function, strict=True).now() if is_function(function) else None
+    except (StatefulError, TypeError):  # the second: it cannot be hashed
+        return None
+
+
 def is_function(x) -> bool:
     """Whether it is a function that may read something, and not a module that holds numbers."""
-    return isinstance(x, FunctionType | MethodType | functools.partial) or callable(_attribute(x, "__wrapped__"))
-
-
-class _Same:
-    """An object that is compared by identity, and kept."""
-
-    __slots__ = ("x",)
-
-    def __init__(self, x):
-        self.x = x
-
-    def __eq__(self, other):
-        return isinstance(other, _Same) and self.x is other.x
-
-    def __hash__(self):
-        return id(self.x)
+    return isinstance(x, FunctionType | MethodType | partial) or callable(_attribute(x, "__wrapped__"))
 
 
 def is_installed(name: str | None) -> bool:
@@ -61,16 +107,10 @@ def is_installed(name: str | None) -> bool:
     top = (name or "").partition(".")[0]
     if top == "__main__":
         return False
-    if top == __name__.partition(".")[0] or top in sys.builtin_module_names or top in sys.stdlib_module_names:
+    if top == __name__.partition(".")[0] or top in sys.stdlib_module_names:
         return True
     file = getattr(sys.modules.get(name or ""), "__file__", None) or ""
     return "site-packages" in file or "dist-packages" in file
-
-
-def own_classes(kind: type) -> tuple[type, ...]:
-    """The class and those that it is derived from, up to the base class of all scenes."""
-    order = kind.__mro__
-    return order[: next((k for k, owner in enumerate(order) if owner.__module__ == _BASE), len(order) - 1)]
 
 
 def functions_in(member) -> list[FunctionType]:
@@ -85,56 +125,53 @@ def functions_in(member) -> list[FunctionType]:
 
 
 def _attribute(x, name: str):
-    """An attribute, or None; an object's own `__getattr__` may raise anything."""
+    """An attribute, or None; an object's own `__getattr__` may raise anything, and so does a variable that is not yet set."""
     try:
         return getattr(x, name, None)
     except Exception:
         return None
 
 
-def spaces(f: FunctionType) -> tuple[tuple[Callable, tuple[str, ...]], ...]:
-    """How the names that a function loads itself are looked up, `get(name, default)`, and which: its globals, and the variables of the functions around it."""
+def names_of(f: FunctionType) -> tuple[tuple[tuple[str, ...], Callable[[], list]], ...]:
+    """The names that a function loads itself, with what looks them up: its globals, and the variables of the functions around it; None where not yet set."""
     written = {"__class__"} | names_in(f.__code__, ("STORE_GLOBAL", "STORE_DEREF"))  # a counter of calls, say
-    own, around = names_in(f.__code__, ("LOAD_GLOBAL", "LOAD_NAME")) - written, set(f.__code__.co_freevars) - written
-    cells = dict(zip(f.__code__.co_freevars, f.__closure__ or (), strict=True))
-
-    def variable(name: str, default=None):
-        try:
-            return cells[name].cell_contents
-        except ValueError:  # not yet set
-            return default
-
-    return (f.__globals__.get, tuple(sorted(own))), (variable, tuple(sorted(around)))
+    own = tuple(sorted(names_in(f.__code__, ("LOAD_GLOBAL", "LOAD_NAME")) - written))
+    cells = {name: cell for name, cell in zip(f.__code__.co_freevars, f.__closure__ or (), strict=True) if name not in written}
+    return (own, lambda: [*map(f.__globals__.get, own)]), (tuple(cells), lambda: [_attribute(cell, "cell_contents") for cell in cells.values()])
 
 
-@functools.lru_cache(maxsize=4096)
+@lru_cache(maxsize=4096)
 def names_in(code: CodeType, operations: tuple[str, ...] | None = None) -> frozenset[str]:
     """Names on which code works, of attributes too, or those by some operations of Python's machine alone; functions inside it included."""
     own = frozenset(code.co_names if operations is None else (i.argval for i in dis.get_instructions(code) if i.opname in operations))
     return own.union(*(names_in(inner, operations) for inner in code.co_consts if isinstance(inner, CodeType)))
 
 
-def member_key(member) -> Hashable:
-    """The key of a member of a class: by value where it has no state, otherwise by identity."""
-    try:
-        return key(member)
-    except StatefulError:
-        return _Same(member)
+class _Same:
+    """An object that is compared by identity, and kept."""
+
+    def __init__(self, x):
+        self.x = x
+
+    def __eq__(self, other):
+        return isinstance(other, _Same) and self.x is other.x
+
+    def __hash__(self):
+        return id(self.x)
 
 
-def key_or_refusal(x: Any, name: str, where: str) -> Hashable:
+def _key_of(x: Any, name: str = "", where: str = "") -> Hashable:
+    """The key of what a name stands for; of what has state its identity, or, where it is said `where` it is read, a StatefulError."""
     try:
         return key(x)
     except StatefulError:
-        pass
-    if is_traced(x):
-        raise StatefulError(f"{where} reads `{name}`, which JAX is tracing (jit, grad, vmap) and which is no field of the scene; {_advice(name)}")
-    kind = type(x).__name__ if "ArrayImpl" not in type(x).__name__ else "array"
-    raise StatefulError(f"{where} reads `{name}`, an object ({kind}) that may change without being noticed; {_advice(name)}")
-
-
-def _advice(name: str) -> str:
-    return f"make it a field, `{name}: ... = jj.parameter(...)`, or, where it holds no numbers, `eqx.field(static=True)`; or a tuple of numbers"
+        if not where:
+            return _Same(x)
+    what = f"an object ({'array' if isinstance(x, jax.Array) else type(x).__name__}) that may change without being noticed"
+    raise StatefulError(
+        f"{where} reads `{name}`, {'which JAX is tracing (jit, grad, vmap) and which is no field of the scene' if is_traced(x) else what}; "
+        f"make it a field, `{name}: ... = jj.parameter(...)`, or, where it holds no numbers, `eqx.field(static=True)`; or a tuple of numbers"
+    )
 
 
 def key(x: Any) -> Hashable:
@@ -144,26 +181,32 @@ def key(x: Any) -> Hashable:
     """
     if type(x) in _VALUES or isinstance(x, np.number | np.bool_ | PurePath):
         return type(x), repr(x)
-    if isinstance(x, slice):
-        return type(x), key((x.start, x.stop, x.step))
-    if isinstance(x, tuple | frozenset) and not getattr(x, "__dict__", None):
-        return type(x), tuple(map(key, x)) if isinstance(x, tuple) else frozenset(map(key, x))
-    if isinstance(x, functools.partial):
-        return type(x), key(x.func), key(x.args), tuple((name, key(value)) for name, value in x.keywords.items())
-    if isinstance(x, enum.Enum) or getattr(vars(type(x)).get("__dataclass_params__"), "frozen", False):
-        own = {field.name: getattr(x, field.name, None) for field in (fields(x) if is_dataclass(x) else ())} | getattr(x, "__dict__", {})
-        return type(x), tuple((name, key(value)) for name, value in own.items())
+    parts = _parts(x)
+    if parts is not None:
+        return type(x), tuple(map(key, parts))
     if _is_constant(x):
         return _Same(x)
     raise StatefulError
+
+
+def _parts(x: Any) -> tuple | None:
+    """What a container holds that cannot change; None of anything else."""
+    if isinstance(x, slice):
+        return x.start, x.stop, x.step
+    if isinstance(x, partial):
+        return x.func, x.args, *x.keywords.items()
+    if isinstance(x, tuple | frozenset) and not getattr(x, "__dict__", None):
+        return tuple(x)
+    if isinstance(x, enum.Enum) or getattr(vars(type(x)).get("__dataclass_params__"), "frozen", False):
+        own = [(field.name, getattr(x, field.name, None)) for field in (fields(x) if is_dataclass(x) else ())]
+        return *own, *getattr(x, "__dict__", {}).items()
+    return None
 
 
 def _is_constant(x: Any) -> bool:
     """Whether it is a module, a class, a function, or something else that has no state of its own."""
     if isinstance(x, BuiltinFunctionType | MethodType):
         return x.__self__ is None or isinstance(x.__self__, ModuleType | type)
-    if isinstance(x, ModuleType | type | FunctionType | staticmethod | classmethod | property | np.ufunc | jnp.ufunc | functools.cached_property):
-        return True
-    if type(x) is object or type(x).__module__ == "typing" or type(x) is eqx.filter_custom_jvp:
+    if isinstance(x, _CONSTANTS) or type(x) is object or type(x).__module__ == "typing":
         return True
     return callable(_attribute(x, "__wrapped__")) and is_installed(type(x).__module__)  # a user's own class of wrappers may have state

@@ -17,11 +17,10 @@ from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.coordinates import Coordinates, Names
 from jourdain_jax.scene.description import check_description, checked_arguments
-from jourdain_jax.scene.identity import NamesRead, names_read
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.names import Named, nearest
-from jourdain_jax.scene.names_read import is_function
+from jourdain_jax.scene.names_read import NamesRead, is_function, names_read
 from jourdain_jax.scene.parameters import check_parameters, parameters_of
 from jourdain_jax.scene.printing import scene_html, scene_text
 from jourdain_jax.scene.visuals import Visual
@@ -59,13 +58,13 @@ class Scene(eqx.Module):
     def __init_subclass__(cls, **options):
         """Look at the names that the methods read; ValueError where one stands for an object with state."""
         super().__init_subclass__(**options)
-        names_read(cls)
+        _names_read(cls)
 
     def __new__(cls, *args, **kwargs):
         """Before any field is set: the arguments are parameters of the scene."""
         checked_arguments(cls, kwargs)
         scene = super().__new__(cls)
-        object.__setattr__(scene, "_read", names_read(cls))  # functions in fields come to it when they are known
+        object.__setattr__(scene, "_read", _names_read(cls))  # functions in fields come to it when they are known
         return scene
 
     def __check_init__(self):
@@ -237,6 +236,11 @@ def _vector(entries: list) -> Float[Array | np.ndarray, "entries"]:
     return np.array([value if type(value) is float else np.asarray(value) for value in entries], real_type())  # at once: no small programs to compile
 
 
+def _names_read(kind: type[Scene], *functions: Callable) -> NamesRead:
+    """Return the names that functions and the methods of a scene's own classes read."""
+    return names_read(*(owner for owner in kind.__mro__ if owner not in Scene.__mro__), *functions)
+
+
 class HeldFunction(eqx.Module):
     """A function that JAX takes for part of the structure of the scene, as it takes a static field."""
 
@@ -245,7 +249,7 @@ class HeldFunction(eqx.Module):
 
     def __init__(self, function: Callable[..., Any]):
         self.function = function
-        self.read = names_read(function) if is_function(function) else names_read()
+        self.read = names_read(*filter(is_function, (function,)))
 
     def __call__(self, *args, **kwargs):
         """What the function returns."""
@@ -262,7 +266,7 @@ def hold_leaves(scene) -> None:
         return HeldFunction(leaf) if callable(leaf) else jnp.asarray(leaf) if type(leaf) is float else leaf
 
     static = tuple(value for field in fields(scene) if field.metadata.get("static") and is_function(value := getattr(scene, field.name)))
-    object.__setattr__(scene, "_read", names_read(type(scene), *static))
+    object.__setattr__(scene, "_read", _names_read(type(scene), *static))
     for field in fields(scene):
         if field.metadata.get("static") or field.metadata.get("parameter"):
             continue
