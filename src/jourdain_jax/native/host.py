@@ -2,7 +2,8 @@
 
 Code is kept between processes in the folder of JAX's compilation cache where one is set, otherwise in the user's cache. A file is named by what its code was
 made from. It begins with a digest of that name, of what made it and of the code, so that one that is torn, changed or exchanged for another is made again.
-Code from others would run in this process: a folder or a file that somebody else owns or may write is not used.
+Code from others would run in this process: a folder or a file that somebody else owns or may write is not used. The digest holds no secret, and LLVM does
+not check what it loads: who may write as the user can make a file that runs code or ends the process, and may change what Python imports anyway.
 """
 
 import contextlib
