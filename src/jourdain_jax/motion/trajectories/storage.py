@@ -113,7 +113,7 @@ def load_trajectory(path: str | os.PathLike, scene: Scene | type[Scene]) -> Traj
     """
     header, arrays, kind = _read(path, scene, "trajectory")
     lanes = _lanes(path, kind, header, {name: x[None] for name, x in arrays.items()})
-    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[0]), lanes)
+    return jax.tree.map(lambda x: x[0], lanes)
 
 
 @with_nan_as_a_mark
@@ -134,6 +134,7 @@ def _lanes(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
     longest = max(len(times) for times, _ in samples)  # lanes with fewer are filled up with their last sample
     arrays["input_ts"] = np.stack([np.pad(times, (0, longest - len(times)), mode="edge") for times, _ in samples])
     arrays["inputs"] = np.stack([np.pad(values, ((0, longest - len(values)), (0, 0)), mode="edge") for _, values in samples])
+    arrays = {name: jnp.asarray(x) for name, x in arrays.items()}  # `vmap` hands on what is given to it as it is
     try:
         lanes = jax.vmap(lambda arrays: _trajectory(path, kind, header, arrays))(arrays)
     except _NEEDS_NUMBERS:  # a class that looks at them when a scene is made
@@ -172,10 +173,10 @@ def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajecto
             )
     return Trajectory(
         scene=scene,
-        work=jnp.asarray(arrays["work"]) if "work" in arrays else None,
+        work=arrays.get("work"),
         inputs=Inputs(tuple(Sampled(arrays["input_ts"], column) for column in arrays["inputs"].T)),
         event_names=tuple(header["event_names"]),
-        **{name: jnp.asarray(arrays[name]) for name in _ARRAYS},
+        **{name: arrays[name] for name in _ARRAYS},
         **{name: header[name] for name in RERUN_FIELDS},
     )
 
