@@ -163,9 +163,10 @@ def test_what_is_not_watched_is_said():
 
 
 def test_a_motion_that_burns_its_steps_names_the_load_that_jumps():
-    stuck = motion(Sliding(law=lambda s, t, x, v: -2.0 * jnp.sign(v)), max_steps=2000)
-    assert not stuck.succeeded
-    assert "the force along `x_rate` jumps, or has a kink, at the last state" in stuck.message
+    lanes = jj.rollout(Sliding(law=lambda s, t, x, v: -2.0 * jnp.sign(v)), {"x_rate": np.array([1.0, 50.0])}, t1=1.0, max_steps=2000)
+    assert lanes.failed.tolist() == [0]
+    for text in (lanes.lane(0).message, str(lanes)):
+        assert "(the force along `x_rate` jumps, or has a kink, at the last state" in text
 
 
 class Ring(OnPlane):

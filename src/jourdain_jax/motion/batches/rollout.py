@@ -124,8 +124,8 @@ class Rollout(Printed, eqx.Module):
                 events = np.asarray(self.lanes.event)[lanes]
                 named = " " + ", ".join(f"`{self.lanes.event_names[i]}` {int(np.sum(events == i))}" for i in np.unique(events))
             elif code != results.SUCCESS:
-                named = f" ({', '.join(dict.fromkeys(name for i in lanes[:10] for name in self.lane(int(i)).faults))})" if code == results.BAD_PARAMETER else ""
-                named += ": lanes " + ", ".join(map(str, lanes[:10])) + (" ..." if lanes.size > 10 else "")
+                faults = dict.fromkeys(name for i in lanes[:10] for name in self.lane(int(i)).faults)
+                named = f" ({', '.join(faults)})" * bool(faults) + ": lanes " + ", ".join(map(str, lanes[:10])) + (" ..." if lanes.size > 10 else "")
             lines.append(f"  {lanes.size} {message}{named}")
         if self.continued.size:
             lines.append(f"  {len(self.continued)} left the domain of their privileged speeds and were run with the full state")

@@ -136,12 +136,10 @@ class Trajectory(Record, Printed):
         """How the motion ended, in words."""
         code = int(self.result)
         text = results.MESSAGES[code]
-        if code == results.BAD_PARAMETER:
-            return f"{text} ({', '.join(self.faults)}); check where it was computed"
-        if code in (results.MAX_STEPS, results.SHRANK, results.STEP_TOO_SMALL, results.STIFF):
-            jumping = bent_load(self.scene, self.t_end, self.q_end, self.u_end, inputs_at(self.inputs, self.t_end))
-            return text + f"; {jumping} jumps, or has a kink, at the last state: let it change within a short range, as by `jnp.tanh`" * bool(jumping)
-        return f"{text} `{self.event_names[int(self.event)]}`" if code == results.EVENT else text
+        if code == results.EVENT:
+            return f"{text} `{self.event_names[int(self.event)]}`"
+        named = f" ({', '.join(faults)})" if (faults := self.faults) else ""
+        return text + named + "; check where it was computed" * (code == results.BAD_PARAMETER)
 
     @property
     @of_known_numbers
@@ -162,11 +160,21 @@ class Trajectory(Record, Printed):
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """Parameters that are not finite or have the wrong sign, otherwise what bodies, contacts and gravity cannot have, as they stand in messages."""
+        """What can be named of the cause of a failure, as it stands in messages.
+
+        Parameters that are not finite or have the wrong sign, otherwise what bodies, contacts and gravity cannot have; where steps became short, a load that
+        jumps or has a kink.
+        """
+        code, inputs = int(self.result), inputs_at(self.inputs, self.t_end)
+        if code in (results.MAX_STEPS, results.SHRANK, results.STEP_TOO_SMALL, results.STIFF):
+            load = bent_load(self.scene, self.t_end, self.q_end, self.u_end, inputs)
+            return (f"{load} jumps, or has a kink, at the last state: let it change within a short range, as by `jnp.tanh`",) if load else ()
+        if code != results.BAD_PARAMETER:
+            return ()
         if self.wrong_parameters:
             return tuple(f"`{name}`" for name in self.wrong_parameters)
         q, u, _ = self.scene.named()
-        return tuple(fault for fault, wrong in known_faults_at(self.scene, self.t_end, q, u, inputs_at(self.inputs, self.t_end)).items() if bool(wrong))
+        return tuple(fault for fault, wrong in known_faults_at(self.scene, self.t_end, q, u, inputs).items() if bool(wrong))
 
     def nan_if_failed(self) -> "Trajectory":
         """The trajectory itself, with NaN in place of its states where it reached neither its end nor an event: under `jit`, `vmap` and `grad`, lane by lane.
