@@ -10,7 +10,6 @@ import hashlib
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
-from functools import partial
 from types import CodeType, FunctionType, MethodType, ModuleType
 
 import jax
@@ -60,12 +59,8 @@ def _parts(x: object, depth: int, within: set[int], known: dict) -> object:
         return "set", tuple(sorted(map(repr, map(of, x))))
     if isinstance(x, Mapping):
         return "mapping", tuple((of(key), of(value)) for key, value in x.items())
-    if isinstance(x, partial):
-        return "partial", of(x.func), of(x.args), of(x.keywords)
     if isinstance(x, MethodType):
         return "method", of(x.__func__), of(x.__self__)
-    if isinstance(x, staticmethod | classmethod):
-        return type(x).__name__, of(x.__func__)
     if isinstance(x, property):
         return "property", of(x.fget)
     if isinstance(x, CodeType):
@@ -78,7 +73,7 @@ def _parts(x: object, depth: int, within: set[int], known: dict) -> object:
     if isinstance(x, type):
         return _class(x, of)
     if callable(inner := getattr(x, "__wrapped__", None)):
-        return "wrapped", of(inner)
+        return type(x).__qualname__, of(inner)
     if is_dataclass(x):
         return of(type(x)), tuple((field.name, of(getattr(x, field.name, None))) for field in fields(x))
     members = getattr(x, "__dict__", None)
