@@ -63,7 +63,6 @@ def compiled_by_the_user(scene):
 
 NOTICED = {
     "a number": ("k = 1.0", "k", "k = 4.0"),
-    "a whole number": ("k = 1", "k", "k = 4"),
     "a number of another type": ("k = True", "jnp.where(isinstance(k, bool), 1.0, 4.0)", "k = 1"),
     "a number of NumPy": ("k = np.float32(1)", "k", "k = np.float32(4)"),
     "a tuple": ("k = (1.0, (2.0, 'a'))", "k[0]", "k = (4.0, (2.0, 'a'))"),
@@ -78,6 +77,7 @@ NOTICED = {
     "a function that remembers": ("law = functools.lru_cache(lambda x: 1.0)", "law(1)", "law = functools.lru_cache(lambda x: 4.0)"),
     "a frozen dataclass": (TWO_FIELDS + "k = Two()", "k.a", "k = Two(a=4.0)"),
     "a function": ("def law(): return 1.0", "law()", "def law(): return 4.0"),
+    "other code in a function": ("def law(): return 1.0\ndef other(): return 4.0", "law()", "law.__code__ = other.__code__"),
     "a compiled function": ("import jax\nlaw = jax.jit(lambda x: 1.0 * x)", "law(1.0)", "law = jax.jit(lambda x: 4.0 * x)"),
     "a partial function": ("law = functools.partial(pow, 1.0)", "law(2)", "law = functools.partial(pow, 2.0)"),
     "a class": ("class Law:\n    k = 1.0", "Law.k", "class Law:\n    k = 4.0"),

@@ -4,7 +4,8 @@ As everywhere in JAX, a method is traced once, and what it reads that is no fiel
 scene, looked at when its class is made and again at each call. Looked at are the members of the class, and the global names and the variables of enclosing
 functions that a method loads itself:
 
-- numbers, texts and tuples of them are compared by type and value, functions by identity, so that `g = 1.62` in the next cell of a notebook is noticed;
+- numbers, texts and tuples of them are compared by type and value, functions by their identity and that of
+  their code, so that `g = 1.62` in the next cell of a notebook is noticed, and what `%autoreload` does;
 - modules and classes are constants, as are their attributes; so is a function that Python, JAX or another package has wrapped, by identity;
 - arrays, containers and objects with state are refused by name: what changes in them could not be seen.
 
@@ -20,7 +21,7 @@ from dataclasses import fields, is_dataclass
 from decimal import Decimal
 from fractions import Fraction
 from functools import lru_cache, partial
-from operator import is_
+from operator import attrgetter, is_
 from pathlib import PurePath
 from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
@@ -63,17 +64,23 @@ class NamesRead:
     def _look(self) -> None:
         content: list[tuple] = []
         seen: list[tuple] = []
+        functions: list[FunctionType] = []
         for root in self._roots:
             members = vars(root) if isinstance(root, type) else {"": root}
             seen.append((members.values, tuple(members.values())))
             for name, member in list(members.items()):
                 content.append((name, _key_of(member)))
                 for f in () if name.startswith("__") and name != "__call__" else functions_in(member):
+                    functions.append(f)
                     where = f"`{root.__name__}.{name}`" if name else f"the function `{f.__qualname__}`" if self._strict else ""
                     for names, look in names_of(f):
                         found = look()
                         seen.append((look, found))
                         content += [(n, _key_of(x, n, where)) for n, x in zip(names, found, strict=True)]
+                        functions += [x for x in found if isinstance(x, FunctionType)]
+        codes = lambda: [*map(attrgetter("__code__"), functions)]  # noqa: E731
+        seen.append((codes, codes()))
+        content.append(tuple(map(_Same, codes())))
         self._version = self._versions.setdefault(tuple(content), len(self._versions))
         self._seen = seen  # last: what is refused now is refused at the next call, too
 

@@ -41,7 +41,8 @@ class Scene(eqx.Module):
 
     Methods are traced once, as everywhere in JAX: what they read besides the fields of the scene is a constant. Numbers, texts, tuples of them and functions
     that a method itself reads as global names, or as variables of a function around it, may be bound anew: the next call notices that, as it does a method
-    that is replaced. Arrays, lists, dictionaries and objects with state are refused by name: make them parameters or static fields. Not noticed is a change
+    that is replaced, and code that `%autoreload` puts into functions. Arrays, lists, dictionaries and objects
+    with state are refused by name: make them parameters or static fields. Not noticed is a change
     of what helpers read, of attributes of modules and classes, and of files: `jj.clear_caches()` starts anew.
     """
 
