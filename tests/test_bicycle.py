@@ -484,8 +484,6 @@ def test_the_benchmark_speeds_are_the_published_ones():
     assert_allclose(found.weave_speed, oracle.WEAVE_SPEED, **close)
     assert_allclose(found.capsize_speed, oracle.CAPSIZE_SPEED, **close)
     assert_allclose(found.double_root_speed, oracle.DOUBLE_ROOT_SPEED, **close)
-    assert_allclose(found.weave_frequency, oracle.WEAVE_FREQUENCY, **close)
-    assert_allclose(found.double_root_eigenvalue, oracle.DOUBLE_ROOT, **close)
     assert_allclose(found.stable_from, found.weave_speed, **close)
     assert_allclose(found.stable_to, found.capsize_speed, **close)
     assert found.stable_range_exists
@@ -511,7 +509,7 @@ def test_the_eigenvalues_cross_where_the_speeds_say(name):
     below, above = (_growth_rates(matrices, found.double_root_speed * (1 + shift))[2:] for shift in (-1e-6, 1e-6))
     assert (below.imag == 0).all()
     assert (above.imag != 0).all()
-    assert_allclose([below.real, above.real], found.double_root_eigenvalue, rtol=1e-2)
+    assert_allclose(below.real.mean(), above.real.mean(), rtol=1e-2)
 
     assert found.stable_range_exists
     middle = 0.5 * (found.stable_from + found.stable_to)
@@ -531,12 +529,12 @@ def test_a_bicycle_that_speed_does_not_change_has_no_stable_range():
     M, _, K0, _, g = BENCHMARK
     found = speeds_of(M, np.zeros((2, 2)), K0, np.zeros((2, 2)), g)
     assert np.isnan([found.weave_speed, found.capsize_speed, found.double_root_speed]).all()
-    assert np.isnan([found.weave_frequency, found.stable_from, found.stable_to]).all()
+    assert np.isnan([found.stable_from, found.stable_to]).all()
     assert not found.stable_range_exists
 
     def weave_and_double_root(M):
         found = stability_speeds(M, np.zeros((2, 2)), K0, np.zeros((2, 2)), g)
-        return jnp.stack([found.weave_speed, found.weave_frequency, found.double_root_speed, found.capsize_speed])
+        return jnp.stack([found.weave_speed, found.double_root_speed, found.capsize_speed])
 
     assert (jax.jit(jax.jacrev(weave_and_double_root))(M) == 0).all()
 
@@ -559,7 +557,7 @@ def test_derivatives_of_the_speeds_are_those_of_the_formulas():
 
     def speeds(parameters):
         found = stability_speeds(*_matrices(parameters))
-        return jnp.stack([found.weave_speed, found.capsize_speed, found.double_root_speed, found.weave_frequency])
+        return jnp.stack([found.weave_speed, found.capsize_speed, found.double_root_speed])
 
     parameters = _parameters("Benchmark")
     for derivative in (jax.jacfwd, jax.jacrev):

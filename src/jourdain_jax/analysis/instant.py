@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.build.structure import structure_of, usual_rows
@@ -40,7 +40,7 @@ from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.scene import Scene
 
 Slopes = tuple[Float[Entries, "values"], Float[Entries, "values columns"], Float[Entries, "_ _"]]
-Matrix = tuple[tuple[int, int], dict[tuple[int, int], int]]  # a shape, and nodes by row and column; others are zero
+Nodes = Int[np.ndarray, "_ _"]
 
 
 class Places(NamedTuple):
@@ -71,19 +71,23 @@ def _ranges(*counts: int) -> list[np.ndarray]:
 class Sloped:
     """Values of nodes v, their slopes D, and maybe another matrix, as machine code or by NumPy: a function of the numbers given, which may be traced."""
 
-    def __init__(self, graph: Graph, v: Sequence[int], columns: Sequence[int], given: Sequence[int], guards: Sequence[int], matrix: Matrix = ((0, 0), {})):
-        column = {x: k for k, x in enumerate(columns)}
-        slopes = {(i, column[x]): node for i, row in enumerate(jacobian(graph, v, columns)) for x, node in row.items()}
-        parts = ((len(v), 1), {(i, 0): node for i, node in enumerate(v)}), ((len(v), len(columns)), slopes), matrix
-        nodes = [node for _, entries in parts for node in entries.values()]
-        self.which, first = [], 0
-        for shape, entries in parts:
-            self.which.append(np.full(shape, len(nodes) + len(guards)))  # where there is a zero
-            for k, place in enumerate(entries):
-                self.which[-1][place] = first + k
-            first += len(entries)
-        self.guards, self.is_made = slice(first, None), is_made(graph, [*nodes, *guards])
-        self._parts = graph, [*nodes, *guards], given
+    def __init__(
+        self,
+        graph: Graph,
+        v: Sequence[int],
+        columns: Sequence[int],
+        given: Sequence[int],
+        guards: Sequence[int],
+        matrix: Nodes | None = None,
+    ) -> None:
+        D, column = np.full((len(v), len(columns)), graph.zero), {x: k for k, x in enumerate(columns)}
+        for row, slopes in zip(D, jacobian(graph, v, columns), strict=True):
+            row[[column[x] for x in slopes]] = [*slopes.values()]
+        matrix = np.zeros((0, 0), int) if matrix is None else matrix
+        parts = [np.array(v, int), D, matrix, np.array(guards, int)]
+        nodes = np.unique(np.concatenate([*map(np.ravel, parts)])).tolist()
+        self._which, self._parts = [np.searchsorted(nodes, part) for part in parts], (graph, nodes, given)
+        self.is_made = is_made(graph, nodes)
         self._known = _evaluated(*self._parts)
 
     @cached_property
@@ -94,10 +98,9 @@ class Sloped:
         """v, D and the other matrix; NaN where a guard is not positive."""
         xp = array_module(numbers)
         found = (self._traced if xp is jnp else self._known)(numbers)
-        found = xp.where(xp.all(found[self.guards] > 0), found, xp.nan)
-        found = xp.concatenate([found, xp.zeros(1, found.dtype)])
-        v, D, matrix = (found[which] for which in self.which)
-        return v[:, 0], D, matrix
+        *values, guards = (found[which] for which in self._which)
+        v, D, matrix = (xp.where(xp.all(guards > 0), x, xp.nan) for x in values)
+        return v, D, matrix
 
 
 class ByProgram:
@@ -123,7 +126,9 @@ class ByProgram:
         self.graph, self.given, self.program, self.states = graph, given, program, (first + 1, n, m)
         self.v = [*qdot, *(udot.get(k, graph.zero) for k in range(m)), *g, *phi]
         self.columns = [*given[first:], *(given[k] for k in varied)]
-        matrix = (m, m), {key: node for (i, k), node in zip(M, of_masses, strict=True) for key in ((i, k), (k, i))}
+        matrix = np.full((m, m), graph.zero)
+        for (i, k), node in zip(M, of_masses, strict=True):
+            matrix[i, k] = matrix[k, i] = node
         self.of = Sloped(graph, self.v, self.columns, given, self.guards, matrix)
 
     def __call__(self, scene: Scene, t, q, u, f) -> Slopes:

@@ -121,14 +121,16 @@ class _Problem(eqx.Module):
     privileged: tuple[int, ...] = eqx.field(static=True)
     resting: tuple[int, ...] = eqx.field(static=True)  # coordinates that must not move
 
-    def __call__(self, z: Float[Array, "unknowns"]) -> tuple[Array, Array, Array]:
-        """What vanishes, its slopes, and d2y/dt2."""
+    def __call__(self, z: Float[Array, "unknowns"]) -> tuple[Array, Array, list[Scalar]]:
+        """What vanishes, its slopes, and the largest of the rows, of dy/dt, and of d2y/dt2."""
         at = places_of(self.scene)
         v, D, _ = self.instant(self.scene, self.t, z[: len(at.q)], z[len(at.q) :], self.f)
         y = at.udot[np.array(self.privileged, int)]
-        rows = np.concatenate([at.g, at.phi, y, at.qdot[np.array(self.resting, int)]])
+        of_rows = np.concatenate([at.g, at.phi])
+        rows = np.concatenate([of_rows, y, at.qdot[np.array(self.resting, int)]])
         along = jnp.concatenate([jnp.ones(1, v.dtype), v[at.qdot], v[at.udot], jnp.zeros(len(at.f), v.dtype)])
-        return v[rows], D[rows][:, np.concatenate([at.q, at.u])], D[y] @ along
+        slopes = D[rows][:, np.concatenate([at.q, at.u])]
+        return v[rows], slopes, [largest(v[of_rows]), largest(v[y]), largest(D[y] @ along)]
 
 
 @partial(compiled, options=RUN_SELDOM)
@@ -138,8 +140,7 @@ def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], most_steps: i
     eps = float(np.finfo(guess.dtype).eps)
     round_off = float(np.sqrt(eps))
     z = smooth_root(lambda z: still(z)[:2], lambda z: problem(z)[0], guess, guess, size, eps, round_off, most_steps)
-    left, _, second = problem(z)
-    of_rows, first, _ = (largest(x) for x in jnp.split(left, np.cumsum([len(left) - len(problem.privileged) - len(problem.resting), len(problem.privileged)])))
-    residual = jnp.maximum(of_rows, jnp.maximum(first, largest(second)))
+    of_rows, first, second = problem(z)[2]
+    residual = jnp.maximum(of_rows, jnp.maximum(first, second))
     state = state_of(problem.scene, problem.t, z[:n], z[n:], largest(z[:n] - q), largest(z[n:] - u), of_rows)
     return SteadyMotion(state, first, residual, residual < round_off)

@@ -46,13 +46,14 @@ class BicycleMatrices(NamedTuple):
 
 
 class StabilitySpeeds(eqx.Module):
-    """The speeds at which a bicycle's stability changes, m/s; NaN where there is none up to the largest speed."""
+    """The speeds at which a bicycle's stability changes, m/s; NaN where there is none up to the largest speed.
+
+    Eigenvalues there: `jj.critical`, `eigenvalues`.
+    """
 
     weave_speed: Scalar  # above it the oscillation of lean and steer decays
     capsize_speed: Scalar  # above it a slow fall to one side grows
     double_root_speed: Scalar  # above it the two unstable real eigenvalues are the weave pair
-    weave_frequency: Scalar  # rad/s, at the weave speed
-    double_root_eigenvalue: Scalar  # 1/s, at the double root speed
     stable_from: Scalar  # the widest range of speeds where all four eigenvalues decay (no derivative)
     stable_to: Scalar  # its end: the largest speed looked at if it is still stable there (no derivative)
     stable_range_exists: Flag
@@ -116,14 +117,12 @@ def _stability_speeds(matrices: BicycleMatrices, top: Scalar) -> StabilitySpeeds
 
     upward = is_zero & (_slope(b0, zeros) * jnp.polyval(b1, zeros) < 0)
     capsize = jnp.min(jnp.where(upward, zeros, jnp.inf), initial=jnp.inf)
-    frequencies = jnp.polyval(b1, opposites) / jnp.where(b3 == 0, jnp.inf, b3)
-    downward = is_opposite & (frequencies > 0) & (_slope(opposite, opposites) * b3 > 0)
+    downward = is_opposite & (jnp.polyval(b1, opposites) * b3 > 0) & (_slope(opposite, opposites) * b3 > 0)
     weave = jnp.argmax(jnp.where(downward, opposites, -jnp.inf))
     has_weave = downward[weave]
 
-    below = jnp.where(has_weave, jax.lax.stop_gradient(opposites[weave]), top**2)
-    eigenvalues, merges = jax.vmap(lambda x: _merging(matrices, x))(coincidents)
-    merges = is_coincident & merges & (coincidents < below)
+    below = jnp.where(has_weave, opposites[weave], top**2)
+    merges = is_coincident & jax.vmap(lambda x: _merges(matrices, x))(coincidents) & (coincidents < below)
     last = jnp.argmax(jnp.where(merges, coincidents, -jnp.inf))
     crossings = jnp.concatenate([jnp.where(is_zero, zeros, top**2), jnp.where(is_opposite, opposites, top**2)])
     stable_from, stable_to = _widest_stable_range(matrices, opposite, crossings, top)
@@ -131,8 +130,6 @@ def _stability_speeds(matrices: BicycleMatrices, top: Scalar) -> StabilitySpeeds
         weave_speed=_root_where(has_weave, opposites[weave]),
         capsize_speed=_root_where(jnp.isfinite(capsize), capsize),
         double_root_speed=_root_where(merges[last], coincidents[last]),
-        weave_frequency=_root_where(has_weave, frequencies[weave]),
-        double_root_eigenvalue=jnp.where(merges[last], eigenvalues[last], jnp.nan),
         stable_from=stable_from,
         stable_to=stable_to,
         stable_range_exists=~jnp.isnan(stable_from),
@@ -219,18 +216,15 @@ def _root_where(there, x: Scalar) -> Scalar:
     return jnp.where(there, jnp.sqrt(jnp.where(there, x, 1.0)), jnp.nan)
 
 
-def _merging(matrices: BicycleMatrices, x: Scalar) -> tuple[Scalar, Flag]:
-    """The double eigenvalue (1/s) at a root x, and whether two positive real ones become a pair there, as the speed grows."""
+def _merges(matrices: BicycleMatrices, x: Scalar) -> Flag:
+    """Whether two positive real eigenvalues become a pair at a root x, as the speed grows."""
     v = jnp.sqrt(x)
-    coefficients, slopes = jax.jvp(lambda v: _characteristic(matrices, v), (v,), (jnp.ones_like(v),))
-    roots = jnp.roots(jax.lax.stop_gradient(coefficients), strip_zeros=False)
-    i, j = jnp.triu_indices(4, 1)
-    pair = jnp.argmin(jnp.abs(roots[i] - roots[j]))
-    s, first = (roots[i[pair]] + roots[j[pair]]).real / 2, jnp.polyder(coefficients)
-    bend = _slope(first, s)
-    for _ in range(3):  # dp/ds has a simple root there
-        s = s - jnp.polyval(first, s) / jnp.where(bend == 0, jnp.inf, bend)
-    return s, (s > 0) & (jnp.polyval(slopes, s) * bend > 0)
+    fixed = jax.lax.stop_gradient(matrices)
+    coefficients, slopes = jax.jvp(lambda v: _characteristic(fixed, v), (v,), (jnp.ones_like(v),))
+    first = jnp.polyder(coefficients)
+    roots = jnp.roots(first, strip_zeros=False)
+    s = roots[jnp.argmin(jnp.abs(jnp.polyval(coefficients, roots)))].real
+    return (s > 0) & (jnp.polyval(slopes, s) * jnp.polyval(jnp.polyder(first), s) > 0)
 
 
 def _widest_stable_range(matrices: BicycleMatrices, opposite: Polynomial, crossings: Float[Array, " crossings"], top: Scalar) -> tuple[Scalar, Scalar]:
