@@ -8,7 +8,7 @@ import gc
 import importlib.metadata
 import os
 import sys
-from functools import partial, wraps
+from functools import cache, partial, wraps
 from pathlib import Path
 
 import psutil
@@ -163,18 +163,18 @@ def pytest_configure(config):
 
     def checked_first(function, typechecker):
         """The function, checked the first time that a file of tests calls it; a class with its fields checked, each time that one is made."""
-        checked = jaxtyped(function, typechecker=typechecker)
         if isinstance(function, type):
-            return checked
+            return jaxtyped(function, typechecker=typechecker)
+        checked = cache(lambda: jaxtyped(function, typechecker=typechecker))  # where it is called
 
         @wraps(function)
         def call(*args, **kwargs):
             if function in CHECKED:
                 return function(*args, **kwargs)
             CHECKED.add(function)
-            return checked(*args, **kwargs)
+            return checked()(*args, **kwargs)
 
-        call.__code__ = call.__code__.replace(co_filename=checked.__code__.co_filename)  # in tracebacks no line of a user
+        call.__code__ = call.__code__.replace(co_filename=jaxtyping._decorator.__file__)  # in tracebacks no line of a user
         return call
 
     if os.environ.get("JOURDAIN_JAX_NO_TYPE_CHECKS") != "1":

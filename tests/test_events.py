@@ -491,8 +491,7 @@ def test_a_bounce_that_is_over_has_happened(backend):
     assert lanes.t_end[-1] == 0.0
 
 
-def test_solvers_of_diffrax_start_at_an_event_too():
-    for solver in (diffrax.Tsit5(), diffrax.Bosh3()):
-        motion = jj.simulate(Ball(), {"z": 0.0, "z_rate": 3.0}, ts=[2.0], solver=solver)
-        assert abs(motion.t_end - 6 / GRAVITY) < 1e-6
-        assert float(jj.simulate(Ball(), {"z": 0.0, "z_rate": -3.0}, ts=[2.0], solver=solver).t_end) == 0.0
+def test_a_solver_of_diffrax_starts_at_an_event_too():
+    up, down = (jj.simulate(Ball(), {"z": 0.0, "z_rate": rate}, ts=[2.0], solver=diffrax.Bosh3()).t_end for rate in (3.0, -3.0))
+    assert abs(up - 6 / GRAVITY) < 1e-6
+    assert float(down) == 0.0
