@@ -135,7 +135,7 @@ def memory(lanes: int, folder: Path) -> Figures:
     few, many = (in_fresh_process(count, folder / "memory")["peak"] for count in (lanes, 10 * lanes))
     yield figure(f"growth of resident memory from {lanes} to {10 * lanes} lanes, MB", MODEL, many - few, 300)
     ts = np.linspace(0.0, SPAN, 201).tolist()
-    peak = in_fresh_process(lanes, folder / "memory", save="trajectories", ts=ts, memory="1000MB")["peak"] * 1.048576
+    peak = in_fresh_process(lanes, folder / "memory", keep_every=1, ts=ts, memory="1000MB")["peak"] * 1.048576
     yield figure("largest resident memory, MB, of a study that keeps trajectories under memory='1000MB'", MODEL, peak, 1000)
 
 

@@ -37,14 +37,16 @@ DESIGNS: dict[str, str] = {
     "jj.Design(TWO, samples=8).values(0, 9)": "not among 0 to 8",
 }
 
-STUDIES: dict[str, str] = {
+STUDIES: dict[str, str | tuple[str, str]] = {
     "jj.Study(disc, vary={'radios': jj.Normal(0.5, 0.1)}, samples=8)": "did you mean `radius`",
     "jj.Study(disc, vary={'radius': 0.5}, samples=8)": "set one value on the scene",
     "jj.Study(disc, vary=[1.0])": "`vary` is",
     "jj.Study(disc, start={'laen': jj.Normal(0.5, 0.1)}, samples=8)": "did you mean `lean`",
     "jj.Study(disc, start={'lean': 0.2}, samples=8)": "nothing varies",
     "by_radius.task(save='everything')": "`save` is 'everything'",
-    "by_radius.task(every=2)": "`every` is 2",
+    "by_radius.task(save='trajectories')": "trajectories are kept by `keep_every=1`",
+    "by_radius.task(keep_every=0)": "`keep_every` is 0, expected a whole number of at least 1",
+    "by_radius.task(every=2)": ("TypeError", "Study.run() takes no `every`: trajectories of every N-th lane are kept by `keep_every=N`"),
     "by_radius.task(t1=-np.inf)": "t1",
     "by_radius.task(outputs={'x': jj.End('leen')})": "did you mean `lean`",
     "by_radius.task(outputs={'x': jj.EventTime('fell')})": "did you mean `fallen`",

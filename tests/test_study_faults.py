@@ -335,7 +335,7 @@ def test_a_folder_that_is_moved_while_a_study_runs_is_named(tmp_path, monkeypatc
             path.rename(tmp_path / "moved.zarr")
         before(self, number, *what)
 
-    for options in ({}, {"save": "trajectories"}):
+    for options in ({}, {"keep_every": 1}):
         with monkeypatch.context() as patch:
             patch.setattr(Store, "write", write)
             with pytest.raises(OSError, match=r"the folder is gone: it was moved or removed while the study ran.*discs.zarr"):
@@ -389,7 +389,7 @@ def _is_right_or_said(path, right):
     return False
 
 
-TRAJECTORIES = pytest.param("trajectories", {"every": 2, "ts": np.linspace(0.0, 1.0, 3)}, 6, marks=pytest.mark.slow)
+TRAJECTORIES = pytest.param("outputs", {"keep_every": 2, "ts": np.linspace(0.0, 1.0, 3)}, 6, marks=pytest.mark.slow)
 
 
 @pytest.mark.parametrize(("save", "options", "count"), [("outputs", {}, 2), ("statistics", {}, 6), TRAJECTORIES])

@@ -8,7 +8,7 @@ from test_study_faults import run, study
 import jourdain_jax as jj
 from jourdain_jax.ensembles import memory, task
 
-TIMES = {"ts": np.linspace(0.0, 1.0, 11), "save": "trajectories"}
+TIMES = {"ts": np.linspace(0.0, 1.0, 11), "keep_every": 1}
 
 
 @pytest.fixture(autouse=True)

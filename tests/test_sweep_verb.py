@@ -74,7 +74,7 @@ def places(x, around=()):
         yield (*around, key)
         yield from places(value, (*around, key))
 
-asked = tomllib.loads(sys.argv[1]) | {"seed": 3, "save": "outputs", "every": 1}
+asked = tomllib.loads(sys.argv[1]) | {"seed": 3, "save": "outputs", "keep_every": 1}
 for *way, last in places(asked):
     for value in WRONG:
         changed = copy.deepcopy(asked)

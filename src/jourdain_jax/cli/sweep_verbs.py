@@ -3,7 +3,7 @@
 model = "tilting-disc"                       # a name of `jourdain-jax models`
 t1 = 2.0                                     # s
 samples = 1000
-sampler = "sobol"                            # optional, as are `seed`, `save`, `every`, and the tables `set`, `options`, `correlation`
+sampler = "sobol"                            # optional, as are `seed`, `save`, `keep_every`, and the tables `set`, `options`, `correlation`
 
 [set]                                        # parameters that all lanes share
 mass = 1.0
@@ -47,7 +47,7 @@ OUTPUTS: dict[str, Callable] = {
     re.sub("(?<=.)(?=[A-Z])", "-", kind.__name__).lower(): kind for kind in (End, Largest, Smallest, LargestMagnitude, Integral, EventTime, Happened)
 }
 TABLES = ("set", "vary", "start", "outputs", "options", "correlation")
-KEYS = ("model", "t1", "samples", "sampler", "seed", "save", "every", "chunk", *TABLES)
+KEYS = ("model", "t1", "samples", "sampler", "seed", "save", "keep_every", "chunk", *TABLES)
 
 
 def add(verbs) -> None:
@@ -121,7 +121,7 @@ def described_study(asked: Mapping, memory: str | None = None) -> tuple[Study, d
     correlation = {tuple(pair.split()): value for pair, value in asked.get("correlation", {}).items()}
     known = {name: asked[name] for name in ("sampler", "samples", "seed") if name in asked}
     outputs = {name: _output(name, how) for name, how in asked["outputs"].items()} if "outputs" in asked else None
-    how = {name: asked[name] for name in ("t1", "save", "every", "chunk") if name in asked} | asked.get("options", {})
+    how = {name: asked[name] for name in ("t1", "save", "keep_every", "chunk") if name in asked} | asked.get("options", {})
     scene = scene if memory is None else build(scene, memory=memory)
     return Study(scene, vary=vary, start=start, correlation=correlation or None, **known), how | {"outputs": outputs}
 

@@ -157,7 +157,7 @@ class StudyResult(Printed):
         self._place(output)
         if self.store.study["sampler"] != "saltelli":
             raise ValueError(f"Sobol' indices need sampler='saltelli'; this study has '{self.store.study['sampler']}'")
-        if not self.store.columns or not self.complete:
+        if self.store.study["save"] == "statistics" or not self.complete:
             raise ValueError("Sobol' indices need all lanes of a study with save='outputs'" + ("" if self.complete else "; run it to its end"))
         return sobol_indices(self.to_xarray()[output].values, self.varied, confidence=confidence)
 

@@ -38,9 +38,10 @@ PACKAGES = ("jourdain-jax", "jax", "jaxlib", "diffrax", "numpy", "scipy", "zarr"
 
 @dataclass(frozen=True)
 class Lanes:
-    """What a block gave: values of the columns, by name, and those of all outputs, shape (lanes, outputs)."""
+    """What a block gave: what is kept of it, by column, how its lanes ended, and all outputs, shape (lanes, outputs)."""
 
-    columns: Mapping[str, np.ndarray]
+    kept: Mapping[str, np.ndarray]
+    ends: Mapping[str, np.ndarray]  # by the names of `OF_LANES`
     outputs: np.ndarray
 
 
@@ -71,8 +72,8 @@ class Runner:
         first, last = self.store.span(number)
         numbers = range(first // self.task.block, -(-last // self.task.block))
         blocks = [self.run_block(block) if block else self._first for block in numbers]
-        values = {name: np.concatenate([lanes.columns[name] for lanes in blocks]) for name in self.store.columns}
-        tallies = [Tally.of_block(self.grid, block * self.task.block, lanes.columns, lanes.outputs) for block, lanes in zip(numbers, blocks, strict=True)]
+        values = {name: np.concatenate([lanes.kept[name] for lanes in blocks]) for name in self.store.columns}
+        tallies = [Tally.of_block(self.grid, block * self.task.block, lanes.ends, lanes.outputs) for block, lanes in zip(numbers, blocks, strict=True)]
         tally = Tally.together(tallies, len(self.task.outputs))
         self.store.write(number, values, tally)
         return last - first, tally.failed.size
@@ -87,16 +88,15 @@ class Runner:
         rolled = rollout(task.scene, starts, parameters=parameters or None, chunk=task.block, progress=False, **task.span, options=task.options).lanes
         with nan_is_a_mark():
             outputs = np.array(self._outputs_of(rolled))[:count]
-        columns = {name: np.asarray(getattr(rolled, field))[:count].astype(dtype) for name, (field, dtype, _, _) in OF_LANES.items()}
-        if task.save != "statistics":
-            columns |= values | dict(zip(task.outputs, outputs.T, strict=True))
-        if task.save == "trajectories":
-            kept = slice(-first % task.every, count, task.every)
+        ends = {name: np.asarray(getattr(rolled, field))[:count] for name, (field, *_) in OF_LANES.items()}
+        found = values | ends | dict(zip(task.outputs, outputs.T, strict=True))
+        if task.keep_every:
             for names, array in ((task.scene.coordinate_names, rolled.q), (task.scene.speed_names, rolled.u)):
-                columns |= dict(zip(names, np.moveaxis(np.asarray(array)[kept], -1, 0), strict=True))
+                found |= dict(zip(names, np.moveaxis(np.asarray(array), -1, 0), strict=True))
+        kept = {name: found[name][-first % column.every : count : column.every].astype(column.dtype) for name, column in self.store.columns.items()}
         if task.memory:
             memory.check(task.memory)
-        return Lanes(columns, outputs)
+        return Lanes(kept, ends, outputs)
 
 
 def bounded(task: Task, path, chunk: int | None, allowed: int | None, *, here: bool) -> tuple[Task, int | None]:
@@ -114,13 +114,13 @@ def bounded(task: Task, path, chunk: int | None, allowed: int | None, *, here: b
         while task.block > 8 and memory.BLOCKS * task.block * task.bytes_of_lane > 0.5 * room:
             task = replace(task, largest_block=task.block // 2)
         if chunk is None:
-            unit = int(np.lcm(task.block, task.every))
+            unit = int(np.lcm(task.block, task.stride))
             most = int(0.5 * room / (memory.CHUNKS * max(task.bytes_of_kept_lane, 1.0)))
             chunk = min(_chunk(task, None), max(unit, most // unit * unit))
     lanes = begun.chunk if begun else _chunk(task, chunk)
     if (need := memory.BLOCKS * task.block * task.bytes_of_lane + memory.CHUNKS * lanes * task.bytes_of_kept_lane) > room:
         text = f"blocks of {task.block} lanes and chunks of {lanes} take up to {need / 1e6:.0f} MB, and `memory` leaves {room / 1e6:.0f} MB to each process"
-        raise ValueError(f"{text}: give more, fewer processes, a smaller `chunk`, fewer times `ts`, or trajectories of fewer lanes by `every`")
+        raise ValueError(f"{text}: give more, fewer processes, a smaller `chunk`, fewer times `ts`, or trajectories of fewer lanes by `keep_every`")
     return replace(task, memory=allowed), chunk
 
 
@@ -136,17 +136,17 @@ def opened(task: Task, path, chunk: int | None, command: str) -> Store:
 
 
 def _constants(task: Task) -> dict[str, tuple]:
-    if task.save != "trajectories":
+    if task.keep_every is None:
         return {}
     found = {"time": ("time", np.asarray(task.ts, float), {"units": "s"})}
-    if task.every > 1:
-        found["saved_lane"] = ("saved_lane", np.arange(0, len(task.design), task.every, dtype=np.int32), {"long_name": "lane whose trajectory is kept"})
+    if task.stride > 1:
+        found["saved_lane"] = ("saved_lane", np.arange(0, len(task.design), task.stride, dtype=np.int32), {"long_name": "lane whose trajectory is kept"})
     return found
 
 
 def _chunk(task: Task, chunk: int | None) -> int:
     """Lanes of a chunk: whole blocks, whole strides of saved lanes; by default about a thousandth of all."""
-    unit = np.lcm(task.block, task.every)
+    unit = np.lcm(task.block, task.stride)
     if chunk is None:
         return int(unit * max(1, min(len(task.design) // 1000, 2**20) // unit))
     if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or chunk < 1 or chunk % unit:
@@ -181,7 +181,7 @@ def attributes(task: Task) -> dict:
         "versions": versions(),
         "command": " ".join(sys.argv),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "coordinates": " ".join(task.design.names) if task.save != "statistics" else "",
+        "coordinates": " ".join(task.design.names) if task.columns() else "",
     }
 
 

@@ -29,6 +29,7 @@ from jourdain_jax.scene.printing import Printed
 
 _STATED = "times to save at are `ts`, and what is kept is said by `outputs` and `save`"
 REFUSED = dict.fromkeys(("progress", "parameters", "starts", "scene", "start"), _STATED)
+REFUSED["every"] = "trajectories of every N-th lane are kept by `keep_every=N`"
 
 
 class TaskFields(MotionFields, total=False):
@@ -39,7 +40,7 @@ class TaskFields(MotionFields, total=False):
     ts: Any
     outputs: Mapping | None
     save: str
-    every: int
+    keep_every: int | None
     options: Options | None
 
 
@@ -109,24 +110,34 @@ class Study(Printed):
         return varying, constants
 
     def task(
-        self, *, t1=None, ts=None, t0=None, outputs: Mapping | None = None, save: str = "outputs", every: int = 1, inputs=None, options=None, **by_name
+        self,
+        *,
+        t1=None,
+        ts=None,
+        t0=None,
+        outputs: Mapping | None = None,
+        save: str = "outputs",
+        keep_every: int | None = None,
+        inputs=None,
+        options=None,
+        **by_name,
     ) -> Task:
-        """All that decides the numbers of a run; arguments as in `run`: `t1`, `ts`, `t0` in s, `outputs`, `save`, `every`, `inputs`, `options`, `by_name`."""
-        check_name(save, SAVES, f"`save` is {save!r}")
-        about = "of at least 1; it says of which lanes save='trajectories' keeps the trajectory"
-        every = checked_whole(every, "`every`", 1, None if save == "trajectories" else 1, expected=about)
+        """All that decides the numbers of a run; arguments as in `run`."""
+        check_name(save, SAVES, f"`save` is {save!r} (trajectories are kept by `keep_every=1`)")
+        if keep_every is not None:
+            keep_every = checked_whole(keep_every, "`keep_every`", 1, expected="of at least 1, or None: trajectories of no lane are kept")
         options = replace(as_options(options, by_name, "Study.run", REFUSED, self._given), memory=None)
         if isinstance(self._given, Model) and self._given.formulation == build(self.scene, backend=options.backend).formulation:
             options = replace(options, formulation=None)  # as for the scene by itself: a study may go on with other memory
         known = as_outputs(self.scene, outputs)
         first, times, last = span_and_times(self.scene, None, t0, t1, ts)
-        if ts is None and save != "trajectories" and not any(output.over_times for output in known.values()):
+        if ts is None and keep_every is None and not any(output.over_times for output in known.values()):
             times = last[None]
         if times[0] != first and (missed := [name for name, output in known.items() if isinstance(output, Integral)]):
             text = f"`ts` begins at {times[0]:g} s, and the motion at {first:g} s: the integral `{missed[0]}` would leave out what is between"
             raise ValueError(f"{text}; let `ts` begin where the motion does")
         span = {"t0": float(first), "t1": float(last), "ts": np.asarray(times, float), "inputs": inputs}
-        return Task(self.scene, self.design, self._constants, known, span, options, save, every)
+        return Task(self.scene, self.design, self._constants, known, span, options, save, keep_every)
 
     def run(
         self,
@@ -149,15 +160,17 @@ class Study(Printed):
           all outputs look at the end).
         - `outputs`: name -> `jj.End`, `jj.Largest`, `jj.Smallest`, `jj.LargestMagnitude`, `jj.Integral`, `jj.EventTime`, `jj.Happened`, `jj.Quantity`, or a
           function of a trajectory; default: the end values of all coordinates and speeds. NaN where a motion failed.
-        - `save`: "outputs": parameters, starts, outputs, result code and steps of every lane; "trajectories": these, and states at `ts` of `every` so-many-th
-          lane; "statistics": counts, sums and histograms alone, nothing per lane.
+        - `save`: "outputs": parameters, starts, outputs, result code and steps of every lane; "statistics": counts, sums and histograms alone, and of
+          single lanes what `keep_every` says.
+        - `keep_every`: 1000: states at `ts` of one in a thousand lanes, those whose numbers are multiples of it, and with save="statistics" all else
+          of these lanes; 1: of all lanes; None: of none.
         - `chunk`: lanes that are stored together (default: about a thousandth of all); at most one is computed again after a crash.
         - `processes`: how many compute, each on its share of the cores; more than one need a script whose top level is guarded by
           `if __name__ == "__main__":`, and outputs that are no functions within functions.
         - `client`: a `dask.distributed.Client`, whose workers compute; all of them must reach the folder. One chunk at a time is computed in each worker.
         - `shard`: (k, n): only the k-th of n shares of the chunks, for a folder of its own on one of n machines; `jj.merge_studies` puts them together.
         - `progress`: a bar; `command`: text that is kept with the study.
-        - `options`: a `jj.Options`, or its fields by name; `inputs`: as in `rollout`. These, and `t0` to `save` above, are the `what` of the signature.
+        - `options`: a `jj.Options`, or its fields by name; `inputs`: as in `rollout`. These, and `t0` to `keep_every` above, are the `what` of the signature.
 
         Where the scene is a model, `jj.build(scene, memory="2GB")`, that is what the processes of this machine that compute may hold together, the present
         one with all that is in it included; with `client`, what each worker may hold. Blocks and chunks are made small enough. It is held on Linux. Means

@@ -28,7 +28,7 @@ from jourdain_jax.scene.scene import Scene
 LARGEST_BLOCK = 2048  # lanes: enough that few wait for the last one, few enough that a chunk is a fraction of a second
 AT_START = "_at_start"  # how columns of start values are called, after the coordinate or speed
 RESERVED = ("lane", "saved_lane", "run", "zarr.json")  # axes, and names of files beside the arrays
-SAVES = ("statistics", "outputs", "trajectories")
+SAVES = ("statistics", "outputs")
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Task:
     span: Mapping[str, Any]  # t0, t1, ts, inputs
     options: AllOptions
     save: str
-    every: int
+    keep_every: int | None  # of which lanes states at `ts` are kept; None: of none
     # lanes; the same in all processes. A GPU takes some ten thousand at once
     largest_block: int = field(default_factory=lambda: LARGEST_BLOCK if jax.default_backend() == "cpu" else 2**17)
     memory: int | None = None  # bytes that each process which computes may hold
@@ -67,6 +67,11 @@ class Task:
         return sum(np.dtype(column.dtype).itemsize * math.prod(length for _, length in column.more) / column.every for column in self.columns().values())
 
     @property
+    def stride(self) -> int:
+        """Lanes from one whose states are kept to the next."""
+        return self.keep_every or 1
+
+    @property
     def ts(self) -> np.ndarray:
         """Saved times, s."""
         return np.asarray(self.span["ts"])
@@ -89,26 +94,31 @@ class Task:
     def columns(self) -> dict[str, Column]:
         """The arrays of the store. ValueError where two have one name, or that of an axis or of another file in the store."""
         units = {name: about["unit"] for name, _, about in parameters_of(self.scene)}
-        found = []
+        found: list[tuple[str, Column]] = []
+        if self.save == "statistics" and self.keep_every is None:
+            return {}
+        every = self.stride if self.save == "statistics" else 1
 
         def number(name: str, about: str, unit: str, **role: str) -> None:
-            found.append((name, Column("float64", math.nan, {"long_name": about} | role | ({"units": unit} if unit else {}))))
+            attributes = {"long_name": about} | role | ({"units": unit} if unit else {})
+            found.append((name, Column("float64", math.nan, attributes, every=every)))
 
         for name in self.design.names:
             about = f"start value of {name.removesuffix(AT_START)}" if name.endswith(AT_START) else f"parameter {name}"
             number(name, about, units.get(name, ""), role="varied")
         for name, (_, dtype, fill, attributes) in OF_LANES.items():
             events: dict = {"event_names": list(names_of_events(self.scene))} if name == "event" else {}
-            found.append((name, Column(dtype, fill, attributes | events)))
+            found.append((name, Column(dtype, fill, attributes | events, every=every)))
         for name, output in self.outputs.items():
             number(name, name, output.unit, role="output")
-        along = (*self.scene.coordinate_names, *self.scene.speed_names) if self.save == "trajectories" else ()
+        along = (*self.scene.coordinate_names, *self.scene.speed_names) if self.keep_every else ()
         for name in along:
-            found.append((name, Column("float64", math.nan, {"long_name": f"{name} along the motion"}, (("time", len(self.ts)),), self.every)))
+            about = {"long_name": f"{name} along the motion"}
+            found.append((name, Column("float64", math.nan, about, (("time", len(self.ts)),), self.stride)))
         names = [*(name for name, _ in found), *(("time",) if along else ()), *RESERVED]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"`{twice[0]}` would name two arrays of the study; its names are {', '.join(map(repr, names))}: call the output otherwise")
-        return {} if self.save == "statistics" else dict(found)
+        return dict(found)
 
     def identity(self) -> dict[str, str]:
         """Digests of all that decides the numbers, by what a user would call it."""
@@ -118,7 +128,7 @@ class Task:
             "design": digest((dict(self.design.variables), self.design.sampler, len(self.design), self.design.seed, self.design.correlation)),
             "outputs": digest(dict(self.outputs)),
             "options": digest(dict(sorted(self.settled.items()))),
-            "save": digest((self.save, self.every)),
+            "save": digest((self.save, self.keep_every)),
             "precision": digest(str(jnp.result_type(float))),
             "backend": jax.default_backend(),
         }
