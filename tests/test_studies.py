@@ -145,28 +145,17 @@ def test_statistics_need_no_lanes(whole, tmp_path):
     assert found.lane(3).kept == {}
 
 
-def test_trajectories_of_some_lanes_are_kept(whole, tmp_path):
-    found = discs().run(tmp_path / "discs.zarr", outputs=OUTPUTS, keep_every=12, **ASKED)
+def test_statistics_of_all_lanes_and_every_twelfth_whole(whole, tmp_path):
+    found = discs().run(tmp_path / "discs.zarr", outputs=OUTPUTS, save="statistics", keep_every=12, **ASKED)
     assert_same_statistics(found, whole)
     arrays = found.to_xarray()
+    for name in ("result", "final lean", *found.varied):
+        assert_array_equal(arrays[name].values, whole.to_xarray()[name].values[::12])
     assert arrays["lean"].dims == ("saved_lane", "time")
     assert_array_equal(arrays["saved_lane"].values, np.arange(0, COUNT, 12))
     assert_array_equal(arrays["time"].values, ASKED["ts"])
     for place in (0, 5, 12):
         assert_allclose(arrays["lean"][place].values, found.lane(12 * place).simulate()["lean"], rtol=1e-9, atol=1e-9)
-
-
-def test_statistics_of_all_lanes_and_one_in_twelve_whole(whole, tmp_path):
-    found = discs().run(tmp_path / "discs.zarr", outputs=OUTPUTS, save="statistics", keep_every=12, **ASKED)
-    assert_same_statistics(found, whole)
-    arrays, all_lanes = found.to_xarray(), whole.to_xarray()
-    assert {"result", "steps", "final lean", *found.varied} <= {*arrays.variables}
-    for name in ("result", "steps", "final lean", *found.varied):
-        assert arrays[name].dims == ("saved_lane",)
-        assert_array_equal(arrays[name].values, all_lanes[name].values[::12])
-    assert arrays["lean"].shape == (-(-COUNT // 12), len(ASKED["ts"]))
-    with pytest.raises(ValueError, match=r"`save` is .trajectories. \(trajectories are kept by `keep_every=1`\)"):
-        discs().run(tmp_path / "other.zarr", save="trajectories", **ASKED)
 
 
 def test_a_study_is_opened_without_its_scene(whole):
