@@ -154,7 +154,7 @@ def test_statistics_of_all_lanes_and_every_twelfth_whole(whole, tmp_path):
     assert arrays["lean"].dims == ("saved_lane", "time")
     assert_array_equal(arrays["saved_lane"].values, np.arange(0, COUNT, 12))
     assert_array_equal(arrays["time"].values, ASKED["ts"])
-    for place in (0, 5, 12):
+    for place in (0, 12):
         assert_allclose(arrays["lean"][place].values, found.lane(12 * place).simulate()["lean"], rtol=1e-9, atol=1e-9)
 
 
