@@ -122,7 +122,8 @@ class Study(Printed):
         options=None,
         **by_name,
     ) -> Task:
-        """All that decides the numbers of a run; arguments as in `run`."""
+        """All that decides the numbers of a run. Arguments are those of `run`: `t1`, `ts`, `t0` in s, `outputs`, `save`, `keep_every`, `inputs`, `options`,
+        `by_name`."""
         check_name(save, SAVES, f"`save` is {save!r} (trajectories are kept by `keep_every=1`)")
         if keep_every is not None:
             keep_every = checked_whole(keep_every, "`keep_every`", 1, expected="of at least 1, or None: trajectories of no lane are kept")
