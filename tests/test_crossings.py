@@ -220,16 +220,6 @@ def test_both_loops_take_the_same_steps_in_lanes_and_under_jit_and_back_in_time(
         assert_array_equal(motion.accepted, int(one))
 
 
-@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
-def test_derivatives_go_through_bounded_steps(derivative):
-    def end(x):
-        return jj.simulate(Bead(x), BEGIN, ts=[1.0], max_step=0.02).q_end[0]
-
-    w = np.sqrt(2.0)
-    expected = (-np.sin(w) + 0.5 * np.cos(w) / w - 0.5 * np.sin(w) / w**2) / (2 * w)
-    assert np.isclose(derivative(end)(2.0), expected, atol=1e-7)
-
-
 def test_a_step_of_one_length_has_its_own_bound():
     with pytest.raises(ValueError, match="`max_step`"):
         jj.simulate(FREE, BEGIN, ts=[3.0], max_step=0.1, solver=jj.ImplicitMidpoint(step=0.1))

@@ -1,7 +1,6 @@
 """Stop events: found in their step to round-off, the first of several, in short windows, and again from where they stopped; with derivatives."""
 
 import itertools
-from collections.abc import Callable
 from functools import cache
 
 import diffrax

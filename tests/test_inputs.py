@@ -309,11 +309,6 @@ def test_lanes_feel_blows_of_their_own_forwards_and_backwards():
     assert_allclose(end(at, 10.0, 0.0), 0.5 * at, rtol=1e-9)
 
 
-def test_lanes_of_a_rollout_feel_a_blow_that_they_share():
-    lanes = jj.rollout(Struck(), parameters={"mass": np.array([1.0, 2.0, 4.0])}, ts=[10.0], inputs={"force": BLOW}, work=False).lanes
-    assert_allclose(lanes.u_end[:, 0], [1.0, 0.5, 0.25], rtol=1e-9)
-
-
 CLOCK, FORCE, PUSH = np.linspace(0.0, 2.0, 6), np.array([0.3, -1.0, 0.8, 0.5, -0.7, 0.2]), np.array([-0.4, 0.6, 0.1, -0.9, 0.7, 0.5])
 MODES = {
     "reverse": ({}, jax.grad),

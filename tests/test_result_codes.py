@@ -56,13 +56,6 @@ def test_rows_that_contradict_each_other_later_are_told_and_derivatives_are_as_w
     assert_allclose(slopes[:2], [2.0, 4.0], rtol=1e-7)
 
 
-def test_lanes_are_told_each_by_itself():
-    rollout = jj.rollout(TwoBelts(), {"y_rate": np.array([1.0, 2.0])}, ts=[1.0], inputs=belts(0.5))
-    assert rollout.result.tolist() == [results.CONTRADICTORY_ROWS] * 2
-    with pytest.raises(jj.SimulationError, match="contradict"):
-        rollout.lane(1).raise_if_failed()
-
-
 def test_nonlinear_rows_are_told_as_well():
     run = lambda gain: jj.simulate(Circling(), {"x_rate": 1.0}, ts=[1.0], inputs={"speed": lambda t: 1.0 + gain * t})  # noqa: E731
     assert run(0.0).result == results.SUCCESS

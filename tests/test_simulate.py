@@ -49,13 +49,6 @@ def test_an_event_stops_the_motion_at_the_closed_form_time():
     assert np.all(np.isfinite(np.asarray(motion.q)[~later]))
 
 
-def test_an_event_time_does_not_depend_on_the_times_saved():
-    def landing(longer):
-        return jj.simulate(Falling(), ts=longer * jnp.linspace(0.0, 2.0, 5)).t_end
-
-    assert_allclose(jax.grad(landing)(1.0), 0.0, atol=1e-10)
-
-
 def test_work_without_potential_is_taken_off_the_energy_and_the_result_says_so():
     motion = jj.simulate(Falling(drag=0.3), t1=1.0, inputs={"force": lambda t: jnp.sin(3 * t)}, rtol=1e-11, atol=1e-11)
     energy = motion.energies()
