@@ -255,7 +255,7 @@ def weighed(end: Solved):
 def backwards_through(of: Loop, start: Start, end: Solved) -> tuple:
     """Its derivatives by the start and by k, in reverse mode."""
     g = jax.grad(weighed, allow_int=True)(end)
-    by_y0, (by_k,) = jax.jit(motions.flow_back(of, 0, (0,), 2**20))(start, native_motion.cotangents_of_states(g), g.y_end.rows, g.t_end)
+    by_y0, (by_k,) = jax.jit(motions.flow_back(of, 0, (0,), 2**20))(start, native_motion.cotangents_of_states(g), g.y_end.rows, g.t_end, g.passed.ts)
     return by_y0, by_k
 
 

@@ -19,7 +19,7 @@ from test_mutants import Mutant
 import jourdain_jax as jj
 from jourdain_jax.motion import integration, put_on_rows
 from jourdain_jax.motion.integrators import event_search
-from jourdain_jax.motion.native import back, functions, loop, native_motion, projection, step
+from jourdain_jax.motion.native import back, functions, loop, native_motion, projection, step, transitions
 from jourdain_jax.motion.simulate import set_up
 
 pytestmark = machine_code.needed
@@ -53,6 +53,22 @@ class Dips(OnLine):
 
     def events(self, motion):
         return {"dip": (motion.q.x - 0.52) ** 2 - 1e-4}
+
+
+class Moving(OnLine):
+    """A bead that a moving wall throws back, and that a force pulls afterwards."""
+
+    kept: float = jj.parameter(0.8)
+    pull: float = jj.parameter(0.5)
+    level: float = jj.parameter(0.4)
+    modes = jj.modes(bead=("goes", "comes"))
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=self.pull * motion.modes.bead),)
+
+    def events(self, motion):
+        after = {"x_rate": -self.kept * motion.u.x_rate + 0.1 * motion.t}
+        return {"wall": jj.Event(self.level + 0.05 * motion.t - motion.q.x, to={"bead": "comes"}, jump=after)}
 
 
 class Strip(OnLine):
@@ -258,6 +274,39 @@ def a_hessian_to_an_event():
     _differentiated_twice(jax.hessian, _end, end_by_closed_form, START)
 
 
+THROWN = {"x": jnp.array(0.1), "v": jnp.array(1.1), "kept": jnp.array(0.8), "pull": jnp.array(0.5), "level": jnp.array(0.4)}
+
+
+def _thrown_back(x):
+    """A number made of the position at 1 s and of the time of the event."""
+    found = motion(Moving(x["kept"], x["pull"], x["level"]), {"x": x["x"], "x_rate": x["v"]}, ts=np.array([1.0]))
+    return found.ys.q[0, 0] + 0.3 * found.passed.ts[0]
+
+
+def thrown_back_by_closed_form(x):
+    t = (x["level"] - x["x"]) / (x["v"] - 0.05)
+    return x["level"] + 0.05 * t + (0.1 * t - x["kept"] * x["v"]) * (1.0 - t) + 0.5 * x["pull"] * (1.0 - t) ** 2 + 0.3 * t
+
+
+def _through_a_transition(derivative: Callable) -> None:
+    assert_allclose(_thrown_back(THROWN), thrown_back_by_closed_form(THROWN), **CLOSE, err_msg="state after an event")
+    found = jax.jit(derivative(_thrown_back))(THROWN)
+    for path, value in jax.tree_util.tree_flatten_with_path(derivative(thrown_back_by_closed_form)(THROWN))[0]:
+        assert_allclose(functools.reduce(lambda tree, key: tree[key.key], path, found), value, rtol=0, atol=1e-7, err_msg=WRONG)
+
+
+def forward_mode_through_a_transition():
+    _through_a_transition(jax.jacfwd)
+
+
+def reverse_mode_through_a_transition():
+    _through_a_transition(jax.grad)
+
+
+def a_hessian_through_a_transition():
+    _through_a_transition(jax.hessian)
+
+
 def a_hessian_with_respect_to_times():
     def seen(x):
         found = pushed(x["x"], 0.4, x["k"], ts=x["ts"]).ys
@@ -298,6 +347,7 @@ LONGEST, SERIES_LONGEST = steps_are_no_longer_than_allowed, series_are_no_longer
 LEAVES, LEAVES_BELOW = a_motion_leaves_an_event_at_which_it_starts, a_motion_below_an_event_has_none
 STRIP, NAMED, WINDOW = a_strip_is_met, a_strip_within_a_step_is_named, an_event_where_a_relation_changes_is_found
 PROJECTED_BACK = reverse_mode_back_over_projections
+ON, ON_BACK, ON_TWICE = forward_mode_through_a_transition, reverse_mode_through_a_transition, a_hessian_through_a_transition
 TRIED, WRONG = "tried_by_stages", "derivative with respect to"
 MUTANTS = [
     Mutant("a wrong weight", step, "stages", "method.b[:n]])", "method.b[:n] * (1 + 1e-6)])", FORM, "closed form"),
@@ -368,11 +418,20 @@ MUTANTS = [
         TIMES_BENT,
         WRONG,
     ),
+    Mutant("a state that comes late to an event", transitions, "reset_program", "graph.add(along[n], graph.mul(rate, dt))", "along[n]", ON, WRONG),
+    Mutant("a state that leaves an event late", transitions, "reset_program", "graph.sub(dx, graph.mul(rate, dt))", "dx", ON, WRONG),
+    Mutant("a jump at a fixed time", transitions, "reset_program", "{t: dt}", "{t: graph.zero}", ON, WRONG),
+    Mutant("a mode that stays", event_search, "pass_event", 'w.at(after, of["mode"].start), modes', "modes, modes", ON, "state after"),
+    Mutant("rates after an event in the mode before", back, "reset_back", 'w.at(after, of["mode"].start), modes', "modes, modes", ON_BACK, WRONG),
+    Mutant("rates after an event forgotten", back, "reset_back", "w.load(g, i) * w.load(f_after, i)", "0.0 * w.load(g, i)", ON_BACK, WRONG),
+    Mutant("what moves an event forgotten", back, "reset_back", "w.load(out, i) + w.load(by_event, i)", "w.load(out, i)", ON_BACK, WRONG),
+    Mutant("cotangents of another event's time", back, "_write_transition_back", '"passed", lane) - 1.0', '"passed", lane)', ON_BACK, WRONG),
+    Mutant("a transition whose tangent leaves late", transitions, "reset_program", "graph.sub(dx, graph.mul(rate, dt))", "dx", ON_TWICE, WRONG),
     Mutant("goals that do not move cotangents", native_motion, "moved", "jax.vjp(rates, z)[1](g)[0]", "0 * g", TIMES_BENT, WRONG),
     Mutant("goals that do not move states", native_motion, "moved", "jnp.sum(scaled(rates(z), g))", "0 * jnp.sum(g)", TIME, WRONG),
 ]
 CHECKS = list(dict.fromkeys(mutant.check for mutant in MUTANTS))
-KEPT = (loop.kernel, back.kernel_back, put_on_rows._kernel, functions.reason_against_derivatives)
+KEPT = (loop.kernel, back.kernel_back, transitions.reset_program, put_on_rows._kernel, functions.reason_against_derivatives)
 
 
 @pytest.fixture(autouse=True)

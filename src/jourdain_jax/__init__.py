@@ -69,6 +69,7 @@ from jourdain_jax.scene.coordinates import coordinates, inputs, quaternion, spee
 from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere, Surface
 from jourdain_jax.scene.identity import clear_caches
 from jourdain_jax.scene.loads import Load, damper, generalized_force, gravity, point_force, spring, torque
+from jourdain_jax.scene.modes import Event, modes
 from jourdain_jax.scene.motion_state import fixed_point
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.possible_inertia import inertia_from_log_cholesky, log_cholesky
@@ -198,6 +199,7 @@ __all__ = [
     "Energy",
     "EnergyBalance",
     "Estimate",
+    "Event",
     "EventTime",
     "Experiment",
     "Fit",
@@ -308,6 +310,7 @@ __all__ = [
     "lower",
     "merge_studies",
     "models",
+    "modes",
     "motion_at",
     "newton_residual",
     "parameter",

@@ -32,6 +32,7 @@ from jourdain_jax.program.interpret import Nodes, as_nodes, effects_of, interpre
 from jourdain_jax.program.opaque_calls import interpret_with_calls
 from jourdain_jax.scene.identity import once_per_class
 from jourdain_jax.scene.loads import Load
+from jourdain_jax.scene.modes import Event
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import events_of, loads_of, potential_of
@@ -57,6 +58,7 @@ class VelocityQuantities(eqx.Module):
     direct: Num[Entries, "speeds"]
     power: Num[Entries, ""]  # of loads without a potential, and of potentials that depend on time or on inputs
     events: Num[Entries, "events"]  # sorted by name
+    resets: Num[Entries, "events rows"]  # coordinates, speeds and modes after each; without rows where all stop the motion
     energies: Num[Entries, "2"]  # kinetic and potential
 
 
@@ -104,6 +106,7 @@ def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]
         loads.direct,
         explicit_power(scene, motion, of_inputs, stated),
         event_values(scene, motion) if with_events else jnp.zeros(0),
+        event_resets(scene, motion) if with_events else jnp.zeros((0, 0)),
         jnp.stack(energies_at(scene, motion, stated)),
     )
 
@@ -111,7 +114,22 @@ def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]
 def event_values(scene: Scene, motion: Motion) -> Float[Array, "events"]:
     """Values of the stop events, sorted by name."""
     events = events_of(scene, motion)
-    return jnp.stack([events[name] for name in sorted(events)]) if events else jnp.zeros(0)
+    return jnp.stack([events[name].value for name in sorted(events)]) if events else jnp.zeros(0)
+
+
+def event_resets(scene: Scene, motion: Motion) -> Float[Array, "events rows"]:
+    """Coordinates, speeds and modes after each event, sorted by name; without rows where all events stop the motion."""
+    events = [event for _, event in sorted(events_of(scene, motion).items())]
+    if all(event.stop for event in events):
+        return jnp.zeros((len(events), 0))
+    names = (*scene.coordinate_names.entries, *scene.speed_names.entries, *scene.modes.names)
+    now = jnp.concatenate([motion.q.array, motion.u.array, motion.inputs.array[len(scene.inputs) - len(scene.modes.names) :]])
+
+    def after(event: Event) -> Float[Array, "rows"]:
+        changed = {**event.jump, **event.to}
+        return jnp.stack([changed.get(name, now[i]) for i, name in enumerate(names)])
+
+    return jnp.stack([after(event) for event in events])
 
 
 @dataclass

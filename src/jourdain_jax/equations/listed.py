@@ -15,6 +15,7 @@ class _Listed(NamedTuple):
     rows: tuple[str, ...]
     position_rows: tuple[str, ...]
     events: tuple[str, ...]
+    stops: tuple[bool, ...]  # whether each of them does
     has_load_without_potential: bool
 
 
@@ -34,8 +35,13 @@ def names_of_position_rows(scene: Scene) -> tuple[str, ...]:
 
 
 def names_of_events(scene: Scene) -> tuple[str, ...]:
-    """Names of the stop events, sorted."""
+    """Names of the events, sorted."""
     return _listed(scene).events
+
+
+def stops(scene: Scene) -> tuple[bool, ...]:
+    """Whether each event stops the motion, in the order of their names."""
+    return _listed(scene).stops
 
 
 def has_load_without_potential(scene: Scene) -> bool:
@@ -57,7 +63,8 @@ def _listed(scene: Scene) -> _Listed:
     def look(scene: Scene, motion: Motion) -> None:
         rows, first = (tuple(row_names(found)) for found in (velocity_rows(scene, motion), position_rows(scene, motion.pose())))
         without = any(load.potential is None for load in loads_of(scene, motion))
-        noted.append(_Listed(tuple(motion.bodies), rows, first, tuple(sorted(events_of(scene, motion))), without))
+        events = sorted(events_of(scene, motion).items())
+        noted.append(_Listed(tuple(motion.bodies), rows, first, tuple(name for name, _ in events), tuple(event.stop for _, event in events), without))
 
     shapes_along_motion(look, scene)
     return noted[0]

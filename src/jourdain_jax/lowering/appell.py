@@ -55,6 +55,7 @@ class Equations:
     guards: list[int] = field(default_factory=list)  # must stay positive
     power: int = 0  # `rate_of_work`
     events: list[int] = field(default_factory=list)  # values of the stop events
+    resets: list[int] = field(default_factory=list)  # coordinates, speeds of the state and modes after each
     energies: list[int] = field(default_factory=list)  # kinetic and potential
     directions: list[int] = field(default_factory=list)  # of rows nonlinear in the speeds, an entry for each speed: must not turn round
     squares: list[int] = field(default_factory=list)  # of rows kept by multipliers (`Accelerations`)
@@ -92,14 +93,22 @@ class AppellOnGraph:
             *ydot, power = self.graph.substituted([*ydot, power], kinematics.known)
             qdot = self.graph.substituted(qdot, kinematics.known)
         true_z = {int(self.traced.u[k]): n for k, n in zip(self.dependent, z, strict=True)}
-        *events, T, V = self.graph.substituted([*self.traced.at.events.tolist(), *self.traced.at.energies.tolist()], true_z)
+        at = self.traced.at
+        of_state = self._of_state(at.resets)
+        outputs = self.graph.substituted([*at.events.tolist(), *of_state, *at.energies.tolist()], true_z)
+        events, resets, (T, V) = outputs[: len(at.events)], outputs[len(at.events) : -2], outputs[-2:]
         if not self.forces_work:
             (power,) = self.graph.substituted([int(self.traced.at.power)], true_z)
         elif held:
             true_power = self._power(_Kinematics(self, forms, {}, explicit=False), ydot)
             power = power if equal(self.identity_probes([power]), self.identity_probes([true_power])).all() else true_power
         pivots = list(dict.fromkeys([*kinematics.pivots, *pivots, *sines]))
-        return Equations(qdot, ydot, z, pivots, sorted(guards), power, events, [T, V], directions, found.squares)
+        return Equations(qdot, ydot, z, pivots, sorted(guards), power, events, resets, [T, V], directions, found.squares)
+
+    def _of_state(self, resets: np.ndarray) -> list[int]:
+        """Return what events change of a state, without dependent speeds."""
+        first = len(self.traced.q)
+        return np.delete(resets, [first + k for k in self.dependent], axis=1).ravel().tolist() if resets.size else []
 
     def _at_reference(self, held: tuple[int, ...]) -> dict[int, int]:
         return {int(self.traced.q[i]): self.graph.const(self.reference[i]) for i in held}

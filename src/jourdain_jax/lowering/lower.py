@@ -14,7 +14,8 @@ from jaxtyping import Float
 from jourdain_jax.build.assembling import random_states
 from jourdain_jax.build.structure import Structure, structure_of, structure_whatever_its_faults
 from jourdain_jax.build.trace import TracedScene, Variables, named_values, traced_scene
-from jourdain_jax.lowering.appell import AppellOnGraph, Strategy
+from jourdain_jax.equations.listed import names_of_events, stops
+from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
 from jourdain_jax.lowering.comparison import agree, check_against_dense, rates_of, values_at
 from jourdain_jax.lowering.far import full_turns, on_velocity_rows
 from jourdain_jax.lowering.ignorable import ignorable
@@ -125,6 +126,8 @@ def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
     given = [np.asarray(x) for x in jax.tree.leaves(scene)]
     away = [varied(x, 0.1 * generator.uniform(size=(len(t), *x.shape)), 0.05) - x for x in given]
     inputs = generator.normal(size=(len(t), len(scene.inputs)))
+    for column, values in zip(range(len(scene.inputs))[::-1], list(scene.modes.values.values())[::-1], strict=False):
+        inputs[:, column] = generator.integers(len(values), size=len(t))
     values = named_values(scene, t, q, u, inputs)
 
     def probes(share) -> Probes:
@@ -176,7 +179,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
             best, fewest, way = candidate, count, strategy
     stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors taken out", fewest))
     put_q, put_u = builder.projection(MOST_TERMS if fewest < small else 0, held)
-    groups = {name: getattr(best, name) for name in ("qdot", "ydot", "z", "pivots", "directions", "squares", "guards", "power", "events", "energies")}
+    groups = {name: getattr(best, name) for name in ("qdot", "ydot", "z", "pivots", "directions", "squares", "guards", "power", "events", "resets", "energies")}
     of_rates = [] if scene.speeds is None else _divisors(graph, builder.traced.at.qdot.tolist())
     pivots = _relative(graph, probes, [*of_rates, *best.pivots])
     groups |= {"power": [best.power], "projected_q": put_q, "projected_u": put_u, "pivots": pivots}
@@ -185,6 +188,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
     nodes = {name: tuple(islice(rest, len(group))) for name, group in groups.items()}
     (power,) = nodes.pop("power")
     rates = [*nodes["qdot"], *nodes["ydot"]]
+    _check_resets(scene, builder, best)
     nodes["relations"], nodes["event_relations"] = watched = relations(graph, rates, nodes["events"], probes)
     nodes["jumps"] = jumps(graph, nodes["relations"], rates, probes)
     nodes["fixed"], own = graph.fixed([*outputs, *(n for part in watched for n in part)]), builder.traced
@@ -209,6 +213,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
         divisors=len(of_rates),
         power=place[power],
         by_partition=builder.kept is not None and builder.kept.by_partition,
+        stops=stops(scene),
         left_out=structure.redundant_rows,
         held=tuple(names[i] for i in held),
         stages=tuple(stages),
@@ -216,6 +221,26 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
         seconds=0.0,  # not known yet
         **{name: tuple(place[n] for n in part) for name, part in nodes.items()},
     )
+
+
+def _check_resets(scene: Scene, builder: AppellOnGraph, found: Equations) -> None:
+    """Raise ValueError where an event gives dependent speeds other values than the rows do."""
+    graph, traced, first = builder.graph, builder.traced, len(builder.traced.q)
+    for name, row in zip(names_of_events(scene), traced.at.resets.tolist(), strict=False):
+        if not row or not builder.dependent:
+            continue
+        kept = [*traced.q.tolist(), *(int(traced.u[k]) for k in builder.independent)]
+        after = dict(zip(kept, [*row[:first], *(row[first + k] for k in builder.independent)], strict=True))
+        true_z = {int(traced.u[k]): n for k, n in zip(builder.dependent, found.z, strict=True)}
+        stated = builder.probes(graph.substituted([row[first + k] for k in builder.dependent], true_z))
+        by_rows = builder.probes(graph.substituted(graph.substituted(found.z, after), true_z))
+        if np.any(np.abs(stated - by_rows) > 1e-6 * (1 + np.abs(by_rows))):
+            speeds = scene.speed_names.entries
+            free, tied = (", ".join(f"`{speeds[k]}`" for k in which) for which in (builder.independent, builder.dependent))
+            raise ValueError(
+                f"event `{name}` of `{type(scene).__name__}` moves speeds against the velocity rows, by which {tied} follow from {free}; give all of them "
+                "values that satisfy the rows, or state the independent ones as `privileged`"
+            )
 
 
 def _divisors(graph: Graph, qdot: list[int]) -> list[int]:

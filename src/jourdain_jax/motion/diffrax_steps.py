@@ -18,12 +18,13 @@ import optimistix as optx
 from jaxtyping import Array, Bool, PyTree
 
 from jourdain_jax.calculus.derivatives import SECOND_ORDER_MESSAGE, by_modes
+from jourdain_jax.equations.listed import stops
 from jourdain_jax.motion.arrays.writer import ArrayWriter
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.integrators import event_search, integrands
 from jourdain_jax.motion.model import modelled
 from jourdain_jax.motion.own_steps import reason_against_watching
-from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
+from jourdain_jax.motion.setup import NONE_PASSED, Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.vector_fields.field import Formulation, Integrated, VectorField
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, shown_from_users_lines, users_level
@@ -147,12 +148,15 @@ class Diffrax(eqx.Module, Integrator):
             pivot=jnp.full_like(t_end, jnp.inf),
             crossings=jnp.zeros_like(event_index),
             together=jnp.full_like(t_end, jnp.inf),
+            passed=NONE_PASSED,
         )
 
 
 def check(setup: Setup) -> None:
     """Raise ValueError where the scene does work, which solvers of diffrax do not integrate; warn where it has relations, which they do not watch."""
     name, solver = type(setup.scene).__name__, setup.integrator.name
+    if setup.integrator.event_names and not all(stops(setup.scene)):
+        raise ValueError(f"solver=diffrax.{solver}() does not go on after events of `{name}`; omit `solver`, or give events=False")
     if setup.field.with_work:
         raise ValueError(
             f"solver=diffrax.{solver}() does not integrate the work that no potential of `{name}` accounts for; "

@@ -177,11 +177,27 @@ class Sampled(eqx.Module):
 class Constant(eqx.Module):
     """One value at all times."""
 
-    value: Float[Array | np.ndarray, ""]
+    value: Float[Array | np.ndarray, "*lanes"]
 
     def __call__(self, t):
         """The value."""
         return self.value
+
+
+class Mode(eqx.Module):
+    """A mode: the number of its value at the start, and of those after each transition of a motion."""
+
+    value: Float[Array | np.ndarray, ""]
+    ts: Float[Array, "transitions"] | None = None  # s, times the direction of time; infinite after the last one
+    values: Float[Array, "transitions"] | None = None
+    direction: Float[Array, ""] | None = None  # 1, or -1 where time runs back
+
+    def __call__(self, t):
+        """The number at time t; at a transition the one after it."""
+        if self.ts is None or self.values is None:
+            return self.value
+        passed = jnp.searchsorted(*jax.lax.stop_gradient((self.ts, t * self.direction)), side="right")
+        return jnp.concatenate([jnp.asarray(self.value)[None], self.values])[passed]
 
 
 class Inputs(eqx.Module):
@@ -214,6 +230,16 @@ class Inputs(eqx.Module):
                 f"rows depend on inputs, whose rates the accelerations need, but one of them cannot be differentiated ({said}); give it as `jj.Sampled`"
             ) from None
         return ChangingInputs(t, values, rates)
+
+
+def in_phases(inputs: Inputs, passed, origin, direction) -> Inputs:
+    """Return inputs whose modes change after each transition that a motion from the time `origin` has passed (`setup.Passed`)."""
+    if not len(passed.modes):
+        return inputs
+    ts = jnp.where(jnp.isfinite(passed.ts), (origin + passed.ts) * direction, jnp.inf)
+    values = iter(jax.lax.stop_gradient(passed.modes))
+    phases = lambda channel: Mode(jnp.asarray(channel.value), ts, next(values), direction)  # noqa: E731
+    return Inputs(tuple(phases(channel) if isinstance(channel, Mode) else channel for channel in inputs.channels))
 
 
 def inputs_at(inputs: Inputs, t) -> Float[Array | np.ndarray, "inputs"]:
@@ -258,15 +284,18 @@ def as_inputs(scene: Scene, given) -> Inputs:
         return given
     if given is not None and not isinstance(given, Mapping):
         raise ValueError(f"`inputs` is {described(given)}, expected a dictionary: name -> number, function of time, or `jj.Sampled`")
-    if not given:
+    if not given and not scene.modes.names:
         return Inputs((_ZERO,) * len(scene.inputs))
+    given = given or {}
     check_names(given, scene.inputs.entries, f"`{type(scene).__name__}` has no input `{{}}`")
     channels: list[Callable] = []
     for name in scene.inputs.entries:
         value = given.get(name, _NOTHING)
         advice = "give a number, a function of time, or `jj.Sampled(ts, values)`"
         where = f"input `{name}` of `{type(scene).__name__}`"
-        if isinstance(value, Sampled):  # its own numbers are checked where it is made
+        if name in scene.modes.names:
+            channels.append(Mode(np.asarray(scene.modes.number(name, 0.0 if value is _NOTHING else value, "`inputs`"), real_type())))
+        elif isinstance(value, Sampled):  # its own numbers are checked where it is made
             channels.append(value)
         elif callable(value):
             channels.append(_as_channel(value, where))
@@ -277,9 +306,12 @@ def as_inputs(scene: Scene, given) -> Inputs:
 
 def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
     """A ValueError that names an input on which velocity rows depend and which jumps between the times t0 and t1; nothing where one of these is traced."""
+    traced = looked_at(scene).traced
+    for name, node in zip(scene.inputs.entries, traced.inputs.tolist(), strict=True):
+        if name in scene.modes.names and any(depend_on(traced.graph, traced.at.phi.tolist(), [node])):
+            raise ValueError(f"rows of `{type(scene).__name__}` depend on mode `{name}`; a row holds in all modes, loads and potentials may switch")
     if not structure_of(scene).rows_of_inputs or is_traced(scene, inputs, t0, t1):
         return
-    traced = looked_at(scene).traced
     for name, node, channel in zip(scene.inputs.entries, traced.inputs.tolist(), inputs.channels, strict=True):
         if isinstance(channel, Constant | Sampled) or not any(depend_on(traced.graph, traced.at.phi.tolist(), [node])):
             continue

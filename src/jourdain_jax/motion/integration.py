@@ -25,19 +25,22 @@ from jourdain_jax.build.plausibility import faults_at
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.calculus.markers import entered, lanes_first, left
 from jourdain_jax.calculus.reals import RUN_SELDOM, Count, Flag, Scalar, in_default_precision
+from jourdain_jax.equations.listed import stops
 from jourdain_jax.equations.projection import linearised_rows
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
-from jourdain_jax.motion.inputs import for_programs
+from jourdain_jax.motion.inputs import Inputs, Mode, for_programs, in_phases
 from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod
 from jourdain_jax.motion.native import values
 from jourdain_jax.motion.own_steps import reason_against_watching
 from jourdain_jax.motion.put_on_rows import State, projected
-from jourdain_jax.motion.setup import Begun, Setup, Solved, times_fit
+from jourdain_jax.motion.setup import Begun, Passed, Setup, Solved, times_fit
 from jourdain_jax.motion.trajectories import results
+from jourdain_jax.motion.trajectories.over_times import Phases
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.field import ByProgram, Integrated
 from jourdain_jax.native.scalar_program import unsupported
+from jourdain_jax.scene.modes import Modes
 from jourdain_jax.scene.parameters import parameter_faults
 
 
@@ -106,8 +109,10 @@ def _begin(setup: Setup) -> Begun:
 
 def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Solved) -> Trajectory:
     t0, field, integrator = setup.t0, setup.field, setup.integrator
-    start, args = begun.start, begun.args
-    _, scene, inputs, fixed, origin = args
+    start = begun.start
+    _, scene, inputs, fixed, origin = begun.args
+    inputs = in_phases(inputs, solved.passed, origin, jnp.sign(setup.t1 - t0))
+    args = field, scene, inputs, fixed, origin
     puts_back = field.projects and not integrator.own
     stored_first = field.stored(scene, t0, start.q, inputs(t0))
     direction = jnp.sign(setup.t1 - t0)
@@ -142,16 +147,17 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     result = _result(setup, begun, solved, code, pivot if field.needs_pivot else jnp.inf)
     failed = result > results.EVENT
     # what the steps did not notice happened at a time that is not known
-    passed = (result == results.SINGULAR_PARTITION) & (pivot > 0) & (solved.code > results.EVENT)
-    noticed = passed | (result == solved.code) | (result == results.NOT_FINITE)
+    over = (result == results.SINGULAR_PARTITION) & (pivot > 0) & (solved.code > results.EVENT)
+    noticed = over | (result == solved.code) | (result == results.NOT_FINITE)
     beyond = failed & ~(noticed & jnp.append(valid, False))  # of the saved states, and of the end
 
     t_end = jnp.where(solved.t_end == setup.t1 - origin, setup.t1, origin + solved.t_end)
     saved, treedef = jax.tree.flatten(jax.tree.map(lambda x: x[1:], found))
-    whole = jnp.where(begun.timely, t_end, given.t0), start.moved_q, start.moved_u, pivot
-    marked = left(asked, [beyond] * len(saved) + [failed] * len(whole), [*saved, *whole])
+    passed = jnp.where(jnp.isfinite(solved.passed.ts), origin + solved.passed.ts, jnp.nan)
+    whole = jnp.where(begun.timely, t_end, given.t0), start.moved_q, start.moved_u, pivot, passed
+    marked = left(asked, [beyond] * len(saved) + [failed] * 4 + [jnp.zeros_like(failed)], [*saved, *whole])
     q, u, work = jax.tree.unflatten(treedef, marked[: len(saved)])
-    t_end, moved_q, moved_u, pivot = marked[len(saved) :]
+    t_end, moved_q, moved_u, pivot, passed = marked[len(saved) :]
     return Trajectory(
         scene=given.scene,
         ts=given.ts,
@@ -172,13 +178,29 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
         moved_q=moved_q,
         moved_u=moved_u,
         smallest_pivot=pivot,
-        inputs=given.inputs,
+        inputs=in_phases(given.inputs, solved.passed, origin, direction),
+        phases=_phases(given.inputs, passed, solved.passed, integrator.event_names, given.scene.modes),
         state_form=field.name,
         reduction=field.reduction_name if setup.reason_against_machine_code else f"{field.reduction_name} to machine code",
         solver=integrator.name,
         projected=field.projects,
         unwatched=unwatched,
         event_names=integrator.event_names,
+    )
+
+
+def _phases(inputs: Inputs, ts: Float[Array, "transitions"], passed: Passed, names: tuple[str, ...], named: Modes) -> Phases:
+    """Return the phases of a motion, which events at the times `ts` end."""
+    there = jnp.isfinite(ts)
+    first = [jnp.asarray(channel.value) for channel in inputs.channels if isinstance(channel, Mode)]
+    modes = passed.modes if len(passed.modes) == len(first) else jnp.zeros((len(first), 0))
+    return Phases(
+        ts,
+        jnp.where(there, passed.events, -1),
+        jnp.concatenate([jnp.stack(first)[:, None] if first else jnp.zeros((0, 1)), jnp.where(there, modes, jnp.nan)], axis=1),
+        jnp.where(there, passed.lost, 0.0),
+        names,
+        named,
     )
 
 
@@ -225,7 +247,8 @@ def conserves(setup: Setup) -> bool:
 
     Integrated work is no part of the check: it may be the small rest of large powers, whose errors nothing at the ends of steps bounds.
     """
-    return setup.field.conserves and not isinstance(setup.integrator.solver, FixedStepMethod)
+    goes_on = setup.integrator.event_names and not all(stops(setup.scene))
+    return setup.field.conserves and not goes_on and not isinstance(setup.integrator.solver, FixedStepMethod)
 
 
 def energies_near(setup: Setup, args, t: Float[Array, "times"], y: Integrated) -> Float[Array, "2 times 2"]:

@@ -35,6 +35,7 @@ class Options:
     - `max_steps`: the most steps; `max_step`: the longest one (s). None: 1/16 of the span, so that a load that acts on a part of the way, or a dip of an event,
       is not stepped over where nothing else keeps steps short; inf: no bound.
     - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.
+    - `max_transitions`: the most events after which a motion goes on (`jj.Event`).
     - `retry`: run a motion again that left the domain of its privileged speeds (with the full state), or that is stiff (by an implicit solver, unless
       `solver` is given); `trajectory.fallback` and its summary say so. Inside your own `jit` or `vmap`, and without it, the result code
       stays.
@@ -56,6 +57,7 @@ class Options:
     events: bool = True
     work: bool = True
     retry: bool = False
+    max_transitions: int = 100
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,7 @@ class OptionFields(TypedDict, total=False):
     events: bool
     work: bool
     retry: bool
+    max_transitions: int
     formulation: "Formulation | None"
     backend: str
 
@@ -94,7 +97,7 @@ class MotionFields(OptionFields, total=False):
 
 
 SPAN = ("t0", "t1", "ts", "inputs")  # arguments of a motion by name besides its options
-_STATIC = ("max_steps", "events", "work", "retry", "backend", "memory", "alongside")
+_STATIC = ("max_steps", "max_transitions", "events", "work", "retry", "backend", "memory", "alongside")
 OPTION_NAMES = tuple(OptionFields.__annotations__)
 
 
@@ -197,6 +200,7 @@ def _check(options: AllOptions) -> None:
         if not isinstance(value := getattr(options, name), bool | np.bool_):
             raise ValueError(f"`{name}` is {described(value)}, expected True or False")
     checked_whole(options.max_steps, "`max_steps`", 1, expected="of at least 1; give the number of steps after which to stop")
+    checked_whole(options.max_transitions, "`max_transitions`", 1, expected="of at least 1; give the number of events after which to stop")
     solver = options.solver
     own = solver is None or isinstance(solver, Taylor | Method | ImplicitMethod)
     if not own and not isinstance(solver, diffrax.AbstractSolver):

@@ -22,7 +22,7 @@ from jourdain_jax.lowering.relations import MOST_WATCHED
 from jourdain_jax.motion.arrays import motion as on_arrays
 from jourdain_jax.motion.arrays.functions import joined
 from jourdain_jax.motion.arrays.loop import Loop
-from jourdain_jax.motion.inputs import FunctionOfTime, Inputs, Sampled
+from jourdain_jax.motion.inputs import FunctionOfTime, Inputs, Sampled, in_phases
 from jourdain_jax.motion.integrators.explicit_steps import Method, method_of
 from jourdain_jax.motion.integrators.implicit_steps import FixedStepMethod, ImplicitMethod
 from jourdain_jax.motion.native import native_motion
@@ -49,6 +49,7 @@ class OwnSteps(Integrator):
     native: bool  # whether machine code may integrate
     order: int | None  # of Taylor series, by which machine code steps in place of the solver's tableau
     memory: int  # bytes that the record of reverse mode may take
+    most: int  # events after which a motion goes on
     own: ClassVar[bool] = True
 
     @property
@@ -64,19 +65,19 @@ class OwnSteps(Integrator):
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
         if setup.reason_against_machine_code:
-            run, pull, moved, reason = self._on_arrays, self._pulled_on_arrays, on_arrays.mover(begun.args), lambda: SECOND_ORDER_MESSAGE
+            run, pull, mover, reason = self._on_arrays, self._pulled_on_arrays, on_arrays.mover, lambda: SECOND_ORDER_MESSAGE
         else:
             form = self._form(setup)
-            run, pull, moved = self._by_machine_code, self._pulled, native_motion.mover(begun.args, form)
+            run, pull, mover = self._by_machine_code, self._pulled, partial(native_motion.mover, form=form)
             reason = lambda: reason_against_derivatives(form, 2)  # noqa: E731
         rules = Rules(pushed_by_jax(run), pull, lambda *_: reason())
-        return _on_times(run if self.alongside else with_rules(run, rules), moved, setup, begun)
+        return _on_times(run if self.alongside else with_rules(run, rules), mover, setup, begun)
 
     def _loop(self, setup: Setup, begun: Begun) -> tuple[Loop, Start, int]:
         """The loop on arrays, what it is given, and how many lanes run side by side."""
         program, relations = setup.field.lowered, watched(setup.field, setup.inputs, bool(self.event_names))
         at_once = 0 if program is None or not isinstance(self.solver, Method) else width(program)
-        return *on_arrays.loop_of(self.solver, setup, begun, relations), at_once
+        return *on_arrays.loop_of(self.solver, setup, begun, relations, self.most), at_once
 
     def _on_arrays(self, setup: Setup, begun: Begun) -> Solved:
         of, start, at_once = self._loop(setup, begun)
@@ -89,12 +90,13 @@ class OwnSteps(Integrator):
         varies = [v for v, x in zip(jax.tree.leaves(perturbed[1].args), jax.tree.leaves(begun.args), strict=True) if eqx.is_array(x)]
         asked = tuple(i for i, v in enumerate(varies) if v)
         states = native_motion.cotangents_of_states(g)
-        by_y, by_known = on_arrays.flow_back(of, at_once, asked, self.memory)(start, states, g.y_end.rows, g.t_end)
+        ends = g.y_end.rows, g.t_end, g.passed.ts[: of.form.transitions]
+        by_y, by_known = on_arrays.flow_back(of, at_once, asked, self.memory)(start, states, *ends)
         args = joined(of.rest, [dict(zip(asked, by_known, strict=True)).get(i) for i in range(len(varies))])
         return _by_start(perturbed, arguments, Integrated.of(by_y, of.form), lambda by_args: args)
 
     def _form(self, setup: Setup) -> Form:
-        return native_motion.form_of(setup.field, setup.inputs, bool(self.event_names))
+        return native_motion.form_of(setup.field, setup.inputs, bool(self.event_names), self.most)
 
     def _by_machine_code(self, setup: Setup, begun: Begun) -> Solved:
         form, start = self._form(setup), native_motion.start_of(setup, begun)
@@ -135,7 +137,7 @@ def own_steps(solver, **static) -> OwnSteps | None:
     return OwnSteps(method, **static)
 
 
-def _on_times(run: Callable[[Setup, Begun], Solved], moved: Callable, setup: Setup, begun: Begun) -> Solved:
+def _on_times(run: Callable[[Setup, Begun], Solved], mover: Callable, setup: Setup, begun: Begun) -> Solved:
     """The motion that `run` finds from a number to others, its start and states moved to the times of the setup.
 
     A time is the goal where that was reached, is found by the loop itself where a stop event ended the motion before, and lies at a number after the start
@@ -143,22 +145,24 @@ def _on_times(run: Callable[[Setup, Begun], Solved], moved: Callable, setup: Set
     """
     numbers, (field, scene, inputs, fixed, start) = jax.lax.stop_gradient, begun.args
     goals, later = setup.goals(setup.ts), start - numbers(start)
-    y0 = moved(begun.y0, start, -later)
+    y0 = mover(begun.args)(begun.y0, start, -later)
     setup = setup._replace(**{name: numbers(getattr(setup, name)) for name in ("ts", "t0", "t1")})
     found = run(setup, eqx.tree_at(lambda b: (b.y0, b.args), begun, (y0, (field, scene, inputs, fixed, numbers(start)))))
+    moved = mover((field, scene, in_phases(inputs, found.passed, numbers(start), jnp.sign(numbers(goals[-1]))), fixed, start))
     event = (found.code == results.EVENT) & (found.accepted > 0)
     t_end, number = numbers(found.t_end), numbers(goals)
     by_goal = jnp.append(found.reached, t_end == number[-1]) & ~(event & (number == t_end))
     by = jnp.where(by_goal, goals - number + later, jnp.where(event, 0.0, later))
     at = numbers(start) + jnp.where(by_goal, number, t_end)
     return eqx.tree_at(
-        lambda s: (s.ts, s.ys, s.y_end, s.t_end),
+        lambda s: (s.ts, s.ys, s.y_end, s.t_end, s.passed.ts),
         found,
         (
             goals[:-1],
             jax.vmap(moved)(found.ys, at[:-1], by[:-1]),
             moved(found.y_end, at[-1], by[-1]),
             found.t_end + jnp.where(event, -later, jnp.where(by_goal[-1], goals[-1] - number[-1], 0.0)),
+            found.passed.ts - later,
         ),
     )
 

@@ -28,6 +28,18 @@ LONGEST = 1 / 16  # of the span: the longest step, by default
 _SHORT = 1e-9  # s, a span for motions that are not asked for
 
 
+class Passed(eqx.Module):
+    """The events after which a motion went on."""
+
+    ts: Float[Array | np.ndarray, "transitions *lanes"]  # since the start; infinite beyond the last one
+    events: Int[Array | np.ndarray, "transitions *lanes"]
+    lost: Float[Array | np.ndarray, "transitions *lanes"]  # J, by which the energy fell
+    modes: Float[Array | np.ndarray, "modes transitions *lanes"]  # after each
+
+
+NONE_PASSED = Passed(np.zeros(0), np.zeros(0, np.int32), np.zeros(0), np.zeros((0, 0)))
+
+
 class Solved(eqx.Module):
     """What an integrator finds."""
 
@@ -44,6 +56,7 @@ class Solved(eqx.Module):
     pivot: PerLane  # smallest magnitude of a pivot in any step, negative where one changed its sign; infinite: none was monitored
     crossings: Int[Array, "*lanes"]  # as in `Trajectory`
     together: PerLane
+    passed: Passed
 
 
 class Integrator(abc.ABC):

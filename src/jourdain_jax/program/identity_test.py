@@ -139,7 +139,7 @@ def identity_probes(probes: Probes, unchanged: Collection[str]) -> IdentityProbe
     scale = np.where(np.arange(count) % 2, 10.0, 1.0)
 
     def drawn(name: str, value: np.ndarray) -> np.ndarray:
-        if name in unchanged:
+        if name in unchanged or (name.startswith("i") and np.ptp(value) > 0 and not np.any(value % 1.0)):  # a mode has whole numbers alone
             return value
         return generator.uniform(0.5, 1.5, count) if name.startswith("p") else scale * generator.normal(size=count)
 

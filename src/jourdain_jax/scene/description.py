@@ -13,6 +13,7 @@ import numpy as np
 
 from jourdain_jax.calculus.reals import described, has_unit, known_numbers
 from jourdain_jax.scene.coordinates import Names
+from jourdain_jax.scene.modes import Modes
 from jourdain_jax.scene.names import as_names, check_names
 from jourdain_jax.scene.names_read import functions_in, names_in
 
@@ -30,7 +31,7 @@ METHODS = (
     "invariants",
     "visuals",
 )
-ATTRIBUTES = ("coordinates", "speeds", "inputs", "privileged", "domain", "conventions", "example", "example_span")
+ATTRIBUTES = ("coordinates", "speeds", "inputs", "modes", "privileged", "domain", "conventions", "example", "example_span")
 _MEANT = {  # what other programs and textbooks call them
     "forces": "loads",
     "applied_forces": "loads",
@@ -52,6 +53,8 @@ def check_description(scene, base: Any) -> None:
         names = getattr(scene, what)
         if names is not None and not isinstance(names, Names):
             raise ValueError(f"`{what}` of `{kind.__name__}` is {described(names)}, expected names; write {what} = jj.{what}('a b c')")
+    if not isinstance(scene.modes, Modes):
+        raise ValueError(f"`modes` of `{kind.__name__}` is {described(scene.modes)}, expected jj.modes(gear=('first', 'second'))")
     if scene.speeds is not None and kind.coordinate_rates is base.coordinate_rates:
         raise ValueError(
             f"`{kind.__name__}` has speeds of its own ({', '.join(scene.speeds.entries)}) but does not say how they move its coordinates; "

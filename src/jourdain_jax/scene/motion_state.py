@@ -132,6 +132,11 @@ class Motion(eqx.Module):
     def __contains__(self, name: str) -> bool:
         return name in self.bodies
 
+    @property
+    def modes(self) -> Named:
+        """The modes, numbers of their values: inputs that events switch."""
+        return self.inputs
+
     def pose(self) -> Pose:
         """Time, coordinates and the poses of all bodies, without velocities."""
         return Pose(self.t, self.q, {name: BodyPose(name, motion.body) for name, motion in self.bodies.items()})

@@ -18,6 +18,7 @@ from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.coordinates import Coordinates, Names
 from jourdain_jax.scene.description import check_description, checked_arguments
 from jourdain_jax.scene.loads import Load
+from jourdain_jax.scene.modes import Event, Modes
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.names import Named, nearest
 from jourdain_jax.scene.names_read import NamesRead, is_function, names_read
@@ -33,6 +34,7 @@ class Scene(eqx.Module):
     - `coordinates`: names, from `jj.coordinates(...)` (required).
     - `speeds`: names of user-defined quasi-velocities, from `jj.speeds(...)`; then also define `coordinate_rates`.
     - `inputs`: names of inputs, from `jj.inputs(...)`; `motion.inputs.name` in the methods.
+    - `modes`: names of modes and of their values, from `jj.modes(...)`: inputs that events switch; `motion.modes.name` in the methods.
     - `privileged`: names of the independent speeds, where the user wants to choose them; otherwise the engine does.
     - `domain`: coordinate or speed name -> (low, high), where states may be sampled for probing and tests; default (-3.2, 3.2)
       for coordinates, (-1, 1) for speeds.
@@ -49,6 +51,7 @@ class Scene(eqx.Module):
     coordinates: ClassVar[Coordinates]
     speeds: ClassVar[Names | None] = None
     inputs: ClassVar[Names] = Names(())
+    modes: ClassVar[Modes] = Modes()
     privileged: ClassVar[tuple[str, ...] | None] = None
     domain: ClassVar[dict[str, tuple[float, float]]] = {}
     conventions: ClassVar[str] = "SI units, radians; right-handed inertial frame, z up."
@@ -59,6 +62,8 @@ class Scene(eqx.Module):
     def __init_subclass__(cls, **options):
         """Look at the names that the methods read; ValueError where one stands for an object with state."""
         super().__init_subclass__(**options)
+        if isinstance(cls.inputs, Names) and isinstance(cls.modes, Modes):
+            cls.inputs = Names((*(name for name in cls.inputs if name not in cls.modes.names), *cls.modes.names))
         _names_read(cls)
 
     def __new__(cls, *args, **kwargs):
@@ -114,9 +119,9 @@ class Scene(eqx.Module):
         """Rolling contacts at a `pose`, by name; each adds its no-slip rows, and its height row if it says so."""
         return {}
 
-    def events(self, motion: Motion) -> dict[str, Scalar]:
-        """Named stop events at a `motion`: positive while it may go on; it stops where a value falls through zero, or is no number beyond. At a
-        start a value of zero that rises has not happened.
+    def events(self, motion: Motion) -> dict[str, Scalar | Event]:
+        """Named events at a `motion`: positive while it may go on; it stops where a value falls through zero, or is no number beyond. At a
+        start a value of zero that rises has not happened. A `jj.Event` in place of a value may let the motion go on.
 
         Of several events in one step the first in time counts. A value that falls through zero and rises again within one step is found where the cubic
         through values and rates at the ends of the step shows it (default solvers), or the dense output at three times in the step (other adaptive ones),

@@ -12,8 +12,9 @@ from jourdain_jax.calculus.reals import Scalar, checked_real, described
 from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.loads import Gravity, Load
+from jourdain_jax.scene.modes import Event
 from jourdain_jax.scene.motion_state import Motion, Pose
-from jourdain_jax.scene.names import Named, nearest
+from jourdain_jax.scene.names import Named, check_names, nearest
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 
@@ -101,10 +102,21 @@ def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
     return contacts
 
 
-def events_of(scene: Scene, motion: Motion) -> dict[str, Scalar]:
-    """Values of the stop events by name."""
+def events_of(scene: Scene, motion: Motion) -> dict[str, Event]:
+    """The events by name; a plain value is that of an event that stops the motion."""
     advice = "return a number, positive while the motion may go on, such as `1.4 - motion.q.lean`; give every condition a name of its own"
-    return _numbers(scene, "events", motion, '{"fallen": 1.4 - motion.q.lean}', "event", advice)
+    found = {}
+    for name, given in _dictionary(scene, "events", (motion,), '{"fallen": 1.4 - motion.q.lean}').items():
+        event, where = given if isinstance(given, Event) else Event(given, stop=True), f"event `{name}` of `{_name(scene)}`"
+        check_names(event.to, scene.modes.names, f"{where} switches `{{}}`, which is no mode")
+        check_names(event.jump, scene.coordinate_names.entries + scene.speed_names.entries, f"{where} moves `{{}}`, which is no coordinate or speed")
+        found[name] = Event(
+            checked_real(event.value, where, (), advice=advice),
+            {mode: checked_real(scene.modes.number(mode, value, where), f"mode `{mode}` of {where}", ()) for mode, value in event.to.items()},
+            {moved: checked_real(value, f"`{moved}` after {where}", ()) for moved, value in event.jump.items()},
+            event.stop,
+        )
+    return found
 
 
 def invariants_of(scene: Scene, motion: Motion) -> dict[str, Scalar]:

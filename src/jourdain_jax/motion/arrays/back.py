@@ -22,6 +22,7 @@ from jourdain_jax.motion.native.back import event_back, is_located, step_back
 from jourdain_jax.motion.native.layout import Lanes
 from jourdain_jax.motion.native.loop import Start
 from jourdain_jax.motion.native.record import Slot
+from jourdain_jax.motion.native.transitions import reset_back
 
 SLOTS = (
     256  # tries of steps in a window, or fewer where memory is short: at least a sixteenth, as of checkpoints
@@ -39,11 +40,18 @@ class _Record(NamedTuple):
 
 
 def cotangents(
-    of: Loop, asked: Sequence[int], memory: int, start: Start, g_ys: Array, g_end: Array, g_t: Array
+    of: Loop,
+    asked: Sequence[int],
+    memory: int,
+    start: Start,
+    g_ys: Array,
+    g_end: Array,
+    g_t: Array,
+    g_log: Array,
 ) -> tuple[Array, list[Array]]:
     """Return cotangents of the initial state, and of the known arrays with the numbers `asked`.
 
-    `g_ys`, `g_end`, `g_t`: cotangents of the saved states, of the final state and of its time.
+    `g_ys`, `g_end`, `g_t`, `g_log`: cotangents of the saved states, of the final state and of its time, of times of transitions.
     `memory`: bytes, of which the window and the checkpoints take at most a quarter each.
     """
     form, slot = of.form, Slot.of(of.form, of.method)
@@ -66,7 +74,11 @@ def cotangents(
         )
         new, k = of.tried(going, fixed, start)
         rows = jnp.concatenate(
-            [going.y, k, jnp.stack([going.rows[t], new.rows[taken], going.passed.astype(going.y.dtype)])]
+            [
+                *(going.y, k),
+                jnp.stack([going.rows[t], new.rows[taken], going.passed.astype(going.y.dtype)]),
+                *(new.rows[row][None] for row in form.rows.get("left", ())),
+            ]
         )
         window = jax.lax.dynamic_update_index_in_dim(window, rows, tries % slots, 0)
         return _Record(of.saving(start, new, None)[0], tries + 1, window, checkpoints, every)
@@ -108,17 +120,27 @@ def cotangents(
         )
 
     def step_of(carry):
-        last, saved, g, by_known, window = carry
+        last, saved, g, by_known, changed, window = carry
         w = of.writer(start, asked)
+        going = end._replace(rows=end.rows | changed)
+        state = of.rows_in(w, going, fixed)
         here = jax.lax.dynamic_index_in_dim(window, last % slots, 0, keepdims=False)
         before = here[slot.saved].astype(jnp.int32)
         at, g, by_known = w.holding(here), w.holding(added(g, before, saved)), w.holding(by_known)
+        if form.transitions:
+            lanes_, left = Lanes(w, form, state), w.at(at, slot.left)
+            switched = w.load(left) != 0.0
+            lanes_["passed"] = lanes_["passed"] - jnp.where(switched, 1.0, 0.0)
+            number = lanes_["passed"].astype(jnp.int32)
+            g_time = jnp.sum(jnp.where(numbers(form.transitions, g_t) == number, g_log, 0.0), axis=0)
+            w.if_any(switched, lambda: reset_back(w, form, known, state, left, w.holding(g_time[None]), g, by_known))
         if isinstance(of.method, Method):
-            step_back(w, form, of.method, known, of.rows_in(w, end, fixed), at, g, by_known)
+            step_back(w, form, of.method, known, state, at, g, by_known)
         else:
             w.in_step(here[slot.t], here[slot.taken])
-            w.run("pull_step", at, here[slot.t], here[slot.taken], at, g, by_known)
-        return last - 1, before, w.whole(g.room), w.whole(by_known.room), window
+            w.run("pull_step", state, here[slot.t], here[slot.taken], at, g, by_known)
+        changed = {row: w.load(state, row) for row in changed}
+        return last - 1, before, w.whole(g.room), w.whole(by_known.room), changed, window
 
     def window_of(carry):
         first = carry[0] // slots * slots
@@ -134,6 +156,8 @@ def cotangents(
 
         return last, *found, jax.lax.cond(last >= 0, again, lambda: window)
 
-    carry = record.tries - 1, end.passed, w.whole(g.room), w.whole(by_known.room), record.window
-    _, saved, found, by_known, _ = jax.lax.while_loop(lambda carry: carry[0] >= 0, window_of, carry)
+    changing = [row for name in ("mode", "passed") for row in form.rows.get(name, ())]
+    changed = {row: end.rows[row] for row in changing}
+    carry = record.tries - 1, end.passed, w.whole(g.room), w.whole(by_known.room), changed, record.window
+    _, saved, found, by_known, *_ = jax.lax.while_loop(lambda carry: carry[0] >= 0, window_of, carry)
     return added(found, jnp.zeros(lanes, jnp.int32), saved), w.functions.leaves(by_known)

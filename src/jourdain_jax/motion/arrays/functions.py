@@ -17,7 +17,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jourdain_jax.motion.arrays.writer import ArrayWriter, Pointer, Rows
+from jourdain_jax.motion.inputs import Constant, Inputs, Mode
 from jourdain_jax.motion.integrators import integrands
+from jourdain_jax.motion.integrators.event_search import chosen
 from jourdain_jax.motion.native.layout import Form, copied, each_row
 from jourdain_jax.motion.vector_fields.field import Integrated
 
@@ -34,6 +36,7 @@ class ArrayForm(Form):
     squares: range = range(0)  # type: ignore[assignment]
     relations: range = range(0)  # type: ignore[assignment]
     watched: range = range(0)  # type: ignore[assignment]
+    switched: range = range(0)  # type: ignore[assignment]
 
     @property
     def monitored(self) -> range:  # type: ignore[override]
@@ -80,18 +83,27 @@ class Functions:
     asked: tuple[int, ...]  # of which of them cotangents are asked
     method: Any
     middle: Array | None = None  # of the step whose stages are worked out
+    modes: Sequence[Array] = ()
 
     def __post_init__(self) -> None:
         self.y, self.count = Rows(0, self.form.y), self.form.y
+
+    def take_modes(self, state: Pointer) -> None:
+        """Take all functions in the modes that the lanes are in."""
+        self.modes = [self.w.load(state, row) for row in self.form.rows["mode"]]
 
     def in_step(self, t, h) -> None:
         """Take the rates as within this step: samples have one slope there."""
         self.middle = t + 0.5 * h
 
     def _args(self, shared: Sequence, middle: Array | None = None) -> PyTree:
-        return integrands.within(
-            self.w.number(math.inf) if middle is None else middle, joined(self.rest, shared)
-        )
+        args = joined(self.rest, shared)
+        if self.modes:
+            field, scene, inputs, *more = args
+            left = iter(self.modes)
+            channels = (Constant(next(left)) if isinstance(channel, Mode) else channel for channel in inputs.channels)
+            args = field, scene, Inputs(tuple(channels)), *more
+        return integrands.within(self.w.number(math.inf) if middle is None else middle, args)
 
     def _state(self, rows: Float[Array, "y *lanes"]) -> Integrated:
         return Integrated.of(rows, self.form)
@@ -177,6 +189,73 @@ class Functions:
         """Store the numbers whose signs are watched."""
         found = self.watched(self._args(self.shared[0]), t, self._state(self.w.load(y, self.y)))  # type: ignore[misc]
         self._store([found], values, len(self.form.watched))
+
+    # of events after which the motion goes on (`motion/native/transitions.py`)
+
+    def _reset(self, event, t, y, *shared) -> Float[Array, "rows *lanes"]:
+        """Return the state and the modes after an event."""
+        found = integrands.resets(t, self._state(y), self._args(shared))
+        after = chosen(self.w, event, list(found))
+        state, modes = jnp.split(after, (self.form.q_and_v,))
+        return jnp.concatenate([state, y[self.form.q_and_v :], modes])
+
+    def _reset_at(self, event, t, parts: Sequence[Sequence], fixed: dict, modes: Sequence[Array]) -> tuple[list, list]:
+        """Return the state after an event with its tangents, and its time with its tangents.
+
+        `parts`: the state and the arrays that vary with their tangents; `fixed`: the others, by their places;
+        `modes`: those after the event.
+        """
+        given = lambda at: (dict(zip((k for k in range(len(fixed) + len(at)) if k not in fixed), at, strict=True)) | fixed)  # noqa: E731
+        whole = lambda at: [given(at)[k] for k in range(len(fixed) + len(at))]  # noqa: E731
+        if len(parts) == 1:
+            return [self._reset(event, t, *whole(parts[0]))[: self.count]], [t]
+        before, along = parts[: len(parts) // 2], parts[len(parts) // 2 :]
+
+        def rates(states: Sequence[Array]) -> list[Array]:
+            def f(*at):
+                return self._rates(t, *whole(at))
+
+            return pushed(f, [[y, *part[1:]] for y, part in zip(states, before, strict=True)])
+
+        value = lambda t, *at: chosen(self.w, event, list(self._events(t, *whole(at))))  # noqa: E731
+        now = rates([part[0] for part in before])
+        dc = jax.jvp(partial(value, t), before[0], along[0])[1]
+        zero = [jnp.zeros_like(x) for x in before[0][1:]]
+        c_dot = jax.jvp(value, (t, *before[0]), (jnp.ones_like(t), now[0], *zero))[1]
+        dt = -dc / c_dot
+        moved = [[part[0] + rate * dt, *part[1:]] for part, rate in zip(along, now, strict=True)]
+        (after, times), (d_after, d_times) = jax.jvp(
+            lambda t, parts: self._reset_at(event, t, parts, fixed, modes), (t, before), (dt, moved)
+        )
+        own, self.modes = self.modes, modes
+        later = rates(after)
+        self.modes = own
+        return after + [dy - rate * dt for dy, rate in zip(d_after, later, strict=True)], times + d_times
+
+    def reset(self, state: Pointer, t, y: Pointer, event, after: Pointer) -> None:
+        """Store the state after an event, the modes, and the time of the event, with tangents."""
+        of, parts = self.form.rows_of_transition, [part[1:] for part in self._parts(state, t, y)]
+        modes = self._reset(event, t, *parts[0])[self.count :]
+        moves = {0} | {k for part in parts[1:] for k, x in enumerate(part) if x is not None}
+        fixed = {k: x for k, x in enumerate(parts[0]) if k not in moves}
+        varying = [[jnp.zeros_like(parts[0][k]) if part[k] is None else part[k] for k in sorted(moves)] for part in parts]
+        states, times = self._reset_at(event, t, varying, fixed, list(modes))
+        self._store(states, after, self.count)
+        self.w.store(modes, after, Rows(of["mode"].start, len(modes)))
+        energy = integrands.energy(t, self._state(parts[0][0]), self._args(parts[0][1:]))
+        own, self.modes = self.modes, list(modes)
+        lost = energy - integrands.energy(t, self._state(states[0]), self._args(parts[0][1:]))
+        self.modes = own
+        self.w.store(lost, after, of["lost"].start)
+        self._store([x[None] for x in times], self.w.at(after, of["t"].start), 1)
+
+    def pull_reset(self, state: Pointer, t, y: Pointer, event, g: Pointer, to_y: Pointer, to_known: Pointer) -> None:
+        """Pull cotangents back through the state after an event; that of its time is added after those of the arrays."""
+        known, of_state = sum(self.sizes()), lambda y, *shared: self._reset(event, t, y, *shared)[: self.count]
+        self._pull(of_state, y, g, self.count, to_y, to_known)
+        at, g_y = self.w.load(y, self.y), self.w.load(g, self.y)
+        by_time = jax.vjp(lambda t: self._reset(event, t, at, *self.shared[0])[: self.count], t)[1](g_y)[0]
+        self.w.store(self.w.load(to_known, known) + by_time + self.w.load(g, self.count), to_known, known)
 
     # of implicit methods
 

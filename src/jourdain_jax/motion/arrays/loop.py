@@ -33,6 +33,7 @@ class Going(NamedTuple):
 
     y: Float[Array, "y *lanes"]  # with its tangents
     rows: dict[int, Float[Array, "*lanes"]]  # the others that steps change
+    log: list[Float[Array, "transitions *lanes"]]
     passed: Int[Array, "*lanes"]  # how many times were saved
 
 
@@ -48,14 +49,23 @@ class Loop(NamedTuple):
     def begun(self, start: Start) -> tuple[Going, dict[int, Array]]:
         """Return the start, and the rows that steps do not change."""
         t, form = start.goals[0], self.form
-        given = start._replace(known=()).rows([jnp.zeros_like(t)] * len(form.moving))
+        given = start._replace(known=()).rows(form)
         fixed = {row: given[row] for name in CONTROL for row in form.rows[name]}
+        logged = {row for block in self.log for row in block}
         moving = {
             row: given[row] if row < len(given) else jnp.zeros_like(t)
             for row in range(form.integrated, form.all)
-            if row not in fixed
+            if row not in fixed and row not in logged
         }
-        return Going(given[: form.integrated], moving, jnp.zeros(t.shape, jnp.int32)), fixed
+        log = [jnp.zeros((len(block), *t.shape), t.dtype) for block in self.log]
+        return Going(given[: form.integrated], moving, log, jnp.zeros(t.shape, jnp.int32)), fixed
+
+    @property
+    def log(self) -> list[range]:
+        """The rows of transitions, those of one kind together."""
+        names = [name for name in ("log_event", "log_mode", "log_lost", "log_t") if name in self.form.rows]
+        most = max(self.form.transitions, 1)
+        return [range(k, k + most) for name in names for k in range(self.form.rows[name].start, self.form.rows[name].stop, most)]
 
     def writer(self, start: Start, asked: Sequence[int] = ()) -> ArrayWriter:
         """Return a writer with the functions that a step calls."""
@@ -66,9 +76,9 @@ class Loop(NamedTuple):
     def rows_in(self, w: ArrayWriter, going: Going, fixed: dict) -> Pointer:
         """Put the rows of all lanes into memory."""
         state = w.holding(going.y)
-        state.room.rows.extend(
-            (going.rows | fixed)[row] for row in range(self.form.integrated, self.form.all)
-        )
+        logged = {row: (array, i) for block, array in zip(self.log, going.log, strict=True) for i, row in enumerate(block)}
+        rows = going.rows | fixed | logged
+        state.room.rows.extend(rows[row] for row in range(self.form.integrated, self.form.all))
         return state
 
     def tried(self, going: Going, fixed: dict, start: Start) -> tuple[Going, Array]:
@@ -86,6 +96,7 @@ class Loop(NamedTuple):
         return going._replace(
             y=w.load(state, Rows(0, self.form.integrated)),
             rows={row: w.load(state, row) for row in going.rows},
+            log=[w.load(state, Rows(block.start, len(block))) for block in self.log],
         ), w.whole(k.room)
 
     def _row(self, name: str) -> int:
@@ -143,17 +154,11 @@ class Loop(NamedTuple):
             lambda carry: self.on_its_way(carry[0]), tried, self.saving(start, begun, ys)
         )
         ys = jnp.where(numbers(len(ys), going.y) >= going.passed, going.y, ys)
-        code, form, parts = self._row("code"), self.form, range(1 + len(self.form.moving))
+        code, w = self._row("code"), self.writer(start)
         rows = going.rows | {code: jnp.where(going.rows[code] == IDLE, RUNNING * 1.0, going.rows[code])}
-        t, *progress = (rows[row] for row in range(form.integrated, form.returned))
-        rest = jnp.stack([*progress[: len(progress) - len(form.moving)], going.passed.astype(t.dtype)])
-        each = [slice(k * form.y, (k + 1) * form.y) for k in parts]
-        return Found(
-            tuple(ys[:, part] for part in each),
-            tuple(going.y[part] for part in each),
-            (t, *progress[len(progress) - len(form.moving) :]),
-            rest,
-        )
+        state = self.rows_in(w, going._replace(rows=rows), fixed)
+        end = w.load(state, Rows(0, self.form.returned))
+        return Found.of(self.form, ys, end, going.passed.astype(end.dtype)[None])
 
 
 def at_number(x: Float[Array, "times *lanes"], i) -> Float[Array, "*lanes"]:

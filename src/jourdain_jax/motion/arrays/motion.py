@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
+from jourdain_jax.equations.listed import stops
 from jourdain_jax.motion.arrays.back import cotangents
 from jourdain_jax.motion.arrays.functions import ArrayForm, split
 from jourdain_jax.motion.arrays.loop import Loop
@@ -19,17 +20,22 @@ from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
 from jourdain_jax.motion.native.loop import Found, Start, differentiated
-from jourdain_jax.motion.native.native_motion import control_of, moved
+from jourdain_jax.motion.native.native_motion import control_of, modes_at_start, moved
 from jourdain_jax.motion.setup import Begun, Setup
 from jourdain_jax.motion.vector_fields.field import Integrated
 
 
 def loop_of(
-    method: Method | ImplicitMethod, setup: Setup, begun: Begun, relations: tuple[Callable | None, int]
+    method: Method | ImplicitMethod,
+    setup: Setup,
+    begun: Begun,
+    relations: tuple[Callable | None, int],
+    transitions: int,
 ) -> tuple[Loop, Start]:
     """Return the loop, and the start of one motion.
 
     `relations`: a function for the numbers whose signs are watched, and how many of them are relations.
+    `transitions`: the most of a motion.
     """
     goals, knots, field, y0, names = (
         setup.goals(setup.ts),
@@ -46,6 +52,7 @@ def loop_of(
     count = lambda f: len(jax.eval_shape(f, goals[0], y0, args))  # noqa: E731
     seen = jax.eval_shape(integrands.rates_and_pivots, goals[0], y0, args) if field.has_pivots else None
     watched, several = relations
+    modes = modes_at_start(setup.inputs)
     form = ArrayForm(
         None,
         field.with_work,
@@ -59,6 +66,9 @@ def loop_of(
         turning=seen.directions.size if seen else 0,
         squares=range(2 * field.near_rank_loss),
         relations=range(several),
+        switched=range(len(modes)),
+        stops=stops(setup.scene) if names else (),
+        most=transitions,
         watched=range(count(lambda t, y, args: watched(args, t, y)) if watched else 0),
         compensated=most * eps
         > eps**0.5,  # what is rounded off in so many steps may be more than half of the digits
@@ -67,7 +77,7 @@ def loop_of(
     numbers = jax.lax.stop_gradient(
         (() if knots is None else (knots,), control_of(setup, knots), goals, jnp.zeros_like(goals[0]))
     )
-    return Loop(form, method, watched, rest, most), Start(*numbers, y=(y0.rows,), known=(known,))
+    return Loop(form, method, watched, rest, most), Start(*numbers, y=(y0.rows,), known=(known,), modes=modes)
 
 
 def flow(of: Loop, at_once: int) -> Callable[[Start], Found]:
@@ -126,7 +136,7 @@ def _in_blocks(count, at_once: int, run: Callable, batched: Sequence, *given):
         return block(given)
     index = jnp.minimum(jnp.arange(blocks * at_once), count - 1).reshape(blocks, at_once)
     found = jax.lax.map(block, jax.tree.map(lambda x: x[index], given))
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], found)
+    return jax.tree.map(lambda x: x.reshape(blocks * at_once, *x.shape[2:])[:count], found)
 
 
 def mover(args: PyTree) -> Callable[[Integrated, Array, Array], Integrated]:

@@ -69,7 +69,8 @@ class ArrayWriter:
         return a * b + c
 
     def run(self, function: str, *arguments) -> None:
-        """Call the function of this name."""
+        """Call the function of this name, in the modes of the lanes."""
+        self.functions.take_modes(arguments[0])
         getattr(self.functions, function)(*arguments)
 
     # memory
@@ -119,12 +120,16 @@ class ArrayWriter:
         return row[0][row[1]] if isinstance(row, tuple) else row
 
     def _of(self, rows: list) -> Array:
-        array, first = rows[0] if rows and isinstance(rows[0], tuple) else (None, 0)
-        if array is not None and all(
-            isinstance(row, tuple) and row[0] is array and row[1] == first + i for i, row in enumerate(rows)
-        ):
-            return array if len(rows) == len(array) else array[first : first + len(rows)]
-        return jnp.stack([self._row(row) for row in rows])
+        """Return rows as one array, made of as long parts of other arrays as there are."""
+        parts: list[tuple[Array, int, int]] = []
+        for row in rows:
+            array, i = row if isinstance(row, tuple) else (row[None], 0)
+            if parts and parts[-1][0] is array and parts[-1][2] == i:
+                parts[-1] = (array, parts[-1][1], i + 1)
+            else:
+                parts.append((array, i, i + 1))
+        found = [array if b - a == len(array) else array[a:b] for array, a, b in parts]
+        return found[0] if len(found) == 1 else jnp.concatenate(found)
 
     def whole(self, room: Room) -> Array:
         """Return all rows of a room."""
@@ -195,6 +200,12 @@ class ArrayWriter:
         """Return numbers that stages look up, whole ones as such."""
         found = np.asarray(numbers)
         return jnp.asarray(found, self.dtype if found.dtype.kind == "f" else jnp.int32)
+
+    def put_at(self, place: Pointer, rows: int, index: Array, value: Array, where: Array) -> None:
+        """Put a value into the row of each lane's own index, in lanes `where` this holds; nowhere beyond the last row."""
+        every = Rows(0, rows)
+        here = jnp.reshape(jnp.arange(rows), (-1, *[1] * len(self.lanes))) == index
+        self.store(jnp.where(here & where, value, self.load(place, every)), place, every)
 
     def may_count(self, weights, j: int) -> bool:
         """Return whether a weight may be other than zero."""

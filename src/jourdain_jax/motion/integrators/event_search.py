@@ -7,7 +7,8 @@ An event happens where its value falls through zero. A motion that starts with a
 
     |c_0| <= noise c_0',   noise = eps^0.6 span
 
-if the value is positive after a first step, which is tried again at half its length where it is not, down to that noise; then the event has happened at
+if the value is positive after a first step, which is tried again at half its length where it is not, down to that noise (otherwise the search would find
+the zero at the start); then the event has happened at
 the start, as it has where the value is lower, or does not rise.
 
 All event values are positive at t_b, or rise from zero there, and one of them is not at t_a. What is not a number is not positive: such a value lies
@@ -32,6 +33,7 @@ from functools import reduce
 from typing import Any, NamedTuple
 
 from jourdain_jax.motion.native.layout import Form, Lanes, Number, StepWriter, each_row
+from jourdain_jax.motion.native.transitions import Happened, goes_on, pass_event
 from jourdain_jax.motion.trajectories import results
 
 RUNNING, LOCATING = -1, -2  # codes of a motion on its way, and of one that searches for an event
@@ -78,7 +80,7 @@ def at_start(w, c_0: Values, c_dot_0: Values, c_1: Values, direction, span) -> t
         rate = slope * direction
         rises = (rate > 0.0) & (w.magnitude(a) <= reach_of_noise(w, span) * rate)
         sunk.append(~(a > 0.0) & ~rises)
-        sinks.append(~(a > 0.0) & rises & ~(b > 0.0))
+        sinks.append(rises & ~(b > 0.0))
     return sunk, sinks
 
 
@@ -220,12 +222,20 @@ def monitored(
         w.run("events", p.pointer, t, y, slope, values, rates)
         return [[w.load(place, i) for i in range(count)] for place in (values, rates)]
 
-    c_0, rate_0 = events(t, y, k[0])
-    c_1, rate_1 = events(new["t"], y1, k[1])
+    def armed(found: list[list[Number]]) -> list[list[Number]]:
+        """Take events that have not been left since they happened for none."""
+        if not form.transitions:
+            return found
+        disarmed = [off > 0.0 for off in p.every("disarmed")]
+        return [[w.where(off, value, x) for x, off in zip(part, disarmed, strict=True)] for part, value in zip(found, (1.0, 0.0), strict=True)]
+
+    c_0, rate_0 = armed(events(t, y, k[0]))
+    at_end = events(new["t"], y1, k[1])
+    c_1, rate_1 = armed(at_end)
     locating = w.equal(p["code"], LOCATING)
     # a motion that starts beyond an event has no motion at all; a state that is lost is no event
     sound = w.equal(w.sum_of_squares(range(form.y), lambda i: 0.0 * w.load(y, i)), 0.0)
-    fresh = w.equal(p["accepted"] + p["rejected"], 0.0) & sound
+    fresh = w.equal(p["accepted"] + p["rejected"], p["begun"] if form.transitions else 0.0) & sound
     share = lowest(w, h, c_0, rate_0, c_1, rate_1)
     sunk, sinks = at_start(w, c_0, rate_0, c_1, p["direction"], p["last_goal"])
     again = any_of(sinks) & (w.magnitude(h) > reach_of_noise(w, p["last_goal"]))
@@ -249,14 +259,12 @@ def monitored(
         return w.where(stays, w.load(y, i), w.where(found, w.fma(search.shift, w.load(k[0], i), after), after))
 
     each_row(w, form.integrated, y1, state)
-    if form.moving:
-        put_tangents(w, form, p, k[0], found, new["t"], rate_0, y1)
     which = float(count - 1)
     for i in reversed(range(count - 1)):
         which = w.where(sunk[i] | sinks[i], i, which)
     code = w.where(happened, LOCATING, w.where(found, results.EVENT, w.where(locating, LOCATING, new["code"])))
     tried = w.where(dips, 1.0, 0.0)
-    return new | {
+    changed = {
         "t": w.where(found, new["t"] + search.shift, w.where(stays, p["t"], new["t"])),
         "h": w.where(over, p["h"], w.where(dips, share * w.magnitude(h), w.where(locating, p["h"], new["h"]))),
         "code": w.where(over, results.EVENT, code),
@@ -265,6 +273,22 @@ def monitored(
         "event": w.where(over, which, w.where(happened | (locating & was_trying), w.load(first), p["event"])),
         "taken": w.where(stays, 0.0, new["taken"]),
     }
+    ends = found
+    if form.transitions:
+        goes = goes_on(w, form, changed["event"]) & (found | over)
+        ends = found & ~goes
+        p.put("disarmed", [w.where(~stays & (x > 0.0), 0.0, off) for x, off in zip(at_end[0], p.every("disarmed"), strict=True)])
+        rate, slope = (chosen(w, changed["event"], x) for x in (rate_0, p.every("search_slope")))
+        flat = over | is_flat(w, rate, slope)  # what happens at a start has no derivative
+        passing = Happened(changed["event"], changed["t"], flat, goes, reach_of_noise(w, p["last_goal"]))
+        w.if_any(goes, lambda: pass_event(w, form, p, y1, passing))
+        passed = p["passed"] + w.where(goes, 1.0, 0.0)
+        changed["code"] = w.where(goes, w.where(passed > float(form.transitions), results.TOO_MANY_TRANSITIONS, RUNNING), changed["code"])
+        changed |= {"passed": passed, "begun": w.where(goes, changed["accepted"] + changed["rejected"], p["begun"])}
+        changed["event"] = w.where(goes, -1.0, changed["event"])
+    if form.moving:
+        put_tangents(w, form, p, k[0], ends, new["t"], rate_0, y1)
+    return new | changed
 
 
 def slope_is_flat(w: StepWriter, p: Lanes, rate: Number) -> Number:

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import PerLane
 from jourdain_jax.motion.inputs import seen_from_within
 from jourdain_jax.motion.vector_fields.field import Integrated
 
@@ -49,6 +50,25 @@ def events(tau, y, args) -> Float[Array, "events *lanes"]:
         return eqx.filter_vmap(events, in_axes=(0, -1, eqx.if_array(0)), out_axes=-1)(tau, y, args)
     t = origin + tau
     return field.events(scene, fixed, t, y, _at(_values, inputs, t))
+
+
+@eqx.filter_jit
+def resets(tau, y, args) -> Float[Array, "events rows *lanes"]:
+    field, scene, inputs, fixed, origin = args
+    if jnp.ndim(tau) and not field.lowers_events:
+        return eqx.filter_vmap(resets, in_axes=(0, -1, eqx.if_array(0)), out_axes=-1)(tau, y, args)
+    t = origin + tau
+    return field.resets(scene, fixed, t, y, _at(_values, inputs, t))
+
+
+@eqx.filter_jit
+def energy(tau, y, args) -> PerLane:
+    """T + V, J; a number to differentiation."""
+    field, scene, inputs, fixed, origin = args
+    if jnp.ndim(tau) and field.lowered is None:
+        return eqx.filter_vmap(energy, in_axes=(0, -1, eqx.if_array(0)), out_axes=-1)(tau, y, args)
+    t = origin + tau
+    return jnp.sum(field.energies(scene, fixed, t, y, _at(_values, inputs, t)), axis=0)
 
 
 def within(middle, args):

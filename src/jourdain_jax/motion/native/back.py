@@ -20,6 +20,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -29,10 +30,12 @@ from jourdain_jax.calculus.derivatives import filled
 from jourdain_jax.motion.integrators.event_search import RUNNING, chosen, slope_is_flat
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.native.functions import write_pulled
-from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter, Number, StepWriter, arguments_of_samples, copied, each_row, pass_knot, set_goal
+from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter, Number, StepWriter, arguments_of_samples, copied, each_row, set_goal
 from jourdain_jax.motion.native.loop import MOST_KERNELS, TIMES, Start, begin_lane, with_tangents, write_functions, write_job
 from jourdain_jax.motion.native.record import GOALS, TO_ENDS, TO_STATES, Slot, prepare, write_record
+from jourdain_jax.motion.native.samples import pass_knot
 from jourdain_jax.motion.native.step import near_rank_loss, put_near_rows, squares_of, weighted
+from jourdain_jax.motion.native.transitions import reset_back, write_reset_back
 from jourdain_jax.motion.native.values import called
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native.ffi import taken_in, write_handler
@@ -52,6 +55,9 @@ def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int
     _write_step_back(w, form, method, len(asked))
     if form.has_events:
         _write_event_back(w, form, len(asked))
+    if form.transitions:
+        write_reset_back(w, form, asked)
+        _write_transition_back(w, form, len(asked))
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
         write_record(w, form, method, len(asked), memory, job)
         w.give(Value(w, "ptr", "null"))
@@ -212,6 +218,25 @@ def _write_event_back(w: MachineWriter, form: Form, asked: int) -> None:
             event_back(w, form, asked, state, located, g_t, g, by_known)
 
 
+def _write_transition_back(w: MachineWriter, form: Form, asked: int) -> None:
+    """`reset_back(job, state, who, left, g, by_known)`: as the function of this name, with cotangents of the transition's time from the job."""
+    with w.procedure("reset_back", "job state who left g by_known") as (job, state, who, left, g, by_known):
+        lanes, g_t, numbers = Lanes(w, form, state), w.room(1 + len(form.moving)), w.room()
+        w.store(w.load(left), numbers)
+        each_row(w, 1 + len(form.moving), g_t, lambda i: 0.0)
+        with w.counted(0, w.lanes) as lane:
+            number = w.load(who, lane, "i64")
+            with w.when(w.load(numbers, lane, "double").differs(0.0) & (number >= 0)):
+                passed = lanes.of("passed", lane) - 1.0
+                lanes.set("passed", lane, passed)
+                with w.when(passed < float(form.transitions)):
+                    first = number * form.ends + (form.integrated + 1 + len(form.moving)) + w.converted("fptosi", passed, "i64")
+                    for part in range(1 + len(form.moving)):
+                        g_of = w.load(w.load(job, TO_ENDS, "ptr"), first + part * form.transitions, "double")
+                        w.store(g_of, w.at(g_t, part * w.lanes + lane, "double"))
+        reset_back(w, form, asked, state, left, g_t, g, by_known)
+
+
 def is_located(w: StepWriter, lanes: Lanes) -> Number:
     """Return which lanes ended at an event that was searched for."""
     return w.equal(lanes["code"], results.EVENT) & (lanes["accepted"] > 0.0)
@@ -287,7 +312,8 @@ def flow_back(form: Form, method: Method, asked: tuple[int, ...], memory: int) -
         dg, dends = filled(dg), filled(dends)
         raised, more = with_tangents(form, start, along)
         # of the state and its tangent, at the goals, at the end, and of the time of that
-        both = jnp.concatenate([dg, g], axis=1), jnp.concatenate([dends[:n], ends[:n], dends[n:], ends[n:]])
+        parts = [x for a, b in pairwise((0, n, n + 1, len(ends))) for x in (dends[a:b], ends[a:b])]
+        both = jnp.concatenate([dg, g], axis=1), jnp.concatenate(parts)
         raised = replace(raised, time_moves=form.has_events and bool(form.sampled))  # an event needs to know how fast samples change
         d = _pulled(kernel_back(raised, method, asked, memory), raised, more, *both)
         return own(*primals), jnp.concatenate([d[:n], d[2 * n :]])
@@ -296,5 +322,4 @@ def flow_back(form: Form, method: Method, asked: tuple[int, ...], memory: int) -
 
 
 def _pulled(kernel: Callable, form: Form, start: Start, g, ends) -> Float[Array, "found"]:
-    rows = start.rows([jnp.zeros(())] * len(form.moving))
-    return kernel(*start.of_samples, rows, g, ends, start.goals)
+    return kernel(*start.of_samples, start.rows(form), g, ends, start.goals)

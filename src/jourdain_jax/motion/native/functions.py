@@ -15,7 +15,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from jourdain_jax.calculus.derivatives import DifferentiationModeError
-from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter, looked_up
+from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter
+from jourdain_jax.motion.native.samples import looked_up
 from jourdain_jax.native.ir import Value
 from jourdain_jax.native.scalar_program import as_real, unsupported, written, written_in_turn
 from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
@@ -84,7 +85,8 @@ def known_values(w: MachineWriter, form: Form, state: Value, tau: Value, y: Valu
     program, lanes = form.program, Lanes(w, form, state)
     states = [w.load(y, k) for k in range(form.q_and_v)]
     known, fixed, t = lanes.every("known"), len(program.fixed), lanes["origin"] + tau
-    found = dict(zip(form.sampled, looked_up(w, form, state, tau, form.time_moves), strict=False))
+    found = dict(zip(form.sampled, looked_up(w, form, state, tau, form.time_moves), strict=False)) if form.sampled else {}
+    found |= dict(zip(form.switched, lanes.every("mode"), strict=True))
     inputs = [found.get(i, x) for i, x in enumerate(known[fixed:])]
     return dict(zip(program.variables, [*known[:fixed], t, *states, *inputs], strict=True))
 

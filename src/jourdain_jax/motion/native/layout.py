@@ -8,13 +8,12 @@ a step by Taylor series, `before` is the time at which it began, and `bound` how
 whose signs are watched, and by the time `crossing_by` one of them is known to change (`motion/integrators/crossings.py`).
 
 Where inputs are given by samples, rows of pointers and whole numbers say where the samples of a lane are (`table`), how many each input has (`samples`), and
-where the next knot is at which a step must end (`knot`). Between samples lie straight lines:
+where the next knot is at which a step must end (`knot`; `samples.py`).
 
-    f(t) = f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k),   t_k <= t < t_{k+1};   constant before the first sample and after the last
-    df/dt = (f_{k+1} - f_k)/(t_{k+1} - t_k)
-
-Tables have the shape (tables, inputs, 2, samples): times since the start, then values, of every input that is given by samples, padded with infinite
-times. Knots (`motion/inputs.py`) have the shape (rows, knots). Lanes that share them have one of each: of T tables, lane i of N has number i T / N.
+Where events let the motion go on (`transitions.py`), `mode` are the modes, `passed` counts the transitions, and `log_event`, `log_mode`, `log_lost` and `log_t`
+hold of each the event, the modes after it, by how much the energy fell, and the time with its tangents. `begun` is how many steps had been tried at the
+last one, `disarmed` tells which events have not been left since they happened, and `left` holds what the last try left by a transition: the event's number
+and 1 (negative where its value has no slope), or 0 for none; its time; the state and the modes before it.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +23,6 @@ from typing import Any
 
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.lowering.relations import MOST_WATCHED
-from jourdain_jax.native.ffi import Given, last_size, product
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.math_functions import power
 
@@ -47,6 +45,9 @@ class Form:
     sampled: tuple[int, ...] = ()  # which of the inputs are given by samples
     time_moves: bool = False  # whether time has tangents
     compensated: bool = False  # whether the state is summed with what rounding leaves off, as in single precision
+    switched: tuple[int, ...] = ()  # which of the inputs are modes
+    stops: tuple[bool, ...] = ()  # whether each event ends the motion; empty: all do
+    most: int = 0  # transitions of a motion
 
     @property
     def rates(self) -> list[int]:
@@ -115,6 +116,17 @@ class Form:
         return len(self.program.qdot)
 
     @property
+    def transitions(self) -> int:
+        """The most transitions of a motion; none where all events end it."""
+        return self.most if self.has_events and not all(self.stops) else 0
+
+    @property
+    def rows_of_transition(self) -> dict[str, range]:
+        """What a transition makes: the state after it, modes, by how much the energy falls, and its time with its tangents."""
+        counts = {"y": self.integrated, "mode": len(self.switched), "lost": 1, "t": 1 + len(self.moving)}
+        return _in_a_row(counts)
+
+    @property
     def q_and_v(self) -> int:
         """Numbers of coordinates and speeds."""
         return self.coordinates + self.speeds
@@ -136,8 +148,8 @@ class Form:
 
     @property
     def ends(self) -> int:
-        """Numbers of the state at the end and of its time, and of their tangents."""
-        return (self.y + 1) * (1 + len(self.moving))
+        """Numbers of the state at the end, of its time and of the times of transitions, and of their tangents."""
+        return (self.y + 1 + self.transitions) * (1 + len(self.moving))
 
     @property
     def parts(self) -> list[range]:
@@ -150,7 +162,9 @@ class Form:
         """Name -> rows."""
         search = {"search_t": 3, "search_c": 3 * self.events, "search_step": 1, "search_left": 1, "search_shift": 1, "search_slope": self.events}
         watched = len(self.watched)
-        counts = {"y": self.integrated, **dict.fromkeys(PROGRESS, 1), "dt": len(self.moving), **dict.fromkeys(CONTROL, 1)}
+        most, modes = self.transitions, len(self.switched)
+        log = {"passed": 1, "log_event": most, "log_mode": most * modes, "log_lost": most, "log_t": most * (1 + len(self.moving))} if most else {}
+        counts = {"y": self.integrated, **dict.fromkeys(PROGRESS, 1), "dt": len(self.moving), **log, **dict.fromkeys(CONTROL, 1), "mode": modes}
         counts |= {
             **self.known,
             "goal": 1,
@@ -162,11 +176,8 @@ class Form:
         }
         counts |= {"last": watched, "crossing_by": 1} if watched else {}
         counts |= dict.fromkeys(("rest", "next_rest"), self.y) if self.compensated else {}
-        found, first = {}, 0
-        for name, count in counts.items():
-            found[name] = range(first, first + count)
-            first += count
-        return found
+        counts |= {"begun": 1, "disarmed": self.events, "left": 2 + self.integrated + modes} if most else {}
+        return _in_a_row(counts)
 
     @property
     def returned(self) -> int:
@@ -182,6 +193,14 @@ class Form:
     def all(self) -> int:
         """How many rows there are."""
         return max(rows.stop for rows in self.rows.values())
+
+
+def _in_a_row(counts: dict[str, int]) -> dict[str, range]:
+    found, first = {}, 0
+    for name, count in counts.items():
+        found[name] = range(first, first + count)
+        first += count
+    return found
 
 
 Number = Any  # of a step: a value of machine code, an array, or a pointer to memory of either
@@ -228,6 +247,17 @@ class MachineWriter(Writer):
         """Return numbers that stages look up."""
         return numbers
 
+    def put_at(self, place: Value, rows: int, index: Value, value: Value, where: Value) -> None:
+        """Put a value into the row of each lane's own index, in lanes `where` this holds; nowhere beyond the last row."""
+        values, indices = self.room(), self.room()
+        self.store(value, values)
+        self.store(self.where(where & (index < float(rows)), index, -1.0), indices)
+        with self.counted(0, self.lanes) as lane:
+            row = self.load(indices, lane, "double")
+            with self.when(row >= 0.0):
+                into = self.converted("fptosi", row, "i64") * self.lanes + lane
+                self.store(self.load(values, lane, "double"), self.at(place, into, "double"))
+
     def may_count(self, weights: Any, j: int) -> bool:
         """Return whether a weight may be other than zero."""
         return bool(weights[j] != 0)
@@ -264,10 +294,12 @@ class Lanes:
         self.w, self.form, self.pointer, self.rows = w, form, pointer, form.rows
 
     def __getitem__(self, name: str) -> Number:
-        return self.every(name)[0]
+        """Return the first row of this name."""
+        return self.w.load(self.pointer, self.rows[name].start)
 
     def __setitem__(self, name: str, value: Number) -> None:
-        self.put(name, [value])
+        """Set the first row of this name."""
+        self.w.store(value, self.pointer, self.rows[name].start)
 
     def every(self, name: str) -> list[Number]:
         """The vectors of all rows of this name."""
@@ -301,40 +333,9 @@ def copied(w: StepWriter, rows: int, source: Number, into: Number, where: Number
     each_row(w, rows, into, lambda i: w.load(source, i) if where is None else w.where(where, w.load(source, i), w.load(into, i)))
 
 
-WORDS_OF_SAMPLES = 6  # of a job: pointers to the tables and the knots, how many there are of each, samples of a table, knots of a row
-_TABLES, _KNOTS, _TABLE_COUNT, _KNOT_COUNT, _SAMPLES, _KNOTS_EACH = range(WORDS_OF_SAMPLES)
-
-
 def arguments_of_samples(form: Form) -> int:
     """How many arguments of a handler are samples."""
     return 2 if form.sampled else 0
-
-
-def store_samples(w: MachineWriter, words: Value, given: list[Given]) -> None:
-    """The words of a job that say where samples are."""
-    tables, knots = given
-    for word, value in (
-        (_TABLES, tables.data),
-        (_KNOTS, knots.data),
-        (_TABLE_COUNT, product(w, tables, 3)),
-        (_KNOT_COUNT, product(w, knots, 1)),
-        (_SAMPLES, last_size(w, tables)),
-        (_KNOTS_EACH, last_size(w, knots)),
-    ):
-        w.store(value, words, word)
-
-
-def begin_samples(w: MachineWriter, form: Form, words: Value, count: Value, lanes: Lanes, lane: Value, number: Value) -> None:
-    """A place takes the table and the knots of the lane with this number, of so many."""
-    size = w.load(words, _SAMPLES, "i64")
-
-    def share(of: int) -> Value:
-        return w.binary("sdiv", number * w.load(words, of, "i64"), count)
-
-    table = w.at(w.load(words, _TABLES, "ptr"), share(_TABLE_COUNT) * size * (2 * len(form.sampled)), "double")
-    knot = w.at(w.load(words, _KNOTS, "ptr"), share(_KNOT_COUNT) * w.load(words, _KNOTS_EACH, "i64"), "double")
-    for name, value in (("table", table), ("samples", size), ("knot", knot)):
-        lanes.set(name, lane, value)
 
 
 def set_goal(w: MachineWriter, lanes: Lanes, lane: Value, goal: Value) -> None:
@@ -343,47 +344,3 @@ def set_goal(w: MachineWriter, lanes: Lanes, lane: Value, goal: Value) -> None:
         knot = w.load(lanes.of("knot", lane, "ptr"), type="double")
         goal = w.where((knot - goal) * lanes.of("direction", lane) < 0.0, knot, goal)
     lanes.set("goal", lane, goal)
-
-
-def pass_knot(w: MachineWriter, lanes: Lanes, lane: Value) -> None:
-    """The next knot is behind."""
-    lanes.set("knot", lane, w.at(lanes.of("knot", lane, "ptr"), 1, "double"))
-
-
-def write_sampled_inputs(w: MachineWriter, form: Form, with_slopes: bool) -> None:
-    """`sampled_inputs(state, t, values)`: the values of all inputs that are given by samples, at the time t since the start, of each lane; then df/dt."""
-    with w.procedure("sampled_inputs", "state t:real values") as (state, t, values):
-        lanes, times, low, high = Lanes(w, form, state), w.room(), w.room(type="i64"), w.room(type="i64")
-        w.store(t, times)
-        with w.counted(0, w.lanes) as lane:
-            now, count = w.load(times, lane, "double"), lanes.of("samples", lane, "i64")
-            for i in range(len(form.sampled)):
-                ts = w.at(lanes.of("table", lane, "ptr"), count * (2 * i), "double")
-                fs = w.at(ts, count, "double")
-                w.store(w.literal(0, "i64"), low)
-                w.store(count - 1, high)
-                with w.repeated() as leave:
-                    a, b = w.load(low, type="i64"), w.load(high, type="i64")
-                    leave((b - a) <= 1)
-                    middle = w.binary("sdiv", a + b, 2)
-                    after = w.load(ts, middle, "double") <= now
-                    w.store(w.where(after, middle, a), low)
-                    w.store(w.where(after, b, middle), high)
-                k = w.load(low, type="i64")
-                t_k, f_k = w.load(ts, k, "double"), w.load(fs, k, "double")
-                span, rise = w.load(ts, k + 1, "double") - t_k, w.load(fs, k + 1, "double") - f_k
-                there = (now - t_k) / span
-                share = w.smaller(w.larger(there, 0.0), 1.0)
-                w.store(f_k + share * rise, w.at(values, i * w.lanes + lane, "double"))
-                if with_slopes:
-                    w.store(w.where(there.equals(share), rise / span, 0.0), w.at(values, (len(form.sampled) + i) * w.lanes + lane, "double"))
-
-
-def looked_up(w: MachineWriter, form: Form, state: Value, t: Value, with_slopes: bool) -> list[Value]:
-    """The values at the time t since the start of all inputs that are given by samples, then their slopes."""
-    if not form.sampled:
-        return []
-    count = len(form.sampled) * (1 + with_slopes)
-    values = w.room(count)
-    w.run("sampled_inputs", state, t, values)
-    return [w.load(values, i) for i in range(count)]

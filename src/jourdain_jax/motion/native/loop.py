@@ -24,19 +24,18 @@ from jourdain_jax.motion.integrators.event_search import LOCATING, RUNNING
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.native.functions import check_derivatives, write_events, write_projection, write_rates, write_relations
 from jourdain_jax.motion.native.layout import (
-    WORDS_OF_SAMPLES,
+    CONTROL,
+    PROGRESS,
     Form,
     Lanes,
     MachineWriter,
     arguments_of_samples,
-    begin_samples,
-    pass_knot,
     set_goal,
-    store_samples,
-    write_sampled_inputs,
 )
+from jourdain_jax.motion.native.samples import WORDS_OF_SAMPLES, begin_samples, pass_knot, store_samples, write_sampled_inputs
 from jourdain_jax.motion.native.step import IDLE, write_step
 from jourdain_jax.motion.native.taylor import TaylorSteps, products
+from jourdain_jax.motion.native.transitions import write_reset
 from jourdain_jax.motion.native.values import called
 from jourdain_jax.native.ffi import Given, handed_out, last_size, next_lane, product, share, start_counting, taken_in, write_handler
 from jourdain_jax.native.ir import Value
@@ -68,6 +67,8 @@ def write_functions(w: MachineWriter, form: Form, method: Method | TaylorSteps) 
         write_projection(w, form)
     if form.has_events:
         write_events(w, form)
+    if form.transitions:
+        write_reset(w, form)
     if form.relations:
         write_relations(w, form)
     write_step(w, form, method)
@@ -134,6 +135,8 @@ def begin_lane(w: MachineWriter, form: Form, job: Value, goals: Value, lanes: La
     lanes.set("bound", lane, math.inf)
     if form.has_events:
         lanes.set("search_left", lane, 0.0)
+    for row in (row for name in ("begun", "disarmed", "left") for row in form.rows.get(name, ())):
+        w.store(w.literal(0.0, "double"), w.at(lanes.pointer, lane + row * w.lanes, "double"))
 
 
 def _write_begin(w: MachineWriter, form: Form) -> None:
@@ -229,15 +232,17 @@ class Start(NamedTuple):
     origin: Float[Array, "*lanes"]  # the time of the start
     y: tuple[Float[Array, "y *lanes"], ...]
     known: tuple[tuple[Array, ...], ...]  # numbers; of a loop on arrays those in which the arguments of rates are stored, with their lanes first
+    modes: tuple[Float[Array, "*lanes"], ...] = ()
 
-    def rows(self, dt: Sequence) -> Float[Array, "given *lanes"]:
-        """The rows of a lane at the start, whose time has tangents."""
+    def rows(self, form: Form) -> Float[Array, "given *lanes"]:
+        """The rows of a lane at the start."""
         rtol, atol, shortest, longest, first, most = self.control
         zero, one = jnp.zeros_like(self.goals[0]), jnp.ones_like(self.goals[0])
-        progress = [zero, jnp.minimum(jnp.abs(first), longest), RUNNING * one, zero, zero, -one, jnp.inf * one, zero, jnp.inf * one, *dt]
+        progress = [zero, jnp.minimum(jnp.abs(first), longest), RUNNING * one, zero, zero, -one, jnp.inf * one, zero, jnp.inf * one]
+        progress += [zero] * (form.rows[CONTROL[0]].start - form.integrated - len(progress))
         limits = [jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, longest, most, self.origin]
         known = [jnp.stack(part) for part in self.known if part]  # each tangent by itself: values may have no lanes where tangents have
-        return jnp.concatenate([*self.y, jnp.stack(progress), jnp.stack(limits), *known])
+        return jnp.concatenate([*self.y, jnp.stack(progress), jnp.stack([*limits, *(mode * one for mode in self.modes)]), *known])
 
 
 class Found(NamedTuple):
@@ -246,7 +251,32 @@ class Found(NamedTuple):
     y: tuple[Float[Array, "times y *lanes"], ...]  # at the goals
     end: tuple[Float[Array, "y *lanes"], ...]
     t: tuple[Float[Array, "*lanes"], ...]  # of the end, since the start
-    rest: Float[Array, "rest *lanes"]  # rows of the progress after its time, and the number of goals that were reached one after the other
+    log: tuple[Float[Array, "transitions *lanes"], ...]  # times of transitions
+    rest: Float[Array, "rest *lanes"]  # rows of the progress after its time, the number of goals that were reached one after the other, and of transitions
+    # their number, events, energies lost and modes
+
+    @staticmethod
+    def of(form: Form, states: Float[Array, "times y *lanes"], end: Float[Array, "returned *lanes"], count: Float[Array, "one *lanes"]) -> "Found":
+        """Put a motion together from its states, its rows at the end, and the number of goals that were reached."""
+        rows, parts = form.rows, range(1 + len(form.moving))
+        every = [slice(k * form.y, (k + 1) * form.y) for k in parts]
+
+        def named(name: str) -> Array:
+            return end[rows[name].start : rows[name].stop]
+
+        log: list[Array] = [jnp.zeros((0, *end.shape[1:]), end.dtype) for _ in parts]
+        more = []
+        if form.transitions:
+            log = jnp.split(named("log_t"), len(parts))
+            more = [named(name) for name in ("passed", "log_event", "log_lost", "log_mode") if rows[name]]
+        progress = end[rows[PROGRESS[1]].start : rows[PROGRESS[-1]].stop]
+        return Found(
+            tuple(states[:, part] for part in every),
+            tuple(end[part] for part in every),
+            tuple(end[row] for row in (rows["t"].start, *rows["dt"])),
+            tuple(log),
+            jnp.concatenate([progress, count, *more]),
+        )
 
     def shared(self, given: Start) -> tuple["Found", "Found"]:
         """Return what `vmap` finds, without lanes in the parts that have none, and which have them; `given`: what of the start has.
@@ -257,7 +287,7 @@ class Found(NamedTuple):
         base = any(jax.tree.leaves(given._replace(y=(), known=())))
         own = [any(jax.tree.leaves((given.y[k], given.known[k]))) for k in parts]
         of_parts = tuple(base or any(own[other] for other in range(k + 1) if other & k == other) for k in parts)
-        lanes = Found(of_parts, of_parts, of_parts, of_parts[0])
+        lanes = Found(of_parts, of_parts, of_parts, of_parts, of_parts[0])
         return jax.tree.map(lambda x, has_lanes: x if has_lanes else x[0], self, lanes), lanes
 
 
@@ -265,7 +295,6 @@ class Found(NamedTuple):
 def kernel(form: Form, method: Method, order: int | None = None) -> Callable[[Start], Found]:
     """The motion of what is integrated, by a tableau, or by Taylor series up to an order."""
     steps = method if order is None else TaylorSteps(order)
-    n, parts = form.y, 1 + len(form.moving)
 
     def shapes(*arguments):
         return (arguments[-1].shape[-1], form.integrated), (form.returned + 1,)
@@ -274,15 +303,8 @@ def kernel(form: Form, method: Method, order: int | None = None) -> Callable[[St
 
     @jax.custom_batching.custom_vmap
     def motion(start: Start) -> Found:
-        states, end = run(*start.of_samples, start.rows([jnp.zeros(())] * (parts - 1)), start.goals)
-        progress, dt, count = end[n * parts : -parts], end[-parts:-1], end[-1:]
-        every = [slice(k * n, (k + 1) * n) for k in range(parts)]
-        return Found(
-            tuple(states[:, part] for part in every),
-            tuple(end[part] for part in every),
-            (progress[0], *dt),
-            jnp.concatenate([progress[1:], count]),
-        )
+        states, end = run(*start.of_samples, start.rows(form), start.goals)
+        return Found.of(form, states, end[:-1], end[-1:])
 
     @motion.def_vmap
     def motions(count, batched: Sequence, start: Start):
@@ -322,7 +344,7 @@ def differentiated(motion: Callable[[Form], Callable[[Start], Found]], form: For
         check(form, along)
         raised, more = with_tangents(form, start, along)
         both = differentiated(motion, replace(raised, time_moves=form.has_events and len(start.y) > 1), check)(more)
-        found, d = (Found(*(part[half] for part in both[:3]), both.rest) for half in (slice(len(start.y)), slice(len(start.y), None)))
+        found, d = (Found(*(part[half] for part in both[:4]), both.rest) for half in (slice(len(start.y)), slice(len(start.y), None)))
         return found, d._replace(rest=jnp.zeros_like(found.rest))
 
     return own

@@ -31,7 +31,7 @@ from jourdain_jax.calculus.markers import entries_of
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.lowering.relations import jumps, switches
-from jourdain_jax.motion.inputs import Constant, FunctionOfTime, Inputs, Sampled, TimeProgram
+from jourdain_jax.motion.inputs import Constant, FunctionOfTime, Inputs, Mode, Sampled, TimeProgram
 from jourdain_jax.motion.integrators.explicit_steps import Method, code_at_end
 from jourdain_jax.motion.native import taylor
 from jourdain_jax.motion.native.back import flow_back
@@ -39,7 +39,7 @@ from jourdain_jax.motion.native.functions import check_derivatives, event_progra
 from jourdain_jax.motion.native.layout import Form
 from jourdain_jax.motion.native.loop import Found, Start
 from jourdain_jax.motion.native.values import values_of_nodes
-from jourdain_jax.motion.setup import Begun, Setup, Solved
+from jourdain_jax.motion.setup import NONE_PASSED, Begun, Passed, Setup, Solved
 from jourdain_jax.motion.vector_fields.field import ByProgram, Integrated, VectorField
 from jourdain_jax.native import ffi
 from jourdain_jax.native.scalar_program import unsupported
@@ -50,7 +50,7 @@ from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 
 # Parts of a program that are nodes; `power` is another one.
 _NODES = (
-    *("qdot", "ydot", "pivots", "directions", "squares", "guards", "events"),
+    *("qdot", "ydot", "pivots", "directions", "squares", "guards", "events", "resets", "energies"),
     *("projected_q", "projected_u", "relations", "event_relations", "jumps"),
 )
 MOST_NUMBERS = 200  # in a function of time; of a long table each is a row of a lane, and `jj.Sampled` looks up in it
@@ -95,7 +95,6 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
         power=new[program.power],
         **on_it,
         z=(),  # what is seen of a motion is evaluated with the values of inputs
-        energies=(),
     )
 
 
@@ -195,13 +194,13 @@ def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events
         return reason
     if any(isinstance(x, Sampled) for x in jax.tree.leaves(scene, is_leaf=lambda x: isinstance(x, Sampled))):
         return "the scene itself holds samples"
-    if not all(isinstance(channel, Constant | Sampled | FunctionOfTime) for channel in inputs.channels):
+    if not all(isinstance(channel, Constant | Sampled | FunctionOfTime | Mode) for channel in inputs.channels):
         return "an input is a function of time that holds arrays of its own"
     if isinstance(reason := driven(field.program, inputs), str):
         return reason
     if has_events and not field.lowers_events:
         return "a stop event is no part of the scalar program"
-    return _reason_against_program(form_of(field, inputs, has_events), order)
+    return _reason_against_program(form_of(field, inputs, has_events, 1), order)
 
 
 @lru_cache(maxsize=64)
@@ -241,13 +240,20 @@ def driven(program: Lowered, inputs: Inputs) -> Lowered | str:
     return with_functions(program, tuple(channel.program if isinstance(channel, FunctionOfTime) else None for channel in inputs.channels))
 
 
-def form_of(field: VectorField, inputs: Inputs, has_events: bool) -> Form:
-    """What machine code integrates."""
+def form_of(field: VectorField, inputs: Inputs, has_events: bool, most: int) -> Form:
+    """What machine code integrates; `most`: transitions of a motion."""
     assert isinstance(field, ByProgram)
     sampled = tuple(i for i, channel in enumerate(_others(inputs)) if isinstance(channel, Sampled))
     program = driven(field.program, inputs)
     assert not isinstance(program, str), program
-    return Form(program, field.with_work, field.projects, field.affine, has_events, field.pivots, sampled=sampled)
+    switched, goes_on = modes_among(inputs), has_events and not all(program.stops)
+    of_events: dict[str, Any] = {"stops": program.stops, "most": most} if goes_on else {}
+    return Form(program, field.with_work, field.projects, field.affine, has_events, field.pivots, sampled=sampled, switched=switched, **of_events)
+
+
+def modes_among(inputs: Inputs) -> tuple[int, ...]:
+    """Which of the inputs that are no functions of time are modes."""
+    return tuple(i for i, channel in enumerate(_others(inputs)) if isinstance(channel, Mode))
 
 
 def cotangents(form: Form, method: Method, start: Start, asked: Sequence[bool], memory: int, g: Solved) -> tuple[Integrated, list]:
@@ -257,7 +263,8 @@ def cotangents(form: Form, method: Method, start: Start, asked: Sequence[bool], 
     """
     which = tuple(i for i, is_asked in enumerate(asked) if is_asked)
     check_derivatives(form, 1)
-    found = flow_back(form, method, which, memory)(start, cotangents_of_states(g), jnp.concatenate([g.y_end.rows, g.t_end[None]]))
+    ends = jnp.concatenate([g.y_end.rows, g.t_end[None], g.passed.ts[: form.transitions]])
+    found = flow_back(form, method, which, memory)(start, cotangents_of_states(g), ends)
     known = dict(zip(which, entries_of(found[form.y :]), strict=True))
     return Integrated.of(found[: form.y], form), [known.get(i) for i in range(len(asked))]
 
@@ -275,7 +282,7 @@ def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integ
     def moved_by(y, t, d):
         known = known_of(args)
         values, slopes = zip(*(jax.jvp(others[i], (t,), (jnp.ones_like(t),)) for i in form.sampled), strict=True) if form.sampled else ((), ())
-        for i, value in zip(form.sampled, values, strict=True):
+        for i, value in [*zip(form.sampled, values, strict=True), *((i, others[i](t)) for i in form.switched)]:
             known[fixed + i] = value
         z = jnp.concatenate([y.rows, jnp.stack([jnp.asarray(x, real_type()) for x in (t, *known, *slopes)])])
         return Integrated.of(along_rates(z, d)[: form.y], form)
@@ -287,7 +294,13 @@ def start_of(setup: Setup, begun: Begun) -> Start:
     """What a kernel is given of a motion."""
     knots, goals = setup.knots, setup.goals(setup.ts)
     known = tuple(jnp.asarray(0.0 if x is None else x, real_type()) for x in known_of(begun.args))  # what samples say is looked up
-    return Start(_samples(begun.args, goals, knots), control_of(setup, knots), goals, jnp.asarray(begun.args[-1], real_type()), (begun.y0.rows,), (known,))
+    origin, modes = jnp.asarray(begun.args[-1], real_type()), modes_at_start(begun.args[2])
+    return Start(_samples(begun.args, goals, knots), control_of(setup, knots), goals, origin, (begun.y0.rows,), (known,), modes)
+
+
+def modes_at_start(inputs: Inputs) -> tuple[Array, ...]:
+    """The numbers of the modes at the start."""
+    return tuple(jax.lax.stop_gradient(jnp.asarray(channel.value, real_type())) for channel in inputs.channels if isinstance(channel, Mode))
 
 
 def control_of(setup: Setup, knots: Float[Array, "knots"] | None) -> tuple[Float[Array, ""], ...]:
@@ -340,9 +353,16 @@ def _samples(args: tuple, goals: Float[Array, "times"], knots: Float[Array, "kno
 
 def solved(form: Form, goals: Float[Array, "times"], found: Found) -> Solved:
     """What a loop found, in words."""
-    h, code, accepted, rejected, event, pivot, crossings, together, count = found.rest
-    (states,), (end,), (t,) = found[:3]
+    h, code, accepted, rejected, event, pivot, crossings, together, count = found.rest[:9]
+    (states,), (end,), (t,), (log,) = found[:4]
     code, accepted, rejected, event, crossings = (x.astype(jnp.int32) for x in (code, accepted, rejected, event, crossings))
     reached = (jnp.arange(len(goals)) < count) | (goals == t)
     ys, code = jax.vmap(lambda rows: Integrated.of(rows, form))(states[:-1]), code_at_end(code, h, accepted, t)
-    return Solved(goals[:-1], ys, reached[:-1], t, Integrated.of(end, form), code, event, accepted, rejected, h, pivot, crossings, together)
+    most = form.transitions
+    passed = NONE_PASSED
+    if most:
+        number, more = found.rest[9], found.rest[10:]
+        times = jnp.where(jnp.arange(most) < number, log, jnp.inf)
+        modes = jnp.reshape(more[2 * most :], (len(form.switched), most)) if form.switched else jnp.zeros((0, most))
+        passed = Passed(times, more[:most].astype(jnp.int32), more[most : 2 * most], modes)
+    return Solved(goals[:-1], ys, reached[:-1], t, Integrated.of(end, form), code, event, accepted, rejected, h, pivot, crossings, together, passed)

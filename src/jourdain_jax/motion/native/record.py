@@ -21,19 +21,20 @@ FIRST_SLOTS = 64  # for which there is memory at first; then twice as many, and 
 
 
 class Slot(NamedTuple):
-    """Rows of a slot: those of a state come first, then those of its slopes; `all`: how many there are."""
+    """Rows of a slot: those of a state come first, then those of its slopes; those that a transition left last; `all`: how many there are."""
 
     y: int
     t: int
     taken: int
     saved: int
+    left: int
     all: int
 
     @staticmethod
     def of(form: Form, method: Method | ImplicitMethod) -> "Slot":
         y = form.integrated
         t = y * (1 + method.needed)
-        return Slot(y, t, t + 1, t + 2, t + 3)
+        return Slot(y, t, t + 1, t + 2, t + 3, t + 3 + len(form.rows.get("left", ())))
 
 
 class _Rooms(NamedTuple):
@@ -90,7 +91,7 @@ def write_record(w: MachineWriter, form: Form, method: Method, asked: int, memor
             with w.repeated() as at_start:
                 number = w.load(count, type="i64") - 1
                 at_start(~w.together(number >= w.load(end, type="i64")))
-                _write_try_back(w, slot, job, rooms, places.kept(number))
+                _write_try_back(w, form, slot, job, rooms, places.kept(number))
             done(~w.together(w.load(end, type="i64") > 0))
         leave(places.lost())
         _write_found(w, form, asked, job, rooms)
@@ -185,6 +186,8 @@ def _write_try(w: MachineWriter, form: Form, slot: Slot, job: Value, rooms: "_Ro
     w.store(w.load(rooms.saved), here, slot.saved)
     w.run("step", rooms.state, w.at(here, slot.y))
     w.store(lanes["taken"], here, slot.taken)
+    if form.transitions:
+        copied(w, len(form.rows["left"]), w.at(rooms.state, form.rows["left"].start), w.at(here, slot.left))
     w.run("note", job, rooms.state, rooms.who, rooms.saved)
     w.store(w.load(rooms.tries, type="i64") + 1, rooms.tries)
 
@@ -206,11 +209,14 @@ def _write_ends(w: MachineWriter, form: Form, asked: int, job: Value, rooms: "_R
         w.run("event_back", job, rooms.state, rooms.who, g, rooms.by_known)
 
 
-def _write_try_back(w: MachineWriter, slot: Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
+def _write_try_back(w: MachineWriter, form: Form, slot: Slot, job: Value, rooms: "_Rooms", here: Value) -> None:
     """Back over the try in a slot."""
     before = w.load(here, slot.saved)
     w.run("added", job, rooms.who, before, w.load(rooms.saved), rooms.g)
     w.store(before, rooms.saved)
+    if form.transitions:
+        with w.when(w.any(w.load(here, slot.left).differs(0.0))):
+            w.run("reset_back", job, rooms.state, rooms.who, w.at(here, slot.left), rooms.g, rooms.by_known)
     with w.when(w.any(w.load(here, slot.taken).differs(0.0))):
         w.run("step_back", rooms.state, here, rooms.g, rooms.by_known)
     w.store(w.load(rooms.tries, type="i64") - 1, rooms.tries)

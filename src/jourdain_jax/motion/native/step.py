@@ -157,6 +157,8 @@ def _tried_by_series(w: StepWriter, form: Form, method: TaylorSteps, p: Lanes, k
 def take(w: StepWriter, form: Form, method, p: Lanes, k: Number, trial: Trial) -> None:
     """What becomes of the lanes after a step that was tried; `k`: slopes, the one at the start first."""
     y, count = p.pointer, form.integrated
+    if form.transitions:
+        p["left"] = w.number(0.0)
     aim, y1, accept, next_h, smallest = trial[:5]
     t1, locating = aim.t_1, aim.locating
     fits = accept & (~locating) if not trial.even else w.literal(0, w.truth)

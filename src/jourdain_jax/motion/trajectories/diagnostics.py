@@ -11,7 +11,7 @@ from jourdain_jax.calculus.reals import Count, Scalar, largest, passing_cutoff
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.dynamics.reactions import ContactForce
 from jourdain_jax.eager.eager import eager_if_concrete
-from jourdain_jax.motion.inputs import Constant, Sampled
+from jourdain_jax.motion.inputs import Constant, Mode, Sampled
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.trajectories.over_times import Checked, Checks, Record, map_over_times
 from jourdain_jax.motion.trajectories.results import FALLBACKS, SINGULAR_PARTITION
@@ -24,18 +24,18 @@ class Energies(eqx.Module):
     kinetic: Float[Array, "*lanes times"]
     potential: Float[Array, "*lanes times"]
     work: Float[Array, "*lanes times"] | None
+    lost: Float[Array, "*lanes times"] | None = None  # by events until then; None where no event lets a motion go on
 
     @property
     @with_nan_as_a_mark
     def balance(self) -> Float[Array, "*lanes times"]:
-        """T + V - W; W is the work of forces without potential and of rows that do work."""
-        total = self.kinetic + self.potential
-        return total if self.work is None else total - self.work
+        """T + V - W + D; W is the work of forces without potential and of rows that do work, D what events took."""
+        return sum((x for x in (self.potential, self.lost) if x is not None), start=self.kinetic) - (0.0 if self.work is None else self.work)
 
     @property
     def kind(self) -> str:
         """What `balance` is, in words."""
-        return "T + V" if self.work is None else "T + V less the work done"
+        return "T + V" + " less the work done" * (self.work is not None) + " and what events took" * (self.lost is not None)
 
 
 class Diagnostics(eqx.Module):
@@ -84,7 +84,7 @@ DRIFTED = 1e-2  # of the energy that moves
 
 @eager_if_concrete
 def _diagnosed(trajectory: Record, found: Checked, lacks_work: bool) -> Diagnostics:
-    energy = Energies(*found.energies, trajectory.work)
+    energy = Energies(*found.energies, trajectory.work, lost_of(trajectory))
     geometric, rows = found.residuals
     reached = jnp.all(jnp.isfinite(trajectory.q), axis=-1)
     return Diagnostics(
@@ -99,6 +99,11 @@ def _diagnosed(trajectory: Record, found: Checked, lacks_work: bool) -> Diagnost
         invariant_drifts={name: _span(values) for name, values in found.invariants.items()},
         contacts={name: _extremes(force) for name, force in found.contacts.items()},
     )
+
+
+def lost_of(trajectory: Record) -> Float[Array, "*lanes times"] | None:
+    """Return the energy that events took until each saved time, J; None where no event lets the motion go on."""
+    return trajectory.phases.lost_until(trajectory.ts) if trajectory.phases.ts.shape[-1] else None
 
 
 def _lacks_work(trajectory: Record) -> bool:
@@ -191,6 +196,7 @@ def summary(trajectory: Record, message: str) -> str:
         *([("dense", dense)] if dense else []),
         *([("relations", f"{int(trajectory.crossings)} crossings")] if int(trajectory.crossings) > 0 else []),
         *([("relations", f"not watched: {trajectory.unwatched}")] if trajectory.unwatched else []),
+        *([("phases", _phases_text(trajectory))] if trajectory.phases.ts.size else []),
         ("energy", f"drift {float(found.energy_drift):.2e} J of {found.energy_kind}" if several else "drift is not seen: one time was saved"),
         ("residuals", f"position {float(found.position_residual):.1e}, velocity {float(found.velocity_residual):.1e}"),
         ("rows", f"rank {low if low == high else f'{low} to {high}'}, smallest singular value {float(found.smallest_singular_value):.2e}"),
@@ -202,6 +208,12 @@ def summary(trajectory: Record, message: str) -> str:
     rows += [("warning", text) for text in warnings_of(found, trajectory) if not text.startswith("contact")]
     width = max(len(name) for name, _ in rows)
     return "\n".join([f"Trajectory of {type(trajectory.scene).__name__}", *(f"  {name:<{width}}  {text}" for name, text in rows)])
+
+
+def _phases_text(trajectory: Record) -> str:
+    """The first events after which a motion went on."""
+    lines = trajectory.phases.texts()
+    return ("; ".join(lines[:6]) or "no event") + f"; and {len(lines) - 6} more" * (len(lines) > 6)
 
 
 def _left_domain(trajectory: Record) -> str:
@@ -221,6 +233,8 @@ def _left_domain(trajectory: Record) -> str:
 
 def _channel_text(channel) -> str:
     """An input as it was given; those that were not are zero."""
+    if isinstance(channel, Mode):
+        return "a mode"
     if isinstance(channel, Constant):
         return f"= {float(channel.value):.6g}"
     return f"of {channel.ts.shape[0]} samples" if isinstance(channel, Sampled) else "a function of time"

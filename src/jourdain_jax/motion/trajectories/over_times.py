@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.reals import Count, Scalar, Speeds, Vector3, is_traced, with_usual_promotion
@@ -21,8 +21,51 @@ from jourdain_jax.equations.rows import UsualRows, velocity_residual
 from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.motion.inputs import Inputs, for_programs
 from jourdain_jax.motion.marks import with_nan_as_a_mark
+from jourdain_jax.scene.modes import Modes
+from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import invariants_of
+
+
+class Phases(eqx.Module, Printed):
+    """The phases of a motion, which goes from one to the next by an event after which it goes on."""
+
+    ts: Float[Array, "transitions"]  # s, of these events; NaN after the last one
+    events: Int[Array, "transitions"]  # index into `event_names`; -1 after the last one
+    modes: Float[Array, "modes phases"]  # numbers of their values in each phase
+    lost: Float[Array, "transitions"]  # J, by which T + V fell at each event
+    event_names: tuple[str, ...] = eqx.field(static=True)
+    named: Modes = eqx.field(static=True)
+
+    @property
+    def count(self) -> Count:
+        """How many such events there were."""
+        return jnp.sum(jnp.isfinite(self.ts), axis=-1)
+
+    def texts(self) -> list[str]:
+        """Return one line for each event: its time, its name, the modes that it switched and the energy that it took."""
+        ts, events, modes, lost = (np.asarray(x) for x in (self.ts, self.events, self.modes, self.lost))
+        lines = []
+        for k in range(int(self.count)):
+            pairs = zip(self.named.pairs, modes[:, k], modes[:, k + 1], strict=True)
+            switched = [f"{name}: {values[int(new)]}" for (name, values), old, new in pairs if new != old]
+            took = [f"took {lost[k]:.4g} J"] if abs(lost[k]) > 1e-12 * np.max(np.abs(lost)) else []
+            lines.append(", ".join([f"{ts[k]:.6g} s `{self.event_names[events[k]]}`", *switched, *took]))
+        return lines
+
+    def _text(self) -> str:
+        return "\n".join(["Phases, which end at", *(f"  {line}" for line in self.texts())]) if self.ts.ndim == 1 else f"Phases of lanes {self.ts.shape[:-1]}"
+
+    def lost_until(self, ts: Float[Array, "*lanes times"]) -> Float[Array, "*lanes times"]:
+        """Return by how much events have lowered T + V at each time `ts` (s), in J."""
+        ahead = (self.ts[..., None, :] - ts[..., None]) * jnp.sign(ts[..., -1:] - ts[..., :1])[..., None]
+        return jnp.sum(jnp.where(ahead <= 0, self.lost[..., None, :], 0.0), axis=-1)
+
+
+def one_phase(event_names: tuple[str, ...]) -> Phases:
+    """Return the phases of a motion with one of them, without modes."""
+    none = jnp.zeros(0)
+    return Phases(none, none.astype(jnp.int32), jnp.zeros((0, 1)), none, event_names, Modes())
 
 
 class Record(eqx.Module):
@@ -50,6 +93,7 @@ class Record(eqx.Module):
     # full state, dense: of those of the reduction, 1 where it has none
     smallest_pivot: Scalar
     inputs: Inputs
+    phases: Phases
     state_form: str = eqx.field(static=True)  # "minimal" or "full"
     reduction: str = eqx.field(static=True)
     solver: str = eqx.field(static=True)
@@ -127,6 +171,15 @@ class BodyPoint(eqx.Module):
 def energies(scene, t, q, u, inputs):
     """Kinetic and potential energy, J."""
     return energies_at(scene, motion_at(scene, t, q, u, inputs))
+
+
+class InputOf(eqx.Module):
+    """An input by its name."""
+
+    name: str = eqx.field(static=True)
+
+    def __call__(self, scene, t, q, u, inputs) -> Scalar:
+        return inputs[scene.inputs.entries.index(self.name)]
 
 
 class AccelerationsBySvd(eqx.Module):

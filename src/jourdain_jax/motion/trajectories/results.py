@@ -5,6 +5,7 @@ Codes up to `EVENT` are those of motions that reached the end of their span, or 
 
 SUCCESS, EVENT, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, INCONSISTENT_START, SINGULAR_PARTITION, BAD_PARAMETER, BAD_START, UNSOLVED_STEP = range(10)
 SHRANK, STIFF, OFF_CONSTRAINTS, BAD_TIMES, ENERGY_LOST, PROCESS_DIED, CONTRADICTORY_ROWS, UNRESOLVED = 10, 11, 12, 13, 14, 15, 16, 17
+TOO_MANY_TRANSITIONS = 18
 CODES = tuple(name.lower() for name, code in globals().items() if type(code) is int)  # their names, in order
 MOST_PROJECTED = 0.5  # of the change by a step
 
@@ -35,6 +36,8 @@ MESSAGES = {
     PROCESS_DIED: "processes died on it again and again, and an earlier version's study skipped it",
     UNRESOLVED: "the step size shrank to nothing, and `rtol` is less than this precision resolves, 1.2e-7 in float32 and 2.2e-16 in float64: loosen it to "
     "1e-5 and 1e-13, or set jax.config.update('jax_enable_x64', True)",
+    TOO_MANY_TRANSITIONS: "events after which the motion goes on happened more than `max_transitions` times; raise it, or look for events that follow "
+    "each other faster and faster near the last time, as the bounces of a ball that comes to rest do: switch to a mode in which it rests",
     UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; take a shorter step, or look for a singularity there",
 }
 

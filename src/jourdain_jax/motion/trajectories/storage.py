@@ -2,7 +2,8 @@
 
 Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `work` (times; absent where not tracked), `t_end`, `q_end`, `u_end`,
 `result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `last_step`, `crossings`, `together`, `fallback`, `inputs` (times, inputs;
-sampled at `ts`), and `parameter:NAME` for every field that is an array. `header` is JSON text: `format`, `kind`, `scene` (class name), `coordinates`,
+sampled at `ts`), `phases.NAME` for every array of `motion.phases` (absent where there is one phase, without modes), and `parameter:NAME` for every field that
+is an array. `header` is JSON text: `format`, `kind`, `scene` (class name), `coordinates`,
 `speeds`, `input_names`, `units` of the parameters, `static` (fields that are plain numbers or texts),
 `state_form`, `reduction`, `solver`, `projected`, `unwatched`, `event_names`, `arrays` (names of all arrays), `versions`.
 `kind` is "trajectory" or "rollout"; in a rollout every array has a leading axis of lanes (so `result` is one code per lane), and `reruns` in its header
@@ -18,6 +19,7 @@ import math
 import os
 import zipfile
 from dataclasses import fields
+from operator import attrgetter
 from typing import Any, get_args
 
 import jax
@@ -31,10 +33,10 @@ from jourdain_jax.calculus.on_first_use import version_of
 from jourdain_jax.calculus.reals import described, largest
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.batches.rollout import Rollout
-from jourdain_jax.motion.inputs import Inputs, Sampled
+from jourdain_jax.motion.inputs import Inputs, Mode, Sampled
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.retries import RERUN_FIELDS
-from jourdain_jax.motion.trajectories.over_times import Record
+from jourdain_jax.motion.trajectories.over_times import Phases, Record, one_phase
 from jourdain_jax.motion.trajectories.results import BAD_PARAMETER, EVENT, FALLBACKS, MESSAGES, SUCCESS
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.arguments import of_known_numbers
@@ -44,13 +46,15 @@ from jourdain_jax.scene.scene import Scene
 
 # arrays and their axes, after that of the lanes of a rollout, as a trajectory states them; `work` is absent where it is not tracked
 _STATED: dict[str, Any] = {field.name: (get_args(field.type) or (field.type,))[0] for field in fields(Record)}
+_PHASES = tuple(f"phases.{field.name}" for field in fields(Phases) if hasattr(field.type, "dim_str"))
+_STATED |= {f"phases.{field.name}": field.type for field in fields(Phases)}
 AXES = {name: tuple(kind.dim_str.split()) for name, kind in _STATED.items() if hasattr(kind, "dim_str")} | {"inputs": ("times", "input_names")}
 # entries of the header: their type, in words too
 HEADER: dict[str, tuple[type, str]] = dict.fromkeys(("scene", "state_form", "reduction", "solver", "unwatched", "kind"), (str, "a text"))
 _LISTS = ("coordinates", "speeds", "input_names", "event_names", "arrays")
 HEADER |= dict.fromkeys(_LISTS, (list, "a list of names"))
 HEADER |= {"static": (dict, "a dictionary"), "units": (dict, "a dictionary"), "projected": (bool, "true or false"), "reruns": (list, "a list")}
-_ARRAYS = tuple(name for name in AXES if name not in ("inputs", "work"))
+_ARRAYS = tuple(name for name in AXES if name not in ("inputs", "work", *_PHASES))
 _NEEDS_NUMBERS = jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError
 _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load_rollout(path, scene)"}
 
@@ -80,6 +84,8 @@ def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
             )
     check_place(path)
     arrays = {name: np.asarray(getattr(trajectory, name)) for name in (*_ARRAYS, "work") if getattr(trajectory, name) is not None}
+    if any(x.size for x in jax.tree.leaves(trajectory.phases)):
+        arrays |= {name: np.asarray(attrgetter(name)(trajectory)) for name in _PHASES}
     arrays["inputs"] = np.asarray((jax.vmap(_sampled) if isinstance(motion, Rollout) else _sampled)(trajectory.inputs, trajectory.ts))
     arrays |= {f"parameter:{name}": np.asarray(value) for name, value in parameters.items()}
     header = {name: getattr(trajectory, name) for name in RERUN_FIELDS} | {
@@ -171,10 +177,18 @@ def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajecto
                 f"the file holds the {name.replace('_', ' ')} {', '.join(header[name])}, but `{kind.__name__}` has {', '.join(now.entries) or 'none'}; "
                 "pass the class as it was when the file was written"
             )
+    channels = [Sampled(arrays["input_ts"], column) for column in arrays["inputs"].T]
+    phases = one_phase(tuple(header["event_names"]))
+    if "phases.ts" in arrays:
+        phases = Phases(**{name.removeprefix("phases."): arrays[name] for name in _PHASES}, event_names=tuple(header["event_names"]), named=scene.modes)
+        direction = jnp.where(arrays["t_end"] < arrays["ts"][0], -1.0, 1.0)
+        ts = jnp.where(jnp.isfinite(phases.ts), phases.ts * direction, jnp.inf)
+        channels[len(channels) - len(phases.modes) :] = [Mode(modes[0], ts, modes[1:], direction) for modes in phases.modes]
     return Trajectory(
         scene=scene,
         work=arrays.get("work"),
-        inputs=Inputs(tuple(Sampled(arrays["input_ts"], column) for column in arrays["inputs"].T)),
+        inputs=Inputs(tuple(channels)),
+        phases=phases,
         event_names=tuple(header["event_names"]),
         **{name: arrays[name] for name in _ARRAYS},
         **{name: header[name] for name in RERUN_FIELDS},
@@ -226,6 +240,7 @@ def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type
     if found != kind:
         raise ValueError(f"`{path}` holds a {found}, expected a {kind}; read it with `{_READERS.get(str(found), 'the version of jourdain-jax that wrote it')}`")
     missing = [name for name in (*_ARRAYS, "inputs") if name not in arrays]
+    missing += [name for name in _PHASES if name not in arrays and any(one in arrays for one in _PHASES)]
     missing += [name for name in HEADER if name not in header]
     if not missing:
         check_header(path, header)
@@ -290,7 +305,8 @@ def check_arrays(path, header: dict, arrays: dict) -> None:
     """ValueError for an array of another shape or type than the others ask for, or with numbers that no motion has."""
     lead = arrays["result"].shape[:1] if header["kind"] == "rollout" else ()
     times = arrays["ts"].shape[-1] if arrays["ts"].ndim else 0
-    sizes = {"times": times} | {name: len(header[name]) for name in ("coordinates", "speeds", "input_names")}
+    sizes = dict(zip(("modes", "phases"), arrays["phases.modes"].shape[-2:], strict=False)) if "phases.modes" in arrays else {}
+    sizes |= {"times": times, "transitions": sizes.get("phases", 1) - 1} | {name: len(header[name]) for name in ("coordinates", "speeds", "input_names")}
     for name in ("q", "u", "inputs"):
         found, what = arrays[name].shape[-1:], AXES[name][1]
         if found not in ((), (sizes[what],)):
@@ -313,6 +329,8 @@ def _check_codes(path, header: dict, arrays: dict) -> None:
     ranges = {"result": np.isin(arrays["result"], list(MESSAGES)), "fallback": np.isin(arrays["fallback"], list(FALLBACKS))}
     ranges["event"] = (arrays["event"] <= events) & (arrays["event"] >= np.where(arrays["result"] == EVENT, 0, -1))
     ranges |= {name: arrays[name] >= 0 for name in ("accepted", "rejected")} | {"crossings": arrays["crossings"] >= -1}
+    if "phases.events" in arrays:
+        ranges["phases.events"] = (arrays["phases.events"] >= -1) & (arrays["phases.events"] < len(header["event_names"]))
     for name, right in ranges.items():
         if not np.all(right):
             raise refused(path, f"has {arrays.get(name, header.get(name))} as `{name}`, which no motion has")

@@ -21,12 +21,12 @@ from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.start import consistent
 from jourdain_jax.motion.trajectories import labelled, over_times, results
-from jourdain_jax.motion.trajectories.diagnostics import Energies, diagnose, summary, warnings_of
+from jourdain_jax.motion.trajectories.diagnostics import Energies, diagnose, lost_of, summary, warnings_of
 from jourdain_jax.motion.trajectories.over_times import Record, map_over_times
 from jourdain_jax.motion.trajectories.sketch import sketch
 from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.names import UnknownNameError, nearest
+from jourdain_jax.scene.names import UnknownNameError, check_name, nearest
 from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.printing import Printed
 
@@ -77,6 +77,11 @@ class Trajectory(Record, Printed):
             return eqx.filter_vmap(lambda motion: motion.end)(self)
         return consistent(self.scene, self.t_end, self.q_end, self.u_end, inputs_at(self.inputs, self.t_end))
 
+    def phase(self, mode: str) -> Float[Array, "*lanes times"]:
+        """Return the number of a mode's value at all times; at an event that switches it the one after it."""
+        check_name(mode, self.scene.modes.names, f"`{type(self.scene).__name__}` has no mode `{mode}`")
+        return map_over_times(over_times.InputOf(mode), self)
+
     def motions(self) -> Motion:
         """Poses and velocities (inertial frame) of all bodies at all times (leading axis: times)."""
         return map_over_times(motion_at, self)
@@ -89,7 +94,7 @@ class Trajectory(Record, Printed):
     def energies(self) -> Energies:
         """Kinetic and potential energy, and the work where it is tracked, in J; `.balance` is constant for a right motion."""
         kinetic, potential = map_over_times(over_times.energies, self)
-        return Energies(kinetic, potential, self.work)
+        return Energies(kinetic, potential, self.work, lost_of(self))
 
     def accelerations(self) -> Accelerations:
         """Accelerations, multipliers, rank and smallest singular value at all times."""

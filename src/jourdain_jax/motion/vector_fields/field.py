@@ -12,10 +12,11 @@ from typing import Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import Structure
-from jourdain_jax.build.trace import event_values, stored_by_inputs
+from jourdain_jax.build.trace import event_resets, event_values, stored_by_inputs
 from jourdain_jax.calculus.reals import PerLane, Scalar, Speeds, described
 from jourdain_jax.dynamics.accelerations import Baumgarte
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
@@ -207,6 +208,12 @@ class VectorField(eqx.Module):
         """Values of the stop events, in the order of their names; lanes only where `lowers_events`."""
         return event_values(scene, motion_at(scene, t, y.q, self.speeds(scene, fixed, t, y, inputs), inputs))
 
+    def resets(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events rows *lanes"]:
+        """Coordinates, integrated speeds and modes after each event, in the order of their names; lanes only where `lowers_events`."""
+        found = event_resets(scene, motion_at(scene, t, y.q, self.speeds(scene, fixed, t, y, inputs), inputs))
+        left_out = set(range(len(scene.speed_names))) - set(range(len(scene.speed_names)) if self.independent is None else self.independent)
+        return jnp.delete(found, np.array([len(y.q) + k for k in sorted(left_out)], int), axis=1)
+
     def energies(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "2"]:
         """Kinetic and potential energy, J; numbers to differentiation."""
         scene, fixed, t, y, inputs = jax.lax.stop_gradient((scene, fixed, t, y, inputs))
@@ -287,6 +294,12 @@ class ByProgram(VectorField):
         if self.program.events:
             return self.program.values(self.program.events, fixed, t, tuple(y.q), tuple(y.v), inputs)
         return super().events(scene, fixed, t, y, inputs)
+
+    def resets(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events rows *lanes"]:
+        if self.program.events:
+            found = self.program.values(self.program.resets, fixed, t, tuple(y.q), tuple(y.v), inputs)
+            return found.reshape(len(self.program.events), -1, *found.shape[1:])
+        return super().resets(scene, fixed, t, y, inputs)
 
     def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Watched:
         """Return `rates`, the pivots of the elimination, and the eliminated rows."""

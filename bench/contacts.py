@@ -1,0 +1,93 @@
+"""Events after which a motion goes on: how exact motions and derivatives through them are, and how long they take.
+
+    python bench/contacts.py [--quick] [--json FILE]
+
+Closed forms: t_10 of a ball that falls from 1 m and bounces, sqrt(2 h/g) (1 + 2 (e + ... + e^9)) with e = 0.7, and its
+derivatives; processor time. A `solve` is one motion without derivatives. `--quick`: fewer lanes. The JSON is a list of
+{"figure", "model", "value", "required", "met"}.
+"""
+
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from figures import Figures, figure, main
+
+import jourdain_jax as jj
+
+jax.config.update("jax_enable_x64", True)
+NAME = "bouncing ball"
+RIGHT = 2.47360446364125, 8.53571984478680, 41.2871353427762  # s, and by e
+
+
+class Ball(jj.Scene):
+    """A ball above a floor, in a draught, so that eight numbers say how it moves."""
+
+    bounce: float = jj.parameter(0.7, non_negative=True)
+    gravity: float = jj.parameter(9.81)
+    drag: float = jj.parameter(0.0)
+    draught: float = jj.parameter(0.0)
+    slope: float = jj.parameter(0.0)
+    mass: float = jj.parameter(1.0, positive=True)
+    coordinates = jj.coordinates("x z")
+
+    def bodies(self, t, q):
+        return {"ball": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, q.z]))}
+
+    def loads(self, motion):
+        along = self.drag * (self.draught - motion.u.x_rate)
+        return jj.gravity(motion, self.gravity), jj.Load(forces={"ball": jnp.stack([along, 0.0 * along, 0.0 * along])})
+
+    def events(self, motion):
+        return {"floor": jj.Event(motion.q.z - self.slope * motion.q.x, jump={"z_rate": -self.bounce * motion.u.z_rate})}
+
+
+def bounces(e, h=1.0, tolerance=1e-12):
+    """Return the times of the first twelve bounces."""
+    motion = jj.simulate(Ball(e), {"z": h}, ts=[2.52], rtol=tolerance, atol=tolerance, max_transitions=60)
+    return motion.phases.ts[:12]
+
+
+def digits(quick: bool) -> Figures:
+    """Errors of the time of the tenth bounce and of its derivatives by e, and of the energy."""
+    tenth = lambda e: bounces(e)[9]  # noqa: E731
+    found = tenth(0.7), max(abs(f(tenth)(0.7) - RIGHT[1]) for f in (jax.grad, jax.jacfwd)) + RIGHT[1], jax.hessian(tenth)(0.7)
+    for name, value, right, required in zip(("time", "d/de", "d2/de2"), found, RIGHT, (1e-12, 1e-10, 1e-8), strict=True):
+        yield figure(f"ten bounces, {name}: error", NAME, float(abs(value - right)), required)
+    motion = jj.simulate(Ball(), {"z": 1.0}, t1=2.5, rtol=1e-12, atol=1e-12)
+    balance = np.asarray(motion.energies().balance)
+    yield figure("energy audit, of the energy", NAME, float(np.ptp(balance) / 9.81), 1e-9)
+
+
+def seconds(call, *arguments) -> float:
+    """Return the shortest processor time of a warm call."""
+    jax.block_until_ready(call(*arguments))
+    taken = []
+    for _ in range(7):
+        begin = time.process_time()
+        jax.block_until_ready(call(*arguments))
+        taken.append(time.process_time() - begin)
+    return min(taken)
+
+
+def times(quick: bool) -> Figures:
+    """Time of a lane with ten bounces and more, and of derivatives by eight numbers through twelve, in solves."""
+    e = jnp.linspace(0.5, 0.7, 200 if quick else 1000)
+    lanes = seconds(jax.jit(jax.vmap(lambda e: bounces(e, tolerance=1e-8)[9])), e)
+    yield figure("a lane with its bounces, us", NAME, 1e6 * lanes / len(e), 5.0)
+
+    def last(x):
+        motion = jj.simulate(Ball(*x[:6]), {"z": x[6], "x_rate": x[7]}, ts=[2.52], rtol=1e-8, atol=1e-8, max_transitions=60)
+        return motion.phases.ts[11] + motion.q[-1, 0]
+
+    at = jnp.array([0.7, 9.81, 0.1, 0.3, 0.02, 1.0, 1.0, 0.5])
+    lanes = jnp.tile(at, (64, 1))
+    solve = seconds(jax.jit(jax.vmap(last)), lanes)
+    for name, derivative, required in (("forward", jax.jacfwd, 6.0), ("reverse", jax.grad, 8.0)):
+        taken = seconds(jax.jit(jax.vmap(derivative(last))), lanes)
+        yield figure(f"gradient by 8 numbers through 12 events, {name}, solves", NAME, taken / solve, required)
+
+
+if __name__ == "__main__":
+    main(__doc__, (digits, times))

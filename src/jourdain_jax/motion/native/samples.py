@@ -1,0 +1,85 @@
+"""Inputs that are given by samples, as machine code looks them up: between samples lie straight lines:
+
+    f(t) = f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k),   t_k <= t < t_{k+1};   constant before the first sample and after the last
+    df/dt = (f_{k+1} - f_k)/(t_{k+1} - t_k)
+
+Tables have the shape (tables, inputs, 2, samples): times since the start, then values, of every input that is given by samples, padded with infinite
+times. Knots (`motion/inputs.py`) have the shape (rows, knots). Lanes that share them have one of each: of T tables, lane i of N has number i T / N.
+"""
+
+from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter
+from jourdain_jax.native.ffi import Given, last_size, product
+from jourdain_jax.native.ir import Value
+
+WORDS_OF_SAMPLES = 6  # of a job: pointers to the tables and the knots, how many there are of each, samples of a table, knots of a row
+_TABLES, _KNOTS, _TABLE_COUNT, _KNOT_COUNT, _SAMPLES, _KNOTS_EACH = range(WORDS_OF_SAMPLES)
+
+
+def store_samples(w: MachineWriter, words: Value, given: list[Given]) -> None:
+    """The words of a job that say where samples are."""
+    tables, knots = given
+    for word, value in (
+        (_TABLES, tables.data),
+        (_KNOTS, knots.data),
+        (_TABLE_COUNT, product(w, tables, 3)),
+        (_KNOT_COUNT, product(w, knots, 1)),
+        (_SAMPLES, last_size(w, tables)),
+        (_KNOTS_EACH, last_size(w, knots)),
+    ):
+        w.store(value, words, word)
+
+
+def begin_samples(w: MachineWriter, form: Form, words: Value, count: Value, lanes: Lanes, lane: Value, number: Value) -> None:
+    """A place takes the table and the knots of the lane with this number, of so many."""
+    size = w.load(words, _SAMPLES, "i64")
+
+    def share(of: int) -> Value:
+        return w.binary("sdiv", number * w.load(words, of, "i64"), count)
+
+    table = w.at(w.load(words, _TABLES, "ptr"), share(_TABLE_COUNT) * size * (2 * len(form.sampled)), "double")
+    knot = w.at(w.load(words, _KNOTS, "ptr"), share(_KNOT_COUNT) * w.load(words, _KNOTS_EACH, "i64"), "double")
+    for name, value in (("table", table), ("samples", size), ("knot", knot)):
+        lanes.set(name, lane, value)
+
+
+
+def pass_knot(w: MachineWriter, lanes: Lanes, lane: Value) -> None:
+    """The next knot is behind."""
+    lanes.set("knot", lane, w.at(lanes.of("knot", lane, "ptr"), 1, "double"))
+
+
+def write_sampled_inputs(w: MachineWriter, form: Form, with_slopes: bool) -> None:
+    """`sampled_inputs(state, t, values)`: the values of all inputs that are given by samples, at the time t since the start, of each lane; then df/dt."""
+    with w.procedure("sampled_inputs", "state t:real values") as (state, t, values):
+        lanes, times, low, high = Lanes(w, form, state), w.room(), w.room(type="i64"), w.room(type="i64")
+        w.store(t, times)
+        with w.counted(0, w.lanes) as lane:
+            now, count = w.load(times, lane, "double"), lanes.of("samples", lane, "i64")
+            for i in range(len(form.sampled)):
+                ts = w.at(lanes.of("table", lane, "ptr"), count * (2 * i), "double")
+                fs = w.at(ts, count, "double")
+                w.store(w.literal(0, "i64"), low)
+                w.store(count - 1, high)
+                with w.repeated() as leave:
+                    a, b = w.load(low, type="i64"), w.load(high, type="i64")
+                    leave((b - a) <= 1)
+                    middle = w.binary("sdiv", a + b, 2)
+                    after = w.load(ts, middle, "double") <= now
+                    w.store(w.where(after, middle, a), low)
+                    w.store(w.where(after, b, middle), high)
+                k = w.load(low, type="i64")
+                t_k, f_k = w.load(ts, k, "double"), w.load(fs, k, "double")
+                span, rise = w.load(ts, k + 1, "double") - t_k, w.load(fs, k + 1, "double") - f_k
+                there = (now - t_k) / span
+                share = w.smaller(w.larger(there, 0.0), 1.0)
+                w.store(f_k + share * rise, w.at(values, i * w.lanes + lane, "double"))
+                if with_slopes:
+                    w.store(w.where(there.equals(share), rise / span, 0.0), w.at(values, (len(form.sampled) + i) * w.lanes + lane, "double"))
+
+
+def looked_up(w: MachineWriter, form: Form, state: Value, t: Value, with_slopes: bool) -> list[Value]:
+    """The values at the time t since the start of all inputs that are given by samples, then their slopes."""
+    count = len(form.sampled) * (1 + with_slopes)
+    values = w.room(count)
+    w.run("sampled_inputs", state, t, values)
+    return [w.load(values, i) for i in range(count)]

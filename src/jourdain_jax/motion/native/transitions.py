@@ -1,0 +1,230 @@
+"""Events after which a motion goes on: the state and the modes after one, and derivatives through it.
+
+    z+ = R(t_e, z-, p),   c(t_e, z-, p) = 0        f, f+: rates before and after
+
+The time of the event moves with the state and the numbers p. At a number for a time, tangents and cotangents go through it by
+
+    dt_e = -(c_z dz + c_p dp)/cdot,   cdot = c_t + c_z f
+    dz+ = R_z (dz + f dt_e) + R_t dt_e + R_p dp - f+ dt_e
+    s = (g.(f+ - R_z f - R_t) - g_t)/cdot,   G = R_z' g + s c_z,   G_p += R_p' g + s c_p
+
+where g_t is the cotangent of t_e. A state with a tangent is a state of a motion by itself, whose reset is the line of dz+ beside R; so derivatives of the
+second order are by the same formulas. This is the saltation matrix of hybrid systems.
+
+Source: M. A. Aizerman, F. R. Gantmakher, Quarterly Journal of Mechanics and Applied Mathematics 11 (1958) 433-447.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+from jourdain_jax.motion.native.functions import Outputs, given_values, known_values
+from jourdain_jax.motion.native.layout import Form, Lanes, MachineWriter, Number, StepWriter, copied, each_row
+from jourdain_jax.native.ir import Value
+from jourdain_jax.native.scalar_program import as_real, written_in_turn
+from jourdain_jax.program.derivative import cotangents, derivatives, on_its_own
+from jourdain_jax.program.graph import Graph
+
+
+class Reset(NamedTuple):
+    """What an event makes of a state with its tangents, at a number for a time, on a graph of its own."""
+
+    own: Outputs  # without values
+    event: int  # input: which one it is
+    work: list[int]  # inputs: the work and its tangents; none where it is not integrated
+    state: list[int]  # after it, with its tangents
+    modes: list[int]
+    lost: int  # energy
+    times: list[int]  # of the event, with its tangents
+
+    @property
+    def graph(self) -> Graph:
+        """Where the nodes are."""
+        return self.own.graph
+
+    @property
+    def found(self) -> list[int]:
+        """All rows, as `Form.rows_of_transition` has them."""
+        return [*self.state, *self.modes, self.lost, *self.times]
+
+
+@lru_cache(maxsize=64)
+def reset_program(form: Form) -> Reset:
+    """Return the reset of a form."""
+    program, count, events = form.program, len(form.moving), form.events
+    graph, values, variables = on_its_own(program.graph, [*form.rates, *program.events, *program.energies, *program.resets], program.variables)
+    fixed, t, y, inputs = form.split(variables)
+    event, modes = graph.input("event", True), [inputs[i] for i in form.switched]
+    rates, of_events = values[: form.y], values[form.y : form.y + events]
+    T, V, *resets = values[form.y + events :]
+    each = len(resets) // events
+
+    def chosen(nodes: Sequence[int]) -> int:
+        found = nodes[0]
+        for i, node in enumerate(nodes[1:], 1):
+            found = graph.call("select", graph.call("eq", event, graph.const(float(i))), found, node)
+        return found
+
+    c, after = chosen(of_events), [chosen(resets[i::each]) for i in range(each)]
+    kept = dict(zip([*y, *modes], after, strict=True))
+    energy = graph.add(T, V)
+    lost = graph.sub(energy, *graph.substituted([energy], kept))
+    state, modes_after, times = after[: form.q_and_v], after[form.q_and_v :], [t]
+    # each with its tangents, as many as are lifted so far
+    work = [graph.input(f"tangent {k} of work", True) for k in range((1 + count) * form.with_work)]
+    states = [[graph.input(f"tangent {k} of state {i}", True) for i in range(len(y))] for k in range(count)]
+    slopes = [graph.input(f"slope of input {i}", True) for i in (form.sampled if form.time_moves else ())]
+    known = [dict(enumerate([*fixed, *inputs]))]
+    known += [{i: graph.input(f"tangent {k} of number {i}", True) for i in moving} for k, moving in enumerate(form.moving)]
+    z = [part + work[k : k + 1] for k, part in enumerate([y, *states])]
+    state += z[0][form.q_and_v :]
+    while (parts := len(state) // form.y) <= count:
+        before = [n for part in z[:parts] for n in part]
+        along = {n: dn for k in range(parts) for n, dn in zip(z[k], z[k + parts], strict=True)}
+        of_known = {known[k][i]: dn for k in range(parts) for i, dn in known[k + parts].items()}
+        (dc,) = derivatives(graph, [c], along | of_known)
+        (c_dot,) = derivatives(graph, [c], dict(zip([t, *before[: form.y]], [graph.one, *rates[: form.y]], strict=True)))
+        dt = graph.neg(graph.div(dc, c_dot))
+        moved = {n: graph.add(along[n], graph.mul(rate, dt)) for n, rate in zip(before, rates, strict=True)}
+        of_time = {t: dt} | {inputs[i]: graph.mul(slope, dt) for i, slope in zip(form.sampled, slopes, strict=False)}
+        direction = moved | of_known | of_time
+        rates_after = graph.substituted(rates, dict(zip([*before, *modes], [*state, *modes_after], strict=True)))
+        moved_after = derivatives(graph, state, direction)
+        state = [*state, *(graph.sub(dx, graph.mul(rate, dt)) for dx, rate in zip(moved_after, rates_after, strict=True))]
+        times = [*times, *derivatives(graph, times, direction)]
+        rates = [*rates, *derivatives(graph, rates, along | of_known)]
+    of_known = [n for part in known[1:] for n in part.values()]
+    return Reset(Outputs(graph, [], [], variables, states, of_known, [], slopes), event, work, state, modes_after, lost, times)
+
+
+def write_reset(w: MachineWriter, form: Form) -> None:
+    """`reset(state, tau, y, event, after)`: what an event makes of the state `y`; rows as in `Form.rows_of_transition`."""
+    reset = reset_program(form)
+    with w.procedure("reset", "state tau:real y event:real after") as (state, tau, y, event, after):
+        for i, x in written_in_turn(w, reset.graph, reset.found, _given(w, form, reset, state, tau, y, event)):
+            w.store(as_real(w, x), after, i)
+
+
+def write_reset_back(w: MachineWriter, form: Form, asked: Sequence[int]) -> None:
+    """`pull_reset(state, tau, y, event, g, to_y, to_known)`: `g`: of the state, then of the times; after the numbers `asked` for comes the time."""
+    reset, each = reset_program(form), form.y
+    graph, (fixed, t, y, inputs) = reset.graph, form.split(reset.own.variables)
+    weights = [graph.input(f"cotangent {row}", True) for row in range(form.integrated + len(reset.times))]
+    z = [n for k, part in enumerate([y, *reset.own.states]) for n in [*part, *reset.work[k : k + 1]]]
+    varying = [*z, *([*fixed, *inputs][i] for i in asked), t, *(inputs[i] for i in form.sampled[: len(reset.own.slopes)])]
+    pulled = cotangents(graph, [*reset.state, *reset.times], weights, varying)
+    first = len(z) + len(asked)
+    by_time = pulled[first]
+    for n, slope in zip(pulled[first + 1 :], reset.own.slopes, strict=True):
+        by_time = graph.add(by_time, graph.mul(n, slope))
+    assert len(z) == each * (1 + len(form.moving))
+    with w.procedure("pull_reset", "state tau:real y event:real g to_y to_known") as (state, tau, y, event, g, to_y, to_known):
+        given = _given(w, form, reset, state, tau, y, event) | {n: w.load(g, row) for row, n in enumerate(weights)}
+        for i, x in written_in_turn(w, graph, [*pulled[:first], by_time], given):
+            if i < len(z):
+                w.store(as_real(w, x), to_y, i)
+            else:
+                w.store(w.load(to_known, i - len(z)) + as_real(w, x), to_known, i - len(z))
+
+
+def _given(w: MachineWriter, form: Form, reset: Reset, state: Value, tau: Value, y: Value, event: Value) -> dict[int, Value]:
+    given = given_values(w, form, reset.own, known_values(w, form, state, tau, y), state, tau, y)
+    return given | {reset.event: event} | {n: w.load(y, k * form.y + form.q_and_v) for k, n in enumerate(reset.work)}
+
+
+def goes_on(w: StepWriter, form: Form, event: Number) -> Number:
+    """Return whether a motion goes on after this event."""
+    found = w.literal(0, w.truth) if form.stops[0] else w.literal(1, w.truth)
+    for i, stops in enumerate(form.stops):
+        found = w.where(w.equal(event, float(i)), w.literal(not stops, w.truth), found) if i else found
+    return found
+
+
+class Happened(NamedTuple):
+    """An event after which lanes go on."""
+
+    event: Number
+    t: Number
+    flat: Number  # whether its value has no slope
+    here: Number  # in which lanes
+    noise: Number  # the time in which a value rises by round-off
+
+
+def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happened) -> None:
+    """Put the state after an event into `y1`; note the event, and what was before."""
+    event, t, flat, switches, noise = happened
+    rows, of, count = form.rows, form.rows_of_transition, form.integrated
+    after, k, pivots, values, slopes = (w.room(max(n, 1)) for n in (of["t"].stop, count, len(form.monitored), form.events, form.events))
+    w.run("reset", p.pointer, t, y1, event, after)
+    left = w.at(p.pointer, rows["left"].start)
+    w.store(w.where(switches, w.where(flat, w.number(-1.0) - event, event + 1.0), w.load(left)), left)
+    w.store(w.where(switches, t, w.load(left, 1)), left, 1)
+    copied(w, count, y1, w.at(left, 2), switches)
+    modes = w.at(p.pointer, rows["mode"].start)
+    copied(w, len(form.switched), modes, w.at(left, 2 + count), switches)
+    copied(w, len(form.switched), w.at(after, of["mode"].start), modes, switches)
+    copied(w, form.y, after, y1, switches)
+
+    def tangent(i: Number) -> Number:
+        return w.where(switches, w.where(flat, math.nan, w.load(after, i)), w.load(y1, i))
+
+    each_row(w, range(form.y, count), y1, tangent)
+    number, most = p["passed"], form.transitions
+    noted = [(event, "log_event", 0)] + [(w.load(modes, i), "log_mode", i) for i in range(len(form.switched))]
+    times = [t, *(w.load(after, row) for row in of["t"][1:])]
+    noted += [(w.load(after, of["lost"].start), "log_lost", 0)]
+    noted += [(times[0], "log_t", 0)] + [(w.where(flat, math.nan, dt), "log_t", i) for i, dt in enumerate(times[1:], 1)]
+    for value, name, part in noted:
+        w.put_at(w.at(p.pointer, rows[name].start + part * most), most, number, value, switches)
+    w.run("rates", p.pointer, t, y1, k, pivots)
+    w.run("events", p.pointer, t, y1, k, values, slopes)
+    disarmed = []
+    for i, old in enumerate(p.every("disarmed")):
+        c, rate = w.load(values, i), w.load(slopes, i) * p["direction"]
+        rises = (c > 0.0) | ((rate > 0.0) & (w.magnitude(c) <= noise * rate))
+        this = w.equal(event, float(i)) & switches
+        disarmed.append(w.where(this, w.where(rises, 0.0, 1.0), old))
+    p.put("disarmed", disarmed)
+    if form.relations:
+        now = w.room(len(form.watched))
+        w.run("relations", p.pointer, t, y1, now)
+        p.put("last", [w.where(switches, w.load(now, i), old) for i, old in enumerate(p.every("last"))])
+        p["crossing_by"] = w.where(switches, p["direction"] * math.inf, p["crossing_by"])
+
+
+def reset_back(w: StepWriter, form: Form, asked: int, state: Number, left: Number, g_t: Number, g: Number, by_known: Number) -> None:
+    """Make cotangents after a transition those before it, in lanes that have `left` something by one, and put the modes back.
+
+    `left`: as the rows of this name; `g_t`: cotangents of its time and of the tangents of that.
+    """
+    count, of = form.integrated, form.rows_of_transition
+    mark, t, z, before = w.load(left), w.load(left, 1), w.at(left, 2), w.at(left, 2 + count)
+    switched, event = w.differs(mark, 0.0), w.magnitude(mark) - 1.0
+    sizes = of["t"].stop, count, count, count, len(form.monitored), count + len(of["t"]), count, asked + 1
+    after, f, f_after, out, pivots, given, by_event, added = (w.room(max(n, 1)) for n in sizes)
+    values, rates, weights = (w.room(form.events) for _ in range(3))
+    modes = w.at(state, form.rows["mode"].start)
+    copied(w, len(form.switched), before, modes, switched)
+    w.run("reset", state, t, z, event, after)
+    w.run("rates", state, t, z, f, pivots)
+    w.run("events", state, t, z, f, values, rates)
+    copied(w, len(form.switched), w.at(after, of["mode"].start), modes, switched)
+    w.run("rates", state, t, after, f_after, pivots)
+    copied(w, len(form.switched), before, modes, switched)
+    copied(w, count, g, given)
+    copied(w, len(of["t"]), g_t, w.at(given, count))
+    each_row(w, asked + 1, added, lambda i: 0.0)
+    w.run("pull_reset", state, t, z, event, given, out, added)
+    total = w.load(added, asked)
+    for i in range(count):
+        total = total + w.load(out, i) * w.load(f, i) - w.load(g, i) * w.load(f_after, i)
+    rate = w.load(rates)
+    for i in range(1, form.events):
+        rate = w.where(w.equal(event, float(i)), w.load(rates, i), rate)
+    by_value = w.where((mark < 0.0) & w.differs(total, 0.0), math.nan, w.where(w.equal(total, 0.0), 0.0, -total / rate))
+    for i in range(form.events):
+        w.store(w.where(switched & w.equal(event, float(i)), by_value, 0.0), weights, i)
+    w.run("pull_events", state, t, z, weights, by_event, added)
+    each_row(w, count, g, lambda i: w.where(switched, w.load(out, i) + w.load(by_event, i), w.load(g, i)))
+    each_row(w, asked, by_known, lambda i: w.load(by_known, i) + w.where(switched, w.load(added, i), 0.0))

@@ -1,0 +1,90 @@
+"""Modes: inputs that events of the motion switch, and events after which a motion goes on, with a state that may jump.
+
+    t_e:  c(t, q, u) falls through zero      (q, u) <- R(t, q, u),   mode <- another one
+
+Between events a mode is a constant number: the place of its value in the list that the scene gives. Source of the derivatives:
+`motion/native/transitions.py`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from jourdain_jax.calculus.reals import Scalar, described, is_traced
+from jourdain_jax.scene.names import check_name, nearest
+
+
+@dataclass(frozen=True)
+class Modes:
+    """Names of modes, and of the values of each."""
+
+    pairs: tuple[tuple[str, tuple[str, ...]], ...] = ()
+
+    @property
+    def values(self) -> dict[str, tuple[str, ...]]:
+        """Mode -> names of its values."""
+        return dict(self.pairs)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The modes, in order."""
+        return tuple(name for name, _ in self.pairs)
+
+    def number(self, name: str, value, where: str):
+        """Return the number of a mode's value, given by its name or as a number; ValueError where there is none. `where`: who gives it."""
+        names = self.values[name]
+        if isinstance(value, str):
+            check_name(value, names, f"{where} gives mode `{name}` the value `{value}`")
+            return float(names.index(value))
+        if not is_traced(value) and not (np.shape(value) == () and float(value) in range(len(names))):
+            raise ValueError(f"{where} gives mode `{name}` the value {described(value)}; {nearest('', names)} Or give the number of one")
+        return value
+
+
+def modes(**values) -> Modes:
+    """Declare modes: name -> names of its values, of which a motion begins with the first.
+
+    `motion.modes.name` is the number of the value: constant between events, and switched by `jj.Event(..., to={name: value})`.
+    `inputs={name: value}` begins a motion in another one.
+
+    **Examples**
+
+        modes = jj.modes(gear=("first", "second"))
+
+    **Raises** ValueError for fewer than two values, or values that are no texts.
+    """
+    for name, of_mode in values.items():
+        if isinstance(of_mode, str) or not all(isinstance(value, str) for value in of_mode) or len(set(of_mode)) < 2:
+            raise ValueError(f"mode `{name}` has the values {of_mode!r}, expected two names or more: jj.modes({name}=('open', 'closed'))")
+    return Modes(tuple((name, tuple(of_mode)) for name, of_mode in values.items()))
+
+
+@dataclass(frozen=True)
+class Event:
+    """An event of a scene after which the motion goes on: what its methods `events` return in place of a plain value.
+
+    - `value`: the event happens where it falls through zero.
+    - `to`: mode -> its value afterwards, by name.
+    - `jump`: coordinate or speed -> its value afterwards; what is not named stays. Named speeds must satisfy the velocity rows.
+    - `stop`: whether the motion ends here, as it does at a plain value.
+
+    **Examples**
+
+        def events(self, motion):
+            return {"floor": jj.Event(motion.q.z, jump={"z_rate": -self.bounce * motion.u.z_rate})}
+    """
+
+    value: Scalar
+    to: Mapping[str, str | Scalar] = field(default_factory=dict)
+    jump: Mapping[str, Scalar] = field(default_factory=dict)
+    stop: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("to", "jump"):
+            if not isinstance(given := getattr(self, name), Mapping):
+                raise ValueError(f"`{name}` of an event is {described(given)}, expected a dictionary by name")
+        if not isinstance(self.stop, bool):
+            raise ValueError(f"`stop` of an event is {described(self.stop)}, expected True or False")
+        if self.stop and (self.to or self.jump):
+            raise ValueError("an event that stops the motion has nothing to switch; omit `to` and `jump`, or `stop`")

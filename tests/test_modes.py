@@ -1,0 +1,296 @@
+"""Events after which a motion goes on: states that jump, modes that switch, and derivatives through both, in both modes and to the second order."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+
+TIGHT = {"rtol": 1e-12, "atol": 1e-12}
+
+
+class Ball(jj.Scene):
+    """A ball that falls on a floor and bounces: v+ = -e v-."""
+
+    bounce: float = jj.parameter(0.7, non_negative=True)
+    gravity: float = jj.parameter(9.81)
+    coordinates = jj.coordinates("z")
+
+    def bodies(self, t, q):
+        return {"ball": jj.Particle(1.0, jnp.stack([0.0 * q.z, 0.0 * q.z, q.z]))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, self.gravity),)
+
+    def events(self, motion):
+        return {"floor": jj.Event(motion.q.z, jump={"z_rate": -self.bounce * motion.u.z_rate})}
+
+
+class Switching(jj.Scene):
+    """A block on springs of two stiffnesses: events depend on time, state and parameters, and move coordinates, speeds and modes."""
+
+    mass: float = jj.parameter(1.3, positive=True)
+    stiff: float = jj.parameter(4.0)
+    soft: float = jj.parameter(1.5)
+    limit: float = jj.parameter(0.3)
+    kept: float = jj.parameter(0.8)
+    kick: float = jj.parameter(0.05)
+    drag: float = jj.parameter(0.2)
+    coordinates = jj.coordinates("x y")
+    inputs = jj.inputs("push")
+    modes = jj.modes(spring=("stiff", "soft"), side=("in", "out"))
+
+    def bodies(self, t, q):
+        return {"block": jj.Particle(self.mass, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        q, u, spring, side = motion.q, motion.u, motion.modes.spring, motion.modes.side
+        along_x = -(self.stiff * (1 - spring) + self.soft * spring) * q.x - self.drag * u.x_rate * (1 + spring)
+        along_x = along_x + motion.inputs.push + 0.3 * jnp.cos(2 * motion.t)
+        return (jj.Load(forces={"block": jnp.stack([along_x, 0.5 * side * q.x - 2.0 * q.y, 0.0 * q.x])}),)
+
+    def events(self, motion):
+        q, u, t, spring = motion.q, motion.u, motion.t, motion.modes.spring
+        over = {"x_rate": self.kept * u.x_rate + self.kick * t * q.y}
+        back = {"y_rate": -self.kept * u.y_rate, "y": q.y + 0.01 * (1 + u.x_rate**2)}
+        return {
+            "over": jj.Event(jnp.where(spring == 0, self.limit - q.x, 1.0), to={"spring": "soft"}, jump=over),
+            "under": jj.Event(jnp.where(spring == 1, q.x - 0.1 * self.limit * (1 + 0.1 * t), 1.0), to={"spring": "stiff", "side": "out"}),
+            "y": jj.Event(q.y + 0.3, jump=back),
+        }
+
+
+NUMBERS = jnp.array([1.3, 4.0, 1.5, 0.3, 0.8, 0.05, 0.2, 0.1, 1.0, 0.4])
+
+
+def switching(numbers, **options):
+    scene = Switching(*(numbers[i] for i in range(7)))
+    start = dict(zip(("x", "x_rate", "y"), numbers[7:], strict=True))
+    inputs = {"push": lambda t: 0.1 * numbers[0] * jnp.sin(3 * t)}
+    return jj.simulate(scene, start, ts=jnp.array([2.0, 6.0]), inputs=inputs, **(TIGHT | options))
+
+
+def seen(numbers, **options):
+    motion = switching(numbers, **options)
+    return jnp.concatenate([motion.q.ravel(), motion.u.ravel(), motion.work, motion.phases.ts[:3]])
+
+
+def bounces(e, h, **options):
+    return jj.simulate(Ball(e), {"z": h}, ts=[1.3, 5.5], **(TIGHT | {"max_transitions": 15} | options)).phases.ts[9]
+
+
+@pytest.mark.parametrize("backend", ["native", "xla", "dense"])
+def test_ten_bounces(backend):
+    """t_10 = sqrt(2 h/g) (1 + 2 (e + ... + e^9)), and its derivatives."""
+    e, h = 0.7, 1.0
+    time = lambda e, h: bounces(e, h, backend=backend)  # noqa: E731
+    np.testing.assert_allclose(time(e, h), 2.47360446364125, rtol=1e-14)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derivative(time, (0, 1))(e, h), [8.53571984478680, 1.23680223182063], rtol=1e-13)
+    second = [jax.jacfwd(jax.jacfwd(time)), *([jax.hessian(time), jax.jacrev(jax.jacfwd(time))] if backend == "native" else [])]
+    for derivative in second:
+        np.testing.assert_allclose(derivative(e, h), 41.2871353427762, rtol=1e-12)
+
+
+def test_lanes_bounce_by_themselves():
+    e = jnp.linspace(0.3, 0.9, 11)
+    at_once = jax.jit(jax.vmap(lambda e: bounces(e, 1.0)))(e)
+    np.testing.assert_array_equal(at_once, [bounces(x, 1.0) for x in e])
+    flights = sum(2 * e**k for k in range(1, 10))
+    np.testing.assert_allclose(at_once, np.sqrt(2 / 9.81) * (1 + flights), rtol=1e-11)
+
+
+@pytest.mark.parametrize(("e", "slope"), [(1.0, -1.0), (0.8, -0.8)])
+def test_a_bounce_without_gravity_turns_the_derivative_round(e, slope):
+    """z(1) = -e (z_0 + v), so that dz(1)/dz_0 = -e: simulators of soft contact give another sign (google/brax#317)."""
+
+    def end(z):
+        return jj.simulate(Ball(e, 0.0), {"z": z, "z_rate": -2.0}, ts=[1.0], **TIGHT)["z"][-1]
+
+    for derivative in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(derivative(end)(0.5), slope, rtol=1e-12)
+
+
+@pytest.mark.parametrize("backend", ["native", "xla"])
+def test_derivatives_through_modes_and_jumps(backend):
+    """Against differences; both modes of differentiation, and the second order, against each other."""
+    motion = switching(NUMBERS, backend=backend)
+    assert [motion.event_names[i] for i in motion.phases.events[: int(motion.phases.count)]] == ["over", "y", "under"]
+    np.testing.assert_array_equal([motion.phase("spring"), motion.phase("side")], [[1, 0], [0, 1]])
+    of = lambda numbers: seen(numbers, backend=backend)  # noqa: E731
+    forward = jax.jacfwd(of)(NUMBERS)
+    steps = 1e-5 * np.eye(len(NUMBERS))
+    differences = np.stack([(of(NUMBERS + d) - of(NUMBERS - d)) / 2e-5 for d in steps], axis=1)
+    np.testing.assert_allclose(forward, differences, rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(jax.jacrev(of)(NUMBERS), forward, rtol=1e-12, atol=1e-13)
+    if backend == "native":
+        total = lambda numbers: jnp.linspace(0.3, 1.0, 13) @ of(numbers)  # noqa: E731
+        hessian = jax.jacfwd(jax.jacfwd(total))(NUMBERS)
+        slopes = [(jax.grad(total)(NUMBERS + d) - jax.grad(total)(NUMBERS - d)) / 2e-5 for d in steps]
+        np.testing.assert_allclose(hessian, slopes, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(jax.hessian(total)(NUMBERS), hessian, rtol=1e-11, atol=1e-11)
+
+
+def test_the_loops_agree_and_lanes_are_in_modes_of_their_own():
+    numbers = NUMBERS * (1 + 0.2 * jax.random.normal(jax.random.PRNGKey(0), (19, 10)))
+    together = jax.jit(jax.vmap(seen))(numbers)
+    np.testing.assert_array_equal(together[:4], [seen(x) for x in numbers[:4]])
+    by_arrays = jax.jit(jax.vmap(lambda x: seen(x, backend="xla")))(numbers)
+    np.testing.assert_allclose(together, by_arrays, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(together, jax.vmap(lambda x: seen(x, solver=jj.Taylor()))(numbers), rtol=1e-10, atol=1e-10)
+    assert len(np.unique(jax.vmap(lambda x: switching(x).phases.count)(numbers))) > 2
+
+
+def test_the_whole_as_its_parts():
+    """A motion through its events is what restarts by hand make of it."""
+    motion = switching(NUMBERS)
+    scene, inputs = motion.scene, {"push": lambda t: 0.13 * jnp.sin(3 * t)}
+    halves = jj.simulate(scene, {"x": 0.1, "x_rate": 1.0, "y": 0.4}, ts=[1.0], inputs=inputs, **TIGHT)
+    modes = {name: scene.modes.values[name][int(halves.phase(name)[-1])] for name in scene.modes.names}
+    rest = jj.simulate(scene, halves.end, ts=[6.0], inputs=inputs | modes, **TIGHT)
+    np.testing.assert_allclose(rest.q[-1], motion.q[-1], rtol=1e-10)
+    np.testing.assert_allclose(rest.phases.ts[:2], motion.phases.ts[1:3], rtol=1e-10)
+
+
+def test_energy_falls_by_what_events_take():
+    motion = jj.simulate(Ball(), {"z": 1.0}, t1=2.0, **TIGHT)
+    np.testing.assert_allclose(motion.phases.lost[:3], [9.81 * (1 - 0.49) * 0.49**k for k in range(3)], rtol=1e-11)
+    np.testing.assert_allclose(motion.energies().balance, 9.81, rtol=1e-12)
+    assert not motion.warnings
+    assert "floor" in str(motion)
+    assert "took" in str(motion.phases)
+
+
+class Rimless(jj.Scene):
+    """A wheel of eight spokes without a rim, its mass in the hub, that rolls down a slope; each spoke sticks where it strikes (McGeer, 1990)."""
+
+    slope: float = jj.parameter(0.08)
+    coordinates = jj.coordinates("angle")  # of the spoke on the ground, from the vertical, downhill
+
+    def bodies(self, t, q):
+        return {"hub": jj.Particle(1.0, jnp.stack([jnp.sin(q.angle), 0.0 * q.angle, jnp.cos(q.angle)]))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, 9.81),)
+
+    def events(self, motion):
+        half = jnp.pi / 8
+        after = {"angle": motion.q.angle - 2 * half, "angle_rate": jnp.cos(2 * half) * motion.u.angle_rate}
+        return {"spoke": jj.Event(self.slope + half - motion.q.angle, jump=after)}
+
+
+def test_rimless_wheel():
+    def cycle(slope, steps):
+        start = {"angle": slope - jnp.pi / 8, "angle_rate": 1.2}
+        motion = jj.simulate(Rimless(slope), start, ts=[45.0], **TIGHT)
+        return motion.phases.ts[steps] - motion.phases.ts[steps - 1], motion.u[-1, 0]
+
+    np.testing.assert_allclose(cycle(0.08, 38)[0], 1.03454981142327, rtol=1e-10)
+    np.testing.assert_allclose(jax.jacfwd(lambda slope: cycle(slope, 38)[0])(0.08), -25.1071124092, rtol=1e-8)
+
+    def periods(rate):
+        motion = jj.simulate(Rimless(), {"angle": 0.08 - jnp.pi / 8, "angle_rate": rate}, ts=[4.2], **TIGHT)
+        return jnp.diff(motion.phases.ts[:4], prepend=0.0)
+
+    np.testing.assert_allclose(periods(1.09546283964766), 1.03454981142327, rtol=1e-11)
+    slopes = jax.jacrev(periods)(1.09546283964766)
+    np.testing.assert_allclose(slopes[1:] / slopes[:-1], 0.5, rtol=1e-9)  # the multiplier of the rate
+
+
+class Belt(jj.Scene):
+    """A block of 1 kg at a spring of 40 N/m on a belt of 0.1 m/s: it sticks until the spring pulls with more than mu_s m g, then slips."""
+
+    static: float = jj.parameter(0.4)
+    sliding: float = jj.parameter(0.25)
+    coordinates = jj.coordinates("x")
+    modes = jj.modes(block=("sticks", "slips"))
+
+    def bodies(self, t, q):
+        return {"block": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        spring = 40.0 * motion.q.x
+        friction = jnp.where(motion.modes.block == 0, spring, self.sliding * 9.81)
+        return (jj.Load(forces={"block": jnp.stack([friction - spring, 0.0 * spring, 0.0 * spring])}),)
+
+    def events(self, motion):
+        sticks = motion.modes.block == 0
+        return {
+            "breaks": jj.Event(jnp.where(sticks, self.static * 9.81 - 40.0 * motion.q.x, 1.0), to={"block": "slips"}),
+            "holds": jj.Event(jnp.where(sticks, 1.0, 0.1 - motion.u.x_rate), to={"block": "sticks"}, jump={"x_rate": 0.1}),
+        }
+
+
+def test_block_on_a_belt():
+    def period(static, x):
+        motion = jj.simulate(Belt(static), {"x": x, "x_rate": 0.1}, ts=[4.0], **TIGHT)
+        return motion.phases.ts[2] - motion.phases.ts[0]
+
+    np.testing.assert_allclose(period(0.4, 0.05), 1.360846391399, rtol=1e-11)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derivative(period)(0.4, 0.05), 4.14018082448, rtol=1e-10)
+        assert abs(derivative(period, 1)(0.4, 0.05)) < 1e-11  # what sticks has forgotten how it came there
+
+
+def test_of_a_batch_and_a_file(tmp_path):
+    lanes = jj.rollout(Switching(), {"x": jnp.linspace(0.0, 0.2, 3), "x_rate": 1.0, "y": 0.4}, ts=[3.0, 6.0])
+    one = jj.simulate(Switching(), {"x": 0.1, "x_rate": 1.0, "y": 0.4}, ts=[3.0, 6.0])
+    np.testing.assert_array_equal(lanes.lane(1).phases.ts, one.phases.ts)
+    jj.save(one, tmp_path / "motion.npz")
+    found = jj.load_trajectory(tmp_path / "motion.npz", Switching)
+    np.testing.assert_array_equal(found.phases.lost, one.phases.lost)
+    np.testing.assert_array_equal(found.phase("side"), one.phase("side"))
+
+
+def test_a_mode_to_begin_with_and_no_events():
+    soft = jj.simulate(Switching(), {"x": 0.1}, ts=[0.5], inputs={"spring": "soft"}, events=False)
+    assert soft.phase("spring")[-1] == 1
+    assert soft.phases.ts.size == 0
+
+
+def test_too_many_transitions():
+    motion = jj.simulate(Ball(), {"z": 1.0}, t1=3.0, max_transitions=20)
+    assert not motion.succeeded
+    assert "max_transitions" in motion.message
+    assert 2.5 < motion.t_end < 2.5587
+
+
+def test_what_happens_at_the_start_has_no_derivative():
+    """Below the floor already: the bounce is there, and its derivative, which does not exist, is NaN."""
+    end = lambda z: jj.simulate(Ball(), {"z": z, "z_rate": -1.0}, ts=[0.05])["z"][-1]  # noqa: E731
+    assert end(-1e-3) > end(0.0) - 2e-3
+    assert np.isnan(jax.jacfwd(end)(-1e-3))
+    assert np.isnan(jax.grad(end)(-1e-3))
+
+
+def test_wrong_events_are_named():
+    class Wrong(Ball):
+        def events(self, motion):
+            return {"floor": jj.Event(motion.q.z, jump={"w": 0.0})}
+
+    with pytest.raises(ValueError, match=r"event `floor` of `Wrong` moves `w`, which is no coordinate or speed"):
+        jj.simulate(Wrong())
+
+    class WrongMode(Ball):
+        modes = jj.modes(gear=("first", "second"))
+
+        def events(self, motion):
+            return {"floor": jj.Event(motion.q.z, to={"gear": "third"})}
+
+    with pytest.raises(ValueError, match=r"gives mode `gear` the value `third`.*`second`"):
+        jj.simulate(WrongMode())
+
+    class Row(Switching):
+        def velocity_constraints(self, motion):
+            return {"edge": jnp.where(motion.modes.side == 0, motion.u.x_rate, motion.u.y_rate)}
+
+    with pytest.raises(ValueError, match="rows of `Row` depend on mode `side`"):
+        jj.simulate(Row(), t1=1.0)
+    with pytest.raises(ValueError, match="has the values"):
+        jj.modes(gear="first")
+    with pytest.raises(ValueError, match="has nothing to switch"):
+        jj.Event(1.0, to={"gear": "first"}, stop=True)
+    with pytest.raises(ValueError, match="does not go on after events"):
+        jj.simulate(Ball(), solver=diffrax.Kvaerno5())
