@@ -38,11 +38,15 @@ PACKAGES = ("jourdain-jax", "jax", "jaxlib", "diffrax", "numpy", "scipy", "zarr"
 
 @dataclass(frozen=True)
 class Lanes:
-    """What a block gave: what is kept of it, by column, how its lanes ended, and all outputs, shape (lanes, outputs)."""
+    """What a block of lanes gave: what is kept of it, by column; how its lanes ended, by the names of `OF_LANES`, and all outputs (lanes, outputs).
 
+    The last two are on the device, and may have more lanes, which do not count.
+    """
+
+    lanes: range
     kept: Mapping[str, np.ndarray]
-    ends: Mapping[str, np.ndarray]  # by the names of `OF_LANES`
-    outputs: np.ndarray
+    ends: Mapping[str, jax.Array]
+    outputs: jax.Array
 
 
 class Runner:
@@ -57,7 +61,7 @@ class Runner:
             memory.give_back_at_once()
         self._outputs_of = eqx.filter_jit(eqx.filter_vmap(task.outputs_of_lane))
         self._first = self.run_block(0)
-        found = Grid.of(self._first.outputs).as_dict()
+        found = Grid.of(np.asarray(self._first.outputs)[: len(self._first.lanes)]).as_dict()
         kept = store.read_grid() or store.write_grid(found)
         if kept != found:
             warnings.warn(
@@ -70,10 +74,12 @@ class Runner:
     def run(self, number: int) -> tuple[int, int]:
         """Compute and keep a chunk; how many lanes it has, and how many of them failed."""
         first, last = self.store.span(number)
-        numbers = range(first // self.task.block, -(-last // self.task.block))
-        blocks = [self.run_block(block) if block else self._first for block in numbers]
-        values = {name: np.concatenate([lanes.kept[name] for lanes in blocks]) for name in self.store.columns}
-        tallies = [Tally.of_block(self.grid, block * self.task.block, lanes.ends, lanes.outputs) for block, lanes in zip(numbers, blocks, strict=True)]
+        kept, tallies = [], []
+        for number_of_block in range(first // self.task.block, -(-last // self.task.block)):
+            block = self.run_block(number_of_block) if number_of_block else self._first
+            kept.append(block.kept)
+            tallies.append(Tally.of_block(self.grid, block.lanes, block.ends, block.outputs))
+        values = {name: np.concatenate([columns[name] for columns in kept]) for name in self.store.columns}
         tally = Tally.together(tallies, len(self.task.outputs))
         self.store.write(number, values, tally)
         return last - first, tally.failed.size
@@ -87,16 +93,28 @@ class Runner:
         starts, parameters = task.starts_and_parameters({name: np.pad(column, (0, task.block - count), mode="edge") for name, column in values.items()})
         rolled = rollout(task.scene, starts, parameters=parameters or None, chunk=task.block, progress=False, **task.span, options=task.options).lanes
         with nan_is_a_mark():
-            outputs = np.array(self._outputs_of(rolled))[:count]
-        ends = {name: np.asarray(getattr(rolled, field))[:count] for name, (field, *_) in OF_LANES.items()}
-        found = values | ends | dict(zip(task.outputs, outputs.T, strict=True))
+            outputs = self._outputs_of(rolled)
+        ends = {name: getattr(rolled, field) for name, (field, *_) in OF_LANES.items()}
+
+        def rows(array, every: int) -> np.ndarray:
+            return np.asarray(array if every == 1 else _rows(array, np.arange(-first % every, count, every)))[:count]
+
+        found: dict[str, np.ndarray] = {}
+        if self.store.columns:
+            every = self.store.columns["result"].every
+            found = {name: rows(array, every) for name, array in (values | ends).items()} | dict(zip(task.outputs, rows(outputs, every).T, strict=True))
         if task.keep_every:
             for names, array in ((task.scene.coordinate_names, rolled.q), (task.scene.speed_names, rolled.u)):
-                found |= dict(zip(names, np.moveaxis(np.asarray(array), -1, 0), strict=True))
-        kept = {name: found[name][-first % column.every : count : column.every].astype(column.dtype) for name, column in self.store.columns.items()}
+                found |= dict(zip(names, np.moveaxis(rows(array, task.keep_every), -1, 0), strict=True))
+        kept = {name: found[name].astype(column.dtype) for name, column in self.store.columns.items()}
         if task.memory:
             memory.check(task.memory)
-        return Lanes(kept, ends, outputs)
+        return Lanes(range(first, first + count), kept, ends, outputs)
+
+
+@jax.jit
+def _rows(array, index):
+    return array[index]
 
 
 def bounded(task: Task, path, chunk: int | None, allowed: int | None, *, here: bool) -> tuple[Task, int | None]:

@@ -1,6 +1,6 @@
 """Statistics of outputs while a study runs, the same bits whatever the chunks and their order.
 
-Lanes are summed block by block (a block: some thousand lanes with fixed numbers), about a centre c near the mean. With m_i = 1 where output i is finite and
+Lanes are counted by JAX on the device where they lie, in doubles; sums and histograms alone come to the host. Lanes are summed block by block (a block: some thousand lanes with fixed numbers), about a centre c near the mean. With m_i = 1 where output i is finite and
 x_i = 0 where it is not, a block gives
 
     N_ij = sum m_i m_j,   A_ij = sum (x_i - c_i) m_j,   S_ij = sum (x_i - c_i)(x_j - c_j)
@@ -17,6 +17,8 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.motion.trajectories.results import CODES, EVENT, SUCCESS
@@ -44,9 +46,9 @@ class Grid:
         low, high, centre = np.array(ends, float).reshape(-1, 3).T
         return cls(low, high, centre)
 
-    def edges(self, i: int) -> np.ndarray:
-        """The edges of the cells of output `i`."""
-        return np.linspace(self.low[i], self.high[i], CELLS + 1)
+    def edges(self) -> np.ndarray:
+        """The edges of the cells of all outputs, shape (outputs, CELLS + 1)."""
+        return np.linspace(self.low, self.high, CELLS + 1, axis=1)
 
     def as_dict(self) -> dict:
         """The grid for JSON; floats keep all their digits there."""
@@ -74,23 +76,15 @@ class Tally:
     extremes: np.ndarray  # (2, outputs): smallest and largest value; infinite where there is none
 
     @classmethod
-    def of_block(cls, grid: Grid, first: int, columns: Mapping[str, np.ndarray], values: np.ndarray) -> "Tally":
-        """The tally of a block that begins with the lane `first`, from columns of its lanes and values (lanes, outputs)."""
-        codes, finite = columns["result"], np.isfinite(values)
-        x = np.ascontiguousarray(np.where(finite, values - grid.centre, 0.0).T)
-        m = np.ascontiguousarray(finite.T, float)
-        places = [np.searchsorted(grid.edges(i), column[finite[:, i]], side="right") for i, column in enumerate(values.T)]
-        counts = np.array([np.bincount(place, minlength=CELLS + 2) for place in places], np.int64)
-        return cls(
-            np.bincount(codes, minlength=len(CODES)),
-            np.array([np.sum(columns["retries"] > 0)]),
-            np.array([np.sum(columns[name], dtype=np.int64) for name in ("steps", "rejected_steps")]),
-            first + np.flatnonzero((codes != SUCCESS) & (codes != EVENT)),
-            # not by a library of matrices, whose rounding may depend on its threads
-            np.stack([np.einsum("ik,jk->ij", a, b) for a, b in ((m, m), (x, m), (x, x))])[None],
-            _sparse(counts),
-            np.stack([np.min(values, axis=0, where=finite, initial=np.inf), np.max(values, axis=0, where=finite, initial=-np.inf)]),
-        )
+    def of_block(cls, grid: Grid, lanes: range, ends: Mapping[str, jax.Array], values: jax.Array) -> "Tally":
+        """The tally of a block of `lanes`, by how they ended and their values (lanes, outputs); what follows them in the arrays does not count."""
+        with jax.enable_x64(True):
+            counted = jax.device_get(_counted(grid.edges(), grid.centre, len(lanes), ends, values))
+        failed = np.zeros(0, np.int64)
+        if counted["codes"].sum() > counted["codes"][[SUCCESS, EVENT]].sum():
+            codes = np.asarray(ends["result"])[: len(lanes)]
+            failed = lanes.start + np.flatnonzero((codes != SUCCESS) & (codes != EVENT))
+        return cls(**counted | {"cells": _sparse(counted["cells"])}, failed=failed)
 
     @classmethod
     def together(cls, several: Iterable["Tally"], outputs: int) -> "Tally":
@@ -123,6 +117,25 @@ class Tally:
         return cls(**dict(arrays) | {"codes": np.pad(codes, (0, len(CODES) - codes.size))})
 
 
+@jax.jit
+def _counted(edges, centre, lanes, ends, values) -> dict[str, jax.Array]:
+    """The fields of a tally of the first so many lanes but its failed ones; `cells`: lanes in all cells."""
+    counts = jnp.arange(len(values)) < lanes
+    values, finite = values.astype(float), jnp.isfinite(values) & counts[:, None]
+    x, m = jnp.where(finite, values - centre, 0.0), finite.astype(float)
+    places = jax.vmap(lambda of_one, column: jnp.searchsorted(of_one, column, side="right"))(edges, values.T)
+    cells = jnp.zeros((len(edges), CELLS + 2), int).at[jnp.arange(len(edges))[:, None], places].add(finite.T)
+    return {
+        "codes": jnp.sum((ends["result"][:, None] == jnp.arange(len(CODES))) & counts[:, None], axis=0),
+        "again": jnp.sum((ends["retries"] > 0) & counts)[None],
+        "steps": jnp.stack([jnp.sum(jnp.where(counts, ends[name], 0), dtype=int) for name in ("steps", "rejected_steps")]),
+        # not by a product of matrices, whose rounding may depend on threads
+        "sums": jnp.stack([jnp.sum(a[:, :, None] * b[:, None], axis=0) for a, b in ((m, m), (x, m), (x, x))])[None],
+        "cells": cells,
+        "extremes": jnp.stack([jnp.min(values, 0, initial=jnp.inf, where=finite), jnp.max(values, 0, initial=-jnp.inf, where=finite)]),
+    }
+
+
 def _sparse(counts: np.ndarray) -> np.ndarray:
     return np.stack([place := np.flatnonzero(counts), counts.reshape(-1)[place]])
 
@@ -149,7 +162,7 @@ class Statistics:
         i = self.names.index(name)
         counts, (least, largest) = self.counts[i], self.extremes[:, i]
         first, last = int(not counts[0]), len(counts) - int(not counts[-1])
-        edges = np.concatenate([[least], self.grid.edges(i), [largest]])
+        edges = np.concatenate([[least], self.grid.edges()[i], [largest]])
         return counts[first:last], edges[first : last + 1]
 
     def quantile(self, name: str, level: float) -> tuple[float, float]:

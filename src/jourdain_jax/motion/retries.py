@@ -66,11 +66,14 @@ def lanes_retried(
 def _next_retries(form: Callable[[AllOptions], VectorField], lanes: Trajectory, begun, options: AllOptions) -> Int[np.ndarray, "lanes"]:
     """Return how each lane is run again, with all earlier changes of its run; AS_ASKED: it is not."""
     begun = np.broadcast_to(np.asarray(begun), lanes.result.shape)
-    found = np.full(lanes.result.shape, results.AS_ASKED)
-    for tried in np.unique(lanes.fallback).tolist():
+    found, codes, fallback = np.full(lanes.result.shape, results.AS_ASKED), np.asarray(lanes.result), np.asarray(lanes.fallback)
+    for tried in np.unique(fallback).tolist():
         field = form(_with_retries(tried, options))
-        for i in np.flatnonzero((np.asarray(lanes.fallback) == tried) & np.isin(lanes.result, (*lost_codes(field), *OUT_OF_STEPS))):
-            found[i] = _next_retry(field, jax.tree.map(lambda x, i=i: x[i], lanes), begun[i], options)
+        again = np.flatnonzero((fallback == tried) & np.isin(codes, (*lost_codes(field), *OUT_OF_STEPS)))
+        # all lanes come to the host where one may run again
+        known = jax.tree.map(np.asarray, lanes) if again.size else lanes
+        for i in again:
+            found[i] = _next_retry(field, jax.tree.map(lambda x, i=i, known=known: x[i], known), begun[i], options)
     return found
 
 

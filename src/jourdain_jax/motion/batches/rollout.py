@@ -208,10 +208,12 @@ def rollout(
     bar = tqdm(total=count, unit="lane", disable=not (count > chunk if progress is None else progress))
     for first in range(0, count, chunk):
         index = np.minimum(np.arange(first, first + chunk), count - 1)  # the last chunk is filled up with copies of its last lane
-        pieces.append(jax.tree.map(np.asarray, run_some(options, index)))
+        piece = run_some(options, index)
+        # one piece stays where it is; several are put together on the host
+        pieces.append(jax.block_until_ready(piece) if chunk == count else jax.tree.map(np.asarray, piece))
         bar.update(min(chunk, count - first))
     bar.close()
-    lanes, reruns = jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *pieces), ()
+    lanes, reruns = pieces[0] if chunk == count else jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *pieces), ()
     if options.retry:
         own_times = isinstance(varied, State) and span["t0"] is None
         begun = varied.t if own_times else 0.0 if span["t0"] is None else span["t0"]
