@@ -1,6 +1,7 @@
 """Statistics of outputs while a study runs, the same bits whatever the chunks and their order.
 
-Lanes are counted by JAX on the device where they lie, in doubles; sums and histograms alone come to the host. Lanes are summed block by block (a block: some thousand lanes with fixed numbers), about a centre c near the mean. With m_i = 1 where output i is finite and
+Lanes are counted by JAX on the device where they lie, in doubles; sums and histograms alone come to the host. They are summed block by block (a block:
+some thousand lanes with fixed numbers), about a centre c near the mean. With m_i = 1 where output i is finite and
 x_i = 0 where it is not, a block gives
 
     N_ij = sum m_i m_j,   A_ij = sum (x_i - c_i) m_j,   S_ij = sum (x_i - c_i)(x_j - c_j)
