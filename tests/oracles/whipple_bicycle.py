@@ -43,7 +43,6 @@ EIGENVALUES: dict[int, np.ndarray] = {
     **{v: np.array([ca, cs, complex(re, im), complex(re, -im)]) for v, (ca, cs, re, im) in _MODES.items()},
 }
 WEAVE_SPEED = 4.2923825363411039587
-WEAVE_FREQUENCY = 3.43503384866144
 CAPSIZE_SPEED = 6.0242620153883588899
 DOUBLE_ROOT_SPEED = 0.68428307889246
 DOUBLE_ROOT = 3.78290405129320

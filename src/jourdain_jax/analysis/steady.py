@@ -138,9 +138,9 @@ def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], most_steps: i
     guess, n, still = jnp.concatenate([q, u]), len(q), jax.lax.stop_gradient(problem)
     size = jnp.where(free, jnp.asarray(sizes(problem.scene, range(n)), guess.dtype), 0.0)
     eps = float(np.finfo(guess.dtype).eps)
-    round_off = float(np.sqrt(eps))
+    round_off = eps**0.5
     z = smooth_root(lambda z: still(z)[:2], lambda z: problem(z)[0], guess, guess, size, eps, round_off, most_steps)
-    of_rows, first, second = problem(z)[2]
-    residual = jnp.maximum(of_rows, jnp.maximum(first, second))
+    of_rows, first, _ = left = jnp.stack(problem(z)[2])
+    residual = largest(left)
     state = state_of(problem.scene, problem.t, z[:n], z[n:], largest(z[:n] - q), largest(z[n:] - u), of_rows)
     return SteadyMotion(state, first, residual, residual < round_off)

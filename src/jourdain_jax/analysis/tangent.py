@@ -97,8 +97,8 @@ def privileged_at(scene: Scene, state: State, f, usual: tuple[int, ...]) -> tupl
     """Indices of independent speeds at a known state: the `usual` ones, or others where these do not determine the rest well."""
     A, count = _scaled_rows(scene, state.t, state.q, state.u, f)[None], len(scene.speed_names)
     rank = count - len(usual)
-    pivot = lambda y: pivots_at(A, others(y, count).tolist(), rank)[0]  # noqa: E731
-    return usual if pivot(usual) >= WELL_CONDITIONED else best_privileged(A, count, rank)
+    pivot = pivots_at(A, others(usual, count).tolist(), rank)[0]
+    return usual if pivot >= WELL_CONDITIONED else best_privileged(A, count, rank)
 
 
 @eval_numpy

@@ -116,7 +116,7 @@ def _stability_speeds(matrices: BicycleMatrices, top: Scalar) -> StabilitySpeeds
     (zeros, is_zero), (opposites, is_opposite), (coincidents, is_coincident) = (_roots(polynomial, top**2) for polynomial in (b0, opposite, coincident))
 
     upward = is_zero & (_slope(b0, zeros) * jnp.polyval(b1, zeros) < 0)
-    capsize = jnp.min(jnp.where(upward, zeros, jnp.inf), initial=jnp.inf)
+    capsize = jnp.min(zeros, where=upward, initial=jnp.inf)
     downward = is_opposite & (jnp.polyval(b1, opposites) * b3 > 0) & (_slope(opposite, opposites) * b3 > 0)
     weave = jnp.argmax(jnp.where(downward, opposites, -jnp.inf))
     has_weave = downward[weave]
@@ -124,7 +124,7 @@ def _stability_speeds(matrices: BicycleMatrices, top: Scalar) -> StabilitySpeeds
     below = jnp.where(has_weave, opposites[weave], top**2)
     merges = is_coincident & jax.vmap(lambda x: _merges(matrices, x))(coincidents) & (coincidents < below)
     last = jnp.argmax(jnp.where(merges, coincidents, -jnp.inf))
-    crossings = jnp.concatenate([jnp.where(is_zero, zeros, top**2), jnp.where(is_opposite, opposites, top**2)])
+    crossings = jnp.where(jnp.append(is_zero, is_opposite), jnp.append(zeros, opposites), top**2)
     stable_from, stable_to = _widest_stable_range(matrices, opposite, crossings, top)
     return StabilitySpeeds(
         weave_speed=_root_where(has_weave, opposites[weave]),

@@ -218,9 +218,10 @@ class _Special(eqx.Module):
             DOUBLE: [(a0, no, 1.0), (no, a0, 0.0)],
             ZERO: [(a0, no, 1.0), (b0, no, 0.0), (no, a0, 0.0), (no, b0, b0 @ b0)],
         }[self.kind]
+        a, b, c = (jnp.array(x) for x in zip(*of_ab, strict=True))
         of_z, of_w = jnp.eye(len(z), len(near))[held], jnp.eye(len(near))[-1:] * (self.kind == ZERO)
-        L = jnp.concatenate([of_z, jnp.pad(jnp.stack([jnp.concatenate(row[:2]) for row in of_ab]), ((0, 0), (len(z), 1))), of_w])
-        return L, jnp.concatenate([self.X[held], jnp.stack([c for *_, c in of_ab]), jnp.zeros(1)])
+        L = jnp.concatenate([of_z, jnp.pad(jnp.concatenate([a, b], axis=1), ((0, 0), (len(z), 1))), of_w])
+        return L, jnp.concatenate([self.X[held], c, jnp.zeros(1)])
 
     def equations_at(self, scene: Scene, X: Unknowns, near: Unknowns) -> Array:
         """G."""
@@ -309,7 +310,7 @@ def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:
     known = {point: [point.kind, *(point.modes if point.kind != DOUBLE else ())] for point in curve.changes if point.kind in SHAPES}
     found = [point for point, names in known.items() if what is point or what in names]
     if not found:
-        names = ", ".join(sorted({name for names in known.values() for name in names}))
+        names = ", ".join(sorted(set().union(*known.values())))
         raise ValueError(f"the family of `{type(curve.equations.scene).__name__}` has no such special point; it has: {names or 'none'}")
     start = curve.equations.start
     return min(found, key=lambda point: largest(curve.equations.place(point) - start))

@@ -179,7 +179,7 @@ def family(
     - `vary`: a parameter of the scene, one number, that changes along the curve.
     - `held`: names of coordinates and speeds that keep the guess's value; `inputs`: as of `steady`.
     - `names`: of the modes at the start, by ascending real part and of a pair the positive imaginary part first;
-      default: the `mode_names` of the scene, or "mode 1", ...
+      default: the `mode_names` of the scene at the point farthest out (of a bicycle the fastest), or "mode 1", ...
     - `max_points`: at most, in each direction.
 
     **Returns** a `Family`, traced by pseudo-arclength, with special points located to round-off. Two special points of one kind within one step may be
@@ -209,6 +209,7 @@ def family(
         raise ValueError(f"`guess` is a point of a family ({point.kind or 'not special'}), expected a branch point of one with the same unknowns")
     points, ends = followed(equations, begin, targets, max_points)
     # between its neighbours a branch point is found as any other
-    found = Family(equations, tuple(p for p in points if not (point and p.z is begin.z)), ends, mode_names(scene, names, begin.modes))
+    labels = mode_names(scene, names, (begin if names else max(points, key=lambda p: largest(p.z))).modes)
+    found = Family(equations, tuple(p for p in points if not (point and p.z is begin.z)), ends, labels)
     turning = {name: equations.index(name) for name in dict.fromkeys([*named, *until, *varied])}
     return replace(found, special=tuple(found.point(at, crossing.kind, crossing.columns) for crossing, at in special(equations, found.points, turning)))
