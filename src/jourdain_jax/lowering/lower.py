@@ -126,7 +126,7 @@ def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
     given = [np.asarray(x) for x in jax.tree.leaves(scene)]
     away = [varied(x, 0.1 * generator.uniform(size=(len(t), *x.shape)), 0.05) - x for x in given]
     inputs = generator.normal(size=(len(t), len(scene.inputs)))
-    for column, values in zip(range(len(scene.inputs))[::-1], list(scene.modes.values.values())[::-1], strict=False):
+    for column, (_, values) in enumerate(scene.modes.pairs, len(scene.inputs) - len(scene.modes.pairs)):
         inputs[:, column] = generator.integers(len(values), size=len(t))
     values = named_values(scene, t, q, u, inputs)
 

@@ -18,7 +18,6 @@ import optimistix as optx
 from jaxtyping import Array, Bool, PyTree
 
 from jourdain_jax.calculus.derivatives import SECOND_ORDER_MESSAGE, by_modes
-from jourdain_jax.equations.listed import stops
 from jourdain_jax.motion.arrays.writer import ArrayWriter
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.integrators import event_search, integrands
@@ -155,7 +154,7 @@ class Diffrax(eqx.Module, Integrator):
 def check(setup: Setup) -> None:
     """Raise ValueError where the scene does work, which solvers of diffrax do not integrate; warn where it has relations, which they do not watch."""
     name, solver = type(setup.scene).__name__, setup.integrator.name
-    if setup.integrator.event_names and not all(stops(setup.scene)):
+    if setup.integrator.event_names and not all(setup.field.stops):
         raise ValueError(f"solver=diffrax.{solver}() does not go on after events of `{name}`; omit `solver`, or give events=False")
     if setup.field.with_work:
         raise ValueError(

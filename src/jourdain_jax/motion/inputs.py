@@ -284,16 +284,17 @@ def as_inputs(scene: Scene, given) -> Inputs:
         return given
     if given is not None and not isinstance(given, Mapping):
         raise ValueError(f"`inputs` is {described(given)}, expected a dictionary: name -> number, function of time, or `jj.Sampled`")
-    if not given and not scene.modes.names:
+    if not given and not scene.modes.pairs:
         return Inputs((_ZERO,) * len(scene.inputs))
     given = given or {}
     check_names(given, scene.inputs.entries, f"`{type(scene).__name__}` has no input `{{}}`")
     channels: list[Callable] = []
+    modes = dict(scene.modes.pairs)
     for name in scene.inputs.entries:
         value = given.get(name, _NOTHING)
         advice = "give a number, a function of time, or `jj.Sampled(ts, values)`"
         where = f"input `{name}` of `{type(scene).__name__}`"
-        if name in scene.modes.names:
+        if name in modes:
             channels.append(Mode(np.asarray(scene.modes.number(name, 0.0 if value is _NOTHING else value, "`inputs`"), real_type())))
         elif isinstance(value, Sampled):  # its own numbers are checked where it is made
             channels.append(value)
@@ -308,7 +309,7 @@ def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
     """A ValueError that names an input on which velocity rows depend and which jumps between the times t0 and t1; nothing where one of these is traced."""
     traced = looked_at(scene).traced
     for name, node in zip(scene.inputs.entries, traced.inputs.tolist(), strict=True):
-        if name in scene.modes.names and any(depend_on(traced.graph, traced.at.phi.tolist(), [node])):
+        if name in dict(scene.modes.pairs) and any(depend_on(traced.graph, traced.at.phi.tolist(), [node])):
             raise ValueError(f"rows of `{type(scene).__name__}` depend on mode `{name}`; a row holds in all modes, loads and potentials may switch")
     if not structure_of(scene).rows_of_inputs or is_traced(scene, inputs, t0, t1):
         return

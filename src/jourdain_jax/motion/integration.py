@@ -25,7 +25,6 @@ from jourdain_jax.build.plausibility import faults_at
 from jourdain_jax.build.row_program import row_program
 from jourdain_jax.calculus.markers import entered, lanes_first, left
 from jourdain_jax.calculus.reals import RUN_SELDOM, Count, Flag, Scalar, in_default_precision
-from jourdain_jax.equations.listed import stops
 from jourdain_jax.equations.projection import linearised_rows
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.inputs import Inputs, Mode, for_programs, in_phases
@@ -247,7 +246,7 @@ def conserves(setup: Setup) -> bool:
 
     Integrated work is no part of the check: it may be the small rest of large powers, whose errors nothing at the ends of steps bounds.
     """
-    goes_on = setup.integrator.event_names and not all(stops(setup.scene))
+    goes_on = setup.integrator.event_names and not all(setup.field.stops)
     return setup.field.conserves and not goes_on and not isinstance(setup.integrator.solver, FixedStepMethod)
 
 

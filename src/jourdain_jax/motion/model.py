@@ -15,7 +15,7 @@ from jourdain_jax.build.structure import WELL_CONDITIONED, Reference, Structure,
 from jourdain_jax.calculus.reals import passing_cutoff, real_type, undecided
 from jourdain_jax.dynamics.accelerations import as_reduction
 from jourdain_jax.dynamics.power import needs_work
-from jourdain_jax.equations.listed import names_of_events, names_of_invariants, names_of_position_rows
+from jourdain_jax.equations.listed import names_of_events, names_of_invariants, names_of_position_rows, stops
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered, NotLowered
@@ -332,6 +332,7 @@ def _vector_field(model: Model, constant: bool, work: bool) -> VectorField:
         "rows_may_contradict": (minimal or formulation.projects) and structure.rows_may_contradict,
         "of_inputs": structure.potentials_of_inputs,
         "event_names": names_of_events(scene),
+        "stops": stops(scene),
     }
     if program is not None:
         return ByProgram(**common, program=program, affine=structure.affine)

@@ -141,7 +141,7 @@ def as_input_vector(scene: Scene, inputs, dtype=None) -> Float[Array, "inputs"]:
         return checked_real(inputs, f"`inputs` of `{type(scene).__name__}`", (len(names),), advice=f"one number for each of {listed}")
     check_names(inputs, names, f"`{type(scene).__name__}` has no input `{{}}`")
     advice = "a function of time is for `simulate`; here give its value at this instant"
-    inputs = {name: scene.modes.number(name, x, "`inputs`") if name in scene.modes.names else x for name, x in inputs.items()}
+    inputs = {name: scene.modes.number(name, x, "`inputs`") if name in dict(scene.modes.pairs) else x for name, x in inputs.items()}
     values = [checked_real(inputs.get(name, 0.0), f"input `{name}` of `{type(scene).__name__}`", (), advice=advice) for name in names]
     return jnp.stack(values) if values else jnp.zeros(0, dtype)
 

@@ -79,12 +79,3 @@ class Event:
     to: Mapping[str, str | Scalar] = field(default_factory=dict)
     jump: Mapping[str, Scalar] = field(default_factory=dict)
     stop: bool = False
-
-    def __post_init__(self) -> None:
-        for name in ("to", "jump"):
-            if not isinstance(given := getattr(self, name), Mapping):
-                raise ValueError(f"`{name}` of an event is {described(given)}, expected a dictionary by name")
-        if not isinstance(self.stop, bool):
-            raise ValueError(f"`stop` of an event is {described(self.stop)}, expected True or False")
-        if self.stop and (self.to or self.jump):
-            raise ValueError("an event that stops the motion has nothing to switch; omit `to` and `jump`, or `stop`")

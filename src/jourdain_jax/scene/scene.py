@@ -63,7 +63,8 @@ class Scene(eqx.Module):
         """Look at the names that the methods read; ValueError where one stands for an object with state."""
         super().__init_subclass__(**options)
         if isinstance(cls.inputs, Names) and isinstance(cls.modes, Modes):
-            cls.inputs = Names((*(name for name in cls.inputs if name not in cls.modes.names), *cls.modes.names))
+            modes = dict(cls.modes.pairs)
+            cls.inputs = Names((*(name for name in cls.inputs.entries if name not in modes), *modes))
         _names_read(cls)
 
     def __new__(cls, *args, **kwargs):

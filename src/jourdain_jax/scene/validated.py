@@ -3,7 +3,7 @@
 The checks look at kinds and shapes, which are known while a scene is traced: no compiled program contains any of them.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import get_args
 
 from jaxtyping import Array, Float
@@ -108,7 +108,12 @@ def events_of(scene: Scene, motion: Motion) -> dict[str, Event]:
     found = {}
     for name, given in _dictionary(scene, "events", (motion,), '{"fallen": 1.4 - motion.q.lean}').items():
         event, where = given if isinstance(given, Event) else Event(given, stop=True), f"event `{name}` of `{_name(scene)}`"
-        check_names(event.to, scene.modes.names, f"{where} switches `{{}}`, which is no mode")
+        for what, changed in (("to", event.to), ("jump", event.jump)):
+            if not isinstance(changed, Mapping):
+                raise ValueError(f"`{what}` of {where} is {described(changed)}, expected a dictionary by name")
+        if event.stop and (event.to or event.jump):
+            raise ValueError(f"{where} stops the motion and has nothing to switch; omit `to` and `jump`, or `stop`")
+        check_names(event.to, dict(scene.modes.pairs), f"{where} switches `{{}}`, which is no mode")
         check_names(event.jump, scene.coordinate_names.entries + scene.speed_names.entries, f"{where} moves `{{}}`, which is no coordinate or speed")
         found[name] = Event(
             checked_real(event.value, where, (), advice=advice),

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from jourdain_jax.equations.listed import stops
 from jourdain_jax.motion.arrays.back import cotangents
 from jourdain_jax.motion.arrays.functions import ArrayForm, split
 from jourdain_jax.motion.arrays.loop import Loop
@@ -67,7 +66,7 @@ def loop_of(
         squares=range(2 * field.near_rank_loss),
         relations=range(several),
         switched=range(len(modes)),
-        stops=stops(setup.scene) if names else (),
+        stops=field.stops if names else (),
         most=transitions,
         watched=range(count(lambda t, y, args: watched(args, t, y)) if watched else 0),
         compensated=most * eps

@@ -204,6 +204,7 @@ def full_without_projection(field: VectorField, scene: Scene, own_equations: str
         rows_may_contradict=False,
         of_inputs=field.of_inputs,
         event_names=field.event_names,
+        stops=field.stops,
         nonlinear_rows=(),
         stabilisation=field.stabilisation if isinstance(field, ByMatrices) else None,
         usual=usual_lengths(scene),

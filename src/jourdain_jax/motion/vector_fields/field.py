@@ -133,6 +133,7 @@ class VectorField(eqx.Module):
     rows_may_contradict: bool = eqx.field(static=True)  # each other, although the start meets all (`motion/integration.py`)
     of_inputs: tuple[int, ...] = eqx.field(static=True)  # numbers of the loads whose potential depends on inputs
     event_names: tuple[str, ...] = eqx.field(static=True)  # sorted
+    stops: tuple[bool, ...] = eqx.field(static=True)  # whether each event ends the motion
 
     @property
     def name(self) -> str:
