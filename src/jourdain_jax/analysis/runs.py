@@ -212,7 +212,7 @@ class Group:
         saved = times if first.grid is None else first.grid.shape[0]
         states = saved * (len(scene.coordinate_names) + len(scene.speed_names)) * 8 * (1 + sum(layout.sizes))
         # bytes of saved states with their tangents in one loop: far below what XLA compiles into one function (see `jourdain_jax`)
-        self._width = int(min(64, max(1, 2**18 // states)))
+        self._width, self._fewest = int(min(64, max(1, 2**18 // states))), 1
 
     def places(self, runs: np.ndarray) -> np.ndarray:
         """Return the places of these runs in the group."""
@@ -237,7 +237,10 @@ class Group:
     def _chunks(self, members: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
         """How many lanes at a time, with positions of their members and runs; these are filled up with copies of the last."""
         count = members * len(self.runs)
-        width = min(self._width, 1 << (count - 1).bit_length())
+        # of many lanes those that are left last run eight at a time: these cost less than another program for fewer
+        width, self._fewest = self._width, max(self._fewest, min(count, 8))
+        while width >= 2 * max(count, self._fewest):
+            width = -(-width // 2)
         lanes = np.minimum(np.arange(-(-count // width) * width), count - 1).reshape(-1, width)
         return [(min(width, count - k * width), *np.divmod(some, len(self.runs))) for k, some in enumerate(lanes)]
 
@@ -311,4 +314,6 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
     def lanes(common: Float[Array, "shared"], rows: Float[Array, "lanes own"]) -> Float[Array, "lanes samples width"]:
         return each(common, *jnp.split(rows, [rows.shape[1] - unknowns], axis=1))
 
-    return jax.jit(lanes)
+    # XLA's newer emitters compile it in twice the time, for a program that is no faster; from jaxlib 0.11.1 on there are no others
+    older = jax.default_backend() == "cpu" and jax.version.__version_info__ < (0, 11, 1)
+    return jax.jit(lanes, compiler_options={"xla_cpu_use_fusion_emitters": False} if older else None)
