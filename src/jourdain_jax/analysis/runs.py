@@ -298,7 +298,8 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
     arrays, rest = eqx.partition(jax.tree.unflatten(treedef, zeros), is_array)
     (_, of_all), (_, of_run) = map(ravel_pytree, arrays)
 
-    def lane(common: Float[Array, "shared"], row: Float[Array, "own"], x: Float[Array, "unknowns"]) -> Float[Array, "samples width"]:
+    def lane(common: Float[Array, "shared"], numbers: Float[Array, "own"]) -> Float[Array, "samples width"]:
+        row, x = jnp.split(numbers, [len(numbers) - unknowns])
         (scene, options), run = eqx.combine((of_all(common), of_run(row)), rest)
 
         def flat(x):
@@ -309,11 +310,6 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
             r, J = jax.vmap(lambda e: jax.jvp(flat, (x,), (e,)), out_axes=(None, 1))(np.eye(unknowns, dtype=x.dtype))
         return jnp.concatenate([J, r[:, None]], axis=1)
 
-    each = jax.vmap(lane, (None, 0, 0))
-
-    def lanes(common: Float[Array, "shared"], rows: Float[Array, "lanes own"]) -> Float[Array, "lanes samples width"]:
-        return each(common, *jnp.split(rows, [rows.shape[1] - unknowns], axis=1))
-
     # XLA's newer emitters compile it in twice the time, for a program that is no faster; from jaxlib 0.11.1 on there are no others
     older = jax.default_backend() == "cpu" and jax.version.__version_info__ < (0, 11, 1)
-    return jax.jit(lanes, compiler_options={"xla_cpu_use_fusion_emitters": False} if older else None)
+    return jax.jit(jax.vmap(lane, (None, 0)), compiler_options={"xla_cpu_use_fusion_emitters": False} if older else None)

@@ -89,7 +89,8 @@ def _drawn(ts: np.ndarray, reached: np.ndarray, seen) -> Drawn:
     for name, body in first.items():
         if name not in stated:
             shapes = [_at(contact.shape, 0) for contact in contacts.values() if contact.body == name and contact.shape is not None]
-            stated[name] = [_same_at_all(look, len(reached)) for look in guessed(body, shapes, dot)]
+            at_all = lambda x: np.broadcast_to(np.asarray(x), (len(reached), *np.shape(x)))  # noqa: E731
+            stated[name] = [jax.tree.map(at_all, look) for look in guessed(body, shapes, dot)]
     drawn, upright = {}, np.broadcast_to(np.eye(3), (len(reached), 3, 3))
     for k, (name, body) in enumerate(bodies.items()):
         turned = np.asarray(body.orientation) if isinstance(body, RigidBody) else upright
@@ -117,10 +118,6 @@ class Curved(eqx.Module):
 
 def _at(tree, index):
     return jax.tree.map(lambda x: np.asarray(x)[index], tree)
-
-
-def _same_at_all(visual: Visual, times: int) -> Visual:
-    return jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), (times, *np.shape(x))), visual)
 
 
 def _corners_of(visual: Visual) -> np.ndarray:
