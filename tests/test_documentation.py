@@ -148,6 +148,13 @@ def test_the_code_of_the_page_on_events_runs(capsys):
 
 
 @pytest.mark.slow
+def test_a_design_is_made_stable_as_its_page_says(capsys):
+    run(DOCS / "howto" / "stable_design.md")
+    shown = re.findall(r"```text\n(.*?)```", (DOCS / "howto" / "stable_design.md").read_text(encoding="utf-8"), re.S)
+    assert capsys.readouterr().out == "".join(shown)
+
+
+@pytest.mark.slow
 def test_the_code_of_the_page_on_what_is_learned_runs():
     page = run(DOCS / "howto" / "learned.md")
     assert page["errors"][-1] < 0.3 * page["errors"][0]
