@@ -87,18 +87,18 @@ def test_a_lane_does_not_depend_on_its_company(solver):
 
 
 @every_solver
-@pytest.mark.parametrize("changed", [{"EFFORT": 2}, {"threads": lambda: 1}, {"threads": lambda: 5}], ids=["effort", "1", "5"])
-def test_no_bit_depends_on_the_effort_spent_on_machine_code_or_the_number_of_threads(solver, changed, monkeypatch):
+def test_no_bit_depends_on_the_effort_spent_on_machine_code_or_the_number_of_threads(solver, monkeypatch):
     """Of effort, what `conftest.py` takes for granted: tests run code made with little, users run code made with more."""
     leans, lanes = jnp.tile(LEAN, 13), jax.jit(jax.vmap(lambda lean: ended(lean, solver)))
     expected = lanes(leans)
-    ((name, value),) = changed.items()
-    monkeypatch.setattr(host, name, value)
-    kernels.kernel.cache_clear()
-    jax.clear_caches()
-    for found, usual in zip(lanes(leans), expected, strict=True):
-        assert_array_equal(found, usual)
-    assert kernels.kernel.cache_info().currsize > 0
+    for effort, threads in ((0, 1), (2, 5)):
+        monkeypatch.setattr(host, "EFFORT", effort)
+        monkeypatch.setattr(host, "threads", lambda threads=threads: threads)
+        kernels.kernel.cache_clear()
+        jax.clear_caches()
+        for found, usual in zip(lanes(leans), expected, strict=True):
+            assert_array_equal(found, usual)
+        assert kernels.kernel.cache_info().currsize > 0
 
 
 def test_lanes_of_a_rollout_are_those_of_xla():
