@@ -253,6 +253,9 @@ def test_too_many_transitions():
     assert not motion.succeeded
     assert "max_transitions" in motion.message
     assert 2.5 < motion.t_end < 2.5587
+    motion = jj.simulate(Ball(0.5), {"z": 1.0}, t1=3.0)  # its bounces end before there are so many
+    assert not motion.succeeded
+    np.testing.assert_allclose(motion.t_end, 3 * np.sqrt(2 / 9.81), atol=1e-8)
 
 
 def test_what_happens_at_the_start_has_no_derivative():

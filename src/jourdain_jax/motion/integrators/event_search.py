@@ -33,7 +33,7 @@ from functools import reduce
 from typing import Any, NamedTuple
 
 from jourdain_jax.motion.native.layout import Form, Lanes, Number, StepWriter, each_row
-from jourdain_jax.motion.native.transitions import Happened, goes_on, pass_event
+from jourdain_jax.motion.native.transitions import Happened, goes_on, is_left, pass_event
 from jourdain_jax.motion.trajectories import results
 
 RUNNING, LOCATING = -1, -2  # codes of a motion on its way, and of one that searches for an event
@@ -277,13 +277,18 @@ def monitored(
     if form.transitions:
         goes = goes_on(w, form, changed["event"]) & (found | over)
         ends = found & ~goes
-        p.put("disarmed", [w.where(~stays & (x > 0.0), 0.0, off) for x, off in zip(at_end[0], p.every("disarmed"), strict=True)])
+        noise = reach_of_noise(w, p["last_goal"])
+        left = [~stays & is_left(w, x, rate, noise) for x, rate in zip(*at_end, strict=True)]
+        p.put("disarmed", [w.where(has_left, 0.0, off) for has_left, off in zip(left, p.every("disarmed"), strict=True)])
         rate, slope = (chosen(w, changed["event"], x) for x in (rate_0, p.every("search_slope")))
         flat = over | is_flat(w, rate, slope)  # what happens at a start has no derivative
-        passing = Happened(changed["event"], changed["t"], flat, goes, reach_of_noise(w, p["last_goal"]))
-        w.if_any(goes, lambda: pass_event(w, form, p, y1, passing))
+        passing = Happened(changed["event"], changed["t"], flat, goes, noise, found)
+        stuck, at_once = w.room(), over & any_of(sinks) & (p["passed"] > 0.0)
+        w.store(0.0, stuck)
+        w.if_any(goes, lambda: pass_event(w, form, p, y1, passing, stuck))
         passed = p["passed"] + w.where(goes, 1.0, 0.0)
-        changed["code"] = w.where(goes, w.where(passed > float(form.transitions), results.TOO_MANY_TRANSITIONS, RUNNING), changed["code"])
+        too_many = at_once | (w.load(stuck) > 0.0) | (passed > float(form.transitions))
+        changed["code"] = w.where(goes, w.where(too_many, results.TOO_MANY_TRANSITIONS, RUNNING), changed["code"])
         changed |= {"passed": passed, "begun": w.where(goes, changed["accepted"] + changed["rejected"], p["begun"])}
         changed["event"] = w.where(goes, -1.0, changed["event"])
     if form.moving:

@@ -141,6 +141,11 @@ def goes_on(w: StepWriter, form: Form, event: Number) -> Number:
     return found
 
 
+def is_left(w: StepWriter, c: Number, rate: Number, noise: Number) -> Number:
+    """Return whether a value is positive beyond round-off."""
+    return c > noise * w.magnitude(rate)
+
+
 class Happened(NamedTuple):
     """An event after which lanes go on."""
 
@@ -149,11 +154,15 @@ class Happened(NamedTuple):
     flat: Number  # whether its value has no slope
     here: Number  # in which lanes
     noise: Number  # the time in which a value rises by round-off
+    found: Number  # whether it was searched for
 
 
-def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happened) -> None:
-    """Put the state after an event into `y1`; note the event, and what was before."""
-    event, t, flat, switches, noise = happened
+def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happened, stuck: Number) -> None:
+    """Put the state after an event into `y1`; note the event, and what was before.
+
+    `stuck` becomes 1 where the event's value rises afterwards, but so slowly that round-off hides it.
+    """
+    event, t, flat, switches, noise, found = happened
     rows, of, count = form.rows, form.rows_of_transition, form.integrated
     after, k, pivots, values, slopes = (w.room(max(n, 1)) for n in (of["t"].stop, count, len(form.monitored), form.events, form.events))
     w.run("reset", p.pointer, t, y1, event, after)
@@ -182,9 +191,11 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
     disarmed = []
     for i, old in enumerate(p.every("disarmed")):
         c, rate = w.load(values, i), w.load(slopes, i) * p["direction"]
-        rises = (c > 0.0) | ((rate > 0.0) & (w.magnitude(c) <= noise * rate))
+        rises = (rate > 0.0) & (w.magnitude(c) <= noise * rate)
         this = w.equal(event, float(i)) & switches
-        disarmed.append(w.where(this, w.where(rises, 0.0, 1.0), old))
+        slow = this & found & (rate > 0.0) & ~rises & ~is_left(w, c, rate, noise)
+        w.store(w.where(slow, 1.0, w.load(stuck)), stuck)
+        disarmed.append(w.where(this, w.where(rises | is_left(w, c, rate, noise), 0.0, 1.0), old))
     p.put("disarmed", disarmed)
     if form.relations:
         now = w.room(len(form.watched))

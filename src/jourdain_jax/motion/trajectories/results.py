@@ -36,8 +36,8 @@ MESSAGES = {
     PROCESS_DIED: "processes died on it again and again, and an earlier version's study skipped it",
     UNRESOLVED: "the step size shrank to nothing, and `rtol` is less than this precision resolves, 1.2e-7 in float32 and 2.2e-16 in float64: loosen it to "
     "1e-5 and 1e-13, or set jax.config.update('jax_enable_x64', True)",
-    TOO_MANY_TRANSITIONS: "events after which the motion goes on happened more than `max_transitions` times; raise it, or look for events that follow "
-    "each other faster and faster near the last time, as the bounces of a ball that comes to rest do: switch to a mode in which it rests",
+    TOO_MANY_TRANSITIONS: "events after which the motion goes on happened more than `max_transitions` times, or followed each other within "
+    "round-off, as the bounces of a ball that comes to rest do: switch to a mode in which it rests, or raise `max_transitions`",
     UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; take a shorter step, or look for a singularity there",
 }
 
