@@ -13,7 +13,8 @@ the start, as it has where the value is lower, or does not rise.
 
 All event values are positive at t_b, or rise from zero there, and one of them is not at t_a. What is not a number is not positive: such a value lies
 beyond its boundary. Of the values that are not positive at t_a, the one whose secant from t_b falls to zero first is followed; the next trial, between t_b
-and t_a, is by Chandrupatla's method (inverse quadratic interpolation where it is safe, otherwise the middle). Where a trial finds another event, all that
+and t_a, is by the cubic through values and rates at both ends, later ones by Chandrupatla's method (inverse quadratic interpolation where it is safe,
+otherwise the middle). Where a trial finds another event, all that
 is after it no longer counts: so the event that is found has no other before it, as far as values were seen. A value of zero may be one that stays zero
 beyond the event: it is an end of the bracket like a negative one, which is then halved.
 
@@ -96,10 +97,26 @@ def first_event(w, before: Values, after: Values):
     return first
 
 
-def trial(w, t, c, step, last) -> tuple:
+def cubic(h, a, slope_a, b, slope_b) -> tuple:
+    """Return m, A, B of the cubic a + m s + A s^2 + B s^3 through values and slopes at the ends of a step h, where s runs from 0 to 1."""
+    m_0, m_1, rise = h * slope_a, h * slope_b, b - a
+    return m_0, 3.0 * rise - 2.0 * m_0 - m_1, m_0 + m_1 - 2.0 * rise
+
+
+def falls_through(w, h, a, slope_a, b, slope_b):
+    """Return after which part of a step that cubic falls to zero; where Newton's method does not tell, the straight line."""
+    m, A, B = cubic(h, a, slope_a, b, slope_b)
+    s = line = a / (a - b)
+    for _ in range(4):
+        s = s - (a + s * (m + s * (A + s * B))) / (m + s * (2.0 * A + s * (3.0 * B)))
+    left = a + s * (m + s * (A + s * B))
+    return w.where((s > 0.0) & (s < 1.0) & (w.magnitude(left) < 1e-3 * (a - b)), s, line)
+
+
+def trial(w, t, c, step, last, guess) -> tuple:
     """Return the next time to try in a step of length `step`, and whether the last one is near enough, of the times and values of a bracket.
 
-    With `last` the search ends, at a time where the value is a number.
+    The first one is after the part `guess` of the way back. With `last` the search ends, at a time where the value is a number.
     """
     eps = w.eps
     (t_1, t_2, t_3), (c_1, c_2, c_3) = t, c
@@ -107,7 +124,7 @@ def trial(w, t, c, step, last) -> tuple:
     xi, phi = (t_1 - t_2) / (t_3 - t_2), (c_1 - c_2) / (c_3 - c_2)
     safe = (phi * phi < xi) & ((1.0 - phi) * (1.0 - phi) < 1.0 - xi)
     inverse = c_1 / (c_2 - c_1) * c_3 / (c_2 - c_3) - (t_3 - t_1) / width * c_1 / (c_3 - c_1) * c_2 / (c_2 - c_3)
-    share = w.where(w.equal(w.magnitude(t_3), math.inf), c_1 / (c_1 - c_2), w.where(safe, inverse, 0.5))
+    share = w.where(w.equal(w.magnitude(t_3), math.inf), guess, w.where(safe, inverse, 0.5))
     share = w.where(w.magnitude(share) < math.inf, share, 0.5)
     least = w.smaller(tiny / w.magnitude(width), 0.5)
     # near in time by the slope, and small beside the value at the other end: neither says enough of a value that is flat, or that jumps; nor does the mean
@@ -150,11 +167,11 @@ def search_of(form: Form, p: Lanes) -> Search:
 
 
 def _follow(w: StepWriter, form: Form, p: Lanes, begins: Number, changes: Number, start: tuple, end: tuple) -> Number:
-    """Advance the search by a step, its `start` (time, values of all events, rates) and `end` (time, values), in lanes where it `changes`.
+    """Advance the search by a step, its `start` and `end` (time, values of all events, rates), in lanes where it `changes`.
 
     `begins`: it is the step of the event. Returns the index of the event that is followed.
     """
-    old, (t_0, c_0, rate_0), (t_1, c_1) = search_of(form, p), start, end
+    old, (t_0, c_0, rate_0), (t_1, c_1, rate_1) = search_of(form, p), start, end
     # narrowed: the time tried, one on the other side of the event, and one that was either before
     same = ~(no_event(c_1) ^ no_event(old.c[0]))
     narrowed_t = t_1, w.where(same, old.t[1], old.t[0]), w.where(same, old.t[0], old.t[1])
@@ -167,7 +184,8 @@ def _follow(w: StepWriter, form: Form, p: Lanes, begins: Number, changes: Number
     is_before = no_event(c[0])
     before, after = _each(w, is_before, c[0], c[1]), _each(w, is_before, c[1], c[0])
     first = first_event(w, before, after)
-    tried, near = trial(w, t, [chosen(w, first, x) for x in c], step, left <= DIFFERENTIABLE + 3.0)
+    guess = 1.0 - falls_through(w, t_1 - t_0, *(chosen(w, first, x) for x in (c_0, rate_0, c_1, rate_1)))
+    tried, near = trial(w, t, [chosen(w, first, x) for x in c], step, left <= DIFFERENTIABLE + 3.0, guess)
     trying = begins | old.trying
     left = w.where(trying & near, DIFFERENTIABLE + 1.0, left)
     far = w.magnitude(t[0] - t[1]) + math.sqrt(w.eps) * step
@@ -197,14 +215,22 @@ def lowest(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values):
     """
     share = None
     for a, slope_a, b, slope_b in zip(c_0, c_dot_0, c_1, c_dot_1, strict=True):
-        m_0, m_1 = h * slope_a, h * slope_b
-        rise = b - a
-        A, B = 3.0 * rise - 2.0 * m_0 - m_1, m_0 + m_1 - 2.0 * rise
+        m_0, A, B = cubic(h, a, slope_a, b, slope_b)
         s = -m_0 / (A + w.root(w.larger(A * A - 3.0 * B * m_0, 0.0)))
         value = a + s * (m_0 + s * (A + s * B))
-        dips = (b > 0.0) & (m_0 < 0.0) & (m_1 > 0.0) & (s < LATE) & (value < -1e-12 * (a + b))
+        dips = (b > 0.0) & (m_0 < 0.0) & (h * slope_b > 0.0) & (s < LATE) & (value < -1e-12 * (a + b))
         found = w.where(dips, s, 1.0)
         share = found if share is None else w.smaller(share, found)
+    return share
+
+
+def ahead(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values, sinks: Values):
+    """Return half of the part of a step `h` for which all values stay positive that rise from zero and `sink` in it, by their cubics; at most a half."""
+    share = w.number(0.5)
+    for a, slope_a, b, slope_b, sinking in zip(c_0, c_dot_0, c_1, c_dot_1, sinks, strict=True):
+        m, A, B = cubic(h, a, slope_a, b, slope_b)
+        back = m / (w.root(w.larger(A * A - 4.0 * B * m, 0.0)) - A)  # half of the root of m + A s + B s^2
+        share = w.where(sinking & (back > 0.0) & (back < share), back, share)
     return share
 
 
@@ -239,13 +265,13 @@ def monitored(
     share = lowest(w, h, c_0, rate_0, c_1, rate_1)
     sunk, sinks = at_start(w, c_0, rate_0, c_1, p["direction"], p["last_goal"])
     again = any_of(sinks) & (w.magnitude(h) > reach_of_noise(w, p["last_goal"]))
-    dips, share = accept & ((share < 1.0) | again), w.where(again, 0.5, share)
+    dips, share = accept & ((share < 1.0) | again), w.where(again, ahead(w, h, c_0, rate_0, c_1, rate_1, sinks), share)
     happened = accept & ~dips & ~no_event(c_1)
     was_trying, changes, first = search_of(form, p).trying, happened | locating, w.room()
     w.store(p["event"], first)
 
     def follow() -> None:
-        w.store(w.literal(_follow(w, form, p, happened, changes, (t, c_0, rate_0), (new["t"], c_1)), w.real), first)
+        w.store(w.literal(_follow(w, form, p, happened, changes, (t, c_0, rate_0), (new["t"], c_1, rate_1)), w.real), first)
 
     w.if_any(changes, follow)
     search = search_of(form, p)
