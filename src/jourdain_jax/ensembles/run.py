@@ -217,7 +217,8 @@ def _check_same(store: Store, task: Task, chunk: int | None) -> None:
         raise ValueError(f"`{store.path}` holds another study; what differs: {what}; give a new name, or ask for the same")
     if chunk is not None and chunk != store.chunk:
         raise ValueError(f"`{store.path}` was begun with chunks of {store.chunk} lanes, and `chunk` is {chunk}; leave `chunk` out")
-    changed = [f"{name} {held} (now {versions()[name]})" for name, held in store.study["versions"].items() if versions().get(name) != held]
+    now = versions()
+    changed = [f"{name} {held} (now {now[name]})" for name, held in store.study["versions"].items() if now.get(name) != held]
     if changed:
         warnings.warn(
             f"`{store.path}` was begun with other versions: {', '.join(changed)}; what is computed now may differ in its last digits", stacklevel=users_level()
