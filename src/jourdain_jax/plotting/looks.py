@@ -89,7 +89,7 @@ def _drawn(ts: np.ndarray, reached: np.ndarray, seen) -> Drawn:
     for name, body in first.items():
         if name not in stated:
             shapes = [_at(contact.shape, 0) for contact in contacts.values() if contact.body == name and contact.shape is not None]
-            at_all = lambda x: np.broadcast_to(np.asarray(x), (len(reached), *np.shape(x)))  # noqa: E731
+            at_all = lambda x: np.broadcast_to(x, (len(reached), *np.shape(x)))  # noqa: E731
             stated[name] = [jax.tree.map(at_all, look) for look in guessed(body, shapes, dot)]
     drawn, upright = {}, np.broadcast_to(np.eye(3), (len(reached), 3, 3))
     for k, (name, body) in enumerate(bodies.items()):
