@@ -9,9 +9,11 @@ from unittest import mock
 
 import gpu_twin
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from ends_of_models import end_of_model
+from test_modes import NUMBERS, seen
 
 import jourdain_jax as jj
 from jourdain_jax.native import ffi, gpu, nvidia
@@ -72,6 +74,19 @@ def test_threads_of_a_gpu_give_the_bits_of_wide_registers_for_every_model(name):
 def test_second_derivatives_and_series_too(name):
     _check(name, ["values", "second"], [("at once", FEW)])
     _check(name, ["values", "tangents"], [("reversed", FEW)], solver=jj.Taylor())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_events_after_which_a_motion_goes_on(kind):
+    def made() -> np.ndarray:
+        of = KINDS[kind](lambda numbers: jnp.sum(jnp.nan_to_num(seen(numbers))))
+        return np.asarray(jax.jit(jax.vmap(of))(NUMBERS * jnp.linspace(0.9, 1.1, 5)[:, None]))
+
+    expected = made()
+    for order, memory in (("in order", 2**40), ("at once", FEW)):
+        with gpu_twin.in_place_of_a_gpu(order, memory):
+            np.testing.assert_array_equal(made(), expected)
 
 
 # What happens where the driver refuses.
