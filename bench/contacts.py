@@ -3,7 +3,7 @@
     python bench/contacts.py [--quick] [--json FILE]
 
 Closed forms: t_10 of a ball that falls from 1 m and bounces, sqrt(2 h/g) (1 + 2 (e + ... + e^9)) with e = 0.7, and its
-derivatives; processor time. A `solve` is one motion without derivatives. `--quick`: fewer lanes. The JSON is a list of
+derivatives; processor time; fits of 500 noisy throws. A `solve` is one motion without derivatives. `--quick`: fewer lanes. The JSON is a list of
 {"figure", "model", "value", "required", "met"}.
 """
 
@@ -88,5 +88,18 @@ def times(quick: bool) -> Figures:
         yield figure(f"gradient by 8 numbers through 12 events, {name}, solves", NAME, taken / solve, required)
 
 
+def fits(quick: bool) -> Figures:
+    """Share of 95 % intervals that hold the truth, of fits to noisy heights of a bouncing ball."""
+    ts, repeats = jnp.linspace(0.0, 1.6, 81), 100 if quick else 500
+    noise = 0.004 * jax.random.normal(jax.random.PRNGKey(0), (repeats, len(ts)))
+    heights = jj.simulate(Ball(0.72), {"z": 1.0}, ts=ts)["z"] + noise
+    throws = jj.Experiment(ts, {"z": heights}, 0.004, start={"z": 1.0})
+    found = jj.fit_batch(Ball(0.7, 9.7), throws, free=("bounce", "gravity")).estimates
+    for name, right in (("bounce", 0.72), ("gravity", 9.81)):
+        held = (found[name].low <= right) & (right <= found[name].high)
+        off = abs(float(np.mean(held)) - 0.95)
+        yield figure(f"share of intervals that hold `{name}`, off 0.95", NAME, off, 0.02 + 2 * (0.95 * 0.05 / repeats) ** 0.5)
+
+
 if __name__ == "__main__":
-    main(__doc__, (digits, times))
+    main(__doc__, (digits, times, fits))

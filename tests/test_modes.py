@@ -242,10 +242,37 @@ def test_of_a_batch_and_a_file(tmp_path):
     np.testing.assert_array_equal(found.phase("side"), one.phase("side"))
 
 
-def test_a_mode_to_begin_with_and_no_events():
-    soft = jj.simulate(Switching(), {"x": 0.1}, ts=[0.5], inputs={"spring": "soft"}, events=False)
+def test_a_mode_to_begin_with():
+    soft = jj.simulate(Switching(), {"x": 0.1}, ts=[0.05], inputs={"spring": "soft"})
     assert soft.phase("spring")[-1] == 1
-    assert soft.phases.ts.size == 0
+
+
+class Ended(Ball):
+    """The ball may not come so far up as it was."""
+
+    def events(self, motion):
+        return super().events(motion) | {"again": motion.q.z - 0.3 + 0.4 * motion.t}
+
+
+def test_without_stop_events_the_others_stay():
+    stopped = jj.simulate(Ended(), {"z": 1.0}, t1=2.0, **TIGHT)
+    assert stopped.event_names[int(stopped.event)] == "again"
+    motion, free = (jj.simulate(scene, {"z": 1.0}, t1=2.0, events=events, **TIGHT) for scene, events in ((Ended(), False), (Ball(), True)))
+    np.testing.assert_array_equal(motion.q, free.q)
+    assert motion.succeeded
+
+
+def test_a_fit_of_bounces():
+    """100 throws with noise of 4 mm: the spread of the estimates is their standard error."""
+    ts = jnp.linspace(0.0, 1.6, 81)
+    heights = jj.simulate(Ball(0.72), {"z": 1.0}, ts=ts)["z"] + 0.004 * jax.random.normal(jax.random.PRNGKey(0), (100, 81))
+    throws = jj.Experiment(ts, {"z": heights}, 0.004, start={"z": 1.0})
+    fits = jj.fit_batch(Ball(0.7, 9.7), throws, free=("bounce", "gravity"))
+    assert fits.converged.all()
+    for name, right in (("bounce", 0.72), ("gravity", 9.81)):
+        found = fits.estimates[name]
+        assert abs(np.mean(found.value) - right) < 3 * np.mean(found.standard_error) / np.sqrt(100)
+        np.testing.assert_allclose(np.std(found.value), np.mean(found.standard_error), rtol=0.25)
 
 
 def test_too_many_transitions():

@@ -154,8 +154,8 @@ class Diffrax(eqx.Module, Integrator):
 def check(setup: Setup) -> None:
     """Raise ValueError where the scene does work, which solvers of diffrax do not integrate; warn where it has relations, which they do not watch."""
     name, solver = type(setup.scene).__name__, setup.integrator.name
-    if setup.integrator.event_names and not all(setup.field.stops):
-        raise ValueError(f"solver=diffrax.{solver}() does not go on after events of `{name}`; omit `solver`, or give events=False")
+    if not all(setup.field.stops):
+        raise ValueError(f"solver=diffrax.{solver}() does not go on after events of `{name}`; omit `solver`")
     if setup.field.with_work:
         raise ValueError(
             f"solver=diffrax.{solver}() does not integrate the work that no potential of `{name}` accounts for; "

@@ -246,8 +246,7 @@ def conserves(setup: Setup) -> bool:
 
     Integrated work is no part of the check: it may be the small rest of large powers, whose errors nothing at the ends of steps bounds.
     """
-    goes_on = setup.integrator.event_names and not all(setup.field.stops)
-    return setup.field.conserves and not goes_on and not isinstance(setup.integrator.solver, FixedStepMethod)
+    return setup.field.conserves and all(setup.field.stops) and not isinstance(setup.integrator.solver, FixedStepMethod)
 
 
 def energies_near(setup: Setup, args, t: Float[Array, "times"], y: Integrated) -> Float[Array, "2 times 2"]:

@@ -34,7 +34,8 @@ class Options:
       times. None: Tsit5 for rtol >= 1e-6, Dopri8 below.
     - `max_steps`: the most steps; `max_step`: the longest one (s). None: 1/16 of the span, so that a load that acts on a part of the way, or a dip of an event,
       is not stepped over where nothing else keeps steps short; inf: no bound.
-    - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.
+    - `events`: stop where an event value of the scene falls through zero. False: pass over events that stop a motion; those after which it goes on stay.
+      `work`: integrate the work that no potential accounts for.
     - `max_transitions`: the most events after which a motion goes on (`jj.Event`).
     - `retry`: run a motion again that left the domain of its privileged speeds (with the full state), or that is stiff (by an implicit solver, unless
       `solver` is given); `trajectory.fallback` and its summary say so. Inside your own `jit` or `vmap`, and without it, the result code

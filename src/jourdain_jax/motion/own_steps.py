@@ -50,6 +50,7 @@ class OwnSteps(Integrator):
     order: int | None  # of Taylor series, by which machine code steps in place of the solver's tableau
     memory: int  # bytes that the record of reverse mode may take
     most: int  # events after which a motion goes on
+    stopping: bool  # whether other events end it
     own: ClassVar[bool] = True
 
     @property
@@ -77,7 +78,7 @@ class OwnSteps(Integrator):
         """The loop on arrays, what it is given, and how many lanes run side by side."""
         program, relations = setup.field.lowered, watched(setup.field, setup.inputs, bool(self.event_names))
         at_once = 0 if program is None or not isinstance(self.solver, Method) else width(program)
-        return *on_arrays.loop_of(self.solver, setup, begun, relations, self.most), at_once
+        return *on_arrays.loop_of(self.solver, setup, begun, relations, {"most": self.most, "stopping": self.stopping}), at_once
 
     def _on_arrays(self, setup: Setup, begun: Begun) -> Solved:
         of, start, at_once = self._loop(setup, begun)
@@ -96,7 +97,7 @@ class OwnSteps(Integrator):
         return _by_start(perturbed, arguments, Integrated.of(by_y, of.form), lambda by_args: args)
 
     def _form(self, setup: Setup) -> Form:
-        return native_motion.form_of(setup.field, setup.inputs, bool(self.event_names), self.most)
+        return native_motion.form_of(setup.field, setup.inputs, bool(self.event_names), self.most, self.stopping)
 
     def _by_machine_code(self, setup: Setup, begun: Begun) -> Solved:
         form, start = self._form(setup), native_motion.start_of(setup, begun)

@@ -131,9 +131,9 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     field = solver.fitted(scene, field, model.state) if isinstance(solver, ImplicitMethod) else field
     if not inputs.constant:
         check_inputs_in_rows(scene, inputs, t0, t1)
-    static: dict[str, Any] = {"max_steps": options.max_steps, "event_names": field.event_names if options.events else ()}
+    static: dict[str, Any] = {"max_steps": options.max_steps, "event_names": field.event_names if options.events or not all(field.stops) else ()}
     static["alongside"] = options.alongside
-    own = own_steps(solver, **static, native=native, order=order, memory=options.memory or MEMORY, most=options.max_transitions)
+    own = own_steps(solver, **static, native=native, order=order, memory=options.memory or MEMORY, most=options.max_transitions, stopping=options.events)
     integrator = diffrax_steps.Diffrax(cast(Any, solver), **static) if own is None else own
     tolerances = tuple(as_array(x, start.q.dtype) for x in (options.rtol, options.atol))  # arrays: another tolerance is no other program
     first_step = (1.0 if isinstance(solver, FixedStepMethod) else 1e-4) * (t1 - t0)  # diffrax's own guess costs two more copies of the vector field to compile

@@ -5,6 +5,7 @@ Lanes that `vmap` makes run side by side, some at a time, where the rates take l
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -29,12 +30,12 @@ def loop_of(
     setup: Setup,
     begun: Begun,
     relations: tuple[Callable | None, int],
-    transitions: int,
+    transitions: dict[str, Any],
 ) -> tuple[Loop, Start]:
     """Return the loop, and the start of one motion.
 
     `relations`: a function for the numbers whose signs are watched, and how many of them are relations.
-    `transitions`: the most of a motion.
+    `transitions`: what the form says of them.
     """
     goals, knots, field, y0, names = (
         setup.goals(setup.ts),
@@ -67,7 +68,7 @@ def loop_of(
         relations=range(several),
         switched=range(len(modes)),
         stops=field.stops if names else (),
-        most=transitions,
+        **transitions,
         watched=range(count(lambda t, y, args: watched(args, t, y)) if watched else 0),
         compensated=most * eps
         > eps**0.5,  # what is rounded off in so many steps may be more than half of the digits

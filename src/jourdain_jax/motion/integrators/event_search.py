@@ -249,10 +249,11 @@ def monitored(
         return [[w.load(place, i) for i in range(count)] for place in (values, rates)]
 
     def armed(found: list[list[Number]]) -> list[list[Number]]:
-        """Take events that have not been left since they happened for none."""
+        """Take events that have not been left since they happened for none, and those that are to be passed over."""
         if not form.transitions:
             return found
-        disarmed = [off > 0.0 for off in p.every("disarmed")]
+        over = [w.literal(stops and not form.stopping, w.truth) for stops in form.stops]
+        disarmed = [(off > 0.0) | passed for off, passed in zip(p.every("disarmed"), over, strict=True)]
         return [[w.where(off, value, x) for x, off in zip(part, disarmed, strict=True)] for part, value in zip(found, (1.0, 0.0), strict=True)]
 
     c_0, rate_0 = armed(events(t, y, k[0]))

@@ -48,6 +48,7 @@ class Form:
     switched: tuple[int, ...] = ()  # which of the inputs are modes
     stops: tuple[bool, ...] = ()  # whether each event ends the motion; empty: all do
     most: int = 0  # transitions of a motion
+    stopping: bool = True  # whether events that end a motion do
 
     @property
     def rates(self) -> list[int]:

@@ -200,7 +200,7 @@ def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events
         return reason
     if has_events and not field.lowers_events:
         return "a stop event is no part of the scalar program"
-    return _reason_against_program(form_of(field, inputs, has_events, 1), order)
+    return _reason_against_program(form_of(field, inputs, has_events, 1, True), order)
 
 
 @lru_cache(maxsize=64)
@@ -240,14 +240,14 @@ def driven(program: Lowered, inputs: Inputs) -> Lowered | str:
     return with_functions(program, tuple(channel.program if isinstance(channel, FunctionOfTime) else None for channel in inputs.channels))
 
 
-def form_of(field: VectorField, inputs: Inputs, has_events: bool, most: int) -> Form:
-    """What machine code integrates; `most`: transitions of a motion."""
+def form_of(field: VectorField, inputs: Inputs, has_events: bool, most: int, stopping: bool) -> Form:
+    """What machine code integrates; `most`: transitions of a motion; `stopping`: whether other events end it."""
     assert isinstance(field, ByProgram)
     sampled = tuple(i for i, channel in enumerate(_others(inputs)) if isinstance(channel, Sampled))
     program = driven(field.program, inputs)
     assert not isinstance(program, str), program
     switched, goes_on = modes_among(inputs), has_events and not all(program.stops)
-    of_events: dict[str, Any] = {"stops": program.stops, "most": most} if goes_on else {}
+    of_events: dict[str, Any] = {"stops": program.stops, "most": most, "stopping": stopping} if goes_on else {}
     return Form(program, field.with_work, field.projects, field.affine, has_events, field.pivots, sampled=sampled, switched=switched, **of_events)
 
 
