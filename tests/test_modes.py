@@ -193,8 +193,47 @@ def test_rimless_wheel():
         return jnp.diff(motion.phases.ts[:4], prepend=0.0)
 
     np.testing.assert_allclose(periods(1.09546283964766), 1.03454981142327, rtol=1e-11)
+    orbit = jj.periodic(Rimless(), {"angle": 0.03, "angle_rate": 0.5}, period=1.03454981142327, **TIGHT)
+    np.testing.assert_allclose(sorted(orbit.multipliers.real), [0.5, 1.0], rtol=1e-8)
     slopes = jax.jacrev(periods)(1.09546283964766)
     np.testing.assert_allclose(slopes[1:] / slopes[:-1], 0.5, rtol=1e-9)  # the multiplier of the rate
+
+
+class Walker(jj.Scene):
+    """The simplest walking model (Garcia et al., 1998): a hip on two legs, of which the swinging one weighs nothing; lengths and times without units."""
+
+    slope: float = jj.parameter(0.009)
+    coordinates = jj.coordinates("stance swing")
+
+    def bodies(self, t, q):
+        return {name: jj.Particle(1.0, jnp.stack([angle, 0.0 * angle, 0.0 * angle])) for name, angle in (("stance", q.stance), ("swing", q.swing))}
+
+    def loads(self, motion):
+        swing, rate, lean = motion.q.swing, motion.u.stance_rate, motion.q.stance - self.slope
+        return (jj.generalized_force(motion, stance_rate=jnp.sin(lean), swing_rate=jnp.sin(lean) + (rate**2 - jnp.cos(lean)) * jnp.sin(swing)),)
+
+    def events(self, motion):
+        (stance, swing), rate = motion.q.array, motion.u.stance_rate
+        c = jnp.cos(2 * stance)
+        after = {"stance": -stance, "swing": -2 * stance, "stance_rate": c * rate, "swing_rate": c * (1 - c) * rate}
+        return {"strike": jj.Event(jnp.where(stance < 0, 2 * stance - swing, 1.0), jump=after), "upright": stance}
+
+
+def test_simplest_walker():
+    """Period, multipliers and stance of its gait; the third multiplier is zero, since the leg that strikes forgets how fast it swung."""
+    guess = {"swing": -0.0532, "stance_rate": -0.0594, "swing_rate": -0.3398}
+
+    def gait(slope):
+        return jj.periodic(Walker(slope), guess, period=3.88, until="upright", **TIGHT)
+
+    orbit = gait(0.009)
+    np.testing.assert_allclose(orbit.period, 3.88246375, atol=5e-9)
+    expected = [-0.19009984 + 0.55759878j, -0.19009984 - 0.55759878j, 0.0]
+    np.testing.assert_allclose(sorted(orbit.multipliers, key=lambda x: -x.imag - 2 * (abs(x) > 0.1)), expected, atol=2e-8)
+    strikes = jj.simulate(Walker(), orbit.state, ts=jnp.array([1.8317]), events=False, **TIGHT)
+    assert strikes["stance"][-1] - 0.19983247 * (strikes.phases.ts[0] - 1.8317) == pytest.approx(0.2003109, abs=1e-7)
+    slope = jax.grad(lambda slope: gait(slope).period)(0.009)
+    np.testing.assert_allclose(slope, (gait(0.00901).period - gait(0.00899).period) / 2e-5, rtol=1e-5)
 
 
 class Belt(jj.Scene):
