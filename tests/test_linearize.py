@@ -421,6 +421,8 @@ def test_a_family_is_drawn_against_its_own_values(turns, straight):
         ({"lean": 0.3}, {"until": {"x": 1.0}}, "`x` is no unknown"),
         ({"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, {"held": "lean", "names": ("one",)}, "expected one for each of the 2 modes"),
         ({"lean": float("nan")}, {}, "undefined near the guess"),
+        ({"spin_rate": -4.0}, {"held": "lean", "until": {"spin_rate": float("nan")}}, "`until` of `spin_rate` is nan, expected a finite"),
+        ({"spin_rate": -4.0}, {"held": "lean", "until": {"spin_rate": "far"}}, "`until` of `spin_rate` is .*expected real numbers"),
     ],
 )
 def test_what_cannot_be_followed_is_refused(guess, options, says):
@@ -433,6 +435,8 @@ def test_a_motion_that_stands_alone_and_points_that_are_no_branch_points(turns, 
         jj.family(Bead(), {"angle": 0.0})
     with pytest.raises(ValueError, match="expected a branch point"):
         jj.family(bicycle, turns.folds[0])
+    with pytest.raises(ValueError, match="expected two axes"):
+        jj.stability_chart(bicycle, {"c": (0.02, 0.12)})
     with pytest.raises(ValueError, match="one name with its value"):
         turns.at(lean=0.1, steer=0.1)
     with pytest.raises(KeyError, match="did you mean `lean`"):

@@ -44,8 +44,10 @@ def stability_chart(
     A family along the second number, in the middle of the first, tells which boundaries there are; each is a `critical` point as a function of the first
     number, found to round-off. A boundary that does not pass the middle is not seen, and one that turns back along the first number has gaps.
 
-    **Returns** a `StabilityChart`. **Raises** as `family`.
+    **Returns** a `StabilityChart`. **Raises** as `family`; ValueError where there are not two axes.
     """
+    if not isinstance(axes, Mapping) or len(axes) != 2:
+        raise ValueError(f"`axes` is {axes!r}, expected two axes: a parameter, and a coordinate or a speed, each with its first and its last value")
     (first, ends), (second, (begin, end)) = axes.items()
     values = jnp.linspace(*ends, points)
     scene = as_scene(scene).replace(**{first: values[points // 2]})

@@ -17,7 +17,7 @@ from jourdain_jax.analysis.families.spectrum import Modes, mode_names
 from jourdain_jax.analysis.steady import guessed
 from jourdain_jax.analysis.table import complex_numbers, table
 from jourdain_jax.calculus.on_first_use import needed
-from jourdain_jax.calculus.reals import Numbers, largest
+from jourdain_jax.calculus.reals import Numbers, checked_known, largest
 from jourdain_jax.motion.put_on_rows import State, state_of
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, of_known_numbers, shown_from_users_lines
 from jourdain_jax.scene.names import UnknownNameError, as_names, check_name, check_names
@@ -199,7 +199,10 @@ def family(
         t, q, u = (np.asarray(x, float) for x in guessed(scene, point.state if point else guess, 0.0))
         scene = scene.replace(**{name: point[name] for name in varied if point and name in point.values})
         equations = SteadyEquations(scene, (float(t), q, u), np.asarray(as_input_vector(scene, inputs), float), varied, held)
-    targets = [(k := equations.index(name), float(value) / equations.size[k]) for name, value in until.items()]
+    known = {name: checked_known(value, f"`until` of `{name}`", (), advice="give the value at which the curve ends") for name, value in until.items()}
+    if not_numbers := [name for name, value in known.items() if not np.isfinite(value)]:
+        raise ValueError(f"`until` of `{not_numbers[0]}` is {until[not_numbers[0]]}, expected a finite number")
+    targets = [(k := equations.index(name), float(value) / equations.size[k]) for name, value in known.items()]
     named = [name for name in (guess if isinstance(guess, Mapping) else ()) if name in equations.unknowns]
     if point is None:
         begin = first_point(equations, named, [*until])
