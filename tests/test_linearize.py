@@ -373,6 +373,13 @@ def test_a_bead_on_a_turning_hoop_leaves_the_bottom_at_a_pitchfork():
     assert [point["turning"] for point in both.special] == pytest.approx([critical] * 2, abs=1e-9)
 
 
+@pytest.mark.parametrize("until", [{"radius": -0.5}, None])
+def test_a_family_along_a_parameter_ends_where_this_leaves_the_sign_declared_for_it(until):
+    found = jj.family(Bead(turning=1.0), {"angle": 0.0}, vary="radius", until=until)
+    assert 0 < found["radius"].min() < 0.1
+    assert any("`radius` is declared positive" in end for end in found.ends)
+
+
 class SplineBead(Bead):
     """The bead with a field of many numbers, which is no parameter, before the one that varies."""
 

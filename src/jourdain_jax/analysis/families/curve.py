@@ -14,6 +14,7 @@ from jaxtyping import Float
 from jourdain_jax.analysis.families.equations import Look, Motions, Vector
 from jourdain_jax.analysis.families.spectrum import Modes, matched, surely_matched
 from jourdain_jax.calculus.reals import largest
+from jourdain_jax.scene.parameters import parameters_of
 
 Targets = list[tuple[int, float]]  # numbers of unknowns, and values at which a curve ends
 CLOSED = "the curve is closed"
@@ -80,7 +81,10 @@ def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tup
             if past(here) * past(there) <= 0:
                 if past(here) * past(there) < 0 and (end := located(equations, here, there, past)):
                     points[-1] = end
-                return points, f"{equations.unknowns[k]} is {target * equations.size[k]:g}"
+                left = _left(equations, points[-1])
+                return (points[:-1], left) if left else (points, f"{equations.unknowns[k]} is {target * equations.size[k]:g}")
+        if left := _left(equations, there):
+            return points[:-1], left
         if _closed(equations, start, here, there):
             points.append(replace(start, modes=matched(there.modes, start.modes)))
             return points, CLOSED
@@ -90,6 +94,15 @@ def traced(equations: Motions, start: Point, targets: Targets, most: int) -> tup
         if there.hardness <= easy:
             step = min(1.5 * step, LONGEST * max(1.0, reach))
     return points, f"{most} points"
+
+
+def _left(equations: Motions, point: Point) -> str | None:
+    """Why a curve ends before a point: a parameter there has not the sign declared for it; None where all have."""
+    values = equations.values(point.z)
+    for name, _, declared in parameters_of(equations.scene):
+        if name in equations.vary and ((declared["positive"] and values[name] <= 0) or (declared["non_negative"] and values[name] < -1e-12)):
+            return f"`{name}` is declared {'positive' if declared['positive'] else 'non-negative'}, and is {values[name]:.3g} at the next point"
+    return None
 
 
 def _next(equations: Motions, here: Point, step: float, hardest: int) -> Point | None:

@@ -175,7 +175,8 @@ def family(
     - `guess`: as of `steady`; or a branch point of another family of steady motions, whose other curve is followed; or a `PeriodicMotion` of this class of
       scenes, with the inputs, the event and what is held of its search.
     - `until`: name -> value at which the curve ends. It is followed towards it from the guess, whose value of that name is kept at the start; without
-      `until` in both directions. A curve that closes ends there.
+      `until` in both directions. A curve that closes ends there, and one along a parameter before it leaves
+      the sign declared for it.
     - `vary`: a parameter of the scene, one number, that changes along the curve.
     - `held`: names of coordinates and speeds that keep the guess's value; `inputs`: as of `steady`.
     - `names`: of the modes at the start, by ascending real part and of a pair the positive imaginary part first;
