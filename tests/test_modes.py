@@ -314,6 +314,24 @@ def test_a_fit_of_bounces():
         np.testing.assert_allclose(np.std(found.value), np.mean(found.standard_error), rtol=0.25)
 
 
+class Lifted(jj.Scene):
+    """What has fallen through zero once is lifted above it at 1 s, and falls through it again at once."""
+
+    coordinates = jj.coordinates("y")
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(1.0, jnp.stack([q.y, 0.0 * q.y, 0.0 * q.y]))}
+
+    def events(self, motion):
+        return {"falls": jj.Event(motion.q.y), "lifted": jj.Event(1.0 - motion.t, jump={"y": 0.05})}
+
+
+@pytest.mark.parametrize("backend", ["native", "dense"])
+def test_an_event_counts_again_where_another_one_lifts_its_value(backend):
+    motion = jj.simulate(Lifted(), {"y": 0.5, "y_rate": -1.0}, ts=[3.0], backend=backend)
+    np.testing.assert_allclose(motion.phases.ts[:4], [0.5, 1.0, 1.05, np.nan], rtol=1e-12)
+
+
 def test_too_many_transitions():
     motion = jj.simulate(Ball(), {"z": 1.0}, t1=3.0, max_transitions=20)
     assert not motion.succeeded

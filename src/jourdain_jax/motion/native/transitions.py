@@ -164,7 +164,9 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
     """
     event, t, flat, switches, noise, found = happened
     rows, of, count = form.rows, form.rows_of_transition, form.integrated
-    after, k, pivots, values, slopes = (w.room(max(n, 1)) for n in (of["t"].stop, count, len(form.monitored), form.events, form.events))
+    sizes = of["t"].stop, count, len(form.monitored), form.events, form.events, form.events
+    after, k, pivots, before, values, slopes = (w.room(max(n, 1)) for n in sizes)
+    w.run("events", p.pointer, t, y1, y1, before, slopes)
     w.run("reset", p.pointer, t, y1, event, after)
     left = w.at(p.pointer, rows["left"].start)
     w.store(w.where(switches, w.where(flat, w.number(-1.0) - event, event + 1.0), w.load(left)), left)
@@ -193,9 +195,10 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
         c, rate = w.load(values, i), w.load(slopes, i) * p["direction"]
         rises = (rate > 0.0) & (w.magnitude(c) <= noise * rate)
         this = w.equal(event, float(i)) & switches
-        slow = this & found & (rate > 0.0) & ~rises & ~is_left(w, c, rate, noise)
+        slow = this & found & (rate > 0.0) & ~rises & w.equal(c, w.load(before, i))  # a bounce: the value itself does not jump
         w.store(w.where(slow, 1.0, w.load(stuck)), stuck)
-        disarmed.append(w.where(this, w.where(rises | is_left(w, c, rate, noise), 0.0, 1.0), old))
+        left_now = switches & is_left(w, c, rate, noise)
+        disarmed.append(w.where(left_now | (this & rises), 0.0, w.where(this, 1.0, old)))
     p.put("disarmed", disarmed)
     if form.relations:
         now = w.room(len(form.watched))
