@@ -56,8 +56,9 @@ def _check_text(texts, architectures) -> None:
                 gpu_twin.said_by_assembler(ptx)  # refuses what is wrong
 
 
-def test_threads_of_a_gpu_give_the_bits_of_wide_registers():
-    texts = _check("chaplygin-sleigh", ["values", "gradients"], [("reversed", FEW)])
+@pytest.mark.parametrize(("name", "kind"), [("chaplygin-sleigh", "gradients"), ("tilting-disc", "values"), ("double-pendulum-rods", "values")])
+def test_threads_of_a_gpu_give_the_bits_of_wide_registers(name, kind):
+    texts = _check(name, [kind], [("reversed", FEW)])
     assert len(texts) > 2
     _check_text([max(texts, key=len)], ["sm_75"])
 
@@ -141,6 +142,15 @@ def test_a_model_says_on_which_devices_it_is_integrated(monkeypatch):
         for reason, said in (("", "machine code: CPU; NVIDIA GPU (sm_90 on the CPU)"), ("no driver", "XLA: no driver")):
             monkeypatch.setattr(nvidia, "reason_against", lambda reason=reason: reason)
             assert said in str(jj.build(jj.models.ChaplyginSleigh()))
+
+
+@pytest.mark.parametrize("sampler", ["random", "sobol", "saltelli"])
+def test_samples_drawn_on_a_device_have_the_bits_of_the_host(sampler):
+    design = jj.Design({"a": jj.Normal(2.0, 0.7), "b": jj.Uniform(-1.0, 3.3)}, sampler=sampler, samples=40_000, seed=2**62 + 11)
+    found = design._at(np.arange(7, 40_000), on_device=True)
+    for name, column in design.values(7, 40_000).items():
+        assert isinstance(found[name], jax.Array)
+        np.testing.assert_array_equal(found[name], column)
 
 
 def test_many_lanes_run_at_once_on_a_gpu():

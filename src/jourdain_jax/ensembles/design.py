@@ -6,17 +6,21 @@ of normal ones is the one stated.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.calculus.on_first_use import module_on_first_use
 from jourdain_jax.calculus.reals import checked_known, checked_whole, described, has_unit
-from jourdain_jax.ensembles.distributions import Distribution, Levels, special
+from jourdain_jax.ensembles.distributions import Distribution, Levels, Normal, Uniform
 from jourdain_jax.ensembles.samplers import MOST_SOBOL, SAMPLERS
 from jourdain_jax.scene.names import check_names, nearest
 from jourdain_jax.scene.printing import Printed
 
+special = module_on_first_use("scipy.special")
 GRID, TABLE = "grid", "table"
 MOST_SAMPLES = 2**53  # whole numbers that are floats
 MOST_CROSSED = 2**62  # samples of a grid, which are counted in 64 bits
@@ -141,20 +145,34 @@ class Design(Printed):
         last = len(self) if last is None else last
         if not 0 <= first <= last <= len(self):
             raise ValueError(f"samples {first} to {last} are not among 0 to {len(self)}")
+        return self._at(np.arange(first, last))
+
+    def _at(self, index, on_device: bool = False) -> dict:
+        """The values of samples with these numbers, in order; where it may be `on_device`, arrays of JAX.
+
+        That is so where all is made of words and functions with the bits of the host: normal and even quantities that are not correlated.
+        """
         if self.sampler == TABLE:
-            return {name: column[first:last] for name, column in self.variables.items()}
+            return {name: column[index] for name, column in self.variables.items()}
         if self.sampler == GRID:
             shape = [len(levels.levels) for levels in self.variables.values()]
-            places = np.unravel_index(np.arange(first, last), shape)
+            places = np.unravel_index(index, shape)
             return {name: np.asarray(levels.levels)[place] for (name, levels), place in zip(self.variables.items(), places, strict=True)}
-        u = self.probabilities(first, last)
-        return {name: distribution.values(u[:, i]) for i, (name, distribution) in enumerate(self.variables.items())}
+        draw, values = SAMPLERS[self.sampler], Distribution.values
+        alike = self.sampler != "latin-hypercube" and all(isinstance(x, Normal | Uniform) for x in self.variables.values())
+        if on_device and alike and self._factor is None:
+            index, draw, values = jnp.asarray(index), jax.jit(draw, static_argnums=(0, 2, 3)), jax.jit(values, static_argnums=0)
+        u = self._drawn(index, draw)
+        return {name: values(distribution, u[:, i]) for i, (name, distribution) in enumerate(self.variables.items())}
 
     def probabilities(self, first: int, last: int) -> np.ndarray:
         """The probabilities at which the distributions are taken, of samples `first` to `last` - 1, shape (last - first, variables); NaN for grids, tables."""
         if self.sampler in (TABLE, GRID):
             return np.full((last - first, len(self.variables)), np.nan)
-        u = SAMPLERS[self.sampler](int(self.seed), first, last, len(self.variables), len(self))
+        return self._drawn(np.arange(first, last), SAMPLERS[self.sampler])
+
+    def _drawn(self, index, draw: Callable):
+        u = draw(int(self.seed), index, len(self.variables), len(self))
         if self._factor is None:
             return u
         # row by row: a product of matrices may round differently with the number of rows

@@ -11,10 +11,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from jourdain_jax.calculus.on_first_use import module_on_first_use
 from jourdain_jax.calculus.reals import checked_known
-
-special = module_on_first_use("scipy.special")
+from jourdain_jax.ensembles.rounded_functions import normal_quantile, product
 
 
 class Distribution:
@@ -37,7 +35,7 @@ class Distribution:
         if self._positive and known[self._positive] <= 0:
             raise ValueError(f"`{self._positive}` of {kind} is {known[self._positive]:g}, expected a positive number")
 
-    def values(self, u: np.ndarray) -> np.ndarray:
+    def values(self, u):
         """The values at the probabilities `u`, which lie between 0 and 1."""
         return self._inverse(u, *vars(self).values())
 
@@ -61,7 +59,7 @@ class Normal(Distribution):
 
     @staticmethod
     def _inverse(u, mean, sigma):
-        return mean + sigma * special.ndtri(u)
+        return mean + product(sigma, normal_quantile(u), u)
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ class Uniform(Distribution):
 
     @staticmethod
     def _inverse(u, low, high):
-        return low + (high - low) * u
+        return low + product(high - low, u, u)
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ class LogNormal(Distribution):
 
     @staticmethod
     def _inverse(u, median, sigma):
-        return median * np.exp(sigma * special.ndtri(u))
+        return median * np.exp(sigma * normal_quantile(u))
 
 
 @dataclass(frozen=True)

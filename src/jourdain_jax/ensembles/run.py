@@ -89,8 +89,9 @@ class Runner:
         task = self.task
         first = number * task.block
         count = min(task.block, len(task.design) - first)
-        values = task.design.values(first, first + count)
-        starts, parameters = task.starts_and_parameters({name: np.pad(column, (0, task.block - count), mode="edge") for name, column in values.items()})
+        index = np.minimum(first + np.arange(task.block), len(task.design) - 1)
+        values = task.design._at(index, on_device=jax.default_backend() != "cpu" and jax.config.jax_enable_x64)
+        starts, parameters = task.starts_and_parameters(values)
         rolled = rollout(task.scene, starts, parameters=parameters or None, chunk=task.block, progress=False, **task.span, options=task.options).lanes
         with nan_is_a_mark():
             outputs = self._outputs_of(rolled)

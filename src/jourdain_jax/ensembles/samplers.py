@@ -6,36 +6,56 @@ latin-hypercube  one sample in each of N strata of each variable (McKay, Beckman
 sobol            Sobol's sequence with Owen's linear scrambling and a digital shift, from scipy.stats.qmc, half a cell from the edge
 saltelli         for Sobol' indices of d variables: points (A_j, B_j) of that sequence in 2 d dimensions; samples j (d + 2) + i are A_j,
                  then A_j with the entry of one variable from B_j, one after another, then B_j (Saltelli et al. 2010)
+
+Each is a function of an array of whole numbers k in order, of NumPy, and all but the hypercube of JAX on a device, too, with the same bits: what is computed
+are words.
 """
 
-import warnings
+from functools import lru_cache
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.on_first_use import module_on_first_use
+from jourdain_jax.ensembles.rounded_functions import library
 
 qmc = module_on_first_use("scipy.stats.qmc")
 MOST_SOBOL = 2**30  # points of the sequence, of 30 bits
 _M1, _M2, _GOLDEN = (np.uint64(x) for x in (0xBF58476D1CE4E5B9, 0x94D049BB133111EB, 0x9E3779B97F4A7C15))
+_F1, _F2 = np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157)  # factors of Philox, and what is added to its key after each round
+_STEPS = 0x9E3779B97F4A7C15, 0xBB67AE8584CAA73B
 
 
-def _mixed(x: np.ndarray) -> np.ndarray:
+def _mixed(x):
     """Words whose bits each depend on all bits of x (splitmix64; Steele, Lea and Flood 2014)."""
     x = (x ^ (x >> np.uint64(30))) * _M1
     x = (x ^ (x >> np.uint64(27))) * _M2
     return x ^ (x >> np.uint64(31))
 
 
-def _even(words: np.ndarray) -> np.ndarray:
-    """Words of 64 bits as numbers in (0, 1): the middles of 2^53 cells."""
+def _philox(counter, key: int):
+    """The four words of Philox 4x64-10 for each of the counters, whose upper words are 0."""
+    zero = counter ^ counter
+    a, b, c, d = counter, zero, zero, zero
+    for turn in range(10):
+        first, second = (np.uint64(((key >> 64 * i) + turn * step) % 2**64) for i, step in enumerate(_STEPS))
+        a, b, c, d = jax.lax.mulhi(c, _F2) ^ b ^ first, c * _F2, jax.lax.mulhi(a, _F1) ^ d ^ second, a * _F1
+    return a, b, c, d
+
+
+def random(seed: int, index, variables: int, samples: int):
+    """The samples with these numbers, independent of each other, shape (len(index), variables): the middles of 2^53 cells."""
+    groups = -(-variables // 4)  # one step of the counter gives four words
+    if isinstance(index, jax.Array):
+        words = [word for group in range(groups) for word in _philox((index * groups + (1 + group)).astype(np.uint64), seed)]
+        words = jnp.stack(words, axis=1)
+    else:  # the same words by NumPy's own generator, for numbers in order
+        first, last = int(index[:1].sum()), int(index[-1:].sum())
+        words = np.random.Philox(key=seed).advance(first * groups).random_raw((last + 1 - first) * 4 * groups)
+        words = words.reshape(-1, 4 * groups)[index - first]
+    words = words[:, :variables]
     return ((words >> np.uint64(11)).astype(float) + 0.5) * 2.0**-53
-
-
-def random(seed: int, first: int, last: int, variables: int, samples: int) -> np.ndarray:
-    """Samples first to last - 1, independent of each other, shape (last - first, variables)."""
-    blocks = -(-variables // 4)  # one step of the counter gives four words
-    generator = np.random.Philox(key=seed).advance(first * blocks)
-    return _even(generator.random_raw((last - first) * 4 * blocks).reshape(-1, 4 * blocks)[:, :variables])
 
 
 def permuted(seed: int, number: int, index: np.ndarray, count: int) -> np.ndarray:
@@ -53,33 +73,40 @@ def permuted(seed: int, number: int, index: np.ndarray, count: int) -> np.ndarra
     return found.astype(np.int64)
 
 
-def latin_hypercube(seed: int, first: int, last: int, variables: int, samples: int) -> np.ndarray:
-    """Samples first to last - 1 of a Latin hypercube of `samples` strata, shape (last - first, variables)."""
-    inside = random(seed, first, last, variables, samples)
-    strata = np.stack([permuted(seed, number, np.arange(first, last), samples) for number in range(variables)], axis=1)
-    return (strata + inside) / samples
+def latin_hypercube(seed: int, index, variables: int, samples: int):
+    """The samples with these numbers of a Latin hypercube of `samples` strata, shape (len(index), variables); on the host alone."""
+    strata = np.stack([permuted(seed, number, index, samples) for number in range(variables)], axis=1)
+    return (strata + random(seed, index, variables, samples)) / samples
 
 
-def sobol(seed: int, first: int, last: int, variables: int, samples: int) -> np.ndarray:
-    """Points first to last - 1 of a scrambled Sobol sequence, shape (last - first, variables)."""
+@lru_cache(maxsize=16)
+def _directions(seed: int, variables: int, bits: int) -> np.ndarray:
+    """The words of a scrambled Sobol sequence: of its first point, and what each of so many bits of the Gray code of k adds to them."""
     engine = qmc.Sobol(variables, scramble=True, rng=np.random.default_rng(seed))
-    with warnings.catch_warnings():  # pieces of a sequence need not be powers of two
-        warnings.simplefilter("ignore", UserWarning)
-        if first:
-            engine.fast_forward(first)
-        return engine.random(last - first) + 2.0**-31
+    points = []
+    for bit in range(bits + 1):  # the Gray code of 2^b - 1 is 2^(b - 1)
+        if bit > 1:
+            engine.fast_forward(2 ** (bit - 1) - 1)
+        points.append(engine.random(1)[0])
+    words = (np.array(points) * 2**30).astype(int)
+    words[1:] ^= words[0]
+    return words
 
 
-def saltelli(seed: int, first: int, last: int, variables: int, samples: int) -> np.ndarray:
-    """Samples first to last - 1 of Saltelli's design, shape (last - first, variables)."""
-    group = variables + 2
-    begin, end = first // group, -(-last // group)
-    a, b = np.split(sobol(seed, begin, end, 2 * variables, samples), 2, axis=1)
-    mixed = np.repeat(a[:, None], group, axis=1)
-    for i in range(variables):
-        mixed[:, 1 + i, i] = b[:, i]
-    mixed[:, -1] = b
-    return mixed.reshape(-1, variables)[first - begin * group : last - begin * group]
+def sobol(seed: int, index, variables: int, samples: int):
+    """The points with these numbers of a scrambled Sobol sequence, shape (len(index), variables)."""
+    first, *added = _directions(seed, variables, max(1, (samples - 1).bit_length()))
+    gray, words = (index ^ (index >> 1))[:, None], first
+    for bit, word in enumerate(added):
+        words = words ^ ((gray >> bit) & 1) * word
+    return words.astype(float) * 2.0**-30 + 2.0**-31
+
+
+def saltelli(seed: int, index, variables: int, samples: int):
+    """The samples with these numbers of Saltelli's design, shape (len(index), variables)."""
+    xp, group = library(index), variables + 2
+    points, place = sobol(seed, index // group, 2 * variables, -(-samples // group)), (index % group)[:, None]
+    return xp.where((place == xp.arange(1, variables + 1)) | (place == group - 1), points[:, variables:], points[:, :variables])
 
 
 SAMPLERS = {"random": random, "latin-hypercube": latin_hypercube, "sobol": sobol, "saltelli": saltelli}

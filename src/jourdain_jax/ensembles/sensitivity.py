@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jourdain_jax.ensembles.distributions import special
+from jourdain_jax.ensembles.design import special
 from jourdain_jax.scene.printing import Printed
 
 
