@@ -13,6 +13,7 @@ one time is saved, and the end, its code and the counts come back; the best of t
 import re
 import signal
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -128,6 +129,15 @@ def alone(of: str, name: str, x: float, required: float | None, first_within: fl
     yield figure(f"time, ms, {name}", f"one {of}", 1e3 * min(seconds_of(run, time.perf_counter)[1] for _ in range(20)), required)
 
 
+def study(lanes: int, least: float | None, quick: bool) -> Figures:
+    """A study of discs: samples drawn, motions, statistics of their ends; one lane in a thousand is stored."""
+    of = jj.Study(DISC, start={"lean": 0.3, "spin_rate": jj.Uniform(*SPREAD["disc"])}, samples=lanes)
+    with tempfile.TemporaryDirectory() as folder:
+        run = partial(of.run, t1=2.0, rtol=1e-6, atol=1e-6, save="statistics", keep_every=1000, progress=False)
+        seconds = min(seconds_of(partial(run, f"{folder}/{k}"), time.perf_counter)[1] for k in range(2))
+    yield figure("motions a second, statistics of a study, one lane in a thousand stored", f"{lanes:g} discs", lanes / seconds, least=least)
+
+
 def failures(quick: bool) -> Figures:
     """A lane that is no number leaves the others alone; what does not fit into memory is an error, after which all goes on."""
     x = jnp.linspace(-6.0, -3.0, 1000)
@@ -191,7 +201,8 @@ def without_gpu() -> tuple[dict, list[str]]:
         print(f"no text for GPUs is made: {reason}")
         return {}, []
     parts = {f"on the CPU, {of}, {name}": partial(twin, of, name) for of, kinds in KINDS.items() for name in kinds}
-    return parts, [f"on the CPU, disc, {name}" for name in ("values", "gradient")]
+    parts["on the CPU, study"] = partial(study, 20_000, None)  # the calls alone: the figure is one of the CPU
+    return parts, [*(f"on the CPU, disc, {name}" for name in ("values", "gradient")), "on the CPU, study"]
 
 
 def with_gpu() -> tuple[dict, list[str]]:
@@ -202,6 +213,7 @@ def with_gpu() -> tuple[dict, list[str]]:
     parts |= {f"speed, disc, {lanes:g}": partial(speed, "disc", "values", lanes) for lanes in (10**6, 10**7)}
     parts |= {f"speed, disc, {name}": partial(speed, "disc", name, 10**6) for name in list(DISCS)[1:]}
     parts |= {"failures": failures, "interrupted": interrupted} | {f"speed, bicycle, {name}": partial(speed, "bicycle", name, 10**5) for name in BICYCLES}
+    parts["study"] = partial(study, 10**7, 2e7)
     parts["one bicycle, values"] = partial(alone, "bicycle", "values", 0.3, None, 8.0)
     return parts, [name for name in parts if name not in ("bits, bicycle, tangent", "bits, bicycle, gradient")]
 
