@@ -16,8 +16,8 @@ CEILINGS = {
     "code tokens of src": 449_041,
     "code tokens of docs": 11_441,
     "code tokens of notebooks": 7_444,
-    "caches": 49,
-    "named numbers": 269,
+    "caches": 50,
+    "named numbers": 282,
     "tests for a tracer": 60,
     "functions with more than 8 parameters": 2,
     "ways: state put onto its constraints": 3,
@@ -25,8 +25,8 @@ CEILINGS = {
     "ways: rows and their slopes for a projection": 2,
     "ways: damped least squares": 2,
     "ways: step of a motion, the search for an event in it, and the way back over it": 1,
-    "code tokens of tests": 312_363,
-    "code tokens of bench": 101_049,
+    "code tokens of tests": 312_529,
+    "code tokens of bench": 101_222,
     "test files that reach private names": 36,
 }
 
