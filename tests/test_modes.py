@@ -332,6 +332,77 @@ def test_an_event_counts_again_where_another_one_lifts_its_value(backend):
     np.testing.assert_allclose(motion.phases.ts[:4], [0.5, 1.0, 1.05, np.nan], rtol=1e-12)
 
 
+class Sunk(Ball):
+    """It strikes, and begins again below its floor: it rises above that for a while, and falls through it again."""
+
+    def events(self, motion):
+        return {"floor": jj.Event(motion.q.z, jump={"z": -0.01, "z_rate": 0.3})}
+
+
+@pytest.mark.parametrize("backend", ["native", "dense"])
+def test_an_event_happens_again_that_was_left_within_one_step(backend):
+    motion = jj.simulate(Sunk(0.7, 1.0), {"z": 50.0}, ts=[11.5], backend=backend)
+    again = 0.3 + np.sqrt(0.3**2 - 2 * 0.01)
+    np.testing.assert_allclose(motion.phases.ts[:4], [10.0, 10.0 + again, 10.0 + 2 * again, np.nan], rtol=1e-9)
+
+
+class Timed(jj.Scene):
+    """A mass that is pushed harder from a time on, and stops then."""
+
+    at: float = jj.parameter(1.0)
+    coordinates = jj.coordinates("x")
+    modes = jj.modes(push=("soft", "hard"))
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, 1.0 + motion.modes.push, jnp.array([1.0, 0.0, 0.0])),)
+
+    def events(self, motion):
+        return {"late": jj.Event(self.at - motion.t, to={"push": "hard"}, jump={"x_rate": 0.0})}
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_state_and_mode_at_a_saved_time_agree(direction):
+    """Where an event and a saved time are a rounding apart, either both are from before the event or both from after it."""
+    after = set()
+    for k in range(12):
+        t = direction * (0.7 + 0.0317 * k)
+        for at in (np.nextafter(t, -9), t, np.nextafter(t, 9)):
+            scene = Timed(at) if direction > 0 else Back(at)
+            motion = jj.simulate(scene, {"x_rate": 1.0 * direction}, t0=0.3 * direction, ts=[t, t + direction], rtol=1e-10, atol=1e-10)
+            stopped = bool(abs(motion["x_rate"][0]) < 1e-9)
+            assert int(motion.phase("push")[0]) == stopped
+            np.testing.assert_allclose(motion.energies().balance, motion.energies().balance[0], atol=1e-9)
+            after.add(stopped)
+    assert after == {True, False}
+
+
+@pytest.mark.parametrize("backend", ["native", "xla", "dense"])
+def test_work_of_potentials_that_depend_on_modes(backend):
+    """What a mode or a jump adds to a potential is the event's, not work done between events; x = 1.12 m at the event."""
+
+    class Moved(Timed):
+        def events(self, motion):
+            late = super().events(motion)["late"]
+            return {"late": jj.Event(late.value, to=late.to, jump={"x": motion.q.x + 1.0, "x_rate": 0.0})}
+
+    for scene, lost in ((Timed(0.8), 1.8**2 / 2 + 1.12), (Moved(0.8), 1.8**2 / 2 + 2 * 2.12 - 1.12)):
+        motion = jj.simulate(scene, {"x_rate": 1.0}, ts=[0.5, 1.5], backend=backend, rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(motion.work, 0.0, atol=1e-8)
+        np.testing.assert_allclose(motion.phases.lost[0], lost, rtol=1e-9)
+        np.testing.assert_allclose(motion.energies().balance, 0.5, rtol=1e-8)
+        assert not motion.warnings
+
+
+class Back(Timed):
+    """A mass whose push sets in as time runs back to it."""
+
+    def events(self, motion):
+        return {"late": jj.Event(motion.t - self.at, to={"push": "hard"}, jump={"x_rate": 0.0})}
+
+
 def test_too_many_transitions():
     motion = jj.simulate(Ball(), {"z": 1.0}, t1=3.0, max_transitions=20)
     assert not motion.succeeded

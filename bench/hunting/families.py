@@ -1,12 +1,13 @@
 """All families of generated cases, in one list."""
 
-from hunting import bodies, events, gradients, linkages, oscillators, pendulums, refusals, short_features, sliders, uses
+from hunting import bodies, events, gradients, linkages, oscillators, pendulums, refusals, short_features, sliders, transitions, uses
 
 FAMILIES = (
     *linkages.FAMILIES,
     *sliders.FAMILIES,
     *pendulums.FAMILIES,
     *events.FAMILIES,
+    *transitions.FAMILIES,
     *oscillators.FAMILIES,
     *bodies.FAMILIES,
     *uses.FAMILIES,

@@ -58,7 +58,7 @@ class VelocityQuantities(eqx.Module):
     direct: Num[Entries, "speeds"]
     power: Num[Entries, ""]  # of loads without a potential, and of potentials that depend on time or on inputs
     events: Num[Entries, "events"]  # sorted by name
-    resets: Num[Entries, "events rows"]  # coordinates, speeds and modes after each; without rows where all stop the motion
+    resets: Num[Entries, "events rows"]  # as `event_resets` has them
     energies: Num[Entries, "2"]  # kinetic and potential
 
 
@@ -106,7 +106,7 @@ def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]
         loads.direct,
         explicit_power(scene, motion, of_inputs, stated),
         event_values(scene, motion) if with_events else jnp.zeros(0),
-        event_resets(scene, motion) if with_events else jnp.zeros((0, 0)),
+        event_resets(scene, motion, of_inputs) if with_events else jnp.zeros((0, 0)),
         jnp.stack(energies_at(scene, motion, stated)),
     )
 
@@ -117,17 +117,26 @@ def event_values(scene: Scene, motion: Motion) -> Float[Array, "events"]:
     return jnp.stack([events[name].value for name in sorted(events)]) if events else jnp.zeros(0)
 
 
-def event_resets(scene: Scene, motion: Motion) -> Float[Array, "events rows"]:
-    """Coordinates, speeds and modes after each event, sorted by name; without rows where all events stop the motion."""
+def event_resets(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Float[Array, "events rows"]:
+    """Coordinates, speeds and modes after each event, sorted by name, and by how much what the loads `of_inputs` store rises.
+
+    Without rows where all events stop the motion.
+    """
     events = [event for _, event in sorted(events_of(scene, motion).items())]
     if all(event.stop for event in events):
         return jnp.zeros((len(events), 0))
     names = (*scene.coordinate_names.entries, *scene.speed_names.entries, *scene.modes.names)
-    now = jnp.concatenate([motion.q.array, motion.u.array, motion.inputs.array[len(scene.inputs) - len(scene.modes.names) :]])
+    given, modes = jnp.split(motion.inputs.array, (len(scene.inputs) - len(scene.modes.names),))
+    now = jnp.concatenate([motion.q.array, motion.u.array, modes])
+
+    def stored(state: Float[Array, "rows"]) -> Scalar:
+        q, u, after = jnp.split(state, (len(motion.q.array), len(state) - len(modes)))
+        return stored_by_inputs(scene, motion_at(scene, motion.t, q, 0.0 * u, jnp.concatenate([given, after])), of_inputs)
 
     def after(event: Event) -> Float[Array, "rows"]:
         changed = {**event.jump, **event.to}
-        return jnp.stack([changed.get(name, now[i]) for i, name in enumerate(names)])
+        found = jnp.stack([changed.get(name, now[i]) for i, name in enumerate(names)])
+        return jnp.append(found, stored(found) - stored(now) if of_inputs else 0.0)
 
     return jnp.stack([after(event) for event in events])
 

@@ -55,7 +55,7 @@ class Equations:
     guards: list[int] = field(default_factory=list)  # must stay positive
     power: int = 0  # `rate_of_work`
     events: list[int] = field(default_factory=list)  # values of the stop events
-    resets: list[int] = field(default_factory=list)  # coordinates, speeds of the state and modes after each
+    resets: list[int] = field(default_factory=list)  # of each: coordinates, speeds of the state and modes after it, and what loads store then
     energies: list[int] = field(default_factory=list)  # kinetic and potential
     directions: list[int] = field(default_factory=list)  # of rows nonlinear in the speeds, an entry for each speed: must not turn round
     squares: list[int] = field(default_factory=list)  # of rows kept by multipliers (`Accelerations`)

@@ -59,7 +59,7 @@ class Lowered:
     guards: tuple[int, ...]  # must stay positive
     power: int  # `rate_of_work` (d(T + V)/dt at constant inputs, or that part of it that is integrated)
     events: tuple[int, ...]  # values of the stop events, sorted by name; none where they have no scalar form
-    resets: tuple[int, ...]  # of each event: coordinates, speeds of the state and modes after it; none where all events stop the motion
+    resets: tuple[int, ...]  # of each event: coordinates, speeds of the state, modes, and the rise of what loads store; none where all events stop the motion
     stops: tuple[bool, ...]  # whether each event does
     energies: tuple[int, ...]  # kinetic and potential
     relations: tuple[int, ...]  # numbers whose signs decide between branches of the rates (`lowering/relations.py`)

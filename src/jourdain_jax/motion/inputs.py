@@ -232,12 +232,14 @@ class Inputs(eqx.Module):
         return ChangingInputs(t, values, rates)
 
 
-def in_phases(inputs: Inputs, passed, origin, direction) -> Inputs:
-    """Return inputs whose modes change after each transition that a motion from the time `origin` has passed (`setup.Passed`)."""
-    if not len(passed.modes):
+def in_phases(
+    inputs: Inputs, ts: Float[Array, "transitions"], modes: Float[Array | np.ndarray, "modes transitions"], direction
+) -> Inputs:
+    """Return inputs whose modes change after each transition of a motion, of which those that did not happen have no finite time."""
+    if not len(modes):
         return inputs
-    ts = jnp.where(jnp.isfinite(passed.ts), (origin + passed.ts) * direction, jnp.inf)
-    values = iter(jax.lax.stop_gradient(passed.modes))
+    ts = jnp.where(jnp.isfinite(ts), ts * direction, jnp.inf)
+    values = iter(jax.lax.stop_gradient(modes))
     phases = lambda channel: Mode(jnp.asarray(channel.value), ts, next(values), direction)  # noqa: E731
     return Inputs(tuple(phases(channel) if isinstance(channel, Mode) else channel for channel in inputs.channels))
 

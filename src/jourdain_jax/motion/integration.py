@@ -110,11 +110,12 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     t0, field, integrator = setup.t0, setup.field, setup.integrator
     start = begun.start
     _, scene, inputs, fixed, origin = begun.args
-    inputs = in_phases(inputs, solved.passed, origin, jnp.sign(setup.t1 - t0))
+    direction = jnp.sign(setup.t1 - t0)
+    transitions = solved.passed.times(origin, setup.ts, solved.ts, direction)
+    inputs = in_phases(inputs, transitions, solved.passed.modes, direction)
     args = field, scene, inputs, fixed, origin
     puts_back = field.projects and not integrator.own
     stored_first = field.stored(scene, t0, start.q, inputs(t0))
-    direction = jnp.sign(setup.t1 - t0)
     valid = solved.reached & (solved.ts * direction <= solved.t_end * direction) & begun.timely
 
     def saved_state(tau, y, valid):
@@ -152,7 +153,7 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
 
     t_end = jnp.where(solved.t_end == setup.t1 - origin, setup.t1, origin + solved.t_end)
     saved, treedef = jax.tree.flatten(jax.tree.map(lambda x: x[1:], found))
-    passed = jnp.where(jnp.isfinite(solved.passed.ts), origin + solved.passed.ts, jnp.nan)
+    passed = jnp.where(jnp.isfinite(transitions), transitions, jnp.nan)
     whole = jnp.where(begun.timely, t_end, given.t0), start.moved_q, start.moved_u, pivot, passed
     marked = left(asked, [beyond] * len(saved) + [failed] * 4 + [jnp.zeros_like(failed)], [*saved, *whole])
     q, u, work = jax.tree.unflatten(treedef, marked[: len(saved)])
@@ -177,7 +178,7 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
         moved_q=moved_q,
         moved_u=moved_u,
         smallest_pivot=pivot,
-        inputs=in_phases(given.inputs, solved.passed, origin, direction),
+        inputs=in_phases(given.inputs, transitions, solved.passed.modes, direction),
         phases=_phases(given.inputs, passed, solved.passed, integrator.event_names, given.scene.modes),
         state_form=field.name,
         reduction=field.reduction_name if setup.reason_against_machine_code else f"{field.reduction_name} to machine code",

@@ -149,9 +149,11 @@ def _on_times(run: Callable[[Setup, Begun], Solved], mover: Callable, setup: Set
     y0 = mover(begun.args)(begun.y0, start, -later)
     setup = setup._replace(**{name: numbers(getattr(setup, name)) for name in ("ts", "t0", "t1")})
     found = run(setup, eqx.tree_at(lambda b: (b.y0, b.args), begun, (y0, (field, scene, inputs, fixed, numbers(start)))))
-    moved = mover((field, scene, in_phases(inputs, found.passed, numbers(start), jnp.sign(numbers(goals[-1]))), fixed, start))
+    passed, number, direction = found.passed, numbers(goals), jnp.sign(numbers(goals[-1]))
+    transitions = passed.times(numbers(start), setup.ts, number[:-1], direction)
+    moved = mover((field, scene, in_phases(inputs, transitions, passed.modes, direction), fixed, start))
     event = (found.code == results.EVENT) & (found.accepted > 0)
-    t_end, number = numbers(found.t_end), numbers(goals)
+    t_end = numbers(found.t_end)
     by_goal = jnp.append(found.reached, t_end == number[-1]) & ~(event & (number == t_end))
     by = jnp.where(by_goal, goals - number + later, jnp.where(event, 0.0, later))
     at = numbers(start) + jnp.where(by_goal, number, t_end)
@@ -163,7 +165,7 @@ def _on_times(run: Callable[[Setup, Begun], Solved], mover: Callable, setup: Set
             jax.vmap(moved)(found.ys, at[:-1], by[:-1]),
             moved(found.y_end, at[-1], by[-1]),
             found.t_end + jnp.where(event, -later, jnp.where(by_goal[-1], goals[-1] - number[-1], 0.0)),
-            found.passed.ts - later,
+            passed.ts - later,
         ),
     )
 

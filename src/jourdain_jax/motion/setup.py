@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.build.structure import Reference
-from jourdain_jax.calculus.reals import Flag, PerLane, array_module
+from jourdain_jax.calculus.reals import Flag, PerLane, Scalar, array_module
 from jourdain_jax.motion.inputs import knots_between
 from jourdain_jax.motion.integrators.explicit_steps import Method
 from jourdain_jax.motion.integrators.implicit_steps import ImplicitMethod
@@ -35,6 +35,23 @@ class Passed(eqx.Module):
     events: Int[Array | np.ndarray, "transitions *lanes"]
     lost: Float[Array | np.ndarray, "transitions *lanes"]  # J, by which the energy fell
     modes: Float[Array | np.ndarray, "modes transitions *lanes"]  # after each
+
+    def times(
+        self, origin: Scalar, ts: Float[Array, "times"], goals: Float[Array, "times"], direction: Scalar
+    ) -> Float[Array, "transitions"]:
+        """Return when they happened, on the same side of each of the saved times `ts` as it has since the start, `goals`.
+
+        Sums with the `origin` would not tell where the two are a rounding apart.
+        """
+        if not len(self.ts):
+            return jnp.asarray(self.ts)
+        found = origin + self.ts
+        known = jax.lax.stop_gradient((ts, origin + goals, self.ts, goals, found))
+        ts, also, tau, goals, now = (direction * x for x in known)
+        number = jnp.searchsorted(goals, tau)  # of saved states that are before it
+        least = jnp.append(-jnp.inf, jnp.nextafter(jnp.maximum(ts, also), jnp.inf))[number]
+        most = jnp.append(jnp.minimum(ts, also), jnp.inf)[number]
+        return found + direction * (jnp.clip(now, least, most) - now)
 
 
 NONE_PASSED = Passed(np.zeros(0), np.zeros(0, np.int32), np.zeros(0), np.zeros((0, 0)))

@@ -196,8 +196,8 @@ class Functions:
         """Return the state and the modes after an event."""
         found = integrands.resets(t, self._state(y), self._args(shared))
         after = chosen(self.w, event, list(found))
-        state, modes = jnp.split(after, (self.form.q_and_v,))
-        return jnp.concatenate([state, y[self.form.q_and_v :], modes])
+        state, modes, rise = jnp.split(after, (self.form.q_and_v, len(after) - 1))
+        return jnp.concatenate([state, y[self.form.q_and_v :] - rise, modes])
 
     def _reset_at(self, event, t, parts: Sequence[Sequence], fixed: dict, modes: Sequence[Array]) -> tuple[list, list]:
         """Return the state after an event with its tangents, and its time with its tangents.

@@ -256,14 +256,22 @@ def monitored(
         disarmed = [(off > 0.0) | passed for off, passed in zip(p.every("disarmed"), over, strict=True)]
         return [[w.where(off, value, x) for x, off in zip(part, disarmed, strict=True)] for part, value in zip(found, (1.0, 0.0), strict=True)]
 
-    c_0, rate_0 = armed(events(t, y, k[0]))
+    def with_rises(found: list[list[Number]]) -> list[list[Number]]:
+        """Take those that have not been left with the other sign: one that rises above zero within a step and falls again happens again."""
+        if not form.transitions:
+            return found
+        off = p.every("disarmed")
+        return [[w.where(x > 0.0, -c, c_armed) for x, c, c_armed in zip(off, *pair, strict=True)] for pair in zip(found, armed(found), strict=True)]
+
+    at_begin = events(t, y, k[0])
+    c_0, rate_0 = armed(at_begin)
     at_end = events(new["t"], y1, k[1])
     c_1, rate_1 = armed(at_end)
     locating = w.equal(p["code"], LOCATING)
     # a motion that starts beyond an event has no motion at all; a state that is lost is no event
     sound = w.equal(w.sum_of_squares(range(form.y), lambda i: 0.0 * w.load(y, i)), 0.0)
     fresh = w.equal(p["accepted"] + p["rejected"], p["begun"] if form.transitions else 0.0) & sound
-    share = lowest(w, h, c_0, rate_0, c_1, rate_1)
+    share = lowest(w, h, *with_rises(at_begin), *with_rises(at_end))
     sunk, sinks = at_start(w, c_0, rate_0, c_1, p["direction"], p["last_goal"])
     again = any_of(sinks) & (w.magnitude(h) > reach_of_noise(w, p["last_goal"]))
     half = w.room()
@@ -306,6 +314,9 @@ def monitored(
     ends = found
     if form.transitions:
         goes = goes_on(w, form, changed["event"]) & (found | over)
+        # an event a rounding beyond the end of its step happens there: what is saved there is the state after it
+        now, a, b = (x * p["direction"] for x in (changed["t"], *search.t[:2]))
+        changed["t"] = p["direction"] * w.where(found, w.smaller(now, w.larger(a, b)), now)
         ends = found & ~goes
         noise = reach_of_noise(w, p["last_goal"])
         left = [~stays & is_left(w, x, rate, noise) for x, rate in zip(*at_end, strict=True)]

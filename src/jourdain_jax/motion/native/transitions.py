@@ -67,10 +67,10 @@ def reset_program(form: Form) -> Reset:
         return found
 
     c, after = chosen(of_events), [chosen(resets[i::each]) for i in range(each)]
-    kept = dict(zip([*y, *modes], after, strict=True))
+    kept = dict(zip([*y, *modes], after[:-1], strict=True))
     energy = graph.add(T, V)
     lost = graph.sub(energy, *graph.substituted([energy], kept))
-    state, modes_after, times = after[: form.q_and_v], after[form.q_and_v :], [t]
+    state, modes_after, times = after[: form.q_and_v], after[form.q_and_v : -1], [t]
     # each with its tangents, as many as are lifted so far
     work = [graph.input(f"tangent {k} of work", True) for k in range((1 + count) * form.with_work)]
     states = [[graph.input(f"tangent {k} of state {i}", True) for i in range(len(y))] for k in range(count)]
@@ -78,7 +78,7 @@ def reset_program(form: Form) -> Reset:
     known = [dict(enumerate([*fixed, *inputs]))]
     known += [{i: graph.input(f"tangent {k} of number {i}", True) for i in moving} for k, moving in enumerate(form.moving)]
     z = [part + work[k : k + 1] for k, part in enumerate([y, *states])]
-    state += z[0][form.q_and_v :]
+    state += [graph.sub(W, after[-1]) for W in z[0][form.q_and_v :]]  # to which what loads store is added at saved times
     while (parts := len(state) // form.y) <= count:
         before = [n for part in z[:parts] for n in part]
         along = {n: dn for k in range(parts) for n, dn in zip(z[k], z[k + parts], strict=True)}

@@ -210,8 +210,8 @@ class VectorField(eqx.Module):
         return event_values(scene, motion_at(scene, t, y.q, self.speeds(scene, fixed, t, y, inputs), inputs))
 
     def resets(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events rows *lanes"]:
-        """Coordinates, integrated speeds and modes after each event, in the order of their names; lanes only where `lowers_events`."""
-        found = event_resets(scene, motion_at(scene, t, y.q, self.speeds(scene, fixed, t, y, inputs), inputs))
+        """As `event_resets` has them, of the speeds those that are integrated; lanes only where `lowers_events`."""
+        found = event_resets(scene, motion_at(scene, t, y.q, self.speeds(scene, fixed, t, y, inputs), inputs), self.of_inputs)
         left_out = set(range(len(scene.speed_names))) - set(range(len(scene.speed_names)) if self.independent is None else self.independent)
         return jnp.delete(found, np.array([len(y.q) + k for k in sorted(left_out)], int), axis=1)
 
