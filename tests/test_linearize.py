@@ -517,10 +517,13 @@ def test_a_batch_says_which_bicycles_have_no_such_speed(bicycle, straight):
         assert_allclose(found.speed[k], linear.capsize_speed, rtol=1e-9)
 
 
-def test_a_chart_has_the_speeds_of_stability_as_its_boundaries(bicycle):
-    chart = jj.stability_chart(bicycle, {"c": (0.04, 0.12), "rear_spin_rate": (5.0, 35.0)}, points=3)
+def test_a_chart_has_the_speeds_of_stability_as_its_boundaries_and_what_measurements_leave_open(bicycle):
+    prior = {"w": jj.Normal(1.02, 0.01), "lam": jj.Normal(0.314, 0.005), "c": jj.Normal(0.08, 1.0)}
+    chart = jj.stability_chart(bicycle, {"c": (0.04, 0.12), "rear_spin_rate": (5.0, 35.0)}, points=3, prior=prior)
     linear = linear_speeds(0.12)
     assert_allclose([curve.speed[2] for _, curve in chart.boundaries], [linear.weave_speed, linear.capsize_speed], rtol=1e-12)
+    slopes = np.array([whipple_bicycle.AT_5["w"][2:], whipple_bicycle.AT_5["lam"][2:]])
+    assert_allclose([band[1] for band in chart.bands], np.hypot(0.01 * slopes[0], 0.005 * slopes[1]) / 0.3, rtol=1e-9)
     assert str(chart) == "weave, pair on the imaginary axis: 3 of 3 found\ncapsize, zero eigenvalue: 3 of 3 found"
 
 

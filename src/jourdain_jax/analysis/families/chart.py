@@ -5,11 +5,15 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.families.critical import CriticalPoint, critical
-from jourdain_jax.analysis.families.equations import DOUBLE
+from jourdain_jax.analysis.families.critical import CriticalPoint, followed_to, special_at
+from jourdain_jax.analysis.families.equations import DOUBLE, SteadyEquations, numbered
 from jourdain_jax.analysis.families.family import Family, family
+from jourdain_jax.calculus.reals import RUN_SELDOM, compiled
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers
+from jourdain_jax.scene.names import check_names
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
@@ -20,6 +24,7 @@ class StabilityChart(Printed):
 
     values: jax.Array  # of the first number, even ones
     boundaries: tuple[tuple[str, CriticalPoint], ...]  # mode, and a point for each value: NaN, with a code, where the curve has none
+    bands: tuple[Float[Array, "values"], ...]  # standard deviations of the second number; NaN without a prior
     middle: Family  # along the second number, in the middle of the first: it tells which side is stable
 
     def _text(self) -> str:
@@ -28,7 +33,13 @@ class StabilityChart(Printed):
 
 @of_known_numbers
 def stability_chart(
-    scene: Scene | BuiltFor, axes: Mapping[str, tuple[float, float]], *, guess: Mapping[str, float] | None = None, points: int = 101, **asked
+    scene: Scene | BuiltFor,
+    axes: Mapping[str, tuple[float, float]],
+    *,
+    guess: Mapping[str, float] | None = None,
+    prior: Mapping | None = None,
+    points: int = 101,
+    **asked,
 ) -> StabilityChart:
     """Find the boundaries of stability of steady motions in a plane of two numbers.
 
@@ -38,7 +49,11 @@ def stability_chart(
 
     **Arguments**
     - `axes`: a parameter of the scene, and a coordinate or a speed, each with its first and its last value.
-    - `guess`: named values of one of the motions (the rest zero); `points`: number of values of the first parameter, at least 3.
+    - `guess`: named values of one of the motions (the rest zero); `points`: number of values of the first
+      parameter, at least 3.
+    - `prior`: parameter (one number) -> `jj.Normal`, as `measured_bicycle(...).prior`: `chart.bands` are the
+      standard deviations that these make, to the first order and independent, where the first number keeps its
+      value.
     - `asked`: what `family` takes: `held`, `inputs`, `names`.
 
     A family along the second number, in the middle of the first, tells which boundaries there are; each is a `critical` point as a function of the first
@@ -52,9 +67,27 @@ def stability_chart(
     values = jnp.linspace(*ends, points)
     scene = as_scene(scene).replace(**{first: values[points // 2]})
     middle = family(scene, {**(guess or {}), second: begin}, until={second: end}, **asked)
-    boundaries = []
+    known, place, given = middle.equations, numbered(scene), dict(prior or {})
+    assert isinstance(known, SteadyEquations)
+    check_names(given, vars(place), f"`prior` names `{{}}`, no parameter of `{type(scene).__name__}`")
+    sigma, k = np.zeros(len(known.given)), known.index(second)
+    sigma[[getattr(place, name) for name in given]] = [one.sigma for one in given.values()]
+    sigma[getattr(place, first)] = 0.0
+    boundaries, bands = [], []
     for change in middle.changes:
         if change.kind != DOUBLE:
-            curve = [critical(scene.replace(**{first: x}), middle, change) for x in values]  # compiled in less time than a batch
-            boundaries.append((change.modes[0], jax.tree.map(lambda *x: jnp.stack(x), *curve)))
-    return StabilityChart(values, tuple(boundaries), middle)
+            special, curve = special_at(known, change), []
+            for x in values:  # compiled in less time than a batch
+                there = scene.replace(**{first: x})
+                X, inverse, *code = _followed_to(special, there)
+                numbers = special.given(special.numbers(there, X), X)
+                by_all = special.program.pulled(numbers, inverse[k]) if given else sigma * np.nan
+                spread = jnp.linalg.norm(by_all[: len(sigma)] * sigma) * known.size[k]
+                curve.append((special.point(there, X, *code), spread))
+            found, band = jax.tree.map(lambda *x: jnp.stack(x), *curve)
+            boundaries.append((change.modes[0], found))
+            bands.append(band)
+    return StabilityChart(values, tuple(boundaries), tuple(bands), middle)
+
+
+_followed_to = compiled(followed_to, options=RUN_SELDOM)

@@ -162,7 +162,7 @@ class _Program:
         nodes, variables = [*nodes, *beside], [*instant.given, *given]
         self._sloped = graph, nodes, [*(instant.given[k] for k in places), *given], variables, instant.guards
         self.values = differentiable(graph, nodes, variables)
-        self.pulled = jax.jit(lambda x, weights: jax.vjp(lambda x: self.values(x)[: len(weights)], x)[1](weights)[0])
+        self.pulled = jax.jit(lambda x, w: jax.vjp(self.values, x)[1](jnp.pad(w, (0, len(nodes)))[: len(nodes)])[0])
 
     @cached_property
     def of(self) -> Sloped:
@@ -178,7 +178,7 @@ def _program(equations: SteadyEquations) -> _Program:
 _program_of = once_per_class(_Program)
 
 
-class _Special(eqx.Module):
+class Special(eqx.Module):
     """The equations of a special point, and the point of the family from which it is followed as parameters change."""
 
     equations: SteadyEquations = eqx.field(static=True)
@@ -203,11 +203,11 @@ class _Special(eqx.Module):
         size = jnp.sqrt(a @ a + b @ b) if self.kind == PAIR else jnp.linalg.norm(a)
         return jnp.concatenate([z, a / size, b if self.kind == ZERO else b / size, w])
 
-    def given(self, scene: Scene, X: Unknowns) -> Float[Array, "all_numbers"]:
+    def given(self, numbers: Float[Array, "numbers"], X: Unknowns) -> Float[Array, "all_numbers"]:
         """What the program takes: all numbers, a, b, and S(w) by rows."""
         _, a, b, w = self.parts(X)
         of_w, fixed = np.array(SHAPES[self.kind])
-        return jnp.concatenate([self.numbers(scene, X), a, b, of_w * w + fixed])
+        return jnp.concatenate([numbers, a, b, of_w * w + fixed])
 
     def linear(self, near: Unknowns) -> tuple[Array, Array]:
         """Rows L with L X = c: what keeps its value, size and phase of a and b by a normal point near by, and w where it is zero."""
@@ -226,52 +226,61 @@ class _Special(eqx.Module):
     def equations_at(self, scene: Scene, X: Unknowns, near: Unknowns) -> Array:
         """G."""
         L, c = self.linear(near)
-        return jnp.concatenate([self.program.values(self.given(scene, X)), L @ X - c])
+        return jnp.concatenate([self.program.values(self.given(self.numbers(scene, X), X)), L @ X - c])
 
     def correction(self, scene: Scene, X: Unknowns, near: Unknowns) -> tuple[Array, Array, Array]:
         """The step of Gauss and Newton, the pseudo-inverse of G_X, and its least pivot over the largest."""
-        (L, c), (G, D, _), of_w = self.linear(near), self.program.of(self.given(scene, X)), np.array(SHAPES[self.kind][0])
+        (L, c), of_w = self.linear(near), np.array(SHAPES[self.kind][0])
+        G, D, _ = self.program.of(self.given(self.numbers(scene, X), X))
         size = np.concatenate([self.equations.size, np.ones(2 * len(self.equations.states))])
         Q, T = jnp.linalg.qr(jnp.concatenate([jnp.column_stack([D[:, :-4] * size, D[:, -4:] @ of_w]), L]))
         inverse, pivots = jax.scipy.linalg.solve_triangular(T, Q.T), jnp.abs(jnp.diagonal(T))
         return inverse @ jnp.concatenate([G, L @ X - c]), inverse, jnp.min(pivots) / jnp.max(pivots)
 
+    def point(self, scene: Scene, X: Unknowns, condition, code) -> CriticalPoint:
+        """The point of a scene at X."""
+        of, w = self.equations, self.parts(X)[-1][0]
+        q, u, varied = of.split(self.numbers(scene, X))
+        eigenvalue = jax.lax.complex(*((0 * w, w) if self.kind == PAIR else (w, 0 * w)))
+        return CriticalPoint(state_of(scene, of.t, q, u), varied, eigenvalue, condition, code, self.kind)
+
 
 @partial(compiled, options=RUN_SELDOM)
-def _solution(special: _Special, scene: Scene) -> tuple[Array, Array, Array, Array]:
-    """All numbers at the point and w, differentiable twice; its condition and code, of which all is NaN unless it is 0."""
-    X, inverse, condition, code = jax.lax.stop_gradient(_found(special, jax.lax.stop_gradient(scene)))
+def _solution(special: Special, scene: Scene) -> tuple[Array, Array, Array]:
+    """X, differentiable twice, its condition and code, of which all is NaN unless it is 0."""
+    X, inverse, condition, code = jax.lax.stop_gradient(followed_to(special, jax.lax.stop_gradient(scene)))
     near = X
     for _ in range(2):  # each carries one order of derivatives
         X = X - inverse @ special.equations_at(scene, X, near)
-    X = X * jnp.where(code == FOUND, 1.0, jnp.nan)
-    return special.numbers(scene, X), special.parts(X)[-1][0], condition, code
+    return X, condition, code
 
 
-def _found(special: _Special, scene: Scene) -> tuple[Array, Array, Array, Array]:
-    """X, the pseudo-inverse of G_X, its least pivot over the largest, and a code.
+def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Array]:
+    """X, the pseudo-inverse of G_X, its least pivot over the largest, and a code: all is NaN unless it is 0.
 
     Parameters go straight from those of the family to these; steps are cut where corrections do not shrink at once, so that none leads to another point.
     """
+
+    def corrected(there: Scene, near: Unknowns):
+        def once(X, _):
+            change, inverse, condition = special.correction(there, X, near)
+            return X - change, (largest(change), inverse, condition)
+
+        return jax.lax.scan(once, near, length=3)
 
     def once(carried):
         X, done, step, count = carried
         share = jnp.minimum(done + step, 1.0)
         there = jax.tree.map(lambda a, b: a + share * (b - a), special.equations.scene, scene)
-
-        def corrected(new, _):
-            change = special.correction(there, new, X)[0]
-            return new - change, largest(change)
-
-        new, (first, second, third) = jax.lax.scan(corrected, X, length=3)
+        new, ((first, second, third), *_) = corrected(there, X)
         good = (first < 0.1) & (second <= 0.2 * first + 1e-9) & (third <= 0.2 * second + 1e-9)
         return jnp.where(good, special.normal(new), X), jnp.where(good, share, done), jnp.where(good, 2 * step, step / 4), count + 1
 
     start = special.normal(special.X), jnp.zeros(()), jnp.ones(()), jnp.zeros((), jnp.int32)
     X, done, *_ = jax.lax.while_loop(lambda c: (c[1] < 1) & (c[2] > 1e-3) & (c[3] < 100), once, start)
-    change, inverse, condition = special.correction(scene, X, X)
-    left = largest(special.equations_at(scene, X - change, X))
-    return X - change, inverse, condition, jnp.where((done == 1) & (left < 1e-8), jnp.where(condition < 1e-6, SINGULAR, FOUND), NOT_FOUND)
+    X, (left, inverses, conditions) = corrected(scene, X)
+    code = jnp.where((done == 1) & (left[-1] < 1e-8), jnp.where(conditions[-1] < 1e-6, SINGULAR, FOUND), NOT_FOUND)
+    return X * jnp.where(code == FOUND, 1.0, jnp.nan), inverses[-1], conditions[-1], code
 
 
 @shown_from_users_lines
@@ -297,12 +306,8 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
     if type(scene) is not type(equations.scene):
         raise ValueError(f"the family is one of `{type(equations.scene).__name__}`, and the scene a `{type(scene).__name__}`")
     with jax.ensure_compile_time_eval():
-        point = _chosen(motions, what)
-        special = _special(equations, point)
-    numbers, w, condition, code = _solution(special, scene)
-    q, u, varied = equations.split(numbers)
-    eigenvalue = jax.lax.complex(*((0 * w, w) if point.kind == PAIR else (w, 0 * w)))
-    return CriticalPoint(state_of(scene, equations.t, q, u), varied, eigenvalue, condition, code, point.kind)
+        special = special_at(equations, _chosen(motions, what))
+    return special.point(scene, *_solution(special, scene))
 
 
 def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:
@@ -316,7 +321,7 @@ def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:
     return min(found, key=lambda point: largest(curve.equations.place(point) - start))
 
 
-def _special(equations: SteadyEquations, point: FamilyPoint) -> _Special:
+def special_at(equations: SteadyEquations, point: FamilyPoint) -> Special:
     """The equations, with vectors a and b at the point of the family."""
     z, s = equations.place(point), point.eigenvalues
     look = equations(z)
@@ -339,4 +344,4 @@ def _special(equations: SteadyEquations, point: FamilyPoint) -> _Special:
         a = np.linalg.svd(moved)[2][-1]
         a, b = E @ a, E @ np.linalg.lstsq(np.vstack([moved, a]), np.append(a, 0.0), rcond=None)[0]
     X = jnp.asarray(np.concatenate([z, a, b, [w]]))
-    return _Special(equations, _program(equations), point.kind, X)
+    return Special(equations, _program(equations), point.kind, X)
