@@ -527,6 +527,30 @@ def test_a_chart_has_the_speeds_of_stability_as_its_boundaries_and_what_measurem
     assert str(chart) == "weave, pair on the imaginary axis: 3 of 3 found\ncapsize, zero eigenvalue: 3 of 3 found"
 
 
+class Twice(OnLine):
+    """A particle on a spring and in a medium that both nearly give way at a place, by a closed form: twice, and 1 mm apart, or not at all."""
+
+    push: float = jj.parameter(-0.1)
+    place: float = jj.parameter(0.0123)
+    apart: float = jj.parameter(1e-6)  # square of the distance
+    damped: float = jj.parameter(1.0)
+
+    def loads(self, motion):
+        x = motion.q.x - self.place
+        drag = self.damped + (1 - self.damped) * (12 * x**2 - 3 * self.apart)
+        spring = self.damped * (x**3 - 0.75 * self.apart * x) + (1 - self.damped) * x
+        return (jj.generalized_force(motion, x_rate=self.push - drag * motion.u.x_rate - spring),)
+
+
+@pytest.mark.parametrize("place", [0.0123, 0.05, 0.0877])
+@pytest.mark.parametrize(("damped", "kind"), [(1.0, "fold in push"), (1.0, "zero eigenvalue"), (0.0, "pair on the imaginary axis")])
+def test_two_special_points_a_hundredth_of_a_step_apart_are_found(place, damped, kind):
+    for apart, expected in ((1e-6, [-5e-4, 5e-4]), (-1e-6, [])):
+        scene = Twice(place=place, apart=apart, damped=damped)
+        found = jj.family(scene, {"x": -0.45}, vary="push", until={"push": 0.6}).special
+        assert_allclose([point["x"] - place for point in found if point.kind == kind], expected, atol=1e-7)
+
+
 class Fluttering(OnLine):
     """A particle on a stiffening spring under a constant push, with a drag and a gain that feeds its speed back."""
 

@@ -6,9 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from jourdain_jax.analysis.families.curve import CLOSED, Point, Targets, located, reversed_at, solved, traced
+from jourdain_jax.analysis.families.curve import CLOSED, Point, Targets, along, located, reversed_at, solved, traced
 from jourdain_jax.analysis.families.equations import Motions, Vector
-from jourdain_jax.analysis.families.special import Crossing, branches, changes, folds, tangents_across
+from jourdain_jax.analysis.families.special import Test, dip, tangents_across, tests_between
 from jourdain_jax.calculus.reals import largest
 
 
@@ -24,17 +24,35 @@ def followed(equations: Motions, begin: Point, targets: Targets, most: int) -> t
     return [*(reversed_at(point) for point in reversed(back[1:])), *points], (first, last)
 
 
-def special(equations: Motions, points: Sequence[Point], turning: dict[str, int]) -> Iterator[tuple[Crossing, Point]]:
+def special(equations: Motions, points: Sequence[Point], turning: dict[str, int]) -> Iterator[tuple[Test, Point]]:
     """What is special between the points, in their order."""
-    for here, there in pairwise(points):
+    for here, there in pairwise(_with_dips(equations, points, turning)):
         found = []
-        for crossing in (*branches(here, there), *folds(here, there, turning), *changes(equations, here, there)):
-            point = located(equations, here, there, crossing.test, bool(crossing.columns))
-            found.append((crossing, point) if point else (replace(crossing, kind=f"{crossing.kind}, before this point"), there))
-        branch = next((point for crossing, point in found if crossing.kind == "branch point"), None)
+        for test in tests_between(equations, here, there, turning):
+            if test.changes(here, there):
+                point = located(equations, here, there, test.of, bool(test.columns))
+                found.append((test, point) if point else (replace(test, kind=f"{test.kind}, before this point"), there))
+        branch = next((point for test, point in found if test.kind == "branch point"), None)
         if branch is not None:  # beside it tangents have few digits: what lies as close as this lies there
-            found = [(crossing, branch if largest(point.z - branch.z) < 1e-4 else point) for crossing, point in found]
+            found = [(test, branch if largest(point.z - branch.z) < 1e-4 else point) for test, point in found]
         yield from sorted(found, key=lambda pair: here.tangent @ (pair[1].z - here.z))
+
+
+def _with_dips(equations: Motions, points: Sequence[Point], turning: dict[str, int]) -> list[Point]:
+    """The points, and one wherever a test nearly vanishes between them, not beside branch points: two special points may be there within a step."""
+    points, k = list(points), 1
+    while k < len(points) - 1:
+        _, here, there = three = points[k - 1 : k + 2]
+        at = tuple(float(here.tangent @ (point.z - here.z)) for point in three)
+        branch, *tests = ((tuple(map(test.of, three)), test.least) for test in tests_between(equations, here, there, turning))
+        beside = min(branch[0]) * max(branch[0]) < 0
+        s = None if beside else next((s for one in (branch, *tests) if (s := dip(at, *one)) is not None), None)
+        new = None if s is None else along(equations, here, s)
+        if s is None or new is None:
+            k += 1
+        else:
+            points.insert(k + (s > 0), new)
+    return points
 
 
 def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:

@@ -5,6 +5,8 @@ branch point                det (U'J; t) = 0              U: the rows that J hol
 zero eigenvalue             s = 0, real
 pair on the imaginary axis  Re s = 0, complex
 double root                 (s_a - s_b)^2 = 0             a pair of real ones becomes complex, or the reverse
+
+Where a test keeps its sign and nearly vanishes by the parabola through three neighbours, it is looked at there: it may change its sign twice within a step.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,47 +23,53 @@ SURE = 1e-7  # relative to 1 + |s|: a real part, or a distance of two eigenvalue
 
 
 @dataclass(frozen=True)
-class Crossing:
-    """A test that changes its sign between two neighbours."""
+class Test:
+    """What changes its sign at a special point of a kind, and by how much it surely does."""
 
     kind: str
-    test: Callable[[Point], float]
+    of: Callable[[Point], float]
+    least: float
     columns: tuple[int, ...] = ()  # of the eigenvalues concerned
 
-
-def folds(here: Point, there: Point, unknowns: dict[str, int]) -> Iterator[Crossing]:
-    """Folds of the named unknowns."""
-    for name, k in unknowns.items():
-        if here.tangent[k] * there.tangent[k] < 0 and min(abs(here.tangent[k]), abs(there.tangent[k])) > 1e-10:  # not round-off
-            yield Crossing(f"fold in {name}", lambda p, k=k: p.tangent[k])
+    def changes(self, here: Point, there: Point) -> bool:
+        """Whether it changes its sign between two neighbours."""
+        a, b = self.of(here), self.of(there)
+        return a * b < 0 and min(abs(a), abs(b)) > self.least
 
 
-def branches(here: Point, there: Point) -> Iterator[Crossing]:
-    """A branch point."""
+def dip(at: tuple[float, ...], f: tuple[float, ...], least: float) -> float | None:
+    """Where a test with the values f at three neighbours, the second at zero, nearly vanishes by a parabola through them; None where it changes its sign."""
+    (before, _, after), (a, b, c) = at, f
+    if min(f) * max(f) <= 0 or min(map(abs, f)) <= least or not before < 0 < after:
+        return None
+    low, high = (a - b) / before, (c - b) / after
+    curvature = (high - low) / (after - before)
+    slope = low - curvature * before
+    s = -slope / (2 * curvature) if curvature * b > 0 else after
+    near = min(abs(s - x) for x in at) < 1e-4 * (after - before)
+    return s if before < s < after and not near and 1 + slope * s / (2 * b) < 0.02 * max(a / b, 1.0, c / b) else None
+
+
+def tests_between(equations: Motions, here: Point, there: Point, unknowns: dict[str, int]) -> Iterator[Test]:
+    """The tests between two neighbours: of folds of the named unknowns, branch points, and what eigenvalues do."""
     held = len(here.z) - 1
     U = np.linalg.svd(here.look.J)[0][:, :held]
 
-    def test(point: Point) -> float:
+    def branch(point: Point) -> float:
         side = np.linalg.slogdet(np.vstack([U.T @ point.look.J, point.tangent]))[0]
         return float(side * np.linalg.svd(point.look.J, compute_uv=False)[held - 1])
 
-    if test(here) * test(there) < 0:
-        yield Crossing("branch point", test)
-
-
-def changes(equations: Motions, here: Point, there: Point) -> Iterator[Crossing]:
-    """Eigenvalues that pass zero or the imaginary axis, and pairs that meet."""
+    yield Test("branch point", branch, 0.0)
+    for name, k in unknowns.items():
+        yield Test(f"fold in {name}", lambda p, k=k: p.tangent[k], 1e-10)
     before, now = here.modes, there.modes
-    for k, (a, b) in enumerate(zip(equations.growth(before), equations.growth(now), strict=True)):
-        if a * b < 0 and min(abs(a), abs(b)) > SURE * (1 + abs(before[k])) and before[k].imag >= 0 and (before[k].imag == 0) == (now[k].imag == 0):
-            columns = tuple(np.flatnonzero(np.isin(before, (before[k], np.conj(before[k])))).tolist())
-            yield Crossing(equations.crossing(before[k]), lambda point, k=k: float(equations.growth(point.modes)[k]), columns)
+    for k, s in enumerate(before):
+        if s.imag >= 0 and (s.imag == 0) == (now[k].imag == 0):
+            columns = tuple(np.flatnonzero(np.isin(before, (s, np.conj(s)))).tolist())
+            yield Test(equations.crossing(s), lambda p, k=k: float(equations.growth(p.modes)[k]), SURE * (1 + abs(s)), columns)
     for a, b in combinations(range(len(before)), 2):
-        test = lambda point, a=a, b=b: float(((point.modes[a] - point.modes[b]) ** 2).real)  # noqa: E731
-        values = test(here), test(there)
-        least = (SURE * (1 + abs(before[a]))) ** 2
-        if are_partners(before, now, a, b) and values[0] * values[1] < 0 and min(map(abs, values)) > least:
-            yield Crossing(DOUBLE, test, (a, b))
+        if are_partners(before, now, a, b):
+            yield Test(DOUBLE, lambda p, a=a, b=b: float(((p.modes[a] - p.modes[b]) ** 2).real), (SURE * (1 + abs(before[a]))) ** 2, (a, b))
 
 
 def tangents_across(equations: Motions, z: Vector) -> list[Vector]:
