@@ -2,16 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.families.critical import CriticalPoint, followed_to, special_at
+from jourdain_jax.analysis.families.critical import CriticalPoint, Special, followed_to, special_at
 from jourdain_jax.analysis.families.equations import DOUBLE, SteadyEquations, numbered
 from jourdain_jax.analysis.families.family import Family, family
-from jourdain_jax.calculus.reals import RUN_SELDOM, compiled
+from jourdain_jax.calculus.reals import RUN_SELDOM, Scalar, compiled
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers
 from jourdain_jax.scene.names import check_names
 from jourdain_jax.scene.printing import Printed
@@ -22,9 +22,9 @@ from jourdain_jax.scene.scene import Scene
 class StabilityChart(Printed):
     """Curves on which modes pass the axis of stability; `mode, curve = chart.boundaries[0]`, `curve["rear_spin_rate"]`."""
 
-    values: jax.Array  # of the first number, even ones
+    values: Float[np.ndarray, "values"]  # of the first number, even ones
     boundaries: tuple[tuple[str, CriticalPoint], ...]  # mode, and a point for each value: NaN, with a code, where the curve has none
-    bands: tuple[Float[Array, "values"], ...]  # standard deviations of the second number; NaN without a prior
+    bands: tuple[Float[np.ndarray, "values"], ...]  # standard deviations of the second number; NaN without a prior
     middle: Family  # along the second number, in the middle of the first: it tells which side is stable
 
     def _text(self) -> str:
@@ -64,8 +64,8 @@ def stability_chart(
     if not isinstance(axes, Mapping) or len(axes) != 2:
         raise ValueError(f"`axes` is {axes!r}, expected two axes: a parameter, and a coordinate or a speed, each with its first and its last value")
     (first, ends), (second, (begin, end)) = axes.items()
-    values = jnp.linspace(*ends, points)
-    scene = as_scene(scene).replace(**{first: values[points // 2]})
+    values = np.linspace(*ends, points)
+    scene = [as_scene(scene).replace(**{first: x}) for x in (*ends, values[points // 2])][-1]  # the ends are values that it may have
     middle = family(scene, {**(guess or {}), second: begin}, until={second: end}, **asked)
     known, place, given = middle.equations, numbered(scene), dict(prior or {})
     assert isinstance(known, SteadyEquations)
@@ -78,16 +78,18 @@ def stability_chart(
         if change.kind != DOUBLE:
             special, curve = special_at(known, change), []
             for x in values:  # compiled in less time than a batch
-                there = scene.replace(**{first: x})
-                X, inverse, *code = _followed_to(special, there)
-                numbers = special.given(special.numbers(there, X), X)
-                by_all = special.program.pulled(numbers, inverse[k]) if given else sigma * np.nan
-                spread = jnp.linalg.norm(by_all[: len(sigma)] * sigma) * known.size[k]
-                curve.append((special.point(there, X, *code), spread))
-            found, band = jax.tree.map(lambda *x: jnp.stack(x), *curve)
+                point, numbers, inverse = _followed_to(special, scene, first, np.asarray(x))
+                by_all = np.asarray(special.program.pulled(numbers, inverse[k])) if given else np.full(len(numbers), np.nan)
+                curve.append((point, np.linalg.norm(by_all[: len(sigma)] * sigma) * known.size[k]))
+            found, band = jax.tree.map(lambda *x: np.stack(x), *curve)
             boundaries.append((change.modes[0], found))
             bands.append(band)
     return StabilityChart(values, tuple(boundaries), tuple(bands), middle)
 
 
-_followed_to = compiled(followed_to, options=RUN_SELDOM)
+@partial(compiled, options=RUN_SELDOM)
+def _followed_to(special: Special, scene: Scene, first: str, x: Scalar) -> tuple[CriticalPoint, Array, Array]:
+    """The point of a scene with this value, all that the program takes there, and the pseudo-inverse of the equations' slopes."""
+    scene = scene.replace(**{first: x})
+    X, inverse, *found = followed_to(special, scene)
+    return special.point(scene, X, *found), special.given(special.numbers(scene, X), X), inverse

@@ -161,8 +161,8 @@ class _Program:
             beside += found[m:]
         nodes, variables = [*nodes, *beside], [*instant.given, *given]
         self._sloped = graph, nodes, [*(instant.given[k] for k in places), *given], variables, instant.guards
-        self.values = differentiable(graph, nodes, variables)
-        self.pulled = jax.jit(lambda x, w: jax.vjp(self.values, x)[1](jnp.pad(w, (0, len(nodes)))[: len(nodes)])[0])
+        self.values, self.rows = differentiable(graph, nodes, variables), len(nodes)
+        self.pulled = jax.jit(lambda x, w: jax.vjp(self.values, x)[1](jnp.pad(w, (0, self.rows))[: self.rows])[0])
 
     @cached_property
     def of(self) -> Sloped:
@@ -261,26 +261,26 @@ def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Ar
     Parameters go straight from those of the family to these; steps are cut where corrections do not shrink at once, so that none leads to another point.
     """
 
-    def corrected(there: Scene, near: Unknowns):
-        def once(X, _):
-            change, inverse, condition = special.correction(there, X, near)
-            return X - change, (largest(change), inverse, condition)
-
-        return jax.lax.scan(once, near, length=3)
-
     def once(carried):
-        X, done, step, count = carried
+        near, done, step, count, *_ = carried
         share = jnp.minimum(done + step, 1.0)
         there = jax.tree.map(lambda a, b: a + share * (b - a), special.equations.scene, scene)
-        new, ((first, second, third), *_) = corrected(there, X)
-        good = (first < 0.1) & (second <= 0.2 * first + 1e-9) & (third <= 0.2 * second + 1e-9)
-        return jnp.where(good, special.normal(new), X), jnp.where(good, share, done), jnp.where(good, 2 * step, step / 4), count + 1
 
-    start = special.normal(special.X), jnp.zeros(()), jnp.ones(()), jnp.zeros((), jnp.int32)
-    X, done, *_ = jax.lax.while_loop(lambda c: (c[1] < 1) & (c[2] > 1e-3) & (c[3] < 100), once, start)
-    X, (left, inverses, conditions) = corrected(scene, X)
-    code = jnp.where((done == 1) & (left[-1] < 1e-8), jnp.where(conditions[-1] < 1e-6, SINGULAR, FOUND), NOT_FOUND)
-    return X * jnp.where(code == FOUND, 1.0, jnp.nan), inverses[-1], conditions[-1], code
+        def corrected(X, _):
+            change, *beside = special.correction(there, X, near)
+            return X - change, (largest(change), *beside)
+
+        X, ((first, second, third), inverses, conditions) = jax.lax.scan(corrected, near, length=3)
+        good = (first < 0.1) & (second <= 0.2 * first + 1e-9) & (third <= 0.2 * second + 1e-9)
+        found = (done == 1) & (third < 1e-8), X, inverses[-1], conditions[-1]
+        return jnp.where(good, special.normal(X), near), jnp.where(good, share, done), jnp.where(good, 2 * step, step / 4), count + 1, *found
+
+    X, zero = special.normal(special.X), jnp.zeros(())
+    inverse = jnp.zeros((len(X), special.program.rows + len(special.linear(X)[1])))
+    start = X, zero, jnp.ones(()), jnp.zeros((), jnp.int32), jnp.array(False), X, inverse, zero
+    *_, found, X, inverse, condition = jax.lax.while_loop(lambda c: ~c[4] & (c[2] > 1e-3) & (c[3] < 100), once, start)
+    code = jnp.where(found, jnp.where(condition < 1e-6, SINGULAR, FOUND), NOT_FOUND)
+    return X * jnp.where(code == FOUND, 1.0, jnp.nan), inverse, condition, code
 
 
 @shown_from_users_lines
