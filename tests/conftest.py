@@ -70,17 +70,28 @@ def _types_are_checked():
 def _less_effort():
     """Machine code of our own is made with less effort, which changes no bit of a number, and XLA's programs of a file share a context of MLIR.
 
-    JAX makes one for each, at 3 ms and a megabyte. A program that is lowered while another is gets its own.
+    JAX makes one for each, at 3 ms and a megabyte. A program that is lowered while another is gets its own. And JAX does not note for each operation
+    all the lines that led to it, which took 3 to 5 % of a first motion.
     """
+    from jax._src import source_info_util
     from jax._src.interpreters import mlir
 
     from jourdain_jax.native import host
 
-    make, shared = mlir.make_ir_context, mlir.make_ir_context()
+    make, shared, noting = mlir.make_ir_context, mlir.make_ir_context(), source_info_util.current
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(host, "EFFORT", 0)
         patch.setattr(mlir, "make_ir_context", lambda: make() if mlir.ir.Context.current else shared)
-        yield
+        patch.setattr(source_info_util, "current", lambda: source_info_util._source_info_context.context)
+        yield noting
+
+
+@pytest.fixture
+def lines_are_noted(monkeypatch, _less_effort):
+    """JAX notes the lines of each operation, as outside of tests."""
+    from jax._src import source_info_util
+
+    monkeypatch.setattr(source_info_util, "current", _less_effort)
 
 
 MOST_RESIDENT = 1.9e9  # bytes of a process between files: two workers, with what a file adds, stay below 5 GB

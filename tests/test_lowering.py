@@ -345,6 +345,7 @@ class Looped(jj.Scene):
         return {"row": motion.u.y_rate - self.asked("rows", motion.q.x)}
 
 
+@pytest.mark.usefixtures("lines_are_noted")
 @pytest.mark.parametrize("where", ["bodies", "loads", "rows"])
 def test_a_loop_that_does_not_end_is_named(where, monkeypatch):
     monkeypatch.setattr(Looped, "where", where)

@@ -27,7 +27,6 @@ def _motions(scene, starts=None, **options):
 @pytest.mark.parametrize(
     ("name", "options"),
     [
-        ("tilting-disc", {"t1": 3.0, "rtol": 1e-9, "atol": 1e-9}),
         ("tilting-disc", {"t1": 3.0, "rtol": 1e-5, "atol": 1e-5}),
         ("chaplygin-sleigh", {"ts": [7.0]}),
         ("whipple-bicycle", {"ts": [1.0, 2.0]}),
@@ -101,7 +100,7 @@ def test_no_bit_depends_on_the_effort_spent_on_machine_code_or_the_number_of_thr
         assert kernels.kernel.cache_info().currsize > 0
 
 
-def test_lanes_of_a_rollout_are_those_of_xla():
+def test_lanes_of_a_rollout_are_those_of_xla_step_by_step():
     disc = jj.models.TiltingDisc()
     starts = {"lean": jnp.asarray([0.1, 0.3, jnp.nan, 1.2, 0.2, 0.7, 0.0, 0.5, -0.4]), "spin_rate": jnp.linspace(-4.0, 0.0, 9)}
     ours, theirs = (jj.rollout(disc, starts, ts=[0.5, 1.0], backend=backend) for backend in ("native", "xla"))
@@ -109,6 +108,9 @@ def test_lanes_of_a_rollout_are_those_of_xla():
     assert_array_equal(ours.lanes.accepted, theirs.lanes.accepted)
     assert_array_equal(ours.lanes.rejected, theirs.lanes.rejected)
     assert_allclose(ours.lanes.q_end, theirs.lanes.q_end, rtol=1e-10, atol=1e-10)
+    for name in ("q", "u", "u_end", "t_end", "smallest_pivot"):
+        of_ours, of_theirs = (getattr(each.lanes, name)[each.result == results.SUCCESS] for each in (ours, theirs))
+        assert_allclose(of_ours, of_theirs, rtol=1e-10, atol=1e-10)
 
 
 def test_it_is_said_why_machine_code_is_not_taken(monkeypatch):

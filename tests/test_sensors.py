@@ -6,7 +6,6 @@ A cart with a spring and a damper is linear, so that its readings are sums of ex
 
 import jax
 import jax.numpy as jnp
-import machine_code
 import numpy as np
 import pages
 import pytest
@@ -240,17 +239,6 @@ def test_intervals_that_a_bound_makes_too_narrow_are_named():
     near = jj.fit(Cart(), late(3, 0.0, tau=jj.Estimate(0.05)), ("mass",))
     assert near["late.lag"].low > 0.0
     assert near.warning.startswith("the interval of `late.lag` is too narrow, and so may be those of others: up to a bound nearby")
-
-
-@machine_code.needed
-def test_a_likelihood_with_sensors_is_the_same_by_machine_code_and_by_xla():
-    data = run(4, gain=1.2, delay=0.05)
-
-    def likelihood(mass, backend):
-        return jj.log_likelihood(Cart(mass=mass), data, backend=backend)
-
-    native, xla = (jax.jit(lambda m, backend=backend: jax.jvp(lambda m: likelihood(m, backend), (m,), (1.0,)))(1.8) for backend in ("native", "xla"))
-    assert_allclose(native, xla, rtol=1e-7)
 
 
 def test_other_numbers_of_a_sensor_compile_nothing(compilations):
