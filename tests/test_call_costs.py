@@ -160,8 +160,8 @@ def test_a_warm_call_from_python_is_short():
     """Counted in calls of Python functions, which no other load on the machine changes, and in files of our own, in a process that checks no types."""
     done = subprocess.run([sys.executable, "-c", WARM_CALL], capture_output=True, text=True, check=True)
     of_names, of_state, *files = done.stdout.split()
-    assert int(of_state) < 720  # 626 at the time of writing
-    assert int(of_names) < 1230  # 1120 at the time of writing: a program for the start, and one for the motion
+    assert int(of_state) < 590  # 536 at the time of writing
+    assert int(of_names) < 760  # 698 at the time of writing: a program for the start, and one for the motion
     assert len(files) <= MOST_FILES, files
 
 

@@ -201,8 +201,8 @@ def described(value) -> str:
 
 def is_traced(*trees) -> bool:
     """Whether any leaf is being traced, so that its number is not known."""
-    known = len(trees) == 1 and isinstance(trees[0], float | int | np.ndarray)  # no tree, and this takes a tenth of the time
-    return not known and any(is_traced_type(type(leaf)) for leaf in jax.tree.leaves(trees))
+    unknown = [tree for tree in trees if not isinstance(tree, float | int | np.ndarray)]  # no trees, and this takes a tenth of the time
+    return bool(unknown) and any(map(is_traced_type, map(type, jax.tree.leaves(unknown))))
 
 
 def known_numbers(x) -> np.ndarray:

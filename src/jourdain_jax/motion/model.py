@@ -298,8 +298,9 @@ def modelled(scene: Scene | BuiltFor, formulation: Formulation | None = None, ba
             return scene
         decided, memory, scene = scene.decided, scene.memory, scene.scene
     asked, scene = as_formulation(formulation), as_scene(scene)
-    in_words = asked.reduction is None and asked.baumgarte is None and isinstance(backend, str)  # these are compared in no time
-    made = _kept(scene, asked.state, asked.stabilisation, backend) if in_words else {}
+    stabilisation = asked.stabilisation
+    in_words = isinstance(stabilisation, str | None) and isinstance(backend, str) and asked.reduction is None  # these are compared in no time
+    made = _kept(scene, asked.state, stabilisation, backend) if in_words else {}
     return Model(scene, asked, backend, decided, memory, made)
 
 

@@ -176,9 +176,9 @@ class Guess(NamedTuple):
 
     q: Float[Array | np.ndarray, "coordinates"]
     u: Float[Array | np.ndarray, "speeds"]
-    free_q: Bool[np.ndarray, "coordinates"]
-    free_u: Bool[np.ndarray, "speeds"]
-    bounded: Bool[np.ndarray, "coordinates"]  # which must end inside the domain that the scene states
+    free_q: Bool[Array | np.ndarray, "coordinates"]
+    free_u: Bool[Array | np.ndarray, "speeds"]
+    bounded: Bool[Array | np.ndarray, "coordinates"]  # which must end inside the domain that the scene states
     usual: Usual
 
     def inside(self, q) -> Bool[Array, "coordinates"]:

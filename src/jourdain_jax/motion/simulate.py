@@ -125,19 +125,20 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
         max_step = solver.step
     native = options.backend in ("auto", "native")
     inputs = model.inputs(inputs)
+    constant = inputs.constant
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
     start, usual = _start(model, start, t0, inputs)
-    field = model.field(inputs.constant, bool(options.work))
+    field, dtype = model.field(constant, bool(options.work)), start.q.dtype
     field = solver.fitted(scene, field, model.state) if isinstance(solver, ImplicitMethod) else field
-    if not inputs.constant:
+    if not constant:
         check_inputs_in_rows(scene, inputs, t0, t1)
-    static: dict[str, Any] = {"max_steps": options.max_steps, "event_names": field.event_names if options.events or not all(field.stops) else ()}
-    static["alongside"] = options.alongside
+    events = field.event_names if options.events or not all(field.stops) else ()
+    static: dict[str, Any] = {"max_steps": options.max_steps, "event_names": events, "alongside": options.alongside}
     own = own_steps(solver, **static, native=native, order=order, memory=options.memory or MEMORY, most=options.max_transitions, stopping=options.events)
     integrator = diffrax_steps.Diffrax(cast(Any, solver), **static) if own is None else own
-    tolerances = tuple(as_array(x, start.q.dtype) for x in (options.rtol, options.atol))  # arrays: another tolerance is no other program
+    tolerances = tuple(as_array(x, dtype) for x in (options.rtol, options.atol))  # arrays: another tolerance is no other program
     first_step = (1.0 if isinstance(solver, FixedStepMethod) else 1e-4) * (t1 - t0)  # diffrax's own guess costs two more copies of the vector field to compile
-    longest = as_array(LONGEST * abs(t1 - t0) if max_step is None else max_step, start.q.dtype)
+    longest = LONGEST * abs(t1 - t0) if max_step is None else as_array(max_step, dtype)
     setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, longest, integrator, usual, model.decided)
     if own is None:
         diffrax_steps.check(setup)
@@ -152,7 +153,7 @@ _BY_SERIES = "solver=jj.Taylor()", "omit `solver`, or use solver=diffrax.Dopri8(
 
 def _start(model: Model, given, t0, inputs: Inputs) -> tuple[State, Usual | None]:
     """Return the start on its constraints; or a `State` as it is, and the sizes by which the program that integrates projects it."""
-    if not (model.formulation.projects and isinstance(given, State)):
+    if not (isinstance(given, State) and model.formulation.projects):
         return as_state(model, given, t0=t0, inputs=inputs_at(inputs, t0)), None
     q, u = as_coordinates(model.scene, given.q), as_speeds(model.scene, given.u)
     as_given = q is given.q and u is given.u
@@ -181,7 +182,7 @@ DEFAULT_SAMPLES = 201
 _EVEN = np.linspace(0.0, 1.0, DEFAULT_SAMPLES)
 
 
-def as_state(model: Model | Scene, given, *, what: str = "start", t0=0.0, inputs=None) -> State:
+def as_state(model: Model | Scene, given, *, what: str = "start", t0=None, inputs=None) -> State:
     """A state from a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for the scene's example.
 
     `inputs`: the scene's inputs at that instant, a vector or by name (default: zero); they count where velocity rows depend on them.
@@ -194,28 +195,28 @@ def as_state(model: Model | Scene, given, *, what: str = "start", t0=0.0, inputs
             f"scene's example{'; write `.state` after it' if isinstance(getattr(given, 'state', None), State) else ''}"
         )
     model = modelled(model)
-    return named_start(model, model.scene.example if given is None else given, t0, inputs)
+    return named_start(model, model.scene.example if given is None else given, one_time(0.0) if t0 is None else t0, inputs)
 
 
 def span_and_times(scene: Scene, start, t0, t1, ts):
     """t0, the times to save at, t1; a ValueError where they are known and do not go together."""
-    real = real_type()
-    if isinstance(start, State) and start.q.ndim != 1:
+    from_state = isinstance(start, State)
+    if from_state and start.q.ndim != 1:
         raise ValueError(f"`start` holds a batch of shape {start.q.shape[:-1]}; use `jj.rollout` or `jax.vmap` for many starts")
     ts = None if ts is None else saved_times(ts)
-    t0, t1 = (one_time(value, name) for name, value in (("t0", t0), ("t1", t1)))
+    t0, t1 = one_time(t0, "t0"), one_time(t1, "t1")
     if t0 is None:
-        t0 = one_time(start.t if isinstance(start, State) else 0.0)
+        t0 = as_array(start.t if from_state else 0.0, real_type())
     if t1 is None:
-        t1 = t0 + scene.example_span if ts is None else ts[-1]
-    ends = known_numbers([t0, t1])
-    if not np.isfinite(ends).all() or (ends[:1] == ends[1:]).any():
+        t1 = as_array(t0 + scene.example_span if ts is None else ts[-1], t0.dtype)
+    ends = known_numbers((t0, t1)).tolist()
+    if ends and not 0 < abs(ends[1] - ends[0]) < np.inf:
         raise ValueError(f"the span from t0 = {t0} to t1 = {t1} s is empty or not finite; give a finite `t1` different from `t0`")
     if ts is None:
-        ts = t0 + (t1 - t0) * _EVEN  # of known ends: nothing to compile
+        ts = t0 + (t1 - t0) * _EVEN.astype(t0.dtype)  # of known ends: nothing to compile
     elif not known_numbers(times_fit(ts, t0, t1)).all():
         raise ValueError(f"`ts` runs from {ts[0]} to {ts[-1]} s, outside of the span from t0 = {t0} to t1 = {t1} s or against it; give `t0` and `t1` around it")
-    return tuple(as_array(x, real) for x in (t0, ts, t1))
+    return t0, ts, t1
 
 
 def saved_times(ts) -> "Float[Array, 'times'] | Float[np.ndarray, 'times']":

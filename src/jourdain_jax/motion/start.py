@@ -11,7 +11,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
 
 from jourdain_jax.build.sampling import guesses_of
 from jourdain_jax.build.structure import structure_of
@@ -58,7 +57,7 @@ def _consistent(scene: Scene, t, start: Guess, inputs, guesses: Callable | None 
     # numbers are put onto the rows at once, also where a function around this call is being traced; elsewhere that would compile constants one by one
     with at_once():
         state, arrived = _compiled_projection(*given, None)
-        if guesses is not None and not np.asarray(arrived) and len(start.usual.closures):  # rare, and long to compile
+        if guesses is not None and len(start.usual.closures) and not np.asarray(arrived):  # rare, and long to compile
             by_xla = start._replace(usual=replace(start.usual, program=None))
             state = jax.tree.map(jnp.asarray, _uncompiled_projection(scene, t, by_xla, inputs, guesses())[0])
     return state
@@ -67,11 +66,6 @@ def _consistent(scene: Scene, t, start: Guess, inputs, guesses: Callable | None 
 def _as_input_vector(scene: Scene, inputs, dtype):
     """A vector on NumPy as it is, which is not traced and takes no time."""
     return inputs if isinstance(inputs, np.ndarray) and inputs.shape == (len(scene.inputs),) else as_input_vector(scene, inputs, dtype)
-
-
-def _is_off(state: State) -> Bool[Array | np.ndarray, ""]:
-    """Whether more than round-off is left of the rows; also where that is no number."""
-    return ~(state.residual <= OFF * np.finfo(state.q.dtype).eps)
 
 
 _compiled_projection = compiled(put_onto_constraints, options=RUN_SELDOM)  # one program for every choice of what is held
@@ -100,12 +94,13 @@ def start(scene: Scene | BuiltFor, given=None, *, near=None, t0: Number = 0.0, i
         raise ValueError(f"`start` was given {described(given)}, expected named values: `jj.start(scene, lean=0.3)`, or a dictionary of them")
     if near is not None and not isinstance(near, Mapping):
         raise ValueError(f'`near` is {described(near)}, expected a dictionary of coordinates: near={{"z": -0.4}}')
+    t = one_time(t0)
     with model.standing_in:
-        return named_start(model, {**(given or {}), **values}, t0, inputs_at(model.inputs(inputs), one_time(t0)), near=near or {})
+        return named_start(model, {**(given or {}), **values}, t, inputs_at(model.inputs(inputs), t), near=near or {})
 
 
-def named_start(model: Model, values: Mapping, t0, inputs, *, near: Mapping = _NOTHING) -> State:
-    """Return the start that `start` describes; `inputs` at time `t0`: a vector, or by name (None: zero)."""
+def named_start(model: Model, values: Mapping, t, inputs, *, near: Mapping = _NOTHING) -> State:
+    """Return the start that `start` describes; `inputs` at time `t`, which is an array: a vector, or by name (None: zero)."""
     scene = model.scene
     q, u, given = vectors_named(scene, {**near, **values})
     about = given if near else ()
@@ -115,9 +110,8 @@ def named_start(model: Model, values: Mapping, t0, inputs, *, near: Mapping = _N
             if name not in scene.coordinate_names:
                 raise ValueError(f"`near` names `{name}`, which is no coordinate; {nearest(name, scene.coordinate_names.entries)}")
     inputs = _as_input_vector(scene, inputs, q.dtype)
-    t = one_time(t0)
     if is_traced(q, u, t) or not (np.isfinite(q).all() and np.isfinite(u).all() and np.isfinite(t)):  # one look where all is known, and right
-        for name, value in {**near, **values, "t0": t0}.items():
+        for name, value in {**near, **values, "t0": t}.items():
             if not np.all(np.isfinite(known_numbers(value))):
                 raise ValueError(f"start value `{name}` is {value}, expected a finite number; check where it was computed")
     held, contradict = model.once((given, about), lambda: _held(model, given, about))
@@ -149,7 +143,9 @@ def _held(model: Model, given: tuple[str, ...], about: tuple[str, ...]) -> tuple
     if program is not None:
         slopes = [n for (_, k), n in program.G.items() if free_q[k]]
         bounded = bounded & any(depend_on(program.graph, slopes, np.array(program.q)[free_q].tolist()))
-    return (free_q, free_u, bounded, usual), may_contradict(scene, known, free_q, free_u)
+    with at_once():
+        on_device = jax.device_put((free_q, free_u, bounded))  # handed over in a third of the time that arrays of NumPy take
+    return (*on_device, usual), may_contradict(scene, known, free_q, free_u)
 
 
 def _moved_if_near(model: Model, start: State, inputs) -> State:
@@ -159,7 +155,7 @@ def _moved_if_near(model: Model, start: State, inputs) -> State:
     these parameters contradict each other at others.
     """
     near = start.residual < contradiction(start.q.dtype)
-    if not np.all(known_numbers(near & _is_off(start))):
+    if not known_numbers(near & (start.residual > OFF * np.finfo(start.q.dtype).eps)).all():  # more than round-off is left
         return start
     state = consistent(model, start.t, start.q, start.u, inputs)
     moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
@@ -168,7 +164,7 @@ def _moved_if_near(model: Model, start: State, inputs) -> State:
 
 
 def _check_residual(scene: Scene, start: Guess, state: State, inputs, given: tuple[str, ...]) -> None:
-    if np.all(known_numbers(state.residual) < contradiction(state.q.dtype)):
+    if (known_numbers(state.residual) < contradiction(start.q.dtype)).all():
         return
     who, held = type(scene).__name__, ", ".join(f"`{name}`" for name in given) or "none"
     g = np.abs(np.asarray(closure_residual(scene, state.t, state.q)))

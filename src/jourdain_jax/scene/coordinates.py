@@ -63,7 +63,8 @@ class Coordinates:
     def reference(self) -> Float[np.ndarray, "coordinates"]:
         """The reference configuration: zero, and the identity for every quaternion."""
         q = np.zeros(len(self.names), real_type())
-        q[[first for first, _ in self.quaternions]] = 1.0
+        for first, _ in self.quaternions:
+            q[first] = 1.0
         return q
 
     def default_rates(self, q: Float[Array, "coordinates"], u: Speeds) -> Float[Array, "coordinates"]:

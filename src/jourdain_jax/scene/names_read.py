@@ -54,20 +54,20 @@ class NamesRead:
 
     def now(self) -> tuple["NamesRead", int]:
         """Return itself and a version: equal contents have equal versions. ValueError where a name has come to stand for an object with state."""
-        for look, before in self._seen:
-            found = look()
-            if len(found) != len(before) or not all(map(is_, found, before)):
-                self._look()
-                break
+        found = [x for look in self._looks for x in look()]
+        if len(found) != len(self._seen) or not all(map(is_, found, self._seen)):
+            self._look()
         return self, self._version
 
     def _look(self) -> None:
         content: list[tuple] = []
-        seen: list[tuple] = []
+        looks: list[Callable] = []
+        seen: list = []
         functions: list[FunctionType] = []
         for root in self._roots:
             members = vars(root) if isinstance(root, type) else {"": root}
-            seen.append((members.values, tuple(members.values())))
+            looks.append(members.values)
+            seen += members.values()
             for name, member in list(members.items()):
                 content.append((name, _key_of(member)))
                 for f in () if name.startswith("__") and name != "__call__" else functions_in(member):
@@ -75,14 +75,16 @@ class NamesRead:
                     where = f"`{root.__name__}.{name}`" if name else f"the function `{f.__qualname__}`" if self._strict else ""
                     for names, look in names_of(f):
                         found = look()
-                        seen.append((look, found))
+                        looks += [look] if names else []
+                        seen += found
                         content += [(n, _key_of(x, n, where)) for n, x in zip(names, found, strict=True)]
                         functions += [x for x in found if isinstance(x, FunctionType)]
-        codes = lambda: [*map(attrgetter("__code__"), functions)]  # noqa: E731
-        seen.append((codes, codes()))
-        content.append(tuple(map(_Same, codes())))
+        looks.append(lambda: [*map(attrgetter("__code__"), functions)])
+        codes = looks[-1]()
+        seen += codes
+        content.append(tuple(map(_Same, codes)))
         self._version = self._versions.setdefault(tuple(content), len(self._versions))
-        self._seen = seen  # last: what is refused now is refused at the next call, too
+        self._looks, self._seen = looks, seen  # last: what is refused now is refused at the next call, too
 
 
 jax.tree_util.register_pytree_node(NamesRead, lambda read: ((), read.now()), lambda now, _: now[0])

@@ -220,21 +220,21 @@ def _completed(parts: tuple[str, ...], q: list, first: int, given: list[str]) ->
 
 def _put(names: Names, entries: list, name: str, value) -> list[str]:
     """Put a value, or a run of values, where `name` says; the names of the entries that were set."""
-    if type(value) is not float and (name in names.entries or name in (group for group, _, _ in names.groups)):
+    if name not in names:
+        return []
+    if type(value) is not float:
         checked_unless_traced(value, f"`{name}`", advice="give its value")
-    shape = np.shape(value)
+    shape = () if type(value) is float else np.shape(value)
     if name in names.entries:
         if shape != ():
             raise ValueError(f"`{name}` was given an array of shape {shape}, expected one number; use `jax.vmap` or `rollout` for many")
         entries[names.entries.index(name)] = value
         return [name]
-    for group, first, length in names.groups:
-        if group == name:
-            if shape != (length,):
-                raise ValueError(f"`{name}` was given an array of shape {shape}, expected ({length},)")
-            entries[first : first + length] = [value[i] for i in range(length)]
-            return list(names.entries[first : first + length])
-    return []
+    first, length = next(rest for group, *rest in names.groups if group == name)
+    if shape != (length,):
+        raise ValueError(f"`{name}` was given an array of shape {shape}, expected ({length},)")
+    entries[first : first + length] = [value[i] for i in range(length)]
+    return list(names.entries[first : first + length])
 
 
 def _vector(entries: list) -> Float[Array | np.ndarray, "entries"]:
