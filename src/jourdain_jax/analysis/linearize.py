@@ -40,7 +40,7 @@ from jourdain_jax.motion.put_on_rows import State
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import as_state
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, shown_from_users_lines, users_level
+from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, shown_from_users_lines, users_level
 from jourdain_jax.scene.names import as_names, check_name
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
@@ -175,7 +175,7 @@ def linearize(
     state, speeds or coordinates that do not determine the others there.
     **Warns** (`SensitivityWarning`): a load has a kink or jumps at the state, as dry friction does at rest.
     """
-    built, scene = scene, as_scene(scene)
+    built, scene = scene, as_rolling(scene, "linearize")
     f = as_input_vector(scene, inputs)
     state = as_state(scene, state, what="state", inputs=f)
     f = f.astype(state.q.dtype)

@@ -23,7 +23,7 @@ from jourdain_jax.calculus.reals import RUN_SELDOM, Flag, Number, Numbers, Scala
 from jourdain_jax.calculus.roots import smooth_root
 from jourdain_jax.motion.options import OPTION_NAMES, SPAN, OptionFields, Options, as_options
 from jourdain_jax.motion.put_on_rows import State, state_of
-from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, shown_from_users_lines
+from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, shown_from_users_lines
 from jourdain_jax.scene.names import as_names, check_names
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
@@ -83,7 +83,7 @@ def steady(
     **Raises** ValueError: an unknown name. TypeError: another option by name.
     """
     most_steps = as_options(Options(max_steps=60) if options is None else options, by_name, "steady", _REFUSED).max_steps
-    built, scene = scene, as_scene(scene)
+    built, scene = scene, as_rolling(scene, "steady")
     t, q, u = guessed(scene, guess, t0)
     f = as_input_vector(scene, inputs, q.dtype).astype(q.dtype)
     held, entries = as_names(held), scene.coordinate_names.entries

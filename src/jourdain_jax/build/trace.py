@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import jaxpr_as_fun
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Num, PyTree
 
 from jourdain_jax.build.plausibility import Numbers, numbers_of
@@ -26,7 +27,8 @@ from jourdain_jax.calculus.reals import Entries, Scalar, is_traced, real_type
 from jourdain_jax.equations.kinematics import coordinate_rates, inertias_of, motion_at, of_bodies, pose_at, velocities_of
 from jourdain_jax.equations.listed import names_of_bodies, names_of_position_rows
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
-from jourdain_jax.equations.virtual_power import energies_at, impressed, potential_energy, resultants
+from jourdain_jax.equations.switching import At, contact_changes, contact_events, contacts_at_start, put_back
+from jourdain_jax.equations.virtual_power import energies_at, impressed, loads_at, potential_energy, resultants
 from jourdain_jax.program.graph import MOST_MULTIPLICATIONS, Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, effects_of, interpret
 from jourdain_jax.program.opaque_calls import interpret_with_calls
@@ -60,6 +62,9 @@ class VelocityQuantities(eqx.Module):
     events: Num[Entries, "events"]  # sorted by name
     resets: Num[Entries, "events rows"]  # as `event_resets` has them
     energies: Num[Entries, "2"]  # kinetic and potential
+    held: Num[Entries, "coordinates_and_speeds"]  # put back onto the rows of contacts that are closed; none where no contact switches
+    start: Num[Entries, "numbers"]  # `switching.Begun`
+    responses: Num[Entries, "states numbers"]  # of contacts that switch, of which the others are made: at coordinates, speeds and inputs, which come first
 
 
 class Particulars(eqx.Module):
@@ -81,14 +86,15 @@ def explicit_rates(scene: Scene, motion: Motion) -> dict[str, PyTree]:
 
     def pieces(t):
         held = eqx.tree_at(lambda m: m.t, motion, t)
-        return {"loads": resultants(scene, held), "potential": potential_energy(scene, held)}
+        return {"loads": resultants(scene, held, loads=loads_of(scene, held)), "potential": potential_energy(scene, held)}
 
     return jax.jvp(pieces, (motion.t,), (jnp.ones_like(motion.t),))[1]
 
 
 def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...] = (), with_events: bool = True) -> VelocityQuantities:
     """What is traced, computed on numbers; `of_inputs`: numbers of the loads whose potential depends on inputs."""
-    stated = loads_of(scene, motion)  # once: a second time a callback would be another one
+    at = At(scene, motion) if scene.switching.contacts else None
+    stated = loads_at(scene, motion, at.found if at else None)  # once: a second time a callback would be another one
     velocities, weights, loads = velocities_of(motion), inertias_of(motion), impressed(scene, motion, stated)
     return VelocityQuantities(
         velocities.linear,
@@ -105,24 +111,30 @@ def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]
         loads.torque,
         loads.direct,
         explicit_power(scene, motion, of_inputs, stated),
-        event_values(scene, motion) if with_events else jnp.zeros(0),
-        event_resets(scene, motion, of_inputs) if with_events else jnp.zeros((0, 0)),
+        event_values(scene, motion, at) if with_events else jnp.zeros(0),
+        event_resets(scene, motion, of_inputs, at) if with_events else jnp.zeros((0, 0)),
         jnp.stack(energies_at(scene, motion, stated)),
+        jnp.concatenate(put_back(at)) if at else jnp.zeros(0),
+        ravel_pytree(contacts_at_start(at))[0] if at and with_events else jnp.zeros(0),
+        jnp.stack([ravel_pytree(response)[0] for response in at.responses]) if at else jnp.zeros((0, 0)),
     )
 
 
-def event_values(scene: Scene, motion: Motion) -> Float[Array, "events"]:
-    """Values of the stop events, sorted by name."""
-    events = events_of(scene, motion)
-    return jnp.stack([events[name].value for name in sorted(events)]) if events else jnp.zeros(0)
+def event_values(scene: Scene, motion: Motion, at: At | None = None) -> Float[Array, "events"]:
+    """Values of the events, sorted by name; `at`: contacts that switch, where they are known already."""
+    values = {name: event.value for name, event in events_of(scene, motion).items()}
+    if scene.switching.contacts:
+        values |= contact_events(at or At(scene, motion))
+    return jnp.stack([values[name] for name in sorted(values)]) if values else jnp.zeros(0)
 
 
-def event_resets(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Float[Array, "events rows"]:
+def event_resets(scene: Scene, motion: Motion, of_inputs: tuple[int, ...], at: At | None = None) -> Float[Array, "events rows"]:
     """Coordinates, speeds and modes after each event, sorted by name, and by how much what the loads `of_inputs` store rises.
 
     Without rows where all events stop the motion.
     """
-    events = [event for _, event in sorted(events_of(scene, motion).items())]
+    every = events_of(scene, motion) | (contact_changes(at or At(scene, motion)) if scene.switching.contacts else {})
+    events = [event for _, event in sorted(every.items())]
     if all(event.stop for event in events):
         return jnp.zeros((len(events), 0))
     names = (*scene.coordinate_names.entries, *scene.speed_names.entries, *scene.modes.names)

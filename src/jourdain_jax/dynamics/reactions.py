@@ -25,7 +25,7 @@ from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, of_bo
 from jourdain_jax.equations.listed import names_of_rows
 from jourdain_jax.equations.rows import flatten_rows, velocity_residual, velocity_rows
 from jourdain_jax.equations.scaling import row_scale
-from jourdain_jax.equations.virtual_power import resultants
+from jourdain_jax.equations.virtual_power import contact_response, resultants, switching_forces
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyMotion, Motion
 from jourdain_jax.scene.names import Named, UnknownNameError, check_name
@@ -144,9 +144,16 @@ def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=N
     held = Wrenches(total.linear - jnp.sum(rows.force, axis=0), total.angular - jnp.sum(rows.torque, axis=0))  # by construction of the coordinates
     spare = jax.tree.map(lambda part: jnp.einsum("sr,sbi->rbi", unit[2], part), unit[0])
     positions = of_bodies(motion, "position")
-    built_in = normal_forces(contacts, rows.body_names, positions, held, spare, size)
+    rolling = {name: contact for name, contact in contacts.items() if contact.friction is None}
+    built_in = normal_forces(rolling, rows.body_names, positions, held, spare, size)
     forces = {}
+    if scene.switching.contacts:
+        found = switching_forces(scene, motion, contact_response(scene, motion))
+        sure = jnp.array(True)
+        forces = {name: _contact_force(L[0], L[1:], sure, sure, margin) for name, L in zip(scene.switching.contacts, found.reshape(-1, 3), strict=True)}
     for name, contact in contacts.items():
+        if name in forces:
+            continue
         slip = jnp.array([rows.row_names.index(f"{name} slip[{i}]") for i in range(2)])
         tangential, determined = rows.multipliers[slip], jnp.all(rows.determined[slip])
         if contact.height == "row":

@@ -62,9 +62,10 @@ def _listed(scene: Scene) -> _Listed:
 
     def look(scene: Scene, motion: Motion) -> None:
         rows, first = (tuple(row_names(found)) for found in (velocity_rows(scene, motion), position_rows(scene, motion.pose())))
-        without = any(load.potential is None for load in loads_of(scene, motion))
-        events = sorted(events_of(scene, motion).items())
-        noted.append(_Listed(tuple(motion.bodies), rows, first, tuple(name for name, _ in events), tuple(event.stop for _, event in events), without))
+        without = bool(scene.switching.contacts) or any(load.potential is None for load in loads_of(scene, motion))
+        stop = {name: event.stop for name, event in events_of(scene, motion).items()} | dict.fromkeys(scene.switching.events, False)
+        events = tuple(sorted(stop))
+        noted.append(_Listed(tuple(motion.bodies), rows, first, events, tuple(stop[name] for name in events), without))
 
     shapes_along_motion(look, scene)
     return noted[0]

@@ -7,6 +7,8 @@ rows, contact heights (these have a position residual), then contact no-slip row
 Source: Wang and Pao (2003), eqs. (5)-(9), (19), (25).
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -46,13 +48,16 @@ def position_rows(scene: Scene, pose: Pose) -> dict[str, Array]:
     """Values of all geometric rows by name: prescribed coordinates, geometric constraints, contact heights."""
     rows = {f"prescribed {name}": pose.q[_coordinate(scene, name)] - value for name, value in prescribed_of(scene, pose.t).items()}
     rows |= geometric_constraints_of(scene, pose)
-    return rows | {f"{name} height": contact.gap() for name, contact in contacts_of(scene, pose).items() if contact.height == "row"}
+    kept = {name: contact for name, contact in contacts_of(scene, pose).items() if contact.height == "row" and contact.friction is None}
+    return rows | {f"{name} height": contact.gap() for name, contact in kept.items()}
 
 
 def velocity_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
     """Values of all rows at the level of velocities, by name."""
-    rows = _rates_of_position_rows(scene, motion)
+    rows = rates_along(scene, motion, lambda pose: position_rows(scene, pose))
     for name, contact in contacts_of(scene, motion.pose()).items():
+        if contact.friction is not None:  # it may slip (`equations/switching.py`)
+            continue
         slip = motion[contact.body].velocity_at(contact.point) - contact.plane.velocity_at(contact.point)
         rows[f"{name} slip"] = contact.plane.tangents @ slip
     for name, value in velocity_constraints_of(scene, motion).items():
@@ -62,20 +67,20 @@ def velocity_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
     return rows
 
 
-def _rates_of_position_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
-    """`dg/dt` along the velocities that the motion carries, so that it can be differentiated with respect to a body's velocity alone."""
+def rates_along(scene: Scene, motion: Motion, values: Callable[[Pose], dict[str, Array]]) -> dict[str, Array]:
+    """Rates of named `values` of a pose along the velocities that the motion carries: they can be differentiated by a body's velocity alone."""
 
     names: list[str] = []
 
     def g(t, q, bodies):
-        rows = position_rows(scene, Pose(t, scene.coordinate_names.view(q), bodies))
+        rows = values(Pose(t, scene.coordinate_names.view(q), bodies))
         names[:] = rows  # in their order: JAX returns dictionaries sorted by name
         return tuple(rows.values())
 
     pose = motion.pose()
     rates = {name: body.rate_of_pose() for name, body in motion.bodies.items()}
-    values = jax.jvp(g, (motion.t, motion.q.array, pose.bodies), (jnp.ones_like(motion.t), motion.qdot.array, rates))[1]
-    return dict(zip(names, values, strict=True))
+    found = jax.jvp(g, (motion.t, motion.q.array, pose.bodies), (jnp.ones_like(motion.t), motion.qdot.array, rates))[1]
+    return dict(zip(names, found, strict=True))
 
 
 def _coordinate(scene: Scene, name: str) -> str:

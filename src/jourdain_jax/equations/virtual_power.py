@@ -16,6 +16,8 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Entries, Scalar, Speeds, described
 from jourdain_jax.eager.eager import eager_if_concrete
+from jourdain_jax.equations.contact_laws import Modes, responses, solved
+from jourdain_jax.equations.contact_rows import ContactRows, contact_loads, contact_rows, switching_contacts
 from jourdain_jax.equations.instant import Instant, instant_at, rows_of
 from jourdain_jax.equations.kinematics import (
     Inertias,
@@ -35,6 +37,7 @@ from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.switching import CREEPS, FLIES, ROLLS, SLIPS
 from jourdain_jax.scene.validated import loads_of, potential_of
 
 
@@ -64,7 +67,7 @@ def resultants(
     force = {name: jnp.zeros_like(body.position) for name, body in motion.bodies.items()}
     torque = dict(force)
     direct = {name: jnp.zeros_like(motion.t) for name in scene.speed_names.entries}
-    for number, load in enumerate(loads_of(scene, motion) if loads is None else loads):
+    for number, load in enumerate(loads_at(scene, motion) if loads is None else loads):
         if conservative is not None and conservative != (load.potential is not None):
             continue
         if among is not None and number not in among:
@@ -120,13 +123,13 @@ def equations_and_rows(scene: Scene, t, q, u, inputs=None) -> tuple[Unconstraine
     return equations_of(scene, instant), rows_of(scene, instant)
 
 
-def equations_of(scene: Scene, instant: Instant) -> UnconstrainedEquations:
-    """M, h and Q of the equations without constraint forces, at a known instant."""
+def equations_of(scene: Scene, instant: Instant, loads: tuple[Load, ...] | None = None) -> UnconstrainedEquations:
+    """M, h and Q of the equations without constraint forces, at a known instant; `loads`: as in `resultants`."""
     partial = instant.by_speeds.bodies
     force, torque = inertia_resultants(instant.weights, instant.value.bodies, instant.rate.bodies)
     h = jnp.einsum("bik,bi->k", partial.linear, force) + jnp.einsum("bik,bi->k", partial.angular, torque)
     M = mass_matrix(instant.weights.mass, instant.weights.inertia, partial.linear, partial.angular)
-    return UnconstrainedEquations(M, h, _generalized_forces(scene, instant.motion, partial))
+    return UnconstrainedEquations(M, h, _generalized_forces(scene, instant.motion, partial, loads))
 
 
 def mass_matrix(
@@ -169,9 +172,72 @@ def generalized_forces(scene: Scene, t, q, u, inputs=None) -> Speeds:
     return _generalized_forces(scene, motion_at(scene, t, q, u, inputs), partial_velocities(scene, t, q, u))
 
 
-def _generalized_forces(scene: Scene, motion: Motion, partial: Velocities) -> Speeds:
-    loads = impressed(scene, motion)
-    return jnp.einsum("bik,bi->k", partial.linear, loads.force) + jnp.einsum("bik,bi->k", partial.angular, loads.torque) + loads.direct
+def _generalized_forces(scene: Scene, motion: Motion, partial: Velocities, loads: tuple[Load, ...] | None = None) -> Speeds:
+    total = impressed(scene, motion, loads)
+    return jnp.einsum("bik,bi->k", partial.linear, total.force) + jnp.einsum("bik,bi->k", partial.angular, total.torque) + total.direct
+
+
+class ContactResponse(eqx.Module):
+    """Contacts that switch at one state, with what their forces L do: `du/dt = free + impulses L`, `dw/dt = G L + b`."""
+
+    rows: ContactRows
+    impulses: Float[Array, "speeds rows"]  # M^-1 A', along the rows that always hold
+    G: Float[Array, "rows rows"]
+    b: Float[Array, "rows"]
+
+
+@eqx.filter_jit  # traced once
+def contact_response(scene: Scene, motion: Motion) -> ContactResponse:
+    """Return how contacts that switch respond to their forces at the state of a motion.
+
+    M (impulses, free) = (A', Q - h) + A_p' (multipliers, so that A_p impulses = 0 and A_p free = -drift_p)       A_p: rows that always hold
+    """
+    instant = instant_at(scene, motion.t, motion.q.array, motion.u.array, motion.inputs.array)
+    equations, held, rows = equations_of(scene, instant, loads_of(scene, motion)), rows_of(scene, instant), contact_rows(scene, motion)
+    count, kept = len(motion.u.array), len(held.phi)
+    right = jnp.concatenate([rows.A, (equations.Q - equations.h)[None], held.A]).T
+    # the last speeds first: they belong to the leaves of a tree, whose elimination fills nothing
+    moved = jnp.stack(solved(list(equations.M[::-1, ::-1]), list(right[::-1])))[::-1]
+    if kept:
+        by_rows, drift = moved[:, len(moved[0]) - kept :], jnp.append(jnp.zeros((kept, len(rows.w))), held.drift[:, None], axis=1)
+        moved = moved[:, : len(moved[0]) - kept]
+        moved = moved - by_rows @ jnp.stack(solved(list(held.A @ by_rows), list(held.A @ moved + drift)))
+    impulses, free = moved[:count, :-1], moved[:count, -1]
+    return ContactResponse(rows, impulses, rows.A @ impulses, rows.A @ free + rows.drift)
+
+
+def contact_modes(scene: Scene, motion: Motion, w: Float[Array, "rows"]) -> Modes:
+    """Return the modes of the contacts that switch; one that slips does so along its slip w, one that creeps along a direction that is kept.
+
+    The direction is a number also where nothing slips.
+    """
+    names = scene.switching.contacts
+    number = jnp.stack([motion.modes[name] for name in names])
+    slips, kept = number == SLIPS, number == CREEPS
+    slip = w.reshape(-1, 3)[:, 1:]
+    size = jnp.sqrt(jnp.where(slips, jnp.sum(slip**2, axis=1), 1.0))
+    directions = jnp.stack([jnp.stack([motion.q[f"{name}_slip_1"], motion.q[f"{name}_slip_2"]]) for name in names])
+    e = jnp.where(slips[:, None], slip / size[:, None], jnp.where(kept[:, None], directions, 0.0))
+    one = jnp.ones_like(size)
+    return Modes(jnp.where(number == FLIES, 0.0, one), jnp.where(number == ROLLS, one, 0.0), e)
+
+
+def friction_of(scene: Scene, motion: Motion) -> Float[Array, "contacts"]:
+    """Coefficients of friction of the contacts that switch."""
+    return jnp.stack([contact.friction for contact in switching_contacts(scene, motion.pose()).values()])
+
+
+def switching_forces(scene: Scene, motion: Motion, found: ContactResponse) -> Float[Array, "rows"]:
+    """Return the forces of contacts in their modes, N."""
+    return responses(found.G, found.b[:, None], contact_modes(scene, motion, found.rows.w), friction_of(scene, motion))[:, 0]
+
+
+def loads_at(scene: Scene, motion: Motion, found: ContactResponse | None = None) -> tuple[Load, ...]:
+    """The loads of a scene, and the forces of contacts that switch, which depend on them; `found`: how these respond, where it is known already."""
+    own = loads_of(scene, motion)
+    if not scene.switching.contacts:
+        return own
+    return (*own, *contact_loads(scene, motion, switching_forces(scene, motion, contact_response(scene, motion) if found is None else found)))
 
 
 def impressed(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> Resultants:

@@ -17,6 +17,7 @@ import numpy as np
 from jourdain_jax.build.probed_on_graph import generic_states
 from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import TracedScene, VelocityQuantities
+from jourdain_jax.lowering.contact_forms import simplify_contacts
 from jourdain_jax.lowering.elimination import eliminate, pivots_ok, solve_symmetric
 from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.multipliers import Accelerations, projected_coordinates
@@ -73,6 +74,8 @@ class AppellOnGraph:
         self.dependent = [k for k in every if k not in self.independent]
         self.kept, self.rows, self.multiplied = kept, *(([], rows) if kept else (rows, []))
         self.reference, self.far, self.identity_probes = reference, far, generic_states(traced, probes)
+        if len(traced.at.responses):
+            simplify_contacts(traced, self._forms)
 
     def build(self, strategy: Strategy) -> Equations:
         """The equations by one strategy."""
@@ -114,7 +117,10 @@ class AppellOnGraph:
         return {int(self.traced.q[i]): self.graph.const(self.reference[i]) for i in held}
 
     def projection(self, most_terms: int, ignorable: tuple[int, ...]) -> tuple[list[int], list[int]]:
-        """Coordinates put back onto quaternion norms and geometric rows; speeds put back onto velocity rows, none where these are eliminated."""
+        """Coordinates put back onto quaternion norms and geometric rows; speeds put back onto velocity rows, none where these are eliminated.
+
+        Contacts that are closed count as rows.
+        """
         g, at, q = self.graph, self.traced.at, self.traced.q.tolist()
         redundant = {s for s in range(len(at.closure)) if s not in self.rows and s not in self.multiplied}
         closure = [int(n) for s, n in enumerate(at.closure) if s not in redundant]
@@ -127,12 +133,18 @@ class AppellOnGraph:
             for first, wxyz in zip(self.traced.quaternions, self.traced.attitudes, strict=True):
                 n = g.dot(wxyz, wxyz)
                 moved[first : first + 4] = [g.div(part, g.call("sqrt", n)) for part in wxyz]
-        if not (self.kept and self.multiplied):
-            return moved, []
-        forms = self._forms(most_terms)
-        M, _ = self._equations(_Kinematics(self, forms, {}, explicit=True), forms)
-        phi = [int(at.phi[s]) for s in self.multiplied]
-        return moved, self.kept.projected_speeds(M, self.traced.u.tolist(), phi, forms)
+        speeds: list[int] = []
+        if self.kept and self.multiplied:
+            forms = self._forms(most_terms)
+            M, _ = self._equations(_Kinematics(self, forms, {}, explicit=True), forms)
+            phi = [int(at.phi[s]) for s in self.multiplied]
+            speeds = self.kept.projected_speeds(M, self.traced.u.tolist(), phi, forms)
+        if len(at.held):  # contacts that are closed, first
+            u = self.traced.u.tolist()
+            held_q, held_u = np.split(at.held, [len(q)])
+            moved = g.substituted(moved, dict(zip(q, held_q.tolist(), strict=True)))
+            speeds = g.substituted(held_u.tolist(), dict(zip(u, speeds or u, strict=True)))
+        return moved, speeds
 
     def _power(self, k: "_Kinematics", ydot: list[int]) -> int:
         """Power of loads without a potential and of potentials in time, and of rows that do work, of what drives poses, and of masses that change.

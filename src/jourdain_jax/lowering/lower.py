@@ -182,7 +182,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
     groups = {name: getattr(best, name) for name in ("qdot", "ydot", "z", "pivots", "directions", "squares", "guards", "power", "events", "resets", "energies")}
     of_rates = [] if scene.speeds is None else _divisors(graph, builder.traced.at.qdot.tolist())
     pivots = _relative(graph, probes, [*of_rates, *best.pivots])
-    groups |= {"power": [best.power], "projected_q": put_q, "projected_u": put_u, "pivots": pivots}
+    groups |= {"at_start": builder.traced.at.start.tolist(), "power": [best.power], "projected_q": put_q, "projected_u": put_u, "pivots": pivots}
     outputs = graph.with_quotients(_with_equal_calls_once(builder.identity_probes, [n for group in groups.values() for n in group]))
     rest = iter(outputs)
     nodes = {name: tuple(islice(rest, len(group))) for name, group in groups.items()}

@@ -67,6 +67,7 @@ class Lowered:
     jumps: tuple[int, ...]  # of the relations, those at whose zeros rates may jump
     projected_q: tuple[int, ...]  # coordinates put back onto norms and geometric rows, one step of Gauss-Newton
     projected_u: tuple[int, ...]  # all speeds put back onto the rows; none where dependent speeds are eliminated
+    at_start: tuple[int, ...]  # contacts that switch at the start of a motion: `switching.Begun`
     by_partition: bool  # all speeds are in the state, but the accelerations come from privileged ones
     left_out: tuple[str, ...]  # rows that follow from the others
     held: tuple[str, ...]  # ignorable coordinates, set to the reference in the accelerations

@@ -49,7 +49,7 @@ def integrate(setup: Setup) -> Trajectory:
 
 
 def _one_motion(setup: Setup) -> Trajectory:
-    given = _with_machine_code(_prepared(setup))
+    given = _in_contact(_with_machine_code(_prepared(setup)))
     setup, asked = _entered(given)
     begun, fitting = _begin(setup), setup.fitting()
     return _finish(given, fitting, asked, begun, setup.integrator.solved(fitting, begun))
@@ -80,7 +80,7 @@ def _with_machine_code(setup: Setup) -> Setup:
 
 def integrate_lanes(setups: Setup) -> Trajectory:
     """The motions of all lanes: `own_steps.width` lanes at a time where the rates are a scalar program, otherwise under `vmap`."""
-    given = _with_machine_code(_prepared(setups))
+    given = eqx.filter_vmap(_in_contact)(_with_machine_code(_prepared(setups)))
     setups, asked = eqx.filter_vmap(_entered)(given)
     begun, fitting = eqx.filter_vmap(_begin)(setups), eqx.filter_vmap(Setup.fitting)(setups)
     solved = setups.integrator.lanes_solved(fitting, begun)
@@ -97,13 +97,29 @@ def _entered(setup: Setup) -> tuple[Setup, Scalar]:
     return setup._replace(**eqx.combine(jax.tree.unflatten(treedef, each), rest)), asked
 
 
+def _in_contact(setup: Setup) -> Setup:
+    """The setup with contacts that switch in the modes of the start, which is on the ground where they touch it."""
+    scene, t0, start = setup.scene, setup.t0, setup.start
+    if not scene.switching.contacts:
+        return setup
+    count = len(scene.switching.contacts)
+    found = setup.field.at_start(scene, t0, start.q, start.u, setup.inputs(t0))
+    numbers, below, q, u = jnp.split(found, (count, count + 1, count + 1 + len(start.q)))
+    residual = jnp.maximum(start.residual, jax.lax.stop_gradient(below[0]))
+    modes = tuple(Mode(jax.lax.stop_gradient(number)) for number in numbers)
+    channels = setup.inputs.channels[: len(setup.inputs.channels) - count]
+    return setup._replace(start=eqx.tree_at(lambda s: (s.q, s.u, s.residual), start, (q, u, residual)), inputs=Inputs((*channels, *modes)))
+
+
 def _begin(setup: Setup) -> Begun:
     field, scene, start = setup.field, setup.scene, setup.start
     if setup.usual is not None:
         start = projected(scene, setup.t0, start, setup.inputs(setup.t0), setup.usual)
     right, start = _without_faults(setup, start)
     args = field, scene, setup.inputs, field.fixed(scene), setup.t0
-    return Begun(right, times_fit(setup.ts, setup.t0, setup.t1), start, args, field.pack(start.q, start.u))
+    timely = times_fit(setup.ts, setup.t0, setup.t1)
+    timely &= (setup.t1 > setup.t0) | (not scene.switching.contacts)  # what slipped, struck or came to rest has forgotten whence
+    return Begun(right, timely, start, args, field.pack(start.q, start.u))
 
 
 def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Solved) -> Trajectory:

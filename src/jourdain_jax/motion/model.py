@@ -315,7 +315,7 @@ def _vector_field(model: Model, constant: bool, work: bool) -> VectorField:
     scene, formulation, structure = model.scene, model.formulation, structure_of(model.scene)
     state, reduction = formulation.state, formulation.reduction
     _check(scene, structure, state, model.backend)
-    minimal = state == "minimal" or (state == "auto" and structure.has_minimal_state)
+    minimal = state == "minimal" or (state == "auto" and structure.has_minimal_state and not scene.switching.contacts)
     independent = structure.independent if minimal else None
     inputs_in_rows = structure.rows_of_inputs and not constant
     conserves = not needs_work(scene, structure)
@@ -328,8 +328,8 @@ def _vector_field(model: Model, constant: bool, work: bool) -> VectorField:
         "reduction": reduction,
         "with_work": with_work,
         "conserves": conserves,
-        "projects_positions": formulation.projects and bool(names_of_position_rows(scene) or scene.coordinates.quaternions),
-        "projects_speeds": formulation.projects and not minimal and bool(structure.row_names),
+        "projects_positions": formulation.projects and bool(names_of_position_rows(scene) or scene.coordinates.quaternions or scene.switching.contacts),
+        "projects_speeds": formulation.projects and not minimal and bool(structure.row_names or scene.switching.contacts),
         "rows_may_contradict": (minimal or formulation.projects) and structure.rows_may_contradict,
         "of_inputs": structure.potentials_of_inputs,
         "event_names": names_of_events(scene),

@@ -127,6 +127,8 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     inputs = model.inputs(inputs)
     constant = inputs.constant
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
+    if scene.switching.contacts and (known_numbers(t1 - t0) < 0).any():
+        raise ValueError(f"`{type(scene).__name__}` has contacts with friction, and time runs from t0 = {t0} back to t1 = {t1} s; give t1 > t0")
     start, usual = _start(model, start, t0, inputs)
     field, dtype = model.field(constant, bool(options.work)), start.q.dtype
     field = solver.fitted(scene, field, model.state) if isinstance(solver, ImplicitMethod) else field

@@ -22,6 +22,9 @@ _GROWING = threading.Lock()  # threads may derive on one graph
 OPERATIONS = {"add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos"}  # what an operation count counts
 
 
+_TRUTHS = frozenset(("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite"))
+
+
 class Unsupported(Exception):
     """What was traced cannot become a scalar program; the text says why."""
 
@@ -332,10 +335,14 @@ class Graph:
         return sorted(seen)  # arguments are older than what uses them
 
     def fixed(self, outputs: Iterable[int]) -> tuple[int, ...]:
-        """What depends on parameters alone and is used by varying nodes."""
+        """What depends on parameters alone and is used by varying nodes; numbers, and not truth values."""
         outputs = list(outputs)
-        found = {a for n in self.reachable(outputs) if self.varies[n] for a in self.args[n]} | set(outputs)
-        return tuple(sorted(n for n in found if not self.varies[n] and not self.is_const(n)))
+        found = {a for n in self.reachable(outputs) if self.varies[n] or self.is_truth(n) for a in self.args[n]} | set(outputs)
+        return tuple(sorted(n for n in found if not (self.varies[n] or self.is_const(n) or self.is_truth(n))))
+
+    def is_truth(self, node: int) -> bool:
+        """Whether a node is a truth value."""
+        return self.op[node] in _TRUTHS or (self.op[node] == "select" and self.is_truth(self.args[node][1]))
 
     def with_quotients(self, outputs: Iterable[int]) -> list[int]:
         """The outputs with `a (1/b)` as one division, where `1/b` serves only once."""

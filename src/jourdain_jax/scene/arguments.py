@@ -62,6 +62,15 @@ def as_scene(scene) -> Scene:
     raise ValueError(f"`scene` is {described(scene)}, expected a scene: an instance of a subclass of `jj.Scene`")
 
 
+def as_rolling(scene, what: str) -> Scene:
+    """As `as_scene`; ValueError where a contact may slip or fly, which `what` does not look at."""
+    scene = as_scene(scene)
+    if scene.switching.contacts:
+        named = ", ".join(f"`{name}`" for name in scene.switching.contacts)
+        raise ValueError(f"`{what}` serves contacts that roll, and {named} of `{type(scene).__name__}` may slip and fly; state it without `friction=` there")
+    return scene
+
+
 def of_known_numbers(function: F) -> F:
     """The function of a scene, or of a motion, and more, run on numbers also inside `jit`, `vmap` and derivatives.
 

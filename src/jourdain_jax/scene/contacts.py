@@ -20,6 +20,13 @@ from jourdain_jax.scene.motion_state import BodyPose
 _HEIGHTS = ("coordinates", "row")
 
 
+class Slipping(TypedDict, total=False):
+    """What contacts may state that slip, fly and strike."""
+
+    friction: Scalar | None
+    restitution: Scalar
+
+
 class Contact(eqx.Module):
     """A point contact of a body with the ground, rolling without slip; for what `ball_contact` and its like do not know.
 
@@ -31,6 +38,7 @@ class Contact(eqx.Module):
       force where `height="coordinates"`.
     - `distance` (m): the gap, where it is not the point's height above the plane.
     - `shape`: left to `ball_contact` and its like, for pictures; how any other body looks is said by the scene's `visuals`.
+    - `friction`, `restitution`: as in `ball_contact`.
 
     Where the point is known in the coordinates, this spares the search for it: `jj.Contact(pose["disc"], p, ground=hill)`.
     ValueError for an unknown height, or anything of another kind or shape.
@@ -44,8 +52,12 @@ class Contact(eqx.Module):
     distance: Scalar | None  # m; None: the point's height above the plane
     shape: Shape | None  # what rolls, for pictures
     ground: Ground | None  # what it rolls on, for pictures; None: the plane
+    friction: Scalar | None  # None: it rolls, whatever friction that needs
+    restitution: Scalar | None
 
-    def __init__(self, body, point, plane=None, height="coordinates", carried=None, distance=None, *, shape=None, ground=None):
+    def __init__(
+        self, body, point, plane=None, height="coordinates", carried=None, distance=None, *, shape=None, ground=None, **slips: Unpack[Slipping]
+    ):
         """A contact of the `body` at its `point` with the tangent `plane` of a ground."""
         if not isinstance(body, BodyPose | str):
             raise ValueError(f'the body of a contact is {described(body)}, expected the pose of a body; write pose["name"]')
@@ -64,13 +76,14 @@ class Contact(eqx.Module):
         self.carried = _checked_carried(carried, self.body)
         self.distance = None if distance is None else checked_real(distance, f"distance of the contact of `{self.body}`", ())
         self.shape, self.ground = shape, ground
+        self.friction, self.restitution = _slipping(self.body, height, **slips)
 
     def gap(self) -> Scalar:
         """Signed distance of the contact point from the ground, m."""
         return self.plane.height_of(self.point) if self.distance is None else self.distance
 
 
-class Rolling(TypedDict, total=False):
+class Rolling(Slipping, total=False):
     """What all rolling bodies may state."""
 
     centre: Vector | None  # m, body frame, of what rolls
@@ -88,6 +101,8 @@ def ball_contact(body: BodyPose, radius, **options: Unpack[Rolling]) -> Contact:
     - `height`: "coordinates" where they keep the body on the ground by themselves, "row" for a geometric row.
     - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all), for the normal force where
       `height="coordinates"`.
+    - `friction`: Coulomb's coefficient. With it the contact flies, rolls or slips (`motion.phase`), and needs `height="row"`; None (default): it rolls,
+      whatever friction that needs. `restitution` e, from 0 (default) to 1: Newton's, of impacts.
 
     Two velocity rows (m/s), along the ground's tangents. ValueError for an unknown height or a length that is not positive; for a ball that does
     not fit into the cylinder or sphere, where its scene is built.
@@ -143,7 +158,7 @@ def _radius(body: BodyPose, radius) -> Scalar:
 
 
 def rolling(
-    body: BodyPose, shape: Callable[[Array], Shape], *, centre=None, ground: Ground | None = None, height: str = "coordinates", carried=None
+    body: BodyPose, shape: Callable[[Array], Shape], *, centre=None, ground: Ground | None = None, height="coordinates", carried=None, **slips: Unpack[Slipping]
 ) -> Contact:
     """The contact of what rolls, whose shape is a function of its centre (m, inertial frame); the other arguments: as in `ball_contact`."""
     _checked_height(height)
@@ -156,7 +171,7 @@ def rolling(
         at = body.place(checked_real(centre, f"centre of the contact of `{body.name}`", (3,), advice="give three components in its body frame, m"))
     rolls = shape(at)
     found = touch(rolls, ground)
-    return Contact(body, found.point, found.plane, height, carried, found.gap, shape=rolls, ground=ground)
+    return Contact(body, found.point, found.plane, height, carried, found.gap, shape=rolls, ground=ground, **slips)
 
 
 def _checked_ground(given, body: str) -> Ground:
@@ -164,6 +179,17 @@ def _checked_ground(given, body: str) -> Ground:
         known = "`jj.Plane(...)`, `jj.Cylinder`, `jj.Sphere`, `jj.Surface` or `jj.HeightMap`"
         raise ValueError(f"`ground` of the contact of `{body}` is {described(given)}, expected a {known}, or None for z = 0 at rest")
     return given
+
+
+def _slipping(body: str, height: str, friction=None, restitution=0.0) -> tuple[Scalar | None, Scalar | None]:
+    if friction is None:
+        return None, None
+    if height != "row":
+        raise ValueError(
+            f'the contact of `{body}` has friction, and `height="coordinates"`, by which it cannot leave the ground; '
+            'give the body coordinates of its own for its height, and write height="row"'
+        )
+    return tuple(checked_real(x, f"{what} of the contact of `{body}`", ()) for x, what in ((friction, "friction"), (restitution, "restitution")))
 
 
 def _checked_height(height: str) -> str:

@@ -2,6 +2,7 @@
 them and what holds them. Everything else (velocities, partial velocities, mass matrix, rows) comes by automatic differentiation.
 """
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any, ClassVar
@@ -24,6 +25,7 @@ from jourdain_jax.scene.names import Named, nearest
 from jourdain_jax.scene.names_read import NamesRead, is_function, names_read
 from jourdain_jax.scene.parameters import check_parameters, parameters_of
 from jourdain_jax.scene.printing import scene_html, scene_text
+from jourdain_jax.scene.switching import NONE_SWITCHES, Declared, Switching, has_friction, switching_of
 from jourdain_jax.scene.visuals import Visual
 
 
@@ -58,6 +60,7 @@ class Scene(eqx.Module):
     example: ClassVar[dict[str, float]] = {}
     example_span: ClassVar[float] = 5.0
     _read: NamesRead = eqx.field(init=False, repr=False)  # a change of what they stand for makes another scene
+    switching: Switching = eqx.field(init=False, repr=False, static=True)  # contacts that have friction
 
     def __init_subclass__(cls, **options):
         """Look at the names that the methods read; ValueError where one stands for an object with state."""
@@ -65,6 +68,10 @@ class Scene(eqx.Module):
         if isinstance(cls.inputs, Names) and isinstance(cls.modes, Modes):
             modes = dict(cls.modes.pairs)
             cls.inputs = Names((*(name for name in cls.inputs.entries if name not in modes), *modes))
+        if has_friction(cls):
+            for name in ("coordinates", "inputs", "modes"):
+                stated = inspect.getattr_static(cls, name)
+                setattr(cls, name, stated if isinstance(stated, Declared) else Declared(name, stated))
         _names_read(cls)
 
     def __new__(cls, *args, **kwargs):
@@ -72,6 +79,7 @@ class Scene(eqx.Module):
         checked_arguments(cls, kwargs)
         scene = super().__new__(cls)
         object.__setattr__(scene, "_read", _names_read(cls))  # functions in fields come to it when they are known
+        object.__setattr__(scene, "switching", NONE_SWITCHES)
         return scene
 
     def __check_init__(self):
@@ -80,6 +88,8 @@ class Scene(eqx.Module):
         check_description(self, Scene)
         hold_leaves(self)
         check_parameters(self)
+        if has_friction(type(self)):
+            object.__setattr__(self, "switching", switching_of(self))
 
     def bodies(self, t: Scalar, q: Named) -> dict[str, Body]:
         """Poses of all bodies by name at time t (s) and coordinates q, `q.name`; in the inertial frame. Required."""

@@ -6,6 +6,7 @@ The checks look at kinds and shapes, which are known while a scene is traced: no
 from collections.abc import Iterable, Mapping
 from typing import get_args
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Scalar, checked_real, described
@@ -34,13 +35,15 @@ def bodies_of(scene: Scene, t, q: Named) -> dict[str, Body]:
 
 def coordinate_rates_of(scene: Scene, t, q: Named, u: Named) -> Float[Array, "coordinates"]:
     """The rates of all coordinates."""
-    names = scene.coordinate_names.entries
-    return checked_real(
+    directions = 2 * len(scene.switching.contacts)  # of slip: they come last, and are constant
+    names = scene.coordinate_names.entries[: len(scene.coordinate_names) - directions]
+    rates = checked_real(
         scene.coordinate_rates(t, q, u),
         f"what `coordinate_rates` of `{_name(scene)}` returned",
         (len(names),),
         advice=f"return one rate for each of {', '.join(names)}, in this order, such as jnp.stack([...])",
     )
+    return jnp.concatenate([rates, jnp.zeros(directions, rates.dtype)]) if directions else rates
 
 
 def loads_of(scene: Scene, motion: Motion) -> tuple[Load, ...]:
@@ -99,6 +102,8 @@ def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
     for name, contact in contacts.items():
         if not isinstance(contact, Contact):
             raise ValueError(f"contact `{name}` of `{_name(scene)}` is {described(contact)}, expected a `jj.disc_contact(...)` or another contact")
+        if (contact.friction is not None) != (name in scene.switching.contacts):
+            raise ValueError(f"contact `{name}` of `{_name(scene)}` got its friction outside of the method `contacts`; state `friction=` in that method itself")
     return contacts
 
 

@@ -19,7 +19,7 @@ from jourdain_jax.analysis.table import complex_numbers, table
 from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.calculus.reals import Numbers, checked_known, largest
 from jourdain_jax.motion.put_on_rows import State, state_of
-from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene, of_known_numbers, shown_from_users_lines
+from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_rolling, as_scene, of_known_numbers, shown_from_users_lines
 from jourdain_jax.scene.names import UnknownNameError, as_names, check_name, check_names
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed, in_digits
@@ -198,6 +198,7 @@ def family(
     if isinstance(guess, PeriodicMotion):
         equations = OrbitEquations(scene, guess, varied, held)
     else:
+        as_rolling(scene, "family")
         t, q, u = (np.asarray(x, float) for x in guessed(scene, point.state if point else guess, 0.0))
         scene = scene.replace(**{name: point[name] for name in varied if point and name in point.values})
         equations = SteadyEquations(scene, (float(t), q, u), np.asarray(as_input_vector(scene, inputs), float), varied, held)

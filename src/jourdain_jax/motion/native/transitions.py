@@ -16,7 +16,6 @@ Source: M. A. Aizerman, F. R. Gantmakher, Quarterly Journal of Mechanics and App
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 from jourdain_jax.motion.native.functions import Outputs, given_values, known_values
@@ -49,7 +48,6 @@ class Reset(NamedTuple):
         return [*self.state, *self.modes, self.lost, *self.times]
 
 
-@lru_cache(maxsize=64)
 def reset_program(form: Form) -> Reset:
     """Return the reset of a form."""
     program, count, events = form.program, len(form.moving), form.events

@@ -213,15 +213,13 @@ def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple
     return by_xla, lambda x: placed(kernel(x), x)
 
 
-_TRUTHS = frozenset(("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite"))
-
-
 class Beside(NamedTuple):
     """Machine code of what stands beside the steps of a program."""
 
     needed: tuple[tuple[int, ...], ...]  # nodes of those entries of the scene's parameters on which something that is fixed depends, -1 for others
     fixed: Callable[[Array], Array]  # of those entries
     at_states: "AtStates"
+    at_start: Callable[..., Array]  # `Lowered.at_start`, of the same
 
 
 class AtStates(NamedTuple):
@@ -235,14 +233,13 @@ class AtStates(NamedTuple):
 def beside(program: Lowered) -> Beside | None:
     """All this; None where it cannot be machine code."""
     graph, nodes = program.graph, [*program.z, *program.pivots, *program.energies, *program.fixed]
-    truths = any(_is_truth(graph, n) for n in program.fixed)  # which XLA hands on as such
     # 60_000 operations
-    if truths or graph.operations(nodes) > 60_000 or unsupported(graph, nodes):
+    if graph.operations(nodes) > 60_000 or unsupported(graph, nodes):
         return None
     used = set(graph.reachable(program.fixed))
     needed = tuple(tuple(n if n in used else -1 for n in np.ravel(leaf).tolist()) for leaf in program.traced.parameters)
     given = [n for leaf in needed for n in leaf if n >= 0]
-    return Beside(needed, values_of_nodes(graph, program.fixed, given), _at_states(program))
+    return Beside(needed, values_of_nodes(graph, program.fixed, given), _at_states(program), _at_state(program, program.at_start, values_of_nodes))
 
 
 def _at_states(program: Lowered) -> AtStates:
@@ -268,10 +265,6 @@ def _at_state(program: Lowered, nodes: Sequence[int], function: Callable) -> Cal
         return run(jnp.concatenate([jnp.asarray(x, real_type()) for x in (known, q, y, inputs)]))
 
     return values
-
-
-def _is_truth(graph: Graph, node: int) -> bool:
-    return graph.op[node] in _TRUTHS or (graph.op[node] == "select" and _is_truth(graph, graph.args[node][1]))
 
 
 def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:

@@ -17,7 +17,8 @@ MESSAGES = {
     STEP_TOO_SMALL: "the step size shrank to nothing: a singularity, a discontinuity, or rows that cannot be met near the last time",
     NOT_FINITE: "the accelerations are not finite near the last time: a load, pose or row is no number there, or they are not determined (rows that lose "
     "rank, no inertia along a free direction); look at the last state with `accelerations` and `verify`",
-    INCONSISTENT_START: "the start does not meet the constraints and could not be projected onto them",
+    INCONSISTENT_START: "the start does not meet the constraints and could not be projected onto them, or a body begins below the ground "
+    "of a contact with friction",
     SINGULAR_PARTITION: "the motion came near a configuration where the rows, as they are solved here, do not determine all speeds: another choice of "
     "`privileged` may serve there, and retry=True, or `formulation=jj.Formulation('full')` with `backend='dense'`, do unless the rows lose rank; or where the "
     "scene's own `coordinate_rates` become infinite: state other speeds there",
@@ -28,7 +29,8 @@ MESSAGES = {
     "put a row in the place of a stiff spring or damper, or loosen the tolerances",
     OFF_CONSTRAINTS: "a step of constant length ended so far from the constraints that the projection moved it by more than half of its change, or a solver of "
     "diffrax left them by more than errors of its steps explain: take shorter steps, the default solver, or look for rows that lose rank",
-    BAD_TIMES: "the times to save at leave the span or are not in order, or the span is empty or not finite; give increasing `ts` between `t0` and `t1`",
+    BAD_TIMES: "the times to save at leave the span or are not in order, or the span is empty or not finite; give increasing `ts` between `t0` and "
+    "`t1`; or time runs back, which it cannot where contacts have friction",
     ENERGY_LOST: "the energy, which nothing changes, changed by more than the steps' tolerances explain: the motion left its branch at a singular position, "
     "missed a short feature of a load, or a load's potential is not that of its force (`verify`)",
     CONTRADICTORY_ROWS: "velocity rows that depend on each other are not met together at some saved time: they contradict each other there; leave one out, "

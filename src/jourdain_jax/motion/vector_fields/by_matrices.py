@@ -18,6 +18,7 @@ from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.equations.reductions import Partition, Privileged, Reduced
 from jourdain_jax.equations.rows import UsualRows, velocity_residual
 from jourdain_jax.equations.scaling import scaled, speed_scale
+from jourdain_jax.equations.switching import At, put_back
 from jourdain_jax.equations.virtual_power import mass_matrix_at
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField, Watched
 from jourdain_jax.scene.identity import with_reference_parameters
@@ -103,6 +104,8 @@ class ByMatrices(VectorField):
         return rate_of_work(scene, motion, found, self.of_inputs) if self.with_work else None
 
     def project(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
+        if scene.switching.contacts and self.projects_speeds:
+            y = Integrated(*put_back(At(scene, motion_at(scene, t, y.q, y.v, inputs))), y.work)
         q = project_positions(scene, t, y.q, iterations=2, typical=self.usual.closures) if self.projects_positions else y.q
         if not self.projects_speeds:
             return Integrated(q, y.v, y.work)

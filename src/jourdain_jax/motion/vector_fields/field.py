@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import Structure
@@ -22,6 +23,7 @@ from jourdain_jax.dynamics.accelerations import Baumgarte
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.reductions import Reduction
+from jourdain_jax.equations.switching import At, contacts_at_start
 from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.native import values
@@ -215,6 +217,10 @@ class VectorField(eqx.Module):
         left_out = set(range(len(scene.speed_names))) - set(range(len(scene.speed_names)) if self.independent is None else self.independent)
         return jnp.delete(found, np.array([len(y.q) + k for k in sorted(left_out)], int), axis=1)
 
+    def at_start(self, scene: Scene, t, q, u, inputs) -> Float[Array, "numbers"]:
+        """Contacts that switch at the start of a motion from (q, u): `switching.Begun` in one vector."""
+        return ravel_pytree(contacts_at_start(At(scene, motion_at(scene, t, q, u, inputs))))[0]
+
     def energies(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "2"]:
         """Kinetic and potential energy, J; numbers to differentiation."""
         scene, fixed, t, y, inputs = jax.lax.stop_gradient((scene, fixed, t, y, inputs))
@@ -285,6 +291,11 @@ class ByProgram(VectorField):
         if self.native:
             return values.speeds_and_pivot(self.program, fixed, t, y.q, y.v, inputs)
         return self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)
+
+    def at_start(self, scene: Scene, t, q, u, inputs) -> Float[Array, "numbers"]:
+        if self.native and (own := values.beside(self.program)) is not None:
+            return own.at_start(self.fixed(scene), t, q, u, inputs)
+        return self.program.values(self.program.at_start, self.fixed(scene), t, tuple(q), tuple(u), inputs)
 
     def energies(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "2"]:
         if self.native:

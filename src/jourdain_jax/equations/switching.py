@@ -1,0 +1,184 @@
+"""Contacts that fly, roll, slip and strike: what ends each phase, and what comes after it.
+
+    M du/dt = h + A' L          flies: L = 0      rolls: dw = 0      slips: dw_n = 0, L_t = -mu L_n e, e = w_t/|w_t|      creeps: slips with e held
+
+    ends        normal                       tangent                      speed
+    flies       gap
+    rolls       L_n                          (mu L_n)^2 - |L_t|^2
+    slips       L_n                          |w_t|^2 - s^2
+    creeps      L_n                          e.w_t                        4 s^2 - |w_t|^2
+
+The direction of slip has no limit at rest: below the speed s it is held, as a number of the state, from where slip begins or until it stops. A contact that
+strikes gets an impulse P by Newton's restitution and Coulomb's law on the slip afterwards (Moreau); closed contacts take part in their modes:
+
+    u+ = u- + M^-1 A' P,   w_n+ = -e w_n-,   |P_t| <= mu P_n, and w_t+ = 0 or P_t against w_t+
+
+Source: J. J. Moreau, in: Nonsmooth Mechanics and Applications (1988), for impacts; Antali and Stepan (`contact_laws.py`) for slip that begins.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.reals import Flag, Scalar, Speeds
+from jourdain_jax.equations.contact_laws import Law, Modes, coulomb, responses, solved
+from jourdain_jax.equations.contact_rows import switching_contacts
+from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.virtual_power import ContactResponse, contact_modes, contact_response, friction_of, switching_forces
+from jourdain_jax.scene.modes import Event
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.switching import CREEPS, FLIES, ROLLS, SLIPS
+
+SLOW = 1e-4  # m/s: the direction of slip is held below this speed
+LEAST_REBOUND = 1e-6  # m/s: a contact that would rebound with less is closed
+TOUCHES = 1e-8  # m: a gap that counts as none at the start
+
+
+class At:
+    """The contacts that switch, at the state of a motion, with what their forces do there (default: worked out).
+
+    `responses`: those that were worked out, here and at states after this one, each after its coordinates, speeds and inputs.
+    """
+
+    def __init__(self, scene: Scene, motion: Motion, found: ContactResponse | None = None, responses: list | None = None):
+        self.scene, self.motion, self.responses = scene, motion, [] if responses is None else responses
+        self.found = contact_response(scene, motion) if found is None else found
+        self.responses += [(motion.q.array, motion.u.array, motion.inputs.array, self.found)] if found is None else []
+        self.friction = friction_of(scene, motion)
+        self.modes: Modes = contact_modes(scene, motion, self.found.rows.w)
+        self.w = self.found.rows.w.reshape(-1, 3)
+        self.number = jnp.stack([motion.modes[name] for name in scene.switching.contacts])
+
+    @property
+    def forces(self) -> Float[Array, "contacts 3"]:
+        """Normal forces, and those along both tangents, N."""
+        return switching_forces(self.scene, self.motion, self.found).reshape(-1, 3)
+
+    def alone(self, i: int, b: Float[Array, "rows"]) -> tuple[Float[Array, "3 3"], Float[Array, "3"], Float[Array, "rows 4"]]:
+        """Return the response `G L + b` of contact i to its own forces while the others are in their modes; and what those bear then."""
+        mine = slice(3 * i, 3 * i + 3)
+        others = self.modes._replace(closed=self.modes.closed.at[i].set(0.0), rolls=self.modes.rolls.at[i].set(0.0))
+        if len(self.number) == 1:
+            return self.found.G, b, jnp.zeros((3, 4), b.dtype)
+        right = jnp.concatenate([self.found.G[:, mine], b[:, None]], axis=1)
+        borne = responses(self.found.G, right, others, self.friction)
+        total = (right + self.found.G @ borne)[mine]
+        return total[:, :3], total[:, 3], borne
+
+    def moved(self, i: int, impulse: Float[Array, "3"], borne: Float[Array, "rows 4"]) -> Speeds:
+        """Return the speeds after an impulse at contact i."""
+        every = (borne[:, :3] @ impulse).at[3 * i : 3 * i + 3].add(impulse)
+        return self.motion.u.array + self.found.impulses @ every
+
+
+def contact_events(at: At) -> dict[str, Scalar]:
+    """Values of the events of all contacts that switch."""
+    events, forces, one = {}, at.forces, jnp.ones_like(at.motion.t)
+    for i, name in enumerate(at.scene.switching.contacts):
+        number, normal, tangential, slip = at.number[i], forces[i, 0], forces[i, 1:], at.w[i, 1:]
+        bound, square = at.friction[i] * normal, slip @ slip
+        events[f"{name} normal"] = jnp.where(number == FLIES, at.found.rows.gap[i], normal)
+        while_closed = jnp.where(number == SLIPS, square - SLOW**2, at.modes.direction[i] @ slip)
+        events[f"{name} tangent"] = jnp.where(number == FLIES, one, jnp.where(number == ROLLS, bound * bound - tangential @ tangential, while_closed))
+        events[f"{name} speed"] = jnp.where(number == CREEPS, 4 * SLOW**2 - square, one)
+    return events
+
+
+def contact_changes(at: At) -> dict[str, Event]:
+    """Return what each event of the contacts that switch makes of the state and the modes."""
+    scene, motion, events = at.scene, at.motion, {}
+    for i, name in enumerate(scene.switching.contacts):
+        number, slip, here = at.number[i], at.w[i, 1:], motion.u.array
+        strikes, stops = number == FLIES, number == CREEPS
+        after = After(at, i, strikes)
+        mode, u = jnp.where(strikes, after.mode, float(FLIES)), jnp.where(strikes, after.u, here)
+        events[f"{name} normal"] = _event(scene, name, mode, u, after.direction)
+        # the law at rest, from where slip begins, says the direction of slip also where round-off would let it stick
+        mode, u = jnp.where(stops, after.mode, float(CREEPS)), jnp.where(stops, after.u, here)
+        along = slip / jnp.sqrt(jnp.where(number == SLIPS, slip @ slip, 1.0))
+        events[f"{name} tangent"] = _event(scene, name, mode, u, jnp.where(number == SLIPS, along, after.direction))
+        events[f"{name} speed"] = _event(scene, name, jnp.asarray(float(SLIPS)), here, at.modes.direction[i])
+    return events
+
+
+def _event(scene: Scene, name: str, mode: Scalar, u: Speeds, e: Float[Array, "2"]) -> Event:
+    e = jnp.where(mode == CREEPS, e, 0.0)
+    jump = dict(zip(scene.speed_names.entries, u, strict=True)) | {f"{name}_slip_1": e[0], f"{name}_slip_2": e[1]}
+    return Event(jnp.ones_like(mode), to={name: mode}, jump=jump)
+
+
+class After:
+    """Speeds, mode and direction of slip of contact i where it closes: after an impact if it `strikes`, otherwise as its slip stops or is about to begin."""
+
+    def __init__(self, at: At, i: int, strikes: Flag):
+        scene, motion, friction = at.scene, at.motion, at.friction[i]
+        G, w, borne = at.alone(i, at.found.rows.w)
+        contact = list(switching_contacts(scene, motion.pose()).values())[i]
+        rebound = -jnp.asarray(contact.restitution) * w[0]
+        rebounds = strikes & (rebound > LEAST_REBOUND)
+        law: Law = coulomb(G, w, jnp.where(rebounds, rebound, 0.0), friction)
+        impulse = jnp.where(strikes, law.forces, law.sticking)
+        rolling = at.number[i] == ROLLS  # nothing strikes or stops
+        self.u = jnp.where(rolling, motion.u.array, at.moved(i, impulse, borne))
+        slip = w[1:] + G[1:] @ law.forces
+        then = At(scene, motion_at(scene, motion.t, motion.q.array, self.u, motion.inputs.array), None, at.responses)
+        G, b, _ = then.alone(i, then.found.b)
+        rest = coulomb(G, b, jnp.zeros_like(b[0]), friction)
+        self.direction = rest.direction
+        settled = jnp.where(rest.forces[0] < 0, float(FLIES), jnp.where(rest.sticks, float(ROLLS), float(CREEPS)))
+        slips = strikes & ~law.sticks & (slip @ slip > SLOW**2)
+        self.mode = jnp.where(rebounds, float(FLIES), jnp.where(slips, float(SLIPS), settled))
+
+
+def put_back(at: At) -> tuple[Float[Array, "coordinates"], Speeds]:
+    """Coordinates on the ground, by one step of Gauss-Newton, and speeds on the rows, of contacts that are closed.
+
+    q - D' (D D')^-1 gap,  D = d gap/dq;       u + M^-1 A' P,  w + G P = 0 along the normals, and along the tangents of those that roll
+    """
+    scene, motion, found, modes = at.scene, at.motion, at.found, at.modes
+    P = responses(found.G, found.rows.w[:, None], modes, jnp.zeros_like(modes.closed))[:, 0]
+    q, closed = motion.q.array, modes.closed
+
+    def gaps(q):
+        pose = motion_at(scene, motion.t, q, motion.u.array, motion.inputs.array).pose()
+        return closed * jnp.stack([contact.gap() for contact in switching_contacts(scene, pose).values()])
+
+    D = jax.jacfwd(gaps)(q)
+    moved = solved(list(D @ D.T + jnp.diag(1 - closed)), list(gaps(q)[:, None]))
+    return q - jnp.concatenate(moved) @ D, motion.u.array + found.impulses @ P
+
+
+class Begun(NamedTuple):
+    """Contacts at the start of a motion."""
+
+    numbers: Float[Array, "contacts"]  # of their modes
+    below: Scalar  # m, how far a body is below its ground
+    q: Float[Array, "coordinates"]  # on the ground where they touch it
+    u: Speeds  # after an impact where they strike it
+
+
+def contacts_at_start(at: At) -> Begun:
+    """Return in which modes contacts begin, and the state then."""
+    scene, motion, gap, w = at.scene, at.motion, at.found.rows.gap, at.w
+    touches = gap < TOUCHES
+    strikes = touches & (w[:, 0] < -LEAST_REBOUND)
+    closed = touches & (jnp.abs(w[:, 0]) <= LEAST_REBOUND)
+    slips = jnp.sum(w[:, 1:] ** 2, axis=1) > SLOW**2
+    numbers = jnp.where(closed, jnp.where(slips, float(SLIPS), float(ROLLS)), float(FLIES))
+    q, u = put_back(At(scene, _switched(scene, motion, numbers, motion.q.array, motion.u.array), at.found))
+    for i, name in enumerate(scene.switching.contacts):
+        after = After(At(scene, _switched(scene, motion, numbers, q, u), None, at.responses), i, strikes[i])
+        numbers = numbers.at[i].set(jnp.where(strikes[i] | (closed[i] & ~slips[i]), after.mode, numbers[i]))
+        u = jnp.where(strikes[i], after.u, u)
+        place = np.array([scene.coordinate_names.entries.index(f"{name}_slip_{k}") for k in (1, 2)])
+        q = q.at[place].set(jnp.where(numbers[i] == CREEPS, after.direction, 0.0))
+    return Begun(numbers, jnp.max(-gap, initial=0.0), q, u)
+
+
+def _switched(scene: Scene, motion: Motion, numbers: Float[Array, "contacts"], q, u) -> Motion:
+    inputs = jnp.concatenate([motion.inputs.array[: len(scene.inputs) - len(numbers)], numbers])
+    return motion_at(scene, motion.t, q, u, inputs)

@@ -1,0 +1,24 @@
+"""Contacts that switch, in normal forms: what they are made of is simplified once, and loads, events, resets and starts are rebuilt from it."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from jourdain_jax.build.trace import TracedScene
+from jourdain_jax.program.polynomial import NormalForms
+
+MOST_TERMS = (8, 60)  # of normal forms that are tried
+
+
+def simplify_contacts(traced: TracedScene, forms: Callable[[int], NormalForms]) -> None:
+    """Put normal forms in the place of `responses`; at states after others these are functions of those. `forms`: normal forms of at most so many terms."""
+    g, at = traced.graph, traced.at
+    state = [*traced.q.tolist(), *traced.u.tolist(), *traced.inputs.tolist()]
+    first, *later = (row[len(state) :] for row in at.responses.tolist())
+    normal = min([first, *(forms(most).all_simplified(first) for most in MOST_TERMS)], key=g.operations)
+    simple = dict(zip(first, normal, strict=True))
+    for row, nodes in zip(at.responses[1:, : len(state)].tolist(), later, strict=True):
+        now = dict(zip(state, g.substituted(row, simple), strict=True))
+        simple |= dict(zip(nodes, g.substituted(normal, now), strict=True))
+    for x in (at.force, at.torque, at.direct, at.power, at.events, at.resets, at.held, at.start):
+        x[...] = np.array(g.substituted(x.ravel().tolist(), simple), np.int64).reshape(x.shape)

@@ -1,0 +1,227 @@
+"""Contacts with friction: slip, sticking, flight and impacts, against closed forms and independent integrations."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+
+G = 9.81
+
+
+class Ball(jj.Scene):
+    """A ball above a plane."""
+
+    mass: float = jj.parameter(0.17, positive=True)
+    radius: float = jj.parameter(0.0285, positive=True)
+    friction: float = jj.parameter(0.2)
+    bounce: float = jj.parameter(0.0)
+    g: float = jj.parameter(G)
+    coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
+
+    def bodies(self, t, q):
+        inertia = 0.4 * self.mass * self.radius**2 * jnp.eye(3)
+        return {"ball": jj.RigidBody(self.mass, inertia, jnp.stack([q.x, q.y, q.z]), jj.quaternion_to_matrix(q.attitude))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, self.g),)
+
+    def contacts(self, pose):
+        return {"cloth": jj.ball_contact(pose["ball"], self.radius, height="row", friction=self.friction, restitution=self.bounce)}
+
+
+SLIDING = {"z": 0.0285, "x_rate": 3.0, "y_rate": 0.4, "attitude_omega": (5.0, -12.0, 20.0)}
+FINE = {"rtol": 1e-12, "atol": 1e-12}
+
+
+def test_a_ball_slides_and_then_rolls():
+    """w0 = v + omega x (-R n);   t = 2 |w0|/(7 mu g), speeds then v - 2/7 w0."""
+    motion = jj.simulate(Ball(), SLIDING, ts=[0.2, 1.0, 2.0], **FINE)
+    np.testing.assert_allclose(motion.phases.ts[1], 0.493045748408300, rtol=1e-11)
+    np.testing.assert_allclose([motion["x_rate"][1], motion["y_rate"][1]], [2.04514285714286, 0.245], rtol=1e-11)
+    np.testing.assert_allclose([motion["x"][2], motion["y"][2]], [4.32567984159722, 0.528211045501643], rtol=1e-11)
+    assert motion.phase("cloth").tolist() == [2, 1, 1]
+    np.testing.assert_allclose(motion.energies().balance, motion.energies().balance[0], rtol=1e-11)
+    forces = motion.contact_forces()["cloth"]
+    np.testing.assert_allclose(forces.normal, 0.17 * G, rtol=1e-10)
+    np.testing.assert_allclose(forces.friction_needed, [0.2, 0.0, 0.0], atol=1e-8)
+    assert "cloth: rolls" in str(motion.phases)
+
+
+def test_derivatives_of_slip():
+    def end(numbers):
+        friction, speed, radius = numbers
+        start = SLIDING | {"z": radius, "x_rate": speed}
+        return jj.simulate(Ball(friction=friction, radius=radius), start, ts=[2.0], **FINE)["x"][-1]
+
+    numbers = jnp.array([0.2, 3.0, 0.0285])
+    first = [-1.17697063655753, 1.56763330222260, -5.13270016244590]
+    np.testing.assert_allclose(jax.jacfwd(end)(numbers), first, rtol=1e-9)
+    np.testing.assert_allclose(jax.grad(end)(numbers), first, rtol=1e-9)
+
+
+def test_bounces_and_rest():
+    """t_n = t_0 (1 + 2 (e + ... + e^n)) with t_0 = sqrt(2 h/g); at rest after t_0 (1 + e)/(1 - e)."""
+
+    def tenth(numbers):
+        bounce, height = numbers
+        return jj.simulate(Ball(bounce=bounce), {"z": 0.0285 + height, "x_rate": 0.1}, t1=2.6, rtol=1e-10, atol=1e-10).phases.ts[9]
+
+    numbers = jnp.array([0.7, 1.0])
+    np.testing.assert_allclose(tenth(numbers), 2.47360446364125, rtol=1e-12)
+    np.testing.assert_allclose(jax.jacfwd(tenth)(numbers), [8.53571984478680, 1.23680223182063], rtol=1e-10)
+    motion = jj.simulate(Ball(bounce=0.7), {"z": 1.0285}, ts=[2.5, 3.0], rtol=1e-10, atol=1e-10)
+    last = np.flatnonzero(np.isfinite(motion.phases.ts))[-1]
+    np.testing.assert_allclose(motion.phases.ts[last], 2.55863396558581, atol=1e-6)  # closed where the rebound is below 1e-6 m/s
+    assert motion.phase("cloth").tolist() == [0, 1]
+    np.testing.assert_allclose(motion["z"][-1], 0.0285, rtol=1e-14)
+
+
+@pytest.mark.parametrize("bounce", [1.0, 0.8])
+def test_trend_of_a_bounce(bounce):
+    """Without gravity dz(1)/dz0 is -e (google/brax#317)."""
+
+    def end(z):
+        return jj.simulate(Ball(bounce=bounce, g=0.0), {"z": z, "z_rate": -1.0}, ts=[1.0])["z"][0]
+
+    np.testing.assert_allclose(jax.grad(end)(0.5), -bounce, rtol=1e-12)
+
+
+class OnSphere(Ball):
+    """A ball on top of a fixed sphere."""
+
+    def contacts(self, pose):
+        ground = jj.Sphere(1 - self.radius, side="outside")
+        return {"ground": jj.ball_contact(pose["ball"], self.radius, ground=ground, height="row", friction=self.friction)}
+
+
+def test_a_ball_slips_and_lifts_off_a_sphere():
+    def phases(friction):
+        start = {"z": 1.0, "x_rate": 0.1, "attitude_omega_y": 1.0}
+        return jj.simulate(OnSphere(mass=1.0, radius=0.1, friction=friction), start, t1=1.6, **FINE).phases
+
+    found = phases(0.5)
+    np.testing.assert_allclose([found.ts[0], found.ts[2]], [1.3847002479896, 1.473754099443], rtol=1e-11)
+    assert [int(mode) for mode in found.modes[0][:4]] == [1, 3, 2, 0]  # rolls, creeps, slips, flies
+    np.testing.assert_allclose(jax.jacfwd(lambda friction: phases(friction).ts)(0.5)[2], 0.019794092885, rtol=1e-9)
+
+
+class Hoop(jj.Scene):
+    """A hoop in a plane with a heavy bead on its rim."""
+
+    coordinates = jj.coordinates("x z turn")
+
+    def bodies(self, t, q):
+        turn, centre = jj.rot_y(q.turn), jnp.stack([q.x, 0.0 * q.x, q.z])
+        hoop = jj.RigidBody(0.2, 0.2 * jnp.diag(jnp.array([0.5, 1.0, 0.5])), centre, turn)
+        return {"hoop": hoop, "bead": jj.Particle(1.0, centre + turn @ jnp.array([0.0, 0.0, 1.0]))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, G),)
+
+    def contacts(self, pose):
+        return {"rim": jj.disc_contact(pose["hoop"], 1.0, height="row", friction=0.6)}
+
+
+def test_a_hoop_slips_and_rolls_again():
+    """In a plane, where nothing moves across: the second tangent has no force."""
+    times = [1.880372501087, 2.017805766802]
+    motion = jj.simulate(Hoop(), {"z": 1.0, "turn_rate": 0.3, "x_rate": 0.3}, ts=[*times, 2.1], **FINE)
+    np.testing.assert_allclose([motion.phases.ts[0], motion.phases.ts[3]], times, rtol=1e-11)
+    np.testing.assert_allclose([motion["turn"][0], motion["x"][1]], [1.888898912431, 2.607814697168], rtol=1e-11)
+
+
+class Coin(jj.Scene):
+    """A coin above a table."""
+
+    friction: float = jj.parameter(0.3)
+    coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
+
+    def bodies(self, t, q):
+        inertia = 0.01 * 0.012**2 * jnp.diag(jnp.array([0.25, 0.5, 0.25]))
+        return {"coin": jj.RigidBody(0.01, inertia, jnp.stack([q.x, q.y, q.z]), jj.quaternion_to_matrix(q.attitude))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, G),)
+
+    def contacts(self, pose):
+        return {"rim": jj.disc_contact(pose["coin"], 0.012, height="row", friction=self.friction, restitution=0.5)}
+
+
+class RollingCoin(Coin):
+    """A coin that cannot slip."""
+
+    def contacts(self, pose):
+        return {"rim": jj.disc_contact(pose["coin"], 0.012, height="row")}
+
+
+def test_a_coin_with_much_friction_rolls_as_one_that_cannot_slip():
+    rolling, lean = RollingCoin(), 0.3
+    start = jj.start(rolling, attitude=(np.cos(lean / 2), np.sin(lean / 2), 0.0, 0.0), attitude_omega_y=30.0, near={"z": 0.0115})
+    kept = jj.simulate(rolling, start, ts=[0.5], **FINE)
+    names = (*rolling.coordinate_names.entries, *rolling.speed_names.entries)
+    free = jj.simulate(Coin(friction=1e6), dict(zip(names, [*start.q, *start.u], strict=True)), ts=[0.5], **FINE)
+    assert not np.isfinite(free.phases.ts).any()
+    np.testing.assert_allclose(free.q[0][:7], kept.q[0], atol=1e-9)
+    np.testing.assert_allclose(free.u[0], kept.u[0], atol=1e-8)
+
+
+def test_dropped_coins():
+    """Energy is lost where an impact or friction takes it; lanes give what each motion gives alone."""
+    attitude = np.random.default_rng(0).normal(size=(4, 4))
+    attitude /= np.linalg.norm(attitude, axis=1)[:, None]
+    starts = {"z": np.full(4, 0.03), "attitude": attitude, "x_rate": np.array([0.2, -0.1, 0.3, 0.0]), "attitude_omega_y": np.full(4, 10.0)}
+    how = {"ts": [0.1, 0.15], "rtol": 1e-10, "atol": 1e-10}
+    together = jj.rollout(Coin(), starts, **how)
+    for i in range(4):
+        alone = jj.simulate(Coin(), {name: x[i] for name, x in starts.items()}, **how)
+        assert alone.succeeded
+        assert np.isfinite(alone.phases.ts).sum() >= 2
+        np.testing.assert_array_equal(alone.q, together.lane(i).q)
+        balance = np.asarray(alone.energies().balance)
+        np.testing.assert_allclose(balance, balance[0], atol=1e-9 * 0.01 * G * 0.03)
+
+
+class Kept(Ball):
+    """A ball that its coordinates are said to keep on the ground."""
+
+    def contacts(self, pose):
+        return {"cloth": jj.ball_contact(pose["ball"], self.radius, friction=self.friction)}
+
+
+def test_bad_contacts():
+    with pytest.raises(ValueError, match="cannot leave the ground; give the body coordinates of its own for its height, and write height="):
+        Kept()
+    with pytest.raises(ValueError, match=r"the friction of contact `cloth` of `Ball` is -0\.1, expected a coefficient that is not negative"):
+        jj.simulate(Ball(friction=-0.1), SLIDING, t1=0.1)
+    with pytest.raises(ValueError, match=r"the restitution of contact `cloth` of `Ball` is 1\.2, expected a number from 0 to 1"):
+        jj.simulate(Ball(bounce=1.2), SLIDING, t1=0.1)
+    with pytest.raises(ValueError, match=r"contacts with friction, and time runs from t0 = 0\.0 back to t1 = -1\.0 s"):
+        jj.simulate(Ball(), SLIDING, t1=-1.0)
+    with pytest.raises(ValueError, match="`linearize` serves contacts that roll, and `cloth` of `Ball` may slip and fly"):
+        jj.linearize(Ball(), {"z": 0.0285})
+    below = jj.simulate(Ball(), SLIDING | {"z": 0.02}, t1=0.1)
+    assert "a body begins below the ground" in below.message
+
+    def end(friction):
+        return jj.simulate(Ball(friction=friction), SLIDING, ts=[0.1]).result
+
+    assert jax.vmap(end)(jnp.array([0.2, -0.1])).tolist() == [0, 7]
+
+
+def test_a_start_in_contact():
+    """A body that strikes at its start rebounds; one at rest on a slope slips at once where friction cannot hold it."""
+    struck = jj.simulate(Ball(bounce=0.5), {"z": 0.0285, "z_rate": -1.0}, ts=[0.01])
+    np.testing.assert_allclose(struck["z_rate"], [0.5 - G * 0.01], rtol=1e-12)
+
+    class OnSlope(Ball):
+        def contacts(self, pose):
+            return {"slope": jj.ball_contact(pose["ball"], self.radius, ground=jj.Plane(tilt=0.5), height="row", friction=self.friction)}
+
+    height = 0.0285 / np.cos(0.5)
+    for friction, phase in ((0.9 * 2 / 7 * np.tan(0.5), 2), (1.1 * 2 / 7 * np.tan(0.5), 1)):  # mu = (2/7) tan beta divides
+        motion = jj.simulate(OnSlope(friction=friction), {"z": height}, ts=[0.3], **FINE)
+        assert motion.phase("slope").tolist() == [phase]
+        along = G * (np.sin(0.5) - friction * np.cos(0.5)) if phase == 2 else 5 / 7 * G * np.sin(0.5)
+        np.testing.assert_allclose(np.hypot(motion["x_rate"], motion["z_rate"]), along * 0.3, rtol=1e-8)
