@@ -176,3 +176,48 @@ class Oscillator(jj.Scene):
 
     def loads(self, motion):
         return (jj.generalized_force(motion, x_rate=-self.damping * motion.u.x_rate - self.stiffness * motion.q.x),)
+
+
+class HoopBead(jj.Scene):
+    """A bead on a hoop that turns about its vertical diameter."""
+
+    radius: float = jj.parameter(0.5, unit="m", positive=True)
+    turning: float = jj.parameter(3.0, unit="rad/s")
+    coordinates = jj.coordinates("angle")
+    domain = {"angle": (-3.0, 3.0)}
+
+    def bodies(self, t, q):
+        x, heading = self.radius * jnp.sin(q.angle), self.turning * t
+        return {"bead": jj.Particle(0.2, jnp.stack([x * jnp.cos(heading), x * jnp.sin(heading), -self.radius * jnp.cos(q.angle)]))}
+
+    def loads(self, motion):
+        return jj.gravity(motion, 9.81)
+
+
+class Twice(OnLine):
+    """A particle on a spring and in a medium that both nearly give way at a place, by a closed form: twice, and 1 mm apart, or not at all."""
+
+    push: float = jj.parameter(-0.1)
+    place: float = jj.parameter(0.0123)
+    apart: float = jj.parameter(1e-6)  # square of the distance
+    damped: float = jj.parameter(1.0)
+
+    def loads(self, motion):
+        x = motion.q.x - self.place
+        drag = self.damped + (1 - self.damped) * (12 * x**2 - 3 * self.apart)
+        spring = self.damped * (x**3 - 0.75 * self.apart * x) + (1 - self.damped) * x
+        return (jj.generalized_force(motion, x_rate=self.push - drag * motion.u.x_rate - spring),)
+
+
+class DrivenSleigh(jj.models.ChaplyginSleigh):
+    """A sleigh with drag, and a torque that changes its sign."""
+
+    along: float = jj.parameter(0.15)
+    turning: float = jj.parameter(0.05)
+    torque: float = jj.parameter(0.6)
+
+    def loads(self, motion):
+        c, s, u = jnp.cos(motion.q.heading), jnp.sin(motion.q.heading), motion.u
+        push = -self.along * (c * u.x_rate + s * u.y_rate)
+        turn = self.torque * jnp.sin(2 * motion.t) - self.turning * u.heading_rate
+        return (jj.generalized_force(motion, x_rate=push * c, y_rate=push * s, heading_rate=turn),)

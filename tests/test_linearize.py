@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import rolling_disc, whipple_bicycle
-from small_scenes import DrivenPendulum, OnLine
+from small_scenes import DrivenPendulum, HoopBead, OnLine, Twice
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
@@ -341,32 +341,16 @@ def test_steady_turns_of_a_disc_meet_their_closed_form():
     assert_allclose(found["spin_rate"], -rolling_disc.steady_circle(np.pi / 2 + 0.3, found["yaw_rate"], **DISC)["spin_rate"], atol=1e-9)
 
 
-class Bead(jj.Scene):
-    """A bead on a hoop that turns about its vertical diameter."""
-
-    radius: float = jj.parameter(0.5, unit="m", positive=True)
-    turning: float = jj.parameter(3.0, unit="rad/s")
-    coordinates = jj.coordinates("angle")
-    domain = {"angle": (-3.0, 3.0)}
-
-    def bodies(self, t, q):
-        x, heading = self.radius * jnp.sin(q.angle), self.turning * t
-        return {"bead": jj.Particle(0.2, jnp.stack([x * jnp.cos(heading), x * jnp.sin(heading), -self.radius * jnp.cos(q.angle)]))}
-
-    def loads(self, motion):
-        return jj.gravity(motion, 9.81)
-
-
 def test_a_bead_on_a_turning_hoop_leaves_the_bottom_at_a_pitchfork():
-    bottom = jj.family(Bead(), {"angle": 0.0}, vary="turning", until={"turning": 6.0})
+    bottom = jj.family(HoopBead(), {"angle": 0.0}, vary="turning", until={"turning": 6.0})
     (branch,) = bottom.branches
     critical = np.sqrt(9.81 / 0.5)
     assert branch["turning"] == pytest.approx(critical, abs=1e-9)
     assert bottom["turning"][-1] == pytest.approx(6.0, abs=1e-9)
     assert_array_equal(bottom.stable, bottom["turning"] < critical)
-    aside = jj.family(Bead(), branch, vary="turning", until={"turning": 8.0})
+    aside = jj.family(HoopBead(), branch, vary="turning", until={"turning": 8.0})
     assert_allclose(np.cos(aside["angle"]), 9.81 / (aside["turning"] ** 2 * 0.5), atol=1e-9)
-    both = jj.family(Bead(), branch, vary="turning")
+    both = jj.family(HoopBead(), branch, vary="turning")
     assert both["angle"].min() < -1.5
     assert both["angle"].max() > 1.5
     assert {point.kind for point in both.special} == {"branch point", "fold in turning"}
@@ -375,19 +359,19 @@ def test_a_bead_on_a_turning_hoop_leaves_the_bottom_at_a_pitchfork():
 
 @pytest.mark.parametrize("until", [{"radius": -0.5}, None])
 def test_a_family_along_a_parameter_ends_where_this_leaves_the_sign_declared_for_it(until):
-    found = jj.family(Bead(turning=1.0), {"angle": 0.0}, vary="radius", until=until)
+    found = jj.family(HoopBead(turning=1.0), {"angle": 0.0}, vary="radius", until=until)
     assert 0 < found["radius"].min() < 0.1
     assert any("`radius` is declared positive" in end for end in found.ends)
 
 
-class SplineBead(Bead):
+class SplineBead(HoopBead):
     """The bead with a field of many numbers, which is no parameter, before the one that varies."""
 
     weight: jj.Spline = jj.Spline(jnp.linspace(0.0, 1.0, 5), jnp.full(5, 9.81))
     pace: float = jj.parameter(3.0, unit="rad/s")
 
     def bodies(self, t, q):
-        return Bead(self.radius, self.pace).bodies(t, q)
+        return HoopBead(self.radius, self.pace).bodies(t, q)
 
     def loads(self, motion):
         return jj.gravity(motion, self.weight(0.5))
@@ -439,7 +423,7 @@ def test_what_cannot_be_followed_is_refused(guess, options, says):
 
 def test_a_motion_that_stands_alone_and_points_that_are_no_branch_points(turns, bicycle):
     with pytest.raises(ValueError, match="stands alone"):
-        jj.family(Bead(), {"angle": 0.0})
+        jj.family(HoopBead(), {"angle": 0.0})
     with pytest.raises(ValueError, match="expected a branch point"):
         jj.family(bicycle, turns.folds[0])
     with pytest.raises(ValueError, match="expected two axes"):
@@ -527,21 +511,6 @@ def test_a_chart_has_the_speeds_of_stability_as_its_boundaries_and_what_measurem
     assert str(chart) == "weave, pair on the imaginary axis: 3 of 3 found\ncapsize, zero eigenvalue: 3 of 3 found"
 
 
-class Twice(OnLine):
-    """A particle on a spring and in a medium that both nearly give way at a place, by a closed form: twice, and 1 mm apart, or not at all."""
-
-    push: float = jj.parameter(-0.1)
-    place: float = jj.parameter(0.0123)
-    apart: float = jj.parameter(1e-6)  # square of the distance
-    damped: float = jj.parameter(1.0)
-
-    def loads(self, motion):
-        x = motion.q.x - self.place
-        drag = self.damped + (1 - self.damped) * (12 * x**2 - 3 * self.apart)
-        spring = self.damped * (x**3 - 0.75 * self.apart * x) + (1 - self.damped) * x
-        return (jj.generalized_force(motion, x_rate=self.push - drag * motion.u.x_rate - spring),)
-
-
 @pytest.mark.parametrize("place", [0.0123, 0.05, 0.0877])
 @pytest.mark.parametrize(("damped", "kind"), [(1.0, "fold in push"), (1.0, "zero eigenvalue"), (0.0, "pair on the imaginary axis")])
 def test_two_special_points_a_hundredth_of_a_step_apart_are_found(place, damped, kind):
@@ -582,8 +551,8 @@ def test_critical_points_along_a_parameter_have_derivatives_of_both_orders():
 
 def test_points_that_meet_are_no_functions_of_parameters():
     """The bead's pair meets where its equilibria branch: any asymmetry takes this point away."""
-    bottom = jj.family(Bead(), {"angle": 0.0}, vary="turning", until={"turning": 6.0})
-    point = jj.critical(Bead(radius=0.8), bottom, "double root")
+    bottom = jj.family(HoopBead(), {"angle": 0.0}, vary="turning", until={"turning": 6.0})
+    point = jj.critical(HoopBead(radius=0.8), bottom, "double root")
     assert point.code != 0
     assert np.isnan(point["turning"])
 

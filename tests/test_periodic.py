@@ -7,23 +7,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
-from small_scenes import OnLine
+from small_scenes import DrivenSleigh, OnLine
 
 import jourdain_jax as jj
-
-
-class DrivenSleigh(jj.models.ChaplyginSleigh):
-    """A sleigh with drag, and a torque that changes its sign."""
-
-    along: float = jj.parameter(0.15)
-    turning: float = jj.parameter(0.05)
-    torque: float = jj.parameter(0.6)
-
-    def loads(self, motion):
-        c, s, u = jnp.cos(motion.q.heading), jnp.sin(motion.q.heading), motion.u
-        push = -self.along * (c * u.x_rate + s * u.y_rate)
-        turn = self.torque * jnp.sin(2 * motion.t) - self.turning * u.heading_rate
-        return (jj.generalized_force(motion, x_rate=push * c, y_rate=push * s, heading_rate=turn),)
 
 
 def on_a_line(force):

@@ -248,7 +248,8 @@ class Special(eqx.Module):
 @partial(compiled, options=RUN_SELDOM)
 def _solution(special: Special, scene: Scene) -> tuple[Array, Array, Array]:
     """X, differentiable twice, its condition and code, of which all is NaN unless it is 0."""
-    X, inverse, condition, code = jax.lax.stop_gradient(followed_to(special, jax.lax.stop_gradient(scene)))
+    lane_by_lane = jax.custom_batching.sequential_vmap(followed_to)  # each takes as many steps as it needs
+    X, inverse, condition, code = jax.lax.stop_gradient(lane_by_lane(*jax.lax.stop_gradient((special, scene))))
     near = X
     for _ in range(2):  # each carries one order of derivatives
         X = X - inverse @ special.equations_at(scene, X, near)
