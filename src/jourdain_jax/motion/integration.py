@@ -151,7 +151,7 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
     # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
     # without rows all are one, which XLA would go through while it compiles, for seconds, were it to know them
     pivots = jax.lax.optimization_barrier(pivots)
-    pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.asarray(jnp.inf, pivots.dtype), jnp.fmin, (0,))
+    pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.inf, jnp.fmin, (0,))
     pivot = jnp.fmin(pivot, jnp.asarray(solved.pivot, pivots.dtype))
     lost = energy_lost(energies_near(setup, args, *states), solved.accepted) if conserves(setup) else False
     violated = rows_violated(setup, states[0], *found[:2]) if field.rows_may_contradict else False
@@ -190,7 +190,7 @@ def _finish(given: Setup, setup: Setup, asked: Scalar, begun: Begun, solved: Sol
         last_step=solved.last_step,
         crossings=jnp.full_like(solved.crossings, -1) if unwatched else solved.crossings,
         together=solved.together,
-        fallback=jnp.zeros((), jnp.int32) + results.AS_ASKED,
+        fallback=jnp.asarray(results.AS_ASKED, jnp.int32),
         moved_q=moved_q,
         moved_u=moved_u,
         smallest_pivot=pivot,
@@ -280,11 +280,11 @@ def energies_near(setup: Setup, args, t: Float[Array, "times"], y: Integrated) -
 
 def energy_lost(energies: Float[Array, "2 times 2"], steps) -> Flag:
     """Whether T + V changed by more than N `steps` explain."""
-    (T, V), off = energies[0].T, energies[1].T
-    error = jnp.abs(off[0] - T) + jnp.abs(off[1] - V) + jnp.finfo(T.dtype).eps * (T + jnp.abs(V))
-    moved = jnp.nanmax(T) + jnp.nanmax(V) - jnp.nanmin(V)
-    allowed = jnp.fmax(DRIFTED * moved, MOST_STEP_ERRORS * steps * jnp.nanmax(error))
-    return jnp.nanmax(T + V) - jnp.nanmin(T + V) > allowed
+    at, off = energies
+    T, V = at.T
+    E, error = T + V, jnp.sum(jnp.abs(off - at) + jnp.finfo(at.dtype).eps * jnp.abs(at), axis=1)
+    most = jax.lax.reduce(jnp.stack([T, V, -V, error, E, -E]), -jnp.inf, jnp.fmax, (1,))  # passes over NaN
+    return most[4] + most[5] > jnp.fmax(DRIFTED * jnp.sum(most[:3]), MOST_STEP_ERRORS * steps * most[3])
 
 
 def rows_violated(setup: Setup, t: Float[Array, "times"], q: Float[Array, "times coordinates"], u: Float[Array, "times speeds"]) -> Flag:
