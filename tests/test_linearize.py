@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from linkages import SliderCrank
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import rolling_disc, whipple_bicycle
 from small_scenes import DrivenPendulum, HoopBead, OnLine, Twice
@@ -428,6 +429,8 @@ def test_a_motion_that_stands_alone_and_points_that_are_no_branch_points(turns, 
         jj.family(bicycle, turns.folds[0])
     with pytest.raises(ValueError, match="expected two axes"):
         jj.stability_chart(bicycle, {"c": (0.02, 0.12)})
+    with pytest.raises(ValueError, match=r"`prior` is .*expected `jj.Normal"):
+        jj.stability_chart(bicycle, {"c": (0.02, 0.12), "rear_spin_rate": (9.0, 10.0)}, prior={"w": 0.1}, points=3)
     with pytest.raises(ValueError, match="one name with its value"):
         turns.at(lean=0.1, steer=0.1)
     with pytest.raises(KeyError, match="did you mean `lean`"):
@@ -562,6 +565,18 @@ def test_critical_points_that_are_not_there_are_refused(bicycle, straight):
         jj.critical(bicycle, straight, "fold in lean")
     with pytest.raises(ValueError, match="the family is one of `WhippleBicycle`"):
         jj.critical(TiltingDisc(), straight, "weave")
+
+
+def test_critical_points_in_float32_are_refused(bicycle, straight):
+    with jax.enable_x64(False), pytest.raises(ValueError, match="in float64 alone; set"):
+        jj.critical(bicycle, straight, "weave")
+
+
+def test_a_family_passes_a_loss_of_rank_and_says_that_others_begin_there():
+    """Where crank and rod stand upright: the equations are undefined at this very point."""
+    found = jj.family(SliderCrank(), {"a": 0.2, "b": -0.2, "x": 1.96}, until={"a": 3.0})
+    assert_allclose(found["x"], 2 * np.cos(found["a"]), atol=1e-9)
+    assert [point.kind for point in found.special] == ["branch point, before this point"]
 
 
 def test_families_are_no_functions_to_be_traced(bicycle):

@@ -59,7 +59,7 @@ def stability_chart(
     A family along the second number, in the middle of the first, tells which boundaries there are; each is a `critical` point as a function of the first
     number, found to round-off. A boundary that does not pass the middle is not seen, and one that turns back along the first number has gaps.
 
-    **Returns** a `StabilityChart`. **Raises** as `family`; ValueError where there are not two axes.
+    **Returns** a `StabilityChart`. **Raises** as `family`; ValueError where there are not two axes; a prior that is no `jj.Normal`.
     """
     if not isinstance(axes, Mapping) or len(axes) != 2:
         raise ValueError(f"`axes` is {axes!r}, expected two axes: a parameter, and a coordinate or a speed, each with its first and its last value")
@@ -71,7 +71,10 @@ def stability_chart(
     assert isinstance(known, SteadyEquations)
     check_names(given, vars(place), f"`prior` names `{{}}`, no parameter of `{type(scene).__name__}`")
     sigma, k = np.zeros(len(known.given)), known.index(second)
-    sigma[[getattr(place, name) for name in given]] = [one.sigma for one in given.values()]
+    try:
+        sigma[[getattr(place, name) for name in given]] = [one.sigma for one in given.values()]
+    except (AttributeError, TypeError):
+        raise ValueError(f"`prior` is {given}, expected `jj.Normal(mean, sigma)` for each name, a parameter that is one number") from None
     sigma[getattr(place, first)] = 0.0
     boundaries, bands = [], []
     for change in middle.changes:

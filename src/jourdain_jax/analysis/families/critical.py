@@ -299,7 +299,7 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
     **Returns** a `CriticalPoint`, by the implicit function theorem: runs under `jit` and `vmap` and is differentiable twice. Where the point does not exist
     for these parameters, or is no smooth function of them, its numbers and their derivatives are NaN, and `code` is not 0.
 
-    **Raises** ValueError: no such point on the family, or one that is a fold or a branch point only; a scene of another class.
+    **Raises** ValueError: no such point on the family, or one that is a fold or a branch point only; a scene of another class; float32.
     """
     scene, equations = as_scene(scene), motions.equations
     if not isinstance(equations, SteadyEquations):
@@ -324,6 +324,8 @@ def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:
 
 def special_at(equations: SteadyEquations, point: FamilyPoint) -> Special:
     """The equations, with vectors a and b at the point of the family."""
+    if not jax.config.jax_enable_x64:
+        raise ValueError("a critical point is found in float64 alone; set jax.config.update('jax_enable_x64', True)")
     z, s = equations.place(point), point.eigenvalues
     look = equations(z)
     F, C = look.small

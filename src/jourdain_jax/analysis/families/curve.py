@@ -129,7 +129,7 @@ def reversed_at(point: Point) -> Point:
 
 
 def located(equations: Motions, here: Point, there: Point, test: Callable[[Point], float], with_modes: bool = False) -> Point | None:
-    """The point between two neighbours at which a smooth `test`, of modes or not, changes its sign; None where the curve is lost.
+    """The point between two neighbours at which a smooth `test`, of modes or not, changes its sign; None where the curve is lost, or undefined.
 
     By unequal halves down to a short piece, and on this along the chord: at a branch point itself the equations lose their rank, and for reasons of symmetry
     it often lies in the middle.
@@ -150,4 +150,6 @@ def located(equations: Motions, here: Point, there: Point, test: Callable[[Point
     part = at_a / (at_a - at_b)
     z, tangent = (getattr(low, name) + part * (getattr(high, name) - getattr(low, name)) for name in ("z", "tangent"))
     look, tangent = equations(z), tangent / np.linalg.norm(tangent)
+    if not np.all(np.isfinite(look.J)):
+        return None
     return Point(z, tangent, look, matched(low.modes, equations.eigenvalues(look, tangent)))
