@@ -3,16 +3,14 @@
     python bench/contacts.py [--quick] [--json FILE]
 
 Closed forms: t_10 of a ball that falls from 1 m and bounces, sqrt(2 h/g) (1 + 2 (e + ... + e^9)) with e = 0.7, and its
-derivatives; processor time; fits of 500 noisy throws. A `solve` is one motion without derivatives. `--quick`: fewer lanes. The JSON is a list of
+derivatives; processor time; fits of 500 noisy throws; ends of slip of 1,000 bowling balls. A `solve` is one motion without derivatives. `--quick`: fewer lanes. The JSON is a list of
 {"figure", "model", "value", "required", "met"}.
 """
-
-import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from figures import Figures, figure, main
+from figures import Figures, figure, main, seconds_of
 
 import jourdain_jax as jj
 
@@ -53,21 +51,15 @@ def digits(quick: bool) -> Figures:
     tenth = lambda e: bounces(e)[9]  # noqa: E731
     found = tenth(0.7), max(abs(f(tenth)(0.7) - RIGHT[1]) for f in (jax.grad, jax.jacfwd)) + RIGHT[1], jax.hessian(tenth)(0.7)
     for name, value, right, required in zip(("time", "d/de", "d2/de2"), found, RIGHT, (1e-12, 1e-10, 1e-8), strict=True):
-        yield figure(f"ten bounces, {name}: error", NAME, float(abs(value - right)), required)
+        yield figure(f"ten bounces, {name}: error", NAME, abs(value - right), required)
     motion = jj.simulate(Ball(), {"z": 1.0}, t1=2.5, rtol=1e-12, atol=1e-12)
-    balance = np.asarray(motion.energies().balance)
-    yield figure("energy audit, of the energy", NAME, float(np.ptp(balance) / 9.81), 1e-9)
+    balance = motion.energies().balance
+    yield figure("energy audit, of the energy", NAME, np.ptp(balance) / 9.81, 1e-9)
 
 
 def seconds(call, *arguments) -> float:
     """Return the shortest processor time of a warm call."""
-    jax.block_until_ready(call(*arguments))
-    taken = []
-    for _ in range(7):
-        begin = time.process_time()
-        jax.block_until_ready(call(*arguments))
-        taken.append(time.process_time() - begin)
-    return min(taken)
+    return min(seconds_of(lambda: call(*arguments))[1] for _ in range(8))
 
 
 def times(quick: bool) -> Figures:
@@ -97,9 +89,39 @@ def fits(quick: bool) -> Figures:
     found = jj.fit_batch(Ball(0.7, 9.7), throws, free=("bounce", "gravity")).estimates
     for name, right in (("bounce", 0.72), ("gravity", 9.81)):
         held = (found[name].low <= right) & (right <= found[name].high)
-        off = abs(float(np.mean(held)) - 0.95)
+        off = abs(np.mean(held) - 0.95)
         yield figure(f"share of intervals that hold `{name}`, off 0.95", NAME, off, 0.02 + 2 * (0.95 * 0.05 / repeats) ** 0.5)
 
 
+class Bowling(jj.Scene):
+    """A bowling ball that slides on its lane."""
+
+    coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
+
+    def bodies(self, t, q):
+        return {"ball": jj.RigidBody.ball(6.8, 0.108, position=jnp.stack([q.x, q.y, q.z]), orientation=jj.quaternion_to_matrix(q.attitude))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, 9.81),)
+
+    def contacts(self, pose):
+        return {"lane": jj.ball_contact(pose["ball"], 0.108, height="row", friction=0.12)}
+
+
+def slips(quick: bool) -> Figures:
+    """Balls that slide in two directions: how many come to roll, and when slip w0 ends against 2 |w0|/(7 mu g)."""
+
+    def slip(along, aside, spin):
+        start = {"z": 0.108, "x_rate": along, "y_rate": aside, "attitude_omega_x": spin}
+        motion = jj.simulate(Bowling(), start, ts=[6.0], rtol=1e-10, atol=1e-10)
+        right = 2 * jnp.hypot(along, aside + 0.108 * spin) / (7 * 0.12 * 9.81)
+        return motion.phase("lane")[0] == 1, jnp.abs(jnp.nanmax(motion.phases.ts) - right)
+
+    speeds = np.random.default_rng(0).uniform([4.0, 0.05, -5.0], [9.0, 1.0, 5.0], (1000, 3))
+    rolls, off = jax.jit(jax.vmap(slip))(*speeds.T)
+    yield figure("share that comes to roll", "bowling ball", jnp.mean(rolls), least=1.0)
+    yield figure("end of slip: error, s", "bowling ball", jnp.max(off), 1e-9)
+
+
 if __name__ == "__main__":
-    main(__doc__, (digits, times, fits))
+    main(__doc__, (digits, times, fits, slips))
