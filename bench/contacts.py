@@ -3,8 +3,8 @@
     python bench/contacts.py [--quick] [--json FILE]
 
 Closed forms: t_10 of a ball that falls from 1 m and bounces, sqrt(2 h/g) (1 + 2 (e + ... + e^9)) with e = 0.7, and its
-derivatives; processor time; fits of 500 noisy throws; ends of slip of 1,000 bowling balls. A `solve` is one motion without derivatives. `--quick`: fewer lanes. The JSON is a list of
-{"figure", "model", "value", "required", "met"}.
+derivatives; processor time; fits of 500 noisy throws; ends of slip of 1,000 bowling balls. A `solve` is one motion without
+derivatives. `--quick`: fewer lanes. The JSON is a list of {"figure", "model", "value", "required", "met"}.
 """
 
 import jax
