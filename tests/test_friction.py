@@ -225,3 +225,41 @@ def test_a_start_in_contact():
         assert motion.phase("slope").tolist() == [phase]
         along = G * (np.sin(0.5) - friction * np.cos(0.5)) if phase == 2 else 5 / 7 * G * np.sin(0.5)
         np.testing.assert_allclose(np.hypot(motion["x_rate"], motion["z_rate"]), along * 0.3, rtol=1e-8)
+
+
+class Cart(jj.Scene):
+    """A block on two runners, in a plane."""
+
+    friction: float = jj.parameter(0.3)
+    coordinates = jj.coordinates("x z pitch")
+
+    def bodies(self, t, q):
+        return {"cart": jj.RigidBody(10.0, jnp.eye(3), jnp.stack([q.x, 0.0 * q.x, q.z]), jj.rot_y(q.pitch))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, G),)
+
+    def contacts(self, pose):
+        def runner(x):
+            return jj.ball_contact(pose["cart"], 0.05, centre=(x, 0.0, -0.45), height="row", friction=self.friction)
+
+        return {"front": runner(0.6), "rear": runner(-0.4)}
+
+
+def test_a_cart_brakes_on_two_runners():
+    """Loads (b + mu h)/w and (w - b - mu h)/w of the weight, b = 0.4, h = 0.5, w = 1 m; it stops as a whole."""
+    motion = jj.simulate(Cart(), {"z": 0.5, "x_rate": 0.6}, ts=[0.1, 0.3], **FINE)
+    forces = motion.contact_forces()
+    weight = 10 * G
+    np.testing.assert_allclose([forces["front"].normal[0], forces["rear"].normal[0]], [0.55 * weight, 0.45 * weight], rtol=1e-10)
+    np.testing.assert_allclose(motion["x"][-1], 0.6**2 / (2 * 0.3 * G), rtol=1e-9)
+    assert [motion.phase(name).tolist() for name in ("front", "rear")] == [[2, 1], [2, 1]]
+
+
+def test_a_cart_falls_onto_two_runners():
+    """The front strikes and slips; as the rear strikes, both stick, whatever round-off says of the slip that is left."""
+    for ts in ([1.0], [0.1, 0.2, 1.0]):
+        motion = jj.simulate(Cart(), {"z": 0.6, "pitch": 0.1, "x_rate": 0.3}, ts=ts, rtol=1e-9, atol=1e-9)
+        assert [motion.phase(name)[-1] for name in ("front", "rear")] == [1, 1]
+        np.testing.assert_allclose([motion["x_rate"][-1], motion["pitch"][-1]], 0.0, atol=1e-12)
+        np.testing.assert_allclose(motion.energies().balance, motion.energies().balance[0], atol=1e-8)

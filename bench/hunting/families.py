@@ -1,6 +1,6 @@
 """All families of generated cases, in one list."""
 
-from hunting import bodies, events, gradients, linkages, oscillators, pendulums, refusals, short_features, sliders, transitions, uses
+from hunting import bodies, contacts, events, gradients, linkages, oscillators, pendulums, refusals, short_features, sliders, transitions, uses
 
 FAMILIES = (
     *linkages.FAMILIES,
@@ -8,6 +8,7 @@ FAMILIES = (
     *pendulums.FAMILIES,
     *events.FAMILIES,
     *transitions.FAMILIES,
+    *contacts.FAMILIES,
     *oscillators.FAMILIES,
     *bodies.FAMILIES,
     *uses.FAMILIES,

@@ -35,6 +35,7 @@ from jourdain_jax.scene.switching import CREEPS, FLIES, ROLLS, SLIPS
 
 SLOW = 1e-4  # m/s: the direction of slip is held below this speed
 LEAST_REBOUND = 1e-6  # m/s: a contact that would rebound with less is closed
+LEAST_CHANGE = 1e-8  # m/s: an impulse that changes speeds by less is round-off
 TOUCHES = 1e-8  # m: a gap that counts as none at the start
 
 
@@ -58,21 +59,29 @@ class At:
         """Normal forces, and those along both tangents, N."""
         return switching_forces(self.scene, self.motion, self.found).reshape(-1, 3)
 
-    def alone(self, i: int, b: Float[Array, "rows"]) -> tuple[Float[Array, "3 3"], Float[Array, "3"], Float[Array, "rows 4"]]:
-        """Return the response `G L + b` of contact i to its own forces while the others are in their modes; and what those bear then."""
-        mine = slice(3 * i, 3 * i + 3)
-        others = self.modes._replace(closed=self.modes.closed.at[i].set(0.0), rolls=self.modes.rolls.at[i].set(0.0))
+    def alone(self, i: int, b: Float[Array, "rows"], modes: Modes | None = None) -> "Alone":
+        """Return how contact i responds, with `G L + b`, while the others are in their modes (default: those that they are in)."""
+        modes, mine = self.modes if modes is None else modes, slice(3 * i, 3 * i + 3)
         if len(self.number) == 1:
-            return self.found.G, b, jnp.zeros((3, 4), b.dtype)
+            return Alone(self.found.G, b, jnp.zeros((3, 4), b.dtype), jnp.diagonal(self.found.G))
+        others = modes._replace(closed=modes.closed.at[i].set(0.0), rolls=modes.rolls.at[i].set(0.0))
         right = jnp.concatenate([self.found.G[:, mine], b[:, None]], axis=1)
         borne = responses(self.found.G, right, others, self.friction)
         total = (right + self.found.G @ borne)[mine]
-        return total[:, :3], total[:, 3], borne
+        return Alone(total[:, :3], total[:, 3], borne, jnp.diagonal(self.found.G)[mine])
 
-    def moved(self, i: int, impulse: Float[Array, "3"], borne: Float[Array, "rows 4"]) -> Speeds:
-        """Return the speeds after an impulse at contact i."""
-        every = (borne[:, :3] @ impulse).at[3 * i : 3 * i + 3].add(impulse)
-        return self.motion.u.array + self.found.impulses @ every
+
+class Alone(NamedTuple):
+    """The response of one contact while the others are in their modes."""
+
+    G: Float[Array, "3 3"]
+    b: Float[Array, "3"]
+    borne: Float[Array, "rows 4"]  # forces of all for those of this one, and without
+    sizes: Float[Array, "3"]  # of the diagonal of G, were all others open
+
+    def every(self, i: int, own: Float[Array, "3"]) -> Float[Array, "rows"]:
+        """Return the forces of all contacts where contact i has its `own`."""
+        return (self.borne[:, :3] @ own + self.borne[:, 3]).at[3 * i : 3 * i + 3].set(own)
 
 
 def contact_events(at: At) -> dict[str, Scalar]:
@@ -90,48 +99,98 @@ def contact_events(at: At) -> dict[str, Scalar]:
 
 def contact_changes(at: At) -> dict[str, Event]:
     """Return what each event of the contacts that switch makes of the state and the modes."""
-    scene, motion, events = at.scene, at.motion, {}
-    for i, name in enumerate(scene.switching.contacts):
-        number, slip, here = at.number[i], at.w[i, 1:], motion.u.array
+    events = {}
+    for i, name in enumerate(at.scene.switching.contacts):
+        number, slip = at.number[i], at.w[i, 1:]
         strikes, stops = number == FLIES, number == CREEPS
         after = After(at, i, strikes)
-        mode, u = jnp.where(strikes, after.mode, float(FLIES)), jnp.where(strikes, after.u, here)
-        events[f"{name} normal"] = _event(scene, name, mode, u, after.direction)
+        events[f"{name} normal"] = _event(after, strikes, FLIES, after.direction)
         # the law at rest, from where slip begins, says the direction of slip also where round-off would let it stick
-        mode, u = jnp.where(stops, after.mode, float(CREEPS)), jnp.where(stops, after.u, here)
         along = slip / jnp.sqrt(jnp.where(number == SLIPS, slip @ slip, 1.0))
-        events[f"{name} tangent"] = _event(scene, name, mode, u, jnp.where(number == SLIPS, along, after.direction))
-        events[f"{name} speed"] = _event(scene, name, jnp.asarray(float(SLIPS)), here, at.modes.direction[i])
+        events[f"{name} tangent"] = _event(after, stops, CREEPS, jnp.where(number == SLIPS, along, after.direction))
+        events[f"{name} speed"] = _event(after, jnp.asarray(False), SLIPS, after.direction)
     return events
 
 
-def _event(scene: Scene, name: str, mode: Scalar, u: Speeds, e: Float[Array, "2"]) -> Event:
-    e = jnp.where(mode == CREEPS, e, 0.0)
-    jump = dict(zip(scene.speed_names.entries, u, strict=True)) | {f"{name}_slip_1": e[0], f"{name}_slip_2": e[1]}
-    return Event(jnp.ones_like(mode), to={name: mode}, jump=jump)
+def _event(after: "After", jumps: Flag, mode: int, e: Float[Array, "2"]) -> Event:
+    """Where speeds jump all modes are those `after` it, otherwise the contact's own becomes this one."""
+    at, i, names = after.at, after.i, after.at.scene.switching.contacts
+    numbers = jnp.where(jumps, after.numbers, at.number.at[i].set(float(mode)))
+    u, e = jnp.where(jumps, after.u, at.motion.u.array), jnp.where(numbers[i] == CREEPS, e, 0.0)
+    jump = dict(zip(at.scene.speed_names.entries, u, strict=True)) | {f"{names[i]}_slip_1": e[0], f"{names[i]}_slip_2": e[1]}
+    return Event(jnp.ones_like(e[0]), to=dict(zip(names, numbers, strict=True)), jump=jump)
 
 
 class After:
-    """Speeds, mode and direction of slip of contact i where it closes: after an impact if it `strikes`, otherwise as its slip stops or is about to begin."""
+    """Speeds, modes and direction of slip where contact i closes: after an impact if it `strikes`, otherwise as its slip stops or is about to begin.
+
+    Other contacts that are closed take part: one that would pull opens, and one that would hold with more than its friction slips. Speeds are no numbers
+    where that does not come out.
+    """
 
     def __init__(self, at: At, i: int, strikes: Flag):
+        self.at, self.i = at, i
         scene, motion, friction = at.scene, at.motion, at.friction[i]
-        G, w, borne = at.alone(i, at.found.rows.w)
         contact = list(switching_contacts(scene, motion.pose()).values())[i]
-        rebound = -jnp.asarray(contact.restitution) * w[0]
+        rebound = -jnp.asarray(contact.restitution) * at.w[i, 0]
         rebounds = strikes & (rebound > LEAST_REBOUND)
-        law: Law = coulomb(G, w, jnp.where(rebounds, rebound, 0.0), friction)
-        impulse = jnp.where(strikes, law.forces, law.sticking)
-        rolling = at.number[i] == ROLLS  # nothing strikes or stops
-        self.u = jnp.where(rolling, motion.u.array, at.moved(i, impulse, borne))
-        slip = w[1:] + G[1:] @ law.forces
-        then = At(scene, motion_at(scene, motion.t, motion.q.array, self.u, motion.inputs.array), None, at.responses)
-        G, b, _ = then.alone(i, then.found.b)
-        rest = coulomb(G, b, jnp.zeros_like(b[0]), friction)
+        goal = jnp.where(rebounds, rebound, 0.0)
+
+        def impulses(modes: Modes) -> tuple[Law, Float[Array, "contacts 3"]]:
+            own = at.alone(i, at.found.rows.w, modes)
+            law = coulomb(own.G, own.b, goal, friction, own.sizes)
+            return law, own.every(i, jnp.where(strikes, law.forces, law.sticking)).reshape(-1, 3)
+
+        modes = at.modes
+        law, P = impulses(modes)
+        right = jnp.asarray(True)
+        if len(at.number) > 1:
+            modes = _yielding(at, i, modes, P)
+            law, P = impulses(modes)
+            right = _is_lawful(at, i, modes, P)
+        jumps = at.number[i] != ROLLS  # otherwise nothing strikes or stops
+        self.u = jnp.where(right | ~jumps, motion.u.array + jnp.where(jumps, at.found.impulses @ P.ravel(), 0.0), jnp.nan)
+        slip = (at.found.rows.w + at.found.G @ P.ravel()).reshape(-1, 3)[:, 1:]
+        fast = jnp.sum(slip**2, axis=1) > SLOW**2
+        slow = jnp.where(at.number == CREEPS, float(CREEPS), float(ROLLS))
+        others = jnp.where(modes.closed == 0, float(FLIES), jnp.where(fast, float(SLIPS), slow))
+        numbers = jnp.where(jumps, others, at.number)
+        then = At(scene, _switched(scene, motion, numbers, motion.q.array, self.u), None, at.responses)
+        own = then.alone(i, then.found.b)
+        rest = coulomb(own.G, own.b, jnp.zeros_like(friction), friction, own.sizes)
         self.direction = rest.direction
-        settled = jnp.where(rest.forces[0] < 0, float(FLIES), jnp.where(rest.sticks, float(ROLLS), float(CREEPS)))
-        slips = strikes & ~law.sticks & (slip @ slip > SLOW**2)
-        self.mode = jnp.where(rebounds, float(FLIES), jnp.where(slips, float(SLIPS), settled))
+        settled = jnp.where(rest.opens, float(FLIES), jnp.where(rest.sticks, float(ROLLS), float(CREEPS)))
+        slips = strikes & ~law.sticks & fast[i]
+        self.numbers = numbers.at[i].set(jnp.where(rebounds, float(FLIES), jnp.where(slips, float(SLIPS), settled)))
+
+
+def _excess(at: At, P: Float[Array, "contacts 3"]) -> tuple[Float[Array, "contacts"], Float[Array, "contacts"]]:
+    """Return by how much (m/s) each contact pulls, and holds more than its friction does, under these impulses."""
+    response = jnp.diagonal(at.found.G)[::3]
+    tangential = jnp.sum(P[:, 1:] ** 2, axis=1)
+    held = jnp.where(tangential > 0, jnp.sqrt(jnp.where(tangential > 0, tangential, 1.0)), 0.0)
+    return -response * P[:, 0], response * (held - at.friction * P[:, 0])
+
+
+def _yielding(at: At, i: int, modes: Modes, P: Float[Array, "contacts 3"]) -> Modes:
+    """Return the modes of the others in an impact of contact i: open where they would pull, slipping where they would hold more than friction does."""
+    pulled, exceeded = _excess(at, P)
+    pulls, gives = (modes.closed > 0) & (pulled > LEAST_CHANGE), (modes.rolls > 0) & (exceeded > LEAST_CHANGE)
+    e = -P[:, 1:] / jnp.sqrt(jnp.where(gives, jnp.sum(P[:, 1:] ** 2, axis=1), 1.0))[:, None]
+    closed, rolls = jnp.where(pulls, 0.0, modes.closed), jnp.where(pulls | gives, 0.0, modes.rolls)
+    return Modes(closed.at[i].set(1.0), rolls, jnp.where(gives[:, None], e, modes.direction))
+
+
+def _is_lawful(at: At, i: int, modes: Modes, P: Float[Array, "contacts 3"]) -> Flag:
+    """Whether no contact but i pulls, holds more than its friction does, is pushed by friction along its slip or aside, or moves into the ground."""
+    w, (pulled, exceeded) = (at.found.rows.w + at.found.G @ P.ravel()).reshape(-1, 3), _excess(at, P)
+    e, closed = modes.direction, modes.closed > 0
+    along, aside = jnp.sum(w[:, 1:] * e, axis=1), w[:, 1] * e[:, 1] - w[:, 2] * e[:, 0]
+    slips = closed & (modes.rolls == 0) & (pulled < -LEAST_CHANGE)
+    against = slips & ((along < -LEAST_CHANGE) | (jnp.abs(aside) > LEAST_CHANGE + 1e-6 * jnp.abs(along)))
+    wrong = closed & ((pulled > LEAST_CHANGE) | ((modes.rolls > 0) & (exceeded > LEAST_CHANGE)) | against)
+    into = (at.number != FLIES) & (w[:, 0] < -LEAST_CHANGE)
+    return ~jnp.any((wrong | into).at[i].set(False))
 
 
 def put_back(at: At) -> tuple[Float[Array, "coordinates"], Speeds]:
@@ -172,7 +231,8 @@ def contacts_at_start(at: At) -> Begun:
     q, u = put_back(At(scene, _switched(scene, motion, numbers, motion.q.array, motion.u.array), at.found))
     for i, name in enumerate(scene.switching.contacts):
         after = After(At(scene, _switched(scene, motion, numbers, q, u), None, at.responses), i, strikes[i])
-        numbers = numbers.at[i].set(jnp.where(strikes[i] | (closed[i] & ~slips[i]), after.mode, numbers[i]))
+        settles = closed[i] & ~slips[i]
+        numbers = jnp.where(strikes[i], after.numbers, numbers.at[i].set(jnp.where(settles, after.numbers[i], numbers[i])))
         u = jnp.where(strikes[i], after.u, u)
         place = np.array([scene.coordinate_names.entries.index(f"{name}_slip_{k}") for k in (1, 2)])
         q = q.at[place].set(jnp.where(numbers[i] == CREEPS, after.direction, 0.0))
