@@ -132,7 +132,7 @@ def test_a_scene_without_freedom_says_so_and_nothing_of_conditioning():
 def test_the_report_tells_stop_events_domain_and_conventions():
     found = report(Drifting())
     text = " ".join(str(found).split())
-    assert "stops at 1: off the belt" in text
+    assert "events 1: off the belt" in text
     assert "probed in y -1 to 2; otherwise coordinates -3.2 to 3.2, speeds -1 to 1" in text
     assert "conventions x along the belt." in text
     facts = json.loads(json.dumps(found.as_dict()))

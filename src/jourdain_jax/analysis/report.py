@@ -57,7 +57,7 @@ class Report(Printed):
     typical_pivot: float
     rank_losses: tuple[str, ...]  # probed configurations where the rows lose rank
     rank_at_start: int | None  # at the given start, or at the scene's example where that has another rank; None otherwise
-    events: tuple[str, ...]  # names of the stop events
+    events: tuple[str, ...]  # names
     domain: dict[str, tuple[float, float]]  # where states were probed, as the scene states it
     conventions: str
 
@@ -87,7 +87,7 @@ class Report(Printed):
             "their conditioning": self._conditioning(),
             "rank is lost at": "none of the probed configurations" if not self.rank_losses else "; ".join(self.rank_losses[:4]),
             **({} if self.rank_at_start is None else {"at the start": self._at_start()}),
-            "stops at": _listed(self.events),
+            "events": _listed(self.events),
             "probed in": self._probed(),
             "conventions": self.conventions,
         }

@@ -147,7 +147,7 @@ class Model(BuiltFor, Printed):
 
     @property
     def events(self) -> tuple[str, ...]:
-        """Names of the events that stop a motion."""
+        """Names of the events."""
         return names_of_events(self.scene)
 
     @property
@@ -207,7 +207,7 @@ class Model(BuiltFor, Printed):
             "ignorable": listed(self.conserved.ignorable),
             "scalar program": f"none: {self.not_lowered}" if program is None else f"{program.operations} operations, {program.way}",
             "integrated by": self.way,
-            "stops at": listed(self.events),
+            "events": listed(self.events),
         }
         warned = [f"  WARNING           {text}" for text in self.warnings]
         return "\n".join([f"Model of {type(self.scene).__name__}", *(f"  {name:18s}{text}" for name, text in facts.items()), *warned])
