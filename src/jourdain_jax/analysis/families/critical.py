@@ -246,14 +246,14 @@ class Special(eqx.Module):
 
 
 @partial(compiled, options=RUN_SELDOM)
-def _solution(special: Special, scene: Scene) -> tuple[Array, Array, Array]:
-    """X, differentiable twice, its condition and code, of which all is NaN unless it is 0."""
+def _solution(special: Special, scene: Scene) -> CriticalPoint:
+    """The point of a scene, differentiable twice."""
     lane_by_lane = jax.custom_batching.sequential_vmap(followed_to)  # each takes as many steps as it needs
     X, inverse, condition, code = jax.lax.stop_gradient(lane_by_lane(*jax.lax.stop_gradient((special, scene))))
     near = X
     for _ in range(2):  # each carries one order of derivatives
         X = X - inverse @ special.equations_at(scene, X, near)
-    return X, condition, code
+    return special.point(scene, X, condition, code)
 
 
 def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Array]:
@@ -308,7 +308,7 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
         raise ValueError(f"the family is one of `{type(equations.scene).__name__}`, and the scene a `{type(scene).__name__}`")
     with jax.ensure_compile_time_eval():
         special = special_at(equations, _chosen(motions, what))
-    return special.point(scene, *_solution(special, scene))
+    return _solution(special, scene)
 
 
 def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:
