@@ -188,9 +188,10 @@ def _follow(w: StepWriter, form: Form, p: Lanes, begins: Number, changes: Number
     tried, near = trial(w, t, [chosen(w, first, x) for x in c], step, left <= DIFFERENTIABLE + 3.0, guess)
     trying = begins | old.trying
     left = w.where(trying & near, DIFFERENTIABLE + 1.0, left)
-    far = w.magnitude(t[0] - t[1]) + math.sqrt(w.eps) * step
+    slack = math.sqrt(w.eps) * step
     value, rate = chosen(w, first, c_1), chosen(w, first, rate_0)
-    usable = (old.left > 0.0) & (w.magnitude(value) < far * w.magnitude(rate)) & (w.magnitude(rate) < math.inf)
+    to = t_1 - value / rate  # within the bracket: of a value that was zero shortly before, that is another event
+    usable = (old.left > 0.0) & (to > w.smaller(t[0], t[1]) - slack) & (to < w.larger(t[0], t[1]) + slack) & (w.magnitude(rate) < math.inf)
     slope = []
     for a, b, kept in zip(c_0, c_1, old.slope, strict=True):
         mean = w.magnitude((b - a) / (t_1 - t_0))
