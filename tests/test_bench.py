@@ -215,7 +215,7 @@ def _columns(states):
 
 
 def _parameters(scene: jj.Scene):
-    return {field.name: float(getattr(scene, field.name)) for field in dataclasses.fields(scene) if field.metadata}
+    return {field.name: float(getattr(scene, field.name)) for field in dataclasses.fields(scene) if field.metadata.get("parameter")}
 
 
 @pytest.mark.parametrize("name", hand_derived.HAND_DERIVED)

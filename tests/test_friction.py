@@ -263,3 +263,33 @@ def test_a_cart_falls_onto_two_runners():
         assert [motion.phase(name)[-1] for name in ("front", "rear")] == [1, 1]
         np.testing.assert_allclose([motion["x_rate"][-1], motion["pitch"][-1]], 0.0, atol=1e-12)
         np.testing.assert_allclose(motion.energies().balance, motion.energies().balance[0], atol=1e-8)
+
+
+class Belt(jj.Scene):
+    """A block of 1 kg at a spring of 40 N/m on a belt of 0.1 m/s."""
+
+    static: float = jj.parameter(0.4)
+    coordinates = jj.coordinates("x z")
+
+    def bodies(self, t, q):
+        return {"block": jj.RigidBody(1.0, jnp.eye(3), jnp.stack([q.x, 0.0 * q.x, q.z]), jnp.eye(3))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, G), jj.generalized_force(motion, x_rate=-40.0 * motion.q.x))
+
+    def contacts(self, pose):
+        law = {"height": "row", "friction": jj.Coulomb(0.25, static=self.static)}
+        return {"belt": jj.ball_contact(pose["block"], 0.1, ground=jj.Plane(velocity=(0.1, 0.0, 0.0)), **law)}
+
+
+def test_a_block_sticks_and_slips_on_a_belt():
+    """With more static friction the force jumps as slip begins; a period 1.360846391399 s."""
+
+    def period(static):
+        ts = jj.simulate(Belt(static), {"z": 0.1, "x_rate": 0.1}, t1=4.0, **FINE).phases.ts
+        return ts[4] - ts[0]
+
+    np.testing.assert_allclose(period(0.4), 1.360846391399, rtol=1e-10)
+    np.testing.assert_allclose(jax.jacfwd(period)(0.4), 4.14018082448, rtol=1e-7)
+    with pytest.raises(ValueError, match=r"static friction of contact `belt` of `Belt` is 0\.2, expected at least that of sliding, 0\.25"):
+        jj.simulate(Belt(0.2), {"z": 0.1}, t1=0.1)

@@ -431,7 +431,7 @@ MUTANTS = [
     Mutant("goals that do not move states", native_motion, "moved", "jnp.sum(scaled(rates(z), g))", "0 * jnp.sum(g)", TIME, WRONG),
 ]
 CHECKS = list(dict.fromkeys(mutant.check for mutant in MUTANTS))
-KEPT = (loop.kernel, back.kernel_back, transitions.reset_program, put_on_rows._kernel, functions.reason_against_derivatives)
+KEPT = (loop.kernel, back.kernel_back, put_on_rows._kernel, functions.reason_against_derivatives)
 
 
 @pytest.fixture(autouse=True)

@@ -64,7 +64,7 @@ from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.field import Formulation
 from jourdain_jax.scene.bodies import Particle, RigidBody
 from jourdain_jax.scene.constraints import knife_edge, pin, rod, weld
-from jourdain_jax.scene.contacts import Contact, ball_contact, disc_contact, ellipsoid_contact, wheel_contact
+from jourdain_jax.scene.contacts import Contact, Coulomb, ball_contact, disc_contact, ellipsoid_contact, wheel_contact
 from jourdain_jax.scene.coordinates import coordinates, inputs, quaternion, speeds
 from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere, Surface
 from jourdain_jax.scene.identity import clear_caches
@@ -190,6 +190,7 @@ __all__ = [
     "Baumgarte",
     "Checked",
     "Contact",
+    "Coulomb",
     "Cylinder",
     "Design",
     "DifferentiationModeError",

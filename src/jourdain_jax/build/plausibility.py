@@ -59,6 +59,7 @@ def stated_of(scene: Scene, pose: Pose, loads: tuple[Load, ...] = ()) -> Numbers
     contacts = {f"contact `{name}`": contact for name, contact in contacts_of(scene, pose).items()}
     rigid = {name: body for name, body in bodies.items() if isinstance(body, RigidBody)}
     closed = {name: c for name, c in contacts.items() if c.height == "coordinates"}
+    laws = {name: c.friction for name, c in contacts.items() if c.friction is not None}
     size = lambda x: jnp.sum(jnp.abs(x))  # noqa: E731
     away = _round_off(pose)  # in the places of contacts that are far out
     return {
@@ -72,7 +73,8 @@ def stated_of(scene: Scene, pose: Pose, loads: tuple[Load, ...] = ()) -> Numbers
         "gap": {name: jnp.stack([c.gap(), size(c.point - pose[c.body].position) + away * size(c.point)]) for name, c in closed.items()},
         "length": {f"{what} of {name}": length for name, c in contacts.items() for what, length in _lengths(c).items()},  # m
         "tyre": {name: c.shape.tyre for name, c in contacts.items() if isinstance(c.shape, Wheel) and c.shape.tyre is not None},  # m
-        "friction": {f"the friction of {name}": c.friction for name, c in contacts.items() if c.friction is not None},
+        "friction": {f"the friction of {name}": law.sliding for name, law in laws.items()},
+        "static": {f"the static friction of {name}": jnp.stack([law.static, law.sliding]) for name, law in laws.items()},
         "restitution": {f"the restitution of {name}": c.restitution for name, c in contacts.items() if c.restitution is not None},
         "gravity": {f"the direction of gravity in load {k}": load.direction @ load.direction for k, load in enumerate(loads, 1) if isinstance(load, Gravity)},
     }
@@ -238,6 +240,12 @@ CHECKS = (
         "a body off its ground",
     ),
     Check("friction", lambda x: x < 0, lambda x: f"is {x:.4g}, expected a coefficient that is not negative", "a negative coefficient of friction"),
+    Check(
+        "static",
+        lambda x: x[..., 0] < x[..., 1],
+        lambda x: f"is {x[0]:.4g}, expected at least that of sliding, {x[1]:.4g}",
+        "static friction below that of sliding",
+    ),
     Check("restitution", lambda x: (x < 0) | (x > 1), lambda x: f"is {x:.4g}, expected a number from 0 to 1", "a restitution that is not from 0 to 1"),
     _unit("gravity", "gravity"),
     Check(

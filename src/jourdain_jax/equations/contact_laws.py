@@ -90,18 +90,18 @@ def responses(G: Float[Array, "rows rows"], b: Float[Array, "rows columns"], mod
     return jnp.stack([found[row] for row in range(len(G))])
 
 
-def coulomb(G: Float[Array, "3 3"], b: Float[Array, "3"], target: Scalar, friction: Scalar, sizes: Float[Array, "3"]) -> Law:
+def coulomb(G: Float[Array, "3 3"], b: Float[Array, "3"], target: Scalar, friction: Scalar, static: Scalar, sizes: Float[Array, "3"]) -> Law:
     """Return what the law makes of one closed contact with the response `G L + b`, whose normal part is to be `target`.
 
     With g = G_tn, H = G_tt and c = target - b_n the direction of slip is a root of
 
         F(e) = (G_nn - mu g.e) (e x b_t) + c (e x g) - c mu (e x H e),      F' along n = J e, the rotation of e
 
-    `sizes`: of the diagonal of G, beside which an entry of it vanishes.
+    `friction`, `static`: the coefficients mu of slip and of sticking; `sizes`: of the diagonal of G, beside which an entry of it vanishes.
     """
     c, free = target - b[0], b[1:]
     sticking = jnp.concatenate(solved(list(G), [c[None], -b[1:2], -b[2:3]], list(sizes)))
-    bound, across = friction * sticking[0], sticking[1:] @ sticking[1:]
+    bound, across = static * sticking[0], sticking[1:] @ sticking[1:]
     loaded = across > 0
     against = jnp.where(loaded, -sticking[1:], jnp.array([1.0, 0.0])) / jnp.sqrt(jnp.where(loaded, across, 1.0))
     g, H = G[0, 1:], G[1:, 1:]

@@ -4,7 +4,7 @@
 
     ends        normal                       tangent                      speed
     flies       gap
-    rolls       L_n                          (mu L_n)^2 - |L_t|^2
+    rolls       L_n                          (mu_s L_n)^2 - |L_t|^2
     slips       L_n                          |w_t|^2 - s^2
     creeps      L_n                          e.w_t                        4 s^2 - |w_t|^2
 
@@ -50,6 +50,7 @@ class At:
         self.found = contact_response(scene, motion) if found is None else found
         self.responses += [(motion.q.array, motion.u.array, motion.inputs.array, self.found)] if found is None else []
         self.friction = friction_of(scene, motion)
+        self.static = jnp.stack([contact.friction.static for contact in switching_contacts(scene, motion.pose()).values() if contact.friction])
         self.modes: Modes = contact_modes(scene, motion, self.found.rows.w)
         self.w = self.found.rows.w.reshape(-1, 3)
         self.number = jnp.stack([motion.modes[name] for name in scene.switching.contacts])
@@ -89,7 +90,7 @@ def contact_events(at: At) -> dict[str, Scalar]:
     events, forces, one = {}, at.forces, jnp.ones_like(at.motion.t)
     for i, name in enumerate(at.scene.switching.contacts):
         number, normal, tangential, slip = at.number[i], forces[i, 0], forces[i, 1:], at.w[i, 1:]
-        bound, square = at.friction[i] * normal, slip @ slip
+        bound, square = at.static[i] * normal, slip @ slip
         events[f"{name} normal"] = jnp.where(number == FLIES, at.found.rows.gap[i], normal)
         while_closed = jnp.where(number == SLIPS, square - SLOW**2, at.modes.direction[i] @ slip)
         events[f"{name} tangent"] = jnp.where(number == FLIES, one, jnp.where(number == ROLLS, bound * bound - tangential @ tangential, while_closed))
@@ -138,7 +139,7 @@ class After:
 
         def impulses(modes: Modes) -> tuple[Law, Float[Array, "contacts 3"]]:
             own = at.alone(i, at.found.rows.w, modes)
-            law = coulomb(own.G, own.b, goal, friction, own.sizes)
+            law = coulomb(own.G, own.b, goal, friction, friction, own.sizes)
             return law, own.every(i, jnp.where(strikes, law.forces, law.sticking)).reshape(-1, 3)
 
         modes = at.modes
@@ -157,7 +158,7 @@ class After:
         numbers = jnp.where(jumps, others, at.number)
         then = At(scene, _switched(scene, motion, numbers, motion.q.array, self.u), None, at.responses)
         own = then.alone(i, then.found.b)
-        rest = coulomb(own.G, own.b, jnp.zeros_like(friction), friction, own.sizes)
+        rest = coulomb(own.G, own.b, jnp.zeros_like(friction), friction, at.static[i], own.sizes)
         self.direction = rest.direction
         settled = jnp.where(rest.opens, float(FLIES), jnp.where(rest.sticks, float(ROLLS), float(CREEPS)))
         slips = strikes & ~law.sticks & fast[i]

@@ -223,8 +223,8 @@ def contact_modes(scene: Scene, motion: Motion, w: Float[Array, "rows"]) -> Mode
 
 
 def friction_of(scene: Scene, motion: Motion) -> Float[Array, "contacts"]:
-    """Coefficients of friction of the contacts that switch."""
-    return jnp.stack([contact.friction for contact in switching_contacts(scene, motion.pose()).values()])
+    """Coefficients of friction of the contacts that switch, while they slip."""
+    return jnp.stack([contact.friction.sliding for contact in switching_contacts(scene, motion.pose()).values() if contact.friction])
 
 
 def switching_forces(scene: Scene, motion: Motion, found: ContactResponse) -> Float[Array, "rows"]:

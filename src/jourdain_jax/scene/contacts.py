@@ -20,10 +20,21 @@ from jourdain_jax.scene.motion_state import BodyPose
 _HEIGHTS = ("coordinates", "row")
 
 
+class Coulomb(eqx.Module):
+    """Coulomb's law of friction: `sliding` is the coefficient of a contact that slips, `static` >= `sliding` that of one that does not (default: the same)."""
+
+    sliding: Scalar
+    static: Scalar
+
+    def __init__(self, sliding, static=None):
+        self.sliding = checked_real(sliding, "coefficient of friction", ())
+        self.static = self.sliding if static is None else checked_real(static, "coefficient of static friction", ())
+
+
 class Slipping(TypedDict, total=False):
     """What contacts may state that slip, fly and strike."""
 
-    friction: Scalar | None
+    friction: Scalar | Coulomb | None
     restitution: Scalar
 
 
@@ -52,7 +63,7 @@ class Contact(eqx.Module):
     distance: Scalar | None  # m; None: the point's height above the plane
     shape: Shape | None  # what rolls, for pictures
     ground: Ground | None  # what it rolls on, for pictures; None: the plane
-    friction: Scalar | None  # None: it rolls, whatever friction that needs
+    friction: Coulomb | None  # None: it rolls, whatever friction that needs
     restitution: Scalar | None
 
     def __init__(
@@ -101,8 +112,8 @@ def ball_contact(body: BodyPose, radius, **options: Unpack[Rolling]) -> Contact:
     - `height`: "coordinates" where they keep the body on the ground by themselves, "row" for a geometric row.
     - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all), for the normal force where
       `height="coordinates"`.
-    - `friction`: Coulomb's coefficient. With it the contact flies, rolls or slips (`motion.phase`), and needs `height="row"`; None (default): it rolls,
-      whatever friction that needs. `restitution` e, from 0 (default) to 1: Newton's, of impacts.
+    - `friction`: Coulomb's coefficient, or a `jj.Coulomb(sliding, static)`. With it the contact flies, rolls or slips (`motion.phase`), and needs
+      `height="row"`; None (default): it rolls, whatever friction that needs. `restitution` e, from 0 (default) to 1: Newton's, of impacts.
 
     Two velocity rows (m/s), along the ground's tangents. ValueError for an unknown height or a length that is not positive; for a ball that does
     not fit into the cylinder or sphere, where its scene is built.
@@ -181,7 +192,7 @@ def _checked_ground(given, body: str) -> Ground:
     return given
 
 
-def _slipping(body: str, height: str, friction=None, restitution=0.0) -> tuple[Scalar | None, Scalar | None]:
+def _slipping(body: str, height: str, friction=None, restitution=0.0) -> tuple[Coulomb | None, Scalar | None]:
     if friction is None:
         return None, None
     if height != "row":
@@ -189,7 +200,8 @@ def _slipping(body: str, height: str, friction=None, restitution=0.0) -> tuple[S
             f'the contact of `{body}` has friction, and `height="coordinates"`, by which it cannot leave the ground; '
             'give the body coordinates of its own for its height, and write height="row"'
         )
-    return tuple(checked_real(x, f"{what} of the contact of `{body}`", ()) for x, what in ((friction, "friction"), (restitution, "restitution")))
+    law = friction if isinstance(friction, Coulomb) else Coulomb(checked_real(friction, f"friction of the contact of `{body}`", ()))
+    return law, checked_real(restitution, f"restitution of the contact of `{body}`", ())
 
 
 def _checked_height(height: str) -> str:
