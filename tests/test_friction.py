@@ -293,3 +293,30 @@ def test_a_block_sticks_and_slips_on_a_belt():
     np.testing.assert_allclose(jax.jacfwd(period)(0.4), 4.14018082448, rtol=1e-7)
     with pytest.raises(ValueError, match=r"static friction of contact `belt` of `Belt` is 0\.2, expected at least that of sliding, 0\.25"):
         jj.simulate(Belt(0.2), {"z": 0.1}, t1=0.1)
+
+
+class Kerb(jj.Scene):
+    """A ball that rolls in a plane against an edge 0.02 m above its floor."""
+
+    coordinates = jj.coordinates("x z turn")
+    domain = {"x": (-1.0, -0.1), "z": (0.1, 0.3)}
+
+    def bodies(self, t, q):
+        return {"ball": jj.RigidBody(1.0, 0.4 * 0.01 * jnp.eye(3), jnp.stack([q.x, 0.0 * q.x, q.z]), jj.rot_y(q.turn))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, G),)
+
+    def contacts(self, pose):
+        edge = jj.Cylinder(1e-7, axis=(0.0, 1.0, 0.0), origin=(0.0, 0.0, 0.02), side="outside")
+        law = {"height": "row", "friction": 5.0}
+        return {"floor": jj.ball_contact(pose["ball"], 0.1, **law), "edge": jj.ball_contact(pose["ball"], 0.1, ground=edge, **law)}
+
+
+@pytest.mark.parametrize(("speed", "climbs"), [(0.617, False), (0.618, True)])
+def test_a_kerb(speed, climbs):
+    """The floor lets go as the edge is struck; speed after/before 6/7; 0.617656862667 m/s climb."""
+    motion = jj.simulate(Kerb(), {"x": -0.3, "z": 0.1, "x_rate": speed, "turn_rate": 10 * speed}, ts=[3.0], max_transitions=200)
+    np.testing.assert_allclose(motion.phases.lost[0] / (0.7 * speed**2), 1 - (6 / 7) ** 2, rtol=1e-5)
+    assert motion.phases.modes[:, 1].tolist() == [0, 1]
+    assert bool(motion["x"][0] > 0) == climbs
