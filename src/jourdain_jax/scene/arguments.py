@@ -63,11 +63,11 @@ def as_scene(scene) -> Scene:
 
 
 def as_rolling(scene, what: str) -> Scene:
-    """As `as_scene`; ValueError where a contact may slip or fly, which `what` does not look at."""
+    """Return the scene; ValueError where a contact may slip or fly, which the function `what` does not serve."""
     scene = as_scene(scene)
     if scene.switching.contacts:
         named = ", ".join(f"`{name}`" for name in scene.switching.contacts)
-        raise ValueError(f"`{what}` serves contacts that roll, and {named} of `{type(scene).__name__}` may slip and fly; state it without `friction=` there")
+        raise ValueError(f"`{what}` serves contacts that roll, and {named} of `{type(scene).__name__}` may slip and fly; omit `friction=` there")
     return scene
 
 

@@ -59,6 +59,7 @@ class Scene(eqx.Module):
     conventions: ClassVar[str] = "SI units, radians; right-handed inertial frame, z up."
     example: ClassVar[dict[str, float]] = {}
     example_span: ClassVar[float] = 5.0
+    _may_switch: ClassVar[bool] = False  # whether contacts may have friction, as the methods say
     _read: NamesRead = eqx.field(init=False, repr=False)  # a change of what they stand for makes another scene
     switching: Switching = eqx.field(init=False, repr=False, static=True)  # contacts that have friction
 
@@ -68,7 +69,8 @@ class Scene(eqx.Module):
         if isinstance(cls.inputs, Names) and isinstance(cls.modes, Modes):
             modes = dict(cls.modes.pairs)
             cls.inputs = Names((*(name for name in cls.inputs.entries if name not in modes), *modes))
-        if has_friction(cls):
+        cls._may_switch = has_friction(cls)
+        if cls._may_switch:
             for name in ("coordinates", "inputs", "modes"):
                 stated = inspect.getattr_static(cls, name)
                 setattr(cls, name, stated if isinstance(stated, Declared) else Declared(name, stated))
@@ -88,7 +90,7 @@ class Scene(eqx.Module):
         check_description(self, Scene)
         hold_leaves(self)
         check_parameters(self)
-        if has_friction(type(self)):
+        if self._may_switch:
             object.__setattr__(self, "switching", switching_of(self))
 
     def bodies(self, t: Scalar, q: Named) -> dict[str, Body]:
