@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
-from jourdain_jax.equations.rows import rates_along
+from jourdain_jax.equations.rows import rates_along, slip_of
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion, Pose
@@ -35,11 +35,8 @@ def switching_contacts(scene: Scene, pose: Pose) -> dict[str, Contact]:
 def contact_speeds(scene: Scene, motion: Motion) -> Float[Array, "rows"]:
     """Rates of the gaps, and slip along both tangents, of all contacts that switch, m/s."""
     rates = rates_along(scene, motion, lambda pose: {name: contact.gap() for name, contact in switching_contacts(scene, pose).items()})
-    found = []
-    for name, contact in switching_contacts(scene, motion.pose()).items():
-        slip = motion[contact.body].velocity_at(contact.point) - contact.plane.velocity_at(contact.point)
-        found.append(jnp.append(rates[name], contact.plane.tangents @ slip))
-    return jnp.concatenate(found)
+    contacts = switching_contacts(scene, motion.pose())
+    return jnp.concatenate([jnp.append(rates[name], slip_of(contact, motion)) for name, contact in contacts.items()])
 
 
 def contact_rows(scene: Scene, motion: Motion) -> ContactRows:

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int
 from jourdain_jax.calculus.reals import Scalar
 from jourdain_jax.equations.kinematics import motion_at, pose_at
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
+from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import contacts_of, geometric_constraints_of, prescribed_of, velocity_constraints_of
@@ -58,13 +59,17 @@ def velocity_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
     for name, contact in contacts_of(scene, motion.pose()).items():
         if contact.friction is not None:  # it may slip (`equations/switching.py`)
             continue
-        slip = motion[contact.body].velocity_at(contact.point) - contact.plane.velocity_at(contact.point)
-        rows[f"{name} slip"] = contact.plane.tangents @ slip
+        rows[f"{name} slip"] = slip_of(contact, motion)
     for name, value in velocity_constraints_of(scene, motion).items():
         if name in rows:
             raise ValueError(f"row name `{name}` of `{type(scene).__name__}` is used twice; give every constraint a name of its own")
         rows[name] = value
     return rows
+
+
+def slip_of(contact: Contact, motion: Motion) -> Float[Array, "2"]:
+    """Return the velocity of a contact's body at its point, beside that of the ground, along both tangents, m/s."""
+    return contact.plane.tangents @ (motion[contact.body].velocity_at(contact.point) - contact.plane.velocity_at(contact.point))
 
 
 def rates_along(scene: Scene, motion: Motion, values: Callable[[Pose], dict[str, Array]]) -> dict[str, Array]:
