@@ -7,7 +7,7 @@
     rides       1,000,000 rides of 5 s from random leans and speeds: where the bicycle falls
 
 Writes a list of {"figure", "model", "value", "required", "met"}, and the pictures `docs/bicycle_stability.png` and `docs/bicycle_rides.png` (into DIR where
-that is given). `--quick`: a hundredth of the samples. Needs the extras `ensembles`, `native` and `plot`.
+that is given). `--quick`: a hundredth of the samples. Needs the extras `studies` and `plot`.
 """
 
 import tempfile

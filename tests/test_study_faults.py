@@ -484,7 +484,7 @@ def test_a_first_block_on_which_processes_die_ends_the_study(tmp_path):
 
 def test_what_is_not_installed_is_named_with_its_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "zarr", None)
-    with pytest.raises(ImportError, match=r"needs the package `zarr`, .*jourdain-jax\[ensembles\]"):
+    with pytest.raises(ImportError, match=r"needs the package `zarr`, .*jourdain-jax\[studies\]"):
         run(tmp_path / "discs.zarr")
 
 

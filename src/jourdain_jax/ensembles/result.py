@@ -174,7 +174,7 @@ class StudyResult(Printed):
         return self._opened()
 
     def _opened(self):
-        return needed("xarray", "a study as labelled arrays", "ensembles").open_zarr(self.store.path, chunks=None, consolidated=True)
+        return needed("xarray", "a study as labelled arrays", "studies").open_zarr(self.store.path, chunks=None, consolidated=True)
 
     def to_netcdf(self, path: str | os.PathLike) -> None:
         """Write all arrays to the NetCDF file `path`, by whichever engine of xarray is installed."""

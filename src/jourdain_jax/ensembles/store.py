@@ -105,7 +105,7 @@ class Store:
     @staticmethod
     def make(path: str | os.PathLike, study: Mapping, columns: Mapping[str, Column], constants: Mapping[str, tuple], attributes: Mapping) -> "Store":
         """A new folder, whole or absent; an existing one is not touched. `constants`: name -> axis, values, attributes."""
-        zarr = needed("zarr", "storing a study", "ensembles")
+        zarr = needed("zarr", "storing a study", "studies")
         path = Path(path)
         if fault := _beyond(study):
             raise ValueError(f"the study is too large: {fault}; take fewer samples, or a larger `chunk`")
@@ -364,4 +364,4 @@ def _ended(content: bytes) -> bytes:
 
 
 def _crc32c(content) -> int:
-    return needed("google_crc32c", "storing a study", "ensembles").value(content)  # comes with zarr
+    return needed("google_crc32c", "storing a study", "studies").value(content)  # comes with zarr

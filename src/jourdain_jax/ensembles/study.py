@@ -58,7 +58,7 @@ class Study(Printed):
         result = study.run("discs.zarr", t1=2.0, outputs={"lean": jj.End("lean", "rad"), "fallen": jj.Happened("fallen")})
         print(result)
 
-    Raises ValueError for unknown names and for what cannot vary. Needs the extra `ensembles`.
+    Raises ValueError for unknown names and for what cannot vary. Needs the extra `studies`.
     """
 
     scene: Any  # a scene, or a model, of which the scene is kept

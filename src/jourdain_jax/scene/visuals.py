@@ -139,14 +139,13 @@ class Visual(eqx.Module):
     def from_file(path: str | os.PathLike, *, scale=1.0, **look: Unpack[Look]) -> "Visual":
         """The mesh in the file `path` that `trimesh` reads, such as .stl or .obj, times `scale` (0.001 for millimetres).
 
-        `look` as for all shapes. ImportError without `trimesh`; ValueError for a file that is missing, of an unknown format, or
+        `look` as for all shapes. ImportError without `trimesh` (the extra `robots`); ValueError for a file that is missing, of an unknown format, or
         without faces.
         """
-        trimesh = needed("trimesh", "reading a mesh from a file")
         if not os.path.isfile(path):
             raise ValueError(f"cannot read a mesh from `{os.fspath(path)}`: there is no such file; relative paths begin at `{os.getcwd()}`")
         try:
-            read = trimesh.load(os.fspath(path), force="mesh")
+            read = needed("trimesh", "reading a mesh from a file", "robots").load(os.fspath(path), force="mesh")
         except (NotImplementedError, ValueError, IndexError, KeyError) as reason:
             raise ValueError(f"cannot read a mesh from `{os.fspath(path)}`: {reason}; give a file such as .stl or .obj") from None
         if not len(read.faces):
