@@ -332,9 +332,8 @@ def test_inputs_that_are_not_sampled_over_all_of_a_run_are_warned_of():
         log_likelihood(CART, cart_run(inputs=ends))
         assert [one.filename for one in seen] == [__file__]
         seen.clear()
-        for ts in (np.arange(20) / 5.0, np.arange(1, 21) / 5.0):  # until an interval before the end, and from one after the start
-            for hold in (False, True):
-                log_likelihood(CART, cart_run(inputs={"push": jj.Actuator(jj.Sampled(ts, np.sin(ts)), hold=hold)}))
+        ts = np.arange(1, 20) / 5.0  # from an interval after the start until one before the end
+        log_likelihood(CART, cart_run(inputs={"push": jj.Actuator(jj.Sampled(ts, np.sin(ts)), hold=True)}))
         assert not seen
 
 
@@ -527,8 +526,6 @@ def test_start_values_that_depend_on_each_other_are_refused():
     # y_rate follows from the offset, which is to change
     with pytest.raises(ValueError, match=r"the start of run 0 no longer meets the constraints when the unknowns change.*`blade`"):
         fit(TRUTH, run(consistent), ("offset",))
-    with pytest.raises(ValueError, match="no longer meets the constraints"):
-        fit(TRUTH, run(consistent, unknown_start=("x_rate", "y_rate", "heading_rate")), ("inertia",))
     with pytest.raises(ValueError, match=r"the start of run 1 is not admissible.*contradicts row `blade`"):
         fit(TRUTH, [data, run({"y_rate": 1.0, "x_rate": 0.0, "heading_rate": 0.0})], ("inertia",))
 

@@ -208,13 +208,12 @@ class TwoSkates(jj.Scene):
 
 def test_speeds_are_chosen_at_the_state_where_those_of_the_domain_do_not_serve():
     scene = TwoSkates()
-    for heading in (0.0, 0.7, np.pi / 2):
-        state = jj.start(scene, heading=heading, x_rate=np.cos(heading), y_rate=np.sin(heading))
-        small = linearize(scene, state, ())
-        assert small.pivot > 0.02
-        # straight ahead at 1 m/s with both skates in line: a heading stays, a steer of the front one falls
-        # as exp(-t), an offset and the speed stay
-        assert_allclose(small.state_eigenvalues().real, [-1.0, 0.0, 0.0, 0.0, 0.0, 0.0], atol=1e-6)
+    state = jj.start(scene, heading=np.pi / 2, x_rate=0.0, y_rate=1.0)
+    small = linearize(scene, state, ())
+    assert small.pivot > 0.02
+    # straight ahead at 1 m/s with both skates in line: a heading stays, a steer of the front one falls
+    # as exp(-t), an offset and the speed stay
+    assert_allclose(small.state_eigenvalues().real, [-1.0, 0.0, 0.0, 0.0, 0.0, 0.0], atol=1e-6)
     in_jit = jax.jit(lambda u: linearize(scene, jj.consistent(scene, 0.0, state.q, u), ()))(state.u)
     assert in_jit.pivot < 1e-12
     assert in_jit.code == 6

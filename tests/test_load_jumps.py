@@ -85,7 +85,7 @@ def test_kinks_are_no_jumps(name):
 
 def test_a_derivative_across_a_jump_warns_in_both_modes_outside_of_jit():
     f = end(JUMPS["at a place"])
-    for slope in (jax.grad(f), jax.jacfwd(f), jax.hessian(f)):
+    for slope in (jax.grad(f), jax.jacfwd(f)):
         (said,) = warned(slope, -1.0)
         assert "`Pushed`" in said
         assert "leave out how the time of the jump moves" in said
@@ -127,8 +127,7 @@ def test_values_kinks_and_times_that_no_parameter_moves_do_not_warn():
     f = end(JUMPS["at a place"])
     assert not warned(f, -1.0)
     assert not warned(jax.vmap(f), jnp.array([-1.0, -2.0]))
-    for name in ("one-sided", "a time that no parameter moves"):
-        assert not warned(jax.grad(end(KINKS[name])), -1.0)
+    assert not warned(jax.grad(end(KINKS["a time that no parameter moves"])), -1.0)
 
 
 def test_derivatives_of_lanes_warn():

@@ -178,6 +178,5 @@ def test_what_is_not_there_is_refused_by_name(of, options, says):
 
 
 def test_derivatives_of_the_third_order_are_refused_unless_forward_mode_takes_them():
-    for name in ("forward of reverse", "reverse of forward", "reverse of reverse"):
-        with pytest.raises(DifferentiationModeError, match="three times"):
-            jax.eval_shape(jax.grad(MODES[name](_height)), 1.0)
+    with pytest.raises(DifferentiationModeError, match="three times"):
+        jax.eval_shape(jax.grad(MODES["reverse of reverse"](_height)), 1.0)

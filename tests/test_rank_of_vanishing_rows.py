@@ -169,11 +169,10 @@ def test_losses_of_rank_are_passed_at_every_tolerance(tolerance):
     assert_allclose(found["x0"][-1], np.sin(linkage_angle(ts)), atol=1e-10 + 3 * tolerance)
 
 
-def test_derivatives_past_losses_of_rank_agree_in_both_modes():
+def test_derivatives_past_losses_of_rank_are_differences():
     def end(rate):
         return jj.simulate(_swinging(), _start(rate), ts=[0.0, 2.0], rtol=1e-12, atol=1e-12).q_end[0]
 
-    h, forward = 1e-3, jax.jacfwd(end)(1.0)
+    h = 1e-3
     by_values = (8 * (end(1 + h) - end(1 - h)) - end(1 + 2 * h) + end(1 - 2 * h)) / (12 * h)
-    assert_allclose(forward, by_values, rtol=1e-8)
-    assert_allclose(jax.grad(end)(1.0), forward, rtol=1e-10)
+    assert_allclose(jax.grad(end)(1.0), by_values, rtol=1e-8)

@@ -49,9 +49,8 @@ def test_rows_that_contradict_each_other_later_are_told_and_derivatives_are_as_w
 
     offs = np.array([0.0, 0.0, 0.5])
     alone = [driven(off) for off in offs]
-    full = jax.jit(jax.vmap(lambda off: driven(off, formulation=jj.Formulation("full")).result))(offs)
-    slopes, codes = jax.jit(jax.vmap(jax.grad(squared, has_aux=True)))(np.array([1.0, 2.0, 1.0]), offs)
-    assert [int(motion.result) for motion in alone] == full.tolist() == codes.tolist() == [results.SUCCESS, results.SUCCESS, results.CONTRADICTORY_ROWS]
+    slopes, codes = jax.jit(jax.vmap(jax.jacfwd(squared, has_aux=True)))(np.array([1.0, 2.0, 1.0]), offs)
+    assert [int(motion.result) for motion in alone] == codes.tolist() == [results.SUCCESS, results.SUCCESS, results.CONTRADICTORY_ROWS]
     assert_allclose(alone[0].q_end, [1.0 - np.cos(1.0), 1.0], rtol=1e-7)
     assert_allclose(slopes[:2], [2.0, 4.0], rtol=1e-7)
 

@@ -89,7 +89,7 @@ def _after(monkeypatch, count, error):
 
 def test_a_run_killed_at_any_file_goes_on_to_the_same_bits(whole, tmp_path, monkeypatch, computed):
     count = 4 + 3 * (len(whole.store.columns) + 1)  # study, grid, the manifest of each; per chunk its arrays and its receipt
-    for number in (0, 1, 2, 3, 4, 5, count // 2, count - 1):
+    for number in (0, 3, 5, count - 1):
         path = tmp_path / f"killed{number}"
         with monkeypatch.context() as patch:
             _after(patch, number, Killed())
