@@ -165,16 +165,6 @@ def test_a_warm_call_from_python_is_short():
     assert len(files) <= MOST_FILES, files
 
 
-def test_a_motion_does_not_depend_on_how_often_it_was_asked_for():
-    disc = jj.models.TiltingDisc()
-    start = jj.start(disc, lean=0.3, spin_rate=-3.0)
-    first, *others = [jj.simulate(scene, start, ts=TS) for scene in (disc, disc, jj.models.TiltingDisc(), *[disc] * 100)]
-    for motion in others:
-        jax.tree.map(assert_array_equal, (motion.q, motion.u, motion.q_end), (first.q, first.u, first.q_end))
-    assert_array_equal(jj.start(disc, lean=0.3, spin_rate=-3.0).u, start.u)
-    assert len({str(motion) for motion in (first, *others[-2:])}) == 1
-
-
 def test_what_is_kept_of_a_scene_is_kept_by_the_values_of_its_parameters():
     def ends(radius):
         disc = jj.models.TiltingDisc(radius=radius)

@@ -208,15 +208,6 @@ def test_steps_are_no_longer_than_a_part_of_the_span(way):
     assert 300 <= short < 330
 
 
-def test_both_loops_take_the_same_steps_in_lanes_and_under_jit_and_back_in_time():
-    starts = {"x": 1.0, "x_rate": jnp.linspace(-1.0, 2.0, 5)}
-    lanes = [jj.rollout(FREE, starts, ts=[-3.0], max_step=0.3, backend=backend).lanes for backend in ("native", "xla")]
-    one = jax.jit(lambda longest: jj.simulate(FREE, BEGIN, ts=[-3.0], max_step=longest).accepted)(0.3)
-    for motion in lanes:
-        assert_array_equal(motion.accepted, int(one))
-
-
 def test_a_step_of_one_length_has_its_own_bound():
     with pytest.raises(ValueError, match="`max_step`"):
         jj.simulate(FREE, BEGIN, ts=[3.0], max_step=0.1, solver=jj.ImplicitMidpoint(step=0.1))
-

@@ -492,9 +492,3 @@ def test_a_bounce_that_is_over_has_happened(backend):
     assert {lanes.event_names[event] for event in np.asarray(lanes.event)} == {"floor"}
     assert np.all(lanes.t_end < 1e-6)
     assert lanes.t_end[-1] == 0.0
-
-
-def test_a_solver_of_diffrax_starts_at_an_event_too():
-    up, down = (jj.simulate(Ball(), {"z": 0.0, "z_rate": rate}, ts=[2.0], solver=diffrax.Bosh3()).t_end for rate in (3.0, -3.0))
-    assert abs(up - 6 / GRAVITY) < 1e-6
-    assert float(down) == 0.0

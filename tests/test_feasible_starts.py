@@ -157,19 +157,6 @@ def test_parts_of_an_attitude_that_no_other_has_leave_the_rest_zero():
     assert_allclose(eval_numpy(jax.grad(lean))(half), -np.sin(2 * half), rtol=1e-9)
 
 
-def test_a_motion_from_named_values_begins_at_their_start():
-    disc, crank, times = SCENES["disc with quaternion"], SCENES["slider-crank"], np.array([0.0, 0.01])
-    found = jj.start(crank, x=1.4)
-    whole = dict(zip(crank.coordinate_names.entries, found.q.tolist(), strict=True))
-    assert int(found.guess) > 0
-    for values in ({"x": 1.4}, whole):
-        motion, state = jj.simulate(crank, values, ts=times), jj.start(crank, **values)
-        assert_allclose(motion.q[0], state.q, atol=1e-9)
-        assert_allclose(float(motion.moved_q), float(state.moved_q), atol=1e-9)
-    with pytest.raises(ValueError, match="contradicts row `rim height`"):
-        jj.simulate(disc, {"z": 0.6}, ts=times)
-
-
 def test_starts_in_lanes_find_what_single_ones_find_and_have_derivatives():
     scene, places = SCENES["slider-crank"], np.array([-1.5, -1.2, 1.4, 2.5])
 
@@ -333,4 +320,3 @@ def test_second_derivatives_are_differences_of_first_ones():
     expected = _slope(jax.jit(jax.jacfwd(put)))
     for second in (jax.jacfwd(jax.jacfwd(put)), jax.jacfwd(jax.jacrev(put)), jax.jacrev(jax.jacrev(put))):
         assert_allclose(jax.jit(second)(0.0), expected, atol=1e-7 * np.max(np.abs(expected)))
-

@@ -528,18 +528,3 @@ def test_start_values_that_depend_on_each_other_are_refused():
         fit(TRUTH, run(consistent), ("offset",))
     with pytest.raises(ValueError, match=r"the start of run 1 is not admissible.*contradicts row `blade`"):
         fit(TRUTH, [data, run({"y_rate": 1.0, "x_rate": 0.0, "heading_rate": 0.0})], ("inertia",))
-
-
-def test_a_fit_ends_at_the_minimum_whatever_its_tolerance():
-    ts = jnp.linspace(0.0, 4.0, 41)
-    truth, start = ChaplyginSleigh(offset=0.25), {"x_rate": -0.6, "heading_rate": 0.9}
-    motion, noise = jj.simulate(truth, start, ts=ts), np.random.default_rng(3)
-    data = jj.Experiment(ts, {"x": motion["x"] + 0.01 * noise.normal(size=41)}, 0.01, start=start, unknown_start=("heading_rate",))
-    found, exact = (jj.fit(truth.replace(offset=0.4), data, ("offset",), tolerance=tolerance) for tolerance in (1e-4, 1e-9))
-    assert found.converged
-    assert exact.converged
-    assert np.max(np.abs(found.values - exact.values) / exact.standard_errors) < 1e-4
-    there = jj.simulate(found.scene, found.starts[0], ts=ts)
-    assert_allclose(found.residuals[0]["x"], (there["x"] - data.values["x"]) / 0.01, atol=1e-3)
-    (_, costs) = found.trace[0]
-    assert_allclose(costs[-1], 0.5 * float(found.chi_square), rtol=1e-6)

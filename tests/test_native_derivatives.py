@@ -87,19 +87,6 @@ def test_cotangents_of_a_lane_do_not_depend_on_its_company():
         assert_allclose(every(LANES[order]), expected[order], rtol=1e-13, atol=1e-14)
 
 
-def test_cotangents_reach_back_over_more_steps_than_there_is_memory_for_at_first():
-    def end(x, closed):
-        options = {"ts": jnp.array([40.0]), "t1": 40.0}
-        w = jnp.sqrt(x[1] / x[0])
-        return x[3] * jnp.cos(40 * w) + x[4] / w * jnp.sin(40 * w) if closed else _ends(x, **options)[2]
-
-    x = X.at[5].set(0.0)
-    scene = Oscillator(mass=x[0], stiffness=x[1])
-    assert int(jj.simulate(scene, {"x": x[3], "x_rate": x[4]}, ts=[40.0], rtol=1e-11, atol=1e-11, events=False).accepted) > 128
-    found, expected = (jax.jit(jax.grad(lambda x, closed=closed: end(x, closed)))(x)[:5] for closed in (False, True))
-    assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
-
-
 @pytest.mark.parametrize("derivative", [jax.jacrev, jax.jacfwd])
 def test_derivatives_pass_through_motions_one_after_the_other(derivative):
     """One compiled step, called with numbers of which other ones vary each time."""

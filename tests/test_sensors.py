@@ -194,7 +194,7 @@ def test_an_accelerometer_feels_centripetal_and_tangential_acceleration_and_grav
 
 
 def test_a_load_cell_shows_what_the_ground_bears_and_tells_a_mass():
-    disc, start, cell = jj.models.TiltingDisc(mass=1.3), {"lean": 0.4, "spin_rate": -4.0, "yaw_rate": 0.5}, jj.LoadCell("rim")
+    disc, start, cell = jj.models.VerticalDisc(mass=1.3), {"heading_rate": 0.5, "roll_rate": 4.0}, jj.LoadCell("rim")
     motion = jj.simulate(disc, start, ts=TS, rtol=1e-10, atol=1e-10)
     force, felt = cell.over_times(motion), jj.Accelerometer("disc").over_times(motion)
     assert_allclose(force, 1.3 * jnp.einsum("tij,tj->ti", motion.motions()["disc"].orientation, felt), atol=1e-9)  # F = m (a - g)

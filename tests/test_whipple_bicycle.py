@@ -18,14 +18,14 @@ from jourdain_jax.models import WhippleBicycle
 BICYCLE = WhippleBicycle()
 NAMES = WhippleBicycle.coordinates.names.entries
 LEAN, STEER = NAMES.index("lean"), NAMES.index("steer")
-STRUCTURE = jj.structure_of(BICYCLE)
 
 
 def state(bicycle, lean, steer, lean_rate, steer_rate, speed):
     """The admissible state with the front wheel rolling at `speed`; the pitch follows from the front contact."""
     q = project_positions(bicycle, 0.0, bicycle.named(lean=lean, steer=steer)[0], free=jnp.array([n == "pitch" for n in NAMES]))
     y = jnp.stack([lean_rate, steer_rate, speed / bicycle.rF])
-    return q, minimal_kinematics(bicycle, STRUCTURE.independent, STRUCTURE.kept_rows, 0.0, q, y).u
+    structure = jj.structure_of(BICYCLE)
+    return q, minimal_kinematics(bicycle, structure.independent, structure.kept_rows, 0.0, q, y).u
 
 
 def other_bicycle():
