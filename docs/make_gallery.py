@@ -214,7 +214,7 @@ def entries() -> dict[str, Entry]:
         found[name] = Entry(name, kind, path, f"from scenes.{path.stem} import {kind.__name__}\n", f"{kind.__name__}()", picture, module.LOOK)
     for name, kind in jj.models.MODELS.items():
         picture = MODEL_PICTURES.get(name, Picture(look=f"How {name.replace('-', ' ')} moves from its example start."))
-        source = Path(inspect.getfile(kind)).resolve()
+        source = ROOT / f"src/{kind.__module__.replace('.', '/')}.py"
         found[name] = Entry(name, kind, source, "", f"jj.models.{kind.__name__}()", picture, picture.look)
     return found
 

@@ -5,6 +5,7 @@ A motion is `right` where its error is within a bound; otherwise it must say so:
 """
 
 from dataclasses import asdict, dataclass
+from traceback import walk_tb
 
 import numpy as np
 
@@ -49,7 +50,5 @@ def refusal(error: Exception) -> tuple[str, str]:
 
 def _raw(error: Exception) -> bool:
     """Whether a ValueError was raised below the engine (JAX, NumPy, diffrax raise such too)."""
-    trace = error.__traceback__
-    while trace is not None and trace.tb_next is not None:
-        trace = trace.tb_next
-    return trace is not None and "jourdain_jax" not in trace.tb_frame.f_code.co_filename
+    *_, (raised, _) = walk_tb(error.__traceback__)
+    return not raised.f_globals["__name__"].startswith("jourdain_jax")

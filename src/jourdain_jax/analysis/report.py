@@ -1,7 +1,9 @@
 """What kind of system a scene is, in one table: freedoms, rows, rank, integrability, growth, cyclic and ignorable coordinates."""
 
 import textwrap
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from typing import Any
 
 from jourdain_jax.analysis.integrability import frobenius_violations, growth_vector, integrable_below, reachable
 from jourdain_jax.build.assembling import COORDINATE_DOMAIN, SPEED_DOMAIN
@@ -137,7 +139,7 @@ class Report(Printed):
 
 @shown_from_users_lines
 @of_known_numbers
-def report(scene: Scene | BuiltFor, *, depth: int = 4, start: State | dict | None = None) -> Report:
+def report(scene: Scene | BuiltFor, *, depth: int = 4, start: "State | Mapping[str, Any] | None" = None) -> Report:
     """Degrees of freedom, rows, rank, redundancy, integrability, growth vector, cyclic and ignorable coordinates of a scene.
 
     `depth` bounds the number of fields in a bracket for the growth vector. `start`: a state, or named values as for `jj.start`, at which the rank is

@@ -21,7 +21,8 @@ near a jump J of the second derivative 0.032 J h^2, at the ends 0.075 J h^2. The
 Both are smooth in delay and lag, at a lag of zero as well. Source: M. Abramowitz and I. A. Stegun, Handbook of Mathematical Functions (1964), 25.2 and 25.4.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -31,7 +32,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.estimate import Estimate, positive, unbounded
 from jourdain_jax.analysis.quantities import Channel, Instrument, StopEvent
-from jourdain_jax.calculus.reals import Scalar, array_module, checked_real, described, holds, is_traced, real_type
+from jourdain_jax.calculus.reals import Number, Scalar, array_module, checked_real, described, holds, is_traced, real_type
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.motion_state import Motion
@@ -40,6 +41,7 @@ FEWEST_INTERVALS = 64  # up to the end of a run, or to the next node of a piece
 Numbers = Float[Array | np.ndarray, "..."]
 Times = Float[Array | np.ndarray, "times"]
 Knots = Float[Array, "knots"]
+Stated: TypeAlias = Number | Sequence[Number] | Estimate
 
 
 def intervals(t0, ts: Times, node) -> int:
@@ -197,7 +199,15 @@ class Sensor(eqx.Module):
     delay: Scalar | Estimate  # s
     lag: Scalar | Estimate  # s
 
-    def __init__(self, quantity=None, *, gain=1.0, bias=0.0, delay=0.0, lag=0.0):
+    def __init__(
+        self,
+        quantity: str | Callable | Instrument | None = None,
+        *,
+        gain: Stated = 1.0,
+        bias: Stated = 0.0,
+        delay: Stated = 0.0,
+        lag: Stated = 0.0,
+    ):
         if not (quantity is None or isinstance(quantity, str | Instrument) or callable(quantity)):
             raise ValueError(f"`quantity` of `Sensor` is {described(quantity)}, expected a coordinate, a speed, or a function of a motion")
         self.quantity = quantity
@@ -228,7 +238,7 @@ class Actuator(eqx.Module):
     lag: Scalar | Estimate  # s
     hold: bool = eqx.field(static=True)
 
-    def __init__(self, command, *, gain=1.0, bias=0.0, delay=0.0, lag=0.0, hold=False):
+    def __init__(self, command: Sampled, *, gain: Stated = 1.0, bias: Stated = 0.0, delay: Stated = 0.0, lag: Stated = 0.0, hold: bool = False):
         if not isinstance(command, Sampled):
             raise ValueError(f"`command` of `Actuator` is {described(command)}, expected `jj.Sampled(ts, values)`")
         if not isinstance(hold, bool):

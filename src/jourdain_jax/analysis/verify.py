@@ -14,6 +14,9 @@ gradients          of udot and A' lambda: forward against reverse mode, and agai
 Everything is worked out once, uncompiled: compiling it would take several times as long as running it.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -45,7 +48,9 @@ from jourdain_jax.scene.validated import loads_of, potential_of
 
 @shown_from_users_lines
 @of_known_numbers
-def verify(scene: Scene | BuiltFor, state: State | dict | None = None, inputs: Numbers | dict | None = None, *, seed: int = 0) -> Verification:
+def verify(
+    scene: Scene | BuiltFor, state: "State | Mapping[str, Any] | None" = None, inputs: "Numbers | Mapping[str, Any] | None" = None, *, seed: int = 0
+) -> Verification:
     """Check the equations of a scene, and what it states, at a consistent state; a failed check names its culprit.
 
         print(verify(disc, start(disc, lean=0.3, spin_rate=-3.0)))

@@ -26,6 +26,7 @@ Numbers = Real[Array | np.ndarray, "_"] | Sequence[ArrayLike]  # any count of th
 Vector = Real[Array | np.ndarray, "3"] | Sequence[ArrayLike]  # three numbers
 # what annotations of all layers name most often
 Scalar = Float[Array, ""]
+Parameter = Scalar | float  # of a scene, as it is given; there it is an array
 Flag = Bool[Array, ""]
 Count = Int[Array, ""]
 Vector3 = Float[Array, "3"]

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from jourdain_jax.models.turning_bodies import FreeRigidBody, Suslov
     from jourdain_jax.models.two_wheel_axle import TwoWheelAxleCoordinates, TwoWheelAxleFree, TwoWheelAxleQuasi, TwoWheelAxleRedundant
     from jourdain_jax.models.whipple_bicycle import WhippleBicycle
-
-__getattr__, __dir__ = names_on_first_use(globals(), CLASSES, {})
+else:
+    __getattr__, __dir__ = names_on_first_use(globals(), CLASSES, {})
 
 __all__ = [
     "MODELS",

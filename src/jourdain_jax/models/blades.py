@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Scalar, Vector3, checked_whole
+from jourdain_jax.calculus.reals import Parameter, Scalar, Vector3, checked_whole
 from jourdain_jax.calculus.rotations import rot_y, rot_z
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.constraints import knife_edge, pin
@@ -26,10 +26,10 @@ class Skate(Scene):
     x, y of the mass centre, heading of the blade.
     """
 
-    mass: Scalar = parameter(1.0, unit="kg", positive=True)
-    inertia: Scalar = parameter(0.2, unit="kg m^2", positive=True, about="about the normal of the slope")
-    slope: Scalar = parameter(0.3, unit="rad")
-    gravity: Scalar = parameter(9.81, unit="m/s^2")
+    mass: Parameter = parameter(1.0, unit="kg", positive=True)
+    inertia: Parameter = parameter(0.2, unit="kg m^2", positive=True, about="about the normal of the slope")
+    slope: Parameter = parameter(0.3, unit="rad")
+    gravity: Parameter = parameter(9.81, unit="m/s^2")
 
     coordinates = coordinates("x y heading")
     conventions = "x down the slope, y across it, z along its normal; heading from x towards y; the blade is along body x."
@@ -67,9 +67,9 @@ class ChaplyginSleigh(Scene):
     x, y of the mass centre, heading of the blade; the blade touches the ice at body point (-offset, 0, 0).
     """
 
-    mass: Scalar = parameter(1.3, unit="kg", positive=True)
-    inertia: Scalar = parameter(0.4, unit="kg m^2", positive=True, about="I, about the mass centre")
-    offset: Scalar = parameter(0.25, unit="m", about="a, of the mass centre ahead of the blade; negative behind it")
+    mass: Parameter = parameter(1.3, unit="kg", positive=True)
+    inertia: Parameter = parameter(0.4, unit="kg m^2", positive=True, about="I, about the mass centre")
+    offset: Parameter = parameter(0.25, unit="m", about="a, of the mass centre ahead of the blade; negative behind it")
 
     coordinates = coordinates("x y heading")
     conventions = "z up; heading from x towards y; the blade is along body x; x, y of the mass centre."
@@ -130,11 +130,11 @@ class Snakeboard(Scene):
     Inputs (N m): `rotor_torque` between rotor and board, `steer_torque` that opens both wheel pairs.
     """
 
-    mass: Scalar = parameter(6.0, unit="kg", positive=True, about="of everything")
-    half_length: Scalar = parameter(0.2, unit="m", positive=True, about="l, from the middle to a wheel pair")
-    board_inertia: Scalar = parameter(0.1, unit="kg m^2", positive=True, about="J, with the masses of rotor and wheels")
-    rotor_inertia: Scalar = parameter(0.05, unit="kg m^2", positive=True, about="Jr")
-    wheel_inertia: Scalar = parameter(0.002, unit="kg m^2", positive=True, about="Jw, of one wheel pair")
+    mass: Parameter = parameter(6.0, unit="kg", positive=True, about="of everything")
+    half_length: Parameter = parameter(0.2, unit="m", positive=True, about="l, from the middle to a wheel pair")
+    board_inertia: Parameter = parameter(0.1, unit="kg m^2", positive=True, about="J, with the masses of rotor and wheels")
+    rotor_inertia: Parameter = parameter(0.05, unit="kg m^2", positive=True, about="Jr")
+    wheel_inertia: Parameter = parameter(0.002, unit="kg m^2", positive=True, about="Jw, of one wheel pair")
 
     coordinates = coordinates("x y heading rotor steer")
     inputs = inputs("rotor_torque steer_torque")
@@ -185,8 +185,8 @@ class TrailerChain(Scene):
     """
 
     trailers: int = eqx.field(static=True, default=3)
-    car_mass: Scalar = parameter(1.0, unit="kg", positive=True)
-    car_inertia: Scalar = parameter(0.1, unit="kg m^2", positive=True)
+    car_mass: Parameter = parameter(1.0, unit="kg", positive=True)
+    car_inertia: Parameter = parameter(0.1, unit="kg m^2", positive=True)
     trailer_mass: Float[Array, "*trailers"] = parameter(0.5, unit="kg", non_negative=True)
     trailer_inertia: Float[Array, "*trailers"] = parameter(0.02, unit="kg m^2", non_negative=True)
     length: Float[Array, "*trailers"] = parameter(0.7, unit="m", positive=True, about="from hitch to axle")

@@ -4,7 +4,7 @@ import math
 
 import jax.numpy as jnp
 
-from jourdain_jax.calculus.reals import Scalar
+from jourdain_jax.calculus.reals import Parameter
 from jourdain_jax.calculus.rotations import quaternion_to_matrix, rot_x, rot_y, rot_z
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import RigidBody
@@ -23,11 +23,11 @@ class VerticalDisc(Heavy):
     x, y of the contact point (and of the centre), heading about the vertical, roll about the axle.
     """
 
-    mass: Scalar = parameter(1.0, unit="kg", positive=True)
-    radius: Scalar = parameter(1.0, unit="m", positive=True)
-    roll_inertia: Scalar = parameter(1.0, unit="kg m^2", positive=True, about="about the axle")
-    turn_inertia: Scalar = parameter(1.0, unit="kg m^2", positive=True, about="about a diameter")
-    gravity: Scalar = parameter(9.81, unit="m/s^2")
+    mass: Parameter = parameter(1.0, unit="kg", positive=True)
+    radius: Parameter = parameter(1.0, unit="m", positive=True)
+    roll_inertia: Parameter = parameter(1.0, unit="kg m^2", positive=True, about="about the axle")
+    turn_inertia: Parameter = parameter(1.0, unit="kg m^2", positive=True, about="about a diameter")
+    gravity: Parameter = parameter(9.81, unit="m/s^2")
 
     coordinates = coordinates("x y heading roll")
     privileged = ("heading_rate", "roll_rate")
@@ -57,9 +57,9 @@ class VerticalDisc(Heavy):
 class _ThinDisc(Heavy):
     """A uniform thin disc on a level plane; the axle is body y."""
 
-    mass: Scalar = parameter(1.0, unit="kg", positive=True)
-    radius: Scalar = parameter(0.5, unit="m", positive=True)
-    gravity: Scalar = parameter(9.81, unit="m/s^2")
+    mass: Parameter = parameter(1.0, unit="kg", positive=True)
+    radius: Parameter = parameter(0.5, unit="m", positive=True)
+    gravity: Parameter = parameter(9.81, unit="m/s^2")
 
     example_span = 10.0
 

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from jourdain_jax.calculus.reals import Scalar
+from jourdain_jax.calculus.reals import Parameter
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import Particle
 from jourdain_jax.scene.coordinates import coordinates
@@ -15,7 +15,7 @@ from jourdain_jax.scene.visuals import Visual
 class _OnSheets(Scene):
     """A free particle whose row allows the velocities in one plane through each point."""
 
-    mass: Scalar = parameter(1.0, unit="kg", positive=True)
+    mass: Parameter = parameter(1.0, unit="kg", positive=True)
 
     coordinates = coordinates("x y z")
     privileged = ("x_rate", "y_rate")
@@ -89,9 +89,9 @@ class IsokineticParticle(Heavy):
     Motion in a vertical plane, x horizontal and z up.
     """
 
-    mass: Scalar = parameter(1.0, unit="kg", positive=True)
-    speed: Scalar = parameter(1.7, unit="m/s", positive=True, about="c, which the row keeps")
-    gravity: Scalar = parameter(9.81, unit="m/s^2")
+    mass: Parameter = parameter(1.0, unit="kg", positive=True)
+    speed: Parameter = parameter(1.7, unit="m/s", positive=True, about="c, which the row keeps")
+    gravity: Parameter = parameter(9.81, unit="m/s^2")
 
     coordinates = coordinates("x z")
     domain = {"x_rate": (0.3, 2.0), "z_rate": (-2.0, 2.0)}

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Scalar, Vector3, checked_whole
+from jourdain_jax.calculus.reals import Parameter, Scalar, Vector3, checked_whole
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import Particle
 from jourdain_jax.scene.constraints import rod
@@ -19,11 +19,11 @@ from jourdain_jax.scene.visuals import Visual
 class _DoublePendulum(Heavy):
     """Two particles on massless rods, one below the other."""
 
-    mass1: Scalar = parameter(1.0, unit="kg", positive=True)
-    mass2: Scalar = parameter(0.7, unit="kg", positive=True)
-    length1: Scalar = parameter(1.0, unit="m", positive=True)
-    length2: Scalar = parameter(0.8, unit="m", positive=True)
-    gravity: Scalar = parameter(9.81, unit="m/s^2")
+    mass1: Parameter = parameter(1.0, unit="kg", positive=True)
+    mass2: Parameter = parameter(0.7, unit="kg", positive=True)
+    length1: Parameter = parameter(1.0, unit="m", positive=True)
+    length2: Parameter = parameter(0.8, unit="m", positive=True)
+    gravity: Parameter = parameter(9.81, unit="m/s^2")
 
     def visuals(self, pose):
         return {"": Visual.line(jnp.zeros(3), pose["first"].position, pose["second"].position, radius=0.012 * self.length1)}
@@ -96,13 +96,13 @@ class SpringAndRod(Scene):
     Cartesian coordinates of both particles; origin - spring (and damper) - first - rod - second.
     """
 
-    mass1: Scalar = parameter(1.0, unit="kg", positive=True)
-    mass2: Scalar = parameter(0.6, unit="kg", positive=True)
-    stiffness: Scalar = parameter(40.0, unit="N/m", non_negative=True)
-    natural_length: Scalar = parameter(0.5, unit="m", non_negative=True, about="of the spring")
-    damping: Scalar = parameter(0.0, unit="N s/m", non_negative=True, about="along the spring")
-    rod_length: Scalar = parameter(0.6, unit="m", positive=True)
-    gravity: Scalar = parameter(9.81, unit="m/s^2")
+    mass1: Parameter = parameter(1.0, unit="kg", positive=True)
+    mass2: Parameter = parameter(0.6, unit="kg", positive=True)
+    stiffness: Parameter = parameter(40.0, unit="N/m", non_negative=True)
+    natural_length: Parameter = parameter(0.5, unit="m", non_negative=True, about="of the spring")
+    damping: Parameter = parameter(0.0, unit="N s/m", non_negative=True, about="along the spring")
+    rod_length: Parameter = parameter(0.6, unit="m", positive=True)
+    gravity: Parameter = parameter(9.81, unit="m/s^2")
 
     coordinates = coordinates("x1 z1 x2 z2")
     domain = {"x2": (-1.5, 1.5), "z2": (-1.5, 1.5)}
@@ -147,7 +147,7 @@ class PendulumChain(Heavy):
     links: int = eqx.field(static=True, default=5)
     mass: Float[Array, "*links"] = parameter(0.2, unit="kg", positive=True)
     length: Float[Array, "*links"] = parameter(0.3, unit="m", positive=True)
-    gravity: Scalar = parameter(9.81, unit="m/s^2")
+    gravity: Parameter = parameter(9.81, unit="m/s^2")
 
     conventions = "x horizontal, z up; pivot at the origin; particle 1 hangs from the pivot."
     example_span = 3.0

@@ -4,7 +4,7 @@ import math
 
 import jax.numpy as jnp
 
-from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector3
+from jourdain_jax.calculus.reals import Matrix3, Parameter, Vector3
 from jourdain_jax.calculus.rotations import quaternion_rate, quaternion_to_matrix, rot_x, rot_y, rot_z
 from jourdain_jax.models.weight import Heavy
 from jourdain_jax.scene.bodies import RigidBody
@@ -29,12 +29,12 @@ class BallOnTurntable(Heavy):
     x, y of the centre along the table, and the attitude; roll_x, roll_y, spin: angular velocity in the table's axes.
     """
 
-    mass: Scalar = parameter(1.0, unit="kg", positive=True)
-    radius: Scalar = parameter(0.05, unit="m", positive=True)
-    inertia_ratio: Scalar = parameter(0.4, positive=True, about="kappa = I/(m r^2): 2/5 solid, 2/3 hollow")
-    turn_rate: Scalar = parameter(2.0, unit="rad/s", about="Om, of the table about its normal through the origin")
-    tilt: Scalar = parameter(0.0, unit="rad", about="of the table, down along x")
-    gravity: Scalar = parameter(9.81, unit="m/s^2")
+    mass: Parameter = parameter(1.0, unit="kg", positive=True)
+    radius: Parameter = parameter(0.05, unit="m", positive=True)
+    inertia_ratio: Parameter = parameter(0.4, positive=True, about="kappa = I/(m r^2): 2/5 solid, 2/3 hollow")
+    turn_rate: Parameter = parameter(2.0, unit="rad/s", about="Om, of the table about its normal through the origin")
+    tilt: Parameter = parameter(0.0, unit="rad", about="of the table, down along x")
+    gravity: Parameter = parameter(9.81, unit="m/s^2")
 
     coordinates = coordinates("x y", quaternion("attitude"))
     speeds = speeds("x_rate y_rate roll_x roll_y spin")
@@ -94,16 +94,16 @@ class Rattleback(Heavy):
     x, y of the mass centre; angles alpha, beta, gamma; body angular velocity w1, w2, w3. Singular at alpha = +-pi/2.
     """
 
-    mass: Scalar = parameter(1.0, unit="kg", positive=True)
-    a: Scalar = parameter(0.20, unit="m", positive=True, about="semi-axis along body 1")
-    b: Scalar = parameter(0.03, unit="m", positive=True, about="semi-axis along body 2")
-    c: Scalar = parameter(0.02, unit="m", positive=True, about="semi-axis along body 3")
-    h: Scalar = parameter(0.01, unit="m", about="of the mass centre below the ellipsoid's centre")
-    A: Scalar = parameter(2e-4, unit="kg m^2", positive=True, about="central moment of inertia about 1")
-    B: Scalar = parameter(16e-4, unit="kg m^2", positive=True, about="central moment of inertia about 2")
-    C: Scalar = parameter(17e-4, unit="kg m^2", positive=True, about="central moment of inertia about 3")
-    D: Scalar = parameter(-0.2e-4, unit="kg m^2", about="entry 12 of the inertia matrix")
-    gravity: Scalar = parameter(9.81, unit="m/s^2")
+    mass: Parameter = parameter(1.0, unit="kg", positive=True)
+    a: Parameter = parameter(0.20, unit="m", positive=True, about="semi-axis along body 1")
+    b: Parameter = parameter(0.03, unit="m", positive=True, about="semi-axis along body 2")
+    c: Parameter = parameter(0.02, unit="m", positive=True, about="semi-axis along body 3")
+    h: Parameter = parameter(0.01, unit="m", about="of the mass centre below the ellipsoid's centre")
+    A: Parameter = parameter(2e-4, unit="kg m^2", positive=True, about="central moment of inertia about 1")
+    B: Parameter = parameter(16e-4, unit="kg m^2", positive=True, about="central moment of inertia about 2")
+    C: Parameter = parameter(17e-4, unit="kg m^2", positive=True, about="central moment of inertia about 3")
+    D: Parameter = parameter(-0.2e-4, unit="kg m^2", about="entry 12 of the inertia matrix")
+    gravity: Parameter = parameter(9.81, unit="m/s^2")
 
     coordinates = coordinates("x y alpha beta gamma")
     speeds = speeds("x_rate y_rate w1 w2 w3")

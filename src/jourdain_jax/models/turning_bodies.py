@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from jourdain_jax.calculus.reals import Scalar
+from jourdain_jax.calculus.reals import Parameter
 from jourdain_jax.calculus.rotations import quaternion_to_matrix
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.coordinates import coordinates, quaternion
@@ -21,10 +21,10 @@ class FreeRigidBody(Scene):
     Position of the mass centre, attitude as a quaternion, body angular velocity as speeds; body axes are principal.
     """
 
-    mass: Scalar = parameter(1.0, unit="kg", positive=True)
-    i1: Scalar = parameter(1.0, unit="kg m^2", positive=True)
-    i2: Scalar = parameter(2.0, unit="kg m^2", positive=True)
-    i3: Scalar = parameter(2.5, unit="kg m^2", positive=True)
+    mass: Parameter = parameter(1.0, unit="kg", positive=True)
+    i1: Parameter = parameter(1.0, unit="kg m^2", positive=True)
+    i2: Parameter = parameter(2.0, unit="kg m^2", positive=True)
+    i3: Parameter = parameter(2.5, unit="kg m^2", positive=True)
 
     coordinates = coordinates("x y z", quaternion("attitude"))
     conventions = "Right-handed inertial axes; attitude takes body to space; i1, i2, i3 about body x, y, z through the mass centre."
@@ -55,10 +55,10 @@ class Suslov(Scene):
     Attitude as a quaternion, speeds: body angular velocity. Moments of inertia about the fixed point, the mass centre.
     """
 
-    i11: Scalar = parameter(1.0, unit="kg m^2", positive=True)
-    i22: Scalar = parameter(2.0, unit="kg m^2", positive=True)
-    i33: Scalar = parameter(1.5, unit="kg m^2", positive=True)
-    i13: Scalar = parameter(0.5, unit="kg m^2", about="entry of the inertia matrix; |i13| < sqrt(i11 i33)")
+    i11: Parameter = parameter(1.0, unit="kg m^2", positive=True)
+    i22: Parameter = parameter(2.0, unit="kg m^2", positive=True)
+    i33: Parameter = parameter(1.5, unit="kg m^2", positive=True)
+    i13: Parameter = parameter(0.5, unit="kg m^2", about="entry of the inertia matrix; |i13| < sqrt(i11 i33)")
 
     coordinates = coordinates(quaternion("attitude"))
     privileged = ("attitude_omega_x", "attitude_omega_y")

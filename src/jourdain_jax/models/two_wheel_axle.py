@@ -16,7 +16,7 @@ Source: Wang and Pao, Am. J. Phys. 71 (2003) 72, section VI, eqs. (57)-(67).
 
 import jax.numpy as jnp
 
-from jourdain_jax.calculus.reals import Scalar
+from jourdain_jax.calculus.reals import Parameter
 from jourdain_jax.calculus.rotations import rot_x, rot_y, rot_z
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contacts import disc_contact
@@ -30,12 +30,12 @@ from jourdain_jax.scene.visuals import Visual
 class _TwoWheelAxle(Scene):
     """What the four scenes share: the parameters, a wheel, the weight, the known integrals."""
 
-    radius: Scalar = parameter(0.3, unit="m", positive=True, about="a, of the wheels")
-    length: Scalar = parameter(0.8, unit="m", positive=True, about="l, of the axle")
-    mass: Scalar = parameter(1.2, unit="kg", positive=True, about="M, of a wheel with its load, at its centre")
-    rim_mass: Scalar = parameter(0.5, unit="kg", positive=True, about="m': a wheel's moments are m'a^2 and m'a^2/2")
-    slope: Scalar = parameter(0.2, unit="rad", about="alpha, of the incline")
-    gravity: Scalar = parameter(9.81, unit="m/s^2")
+    radius: Parameter = parameter(0.3, unit="m", positive=True, about="a, of the wheels")
+    length: Parameter = parameter(0.8, unit="m", positive=True, about="l, of the axle")
+    mass: Parameter = parameter(1.2, unit="kg", positive=True, about="M, of a wheel with its load, at its centre")
+    rim_mass: Parameter = parameter(0.5, unit="kg", positive=True, about="m': a wheel's moments are m'a^2 and m'a^2/2")
+    slope: Parameter = parameter(0.2, unit="rad", about="alpha, of the incline")
+    gravity: Parameter = parameter(9.81, unit="m/s^2")
 
     conventions = (
         "x down the slope, y across it, z along its normal; heading phi from x towards y, theta about the heading, psi about the "

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jourdain_jax.calculus.reals import Matrix3, Scalar, Vector3, real_type
+from jourdain_jax.calculus.reals import Matrix3, Parameter, Scalar, Vector3, real_type
 from jourdain_jax.calculus.rotations import rot_x, rot_y, rot_z
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contacts import disc_contact
@@ -38,32 +38,32 @@ class WhippleBicycle(Scene):
     contact; `steer_torque` on the front frame about the steer axis, with its reaction on the rear frame.
     """
 
-    w: Scalar = parameter(1.02, unit="m", positive=True, about="wheelbase")
-    c: Scalar = parameter(0.08, unit="m", about="trail")
-    lam: Scalar = parameter(math.pi / 10, unit="rad", about="steer axis tilt, backwards from the vertical")
-    g: Scalar = parameter(9.81, unit="m/s^2", about="gravity")
-    rR: Scalar = parameter(0.3, unit="m", positive=True, about="rear wheel radius")
-    mR: Scalar = parameter(2.0, unit="kg", positive=True, about="rear wheel mass")
-    IRxx: Scalar = parameter(0.0603, unit="kg m^2", non_negative=True, about="rear wheel diametral moment of inertia")
-    IRyy: Scalar = parameter(0.12, unit="kg m^2", non_negative=True, about="rear wheel axial moment of inertia")
-    xB: Scalar = parameter(0.3, unit="m", about="rear frame centre of mass, forward")
-    zB: Scalar = parameter(-0.9, unit="m", about="rear frame centre of mass, down")
-    mB: Scalar = parameter(85.0, unit="kg", positive=True, about="rear frame and rider mass")
-    IBxx: Scalar = parameter(9.2, unit="kg m^2", non_negative=True, about="rear frame moment of inertia about x")
-    IByy: Scalar = parameter(11.0, unit="kg m^2", non_negative=True, about="rear frame moment of inertia about y")
-    IBzz: Scalar = parameter(2.8, unit="kg m^2", non_negative=True, about="rear frame moment of inertia about z")
-    IBxz: Scalar = parameter(2.4, unit="kg m^2", about="rear frame product of inertia")
-    xH: Scalar = parameter(0.9, unit="m", about="fork centre of mass, forward")
-    zH: Scalar = parameter(-0.7, unit="m", about="fork centre of mass, down")
-    mH: Scalar = parameter(4.0, unit="kg", positive=True, about="fork mass")
-    IHxx: Scalar = parameter(0.05892, unit="kg m^2", non_negative=True, about="fork moment of inertia about x")
-    IHyy: Scalar = parameter(0.06, unit="kg m^2", non_negative=True, about="fork moment of inertia about y")
-    IHzz: Scalar = parameter(0.00708, unit="kg m^2", non_negative=True, about="fork moment of inertia about z")
-    IHxz: Scalar = parameter(-0.00756, unit="kg m^2", about="fork product of inertia")
-    rF: Scalar = parameter(0.35, unit="m", positive=True, about="front wheel radius")
-    mF: Scalar = parameter(3.0, unit="kg", positive=True, about="front wheel mass")
-    IFxx: Scalar = parameter(0.1405, unit="kg m^2", non_negative=True, about="front wheel diametral moment of inertia")
-    IFyy: Scalar = parameter(0.28, unit="kg m^2", non_negative=True, about="front wheel axial moment of inertia")
+    w: Parameter = parameter(1.02, unit="m", positive=True, about="wheelbase")
+    c: Parameter = parameter(0.08, unit="m", about="trail")
+    lam: Parameter = parameter(math.pi / 10, unit="rad", about="steer axis tilt, backwards from the vertical")
+    g: Parameter = parameter(9.81, unit="m/s^2", about="gravity")
+    rR: Parameter = parameter(0.3, unit="m", positive=True, about="rear wheel radius")
+    mR: Parameter = parameter(2.0, unit="kg", positive=True, about="rear wheel mass")
+    IRxx: Parameter = parameter(0.0603, unit="kg m^2", non_negative=True, about="rear wheel diametral moment of inertia")
+    IRyy: Parameter = parameter(0.12, unit="kg m^2", non_negative=True, about="rear wheel axial moment of inertia")
+    xB: Parameter = parameter(0.3, unit="m", about="rear frame centre of mass, forward")
+    zB: Parameter = parameter(-0.9, unit="m", about="rear frame centre of mass, down")
+    mB: Parameter = parameter(85.0, unit="kg", positive=True, about="rear frame and rider mass")
+    IBxx: Parameter = parameter(9.2, unit="kg m^2", non_negative=True, about="rear frame moment of inertia about x")
+    IByy: Parameter = parameter(11.0, unit="kg m^2", non_negative=True, about="rear frame moment of inertia about y")
+    IBzz: Parameter = parameter(2.8, unit="kg m^2", non_negative=True, about="rear frame moment of inertia about z")
+    IBxz: Parameter = parameter(2.4, unit="kg m^2", about="rear frame product of inertia")
+    xH: Parameter = parameter(0.9, unit="m", about="fork centre of mass, forward")
+    zH: Parameter = parameter(-0.7, unit="m", about="fork centre of mass, down")
+    mH: Parameter = parameter(4.0, unit="kg", positive=True, about="fork mass")
+    IHxx: Parameter = parameter(0.05892, unit="kg m^2", non_negative=True, about="fork moment of inertia about x")
+    IHyy: Parameter = parameter(0.06, unit="kg m^2", non_negative=True, about="fork moment of inertia about y")
+    IHzz: Parameter = parameter(0.00708, unit="kg m^2", non_negative=True, about="fork moment of inertia about z")
+    IHxz: Parameter = parameter(-0.00756, unit="kg m^2", about="fork product of inertia")
+    rF: Parameter = parameter(0.35, unit="m", positive=True, about="front wheel radius")
+    mF: Parameter = parameter(3.0, unit="kg", positive=True, about="front wheel mass")
+    IFxx: Parameter = parameter(0.1405, unit="kg m^2", non_negative=True, about="front wheel diametral moment of inertia")
+    IFyy: Parameter = parameter(0.28, unit="kg m^2", non_negative=True, about="front wheel axial moment of inertia")
 
     coordinates = coordinates("x y yaw lean pitch steer rear_spin front_spin")
     inputs = inputs("lean_torque steer_torque")

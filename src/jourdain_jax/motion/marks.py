@@ -1,9 +1,10 @@
 """Times that a motion did not reach hold NaN on purpose; `jax_debug_nans` must not report them as an error."""
 
-from collections.abc import Callable
 from functools import wraps
 
 import jax
+
+from jourdain_jax.calculus.reals import F
 
 
 def nan_is_a_mark():
@@ -11,7 +12,7 @@ def nan_is_a_mark():
     return jax.debug_nans(False)
 
 
-def with_nan_as_a_mark(f: Callable) -> Callable:
+def with_nan_as_a_mark(f: F) -> F:
     """`f` run without a look for NaN."""
 
     @wraps(f)
@@ -21,4 +22,4 @@ def with_nan_as_a_mark(f: Callable) -> Callable:
         with nan_is_a_mark():
             return f(*arguments, **named)
 
-    return run
+    return run  # type: ignore[return-value]

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.on_first_use import module_on_first_use
-from jourdain_jax.calculus.reals import Number, as_array, described, is_traced, known_numbers, nothing_is_traced, real_type
+from jourdain_jax.calculus.reals import Number, Numbers, as_array, described, is_traced, known_numbers, nothing_is_traced, real_type
 from jourdain_jax.motion.inputs import Inputs, check_inputs_in_rows, inputs_at
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.explicit_steps import DOPRI8, TSIT5, Method
@@ -44,12 +44,12 @@ else:
 @shown_from_users_lines
 def simulate(
     scene: Scene | BuiltFor,
-    start=None,
+    start: "State | Mapping[str, Any] | None" = None,
     *,
     t0: Number | None = None,
     t1: Number | None = None,
-    ts=None,
-    inputs=None,
+    ts: "Numbers | None" = None,
+    inputs: "Inputs | Mapping[str, Any] | None" = None,
     options: Options | None = None,
     **by_name: Unpack[OptionFields],
 ) -> Trajectory:

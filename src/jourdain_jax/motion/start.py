@@ -6,6 +6,7 @@ g(t, q) = 0,  phi(t, q, u) = 0
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -73,7 +74,7 @@ _uncompiled_projection = eval_numpy(put_onto_constraints)
 
 
 @shown_from_users_lines
-def start(scene: Scene | BuiltFor, given=None, *, near=None, t0: Number = 0.0, inputs=None, **values) -> State:
+def start(scene: Scene | BuiltFor, given: Any = None, *, near: Any = None, t0: Number = 0.0, inputs: Any = None, **values: Any) -> State:
     """A consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`, or `start(disc, {"lean": 0.3, "spin_rate": -3.0})`.
 
     `values`, by keyword or in a dictionary `given` (where both name one, the keyword counts), are kept, at time `t0` (s); values that contradict each other by

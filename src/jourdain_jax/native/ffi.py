@@ -35,7 +35,7 @@ _LAYOUTS = {
     "Error_Create_Args": "message errc",
     "Stream_Get_Args": "ctx stream",
 }
-_FUNCTIONS = "Error_Create Error_GetMessage Error_Destroy Handler_Register Stream_Get"  # the first ones
+_FUNCTIONS = ["Error_Create", "Stream_Get"]  # those that are called: the first one and the fifth
 # places, in words of 8 bytes
 ARGS, RETS = 9, 14  # of a frame: its lists of pointers to arguments and results
 
@@ -75,8 +75,8 @@ def _stated_version() -> tuple[int, int] | None:
         return None
     numbers = [re.search(rf"#define XLA_FFI_API_{part} (\d+)", header) for part in ("MAJOR", "MINOR")]
     same = all(_members(header, struct) == f"struct_size extension_start {rest}" for struct, rest in _LAYOUTS.items())
-    functions = re.findall(r"_FIELD\(XLA_FFI_(\w+)\);", header)[: len(_FUNCTIONS.split())]
-    if not same or functions != _FUNCTIONS.split() or None in numbers:
+    functions = re.findall(r"_FIELD\(XLA_FFI_(\w+)\);", header)[:5:4]
+    if not same or functions != _FUNCTIONS or None in numbers:
         return None
     major, minor = (int(number[1]) for number in numbers if number)
     return (major, minor) if major == 0 else None

@@ -36,15 +36,15 @@ def check_format(path: str | os.PathLike) -> None:
 
 @of_known_numbers
 def plot(
-    motion,
+    motion: "Trajectory | Rollout | Family | Sequence[Trajectory | Rollout]",
     *names: str,
-    units=None,
-    labels=None,
-    bands=(0.5, 0.95),
+    units: "Mapping[str, str] | None" = None,
+    labels: "Sequence[str] | None" = None,
+    bands: Sequence[float] = (0.5, 0.95),
     title: str | None = None,
-    path: str | os.PathLike | None = None,
-    axes=None,
-):
+    path: str | os.PathLike[str] | None = None,
+    axes: Any = None,
+) -> tuple[Any, Any]:
     """Plot named quantities of a `motion` against time, one panel each.
 
     - `motion`: from `jj.simulate` or `jj.rollout`, or several of them in a list, each in its own colour; `labels`: what the legend calls each of them.

@@ -5,6 +5,7 @@ import html
 import json
 import os
 import zlib
+from collections.abc import Sequence
 from importlib import resources
 from typing import Any
 
@@ -40,7 +41,7 @@ class View:
 
 
 @of_known_numbers
-def show(motion, path: str | os.PathLike | None = None, **how: Any) -> View:
+def show(motion: "Trajectory | Rollout | Sequence[Trajectory]", path: str | os.PathLike[str] | None = None, **how: Any) -> View:
     """A 3D view of a `motion` to turn, zoom, play and scrub, in a notebook or any browser.
 
     - `motion`: from `jj.simulate`; or several in a list, or the lanes of a rollout (at most 12, evenly chosen), drawn one over the other, all but the first

@@ -3,6 +3,8 @@
 A body states its pose in the inertial frame; `outline` is a line in its own frame, for drawing only.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +25,7 @@ class Particle(eqx.Module):
     mass: Scalar  # kg
     position: Vector3  # m, inertial frame
 
-    def __init__(self, mass, position):
+    def __init__(self, mass: Any, position: Any):
         self.mass = checked_real(mass, "mass of a particle", ())
         self.position = checked_real(position, "position of a particle", (3,))
 
@@ -49,7 +51,7 @@ class RigidBody(eqx.Module):
     outline: Float[Array, "points 3"]  # m, body frame, relative to the mass centre; for drawing only
     solid: str = eqx.field(static=True)
 
-    def __init__(self, mass, inertia, position, orientation, outline=None, solid=""):
+    def __init__(self, mass: Any, inertia: Any, position: Any, orientation: Any, outline: Any = None, solid: str = ""):
         self.mass = checked_real(mass, "mass of a rigid body", ())
         what, advice = "inertia of a rigid body", "give three principal moments or a 3x3 matrix, kg m^2, about the mass centre"
         matrix = checked_real(inertia, what, advice=advice)

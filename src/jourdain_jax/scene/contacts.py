@@ -6,12 +6,12 @@ found from Newton's equations (row S1) instead of from a multiplier. Nothing hin
 """
 
 from collections.abc import Callable, Iterable
-from typing import TypedDict, Unpack, get_args
+from typing import Any, TypedDict, Unpack, get_args
 
 import equinox as eqx
 from jaxtyping import Array
 
-from jourdain_jax.calculus.reals import Scalar, Vector, Vector3, checked_positive, checked_real, described
+from jourdain_jax.calculus.reals import Parameter, Scalar, Vector, Vector3, checked_positive, checked_real, described
 from jourdain_jax.scene.bodies import RigidBody, _axis_index
 from jourdain_jax.scene.contact_points import Ball, Ellipsoid, Shape, Wheel, touch
 from jourdain_jax.scene.grounds import Ground, Plane
@@ -34,8 +34,8 @@ class Coulomb(eqx.Module):
 class Slipping(TypedDict, total=False):
     """What contacts may state that slip, fly and strike."""
 
-    friction: Scalar | Coulomb | None
-    restitution: Scalar
+    friction: Parameter | Coulomb | None
+    restitution: Parameter
 
 
 class Contact(eqx.Module):
@@ -103,7 +103,7 @@ class Rolling(Slipping, total=False):
     carried: tuple[str, ...] | None
 
 
-def ball_contact(body: BodyPose, radius, **options: Unpack[Rolling]) -> Contact:
+def ball_contact(body: BodyPose, radius: Any, **options: Unpack[Rolling]) -> Contact:
     """Rolling of a ball on a ground, without slip; the contact point is `c - a n`.
 
     - `body`: `pose["name"]`; `radius` a in m. The `options`, here and of the other contacts, are
@@ -121,7 +121,7 @@ def ball_contact(body: BodyPose, radius, **options: Unpack[Rolling]) -> Contact:
     return rolling(body, lambda centre: Ball(centre, _radius(body, radius)), **options)
 
 
-def ellipsoid_contact(body: BodyPose, semi_axes, **options: Unpack[Rolling]) -> Contact:
+def ellipsoid_contact(body: BodyPose, semi_axes: Any, **options: Unpack[Rolling]) -> Contact:
     """Rolling of an ellipsoid on a ground, without slip; the contact point is `c - R S n'/sqrt(n'.S n')`, `n' = R' n`, `S = diag(a^2, b^2, c^2)`.
 
     - `body`: `pose["name"]`; `semi_axes` (a, b, c) in m, along the axes of its body frame. `options`: as in `ball_contact`.
@@ -136,7 +136,7 @@ def ellipsoid_contact(body: BodyPose, semi_axes, **options: Unpack[Rolling]) -> 
     return rolling(body, ellipsoid, **options)
 
 
-def disc_contact(body: BodyPose, radius, *, axis: str = "y", **options: Unpack[Rolling]) -> Contact:
+def disc_contact(body: BodyPose, radius: Any, *, axis: str = "y", **options: Unpack[Rolling]) -> Contact:
     """Rolling of the edge of a thin disc on a ground, without slip.
 
     The contact is the lowest point of the circle, `c - a (n - (n.k) k)/|n - (n.k) k|` with the ground's normal n and disc axis k. Undefined for
@@ -149,7 +149,7 @@ def disc_contact(body: BodyPose, radius, *, axis: str = "y", **options: Unpack[R
     return rolling(body, lambda centre: Wheel(centre, body.orientation[:, _axis_index(axis)], _radius(body, radius), None), **options)
 
 
-def wheel_contact(body: BodyPose, radius, tyre, *, axis: str = "y", **options: Unpack[Rolling]) -> Contact:
+def wheel_contact(body: BodyPose, radius: Any, tyre: Any, *, axis: str = "y", **options: Unpack[Rolling]) -> Contact:
     """Rolling of a wheel with a tyre of circular section (a torus) on a ground, without slip.
 
     The contact is the wheel's outermost point along `-n`: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n`, with the ground's normal n, the axle k. R is

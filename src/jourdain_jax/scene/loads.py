@@ -5,6 +5,8 @@ virtual power is `sum F . dv + sum L . domega + sum Q_k du_k`. A load with a `po
 the work of the others is integrated along the motion.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -27,7 +29,7 @@ class Load(eqx.Module):
     generalized: dict[str, Scalar]  # N or N m, on the named speed
     potential: Scalar | None  # J; None: not conservative, its work is integrated along the motion
 
-    def __init__(self, forces=None, torques=None, generalized=None, potential=None):
+    def __init__(self, forces: Any = None, torques: Any = None, generalized: Any = None, potential: Any = None):
         given = {"forces": forces, "torques": torques, "generalized": generalized}
         self.forces, self.torques, self.generalized = (_real_parts(kind, part) for kind, part in given.items())
         self.potential = None if potential is None else checked_real(potential, "potential of a load")
@@ -51,7 +53,7 @@ def _real_parts(kind: str, parts: dict | None) -> dict[str, Array]:
     return {name: checked_real(value, f"load on `{name}`") for name, value in parts.items()}
 
 
-def gravity(motion: Motion, strength, direction=(0.0, 0.0, -1.0)) -> Load:
+def gravity(motion: Motion, strength: Any, direction: Any = (0.0, 0.0, -1.0)) -> Load:
     """Uniform gravity `m g e` on every body of a `motion`, with its potential `- sum m g e . r`.
 
     `strength`: g in m/s^2; `direction`: e, a unit vector of the inertial frame. ValueError for a direction of another length, where its scene is built.
@@ -64,13 +66,13 @@ def gravity(motion: Motion, strength, direction=(0.0, 0.0, -1.0)) -> Load:
     return Gravity(forces, potential, e)
 
 
-def point_force(point: Point, force) -> Load:
+def point_force(point: Point, force: Any) -> Load:
     """A `force` (3,) (N, inertial frame) on a `point` of a body, `motion["body"].point(local)`; no potential."""
     point = _as_point(point, "point of a force")
     return _on_point(point, checked_real(force, f"force on a point of `{point.body}`", (3,), advice="give three components in the inertial frame, N"))
 
 
-def torque(motion: Motion, body: str, moment, *, reaction: str | None = None) -> Load:
+def torque(motion: Motion, body: str, moment: Any, *, reaction: str | None = None) -> Load:
     """A torque `moment` (3,) (N m, inertial frame) on a `body` of a `motion`, with the opposite torque on `reaction` where that body is named.
 
     No potential. ValueError for an unknown body.
@@ -82,7 +84,7 @@ def torque(motion: Motion, body: str, moment, *, reaction: str | None = None) ->
     return Load(torques={name: sign * moment for name, sign in zip(names, (1.0, -1.0), strict=False)})
 
 
-def spring(a: Point, b: Point, stiffness, rest_length=0.0) -> Load:
+def spring(a: Point, b: Point, stiffness: Any, rest_length: Any = 0.0) -> Load:
     """A linear spring between two points `a`, `b`: tension `k (l - l0)`, potential `k (l - l0)^2 / 2`.
 
     Points: `motion["body"].point(local)` or `fixed_point(position)`. `stiffness` k in N/m, `rest_length` l0 in m.
@@ -95,7 +97,7 @@ def spring(a: Point, b: Point, stiffness, rest_length=0.0) -> Load:
     return _between(a, b, pull, 0.5 * stiffness * extension**2)
 
 
-def damper(a: Point, b: Point, damping) -> Load:
+def damper(a: Point, b: Point, damping: Any) -> Load:
     """A linear damper between two points `a`, `b`: tension `c dl/dt` along the line; no potential.
 
     Points: `motion["body"].point(local)` or `fixed_point(position)`. `damping` c in N s/m.
@@ -105,7 +107,7 @@ def damper(a: Point, b: Point, damping) -> Load:
     return _between(a, b, damping * ((b.velocity - a.velocity) @ direction) * direction, None)
 
 
-def generalized_force(motion: Motion, **forces) -> Load:
+def generalized_force(motion: Motion, **forces: Any) -> Load:
     """Forces on speeds by name, `generalized_force(motion, steer_rate=torque)`: power `sum Q_k u_k`; no potential.
 
     `forces`: speed -> force, in N or N m. ValueError for an unknown speed.

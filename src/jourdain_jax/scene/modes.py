@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from jourdain_jax.calculus.reals import Scalar, described, is_traced
+from jourdain_jax.calculus.reals import Parameter, Scalar, described, is_traced
 from jourdain_jax.scene.names import check_name, nearest
 
 
@@ -76,6 +76,6 @@ class Event:
     """
 
     value: Scalar
-    to: Mapping[str, str | Scalar] = field(default_factory=dict)
-    jump: Mapping[str, Scalar] = field(default_factory=dict)
+    to: Mapping[str, str | Parameter] = field(default_factory=dict)
+    jump: Mapping[str, Parameter] = field(default_factory=dict)
     stop: bool = False

@@ -4,6 +4,8 @@
 loads, velocity constraints and events. Velocities are those of the mass centres and angular velocities in space components.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -26,7 +28,7 @@ class Point(eqx.Module):
     body: str | None = eqx.field(static=True, default=None)
 
 
-def fixed_point(position) -> Point:
+def fixed_point(position: Any) -> Point:
     """A point at rest at `position` (3,) (m, inertial frame), for springs, dampers and rods."""
     position = checked_real(position, "position of a fixed point", (3,), advice="give three components in the inertial frame, m")
     return Point(position, jnp.zeros_like(position), jnp.zeros_like(position))
@@ -55,7 +57,7 @@ class BodyPose(eqx.Module):
             return self.body.orientation
         return jnp.broadcast_to(jnp.eye(3, dtype=self.position.dtype), (*self.position.shape, 3))
 
-    def place(self, local) -> Vectors:
+    def place(self, local: Any) -> Vectors:
         """Position (inertial frame) of the point with body-frame coordinates `local` (m, relative to the mass centre)."""
         local = checked_real(local, f"point of body `{self.name}`", (3,), advice="give three components in its body frame, m")
         return self.position + self.orientation @ local.astype(self.position.dtype)

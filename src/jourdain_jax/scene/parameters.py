@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import MISSING
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ def _as_leaf(value):
         return value
 
 
-def parameter(default=..., *, unit: str = "", positive: bool = False, non_negative: bool = False, about: str = ""):
+def parameter(default: Any = ..., *, unit: str = "", positive: bool = False, non_negative: bool = False, about: str = "") -> Any:
     """A field of a scene that is a physical parameter: converted to a floating-point array, so that it is a differentiable leaf.
 
     - `default`: a number or an array; without it the parameter must be given. `unit` and `about` describe it.

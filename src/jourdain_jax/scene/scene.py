@@ -5,7 +5,7 @@ them and what holds them. Everything else (velocities, partial velocities, mass 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -93,7 +93,7 @@ class Scene(eqx.Module):
         if self._may_switch:
             object.__setattr__(self, "switching", switching_of(self))
 
-    def bodies(self, t: Scalar, q: Named) -> dict[str, Body]:
+    def bodies(self, t: Scalar, q: Named) -> Mapping[str, Body]:
         """Poses of all bodies by name at time t (s) and coordinates q, `q.name`; in the inertial frame. Required."""
         raise NotImplementedError(f"scene `{type(self).__name__}` does not say where its bodies are; define `bodies(self, t, q)`")
 
@@ -116,23 +116,23 @@ class Scene(eqx.Module):
         """
         return None
 
-    def prescribed(self, t: Scalar) -> dict[str, Scalar]:
+    def prescribed(self, t: Scalar) -> Mapping[str, Scalar]:
         """Coordinates driven as given functions of time: name -> value. The multiplier of the row is the actuator's force."""
         return {}
 
-    def geometric_constraints(self, pose: Pose) -> dict[str, Array]:
+    def geometric_constraints(self, pose: Pose) -> Mapping[str, Array]:
         """Geometric rows g(q, t) = 0 at a `pose`, by name, each a scalar or a vector; eq. (5)."""
         return {}
 
-    def velocity_constraints(self, motion: Motion) -> dict[str, Array]:
+    def velocity_constraints(self, motion: Motion) -> Mapping[str, Array]:
         """Velocity rows phi(q, u, t) = 0 at a `motion`, by name, each a scalar or a vector: linear, affine or nonlinear in u; (6)-(9)."""
         return {}
 
-    def contacts(self, pose: Pose) -> dict[str, Contact]:
+    def contacts(self, pose: Pose) -> Mapping[str, Contact]:
         """Rolling contacts at a `pose`, by name; each adds its no-slip rows, and its height row if it says so."""
         return {}
 
-    def events(self, motion: Motion) -> dict[str, Scalar | Event]:
+    def events(self, motion: Motion) -> Mapping[str, Scalar | Event]:
         """Named events at a `motion`: positive while it may go on; it stops where a value falls through zero, or is no number beyond. At a
         start a value of zero that rises has not happened. A `jj.Event` in place of a value may let the motion go on.
 
@@ -143,11 +143,11 @@ class Scene(eqx.Module):
         """
         return {}
 
-    def invariants(self, motion: Motion) -> dict[str, Scalar]:
+    def invariants(self, motion: Motion) -> Mapping[str, Scalar]:
         """Named quantities of a `motion` that this scene is known to conserve, besides its energy; for checks and summaries."""
         return {}
 
-    def visuals(self, pose: Pose) -> dict[str, Visual | Sequence[Visual]]:
+    def visuals(self, pose: Pose) -> Mapping[str, Visual | Sequence[Visual]]:
         """What bodies look like at a `pose`, by name, `""` for what stands in the inertial frame; for pictures only. See `jj.Visual`.
 
         Bodies that are left out are drawn by their `outline`, what rolls in their contacts, or their inertia.
@@ -171,7 +171,7 @@ class Scene(eqx.Module):
         """For notebooks: what it is, its parameters with values and units, its coordinates, speeds and inputs."""
         return scene_html(self)
 
-    def replace(self, **changes) -> "Scene":
+    def replace(self, **changes: Any) -> Self:
         """A copy of this scene with some parameters changed: `changes`, name -> value in the parameter's unit.
 
         ValueError for an unknown name (with the nearest valid one) or a value that the parameter does not allow.
@@ -182,7 +182,7 @@ class Scene(eqx.Module):
                 raise ValueError(f"scene `{type(self).__name__}` has no parameter `{name}`; {nearest(name, names)}")
         return replace(self, **changes)
 
-    def named(self, **values) -> tuple[Float[Array, "coordinates"], Speeds, tuple[str, ...]]:
+    def named(self, **values: Any) -> tuple[Float[Array, "coordinates"], Speeds, tuple[str, ...]]:
         """q and u with the named `values`, the rest at the reference (zero; the identity for quaternions); and the names that were given.
 
         A quaternion or its angular velocity may be given whole, by its own name; of a quaternion that is named in part, the other parts are zero.

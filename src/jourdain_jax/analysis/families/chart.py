@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.families.critical import CriticalPoint, Special, followed_to, special_at
 from jourdain_jax.analysis.families.equations import DOUBLE, SteadyEquations, numbered
 from jourdain_jax.analysis.families.family import Family, family
-from jourdain_jax.calculus.reals import RUN_SELDOM, Scalar, compiled
+from jourdain_jax.calculus.reals import RUN_SELDOM, Number, Scalar, compiled
 from jourdain_jax.scene.arguments import BuiltFor, as_scene, of_known_numbers
 from jourdain_jax.scene.names import check_names
 from jourdain_jax.scene.printing import Printed
@@ -34,7 +34,7 @@ class StabilityChart(Printed):
 @of_known_numbers
 def stability_chart(
     scene: Scene | BuiltFor,
-    axes: Mapping[str, tuple[float, float]],
+    axes: Mapping[str, tuple[Number, Number]],
     *,
     guess: Mapping[str, float] | None = None,
     prior: Mapping | None = None,

@@ -5,7 +5,7 @@ Lanes of one chunk run in lockstep as one vmapped integration; chunks run one af
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Unpack
+from typing import Any, Unpack
 
 import equinox as eqx
 import jax
@@ -143,9 +143,9 @@ class Rollout(Printed, eqx.Module):
 @with_nan_as_a_mark
 def rollout(
     scene: Scene | BuiltFor,
-    starts: "dict | State | None" = None,
+    starts: "State | Mapping[str, Any] | None" = None,
     *,
-    parameters: dict | None = None,
+    parameters: "Mapping[str, Any] | None" = None,
     chunk: int | None = None,
     progress: bool | None = None,
     options: Options | None = None,
