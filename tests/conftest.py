@@ -43,7 +43,8 @@ SLOW = frozenset(line for line in (Path(__file__).parent / "slow.txt").read_text
 def pytest_collection_modifyitems(items):
     """Marks what `slow.txt` names; the longest files first."""
     for item in items:
-        if item.nodeid.removeprefix("tests/") in SLOW:
+        name = item.nodeid.removeprefix("tests/")
+        if not SLOW.isdisjoint({name, name.partition("[")[0]}):
             item.add_marker(pytest.mark.slow)
     order = {f"test_{name}": place for place, name in enumerate(LONGEST.split())}
     items.sort(key=lambda item: order.get(item.path.stem, len(order)))

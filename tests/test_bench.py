@@ -54,10 +54,7 @@ SHORT = (
 )
 
 
-SLOW = ("antiparallelogram", "kite", "rod-pendulum")  # closed linkages pass through flat positions also in `test_between_saved_times.py`
-
-
-@pytest.mark.parametrize(("name", "seeds"), [pytest.param(*each, marks=[pytest.mark.slow] * (each[0] in SLOW), id=each[0]) for each in SHORT])
+@pytest.mark.parametrize(("name", "seeds"), SHORT, ids=dict(SHORT))
 def test_no_generated_motion_is_wrong_in_silence(name, seeds):
     records = [record.as_dict() for record in family(name).run(list(seeds))]
     assert len(records) == len(seeds)
@@ -144,7 +141,7 @@ LONGER = [case.name for case in CASES if case.must_be_right and case.name not in
 LONGER += ["E17 1000", "E17 1e+06", "E17 1e+08", "E19 gradient 2 s"]
 
 
-@pytest.mark.parametrize("name", [*REQUIRED, *FLAGS, *(pytest.param(name, marks=pytest.mark.slow) for name in LONGER)])
+@pytest.mark.parametrize("name", [*REQUIRED, *FLAGS, *LONGER])
 def test_the_engine_as_it_comes_is_right_where_other_methods_fail_and_flags_what_has_no_answer(name):
     case = BY_NAME[name]
     found = case.probe().cell(DEFAULT, case.tolerance)
@@ -290,7 +287,6 @@ def test_the_scripts_are_found():
     assert {"lowering.py", "ensembles.py", "identification.py"} <= set(SCRIPTS)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_a_script_runs_quickly_to_its_end(script, tmp_path):
     """Whether requirements on time are met depends on the machine; those that are shares or errors of a sample do not, and rows without one are met."""

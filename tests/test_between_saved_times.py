@@ -66,7 +66,7 @@ def _parallelograms(count, **options):
     return found.result, error
 
 
-@pytest.mark.parametrize("rtol", [1e-4, 1e-6, pytest.param(1e-8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8])
 def test_a_parallelogram_passes_flat_on_its_branch_or_is_flagged(rtol):
     result, error = _parallelograms(128, rtol=rtol, atol=rtol)
     arrived = result == results.SUCCESS

@@ -72,7 +72,6 @@ def deadly(motion):
     return jax.pure_callback(lean, jax.ShapeDtypeStruct((), last.dtype), motion.scene.radius, last, vmap_method="sequential")
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("workers", ["processes of a cluster", "processes of the study"])
 def test_a_chunk_on_which_workers_die_is_named_and_left_out(workers, tmp_path):

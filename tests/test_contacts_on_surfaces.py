@@ -96,8 +96,7 @@ def test_body_and_ground_are_nearest_where_their_normals_are_opposite(ground, sh
 
 MOVING = [(ground, "ball") for ground in GROUNDS if "hill" not in ground and "egg" not in ground] + [("within a sphere", "wheel"), ("plane", "ellipsoid")]
 MOVING += [("on a hill", "ball")]  # by Newton's method: its derivatives take long to compile
-MOVING += [pytest.param(*case, marks=pytest.mark.slow) for case in (("within a cylinder", "wheel"), ("on a hill", "disc"), ("on an egg", "ball"))]
-MOVING += [pytest.param("on an egg", "ellipsoid", marks=pytest.mark.slow)]
+MOVING += [("within a cylinder", "wheel"), ("on a hill", "disc"), ("on an egg", "ball"), ("on an egg", "ellipsoid")]
 
 
 @pytest.mark.parametrize(("ground", "shape"), MOVING)

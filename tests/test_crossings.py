@@ -66,7 +66,7 @@ def motion(scene, start=START, **options):
     return jj.simulate(scene, start, **{"ts": [SPAN], "rtol": 1e-9, "atol": 1e-9} | options)
 
 
-@pytest.mark.parametrize("kind", [kind if kind in ("StripByDistance", "Pulse", "Bump") else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS])
+@pytest.mark.parametrize("kind", KINDS)
 def test_what_acts_in_a_part_of_the_way_is_met_by_the_same_steps_of_both_loops(kind):
     scene, loose = KINDS[kind], {"rtol": 1e-6, "atol": 1e-6}  # at tight ones round-off alone sets the length of steps of a free bead
     exact = motion(scene, max_step=SPAN / 2000, **loose)
@@ -79,7 +79,6 @@ def test_what_acts_in_a_part_of_the_way_is_met_by_the_same_steps_of_both_loops(k
         assert (int(one.accepted), int(one.rejected)) == (int(found[0].accepted), int(found[0].rejected))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_neighbours_in_lanes_are_right_or_flagged(kind):
     generator = np.random.default_rng(5)

@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
 
 from jourdain_jax.program import emit
@@ -58,7 +57,6 @@ def test_batches_are_those_of_single_lanes():
     assert_allclose(jax.jit(jax.vmap(program))(LANES).T, expected, rtol=1e-13)
 
 
-@pytest.mark.slow
 def test_derivatives_of_a_deep_program_are_those_of_the_plain_one():
     weights = jnp.sin(jnp.arange(len(OUTPUTS)))
     found, expected = (jax.jit(jax.vmap(jax.grad(lambda values, f=f: weights @ f(values))))(LANES) for f in (program, recursed))

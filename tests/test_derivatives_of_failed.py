@@ -73,13 +73,9 @@ def _alone(numbers, end):
 
 
 CASES = [(kind, backend, rolled) for kind in FAILURES for backend in ("native", "xla") for rolled in (False, True)]
-QUICK = {("domain", "native", False), ("start", "native", False)}
 
 
-MARKED = [pytest.param(c, marks=() if c in QUICK else pytest.mark.slow) for c in CASES]
-
-
-@pytest.mark.parametrize("case", MARKED, ids=lambda c: f"{c[0]}-{c[1]}-{c[2]}")
+@pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c[0]}-{c[1]}-{c[2]}")
 def test_they_are_nan_after_the_failure_right_before_it_and_zero_where_nobody_asks(case):
     kind, backend, rolled = case
     numbers, moves = FAILURES[kind]

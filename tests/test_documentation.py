@@ -23,7 +23,6 @@ def test_every_public_name_stands_once_in_the_reference():
     assert sorted(named) == sorted(set(jj.__all__) - {"models"})
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not SEARCHED.exists(), reason="the site is not built; see CONTRIBUTING")
 def test_the_search_of_the_built_site_finds_every_public_name():
     written = re.fullmatch(r"Search\.setIndex\((.*)\)\s*", SEARCHED.read_text(encoding="utf-8"), re.DOTALL)
@@ -94,7 +93,6 @@ def test_files_that_the_theory_names_exist():
         assert (ROOT / "src" / "jourdain_jax" / name).exists(), name
 
 
-@pytest.mark.slow
 def test_the_results_of_the_paper_hold_where_they_are_shown():
     page = run(DOCS / "paper_by_example.md")
     text = (DOCS / "paper_by_example.md").read_text(encoding="utf-8")
@@ -107,7 +105,6 @@ def test_the_results_of_the_paper_hold_where_they_are_shown():
     assert_allclose(page["length"], page["scene"].rod_length, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_large_scenes_have_as_many_operations_as_their_page_says():
     page = run(DOCS / "howto" / "large_scenes.md", jj=jj, jnp=jnp, eqx=eqx)
     text = (DOCS / "howto" / "large_scenes.md").read_text(encoding="utf-8")
@@ -119,7 +116,6 @@ def test_large_scenes_have_as_many_operations_as_their_page_says():
         assert found == [int(row[i]) for i in (1, 2, 4, 5)]
 
 
-@pytest.mark.slow
 def test_redundant_rows_are_as_their_page_says(capsys):
     page = run(DOCS / "howto" / "redundant_rows.md")
     assert page["two"].succeeded
@@ -130,7 +126,6 @@ def test_redundant_rows_are_as_their_page_says(capsys):
     assert [words == "reached the end of its span" for words in told] == [True, False, True]
 
 
-@pytest.mark.slow
 def test_the_code_of_the_page_on_inputs_runs():
     page = run(DOCS / "howto" / "inputs.md")
     # the blow of 0.9 N s on 2 kg shows in the speed right after it
@@ -138,7 +133,6 @@ def test_the_code_of_the_page_on_inputs_runs():
     assert_allclose(shortly["x_rate"][-1], 0.45, rtol=5e-3)
 
 
-@pytest.mark.slow
 def test_the_code_of_the_page_on_events_runs(capsys):
     page = run(DOCS / "howto" / "events.md")
     fall = np.sqrt(2 * 1.0 / 9.81)
@@ -147,14 +141,12 @@ def test_the_code_of_the_page_on_events_runs(capsys):
     assert "stone: rests" in capsys.readouterr().out
 
 
-@pytest.mark.slow
 def test_a_design_is_made_stable_as_its_page_says(capsys):
     run(DOCS / "howto" / "stable_design.md")
     shown = re.findall(r"```text\n(.*?)```", (DOCS / "howto" / "stable_design.md").read_text(encoding="utf-8"), re.S)
     assert capsys.readouterr().out == "".join(shown)
 
 
-@pytest.mark.slow
 def test_the_code_of_the_page_on_what_is_learned_runs():
     page = run(DOCS / "howto" / "learned.md")
     assert page["errors"][-1] < 0.3 * page["errors"][0]

@@ -21,7 +21,6 @@ WEIGHTLESS = {"trailer_mass": 0.0, "trailer_inertia": 0.0}
 ROBOT = {"left_rate": 3.0, "right_rate": 20.0}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 3, 5, 12, 15])
 def test_robots_and_beads_have_right_accelerations_at_every_heading(seed):
     anywhere = drawn(seed)
@@ -88,7 +87,6 @@ SERVED = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("state", ["auto", "full"])
 @pytest.mark.parametrize("case", SERVED)
 def test_motions_are_served_by_one_program_in_both_forms_of_the_state(case, state):
@@ -100,7 +98,6 @@ def test_motions_are_served_by_one_program_in_both_forms_of_the_state(case, stat
     assert motion.smallest_pivot > 0.1 or "turns" not in case
 
 
-@pytest.mark.slow
 def test_rows_along_axes_at_any_angle_that_is_traced_are_served():
     scene = PlanarRobot(trailers=1)
     start = jj.start(scene, **scene.start(**ROBOT))

@@ -56,7 +56,7 @@ def test_lanes_have_saved_times_of_their_own():
     assert_allclose(np.nan_to_num(jnp.sum(slopes, axis=2)), expected > 0, atol=1e-9)
 
 
-@pytest.mark.parametrize("solver", [pytest.param(diffrax.Dopri8(), id="Dopri8", marks=pytest.mark.slow), pytest.param(diffrax.Tsit5(), id="Tsit5")])
+@pytest.mark.parametrize("solver", [diffrax.Dopri8(), diffrax.Tsit5()], ids=["Dopri8", "Tsit5"])
 def test_a_fall_is_located_with_derivatives_up_to_the_third(solver):
     def fall_time(height):
         return fallen(height, solver=solver).t_end
@@ -180,7 +180,6 @@ KINDS = {
     "scaled": (lambda x, t, a, w: (jnp.abs(x - a) - w) * (2.0 + x), A - W),
     "either of two": (lambda x, t, a, w: jnp.minimum(jnp.abs(x - a), jnp.abs(x - 1.5)) - w, A - W),
 }
-USUAL = ("distance", "window", "clock", "floor")
 
 
 @cache
@@ -197,7 +196,7 @@ def scene_of(kind: str):
     return Passing
 
 
-@pytest.mark.parametrize("kind", [kind if kind in USUAL else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS])
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_short_window_is_met(kind):
     scene, start = scene_of(kind)(), {"x": 0.0, "x_rate": 1.0}
     assert jj.lower(scene).event_relations

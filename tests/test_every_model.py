@@ -26,7 +26,6 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.scene.parameters import parameters_of
 
 DRAWS, STATES = 5, 20
-QUICK = {"skate", "chaplygin-sleigh"}  # a full state with projection, a minimal state
 
 natively = machine_code.needed
 
@@ -155,16 +154,13 @@ def test_derivatives_through_two_steps_are_those_of_differences_in_both_modes(na
     check_both_modes(derivatives_of(name))
 
 
-some_models = pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in sorted(MODELS)])
-
-
 @natively
-@some_models
+@pytest.mark.parametrize("name", sorted(MODELS))
 def test_derivatives_through_a_start_and_two_steps_are_those_of_differences_in_both_modes(name):
     check_both_modes(derivatives_of(name, with_start=True))
 
 
-@some_models
+@pytest.mark.parametrize("name", sorted(MODELS))
 def test_verification_passes(name):
     scene = MODELS[name]()
     found = jj.verify(scene, jj.start(scene, **scene.example))

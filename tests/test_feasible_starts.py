@@ -35,7 +35,7 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("Bricard", "windows"))) for name in SCENES])
+@pytest.mark.parametrize("name", SCENES)
 def test_any_part_of_a_state_on_the_rows_is_a_start(name):
     scene, generator = SCENES[name], np.random.default_rng(0)
     _, states, _ = jj.sample_states(scene, 8, seed=5)

@@ -85,7 +85,6 @@ def undisturbed():
     yield rods, jj.Experiment(ts, {name: np.asarray(motion[name]) + 0.01 for name in ("z1", "x2", "z2")}, 0.02, start=rods.example, t0=0.0)
 
 
-@pytest.mark.slow
 def test_undisturbed_motions_have_the_plain_likelihood():
     for scene, runs in undisturbed():
         assert_allclose(jj.filtered_log_likelihood(scene, runs, process_noise={}), jj.log_likelihood(scene, runs), rtol=1e-6)

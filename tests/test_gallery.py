@@ -182,7 +182,6 @@ def test_pages_are_written_with_pictures_that_show_something(tmp_path):
     written(tmp_path, "isokinetic-particle", "vertical-disc")
 
 
-@pytest.mark.slow
 def test_all_pages_are_written_with_pictures_that_show_something(tmp_path):
     written(tmp_path)
 

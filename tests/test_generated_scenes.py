@@ -58,7 +58,6 @@ def test_a_generated_scene_holds_every_invariant(number):
     check(number, parameters=PARAMETERS, states=STATES, least=LEAST, seed=0, compiled=False, looks=number == 0)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("number", STRUCTURES)
 def test_a_generated_scene_holds_every_invariant_at_200_instances(number):
     check(number, parameters=MANY_PARAMETERS, states=MANY_STATES, least=MANY, seed=100, compiled=True)
@@ -104,7 +103,6 @@ def test_the_scalar_program_of_a_generated_scene_is_its_dense_equations(number, 
     assert check_lowered(number, every_speed)
 
 
-@pytest.mark.slow
 def test_the_scalar_programs_of_all_generated_scenes_are_their_dense_equations():
     assert sum(check_lowered(number, False) for number in STRUCTURES) >= 12
     assert sum(check_lowered(number, True) for number in STRUCTURES) >= 20

@@ -63,21 +63,18 @@ def test_threads_of_a_gpu_give_the_bits_of_wide_registers(name, kind):
     _check_text([max(texts, key=len)], ["sm_75"])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(jj.models.MODELS))
 def test_threads_of_a_gpu_give_the_bits_of_wide_registers_for_every_model(name):
     texts = _check(name, ["values", "tangents", "gradients"], [("in order", 2**40), ("reversed", FEW), ("at once", FEW)])
     _check_text(texts, ARCHITECTURES)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tilting-disc", "chaplygin-sleigh", "double-pendulum-rods"])
 def test_second_derivatives_and_series_too(name):
     _check(name, ["values", "second"], [("at once", FEW)])
     _check(name, ["values", "tangents"], [("reversed", FEW)], solver=jj.Taylor())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_events_after_which_a_motion_goes_on(kind):
     def made() -> np.ndarray:
@@ -177,7 +174,6 @@ np.testing.assert_array_equal(second, expected)
 """
 
 
-@pytest.mark.slow
 def test_several_gpus_share_lanes():
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "PYTHONPATH": os.pathsep.join(sys.path)}
     subprocess.run([sys.executable, "-c", OF_TWO_DEVICES], env=environment, cwd=Path(__file__).parent, check=True)

@@ -249,7 +249,7 @@ def compiled(scene, backend):
     return motion.result, motion.q
 
 
-@pytest.mark.parametrize("backend", ["auto", pytest.param("dense", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["auto", "dense"])
 @pytest.mark.parametrize("kind", WRONG)
 def test_what_a_single_motion_refuses_is_a_code_in_lanes_and_inside_jit(kind, backend):
     sound, (fault, text) = Rolling(), WRONG[kind]

@@ -162,7 +162,7 @@ def test_privileged_speeds_may_be_named_in_any_order():
     assert_allclose(*(linearize(disc, circle, privileged=speeds).state_eigenvalues() for speeds in named), atol=1e-12)
 
 
-@pytest.mark.parametrize("derivative", [jax.jacrev, pytest.param(jax.jacfwd, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("derivative", [jax.jacrev, jax.jacfwd])
 def test_derivatives_pass_through_linearisation(derivative):
     """Of the gravity term -m g a of lean in the radius, and of the gyroscopic one (C + m a^2) spin = 3/2 m a^2 spin."""
 

@@ -170,7 +170,7 @@ def _kept_by_a_process(folder, seed, names):
 
 
 @machine_code.needed
-@pytest.mark.parametrize("names", [("skate",), pytest.param(("whipple-bicycle", "snakeboard", "trailer-chain", "rattleback"), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("names", [("skate",), ("whipple-bicycle", "snakeboard", "trailer-chain", "rattleback")])
 def test_every_process_writes_the_same_programs(tmp_path, names):
     """Files are named by their programs' text: an order of sets of texts, which differs from process to process, would give others."""
     first = _kept_by_a_process(tmp_path / "kept", 1, names)

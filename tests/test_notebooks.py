@@ -12,10 +12,8 @@ FOLDER = Path(__file__).parent.parent / "notebooks"
 SOURCES = sorted(FOLDER.glob("*.py"))
 
 
-# what these show is also looked at in `test_bicycle.py` and `test_studies.py`
-@pytest.mark.parametrize(
-    "source", [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * path.stem.startswith(("02", "04", "05", "06"))) for path in SOURCES]
-)
+# what the slow ones show is also looked at in `test_bicycle.py` and `test_studies.py`
+@pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
 def test_a_notebook_runs_to_its_end(source, tmp_path, monkeypatch):
     monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel then shows its figures in the notebook
     shutil.copytree(FOLDER / "data", tmp_path / "data")

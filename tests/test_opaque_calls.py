@@ -100,7 +100,7 @@ LAWS = {
     "callback": (Acted(law=by_asking, numbers=np.array([2.0])), "the operation `pure_callback`"),
     "callback with a rule": (Acted(law=by_asking_with_rule, numbers=np.array([2.0])), "`_asked`, which has a derivative of its own"),
 }
-SMOOTH_ENOUGH = ["table", "callback with a rule", *(pytest.param(name, marks=pytest.mark.slow) for name in ("network", "recursion", "branches"))]
+SMOOTH_ENOUGH = ["table", "callback with a rule", "network", "recursion", "branches"]
 
 
 def rates_of(scene):
@@ -121,7 +121,7 @@ def rates_of(scene):
 
 @pytest.mark.parametrize(
     "law",
-    [pytest.param(lambda x, _: jax.nn.softplus(x), marks=pytest.mark.slow), lambda x, _: jnp.sinc(x), lambda x, _: jax.nn.relu(x)],
+    [lambda x, _: jax.nn.softplus(x), lambda x, _: jnp.sinc(x), lambda x, _: jax.nn.relu(x)],
     ids=["softplus", "sinc", "relu"],
 )
 def test_functions_of_jax_have_their_derivatives_where_their_branches_meet(law):
@@ -138,7 +138,7 @@ def states_of(scene, count):
     return jnp.asarray(q), jnp.asarray(u[:, np.array(jj.lower(scene).independent)])
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow) if name in ("recursion", "branches", "matrix") else name for name in LAWS])
+@pytest.mark.parametrize("name", LAWS)
 def test_only_the_part_without_a_scalar_form_is_kept_and_the_rates_are_those_of_the_dense_path(name):
     scene, reason = LAWS[name]
     program = jj.lower(scene)
@@ -186,7 +186,7 @@ START = {"heading": 0.4, "x_rate": 0.8, "heading_rate": 0.9}
 OPTIONS = {"ts": np.array([0.5, 1.0]), "rtol": 1e-9, "atol": 1e-9}
 
 
-@pytest.mark.parametrize("name", ["iteration", "network", pytest.param("callback", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["iteration", "network", "callback"])
 def test_motions_with_a_call_are_the_dense_ones_alone_and_in_lockstep(name):
     scene = LAWS[name][0]
     program, dense = (jj.simulate(scene, START, backend=backend, **OPTIONS) for backend in ("auto", "dense"))

@@ -392,7 +392,6 @@ def test_rattleback_reproduces_the_first_row_of_the_reference():
     assert_same(exact["energy"], np.full(2, rattleback.ENERGY), 1e-14)
 
 
-@pytest.mark.slow
 def test_rattleback_turns_back_first_when_it_is_said_to():
     assert abs(rattleback.motion([0.0, rattleback.FIRST_REVERSAL])["w3"][1]) < 3e-6
 
@@ -405,7 +404,6 @@ def test_rattleback_reference_keeps_energy_and_the_published_digits_to_twenty_se
             assert np.all(np.abs(np.subtract(row, rattleback.TABLE[time])) <= rattleback.DIGITS[time]), time
 
 
-@pytest.mark.slow
 def test_rattleback_reference_is_reproduced_to_twenty_seconds():
     times = [0.0, *rattleback.REFERENCE]
     states = columns(rattleback.motion(times), *rattleback.NAMES)

@@ -87,13 +87,10 @@ SMOOTH = {
 }
 
 
-SEEN = ("few samples", "a gather", "a late start")  # samples, an index, a kink late in time; the others are slow
-
-
 @pytest.mark.parametrize(
     ("kind", "curve"),
     [
-        *((Driven, name) if name in SEEN else pytest.param(Driven, name, marks=pytest.mark.slow) for name in KINKED),
+        *((Driven, name) for name in KINKED),
         (Prescribed, "jnp.interp"),
         (Prescribed, "steps"),
         (InGeometry, "jnp.interp"),

@@ -37,7 +37,6 @@ def assert_alike(printed, told):
     np.testing.assert_allclose(found, expected, rtol=1e-2, atol=1e-9)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_examples_print_what_is_told(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -49,12 +49,11 @@ def drawn(seed):
     return jj.from_urdf(tree(seed, legs, joints, tensor), base="planar" if seed % 3 == 2 else "fixed")
 
 
-@pytest.mark.parametrize("seed", [2, 4, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(5, 40))])
+@pytest.mark.parametrize("seed", [2, *range(4, 40)])
 def test_every_tree_is_lowered(seed):
     assert jj.lower(drawn(seed)()).operations > 0
 
 
-@pytest.mark.slow
 def test_a_quadruped_on_a_free_base_is_lowered():
     built = str(jj.build(jj.from_urdf(tree(0, 4, 3, lambda draw: BONE), base="free")()))
     assert "operations" in built
@@ -95,7 +94,7 @@ JOINT = '<joint name="j" type="continuous"><parent link="base"/><child link="arm
 PENDULUM = '<robot name="p"><link name="base"/><link name="arm">{}</link>' + JOINT + "</robot>"
 
 
-@pytest.mark.parametrize("noise", [2e-35, *(pytest.param(noise, marks=pytest.mark.slow) for noise in (-1e-33, 1e-22))])
+@pytest.mark.parametrize("noise", [2e-35, -1e-33, 1e-22])
 def test_round_off_in_a_tensor_of_zeros_is_no_moment(noise):
     arm = jj.from_urdf(PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), np.array([[0.0, noise, 0.0], [noise, 0.0, noise], [0.0, noise, 0.0]]))))()
     point = jj.from_urdf(PENDULUM.format(inertial(1.0, (0.0, 0.3, 0.0), np.zeros((3, 3)))))()

@@ -170,7 +170,7 @@ class Swing(jj.Scene):
         return (jj.generalized_force(motion, turn_rate=-self.stiffness * motion.q.turn),)
 
 
-@pytest.mark.parametrize("late", [pytest.param(False, marks=pytest.mark.slow), True], ids=["at once", "late"])
+@pytest.mark.parametrize("late", [False, True], ids=["at once", "late"])
 def test_an_accelerometer_feels_centripetal_and_tangential_acceleration_and_gravity(late):
     # turn = 0.7 cos(4 t), at 0.2 m: f = (- turn'^2 r, turn'' r, g) in the axes of the arm
     turn, rate = 0.7 * np.cos(4 * TS), -2.8 * np.sin(4 * TS)

@@ -170,7 +170,6 @@ def test_bodies_are_guessed_from_contacts_lines_and_inertias():
     assert float(dot.size[0]) == 0.01
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", jj.models.MODELS)
 def test_every_model_is_shown_with_shapes_on_its_ground(name):
     scene = jj.models.model(name)
@@ -181,7 +180,6 @@ def test_every_model_is_shown_with_shapes_on_its_ground(name):
     assert set(motion.motions().bodies) <= set(shapes)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "lowest"),
     [

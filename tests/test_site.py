@@ -11,7 +11,7 @@ import pytest
 from browser import dom, needs_browser, screenshot
 
 SITE = Path(__file__).parents[1] / "docs" / "_build" / "html"
-pytestmark = [pytest.mark.slow, needs_browser, pytest.mark.skipif(not (SITE / "index.html").exists(), reason="the site is not built; see CONTRIBUTING")]
+pytestmark = [needs_browser, pytest.mark.skipif(not (SITE / "index.html").exists(), reason="the site is not built; see CONTRIBUTING")]
 
 
 class _Quiet(http.server.SimpleHTTPRequestHandler):

@@ -37,7 +37,7 @@ def _applies(name, heading):
 
 
 # those that are slow here factorise the rows of an upright disc in `test_discs_and_chains.py`; those of the Gibbs function take longest to compile
-SKATES = ["privileged", "qr", *(pytest.param(name, marks=pytest.mark.slow) for name in ("svd", "kkt", "udwadia-kalaba", "gibbs-appell"))]
+SKATES = ["privileged", "qr", "svd", "kkt", "udwadia-kalaba", "gibbs-appell"]
 
 
 @pytest.mark.parametrize("name", SKATES)

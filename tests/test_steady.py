@@ -55,7 +55,6 @@ def test_derivatives_of_a_steady_motion_are_those_of_the_closed_form():
     assert_allclose(jax.jit(jax.jacfwd(_spin, (0, 1)))(0.5, 0.3), reverse, rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_second_derivatives_of_a_steady_motion_are_those_of_the_closed_form():
     h = 1e-4
     second = (_circle(0.3, 2.0, radius=0.5 + h) + _circle(0.3, 2.0, radius=0.5 - h) - 2 * _circle(0.3, 2.0, radius=0.5)) / h**2

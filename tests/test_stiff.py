@@ -119,7 +119,6 @@ def test_a_motion_that_left_its_domain_is_run_again_where_that_is_asked_for_and_
     assert (int(inside.result), int(inside.fallback)) == (results.SINGULAR_PARTITION, results.AS_ASKED)
 
 
-@pytest.mark.slow
 def test_a_lane_that_is_stiff_and_leaves_its_domain_is_run_with_the_full_state_and_an_implicit_solver():
     scene, (rates, ts) = TurnedSkate(), (np.array([0.0, 1e6]), np.linspace(0.0, 2.0, 9))
     both = results.FULL_STATE | results.IMPLICIT
@@ -169,7 +168,7 @@ def test_a_derivative_through_a_motion_that_amplifies_errors_warns_outside_of_ji
     assert said(jax.jacfwd(jax.jacfwd(lambda x: end(x, 1e-10))), 1.0) == []
 
 
-@pytest.mark.parametrize("mode", ["forward", pytest.param("reverse", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
 def test_an_implicit_solver_that_tries_steps_beyond_an_event_has_the_derivative_of_the_closed_form(mode):
     def landing_speed(height):
         motion = jj.simulate(Drawn(), {"x": height}, t1=3.0, ts=[0.0], rtol=1e-8, atol=1e-8, solver=jj.RadauIIA(), work=False)

@@ -40,7 +40,7 @@ def order(errors):
 # Order. ----------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("solver", [MIDPOINT, DLA, pytest.param(GRADIENT, marks=pytest.mark.slow)], ids=named)
+@pytest.mark.parametrize("solver", [MIDPOINT, DLA, GRADIENT], ids=named)
 def test_the_chaplygin_sleigh_is_followed_to_second_order(solver):
     data = chaplygin_sleigh.RUN | {"t_end": 4.0}
     v0, w0, a = data["v0"], data["w0"], data["a"]
@@ -147,11 +147,7 @@ def test_geometric_rows_hold_at_every_node():
 # Derivatives and batches. ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "solver",
-    [MIDPOINT, *(pytest.param(solver, marks=pytest.mark.slow) for solver in (DLA, GRADIENT))],
-    ids=named,
-)
+@pytest.mark.parametrize("solver", [MIDPOINT, DLA, GRADIENT], ids=named)
 def test_derivatives_through_fifty_steps_are_right_in_both_modes(solver):
     scene = ContactOscillator()
     start = jj.start(scene, **scene.example)

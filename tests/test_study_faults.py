@@ -389,10 +389,7 @@ def _is_right_or_said(path, right):
     return False
 
 
-TRAJECTORIES = pytest.param({"keep_every": 2, "ts": np.linspace(0.0, 1.0, 3)}, 6, marks=pytest.mark.slow)
-
-
-@pytest.mark.parametrize(("options", "count"), [({}, 2), ({"save": "statistics"}, 6), TRAJECTORIES])
+@pytest.mark.parametrize(("options", "count"), [({}, 2), ({"save": "statistics"}, 6), ({"keep_every": 2, "ts": np.linspace(0.0, 1.0, 3)}, 6)])
 def test_whatever_happens_to_a_file_of_a_study_no_other_number_comes_out(tmp_path, options, count):
     generator = np.random.default_rng(1)
     path = tmp_path / "discs.zarr"
@@ -624,7 +621,6 @@ def _workers(process):
     return [other for other in psutil.Process(process.pid).children() if "spawn_main" in " ".join(other.cmdline())]
 
 
-@pytest.mark.slow
 def test_workers_end_with_a_run_that_is_killed_while_they_start(tmp_path):
     process = _started(tmp_path, "discs.zarr", 2)
     workers = []
@@ -638,7 +634,6 @@ def test_workers_end_with_a_run_that_is_killed_while_they_start(tmp_path):
     assert _chunks(tmp_path / "discs.zarr") == 0
 
 
-@pytest.mark.slow
 def test_runs_and_workers_that_are_killed_lose_and_repeat_nothing(tmp_path):
     """Twenty times, at random moments: every other time the run itself, otherwise one of its workers."""
     generator, path = np.random.default_rng(0), tmp_path / "discs.zarr"

@@ -106,10 +106,7 @@ def _rolling_acceleration(reduction, x):
     return solved.udot[scene.speed_names.entries.index("psi1_rate")]
 
 
-_SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("qr", "privileged", "svd", "kkt", "udwadia-kalaba")]
-
-
-@pytest.mark.parametrize("name", _SLOW)  # half a minute of compilation each
+@pytest.mark.parametrize("name", ["qr", "privileged", "svd", "kkt", "udwadia-kalaba"])  # half a minute of compilation each
 def test_derivatives_through_dependent_rows_are_those_of_equation_64(name):
     reduction = jj.reductions(TwoWheelAxleRedundant())[name]
     directions = jax.random.normal(jax.random.key(0), (2, 6))
