@@ -96,6 +96,7 @@ def fits(quick: bool) -> Figures:
 class Bowling(jj.Scene):
     """A bowling ball that slides on its lane."""
 
+    friction: float = jj.parameter(0.12)
     coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
 
     def bodies(self, t, q):
@@ -105,7 +106,7 @@ class Bowling(jj.Scene):
         return (jj.gravity(motion, 9.81),)
 
     def contacts(self, pose):
-        return {"lane": jj.ball_contact(pose["ball"], 0.108, height="row", friction=0.12)}
+        return {"lane": jj.ball_contact(pose["ball"], 0.108, height="row", friction=self.friction)}
 
 
 def slips(quick: bool) -> Figures:
@@ -121,6 +122,22 @@ def slips(quick: bool) -> Figures:
     rolls, off = jax.jit(jax.vmap(slip))(*speeds.T)
     yield figure("share that comes to roll", "bowling ball", jnp.mean(rolls), least=1.0)
     yield figure("end of slip: error, s", "bowling ball", jnp.max(off), 1e-9)
+
+    def end(numbers):
+        start = {"z": 0.108, "x_rate": numbers[1], "y_rate": 0.7}
+        motion = jj.simulate(Bowling(numbers[0]), start, ts=[6.0], rtol=1e-12, atol=1e-12)
+        return jnp.stack([motion["x"][0], motion["y"][0]])
+
+    def right(numbers):
+        slip = jnp.stack([numbers[1], 0.7])
+        duration = 2 / (7 * numbers[0] * 9.81)  # in |w0|
+        return slip * (jnp.hypot(*slip) * duration * (1 - 0.5 * 2 / 7) + 5 / 7 * (6.0 - jnp.hypot(*slip) * duration))
+
+    numbers = jnp.array([0.12, 8.0])
+    yield figure("x(6 s), y(6 s): error, m", "bowling ball", jnp.max(jnp.abs(end(numbers) - right(numbers))), 1e-10)
+    for name, derivative in (("forward", jax.jacfwd), ("reverse", jax.jacrev)):
+        off = jnp.max(jnp.abs(derivative(end)(numbers) - jax.jacfwd(right)(numbers)))
+        yield figure(f"d/dmu, d/dv0 of x, y: error, {name}", "bowling ball", off, 1e-8)
 
 
 if __name__ == "__main__":

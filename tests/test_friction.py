@@ -61,6 +61,49 @@ def test_derivatives_of_slip():
     np.testing.assert_allclose(jax.grad(end)(numbers), first, rtol=1e-9)
 
 
+def test_derivatives_across_slip():
+    """A ball thrown aside of its slip: place, speed and end of slip by the closed form; derivatives of both orders by friction."""
+    speed, spin, radius, T = jnp.array([8.0, -0.4]), 15.0, 0.108, 3.0
+
+    def right(friction):
+        slip = speed + jnp.array([0.0, radius * spin])
+        end = 2 * jnp.linalg.norm(slip) / (7 * friction * G)
+        rolling = speed - 2 / 7 * slip
+        return jnp.concatenate([speed * end - friction * G * slip / jnp.linalg.norm(slip) * end**2 / 2 + rolling * (T - end), rolling, end[None]])
+
+    def found(friction):
+        start = {"z": radius, "x_rate": speed[0], "y_rate": speed[1], "attitude_omega_x": spin}
+        motion = jj.simulate(Ball(mass=6.8, radius=radius, friction=friction), start, ts=[T], **FINE)
+        return jnp.stack([*(motion[name][-1] for name in ("x", "y", "x_rate", "y_rate")), motion.phases.ts[1]])
+
+    np.testing.assert_allclose(jax.jacfwd(found)(0.12), jax.jacfwd(right)(0.12), rtol=1e-9, atol=5e-9)
+    second = lambda f: jax.jacfwd(jax.jacfwd(f))(0.12)  # noqa: E731
+    np.testing.assert_allclose(second(found), second(right), rtol=1e-8, atol=5e-6)  # of up to 312
+
+
+class PulledBlock(Ball):
+    """A block on a floor under a force of 3 (1 + t) N that turns at 2 rad/s."""
+
+    coordinates = jj.coordinates("x y z")
+
+    def bodies(self, t, q):
+        return {"ball": jj.RigidBody(self.mass, jnp.eye(3), jnp.stack([q.x, q.y, q.z]), jnp.eye(3))}
+
+    def loads(self, motion):
+        t = motion.t
+        force = 3 * (1 + t) * jnp.stack([jnp.cos(2 * t), jnp.sin(2 * t), 0.0 * t])
+        return jj.gravity(motion, self.g), jj.Load(forces={"ball": force})
+
+
+def test_slip_that_begins_under_a_force_that_turns():
+    """Reference: integration by Radau from small times on (`|f|` reaches friction at t = 0)."""
+    scene = PulledBlock(mass=1.0, friction=0.3, g=10.0)
+    motion = jj.simulate(scene, {"z": 0.0285}, t0=-0.1, ts=[0.5], rtol=1e-10, atol=1e-10)
+    x, y, vx, vy = (motion[name][0] for name in ("x", "y", "x_rate", "y_rate"))
+    np.testing.assert_allclose([x, y, jnp.hypot(vx, vy), jnp.arctan2(vy, vx)], [0.04826763, 0.03778878, 0.37065575, 0.86840719], atol=6e-9)
+    assert motion.accepted + motion.rejected <= 600
+
+
 def test_bounces_and_rest():
     """t_n = t_0 (1 + 2 (e + ... + e^n)) with t_0 = sqrt(2 h/g); at rest after t_0 (1 + e)/(1 - e)."""
 

@@ -28,7 +28,7 @@ from jourdain_jax.equations.kinematics import coordinate_rates, inertias_of, mot
 from jourdain_jax.equations.listed import names_of_bodies, names_of_position_rows
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
 from jourdain_jax.equations.switching import At, contact_changes, contact_events, contacts_at_start, put_back
-from jourdain_jax.equations.virtual_power import energies_at, impressed, loads_at, potential_energy, resultants
+from jourdain_jax.equations.virtual_power import energies_at, impressed, loads_at, potential_energy, resultants, slip_turns
 from jourdain_jax.program.graph import MOST_MULTIPLICATIONS, Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, effects_of, interpret
 from jourdain_jax.program.opaque_calls import interpret_with_calls
@@ -62,6 +62,7 @@ class VelocityQuantities(eqx.Module):
     events: Num[Entries, "events"]  # sorted by name
     resets: Num[Entries, "events rows"]  # as `event_resets` has them
     energies: Num[Entries, "2"]  # kinetic and potential
+    slip_turns: Num[Entries, "directions"]  # rates of directions of slip, the last coordinates
     held: Num[Entries, "coordinates_and_speeds"]  # put back onto the rows of contacts that are closed; none where no contact switches
     start: Num[Entries, "numbers"]  # `switching.Begun`
     responses: Num[Entries, "states numbers"]  # of contacts that switch, of which the others are made: at coordinates, speeds and inputs, which come first
@@ -114,6 +115,7 @@ def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]
         event_values(scene, motion, at) if with_events else jnp.zeros(0),
         event_resets(scene, motion, of_inputs, at) if with_events else jnp.zeros((0, 0)),
         jnp.stack(energies_at(scene, motion, stated)),
+        slip_turns(scene, motion, at.found) if at else jnp.zeros(0),
         jnp.concatenate(put_back(at)) if at else jnp.zeros(0),
         ravel_pytree(contacts_at_start(at))[0] if at and with_events else jnp.zeros(0),
         jnp.stack([ravel_pytree(response)[0] for response in at.responses]) if at else jnp.zeros((0, 0)),

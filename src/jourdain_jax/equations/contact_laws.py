@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import Flag, Scalar
 
 NEWTON_STEPS = 6
+SLOW = 5e-6  # m/s: below, the direction of slip turns as it does at this speed
 ROUND_OFF = 1e-9  # of responses
 LEAST_PIVOT = 1e-12  # beside the entry that it is what is left of
 

@@ -1,15 +1,16 @@
 """Contacts that fly, roll, slip and strike: what ends each phase, and what comes after it.
 
-    M du/dt = h + A' L          flies: L = 0      rolls: dw = 0      slips: dw_n = 0, L_t = -mu L_n e, e = w_t/|w_t|      creeps: slips with e held
+    M du/dt = h + A' L          flies: L = 0      rolls: dw = 0      slips: dw_n = 0, L_t = -mu L_n e, e along w_t      creeps: slips more slowly than s
 
     ends        normal                       tangent                      speed
     flies       gap
     rolls       L_n                          (mu_s L_n)^2 - |L_t|^2
-    slips       L_n                          |w_t|^2 - s^2
-    creeps      L_n                          e.w_t                        4 s^2 - |w_t|^2
+    slips       L_n                          e.w_t - s
+    creeps      L_n                          e.w_t                        2 s - e.w_t
 
-The direction of slip has no limit at rest: below the speed s it is held, as a number of the state, from where slip begins or until it stops. A contact that
-strikes gets an impulse P by Newton's restitution and Coulomb's law on the slip afterwards (Moreau); closed contacts take part in their modes:
+The direction of slip is a number of the state with the rate `n (n.dw_t)/(e.w_t)`, n = J e: errors of w_t across it do not turn it (`slip_turns`). It has no
+limit at rest: below the speed s it turns no faster than at s. A contact that strikes gets an impulse P by Newton's restitution and Coulomb's law on the slip
+afterwards (Moreau); closed contacts take part in their modes:
 
     u+ = u- + M^-1 A' P,   w_n+ = -e w_n-,   |P_t| <= mu P_n, and w_t+ = 0 or P_t against w_t+
 
@@ -20,11 +21,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.reals import Flag, Scalar, Speeds
-from jourdain_jax.equations.contact_laws import Law, Modes, coulomb, responses, solved
+from jourdain_jax.equations.contact_laws import SLOW, Modes, coulomb, responses, solved
 from jourdain_jax.equations.contact_rows import switching_contacts
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.virtual_power import ContactResponse, contact_modes, contact_response, friction_of, switching_forces
@@ -33,9 +33,9 @@ from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.switching import CREEPS, FLIES, ROLLS, SLIPS
 
-SLOW = 1e-4  # m/s: the direction of slip is held below this speed
 LEAST_REBOUND = 1e-6  # m/s: a contact that would rebound with less is closed
 LEAST_CHANGE = 1e-8  # m/s: an impulse that changes speeds by less is round-off
+STOPS = 1e-13  # m/s against its direction end a slip: round-off where slip begins does not
 TOUCHES = 1e-8  # m: a gap that counts as none at the start
 
 
@@ -51,7 +51,7 @@ class At:
         self.responses += [(motion.q.array, motion.u.array, motion.inputs.array, self.found)] if found is None else []
         self.friction = friction_of(scene, motion)
         self.static = jnp.stack([contact.friction.static for contact in switching_contacts(scene, motion.pose()).values() if contact.friction])
-        self.modes: Modes = contact_modes(scene, motion, self.found.rows.w)
+        self.modes: Modes = contact_modes(scene, motion)
         self.w = self.found.rows.w.reshape(-1, 3)
         self.number = jnp.stack([motion.modes[name] for name in scene.switching.contacts])
 
@@ -90,11 +90,11 @@ def contact_events(at: At) -> dict[str, Scalar]:
     events, forces, one = {}, at.forces, jnp.ones_like(at.motion.t)
     for i, name in enumerate(at.scene.switching.contacts):
         number, normal, tangential, slip = at.number[i], forces[i, 0], forces[i, 1:], at.w[i, 1:]
-        bound, square = at.static[i] * normal, slip @ slip
+        bound, along = at.static[i] * normal, at.modes.direction[i] @ slip
         events[f"{name} normal"] = jnp.where(number == FLIES, at.found.rows.gap[i], normal)
-        while_closed = jnp.where(number == SLIPS, square - SLOW**2, at.modes.direction[i] @ slip)
+        while_closed = along - jnp.where(number == SLIPS, SLOW, -STOPS)
         events[f"{name} tangent"] = jnp.where(number == FLIES, one, jnp.where(number == ROLLS, bound * bound - tangential @ tangential, while_closed))
-        events[f"{name} speed"] = jnp.where(number == CREEPS, 4 * SLOW**2 - square, one)
+        events[f"{name} speed"] = jnp.where(number == CREEPS, 2 * SLOW - along, one)
     return events
 
 
@@ -102,24 +102,26 @@ def contact_changes(at: At) -> dict[str, Event]:
     """Return what each event of the contacts that switch makes of the state and the modes."""
     events = {}
     for i, name in enumerate(at.scene.switching.contacts):
-        number, slip = at.number[i], at.w[i, 1:]
+        number = at.number[i]
         strikes, stops = number == FLIES, number == CREEPS
         after = After(at, i, strikes)
         events[f"{name} normal"] = _event(after, strikes, FLIES, after.direction)
         # the law at rest, from where slip begins, says the direction of slip also where round-off would let it stick
-        along = slip / jnp.sqrt(jnp.where(number == SLIPS, slip @ slip, 1.0))
-        events[f"{name} tangent"] = _event(after, stops, CREEPS, jnp.where(number == SLIPS, along, after.direction))
-        events[f"{name} speed"] = _event(after, jnp.asarray(False), SLIPS, after.direction)
+        e = jnp.where(number == SLIPS, at.modes.direction[i], after.direction)
+        events[f"{name} tangent"] = _event(after, stops, CREEPS, e)
+        events[f"{name} speed"] = _event(after, jnp.asarray(False), SLIPS, at.modes.direction[i], _speeds_on_rows(at, at.number.at[i].set(float(SLIPS))))
     return events
 
 
-def _event(after: "After", jumps: Flag, mode: int, e: Float[Array, "2"]) -> Event:
+def _event(after: "After", jumps: Flag, mode: int, e: Float[Array, "2"], u: Speeds | None = None) -> Event:
     """Where speeds jump all modes are those `after` it, otherwise the contact's own becomes this one."""
     at, i, names = after.at, after.i, after.at.scene.switching.contacts
     numbers = jnp.where(jumps, after.numbers, at.number.at[i].set(float(mode)))
-    u, e = jnp.where(jumps, after.u, at.motion.u.array), jnp.where(numbers[i] == CREEPS, e, 0.0)
-    jump = dict(zip(at.scene.speed_names.entries, u, strict=True)) | {f"{names[i]}_slip_1": e[0], f"{names[i]}_slip_2": e[1]}
-    return Event(jnp.ones_like(e[0]), to=dict(zip(names, numbers, strict=True)), jump=jump)
+    u, e = jnp.where(jumps, after.u, at.motion.u.array if u is None else u), jnp.where(jumps, after.e, at.modes.direction.at[i].set(e))
+    e = jnp.where((numbers >= SLIPS)[:, None], e, 0.0)
+    directions = {f"{name}_slip_{k}": e[j, k - 1] for j, name in enumerate(names) for k in (1, 2)}
+    jump = dict(zip(at.scene.speed_names.entries, u, strict=True)) | directions
+    return Event(jnp.ones_like(at.motion.t), to=dict(zip(names, numbers, strict=True)), jump=jump)
 
 
 class After:
@@ -137,32 +139,33 @@ class After:
         rebounds = strikes & (rebound > LEAST_REBOUND)
         goal = jnp.where(rebounds, rebound, 0.0)
 
-        def impulses(modes: Modes) -> tuple[Law, Float[Array, "contacts 3"]]:
+        def impulses(modes: Modes) -> tuple[Flag, Float[Array, "contacts 3"]]:
             own = at.alone(i, at.found.rows.w, modes)
             law = coulomb(own.G, own.b, goal, friction, friction, own.sizes)
-            return law, own.every(i, jnp.where(strikes, law.forces, law.sticking)).reshape(-1, 3)
+            slips = strikes & ~law.sticks & _moves(own.b + own.G @ law.slipping, LEAST_CHANGE)
+            return slips, own.every(i, jnp.where(slips, law.slipping, law.sticking)).reshape(-1, 3)
 
         modes = at.modes
-        law, P = impulses(modes)
+        slips, P = impulses(modes)
         right = jnp.asarray(True)
         if len(at.number) > 1:
             modes = _yielding(at, i, modes, P)
-            law, P = impulses(modes)
+            slips, P = impulses(modes)
             right = _is_lawful(at, i, modes, P)
         jumps = at.number[i] != ROLLS  # otherwise nothing strikes or stops
         self.u = jnp.where(right | ~jumps, motion.u.array + jnp.where(jumps, at.found.impulses @ P.ravel(), 0.0), jnp.nan)
-        slip = (at.found.rows.w + at.found.G @ P.ravel()).reshape(-1, 3)[:, 1:]
-        fast = jnp.sum(slip**2, axis=1) > SLOW**2
-        slow = jnp.where(at.number == CREEPS, float(CREEPS), float(ROLLS))
-        others = jnp.where(modes.closed == 0, float(FLIES), jnp.where(fast, float(SLIPS), slow))
+        w = (at.found.rows.w + at.found.G @ P.ravel()).reshape(-1, 3)
+        slipping = jnp.where(_moves(w, SLOW), float(SLIPS), float(CREEPS))
+        moves = _moves(w, LEAST_CHANGE)
+        others = jnp.where(modes.closed == 0, float(FLIES), jnp.where(moves & (modes.rolls == 0), slipping, float(ROLLS)))
         numbers = jnp.where(jumps, others, at.number)
         then = At(scene, _switched(scene, motion, numbers, motion.q.array, self.u), None, at.responses)
         own = then.alone(i, then.found.b)
         rest = coulomb(own.G, own.b, jnp.zeros_like(friction), friction, at.static[i], own.sizes)
         self.direction = rest.direction
         settled = jnp.where(rest.opens, float(FLIES), jnp.where(rest.sticks, float(ROLLS), float(CREEPS)))
-        slips = strikes & ~law.sticks & fast[i]
-        self.numbers = numbers.at[i].set(jnp.where(rebounds, float(FLIES), jnp.where(slips, float(SLIPS), settled)))
+        self.numbers = numbers.at[i].set(jnp.where(rebounds, float(FLIES), jnp.where(slips, slipping[i], settled)))
+        self.e = jnp.where(moves[:, None], _along(w[:, 1:]), modes.direction.at[i].set(self.direction))
 
 
 def _excess(at: At, P: Float[Array, "contacts 3"]) -> tuple[Float[Array, "contacts"], Float[Array, "contacts"]]:
@@ -197,10 +200,9 @@ def _is_lawful(at: At, i: int, modes: Modes, P: Float[Array, "contacts 3"]) -> F
 def put_back(at: At) -> tuple[Float[Array, "coordinates"], Speeds]:
     """Coordinates on the ground, by one step of Gauss-Newton, and speeds on the rows, of contacts that are closed.
 
-    q - D' (D D')^-1 gap,  D = d gap/dq;       u + M^-1 A' P,  w + G P = 0 along the normals, and along the tangents of those that roll
+    q - D' (D D')^-1 gap,  D = d gap/dq;       u + M^-1 A' P,  w + G P = 0 along the normals, and along the tangents of those that roll;       e/|e|
     """
-    scene, motion, found, modes = at.scene, at.motion, at.found, at.modes
-    P = responses(found.G, found.rows.w[:, None], modes, jnp.zeros_like(modes.closed))[:, 0]
+    scene, motion, modes = at.scene, at.motion, at.modes
     q, closed = motion.q.array, modes.closed
 
     def gaps(q):
@@ -209,7 +211,33 @@ def put_back(at: At) -> tuple[Float[Array, "coordinates"], Speeds]:
 
     D = jax.jacfwd(gaps)(q)
     moved = solved(list(D @ D.T + jnp.diag(1 - closed)), list(gaps(q)[:, None]))
-    return q - jnp.concatenate(moved) @ D, motion.u.array + found.impulses @ P
+    q = q - jnp.concatenate(moved) @ D
+    return jnp.append(q[: -modes.direction.size], _along(modes.direction)), _speeds_on_rows(at, at.number)
+
+
+def _speeds_on_rows(at: At, number: Float[Array, "contacts"]) -> Speeds:
+    """Return `u + M^-1 A' T P`, `(T G T + 1 - T) P = -T w`, for contacts in these modes.
+
+    T: the projection of w onto what vanishes: along the normal of closed contacts, all slip of those that roll, and slip across e of those that slip.
+    """
+    found, blocks = at.found, []
+    for closed, rolls, e, slips in zip(*at.modes, number == SLIPS, strict=True):
+        n = jnp.where(slips, jnp.stack([-e[1], e[0]]), 0.0)
+        blocks.append(jnp.diag(jnp.stack([closed, rolls, rolls])).at[1:, 1:].add(jnp.outer(n, n)))
+    T = jax.scipy.linalg.block_diag(*blocks)
+    P = solved(list(T @ found.G @ T + jnp.eye(len(T)) - T), list(-(T @ found.rows.w)[:, None]))
+    return at.motion.u.array + found.impulses @ T @ jnp.concatenate(P)
+
+
+def _along(x: Float[Array, "*contacts 2"]) -> Float[Array, "*contacts 2"]:
+    """Return unit vectors, and zero for zero."""
+    square = jnp.sum(x * x, axis=-1, keepdims=True)
+    return x / jnp.sqrt(jnp.where(square > 0, square, 1.0))
+
+
+def _moves(w: Float[Array, "*contacts 3"], least: float) -> Bool[Array, "*contacts"]:
+    """Whether slip is faster than so much."""
+    return jnp.sum(w[..., 1:] ** 2, axis=-1) > least**2
 
 
 class Begun(NamedTuple):
@@ -227,16 +255,18 @@ def contacts_at_start(at: At) -> Begun:
     touches = gap < TOUCHES
     strikes = touches & (w[:, 0] < -LEAST_REBOUND)
     closed = touches & (jnp.abs(w[:, 0]) <= LEAST_REBOUND)
-    slips = jnp.sum(w[:, 1:] ** 2, axis=1) > SLOW**2
+    slips = _moves(w, SLOW)
     numbers = jnp.where(closed, jnp.where(slips, float(SLIPS), float(ROLLS)), float(FLIES))
-    q, u = put_back(At(scene, _switched(scene, motion, numbers, motion.q.array, motion.u.array), at.found))
-    for i, name in enumerate(scene.switching.contacts):
+    e = jnp.where((closed & slips)[:, None], _along(w[:, 1:]), 0.0)
+    q = jnp.append(motion.q.array[: -e.size], e)
+    q, u = put_back(At(scene, _switched(scene, motion, numbers, q, motion.u.array), at.found))
+    for i in range(len(numbers)):
         after = After(At(scene, _switched(scene, motion, numbers, q, u), None, at.responses), i, strikes[i])
         settles = closed[i] & ~slips[i]
         numbers = jnp.where(strikes[i], after.numbers, numbers.at[i].set(jnp.where(settles, after.numbers[i], numbers[i])))
         u = jnp.where(strikes[i], after.u, u)
-        place = np.array([scene.coordinate_names.entries.index(f"{name}_slip_{k}") for k in (1, 2)])
-        q = q.at[place].set(jnp.where(numbers[i] == CREEPS, after.direction, 0.0))
+        e = jnp.where(strikes[i], after.e, jnp.where(settles, e.at[i].set(after.direction), e))
+        q = jnp.append(q[: -e.size], jnp.where((numbers >= SLIPS)[:, None], e, 0.0))
     return Begun(numbers, jnp.max(-gap, initial=0.0), q, u)
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Entries, Scalar, Speeds, described
 from jourdain_jax.eager.eager import eager_if_concrete
-from jourdain_jax.equations.contact_laws import Modes, responses, solved
+from jourdain_jax.equations.contact_laws import SLOW, Modes, responses, solved
 from jourdain_jax.equations.contact_rows import ContactRows, contact_loads, contact_rows, switching_contacts
 from jourdain_jax.equations.instant import Instant, instant_at, rows_of
 from jourdain_jax.equations.kinematics import (
@@ -37,7 +37,7 @@ from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import check_name
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.switching import CREEPS, FLIES, ROLLS, SLIPS
+from jourdain_jax.scene.switching import FLIES, ROLLS, SLIPS
 from jourdain_jax.scene.validated import loads_of, potential_of
 
 
@@ -206,20 +206,35 @@ def contact_response(scene: Scene, motion: Motion) -> ContactResponse:
     return ContactResponse(rows, impulses, rows.A @ impulses, rows.A @ free + rows.drift)
 
 
-def contact_modes(scene: Scene, motion: Motion, w: Float[Array, "rows"]) -> Modes:
-    """Return the modes of the contacts that switch; one that slips does so along its slip w, one that creeps along a direction that is kept.
-
-    The direction is a number also where nothing slips.
-    """
+def contact_modes(scene: Scene, motion: Motion) -> Modes:
+    """Return the modes of the contacts that switch, with the directions of slip, which are numbers of the state: zero where none slips or creeps."""
     names = scene.switching.contacts
     number = jnp.stack([motion.modes[name] for name in names])
-    slips, kept = number == SLIPS, number == CREEPS
-    slip = w.reshape(-1, 3)[:, 1:]
-    size = jnp.sqrt(jnp.where(slips, jnp.sum(slip**2, axis=1), 1.0))
-    directions = jnp.stack([jnp.stack([motion.q[f"{name}_slip_1"], motion.q[f"{name}_slip_2"]]) for name in names])
-    e = jnp.where(slips[:, None], slip / size[:, None], jnp.where(kept[:, None], directions, 0.0))
-    one = jnp.ones_like(size)
-    return Modes(jnp.where(number == FLIES, 0.0, one), jnp.where(number == ROLLS, one, 0.0), e)
+    e = jnp.stack([jnp.stack([motion.q[f"{name}_slip_1"], motion.q[f"{name}_slip_2"]]) for name in names])
+    one = jnp.ones_like(number)
+    return Modes(jnp.where(number == FLIES, 0.0, one), jnp.where(number == ROLLS, one, 0.0), e * (number >= SLIPS)[:, None])
+
+
+def slip_turns(scene: Scene, motion: Motion, found: ContactResponse) -> Float[Array, "directions"]:
+    """Rates of the directions of slip, 1/s; none where a contact does not slip.
+
+    de/dt = n (n.dw_t/dt)/|w_t|,   n = e turned by a right angle;   |w_t| = e.w_t, and `SLOW` where it creeps
+    """
+    e = contact_modes(scene, motion).direction
+    slips = jnp.stack([motion.modes[name] for name in scene.switching.contacts]) == SLIPS
+    dw = (found.G @ switching_forces(scene, motion, found) + found.b).reshape(-1, 3)[:, 1:]
+    along = jnp.sum(e * found.rows.w.reshape(-1, 3)[:, 1:], axis=1)
+    aside = e[:, 0] * dw[:, 1] - e[:, 1] * dw[:, 0]
+    rate = aside / jnp.where(slips, along, SLOW)
+    return (rate[:, None] * jnp.stack([-e[:, 1], e[:, 0]], axis=1)).ravel()
+
+
+def coordinate_rates_in_modes(scene: Scene, motion: Motion) -> Float[Array, "coordinates"]:
+    """Rates of all coordinates, with those of directions of slip."""
+    if not scene.switching.contacts:
+        return motion.qdot.array
+    turns = slip_turns(scene, motion, contact_response(scene, motion))
+    return jnp.append(motion.qdot.array[: -len(turns)], turns)
 
 
 def friction_of(scene: Scene, motion: Motion) -> Float[Array, "contacts"]:
@@ -229,7 +244,7 @@ def friction_of(scene: Scene, motion: Motion) -> Float[Array, "contacts"]:
 
 def switching_forces(scene: Scene, motion: Motion, found: ContactResponse) -> Float[Array, "rows"]:
     """Return the forces of contacts in their modes, N."""
-    return responses(found.G, found.b[:, None], contact_modes(scene, motion, found.rows.w), friction_of(scene, motion))[:, 0]
+    return responses(found.G, found.b[:, None], contact_modes(scene, motion), friction_of(scene, motion))[:, 0]
 
 
 def loads_at(scene: Scene, motion: Motion, found: ContactResponse | None = None) -> tuple[Load, ...]:

@@ -11,6 +11,7 @@ simple. *Implicit*: speeds are differentiated as they stand, and the rates of z 
 """
 
 from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
 
@@ -98,8 +99,9 @@ class AppellOnGraph:
         true_z = {int(self.traced.u[k]): n for k, n in zip(self.dependent, z, strict=True)}
         at = self.traced.at
         of_state = self._of_state(at.resets)
-        outputs = self.graph.substituted([*at.events.tolist(), *of_state, *at.energies.tolist()], true_z)
-        events, resets, (T, V) = outputs[: len(at.events)], outputs[len(at.events) : -2], outputs[-2:]
+        outputs = iter(self.graph.substituted([*at.slip_turns.tolist(), *at.events.tolist(), *of_state, *at.energies.tolist()], true_z))
+        turns, events, resets, (T, V) = (list(islice(outputs, n)) for n in (len(at.slip_turns), len(at.events), len(of_state), 2))
+        qdot = [*qdot[: len(qdot) - len(turns)], *turns]
         if not self.forces_work:
             (power,) = self.graph.substituted([int(self.traced.at.power)], true_z)
         elif held:

@@ -38,7 +38,7 @@ def dense_rates(scene: Scene, structure: Structure, independent: tuple[int, ...]
         function = jaxpr_as_fun(needed_only(closed, [getattr(numbers, name) for name in names]))
         return lambda scene, t, q, u, inputs: function(*jax.tree.leaves(scene), t, q, u, inputs)
 
-    values, level = of_state("qdot", "omega", "force", "torque", "direct", "mass", "inertia", "events"), of_state("v", "omega", "phi")
+    values, level = of_state("qdot", "omega", "force", "torque", "direct", "mass", "inertia", "events", "slip_turns"), of_state("v", "omega", "phi")
 
     def slopes(scene, t, q, u, inputs, *along):
         return jax.jvp(lambda *state: level(scene, *state, inputs), (t, q, u), along)
@@ -66,14 +66,14 @@ def _rates(functions: tuple[Callable, Callable], structure: Structure, independe
     if dependent.size:  # A (u - y) = -phi(y)
         A_z = A[:, :, dependent]
         u[:, dependent] = -shortest(A_z, phi[:, 0, kept], typical_lengths(np.linalg.norm(A_z, axis=2)))
-    qdot, omega, force, torque, direct, m, I, events = values(parameters, t, q, u, inputs)
+    qdot, omega, force, torque, direct, m, I, events, turns = values(parameters, t, q, u, inputs)
     # in as many lanes as above, so that JAX traces this once
     a, alpha, drift = (x[:, 0] for x in parted(slopes(*lanes(parameters, t, q, u, inputs, np.ones(states), qdot, np.zeros_like(u))))[1])
     turned = lambda x: np.einsum("sbij,sbj->sbi", I, x)  # noqa: E731
     force, torque = force - m[..., None] * a, torque - turned(alpha) - np.cross(omega, turned(omega))
     f = np.einsum("sbik,sbi->sk", beta, force) + np.einsum("sbik,sbi->sk", gamma, torque) + direct
     udot = accelerations(mass_matrix(m, I, beta, gamma), f, A, drift[:, kept], structure.row_lengths[kept], structure.rank)
-    return qdot, udot[:, list(independent)], events
+    return np.append(qdot[:, : q.shape[1] - turns.shape[1]], turns, axis=1), udot[:, list(independent)], events
 
 
 def accelerations(M, f, A, drift, row_lengths: np.ndarray, rank: int) -> np.ndarray:

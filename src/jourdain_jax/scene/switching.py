@@ -4,7 +4,7 @@ Which contacts have friction is a fact of structure, found when a scene is made,
 
     mode `rim`                                     flies, rolls, slips, creeps
     events `rim normal`, `rim tangent`, `rim speed`
-    coordinates `rim_slip_1`, `rim_slip_2`         the direction of slip while it creeps: constant between events
+    coordinates `rim_slip_1`, `rim_slip_2`         the direction of slip, zero where it does not slip
 
 The mechanics of it: `equations/switching.py`.
 """

@@ -19,7 +19,7 @@ from jourdain_jax.equations.reductions import Partition, Privileged, Reduced
 from jourdain_jax.equations.rows import UsualRows, velocity_residual
 from jourdain_jax.equations.scaling import scaled, speed_scale
 from jourdain_jax.equations.switching import At, put_back
-from jourdain_jax.equations.virtual_power import mass_matrix_at
+from jourdain_jax.equations.virtual_power import coordinate_rates_in_modes, mass_matrix_at
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField, Watched
 from jourdain_jax.scene.identity import with_reference_parameters
 from jourdain_jax.scene.motion_state import Motion
@@ -137,7 +137,7 @@ class MinimalByMatrices(ByMatrices):
         own = isinstance(self.reduction, Privileged) and self.reduction.independent == self.independent and self.stabilisation is None
         motion, found = accelerations_of(scene, known, t, y.q, inputs) if own else self.solved(scene, t, y.q, known.u, inputs)[:2]
         v = found.udot[jnp.array(self.independent, jnp.int32)]
-        rates = Integrated(motion.qdot.array, v, self.power(scene, motion, found))
+        rates = Integrated(coordinate_rates_in_modes(scene, motion), v, self.power(scene, motion, found))
         return self.watched(scene, t, y, rates, known.split.orientation()[None], jnp.zeros((0, len(known.u))))
 
     def _kinematics(self, scene: Scene, t, y: Integrated, inputs) -> MinimalKinematics:
@@ -183,7 +183,7 @@ class FullByMatrices(ByMatrices):
     def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Watched:
         """Return `rates`, eliminated rows, and 1 where the rows decide on which branch the motion continues, -1 where round-off does."""
         motion, found, directions = self.solved(scene, t, y.q, y.v, inputs)
-        rates = Integrated(motion.qdot.array, found.udot, self.power(scene, motion, found))
+        rates = Integrated(coordinate_rates_in_modes(scene, motion), found.udot, self.power(scene, motion, found))
         branch = jnp.zeros(0) if self.undecided is None else jnp.where(found.pivot > self.undecided, 1.0, -1.0)[None]
         watched = self.watched(scene, t, y, rates, branch.astype(y.q.dtype), directions)
         return watched._replace(sine=found.pivot) if self.near_rank_loss else watched
