@@ -29,10 +29,9 @@ LAYERS = ("equations", "dynamics", "motion", "analysis", "ensembles", "models", 
 
 # What takes longest, longest first: started last, one of these would keep one worker busy while the others have nothing to do.
 LONGEST = """
-linearize identify result_codes load_jumps events mutants native_mutants native_second sensors native feasible_starts lowering study_faults diffrax
-rank_of_vanishing_rows malformed_inputs crossings every_model inputs names_read extremes simulate discs_and_chains integrability call_costs report
-bench fit_report inertia what_probes_do_not_show bicycle studies power
-rows_lost_at_rest float32 storage_faults multiple_shooting exported
+modes friction mutants identify linearize malformed_inputs periodic types native_mutants inertia gpu sensors result_codes plain_numbers study_faults
+load_jumps inputs events feasible_starts native simulate whipple_bicycle crossings studies lowering discs_and_chains labelled stiff float32
+derivatives_of_failed diffrax build fit_report quality native_derivatives native_second traced_parameters extremes report
 """
 
 
