@@ -150,6 +150,109 @@ def test_a_ball_slips_and_lifts_off_a_sphere():
     np.testing.assert_allclose(jax.jacfwd(lambda friction: phases(friction).ts)(0.5)[2], 0.019794092885, rtol=1e-9)
 
 
+class DoublePendulum(jj.Scene):
+    """Two rods of 1 m and 1 kg in a plane; the lower end strikes a floor."""
+
+    coordinates = jj.coordinates("a b")
+    impact = "moreau"
+
+    def bodies(self, t, q):
+        def along(angle):
+            return jnp.stack([jnp.sin(angle), 0.0 * angle, -jnp.cos(angle)])
+
+        def turned(angle):
+            x, z = jnp.cos(angle), jnp.sin(angle)
+            return jnp.stack([jnp.stack([x, 0.0 * x, -z]), jnp.array([0.0, 1.0, 0.0]), jnp.stack([z, 0.0 * x, x])])
+
+        inertia = jnp.diag(jnp.array([1.0, 1.0, 0.0])) / 12
+        return {
+            "upper": jj.RigidBody(1.0, inertia, along(q.a) / 2, turned(q.a)),
+            "lower": jj.RigidBody(1.0, inertia, along(q.a) + along(q.b) / 2, turned(q.b)),
+        }
+
+    def contacts(self, pose):
+        lower = pose["lower"]
+        floor = jj.Plane(origin=(0.0, 0.0, -np.cos(0.95) - np.cos(0.64)))
+        return {"floor": jj.Contact(lower, lower.place((0.0, 0.0, -0.5)), floor, "row", friction=0.5, restitution=0.7, impact=self.impact)}
+
+
+@pytest.mark.parametrize(
+    ("law", "rates", "gained"),
+    [
+        ("newton", (0.915089365149, 0.716488935267), -0.392783723957),
+        ("poisson", (0.018640150251, 0.575598620974), -1.288242066472),
+        ("energetic", (0.206481769471, 0.605120722538), -1.199854588715),
+    ],
+)
+def test_impacts_along_the_impulse(law, rates, gained):
+    scene = type("Law", (DoublePendulum,), {"impact": law})()
+    motion = jj.simulate(scene, {"a": 0.95, "b": 0.64, "a_rate": -0.26, "b_rate": -2.45}, ts=[1e-9, 1e-2], **FINE)
+    np.testing.assert_allclose(motion.u[0], rates, rtol=1e-7)
+    np.testing.assert_allclose(motion.energies().kinetic - 1.3488015753419331, gained, rtol=1e-10)
+
+
+def test_an_impact_that_would_gain_energy_has_a_code():
+    """By Newton's restitution and Coulomb's law on the slip afterwards the pendulum would gain 2.13 J (Kane's paradox)."""
+    start = {"a": 0.95, "b": 0.64, "a_rate": -0.26, "b_rate": -2.45}
+    back = {"a": 0.95 + 0.26e-3, "b": 0.64 + 2.45e-3}
+    struck = jj.simulate(DoublePendulum(), start | back, t1=0.1)
+    assert "would gain energy" in str(struck)
+    at_once = jj.simulate(DoublePendulum(), start, t1=0.1)
+    assert "Coulomb's law has no answer" in str(at_once)
+
+
+def test_impacts_where_slip_turns_have_a_code_along_the_impulse():
+    class Coin(Ball):
+        def contacts(self, pose):
+            return {"rim": jj.disc_contact(pose["ball"], self.radius, height="row", friction=0.2, impact="energetic")}
+
+    attitude = np.array([1.0, 0.2, 0.3, 0.1]) / np.sqrt(1.14)
+    motion = jj.simulate(Coin(), {"z": 0.05, "x_rate": 0.3, "attitude": attitude, "attitude_omega": (1.0, 9.0, 3.0)}, t1=0.5)
+    assert "slip turns during an impact" in str(motion)
+
+
+@pytest.mark.parametrize("law", ["moreau", "energetic"])
+def test_a_ball_bounces_with_spin(law):
+    """v (2, -3) m/s, spin -10 rad/s: it grips where mu = 0.5."""
+
+    class Spinning(Ball):
+        def contacts(self, pose):
+            return {"floor": jj.ball_contact(pose["ball"], self.radius, height="row", friction=self.friction, restitution=0.8, impact=law)}
+
+    for friction, speed, spin in ((0.05, 1.73, 3.5), (0.5, 1.28571428571428571, 25.7142857142857143)):
+        scene = Spinning(mass=1.0, radius=0.05, friction=friction, g=0.0)
+        motion = jj.simulate(scene, {"z": 0.05, "x_rate": 2.0, "z_rate": -3.0, "attitude_omega_y": -10.0}, ts=[0.1])
+        np.testing.assert_allclose([motion[name][0] for name in ("x_rate", "z_rate", "attitude_omega_y")], [speed, 2.4, spin], rtol=1e-12)
+
+
+class Rod(jj.Scene):
+    """A rod in a plane, whose lower end touches the floor."""
+
+    friction: float = jj.parameter(1.0)
+    coordinates = jj.coordinates("x z a")
+
+    def bodies(self, t, q):
+        x, z = jnp.cos(q.a), jnp.sin(q.a)
+        turned = jnp.stack([jnp.stack([x, 0.0 * x, -z]), jnp.array([0.0, 1.0, 0.0]), jnp.stack([z, 0.0 * x, x])])
+        return {"rod": jj.RigidBody(1.0, jnp.diag(jnp.array([0.0, 1.0, 1.0])) / 12, jnp.stack([q.x, 0.0 * q.x, q.z]), turned)}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, G),)
+
+    def contacts(self, pose):
+        return {"end": jj.Contact(pose["rod"], pose["rod"].place((-0.5, 0.0, 0.0)), height="row", friction=self.friction)}
+
+
+def test_coulombs_law_has_no_answer_for_a_rod():
+    """Painleve: where mu >= (1 + 3 cos^2 a)/(3 sin a cos a), for slip towards the rod's foot."""
+    most = (1 + 3 * np.cos(1.0) ** 2) / (3 * np.sin(1.0) * np.cos(1.0))
+    np.testing.assert_allclose(most, 1.375259396131)
+    start = {"a": 1.0, "z": 0.5 * np.sin(1.0)}
+    for speed, friction, right in ((-1.0, 0.9995 * most, True), (-1.0, 1.0005 * most, False), (1.0, 2 * most, True)):
+        motion = jj.simulate(Rod(friction), start | {"x_rate": speed}, ts=[1e-3])
+        assert (motion.result == 0) == right
+
+
 class Hoop(jj.Scene):
     """A hoop in a plane with a heavy bead on its rim."""
 

@@ -15,13 +15,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.reals import Flag, Scalar
 
 NEWTON_STEPS = 6
 SLOW = 5e-6  # m/s: below, the direction of slip turns as it does at this speed
 ROUND_OFF = 1e-9  # of responses
+LEAST_SLIP = 1e-8  # m/s: round-off, of speeds that impulses change
 LEAST_PIVOT = 1e-12  # beside the entry that it is what is left of
 
 
@@ -33,11 +34,7 @@ class Law(NamedTuple):
     sticks: Flag
     opens: Flag  # whether it would have to pull
     direction: Float[Array, "2"]  # of slip
-
-    @property
-    def forces(self) -> Float[Array, "3"]:
-        """The forces that the law chooses."""
-        return jnp.where(self.sticks, self.sticking, self.slipping)
+    exists: Flag  # whether it has an answer
 
 
 def solved(K: Sequence[Float[Array, "n"]], right: Sequence[Float[Array, "columns"]], sizes: Sequence[Scalar] | None = None) -> list[Float[Array, "columns"]]:
@@ -126,4 +123,69 @@ def coulomb(G: Float[Array, "3 3"], b: Float[Array, "3"], target: Scalar, fricti
 
     (forces, e, lawful), (other, turned, instead) = slipping(against), slipping(-against)
     forces, e = jnp.where(lawful, forces, jnp.where(instead, other, jnp.nan)), jnp.where(lawful | ~instead, e, turned)
-    return Law(sticking, forces, (bound >= 0) & (across <= bound * bound), c < 0, e)
+    sticks = (bound >= 0) & (across <= bound * bound)
+    return Law(sticking, forces, sticks, c < 0, e, sticks | lawful | instead)
+
+
+def moves(w: Float[Array, "*contacts 3"], least: float) -> Bool[Array, "*contacts"]:
+    """Whether slip is faster than so much."""
+    return jnp.sum(w[..., 1:] ** 2, axis=-1) > least**2
+
+
+class Impulse(NamedTuple):
+    """What a contact that strikes gets."""
+
+    P: Float[Array, "3"]  # N s
+    slips: Flag  # then
+    exists: Flag  # whether the law has an answer
+
+
+def impulse(kind: str, G: Float[Array, "3 3"], w: Float[Array, "3"], restitution: Scalar, friction: Scalar, sizes: Float[Array, "3"]) -> Impulse:
+    """Return the impulse at a contact that strikes with the speeds w.
+
+    moreau:  w_n+ = -e w_n, Coulomb's law on the slip afterwards
+    others:  along the normal impulse s, dw/ds = G (1, -mu e_t), e_t along w_t; where slip has stopped it sticks, or slips along the limit direction.
+             newton: until w_n+ = -e w_n;   poisson: until s = (1 + e) s_c;   energetic: until W_r = -e^2 W_c
+
+    c: of compression, which ends at w_n = 0; W: work of the normal impulse, in compression and restitution. In pieces along which w changes linearly: no
+    numbers where slip would turn. Source: W. J. Stronge, Impact Mechanics (2000).
+    """
+    if kind == "moreau":
+        law = coulomb(G, w, -restitution * w[0], friction, friction, sizes)
+        slips = ~law.sticks & moves(w + G @ law.slipping, LEAST_SLIP)
+        return Impulse(jnp.where(slips, law.slipping, law.sticking), slips, law.exists)
+    at_rest = coulomb(G, jnp.array([-1.0, 0.0, 0.0]), jnp.zeros_like(friction), friction, friction, sizes)  # for w_n to rise by one
+    by_stop = jnp.where(at_rest.sticks, at_rest.sticking, at_rest.slipping)
+    then = 1 / by_stop[0]  # slope of w_n once slip has stopped
+    moving = moves(w, LEAST_SLIP)
+    e = w[1:] / jnp.sqrt(jnp.where(moving, w[1:] @ w[1:], 1.0))
+    slides = jnp.append(jnp.ones_like(friction), -friction * e)
+    rates = G @ slides
+    first, slowing = rates[0], -(e @ rates[1:])
+    stops = jnp.where(moving, jnp.where(slowing > 0, e @ w[1:] / jnp.where(slowing > 0, slowing, 1.0), jnp.inf), 0.0)
+    stop_w = w[0] + first * jnp.where(jnp.isfinite(stops), stops, 0.0)  # w_n as slip stops
+
+    def reached(goal: Scalar) -> Scalar:
+        """The normal impulse at which w_n reaches a value."""
+        early = moving & (first > 0) & ((goal <= stop_w) | ~jnp.isfinite(stops))
+        return jnp.where(early, (goal - w[0]) / jnp.where(first > 0, first, 1.0), jnp.where(early, 0.0, stops) + (goal - stop_w) / then)
+
+    compressed = reached(jnp.zeros_like(w[0]))
+    within = compressed < stops  # compression ends while it slips
+    rise = jnp.where(within, first, 1.0)
+    if kind == "newton":
+        total = reached(-restitution * w[0])
+    elif kind == "poisson":
+        total = (1 + restitution) * compressed
+    else:
+        work = jnp.where(within, w[0] ** 2 / (2 * rise), -(w[0] + stop_w) * jnp.where(within, 0.0, stops) / 2 + stop_w**2 / (2 * then))
+        one = restitution * jnp.sqrt(2 * jnp.where(within, rise, then) * work)  # were it one piece
+        rest = restitution**2 * work - stop_w**2 / (2 * rise)
+        two = within & jnp.isfinite(stops) & (rest > 0)
+        total = reached(jnp.where(two, jnp.sqrt(jnp.where(two, stop_w**2 + 2 * then * rest, 1.0)), one))
+    sliding = jnp.minimum(total, stops)
+    goes_on = total > stops
+    P = sliding * slides + jnp.where(goes_on, (total - sliding) * then * by_stop, 0.0)
+    turned = jnp.where(moving, jnp.abs(e[0] * rates[2] - e[1] * rates[1]) * sliding, 0.0)
+    slips = (~goes_on | ~at_rest.sticks) & moves(w + G @ P, LEAST_SLIP)
+    return Impulse(jnp.where(turned < LEAST_SLIP, P, jnp.nan), slips, at_rest.exists | ~goes_on)

@@ -5,7 +5,7 @@
     ends        normal                       tangent                      speed
     flies       gap
     rolls       L_n                          (mu_s L_n)^2 - |L_t|^2
-    slips       L_n                          e.w_t - s
+    slips       L_n                          e.w_t - s                    (G_nn - mu G_nt.e)/G_nn, which vanishes at Painleve's paradox
     creeps      L_n                          e.w_t                        2 s - e.w_t
 
 The direction of slip is a number of the state with the rate `n (n.dw_t)/(e.w_t)`, n = J e: errors of w_t across it do not turn it (`slip_turns`). It has no
@@ -21,20 +21,20 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Flag, Scalar, Speeds
-from jourdain_jax.equations.contact_laws import SLOW, Modes, coulomb, responses, solved
+from jourdain_jax.equations.contact_laws import LEAST_SLIP, ROUND_OFF, SLOW, Impulse, Modes, coulomb, impulse, moves, responses, solved
 from jourdain_jax.equations.contact_rows import switching_contacts
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.virtual_power import ContactResponse, contact_modes, contact_response, friction_of, switching_forces
 from jourdain_jax.scene.modes import Event
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.switching import CREEPS, FLIES, ROLLS, SLIPS
+from jourdain_jax.scene.switching import CREEPS, FLIES, GAINS_ENERGY, PAINLEVE, ROLLS, SLIPS, UNDECIDED
 
 LEAST_REBOUND = 1e-6  # m/s: a contact that would rebound with less is closed
-LEAST_CHANGE = 1e-8  # m/s: an impulse that changes speeds by less is round-off
+NEARLY = 1e-4  # of the response of the ground that is left near Painleve's paradox
 STOPS = 1e-13  # m/s against its direction end a slip: round-off where slip begins does not
 TOUCHES = 1e-8  # m: a gap that counts as none at the start
 
@@ -94,7 +94,7 @@ def contact_events(at: At) -> dict[str, Scalar]:
         events[f"{name} normal"] = jnp.where(number == FLIES, at.found.rows.gap[i], normal)
         while_closed = along - jnp.where(number == SLIPS, SLOW, -STOPS)
         events[f"{name} tangent"] = jnp.where(number == FLIES, one, jnp.where(number == ROLLS, bound * bound - tangential @ tangential, while_closed))
-        events[f"{name} speed"] = jnp.where(number == CREEPS, 2 * SLOW - along, one)
+        events[f"{name} speed"] = jnp.where(number == CREEPS, 2 * SLOW - along, jnp.where(number == SLIPS, _bearing(at, i) - NEARLY, one))
     return events
 
 
@@ -109,14 +109,15 @@ def contact_changes(at: At) -> dict[str, Event]:
         # the law at rest, from where slip begins, says the direction of slip also where round-off would let it stick
         e = jnp.where(number == SLIPS, at.modes.direction[i], after.direction)
         events[f"{name} tangent"] = _event(after, stops, CREEPS, e)
-        events[f"{name} speed"] = _event(after, jnp.asarray(False), SLIPS, at.modes.direction[i], _speeds_on_rows(at, at.number.at[i].set(float(SLIPS))))
+        faster = jnp.where(number == CREEPS, float(SLIPS), float(PAINLEVE))
+        events[f"{name} speed"] = _event(after, jnp.asarray(False), faster, at.modes.direction[i], _speeds_on_rows(at, at.number.at[i].set(float(SLIPS))))
     return events
 
 
-def _event(after: "After", jumps: Flag, mode: int, e: Float[Array, "2"], u: Speeds | None = None) -> Event:
+def _event(after: "After", jumps: Flag, mode: Scalar | int, e: Float[Array, "2"], u: Speeds | None = None) -> Event:
     """Where speeds jump all modes are those `after` it, otherwise the contact's own becomes this one."""
     at, i, names = after.at, after.i, after.at.scene.switching.contacts
-    numbers = jnp.where(jumps, after.numbers, at.number.at[i].set(float(mode)))
+    numbers = jnp.where(jumps, after.numbers, at.number.at[i].set(mode))
     u, e = jnp.where(jumps, after.u, at.motion.u.array if u is None else u), jnp.where(jumps, after.e, at.modes.direction.at[i].set(e))
     e = jnp.where((numbers >= SLIPS)[:, None], e, 0.0)
     directions = {f"{name}_slip_{k}": e[j, k - 1] for j, name in enumerate(names) for k in (1, 2)}
@@ -124,48 +125,58 @@ def _event(after: "After", jumps: Flag, mode: int, e: Float[Array, "2"], u: Spee
     return Event(jnp.ones_like(at.motion.t), to=dict(zip(names, numbers, strict=True)), jump=jump)
 
 
+def _bearing(at: At, i: int) -> Scalar:
+    """Return how much of the ground's response along the normal is left while contact i slips."""
+    own = at.alone(i, at.found.b)
+    return 1 - at.friction[i] * (own.G[0, 1:] @ at.modes.direction[i]) / own.G[0, 0]
+
+
 class After:
     """Speeds, modes and direction of slip where contact i closes: after an impact if it `strikes`, otherwise as its slip stops or is about to begin.
 
-    Other contacts that are closed take part: one that would pull opens, and one that would hold with more than its friction slips. Speeds are no numbers
-    where that does not come out.
+    Other contacts that are closed take part: one that would pull opens, and one that would hold with more than its friction slips. Where that does not come
+    out, where an impact would gain energy, or has no answer, the mode is a negative number that says why.
     """
 
     def __init__(self, at: At, i: int, strikes: Flag):
         self.at, self.i = at, i
         scene, motion, friction = at.scene, at.motion, at.friction[i]
         contact = list(switching_contacts(scene, motion.pose()).values())[i]
-        rebound = -jnp.asarray(contact.restitution) * at.w[i, 0]
-        rebounds = strikes & (rebound > LEAST_REBOUND)
-        goal = jnp.where(rebounds, rebound, 0.0)
+        rebounds = strikes & (-jnp.asarray(contact.restitution) * at.w[i, 0] > LEAST_REBOUND)
+        restitution = jnp.where(rebounds, contact.restitution, 0.0)
 
-        def impulses(modes: Modes) -> tuple[Flag, Float[Array, "contacts 3"]]:
+        def impulses(modes: Modes) -> tuple[Impulse, Float[Array, "contacts 3"]]:
             own = at.alone(i, at.found.rows.w, modes)
-            law = coulomb(own.G, own.b, goal, friction, friction, own.sizes)
-            slips = strikes & ~law.sticks & _moves(own.b + own.G @ law.slipping, LEAST_CHANGE)
-            return slips, own.every(i, jnp.where(slips, law.slipping, law.sticking)).reshape(-1, 3)
+            struck = impulse(contact.impact, own.G, own.b, restitution, friction, own.sizes)
+            sticking = jnp.concatenate(solved(list(own.G), list(-own.b[:, None]), list(own.sizes)))
+            return struck, own.every(i, jnp.where(strikes, struck.P, sticking)).reshape(-1, 3)
 
         modes = at.modes
-        slips, P = impulses(modes)
+        struck, P = impulses(modes)
         right = jnp.asarray(True)
         if len(at.number) > 1:
             modes = _yielding(at, i, modes, P)
-            slips, P = impulses(modes)
+            struck, P = impulses(modes)
             right = _is_lawful(at, i, modes, P)
         jumps = at.number[i] != ROLLS  # otherwise nothing strikes or stops
-        self.u = jnp.where(right | ~jumps, motion.u.array + jnp.where(jumps, at.found.impulses @ P.ravel(), 0.0), jnp.nan)
         w = (at.found.rows.w + at.found.G @ P.ravel()).reshape(-1, 3)
-        slipping = jnp.where(_moves(w, SLOW), float(SLIPS), float(CREEPS))
-        moves = _moves(w, LEAST_CHANGE)
-        others = jnp.where(modes.closed == 0, float(FLIES), jnp.where(moves & (modes.rolls == 0), slipping, float(ROLLS)))
+        gained = 0.5 * P.ravel() @ (at.found.rows.w + w.ravel())
+        self.u = motion.u.array + jnp.where(jumps & jnp.isfinite(gained), at.found.impulses @ P.ravel(), 0.0)
+        slipping = jnp.where(moves(w, SLOW), float(SLIPS), float(CREEPS))
+        slides = moves(w, LEAST_SLIP)
+        others = jnp.where(modes.closed == 0, float(FLIES), jnp.where(slides & (modes.rolls == 0), slipping, float(ROLLS)))
         numbers = jnp.where(jumps, others, at.number)
         then = At(scene, _switched(scene, motion, numbers, motion.q.array, self.u), None, at.responses)
         own = then.alone(i, then.found.b)
         rest = coulomb(own.G, own.b, jnp.zeros_like(friction), friction, at.static[i], own.sizes)
         self.direction = rest.direction
         settled = jnp.where(rest.opens, float(FLIES), jnp.where(rest.sticks, float(ROLLS), float(CREEPS)))
-        self.numbers = numbers.at[i].set(jnp.where(rebounds, float(FLIES), jnp.where(slips, slipping[i], settled)))
-        self.e = jnp.where(moves[:, None], _along(w[:, 1:]), modes.direction.at[i].set(self.direction))
+        self.numbers = numbers.at[i].set(jnp.where(rebounds, float(FLIES), jnp.where(strikes & struck.slips, slipping[i], settled)))
+        most = ROUND_OFF * jnp.abs(P.ravel() @ at.found.rows.w)
+        has_law = jnp.where(strikes, struck.exists, True) & (rebounds | rest.exists)
+        for lawful, fault in ((has_law, PAINLEVE), (~(gained > most), GAINS_ENERGY), (right & jnp.isfinite(gained), UNDECIDED)):
+            self.numbers = self.numbers.at[i].set(jnp.where(lawful | (~jumps & (fault != PAINLEVE)), self.numbers[i], float(fault)))
+        self.e = jnp.where(slides[:, None], _along(w[:, 1:]), modes.direction.at[i].set(self.direction))
 
 
 def _excess(at: At, P: Float[Array, "contacts 3"]) -> tuple[Float[Array, "contacts"], Float[Array, "contacts"]]:
@@ -179,7 +190,7 @@ def _excess(at: At, P: Float[Array, "contacts 3"]) -> tuple[Float[Array, "contac
 def _yielding(at: At, i: int, modes: Modes, P: Float[Array, "contacts 3"]) -> Modes:
     """Return the modes of the others in an impact of contact i: open where they would pull, slipping where they would hold more than friction does."""
     pulled, exceeded = _excess(at, P)
-    pulls, gives = (modes.closed > 0) & (pulled > LEAST_CHANGE), (modes.rolls > 0) & (exceeded > LEAST_CHANGE)
+    pulls, gives = (modes.closed > 0) & (pulled > LEAST_SLIP), (modes.rolls > 0) & (exceeded > LEAST_SLIP)
     e = -P[:, 1:] / jnp.sqrt(jnp.where(gives, jnp.sum(P[:, 1:] ** 2, axis=1), 1.0))[:, None]
     closed, rolls = jnp.where(pulls, 0.0, modes.closed), jnp.where(pulls | gives, 0.0, modes.rolls)
     return Modes(closed.at[i].set(1.0), rolls, jnp.where(gives[:, None], e, modes.direction))
@@ -190,10 +201,10 @@ def _is_lawful(at: At, i: int, modes: Modes, P: Float[Array, "contacts 3"]) -> F
     w, (pulled, exceeded) = (at.found.rows.w + at.found.G @ P.ravel()).reshape(-1, 3), _excess(at, P)
     e, closed = modes.direction, modes.closed > 0
     along, aside = jnp.sum(w[:, 1:] * e, axis=1), w[:, 1] * e[:, 1] - w[:, 2] * e[:, 0]
-    slips = closed & (modes.rolls == 0) & (pulled < -LEAST_CHANGE)
-    against = slips & ((along < -LEAST_CHANGE) | (jnp.abs(aside) > LEAST_CHANGE + 1e-6 * jnp.abs(along)))
-    wrong = closed & ((pulled > LEAST_CHANGE) | ((modes.rolls > 0) & (exceeded > LEAST_CHANGE)) | against)
-    into = (at.number != FLIES) & (w[:, 0] < -LEAST_CHANGE)
+    slips = closed & (modes.rolls == 0) & (pulled < -LEAST_SLIP)
+    against = slips & ((along < -LEAST_SLIP) | (jnp.abs(aside) > LEAST_SLIP + 1e-6 * jnp.abs(along)))
+    wrong = closed & ((pulled > LEAST_SLIP) | ((modes.rolls > 0) & (exceeded > LEAST_SLIP)) | against)
+    into = (at.number != FLIES) & (w[:, 0] < -LEAST_SLIP)
     return ~jnp.any((wrong | into).at[i].set(False))
 
 
@@ -235,16 +246,11 @@ def _along(x: Float[Array, "*contacts 2"]) -> Float[Array, "*contacts 2"]:
     return x / jnp.sqrt(jnp.where(square > 0, square, 1.0))
 
 
-def _moves(w: Float[Array, "*contacts 3"], least: float) -> Bool[Array, "*contacts"]:
-    """Whether slip is faster than so much."""
-    return jnp.sum(w[..., 1:] ** 2, axis=-1) > least**2
-
-
 class Begun(NamedTuple):
     """Contacts at the start of a motion."""
 
     numbers: Float[Array, "contacts"]  # of their modes
-    below: Scalar  # m, how far a body is below its ground
+    below: Scalar  # m, how far a body is below its ground; infinite where contacts have no answer
     q: Float[Array, "coordinates"]  # on the ground where they touch it
     u: Speeds  # after an impact where they strike it
 
@@ -255,7 +261,7 @@ def contacts_at_start(at: At) -> Begun:
     touches = gap < TOUCHES
     strikes = touches & (w[:, 0] < -LEAST_REBOUND)
     closed = touches & (jnp.abs(w[:, 0]) <= LEAST_REBOUND)
-    slips = _moves(w, SLOW)
+    slips = moves(w, SLOW)
     numbers = jnp.where(closed, jnp.where(slips, float(SLIPS), float(ROLLS)), float(FLIES))
     e = jnp.where((closed & slips)[:, None], _along(w[:, 1:]), 0.0)
     q = jnp.append(motion.q.array[: -e.size], e)
@@ -267,7 +273,10 @@ def contacts_at_start(at: At) -> Begun:
         u = jnp.where(strikes[i], after.u, u)
         e = jnp.where(strikes[i], after.e, jnp.where(settles, e.at[i].set(after.direction), e))
         q = jnp.append(q[: -e.size], jnp.where((numbers >= SLIPS)[:, None], e, 0.0))
-    return Begun(numbers, jnp.max(-gap, initial=0.0), q, u)
+    then = At(scene, _switched(scene, motion, numbers, q, u), None, at.responses)
+    bears = jnp.stack([(number != SLIPS) | (_bearing(then, i) > NEARLY) for i, number in enumerate(numbers)])
+    below = jnp.where(jnp.all(bears & (numbers >= FLIES)), jnp.max(-gap, initial=0.0), jnp.inf)
+    return Begun(numbers, below, q, u)
 
 
 def _switched(scene: Scene, motion: Motion, numbers: Float[Array, "contacts"], q, u) -> Motion:

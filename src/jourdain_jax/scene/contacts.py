@@ -18,6 +18,7 @@ from jourdain_jax.scene.grounds import Ground, Plane
 from jourdain_jax.scene.motion_state import BodyPose
 
 _HEIGHTS = ("coordinates", "row")
+IMPACTS = ("moreau", "newton", "poisson", "energetic")
 
 
 class Coulomb(eqx.Module):
@@ -36,6 +37,7 @@ class Slipping(TypedDict, total=False):
 
     friction: Parameter | Coulomb | None
     restitution: Parameter
+    impact: str
 
 
 class Contact(eqx.Module):
@@ -65,6 +67,7 @@ class Contact(eqx.Module):
     ground: Ground | None  # what it rolls on, for pictures; None: the plane
     friction: Coulomb | None  # None: it rolls, whatever friction that needs
     restitution: Scalar | None
+    impact: str = eqx.field(static=True)
 
     def __init__(
         self, body, point, plane=None, height="coordinates", carried=None, distance=None, *, shape=None, ground=None, **slips: Unpack[Slipping]
@@ -87,7 +90,7 @@ class Contact(eqx.Module):
         self.carried = _checked_carried(carried, self.body)
         self.distance = None if distance is None else checked_real(distance, f"distance of the contact of `{self.body}`", ())
         self.shape, self.ground = shape, ground
-        self.friction, self.restitution = _slipping(self.body, height, **slips)
+        self.friction, self.restitution, self.impact = _slipping(self.body, height, **slips)
 
     def gap(self) -> Scalar:
         """Signed distance of the contact point from the ground, m."""
@@ -113,7 +116,10 @@ def ball_contact(body: BodyPose, radius: Any, **options: Unpack[Rolling]) -> Con
     - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all), for the normal force where
       `height="coordinates"`.
     - `friction`: Coulomb's coefficient, or a `jj.Coulomb(sliding, static)`. With it the contact flies, rolls or slips (`motion.phase`), and needs
-      `height="row"`; None (default): it rolls, whatever friction that needs. `restitution` e, from 0 (default) to 1: Newton's, of impacts.
+      `height="row"`; None (default): it rolls, whatever friction that needs. `restitution` e, from 0 (default) to 1, of impacts.
+    - `impact`: "moreau" (default): w_n+ = -e w_n, and Coulomb's law on the slip afterwards. Along the normal impulse, with friction against the slip of
+      each moment: "newton", until w_n+ = -e w_n; "poisson", until the impulse of restitution is e times that of compression; "energetic", until its work is
+      -e^2 times. These three are for balls and for slip that keeps its direction, as in a plane: a result code where it would turn.
 
     Two velocity rows (m/s), along the ground's tangents. ValueError for an unknown height or a length that is not positive; for a ball that does
     not fit into the cylinder or sphere, where its scene is built.
@@ -192,16 +198,18 @@ def _checked_ground(given, body: str) -> Ground:
     return given
 
 
-def _slipping(body: str, height: str, friction=None, restitution=0.0) -> tuple[Coulomb | None, Scalar | None]:
+def _slipping(body: str, height: str, friction=None, restitution=0.0, impact="moreau") -> tuple[Coulomb | None, Scalar | None, str]:
+    if impact not in IMPACTS:
+        raise ValueError(f"`impact` of the contact of `{body}` is {described(impact)}, expected one of {', '.join(IMPACTS)}")
     if friction is None:
-        return None, None
+        return None, None, impact
     if height != "row":
         raise ValueError(
             f'the contact of `{body}` has friction, and `height="coordinates"`, by which it cannot leave the ground; '
             'give the body coordinates of its own for its height, and write height="row"'
         )
     law = friction if isinstance(friction, Coulomb) else Coulomb(checked_real(friction, f"friction of the contact of `{body}`", ()))
-    return law, checked_real(restitution, f"restitution of the contact of `{body}`", ())
+    return law, checked_real(restitution, f"restitution of the contact of `{body}`", ()), impact
 
 
 def _checked_height(height: str) -> str:

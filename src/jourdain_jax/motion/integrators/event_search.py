@@ -330,7 +330,8 @@ def monitored(
         w.if_any(goes, lambda: pass_event(w, form, p, y1, passing, stuck))
         passed = p["passed"] + w.where(goes, 1.0, 0.0)
         too_many = at_once | (w.load(stuck) > 0.0) | (passed > float(form.transitions))
-        changed["code"] = w.where(goes, w.where(too_many, results.TOO_MANY_TRANSITIONS, RUNNING), changed["code"])
+        why = w.where(w.load(stuck) > 1.0, w.load(stuck) + float(results.IMPACT_GAINS_ENERGY - 2), results.TOO_MANY_TRANSITIONS)
+        changed["code"] = w.where(goes, w.where(too_many, why, RUNNING), changed["code"])
         changed |= {"passed": passed, "begun": w.where(goes, changed["accepted"] + changed["rejected"], p["begun"])}
         changed["event"] = w.where(goes, -1.0, changed["event"])
     if form.moving:

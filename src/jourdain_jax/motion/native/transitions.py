@@ -158,7 +158,7 @@ class Happened(NamedTuple):
 def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happened, stuck: Number) -> None:
     """Put the state after an event into `y1`; note the event, and what was before.
 
-    `stuck` becomes 1 where the event's value rises afterwards, but so slowly that round-off hides it.
+    `stuck` becomes 1 where the event's value rises afterwards, but so slowly that round-off hides it, and 1 - m where a mode is m < 0: no motion follows.
     """
     event, t, flat, switches, noise, found = happened
     rows, of, count = form.rows, form.rows_of_transition, form.integrated
@@ -198,6 +198,9 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
         left_now = switches & is_left(w, c, rate, noise)
         disarmed.append(w.where(left_now | (this & rises), 0.0, w.where(this, 1.0, old)))
     p.put("disarmed", disarmed)
+    for i in range(len(form.switched)):
+        mode = w.load(modes, i)
+        w.store(w.where(switches & (mode < 0.0), w.number(1.0) - mode, w.load(stuck)), stuck)
     if form.relations:
         now = w.room(len(form.watched))
         w.run("relations", p.pointer, t, y1, now)

@@ -5,7 +5,7 @@ Codes up to `EVENT` are those of motions that reached the end of their span, or 
 
 SUCCESS, EVENT, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, INCONSISTENT_START, SINGULAR_PARTITION, BAD_PARAMETER, BAD_START, UNSOLVED_STEP = range(10)
 SHRANK, STIFF, OFF_CONSTRAINTS, BAD_TIMES, ENERGY_LOST, PROCESS_DIED, CONTRADICTORY_ROWS, UNRESOLVED = 10, 11, 12, 13, 14, 15, 16, 17
-TOO_MANY_TRANSITIONS = 18
+TOO_MANY_TRANSITIONS, IMPACT_GAINS_ENERGY, PAINLEVE, CONTACTS_UNDECIDED = 18, 19, 20, 21
 CODES = tuple(name.lower() for name, code in globals().items() if type(code) is int)  # their names, in order
 MOST_PROJECTED = 0.5  # of the change by a step
 
@@ -18,7 +18,7 @@ MESSAGES = {
     NOT_FINITE: "the accelerations are not finite near the last time: a load, pose or row is no number there, or they are not determined (rows that lose "
     "rank, no inertia along a free direction); look at the last state with `accelerations` and `verify`",
     INCONSISTENT_START: "the start does not meet the constraints and could not be projected onto them, or a body begins below the ground "
-    "of a contact with friction",
+    "of a contact with friction, or Coulomb's law has no answer for its contacts (an impact that gains energy, Painleve's paradox)",
     SINGULAR_PARTITION: "the motion came near a configuration where the rows, as they are solved here, do not determine all speeds: another choice of "
     "`privileged` may serve there, and retry=True, or `formulation=jj.Formulation('full')` with `backend='dense'`, do unless the rows lose rank; or where the "
     "scene's own `coordinate_rates` become infinite: state other speeds there",
@@ -40,6 +40,11 @@ MESSAGES = {
     "1e-5 and 1e-13, or set jax.config.update('jax_enable_x64', True)",
     TOO_MANY_TRANSITIONS: "events after which the motion goes on happened more than `max_transitions` times, or followed each other within "
     "round-off, as the bounces of a ball that comes to rest do: switch to a mode in which it rests, or raise `max_transitions`",
+    IMPACT_GAINS_ENERGY: "an impact would gain energy by Newton's restitution and Coulomb's law afterwards; give the contact "
+    "impact='energetic', or a smaller restitution",
+    PAINLEVE: "Coulomb's law has no answer at a contact that slips, or nearly none (Painleve's paradox); reduce its friction",
+    CONTACTS_UNDECIDED: "several contacts close, open or slip at once, and the modes that were tried do not fulfil the laws of all; or slip turns during "
+    "an impact that is worked out along its impulse: give the contact impact='moreau'",
     UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; take a shorter step, or look for a singularity there",
 }
 
