@@ -103,36 +103,36 @@ class Beside(jj.Scene):
 found["far away"] = [motion_of(Beside(), {"x": 1.0, "far": 1e6, "far_rate": 1.0}, backend=way)["far"].tolist() for way in ("auto", "xla")]
 
 
-class Pushed(jj.Scene):
-    "A particle on a wire that is pushed by a record, until it is at 1 m."
-    mass: float = jj.parameter(2.0, unit="kg")
-    coordinates, inputs = jj.coordinates("x"), jj.inputs("push")
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, 0 * q.x, 0 * q.x]))}
-
-    def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=motion.inputs.push),)
-
-    def events(self, motion):
-        return {"arrived": 1.0 - motion.q.x}
-
-
-def arrival(push, mass=2.0):
-    record = jj.Sampled([0.0, 1.0, 3.0], jnp.stack([0 * push, push, push]))
-    return jj.simulate(Pushed(mass), {"x": 0.0}, t1=3.0, rtol=1e-6, atol=1e-6, inputs={"push": record}, work=False)
-
-
-pushes = jnp.asarray([2.0, 4.0, 8.0])
-of_one = arrival(pushes[0])
-found["arrivals"] = {
-    "ways": of_one.reduction,
-    "alone": float(of_one.t_end),
-    "batch": jax.vmap(lambda push: arrival(push).t_end)(pushes).tolist(),
-    "slopes": jax.vmap(jax.grad(lambda mass, push: arrival(push, mass).t_end), (None, 0))(2.0, pushes).tolist(),
-}
-
 if slow:
+    class Pushed(jj.Scene):
+        "A particle on a wire that is pushed by a record, until it is at 1 m."
+        mass: float = jj.parameter(2.0, unit="kg")
+        coordinates, inputs = jj.coordinates("x"), jj.inputs("push")
+
+        def bodies(self, t, q):
+            return {"bead": jj.Particle(self.mass, jnp.stack([q.x, 0 * q.x, 0 * q.x]))}
+
+        def loads(self, motion):
+            return (jj.generalized_force(motion, x_rate=motion.inputs.push),)
+
+        def events(self, motion):
+            return {"arrived": 1.0 - motion.q.x}
+
+
+    def arrival(push, mass=2.0):
+        record = jj.Sampled([0.0, 1.0, 3.0], jnp.stack([0 * push, push, push]))
+        return jj.simulate(Pushed(mass), {"x": 0.0}, t1=3.0, rtol=1e-6, atol=1e-6, inputs={"push": record}, work=False)
+
+
+    pushes = jnp.asarray([2.0, 4.0, 8.0])
+    of_one = arrival(pushes[0])
+    found["arrivals"] = {
+        "ways": of_one.reduction,
+        "alone": float(of_one.t_end),
+        "batch": jax.vmap(lambda push: arrival(push).t_end)(pushes).tolist(),
+        "slopes": jax.vmap(jax.grad(lambda mass, push: arrival(push, mass).t_end), (None, 0))(2.0, pushes).tolist(),
+    }
+
     class Twice(jj.Scene):
         "A particle on a circle, said by two rows that depend on each other on the circle alone, not where rounded coordinates are."
         coordinates = jj.coordinates("x y")

@@ -193,14 +193,11 @@ def test_an_accelerometer_feels_centripetal_and_tangential_acceleration_and_grav
         jj.fit(Swing(), bad, ("stiffness",))
 
 
-def test_a_load_cell_shows_what_the_ground_bears_and_tells_a_mass():
-    disc, start, cell = jj.models.VerticalDisc(mass=1.3), {"heading_rate": 0.5, "roll_rate": 4.0}, jj.LoadCell("rim")
-    motion = jj.simulate(disc, start, ts=TS, rtol=1e-10, atol=1e-10)
+def test_a_load_cell_shows_what_the_ground_bears():
+    cell, start = jj.LoadCell("rim"), {"heading_rate": 0.5, "roll_rate": 4.0}
+    motion = jj.simulate(jj.models.VerticalDisc(mass=1.3), start, ts=TS, rtol=1e-10, atol=1e-10)
     force, felt = cell.over_times(motion), jj.Accelerometer("disc").over_times(motion)
     assert_allclose(force, 1.3 * jnp.einsum("tij,tj->ti", motion.motions()["disc"].orientation, felt), atol=1e-9)  # F = m (a - g)
-    data = jj.Experiment(TS, {"plate": force}, 0.1, start=start, sensors={"plate": cell})
-    found = jj.fit(disc.replace(mass=1.0), data, ("mass",))
-    assert found["mass"].value == pytest.approx(1.3, rel=1e-6)
 
 
 def test_a_delay_that_is_not_there_is_at_its_bound():
