@@ -1,5 +1,6 @@
 """Contacts with friction: slip, sticking, flight and impacts, against closed forms and independent integrations."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -390,6 +391,21 @@ class Cart(jj.Scene):
             return jj.ball_contact(pose["cart"], 0.05, centre=(x, 0.0, -0.45), height="row", friction=self.friction)
 
         return {"front": runner(0.6), "rear": runner(-0.4)}
+
+
+def test_carts_fall_as_they_may():
+    """Runners strike, open, slip, turn round and stick together; without loss of energy but by friction and impacts, whatever the start."""
+    draw, count = np.random.default_rng(0), 100
+
+    class Bouncing(Cart):
+        def contacts(self, pose):
+            return {name: eqx.tree_at(lambda c: c.restitution, contact, 0.5) for name, contact in super().contacts(pose).items()}
+
+    start = {name: draw.uniform(*reach, count) for name, reach in {"z": (0.85, 1), "pitch": (-0.5, 0.5), "x_rate": (-2, 2), "pitch_rate": (-2, 2)}.items()}
+    found = jj.rollout(Bouncing(), start, ts=[0.5, 1.0], rtol=1e-8, atol=1e-8, max_transitions=400)
+    assert np.all(found.lanes.result == 0)
+    balance = jax.vmap(lambda lane: lane.energies().balance)(found.lanes)
+    np.testing.assert_allclose(balance[:, 0], balance[:, 1], rtol=1e-7)
 
 
 def test_a_cart_brakes_on_two_runners():

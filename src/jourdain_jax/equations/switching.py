@@ -36,6 +36,7 @@ from jourdain_jax.scene.switching import CREEPS, FLIES, GAINS_ENERGY, PAINLEVE, 
 LEAST_REBOUND = 1e-6  # m/s: a contact that would rebound with less is closed
 NEARLY = 1e-4  # of the response of the ground that is left near Painleve's paradox
 STOPS = 1e-13  # m/s against its direction end a slip: round-off where slip begins does not
+ROUNDS = 4  # in which the modes of several contacts in an impact are looked for
 TOUCHES = 1e-8  # m: a gap that counts as none at the start
 
 
@@ -154,8 +155,8 @@ class After:
         modes = at.modes
         struck, P = impulses(modes)
         right = jnp.asarray(True)
-        if len(at.number) > 1:
-            modes = _yielding(at, i, modes, P)
+        for turn in range(ROUNDS if len(at.number) > 1 else 0):
+            modes = _yielding(at, i, modes, P, turn % 2 == 1)
             struck, P = impulses(modes)
             right = _is_lawful(at, i, modes, P)
         jumps = at.number[i] != ROLLS  # otherwise nothing strikes or stops
@@ -165,18 +166,26 @@ class After:
         slipping = jnp.where(moves(w, SLOW), float(SLIPS), float(CREEPS))
         slides = moves(w, LEAST_SLIP)
         others = jnp.where(modes.closed == 0, float(FLIES), jnp.where(slides & (modes.rolls == 0), slipping, float(ROLLS)))
-        numbers = jnp.where(jumps, others, at.number)
-        then = At(scene, _switched(scene, motion, numbers, motion.q.array, self.u), None, at.responses)
-        own = then.alone(i, then.found.b)
-        rest = coulomb(own.G, own.b, jnp.zeros_like(friction), friction, at.static[i], own.sizes)
-        self.direction = rest.direction
-        settled = jnp.where(rest.opens, float(FLIES), jnp.where(rest.sticks, float(ROLLS), float(CREEPS)))
-        self.numbers = numbers.at[i].set(jnp.where(rebounds, float(FLIES), jnp.where(strikes & struck.slips, slipping[i], settled)))
+        own_number = jnp.where(rebounds, float(FLIES), jnp.where(strikes & struck.slips, slipping[i], float(ROLLS)))
+        numbers, e = jnp.where(jumps, others, at.number).at[i].set(own_number), jnp.where(slides[:, None], _along(w[:, 1:]), modes.direction)
+        q = jnp.append(motion.q.array[: -e.size], e)
+        then = At(scene, _switched(scene, motion, numbers, q, self.u), None, at.responses)
+        modes, has_law = then.modes, jnp.where(strikes, struck.exists, True)
+        for j in (i, *(j for j in range(len(numbers)) if j != i)):  # what does not slip settles by the law at rest
+            own = then.alone(j, then.found.b, modes)
+            rest = coulomb(own.G, own.b, jnp.zeros_like(friction), at.friction[j], at.static[j], own.sizes)
+            settled = jnp.where(rest.opens, float(FLIES), jnp.where(rest.sticks, float(ROLLS), float(CREEPS)))
+            waits = (numbers[j] == ROLLS) & (jumps | (i == j))
+            number = jnp.where(waits, settled, numbers[j])
+            numbers, e = numbers.at[j].set(number), e.at[j].set(jnp.where(waits, rest.direction, e[j]))
+            closed, rolls = jnp.where(number == FLIES, 0.0, 1.0), jnp.where(number == ROLLS, 1.0, 0.0)
+            direction = jnp.where(number >= SLIPS, e[j], 0.0)
+            modes = Modes(modes.closed.at[j].set(closed), modes.rolls.at[j].set(rolls), modes.direction.at[j].set(direction))
+            has_law &= ~waits | rest.exists
         most = ROUND_OFF * jnp.abs(P.ravel() @ at.found.rows.w)
-        has_law = jnp.where(strikes, struck.exists, True) & (rebounds | rest.exists)
         for lawful, fault in ((has_law, PAINLEVE), (~(gained > most), GAINS_ENERGY), (right & jnp.isfinite(gained), UNDECIDED)):
-            self.numbers = self.numbers.at[i].set(jnp.where(lawful | (~jumps & (fault != PAINLEVE)), self.numbers[i], float(fault)))
-        self.e = jnp.where(slides[:, None], _along(w[:, 1:]), modes.direction.at[i].set(self.direction))
+            numbers = numbers.at[i].set(jnp.where(lawful | (~jumps & (fault != PAINLEVE)), numbers[i], float(fault)))
+        self.numbers, self.e, self.direction = numbers, e, e[i]
 
 
 def _excess(at: At, P: Float[Array, "contacts 3"]) -> tuple[Float[Array, "contacts"], Float[Array, "contacts"]]:
@@ -187,13 +196,25 @@ def _excess(at: At, P: Float[Array, "contacts 3"]) -> tuple[Float[Array, "contac
     return -response * P[:, 0], response * (held - at.friction * P[:, 0])
 
 
-def _yielding(at: At, i: int, modes: Modes, P: Float[Array, "contacts 3"]) -> Modes:
-    """Return the modes of the others in an impact of contact i: open where they would pull, slipping where they would hold more than friction does."""
+def _yielding(at: At, i: int, modes: Modes, P: Float[Array, "contacts 3"], sticking: bool) -> Modes:
+    """Return better modes of the others in an impact of contact i.
+
+    closed, pulls: opens;   sticks, holds more than friction does: slips;   slips: along the slip afterwards;   open, moves into the ground: slips so, too
+
+    `sticking`: what slips against its direction sticks.
+    """
     pulled, exceeded = _excess(at, P)
-    pulls, gives = (modes.closed > 0) & (pulled > LEAST_SLIP), (modes.rolls > 0) & (exceeded > LEAST_SLIP)
-    e = -P[:, 1:] / jnp.sqrt(jnp.where(gives, jnp.sum(P[:, 1:] ** 2, axis=1), 1.0))[:, None]
-    closed, rolls = jnp.where(pulls, 0.0, modes.closed), jnp.where(pulls | gives, 0.0, modes.rolls)
-    return Modes(closed.at[i].set(1.0), rolls, jnp.where(gives[:, None], e, modes.direction))
+    w = (at.found.rows.w + at.found.G @ P.ravel()).reshape(-1, 3)
+    closed, sticks = modes.closed > 0, modes.rolls > 0
+    pulls, enters = closed & (pulled > LEAST_SLIP), ~closed & (at.number != FLIES) & (w[:, 0] < -LEAST_SLIP)
+    gives = sticks & (exceeded > LEAST_SLIP)
+    stops = closed & ~sticks & (jnp.sum(w[:, 1:] * modes.direction, axis=1) < -LEAST_SLIP)
+    fast = moves(w, LEAST_SLIP)
+    along = jnp.where(fast[:, None], _along(w[:, 1:]), modes.direction)
+    e = jnp.where(sticks[:, None], -_along(P[:, 1:]), along)
+    now = jnp.where(pulls, 0.0, jnp.where(enters, 1.0, modes.closed))
+    rolls = jnp.where(pulls | gives, 0.0, jnp.where((stops & sticking) | (enters & ~fast), 1.0, modes.rolls))
+    return Modes(now.at[i].set(1.0), rolls, e)
 
 
 def _is_lawful(at: At, i: int, modes: Modes, P: Float[Array, "contacts 3"]) -> Flag:

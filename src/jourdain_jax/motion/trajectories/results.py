@@ -42,7 +42,7 @@ MESSAGES = {
     "round-off, as the bounces of a ball that comes to rest do: switch to a mode in which it rests, or raise `max_transitions`",
     IMPACT_GAINS_ENERGY: "an impact would gain energy by Newton's restitution and Coulomb's law afterwards; give the contact "
     "impact='energetic', or a smaller restitution",
-    PAINLEVE: "Coulomb's law has no answer at a contact that slips, or nearly none (Painleve's paradox); reduce its friction",
+    PAINLEVE: "Coulomb's law has no answer at a contact that slips, or none was found (Painleve's paradox); reduce its friction",
     CONTACTS_UNDECIDED: "several contacts close, open or slip at once, and the modes that were tried do not fulfil the laws of all; or slip turns during "
     "an impact that is worked out along its impulse: give the contact impact='moreau'",
     UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; take a shorter step, or look for a singularity there",
