@@ -134,10 +134,9 @@ def test_without_a_gpu_that_serves_it_is_said_why(monkeypatch):
     assert "libcuda.so.1" in nvidia.reason_against.__wrapped__()
 
 
-def test_a_model_says_on_which_devices_it_is_integrated(monkeypatch):
-    with gpu_twin.in_place_of_a_gpu():
-        for reason, said in (("", "machine code: CPU; NVIDIA GPU (sm_90 on the CPU)"), ("no driver", "XLA: no driver")):
-            monkeypatch.setattr(nvidia, "reason_against", lambda reason=reason: reason)
+def test_a_model_says_on_which_devices_it_is_integrated():
+    for reason, said in (("", "machine code: CPU; NVIDIA GPU (sm_90 on the CPU)"), ("no driver", "XLA: no driver")):
+        with gpu_twin.in_place_of_a_gpu(), mock.patch.object(nvidia, "reason_against", lambda reason=reason: reason):
             assert said in str(jj.build(jj.models.ChaplyginSleigh()))
 
 
