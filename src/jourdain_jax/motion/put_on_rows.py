@@ -288,7 +288,7 @@ def may_contradict(scene: Scene, known: Structure, free_q: Bool[np.ndarray, "coo
 
 
 def _loses_rank(matrices, free) -> bool:
-    return any(np.linalg.matrix_rank(one[:, free]) < np.linalg.matrix_rank(one) for one in matrices)
+    return any(np.linalg.matrix_rank(one * free) < np.linalg.matrix_rank(one) for one in matrices)
 
 
 @lru_cache(maxsize=64)
