@@ -24,10 +24,11 @@ from jaxtyping import Array, Float, Num, PyTree
 from jourdain_jax.build.plausibility import Numbers, numbers_of
 from jourdain_jax.calculus.jaxprs import needed_only
 from jourdain_jax.calculus.reals import Entries, Scalar, is_traced, real_type
+from jourdain_jax.equations.contact_state import At
 from jourdain_jax.equations.kinematics import coordinate_rates, inertias_of, motion_at, of_bodies, pose_at, velocities_of
 from jourdain_jax.equations.listed import names_of_bodies, names_of_position_rows
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
-from jourdain_jax.equations.switching import At, contact_changes, contact_events, contacts_at_start, put_back
+from jourdain_jax.equations.switching import contact_changes, contact_events, contacts_at_start, put_back
 from jourdain_jax.equations.virtual_power import energies_at, impressed, loads_at, potential_energy, resultants, slip_turns
 from jourdain_jax.program.graph import MOST_MULTIPLICATIONS, Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, effects_of, interpret

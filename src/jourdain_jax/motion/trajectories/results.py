@@ -18,7 +18,7 @@ MESSAGES = {
     NOT_FINITE: "the accelerations are not finite near the last time: a load, pose or row is no number there, or they are not determined (rows that lose "
     "rank, no inertia along a free direction); look at the last state with `accelerations` and `verify`",
     INCONSISTENT_START: "the start does not meet the constraints and could not be projected onto them, or a body begins below the ground "
-    "of a contact with friction, or Coulomb's law has no answer for its contacts (an impact that gains energy, Painleve's paradox)",
+    "of a contact with friction, or Coulomb's law has no solution for its contacts (an impact that gains energy, Painleve's paradox)",
     SINGULAR_PARTITION: "the motion came near a configuration where the rows, as they are solved here, do not determine all speeds: another choice of "
     "`privileged` may serve there, and retry=True, or `formulation=jj.Formulation('full')` with `backend='dense'`, do unless the rows lose rank; or where the "
     "scene's own `coordinate_rates` become infinite: state other speeds there",
@@ -42,9 +42,9 @@ MESSAGES = {
     "round-off, as the bounces of a ball that comes to rest do: switch to a mode in which it rests, or raise `max_transitions`",
     IMPACT_GAINS_ENERGY: "an impact would gain energy by Newton's restitution and Coulomb's law afterwards; give the contact "
     "impact='energetic', or a smaller restitution",
-    PAINLEVE: "Coulomb's law has no answer at a contact that slips, or none was found (Painleve's paradox); reduce its friction",
-    CONTACTS_UNDECIDED: "several contacts close, open or slip at once, and the modes that were tried do not fulfil the laws of all; or slip turns during "
-    "an impact that is worked out along its impulse: give the contact impact='moreau'",
+    PAINLEVE: "Coulomb's law has no solution at a contact that slips, or none was found (Painleve's paradox); reduce its friction",
+    CONTACTS_UNDECIDED: "several contacts close, open or slip at once, and no combination of modes that was tried satisfies Coulomb's law at each; "
+    "or slip turns during an impact that is followed along its impulse: give the contact impact='moreau'",
     UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; take a shorter step, or look for a singularity there",
 }
 

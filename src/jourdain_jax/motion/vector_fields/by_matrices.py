@@ -10,6 +10,7 @@ from jourdain_jax.build.structure import closure_lengths, structure_whatever_its
 from jourdain_jax.calculus.reals import Scalar, Speeds, is_traced
 from jourdain_jax.dynamics.accelerations import Baumgarte, bare_accelerations, reduced_at
 from jourdain_jax.dynamics.power import rate_of_work
+from jourdain_jax.equations.contact_state import At
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.kinematics import motion_at, rates_by_own_speeds
 from jourdain_jax.equations.listed import names_of_position_rows
@@ -18,7 +19,7 @@ from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.equations.reductions import Partition, Privileged, Reduced
 from jourdain_jax.equations.rows import UsualRows, velocity_residual
 from jourdain_jax.equations.scaling import scaled, speed_scale
-from jourdain_jax.equations.switching import At, put_back
+from jourdain_jax.equations.switching import put_back
 from jourdain_jax.equations.virtual_power import coordinate_rates_in_modes, mass_matrix_at
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField, Watched
 from jourdain_jax.scene.identity import with_reference_parameters

@@ -20,10 +20,11 @@ from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import event_resets, event_values, stored_by_inputs
 from jourdain_jax.calculus.reals import PerLane, Scalar, Speeds, described
 from jourdain_jax.dynamics.accelerations import Baumgarte
+from jourdain_jax.equations.contact_state import At
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.reductions import Reduction
-from jourdain_jax.equations.switching import At, contacts_at_start
+from jourdain_jax.equations.switching import contacts_at_start
 from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.native import values

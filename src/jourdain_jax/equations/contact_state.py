@@ -1,0 +1,86 @@
+"""The contacts that switch at one state: their modes, and how they respond to their forces."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.equations.contact_laws import Modes, responses
+from jourdain_jax.equations.contact_rows import switching_contacts
+from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.virtual_power import (
+    ContactResponse,
+    contact_modes,
+    contact_response,
+    friction_of,
+    switching_forces,
+)
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.scene import Scene
+
+
+class At:
+    """The contacts that switch at the state of a motion, and how they respond to their forces.
+
+    `found`: that response, where it is known. `responses`: all that were worked out, here and at later
+    states, each after its coordinates, speeds and inputs.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        motion: Motion,
+        found: ContactResponse | None = None,
+        responses: list | None = None,
+    ):
+        self.scene, self.motion, self.responses = scene, motion, [] if responses is None else responses
+        self.found = contact_response(scene, motion) if found is None else found
+        self.responses += (
+            [(motion.q.array, motion.u.array, motion.inputs.array, self.found)] if found is None else []
+        )
+        self.friction = friction_of(scene, motion)
+        self.static = jnp.stack(
+            [
+                contact.friction.static
+                for contact in switching_contacts(scene, motion.pose()).values()
+                if contact.friction
+            ]
+        )
+        self.modes: Modes = contact_modes(scene, motion)
+        self.w = self.found.rows.w.reshape(-1, 3)
+        self.number = jnp.stack([motion.modes[name] for name in scene.switching.contacts])
+
+    @property
+    def forces(self) -> Float[Array, "contacts 3"]:
+        """Normal forces, and those along both tangents, N."""
+        return switching_forces(self.scene, self.motion, self.found).reshape(-1, 3)
+
+    def alone(self, i: int, b: Float[Array, "rows"], modes: Modes | None = None) -> "Alone":
+        """Return the response of contact i while the others are in `modes` (default: the present ones)."""
+        modes, mine = self.modes if modes is None else modes, slice(3 * i, 3 * i + 3)
+        if len(self.number) == 1:
+            return Alone(self.found.G, b, jnp.zeros((3, 4), b.dtype), jnp.diagonal(self.found.G))
+        others = modes._replace(closed=modes.closed.at[i].set(0.0), rolls=modes.rolls.at[i].set(0.0))
+        right = jnp.concatenate([self.found.G[:, mine], b[:, None]], axis=1)
+        borne = responses(self.found.G, right, others, self.friction)
+        total = (right + self.found.G @ borne)[mine]
+        return Alone(total[:, :3], total[:, 3], borne, jnp.diagonal(self.found.G)[mine])
+
+
+class Alone(NamedTuple):
+    """The response of one contact while the others are in their modes."""
+
+    G: Float[Array, "3 3"]
+    b: Float[Array, "3"]
+    borne: Float[Array, "rows 4"]  # forces of all for those of this one, and without
+    sizes: Float[Array, "3"]  # of the diagonal of G, were all others open
+
+    def every(self, i: int, own: Float[Array, "3"]) -> Float[Array, "rows"]:
+        """Return the forces of all contacts where contact i has its `own`."""
+        return (self.borne[:, :3] @ own + self.borne[:, 3]).at[3 * i : 3 * i + 3].set(own)
+
+
+def switched(scene: Scene, motion: Motion, numbers: Float[Array, "contacts"], q, u) -> Motion:
+    """Return the motion at other coordinates and speeds, with contacts in the modes `numbers`."""
+    inputs = jnp.concatenate([motion.inputs.array[: len(scene.inputs) - len(numbers)], numbers])
+    return motion_at(scene, motion.t, q, u, inputs)
