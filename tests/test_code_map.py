@@ -26,7 +26,7 @@ CEILINGS = {
     "ways: damped least squares": 2,
     "ways: step of a motion, the search for an event in it, and the way back over it": 1,
     "code tokens of tests": 318_165,
-    "code tokens of bench": 107_082,
+    "code tokens of bench": 107_009,
     "test files that reach private names": 36,
 }
 

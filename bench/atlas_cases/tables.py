@@ -7,16 +7,13 @@ from pathlib import Path
 from atlas_cases.cases import CASES
 from atlas_cases.outcomes import FLAGGED, NAN, NOT_APPLICABLE, OUTCOMES, RIGHT, STALLED, WRONG
 
-BEGIN, END = "<!-- from here on written by bench/atlas.py -->", "<!-- up to here -->"
+TITLE = "# The atlas: outcomes by method and by case\n\nWritten by `python bench/atlas.py --out DIR`.\n"
 
 
 def write_tables(cells: list[dict], out: Path) -> None:
-    """Write `atlas.md`, the summary. Of one that is there, only what stands between `BEGIN` and `END` is replaced."""
-    path = out / "atlas.md"
-    before, _, rest = (path.read_text(encoding="utf-8") if path.exists() else "").partition(BEGIN)
-    after = rest.partition(END)[2] or "\n"
-    written = "\n".join([BEGIN, "", *by_method(cells), "", *by_case(cells), "", *_reasons(cells), "", END])
-    path.write_text(before + written + after, encoding="utf-8")
+    """Write `atlas_tables.md`: outcomes by method, by case, and the reasons of failures."""
+    written = "\n".join([TITLE, *by_method(cells), "", *by_case(cells), "", *_reasons(cells), ""])
+    (out / "atlas_tables.md").write_text(written, encoding="utf-8")
 
 
 SHOWN = (RIGHT, FLAGGED, WRONG, NAN, STALLED)

@@ -7,8 +7,6 @@ from figures import figure
 
 from hunting.record import BY_CODE, BY_WARNING, CRASHED, LOST, OUTCOMES, REFUSED, RIGHT, WRONG
 
-BEGIN, END = "<!-- from here on written by bench/hunt.py -->", "<!-- up to here by bench/hunt.py -->"
-
 
 def rows(records: list[dict]) -> Iterator[tuple]:
     """Family, cases, outcomes in their order, seconds; the sum at the end."""
@@ -26,14 +24,13 @@ HEAD = ("family", "cases", *OUTCOMES, "seconds")
 
 
 def as_markdown(records: list[dict]) -> Iterator[str]:
-    """For `docs/atlas.md`; what each family is stands beside its name."""
+    """Return the table of `bench/records/hunt.md`, with a description of each family."""
     from hunting.families import FAMILIES
 
     what = {f.name: f.what for f in FAMILIES}
-    yield from (BEGIN, "", f"| family | what | {' | '.join(HEAD[1:])} |", "|---|---|" + "---|" * (len(HEAD) - 1))
+    yield from (f"| family | what | {' | '.join(HEAD[1:])} |", "|---|---|" + "---|" * (len(HEAD) - 1))
     for row in rows(records):
         yield f"| {row[0]} | {what.get(row[0], '')} | " + " | ".join(str(entry) if entry or k == 0 else "" for k, entry in enumerate(row[1:])) + " |"
-    yield from ("", END)
 
 
 def losses(records: list[dict]) -> Iterator[str]:
