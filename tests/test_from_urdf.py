@@ -1,6 +1,5 @@
 """Scenes from URDF files: equations of closed forms and of scenes written by hand, shapes, and what is refused."""
 
-import re
 from pathlib import Path
 
 import jax
@@ -12,8 +11,7 @@ from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
 
-PAGE = Path(__file__).parents[1] / "docs" / "howto" / "from_other_tools.md"
-ROBOT = re.search(r":caption: robot.urdf\n\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL).group(1)
+ROBOT = (Path(__file__).parents[1] / "docs" / "howto" / "robot.urdf").read_text(encoding="utf-8")
 LINK = '<link name="{0}"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>'
 ARM = """
 <robot name="arm">
