@@ -127,7 +127,7 @@ CALLED = ["simulate", "rollout", "fit", "fit_batch", "log_likelihood", "log_dens
 WENT = ["saveat", "stepsize_controller", "dt0", "adjoint"]
 
 OPTIONS = {f"calls['{name}'](rtoll=1e-6)": ("TypeError", KEYWORD.format(name)) for name in CALLED}
-OPTIONS |= {f"calls['{name}']({option}=None)": ("TypeError", f"`{option}` is no option any more: ") for name in CALLED for option in WENT}
+OPTIONS |= {f"calls['{name}']({option}=None)": ("TypeError", f"`{option}` is no longer an option: ") for name in CALLED for option in WENT}
 OPTIONS |= {
     "calls['fit'](ts=TS)": ("TypeError", "each `Experiment` states start, times and inputs"),
     "calls['fit'](retry=True)": ("TypeError", "its motions are compiled"),
@@ -146,13 +146,13 @@ OPTIONS |= {
 
 SOLVERS = {
     "jj.ImplicitMidpoint(step=0.0)": "`step` of `ImplicitMidpoint` is 0, expected a positive finite length of steps in s",
-    "jj.simulate(oscillator, max_step=0.1, solver=jj.ImplicitMidpoint(step=0.2))": "whose steps are at most as long as its `step`: jj.ImplicitMidpoint(step=",
+    "jj.simulate(oscillator, max_step=0.1, solver=jj.ImplicitMidpoint(step=0.2))": "whose steps are at most its `step`: give jj.ImplicitMidpoint(step=",
     "jj.DiscreteLagrangeDAlembert('midpiont', step=0.1)": "unknown rule `midpiont` of `DiscreteLagrangeDAlembert`; did you mean `midpoint`",
     "jj.simulate(oscillator, solver=jj.DiscreteLagrangeDAlembert(step=0.1), formulation=jj.Formulation('minimal'))": "leave the `state` of its `Formulation`",
     "jj.simulate(model('free-rigid-body'), solver=jj.DiscreteLagrangeDAlembert(step=0.1))": (
         "does not apply to `FreeRigidBody`: its speeds are quasi-velocities or angular velocities ... ; use solver=jj.ImplicitMidpoint(step="
     ),
-    "jj.simulate(model('isokinetic-particle'), solver=jj.DiscreteLagrangeDAlembert(step=0.1))": "its rows are nonlinear in the speeds",
+    "jj.simulate(model('isokinetic-particle'), solver=jj.DiscreteLagrangeDAlembert(step=0.1))": "its constraints are nonlinear in the speeds",
     "jj.simulate(DrivenPendulum(), solver=jj.DiscreteGradient(step=0.1))": "does not apply to `DrivenPendulum`: its T + V is not constant",
     "jj.simulate(model('double-pendulum-rods'), solver=jj.DiscreteGradient(step=0.1))": "its geometric rows would have to be projected",
     "jj.simulate(model('skate'), solver=jj.DiscreteGradient(step=0.1))": "needs the minimal state (`jj.Formulation('minimal')` keeps to the privileged",
@@ -164,10 +164,10 @@ FITS = {
     "tied(lambda scene: scene.mass / (scene.mass - 1.0))": "not allowed: ... `inertia`",
     "tied(lambda scene: 'heavy')": "returns ... heavy ... , expected a number",
     "jj.fit(sleigh, data, free={'inertia': lambda scene: scene.mass})": "nothing is free",
-    "event(events={'bufer': (0.9, 0.003)})": "names `bufer`, which is no event of the scene; did you mean `buffer`",
+    "event(events={'bufer': (0.9, 0.003)})": "names `bufer`, which is not an event of the scene; did you mean `buffer`",
     "event(events={'buffer': (0.9, 0.003), 'far': (1.0, 0.003)})": "`events` names `buffer`, `far`, but a motion stops at the first",
     "event(events={'buffer': 0.9})": "event `buffer` was given 0.9, expected (time, sigma)",
-    "event(events={'buffer': (0.0, 0.003)})": "the time of event `buffer` is 0.0 s, expected one after the start",
+    "event(events={'buffer': (0.0, 0.003)})": "the time of event `buffer` is 0.0 s, expected a time after the start",
     "event(events={'buffer': (0.9, 0.0)})": "sigma of channel `buffer` must be above zero",
     "event(events={'x': (0.9, 0.003)}, values=np.ones(8))": "`x` is both a channel and an event",
     "event(sensors={'buffer': 'x'})": "`buffer` is an event, whose time has no sensor",
@@ -175,10 +175,10 @@ FITS = {
         "run 0 gives the time of its event `buffer`, which `shooting` does not use"
     ),
     "jj.filtered_log_likelihood(Stopped(), stopped(values=np.ones(8)), process_noise={'x_rate': 0.1})": (
-        "run 0 gives the time of its event `buffer`, which a filter does not use"
+        "run 0 gives the time of its event `buffer`, which the filter does not use"
     ),
-    "jj.MultipleShooting()": "expects one of `pieces`",
-    "jj.MultipleShooting(pieces=4, duration=1.0)": "expects one of `pieces`",
+    "jj.MultipleShooting()": "expects either `pieces`",
+    "jj.MultipleShooting(pieces=4, duration=1.0)": "expects either `pieces`",
     "jj.MultipleShooting(pieces=1)": "two or more",
     "jj.MultipleShooting(duration=0.0)": "above zero",
     "jj.MultipleShooting(duration=np.nan)": "above zero",
@@ -199,18 +199,18 @@ FITS = {
     "jj.Spline([0.0, 1.0], [0.0, 1.0, 2.0])": "`Spline`",
     "jj.Spline(0.0, 1.0)": "`Spline`",
     "jj.Spline(['a'], [0])": "`Spline`",
-    "jj.quaternion_to_matrix([0.0, 0.0, 0.0, 0.0])": "quaternion is (0, 0, 0, 0), which is no attitude",
-    "jj.start(jj.models.FreeRigidBody(), attitude=jnp.zeros(4))": "contradicts row `norm of quaternion 1`",
-    "jj.start(disc, lean=0.3, spin_rate=-3.0, x_rate=7.0, yaw_rate=0.1)": "contradicts row",
+    "jj.quaternion_to_matrix([0.0, 0.0, 0.0, 0.0])": "quaternion is (0, 0, 0, 0), which is not an attitude",
+    "jj.start(jj.models.FreeRigidBody(), attitude=jnp.zeros(4))": "violates constraint `norm of quaternion 1`",
+    "jj.start(disc, lean=0.3, spin_rate=-3.0, x_rate=7.0, yaw_rate=0.1)": "violates constraint",
 }
 
 INERTIAS = {
-    "jj.fit(Turning(), jj.Experiment(TS, {'yaw': TS}, 0.1, start={}), {'bodi': possible})": "`bodi`, which is no body of `Turning`; did you mean `body`",
-    "jj.fit(model('double-pendulum-rods'), jj.Experiment(TS, {'x1': TS}, 0.1, start={}), {'first': possible})": "that is a particle, which has none",
+    "jj.fit(Turning(), jj.Experiment(TS, {'yaw': TS}, 0.1, start={}), {'bodi': possible})": "`bodi`, which is not a body of `Turning`; did you mean `body`",
+    "jj.fit(model('double-pendulum-rods'), jj.Experiment(TS, {'x1': TS}, 0.1, start={}), {'first': possible})": "is a particle; name a rigid body",
     "jj.fit(disc, jj.Experiment(TS, {'lean': TS}, 0.1, start={}), {'disc': possible})": "entry 11 of its inertia is made of `mass`, `radius`",
-    "inertia(free={'moments': None})": "`free` has `moments` beside the possible inertia of `body`, which decides `moments`",
-    "inertia(free={'moments': lambda scene: scene.moments})": "a function for `moments` beside the possible inertia",
-    "inertia(moments=(0.1, 0.1, 0.3))": "has the moments of inertia 0.1, 0.1, 0.3 kg m ... , which with its products no body",
+    "inertia(free={'moments': None})": "`free` has `moments` and the possible inertia of `body`, which determines `moments`",
+    "inertia(free={'moments': lambda scene: scene.moments})": "a function for `moments` and the possible inertia",
+    "inertia(moments=(0.1, 0.1, 0.3))": "has the moments of inertia 0.1, 0.1, 0.3 kg m ... , which, with its products, no body",
     "inertia(lambda s: jnp.array([0.0, 0.0, 1.0]) * s.moments[0])": "entry 11 of its inertia, 0 kg m ... , is no parameter; give its parameters ranges or ties",
     "inertia(lambda s: jnp.array([1.0, 1.5, 1.0]) * s.moments[0])": "moments about axes 1 and 2 are different multiples of `moments`",
     "inertia(lambda s: s.moments**2)": "entry 11 of its inertia is made of `moments`, expected one parameter times a constant",
@@ -244,19 +244,19 @@ PLOTTED = {
     "jj.plot(moved, 'heading', units={'heading_rate': 'deg'})": "`deg` is no unit of the speed `heading_rate`",
     "jj.plot(moved, 'heading', units={'heding': 'deg'})": ("KeyError", "`units` names `heding` ... did you mean `heading`"),
     "jj.plot(moved, 'heading', units='deg')": "`units` is ... , expected a dictionary from names to units, such as {\"lean\": \"deg\"}",
-    "jj.plot([moved] * 2, 'heading', labels='one')": "`labels` is 'one', expected a list of as many as there are motions, 2",
-    "jj.plot([moved] * 2, 'heading', labels=['one'])": "expected a list of as many as there are motions, 2",
-    "jj.plot(moved, 'heading', bands=0.5)": "`bands` is 0.5, expected parts of the lanes between 0 and 1",
-    "jj.plot(moved, 'heading', bands=(50,))": "`bands` is (50,), expected parts",
+    "jj.plot([moved] * 2, 'heading', labels='one')": "`labels` is 'one', expected a list with one label for each of 2 motions",
+    "jj.plot([moved] * 2, 'heading', labels=['one'])": "expected a list with one label for each of 2 motions",
+    "jj.plot(moved, 'heading', bands=0.5)": "`bands` is 0.5, expected fractions of the lanes between 0 and 1",
+    "jj.plot(moved, 'heading', bands=(50,))": "`bands` is (50,), expected fractions",
     "jj.plot(moved, 'heading', axes=[None, None])": "`axes` holds 2 axes for 1 names, expected one for each of heading",
     "jj.plot([moved, sleigh], 'x')": "`plot` was given ... in place 1, expected a motion",
     "jj.plot([], 'x')": "`plot` was given an empty list",
     "jj.show(sleigh)": "`show` was given ... expected a motion from `jj.simulate`",
     "jj.show(moved, 'ride.gif')": "a 3D view is a .html file; for a .gif use `jj.animate`",
     "jj.show(moved, 'missing/ride.html')": "there is no folder",
-    "jj.show(moved, colours={'sleig': '#ff0000'})": "`colours` names `sleig`, which is no body; did you mean `sleigh`",
+    "jj.show(moved, colours={'sleig': '#ff0000'})": "`colours` names `sleig`, which is not a body; did you mean `sleigh`",
     "jj.show(moved, view=(1.0, 2.0, 3.0))": "expected elevation and azimuth",
-    "looking(lambda: {'sleig': jj.Visual.ball(0.1)})": "names `sleig`, which is no body",
+    "looking(lambda: {'sleig': jj.Visual.ball(0.1)})": "names `sleig`, which is neither a body",
     "looking(lambda: {'sleigh': 0.1})": "gives ... for `sleigh`, expected shapes",
     "moved['headin']": ("KeyError", "a trajectory of `ChaplyginSleigh` has no `headin`; did you mean `heading`? Valid names:"),
     "moved.constraint_forces().forces_on('slegh')": ("KeyError", "did you mean `sleigh`"),
@@ -277,7 +277,7 @@ PLOTTED = {
 SWEEPS = {
     "described_file(modell='x')": "did you mean `model`",
     "described_file(model='disk')": "unknown model `disk`",
-    "described_file(vary={'radius': {'gauss': [1.0, 2.0]}})": "by one of these names",
+    "described_file(vary={'radius': {'gauss': [1.0, 2.0]}})": "expected a distribution",
     "described_file(vary={'radius': {'normal': [1.0]}})": "1 numbers, expected 2",
     "described_file(vary={'radius': [1.0]})": "write, for example",
     "described_file(outputs={'x': {'ende': 'lean'}})": "output `x`",
@@ -290,17 +290,17 @@ SWEEPS = {
 }
 
 CLASSES = {
-    "described(domain={'xx': (0.0, 1.0)})": "`domain` of `Described` names `xx`, which is no coordinate or speed; did you mean `x`",
+    "described(domain={'xx': (0.0, 1.0)})": "`domain` of `Described` names `xx`, which is not a coordinate or speed; did you mean `x`",
     "described(domain={'x': (1.0, -1.0)})": "`domain` of `Described` gives (1.0, -1.0) for `x`, expected two finite numbers (low, high) with low <= high",
     "described(domain={'x': 1.0})": "gives 1.0 for `x`, expected two finite numbers",
     "described(domain={'x': (0.0, jnp.inf)})": "for `x`, expected two finite numbers",
     "described(domain=('x', 0.0, 1.0))": "`domain` of `Described` is a tuple, expected a dictionary",
-    "described(example={'x_rat': 1.0})": "`example` of `Described` names `x_rat`, which is no coordinate or speed; did you mean `x_rate`",
+    "described(example={'x_rat': 1.0})": "`example` of `Described` names `x_rat`, which is not a coordinate or speed; did you mean `x_rate`",
     "described(speeds=jj.speeds('a b c'))": "`Described` has speeds of its own (a, b, c) but ... ; define `coordinate_rates(self, t, q, u)`",
     "described(speeds='a b')": "`speeds` of `Described` is the text 'a b', expected names; write speeds = jj.speeds('a b c')",
     "described(inputs=('drive',))": "`inputs` of `Described` is a tuple, expected names; write inputs = jj.inputs",
     "described(speeds=jj.speeds('x w'), coordinate_rates=lambda self, t, q, u: u.array)": (
-        "has a coordinate and a speed of the name `x`; give one of them another name"
+        "has a coordinate and a speed named `x`; rename one of them"
     ),
     "described(mass=5.0)": "`Described` sets `mass`, a field of a class that it extends, without an annotation, which has no effect",
     "described(priviledged=('x_rate',))": "`Described` has an attribute `priviledged`, which nothing calls; did you mean `privileged`?",

@@ -35,7 +35,7 @@ density = jj.log_density(cart, [run(unknown_start=("x",))] * 2, {"damping": jj.b
 '''
 
 FITS: dict[str, str] = {
-    "jj.fit(cart, run(), ('mas',))": "`mas`, which is no parameter of `Cart`; did you mean `mass`",
+    "jj.fit(cart, run(), ('mas',))": "`mas`, which is not a parameter of `Cart`; did you mean `mass`",
     "jj.fit(cart, run(), 'mass', cutoff=1.0)": "`cutoff` is 1.0, expected a number between 0 and 1",
     "jj.fit(cart, run(), 'mass', tolerance=0.0)": "`tolerance` is 0.0, expected a number above zero",
     "jj.fit(cart, run(), 'mass', max_iterations=-1)": "`max_iterations` is -1, expected a whole number",
@@ -58,7 +58,7 @@ FITS: dict[str, str] = {
     "run(sigma={'x': 0.1})": "channel `x_rate` has no sigma",
     "run(sigma={'x': 0.1, 'x_rate': 1.0, 'y': 1.0})": "`sigma` names channel `y`",
     "run(values={'x': np.where(TS[4] == TS, np.inf, TS)}, sigma=1.0)": "infinite, the first at sample 4; give NaN",
-    "run(values={'x': np.full(21, np.nan)}, sigma=1.0)": "channel `x` holds no value at all, only NaN",
+    "run(values={'x': np.full(21, np.nan)}, sigma=1.0)": "channel `x` holds only NaN",
     "jj.fit(cart, run(), 'mass', errors='hac')": "`errors` is 'hac', expected",
     "jj.fit(cart, run(), 'mass', errors='runs')": "from how runs differ, but there are 1; give 5 or more",
     "jj.fit(cart, run(sigma={'x': None, 'x_rate': 1.0}), 'mass', loss=jj.huber())": "sigma of channel `x` is None, but a robust loss",
@@ -110,8 +110,8 @@ SENSORS: dict[str, str] = {
     "jj.Sensor(gain='one')": "`gain` of `Sensor` is the text 'one', expected real numbers; give a number, or an `Estimate`",
     "jj.Sensor(lag=[0.1, 0.2])": "`lag` of `Sensor` has shape (2,), expected one number",
     "jj.Sensor(gain=jj.Estimate())": "`gain` of `Sensor` is to be estimated, but has no first guess; give one: `jj.Estimate(1.0)`",
-    "jj.Sensor(delay=jj.Estimate(0.1))": "`delay` of `Sensor` is to be estimated, but nothing says how long it may be; give `range=jj.bounds",
-    "jj.Sensor(delay=jj.Estimate(0.1, range=jj.bounds(-1.0, 1.0)))": "`delay` of `Sensor` may fall to -1 s, expected a range from zero",
+    "jj.Sensor(delay=jj.Estimate(0.1))": "`delay` of `Sensor` is to be estimated, but has no upper limit; give `range=jj.bounds",
+    "jj.Sensor(delay=jj.Estimate(0.1, range=jj.bounds(-1.0, 1.0)))": "`delay` of `Sensor` may fall to -1 s, expected a range that begins at zero",
     "jj.Sensor(lag=jj.Estimate((0.1, 0.2)))": "`lag` of `Sensor` is to be estimated from 2 guesses, expected one number",
     "jj.Estimate(np.inf)": "`guess` of `Estimate` is inf, expected a finite number",
     "jj.Estimate(1.0, range=(0.0, 1.0))": "`range` of `Estimate` is a tuple, expected `bounds",
@@ -125,7 +125,7 @@ SENSORS: dict[str, str] = {
     "jj.fit(cart, jj.Experiment(TS, {'gyro': TS}, 1.0, start={'x': 0.0}, sensors={'gyro': 'x_rte'}), 'mass')": (
         "run 0 of `Cart` has channel `gyro`, whose sensor measures an unknown quantity `x_rte`; did you mean `x_rate`"
     ),
-    "fitted(delay=0.3)": "`gyro` of run 0 of `Cart` begins at 0.2 s, and less its delay of up to 0.3 s that is before the start at t0 = 0 s",
+    "fitted(delay=0.3)": "`gyro` of run 0 of `Cart` begins at 0.2 s; minus its delay of up to 0.3 s, this is before the start at t0 = 0 s",
     "fitted(delay=jj.Estimate(0.1, range=jj.bounds(0.0, 0.5)))": "give an earlier `t0` with the start there, or NaN for the first samples",
     "fitted(gain=jj.Estimate(3.0, range=jj.bounds(0.0, 2.0)))": "first guess of `gyro.gain` is 3.0; expected a first guess between its bounds",
     "fitted(gain=[1.0, 2.0])": "`gain` of sensor `gyro` of run 0 of `Cart` has shape (2,), expected () or ()",
@@ -151,7 +151,7 @@ NOISE: dict[str, str] = {
     "jj.fit(cart, [run(correlation_time=None), run(correlation_time=0.1)], 'mass')": (
         "correlation time of channel `x` is None in one run and given in another"
     ),
-    "jj.fit(cart, run(correlation_time=0.1), 'mass', loss=jj.huber())": "a robust loss takes samples as independent",
+    "jj.fit(cart, run(correlation_time=0.1), 'mass', loss=jj.huber())": "a robust loss assumes independent samples",
     "jj.log_likelihood(cart, run(correlation_time=None))": "the correlation time of channel `x` is None, but a likelihood needs to know it",
 }
 
@@ -159,7 +159,7 @@ PRIORS: dict[str, str] = {
     "jj.joint_normal({}, [[1.0]])": "expected a dictionary of name -> mean",
     "jj.joint_normal({'a': 1.0}, [1.0])": "has shape (1,), expected (1, 1)",
     "jj.joint_normal({'a': 1.0}, [[np.nan]])": "must be finite",
-    "jj.joint_normal({'a': 1.0, 'b': 1.0}, [[1.0, 0.0], [0.0, 0.0]])": "the variance of `b` is 0, expected one above zero",
+    "jj.joint_normal({'a': 1.0, 'b': 1.0}, [[1.0, 0.0], [0.0, 0.0]])": "the variance of `b` is 0, expected a number above zero",
     "jj.joint_normal({'a': 1.0, 'b': 1.0}, [[1.0, 0.5], [0.4, 1.0]])": "is not symmetric",
     "jj.joint_normal({'a': 1.0, 'b': 1.0}, [[1.0, 2.0], [2.0, 1.0]])": "its correlations have the eigenvalue -1",
     "jj.fit(cart, jj.Experiment(TS, {'x': TS}, 0.01, start={'x': 0.3}, unknown_start={'x': together['mass']}, t0=0.0))": "belongs to one run",

@@ -178,24 +178,24 @@ PARAMETERS: dict[str, Case] = {
 
 NAMES: dict[str, Case] = {
     "jj.coordinates()": "`coordinates` was given no name; give at least one, such as jj.coordinates('x y')",
-    "jj.coordinates(3)": "`coordinates` was given an int, expected names in one text, parted by blanks: jj.coordinates('a b c')",
+    "jj.coordinates(3)": "`coordinates` was given an int, expected names in one text, separated by spaces: jj.coordinates('a b c')",
     "jj.coordinates(['x', 'y'])": "`coordinates` was given a list, expected names in one text",
     "jj.coordinates('x y', 'x')": "coordinate name `x` is used twice; every coordinate needs a name of its own",
     "jj.coordinates('1x')": "coordinate name `1x` is not an identifier; use letters, digits and underscores",
-    "jj.coordinates('for')": "coordinate name `for` is a word of Python's own, so that `q.for` cannot be written",
-    "jj.coordinates('array')": "coordinate name `array` is taken by the container itself",
+    "jj.coordinates('for')": "coordinate name `for` is a keyword of Python, so `q.for` cannot be written",
+    "jj.coordinates('array')": "coordinate name `array` is an attribute of the container",
     "jj.coordinates(jj.quaternion('a b'))": "coordinate name `a b_w` is not an identifier",
     "jj.quaternion(3)": "the name of a quaternion is an int, expected a text, such as jj.quaternion('attitude')",
-    "jj.speeds(['a', 'b'])": "`speeds` was given a list, expected names in one text, parted by blanks: jj.speeds('a b c')",
+    "jj.speeds(['a', 'b'])": "`speeds` was given a list, expected names in one text, separated by spaces: jj.speeds('a b c')",
     "jj.speeds('a a')": "speed name `a` is used twice",
     "jj.inputs(None)": "`inputs` was given `None`, expected names in one text",
     "type('S', (jj.Scene,), {'coordinates': 'x y'})()": "scene `S` has no `coordinates`; state them as a class attribute",
     "described(inputs='push')": "`inputs` of `Described` is the text 'push', expected names; write inputs = jj.inputs('a b c')",
-    "described(speeds=jj.speeds('a b'))": "`Described` has speeds of its own (a, b) but does not say how they move its coordinates",
-    "described(domain={'z': (0.0, 1.0)})": "`domain` of `Described` names `z`, which is no coordinate or speed",
+    "described(speeds=jj.speeds('a b'))": "`Described` has speeds of its own (a, b) but not the rates of its coordinates",
+    "described(domain={'z': (0.0, 1.0)})": "`domain` of `Described` names `z`, which is not a coordinate or speed",
     "described(domain={'x': (nan, 0.0)})": "`domain` of `Described` gives (nan, 0.0) for `x`, expected two finite numbers (low, high)",
     "described(domain={'x': (0, 'a')})": "`domain` of `Described` gives (0, 'a') for `x`, expected two finite numbers",
-    "described(example={'z': 1.0})": "`example` of `Described` names `z`, which is no coordinate or speed",
+    "described(example={'z': 1.0})": "`example` of `Described` names `z`, which is not a coordinate or speed",
     "described(load=lambda self, motion: ())": "`Described` has a method `load`, which nothing calls; did you mean `loads`?",
     "looked_at(privileged=('x_rate',))": "`privileged` of `Described` names 1 speeds, but the scene has 2 degrees of freedom",
     "looked_at(privileged=('x_rate', 'z_rate'))": "unknown privileged speed of `Described`: `z_rate`; did you mean `y_rate`?",
@@ -240,8 +240,8 @@ PARTS: dict[str, Case] = {
     "moving['bead'].point([1.0])": "point of body `bead` has shape (1,), expected (3,); give three components in its body frame, m",
     "moving['bed']": ("UnknownNameError", "no body `bed` in this scene; did you mean `bead`? Valid names: `bead`."),
     "pose.q.z": ("AttributeError", "no `z` here; Valid names: `x`, `y`."),
-    "jj.gravity(b, 9.81)": "`gravity` was given a Bead, expected a motion: what `loads(self, motion)` is handed",
-    "pose.q[0]": ("TypeError", "entries are reached by name, and `0` was given; write `q.yaw`"),
+    "jj.gravity(b, 9.81)": "`gravity` was given a Bead, expected a motion: the argument of `loads(self, motion)`",
+    "pose.q[0]": ("TypeError", "`0` was given, but entries are accessed by name; write `q.yaw`"),
     "jj.gravity(moving, [9.81])": "strength of gravity has shape (1,), expected one number",
     "jj.spring(o, fixed, 1.0)": 'first end of a spring is an array of shape (3,), expected a point: motion["name"].point(local) or',
     "jj.spring(fixed, fixed, 'k')": "stiffness of a spring is the text 'k', expected real numbers",
@@ -281,10 +281,10 @@ STATES: dict[str, Case] = {
     "jj.start(b, x=nan)": "start value `x` is nan, expected a finite number; check where it was computed",
     "jj.start(b, t0='noon')": "`t` is the text 'noon', expected real numbers; give one time in s",
     "jj.start(b, t0=nan)": "start value `t0` is nan, expected a finite number",
-    "jj.start(sleigh, x_rate=0.0, y_rate=1.0, heading=0.0, heading_rate=0.0)": "the start of `ChaplyginSleigh` contradicts row `blade`",
-    "jj.start(DoublePendulumRods(), x1=5.0, z1=5.0)": "the start of `DoublePendulumRods` contradicts row `upper rod`: residual",
+    "jj.start(sleigh, x_rate=0.0, y_rate=1.0, heading=0.0, heading_rate=0.0)": "the start of `ChaplyginSleigh` violates constraint `blade`",
+    "jj.start(DoublePendulumRods(), x1=5.0, z1=5.0)": "the start of `DoublePendulumRods` violates constraint `upper rod`: residual",
     "jj.consistent(b, 0.0, [1.0], two)": "`q` of `Bead` has shape (1,), expected (2,); one number for each of x, y",
-    "jj.consistent(b, 0.0, two, two, held=('z',))": "`held` names `z`, which is no coordinate or speed; Valid names: `x`, `y`, `x_rate`, `y_rate`.",
+    "jj.consistent(b, 0.0, two, two, held=('z',))": "`held` names `z`, which is not a coordinate or speed; Valid names: `x`, `y`, `x_rate`, `y_rate`.",
     "jj.accelerations(Bead, 0.0, two, two)": "`scene` is the class `Bead`, expected a scene of it",
     "jj.lagrange_equations(Bead, 0.0, two, two)": "`scene` is the class `Bead`, expected a scene of it",
     "jj.pose_at(Bead, 0.0, two)": "`scene` is the class `Bead`, expected a scene of it",
@@ -342,8 +342,8 @@ MOTIONS: dict[str, Case] = {
     "jj.simulate(b, rest, ts='all')": "`ts` is the text 'all', expected real numbers; give a vector of times in s",
     "jj.simulate(b, rest, ts=[0.0, 0.5, 0.2])": "`ts` must be finite and strictly increasing (or decreasing, for reversed time)",
     "jj.simulate(b, rest, ts=[0.0, nan])": "`ts` must be finite and strictly increasing",
-    "jj.simulate(b, rest, ts=[0.0, 2.0], t1=1.0)": "`ts` runs from 0.0 to 2.0 s, outside of the span from t0 = 0.0 to t1 = 1.0 s",
-    "jj.simulate(b, rest, ts=[1.0, 0.5], t1=2.0)": "`ts` runs from 1.0 to 0.5 s, outside of the span from t0 = 0.0 to t1 = 2.0 s or against it",
+    "jj.simulate(b, rest, ts=[0.0, 2.0], t1=1.0)": "`ts` runs from 0.0 to 2.0 s, outside the span from t0 = 0.0 to t1 = 1.0 s",
+    "jj.simulate(b, rest, ts=[1.0, 0.5], t1=2.0)": "`ts` runs from 1.0 to 0.5 s, outside the span from t0 = 0.0 to t1 = 2.0 s or in the opposite direction",
     "jj.simulate(b, {}, t1=1.0, rtol=nan)": "`rtol` is nan, expected a positive finite number; give a tolerance such as 1e-8",
     "jj.simulate(b, {}, t1=1.0, options={'rtol': 1e-8})": "`options` is a dict, expected `jj.Options(...)`",
     "jj.simulate(b, {}, t1=1.0, rtol='tight')": "`rtol` is the text 'tight', expected real numbers; give one number, such as 1e-8",
@@ -360,7 +360,7 @@ MOTIONS: dict[str, Case] = {
     "jj.simulate(b, {}, t1=1.0, formulation=jj.Formulation('minimum'))": "unknown state form `minimum`; did you mean `minimal`?",
     "jj.simulate(b, {}, t1=1.0, formulation=jj.Formulation(None))": "unknown state form `None`; Valid names: `auto`, `minimal`, `full`.",
     "jj.simulate(held(a=lambda m: m.u.x_rate**2 + m.u.y_rate**2 - 1.0), {'x_rate': 1.0}, t1=1.0, formulation=jj.Formulation('minimal'))": (
-        "the rows of `Described` are nonlinear in the speeds and have no minimal state; use jj.Formulation('full')"
+        "the rows of `Described` are nonlinear in the speeds, so there is no minimal state; use jj.Formulation('full')"
     ),
     "jj.simulate(b, {}, t1=1.0, formulation=jj.Formulation(reduction='QR'))": "unknown reduction `QR`; Valid names: `privileged`, `qr`",
     "jj.Formulation(stabilisation=3.0)": '`stabilisation` is a float, expected "projection", `jj.Baumgarte(alpha, beta)` or None',
@@ -381,7 +381,7 @@ MOTIONS: dict[str, Case] = {
     "jj.Sampled([0, 2, 1], [0, 1, 2])": "the times of `Sampled` must be finite and increase from one to the next; sort the samples by time",
     "jj.Sampled([0, 1], [0, 1, 2])": "`Sampled` was given times of shape (2,) and values of shape (3,), expected two vectors of one length",
     "jj.Sampled(0.0, 1.0)": "`Sampled` was given times of shape () and values of shape ()",
-    "jj.Sampled([0, 1], [0, nan])": "value 1 of `Sampled` is nan, expected finite numbers; leave samples out that were not measured",
+    "jj.Sampled([0, 1], [0, nan])": "value 1 of `Sampled` is nan, expected finite numbers; omit missing samples",
     "jj.Sampled(['a'], [0])": "`ts` of `Sampled` is a list, expected real numbers; give times in s",
     "run['z']": ("UnknownNameError", "a trajectory of `Bead` has no `z`; Valid names: `x`, `y`, `x_rate`, `y_rate`, `t`."),
     "run.point('bed')": ("UnknownNameError", "no body `bed` in this scene; did you mean `bead`?"),
@@ -407,7 +407,7 @@ BATCHES: dict[str, Case] = {
     "jj.rollout(b, {'x': [1.0, 2.0]}, chunk=1.5, t1=0.1)": "`chunk` is 1.5, expected a whole number",
     "jj.rollout(b, {'x': [1.0, 2.0]}, t1=0.0)": "the span from t0 = 0.0 to t1 = 0.0 s is empty or not finite",
     "jj.rollout(b, {'x': [1.0, 2.0]}, ts=[0.2, 0.1, 0.3])": "`ts` must be finite and strictly increasing",
-    "jj.diagnose(jj.rollout(b, {'x': [1.0, 2.0]}, t1=0.1))": "`diagnose` was given a Rollout, expected a `Trajectory`; of a rollout take one",
+    "jj.diagnose(jj.rollout(b, {'x': [1.0, 2.0]}, t1=0.1))": "`diagnose` was given a Rollout, expected a `Trajectory`; for a rollout give one",
     "jj.rollout(b, {'x': [1.0, 2.0]}, t1=0.1, solver='tsit5')": "`solver` is the text 'tsit5', expected an object of diffrax; write `diffrax.Tsit5()`",
     "lanes_ended({'x_rate': [1.0, nan]})": ("result 8", "the start is not finite; check where its values were computed: lanes 1"),
     "lanes_ended({'x_rate': [1.0, 2.0]}, parameters={'mass': [1.0, -1.0]})": ("result 7", "a parameter is not finite or has the wrong sign (`mass`): lanes 1"),
@@ -423,8 +423,8 @@ FILES: dict[str, Case] = {
     "jj.load_trajectory('text.npz', Bead)": "`text.npz`: is no trajectory file written by `save`",
     "jj.load_trajectory('.', Bead)": "`.` cannot be read (Is a directory)",
     "jj.load_trajectory(3.5, Bead)": "`path` is a float, expected the name of a file",
-    "jj.load_trajectory('run.npz', 3)": "`scene` is an int, expected the class of the scene that moved, or any scene of that class",
-    "jj.load_trajectory('run.npz', ChaplyginSleigh)": "`run.npz` holds a trajectory of `Bead`, expected `ChaplyginSleigh`; pass the class it was made with",
+    "jj.load_trajectory('run.npz', 3)": "`scene` is an int, expected the class of the simulated scene, or a scene of that class",
+    "jj.load_trajectory('run.npz', ChaplyginSleigh)": "`run.npz` holds a trajectory of `Bead`, expected `ChaplyginSleigh`; pass its class",
     "jj.load_trajectory(rewritten('noq.npz', q=None), Bead)": "`noq.npz` lacks `q`; it is damaged or was not written by `save`",
     "jj.load_trajectory(rewritten('shape.npz', q=ARRAYS['q'][:, :1]), Bead)": (
         "`shape.npz` has 1 columns for 2 coordinates; it is damaged or was not written by `save`"
@@ -438,7 +438,7 @@ FILES: dict[str, Case] = {
     "jj.load_trajectory(rewritten('listed.npz', header=np.array('[1]')), Bead)": "`listed.npz` has a header that is no dictionary",
     "jj.load_trajectory(rewritten('other.npz', coordinates=['r', 'phi']), Bead)": "the file holds the coordinates r, phi, but `Bead` has x, y",
     "jj.load_trajectory(rewritten('minus.npz', parameter_mass=np.array(-1.0)), Bead)": (
-        "`minus.npz` has -1.0 as a value of the parameter `mass`, which is not finite or has the wrong sign, in a motion that did not fail for it"
+        "`minus.npz` has -1.0 as a value of the parameter `mass`, which is not finite or has the wrong sign, though the motion did not fail"
     ),
     "jj.load_trajectory(rewritten('more.npz', parameter_load=np.array(1.0)), Bead)": "`more.npz` has a parameter `load` that `Bead` has not",
     "jj.save(run, 'nowhere/run.npz')": "cannot write `nowhere/run.npz`: there is no folder `nowhere`; make it first",
@@ -448,7 +448,8 @@ FILES: dict[str, Case] = {
     "jj.save(lanes.lanes, 'lanes.npz')": (
         "`save` takes one motion and was given a batch of shape (2,); save a `Rollout`, `jj.Rollout(batch)` for one axis of lanes"
     ),
-    "jj.animate(lanes, 'run.gif')": "`animate` was given a Rollout, expected one motion; of a rollout take one lane: jj.animate(rollout.lane(0), 'lane-0.gif')",
+    "jj.animate(lanes, 'run.gif')": "`animate` was given a Rollout, expected one motion; for a rollout give one "
+    "lane: jj.animate(rollout.lane(0), 'lane-0.gif')",
     "jj.animate(run, 'run.mp4')": "cannot write `run.mp4`: an animation is a .gif file",
     "jj.animate(run, 'run.gif', frames=0)": "`frames` is 0, expected a whole number of at least 1",
     "jj.plot(run, 'x', path='run.xyz')": "cannot write `run.xyz`: a plot is a .png, .svg or .pdf file, and matplotlib knows no `xyz`",
@@ -475,7 +476,7 @@ ANALYSIS: dict[str, Case] = {
     "jj.linearize(Bead, {})": "`scene` is the class `Bead`",
     "jj.linearize(b, o)": "`state` is an array of shape (3,), expected a State",
     "jj.linearize(sleigh, {}, 'headin')": "`ChaplyginSleigh` has no coordinate `headin` to perturb; did you mean `heading`?",
-    "jj.linearize(b, {}, 3)": "names were expected, in one text or several, and `3` was given",
+    "jj.linearize(b, {}, 3)": "`3` was given, expected names in one text or several",
     "jj.linearize(b, {}, ('x', 'x'))": "`coordinates` names one twice (x, x); name each once",
     "jj.linearize(sleigh, {}, dependent=('hedding',))": "`ChaplyginSleigh` has no coordinate `hedding` to perturb; did you mean `heading`?",
     "jj.linearize(sleigh, {}, ('x',), privileged=('heading_rate',))": "`privileged` of `ChaplyginSleigh` names 1 speeds, but the scene has 2",
@@ -486,7 +487,7 @@ ANALYSIS: dict[str, Case] = {
     "jj.steady(sleigh, {}, held='headin')": "`ChaplyginSleigh` has no `headin` to hold or to move; did you mean `heading`?",
     "jj.steady(b, {}, moving=('z',))": "`Bead` has no `z` to hold or to move; Valid names: `x`, `y`.",
     "jj.steady(b, {}, max_steps=0)": "`max_steps` is 0, expected a whole number of at least 1",
-    "jj.build(b, jj.Formulation('full', reduction='kkt')).save('b')": "a model with a reduction or a stabilisation of its own has no file",
+    "jj.build(b, jj.Formulation('full', reduction='kkt')).save('b')": "a model with its own reduction or stabilisation cannot be saved",
     "jj.steady(b, {}, options={})": "`options` is a dict, expected `jj.Options(...)`",
     "jj.steady(b, {}, rtol=1e-3)": ("TypeError", "steady() takes no `rtol`: no motion is integrated; `max_steps` bounds the search"),
 }
@@ -597,7 +598,7 @@ LOOKS: dict[str, Case] = {
     "jj.Visual.line((0.0, 0.0, 0.0))": "has 1 points, expected at least two",
     "jj.Visual.wheel(1.0, axis='w')": "body axis `w` is unknown",
     "jj.Visual.mesh(np.zeros((4, 2)), [(0, 1, 2)])": "expected (points, 3)",
-    "jj.Visual.mesh(np.zeros((4, 3)), [(0, 1, 4)])": "numbers from 0 to 3",
+    "jj.Visual.mesh(np.zeros((4, 3)), [(0, 1, 4)])": "vertex numbers each, from 0 to 3",
 }
 
 TABLE: dict[str, Case] = BODIES | PARAMETERS | NAMES | PARTS | ROWS | STATES | MOTIONS | BATCHES | FILES | ANALYSIS | COMMANDS | ANSWERS | CONTACTS | LOOKS

@@ -84,7 +84,7 @@ def test_names_say_what_they_hold(lanes):
 
 @pytest.mark.parametrize("kind", ["coordinate", "speed"])
 def test_a_name_that_would_shadow_the_time_is_refused_where_it_is_stated(kind):
-    with pytest.raises(ValueError, match=f"{kind} name `t` is taken by the time"):
+    with pytest.raises(ValueError, match=f"{kind} name `t` is reserved for time"):
         jj.coordinates("x t") if kind == "coordinate" else jj.speeds("t v")
     assert "t" in jj.inputs("t")
 

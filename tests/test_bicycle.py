@@ -349,7 +349,7 @@ READINGS = shipped_measurements()["Browser"].read_text()
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        (READINGS.replace("TtH3", "TtH9"), "missing `alphaH3`, `aH3`, `TtH3`; the parameters of a bicycle do not follow without"),
+        (READINGS.replace("TtH3", "TtH9"), "missing `alphaH3`, `aH3`, `TtH3`, which the parameters of a bicycle need"),
         (READINGS.replace("dP =", "dQ ="), "missing `dP`"),
         (READINGS.replace("w = 1.121+/-0.002", "w"), "got `w`, expected `name = reading+/-sigma`"),
         (READINGS.replace("w = 1.121+/-0.002", "w = 1.1, long"), "reading of `w` is `long`, expected a number"),

@@ -96,7 +96,7 @@ def test_a_model_with_other_parameters_keeps_its_choices_and_is_differentiated_u
 
 
 def test_a_function_that_takes_scenes_only_says_what_to_pass(disc):
-    with pytest.raises(AttributeError, match=r"`Model` has no `bodies`; where a scene is asked for, pass its `\.scene`"):
+    with pytest.raises(AttributeError, match=r"`Model` has no `bodies`; where a scene is expected, pass its `\.scene`"):
         disc.bodies  # as a function of scenes would ask  # noqa: B018
 
 
@@ -164,5 +164,5 @@ def test_a_model_comes_back_from_its_file_without_tracing_the_scene(kind, tmp_pa
     assert str(loaded) == str(model)
     assert_array_equal(jj.simulate(loaded, t1=0.1).q_end, ended)
     path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(ValueError, match="what differs is scene, sha256; build and save it anew"):
+    with pytest.raises(ValueError, match="they differ in scene, sha256; build and save it again"):
         jj.load_model(path, ChaplyginSleigh())

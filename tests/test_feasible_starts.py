@@ -70,7 +70,7 @@ def test_a_disc_leans_as_its_height_wants(given):
     ],
 )
 def test_values_that_no_state_has_are_refused_with_the_row(name, given, row):
-    with pytest.raises(ValueError, match=f"contradicts row `({row})"):
+    with pytest.raises(ValueError, match=f"violates constraint `({row})"):
         jj.start(SCENES[name], **given)
 
 
@@ -111,7 +111,7 @@ def test_what_is_found_outside_of_the_domain_is_refused_unless_it_is_looked_for_
     for look in (jj.start, lambda scene, values: jj.simulate(scene, values, t1=0.1)):
         with pytest.raises(ValueError, match="near="):
             look(scene, {"x": 1.0})
-    with pytest.raises(ValueError, match="`near` names `x_rate`, which is no coordinate"):
+    with pytest.raises(ValueError, match="`near` names `x_rate`, which is not a coordinate"):
         jj.start(scene, near={"x_rate": 1.0})
     with pytest.raises(ValueError, match="expected a dictionary of coordinates"):
         jj.start(scene, near=0.4)

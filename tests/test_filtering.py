@@ -93,7 +93,7 @@ def test_undisturbed_motions_have_the_plain_likelihood():
 @pytest.mark.parametrize(
     ("noise", "change", "message"),
     [
-        ({"x": 0.1}, {}, "`process_noise` names `x`, which is no independent speed of `Oscillator`"),
+        ({"x": 0.1}, {}, "`process_noise` names `x`, which is not an independent speed of `Oscillator`"),
         ({"x_rate": -1.0}, {}, "process noise of `x_rate` is -1, expected zero or more"),
         ({}, {"sigma": None}, "sigma of channel `x` is None"),
         ({}, {"correlation_time": 0.1}, "has a correlation time"),
@@ -112,5 +112,5 @@ def test_quaternions_and_accelerometers_are_refused():
     with pytest.raises(ValueError, match="has quaternions"):
         jj.filtered_log_likelihood(jj.models.FreeRigidBody(), jj.Experiment(TS, {"x": TS}, 0.1, start={}), process_noise={})
     run = jj.Experiment(TS, {"imu": np.zeros((8, 3))}, 0.1, start={}, sensors={"imu": jj.Accelerometer("cart")})
-    with pytest.raises(ValueError, match="shows accelerations, and so the white disturbance itself"):
+    with pytest.raises(ValueError, match="measures accelerations, which contain the white disturbance itself"):
         jj.filtered_log_likelihood(Oscillator(), run, process_noise={})

@@ -233,7 +233,7 @@ def test_reductions_agree_in_single_precision(compared):
 
 
 def test_tolerances_below_single_precision_are_warned_of(single):
-    assert any("asks for more digits than float32 has" in text for text in single["tight"]["warnings"])
+    assert any("needs more digits than float32 has" in text for text in single["tight"]["warnings"])
     assert single["tight"]["files"] == ["<string>"]  # the line of the call
     assert single["tight"]["finite"]
 
@@ -243,7 +243,7 @@ def test_result_codes_hold_in_single_precision(single):
 
 
 def test_values_that_contradict_each_other_are_refused_in_single_precision(single):
-    assert single["contradiction"].startswith("the start of `Skate` contradicts row `edge`: residual 0.1 is left")  # not moved, as if it were round-off
+    assert single["contradiction"].startswith("the start of `Skate` violates constraint `edge`: residual 0.1 remains")  # not moved, as if it were round-off
 
 
 def test_increments_below_the_last_digit_of_a_state_add_up(single):

@@ -346,7 +346,7 @@ def test_bad_contacts():
         jj.simulate(Ball(bounce=1.2), SLIDING, t1=0.1)
     with pytest.raises(ValueError, match=r"contacts with friction, and time runs from t0 = 0\.0 back to t1 = -1\.0 s"):
         jj.simulate(Ball(), SLIDING, t1=-1.0)
-    with pytest.raises(ValueError, match="`linearize` serves contacts that roll, and `cloth` of `Ball` may slip and fly"):
+    with pytest.raises(ValueError, match="`linearize` needs rolling contacts, but `cloth` of `Ball` may slip and lift off"):
         jj.linearize(Ball(), {"z": 0.0285})
     below = jj.simulate(Ball(), SLIDING | {"z": 0.02}, t1=0.1)
     assert "a body begins below the ground" in below.message

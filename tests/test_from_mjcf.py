@@ -208,7 +208,7 @@ def test_geoms_are_drawn():
 def test_what_moves_nothing_is_listed():
     idle = '<camera name="eye"/><light/><light/><geom type="plane" size="1 1 1"/>'
     text = _body(HINGE).replace("<worldbody>", f"<sensor/><worldbody>{idle}")
-    with pytest.warns(UserWarning, match=r"left out `camera`, `geom of type plane`, `light` \(2\), `sensor`;"):
+    with pytest.warns(UserWarning, match=r"omitted `camera`, `geom of type plane`, `light` \(2\), `sensor`;"):
         jj.from_mjcf(text)
 
 
@@ -220,16 +220,16 @@ HINGE = '<joint name="j"/>'
 BAD = {
     "no-file": ("nowhere.xml", r"nowhere.xml: cannot be read"),
     "another-root": ("<robot/>", r"its root is `robot`, expected `mujoco`"),
-    "nothing-moves": (_body(""), r"no joint moves anything"),
+    "nothing-moves": (_body(""), r"no joint moves a body"),
     "unknown-joint": (_body('<joint name="j" type="hing"/>'), r"joint `j` is of the type `hing`; did you mean `hinge`"),
     "armature": (_body('<joint name="j" armature="0.1"/>'), r'`armature="0.1"` of joint `j` is not read.*ignore=\("armature",\)'),
     "ball-spring": (_body('<joint name="j" type="ball" stiffness="1"/>'), r"the stiffness of the ball joint `j` is not read"),
-    "equality": (_body(HINGE, '<equality><joint joint1="k"/></equality>'), r"joint 1 of `equality` names `k`, which is no hinge or slide"),
+    "equality": (_body(HINGE, '<equality><joint joint1="k"/></equality>'), r"joint 1 of `equality` names `k`, which is not a hinge or slide"),
     "no-anchor": (_body(HINGE, '<equality><connect body1="b"/></equality>'), r"anchor of connect 1 of `equality` is missing"),
     "tendon-equality": (_body(HINGE, "<equality><tendon/></equality>"), r"`tendon` in `equality` is not read"),
     "include": (_body(HINGE, '<include file="x.xml"/>'), r"x.xml: cannot be read"),
     "servo": (_body(HINGE, '<actuator><position name="p" joint="j"/></actuator>'), r"`position` `p` in `actuator` is not read"),
-    "motor-of-nothing": (_body(HINGE, '<actuator><motor name="p" joint="k"/></actuator>'), r"motor `p` pushes `k`, which is no hinge or slide"),
+    "motor-of-nothing": (_body(HINGE, '<actuator><motor name="p" joint="k"/></actuator>'), r"motor `p` pushes `k`, which is not a hinge or slide"),
     "motor-of-no-site": (_body(HINGE, '<actuator><motor name="p" site="s"/></actuator>'), r"motor `p` pushes the site `s`, which is none"),
     "massless": (f'<mujoco><worldbody><body name="b">{HINGE}</body></worldbody></mujoco>', r"link `b`, which `j` moves, has no mass"),
     "mesh-of-unknown-mass": (_body(f'{HINGE}<geom type="mesh" mesh="m"/>'), r"the mass of a geom of body `b`, of the type `mesh`, is not read"),
@@ -239,9 +239,9 @@ BAD = {
     "no-class": (_body('<joint name="j" class="heavy"/>'), r"joint `j` is of the class `heavy`, which no `default` states"),
     "default-without-class": (_body(HINGE, compiler="<default><default/></default>"), r"a `default` inside the class `main` has no `class`"),
     "free-below": (_body(f'{HINGE}<body name="c"><freejoint/><geom size="1"/></body>'), r"body `c` has a free joint and a parent"),
-    "quaternion-zero": (_body(f'{HINGE}<body name="c" quat="0 0 0 0"/>'), r"quat of body `c` is `0 0 0 0`, which is no rotation"),
-    "no-axis": (_body(f'{HINGE}<body name="c" axisangle="0 0 0 30"/>'), r"axisangle of body `c` is `0 0 0 30`, which is no rotation"),
-    "parallel-axes": (_body(f'{HINGE}<body name="c" xyaxes="1 0 0 2 0 0"/>'), r"xyaxes of body `c` is `1 0 0 2 0 0`, which is no rotation"),
+    "quaternion-zero": (_body(f'{HINGE}<body name="c" quat="0 0 0 0"/>'), r"quat of body `c` is `0 0 0 0`, which is not a rotation"),
+    "no-axis": (_body(f'{HINGE}<body name="c" axisangle="0 0 0 30"/>'), r"axisangle of body `c` is `0 0 0 30`, which is not a rotation"),
+    "parallel-axes": (_body(f'{HINGE}<body name="c" xyaxes="1 0 0 2 0 0"/>'), r"xyaxes of body `c` is `1 0 0 2 0 0`, which is not a rotation"),
     "two-rotations": (_body(f'{HINGE}<body name="c" euler="1 2 3" quat="1 0 0 0"/>'), r"body `c` is turned by `quat` and by `euler`; expected one of them"),
     "unit-of-angles": (_body(HINGE, compiler='<compiler angle="radians"/>'), r"`angle` of `compiler` is `radians`; did you mean `radian`\?"),
     "sequence": (_body(HINGE, compiler='<compiler eulerseq="xyq"/>'), r"`eulerseq` of `compiler` is `xyq`, expected three letters"),

@@ -228,7 +228,7 @@ def _with(kane, origin, values, **changes):
 
 t, y = (mechanics.dynamicsymbols._t, mechanics.dynamicsymbols("y"))
 BAD = {
-    "input-in-a-position": (lambda: systems.moved_pivot(), r"`pivot\(t\)` occurs in a position.*neither coordinate nor speed"),
+    "input-in-a-position": (lambda: systems.moved_pivot(), r"`pivot\(t\)` occurs in a position.*neither a coordinate nor a speed"),
     "no-value": (lambda: (*systems.pendulum()[:2], {systems.m: 1.0}), r"no value for `c`, `g`, `l`"),
     "value-of-nothing": (lambda: _with(*systems.pendulum(), gg=1.0), r"`values` names `gg`.*did you mean `g`"),
     "value-is-no-number": (lambda: _with(*systems.pendulum(), m="heavy"), r"value of `m` is the text 'heavy'"),
@@ -241,7 +241,7 @@ BAD = {
     "mass-in-time": (lambda: systems.pendulum(mass=2 + sympy.sin(t)), r"mass of body `bob` is `sin\(t\) \+ 2`"),
     "unknown-function": (lambda: systems.pendulum_with(systems.given_function), r"function `f` in `.*` has no counterpart in JAX"),
     "function-not-in-jax": (lambda: systems.pendulum_with(lambda q, N: sympy.besselj(0, q) * N.x), r"function `besselj`"),
-    "imaginary-load": (lambda: systems.pendulum_with(lambda q, N: sympy.I * q * N.x), r"`I` is no real number"),
+    "imaginary-load": (lambda: systems.pendulum_with(lambda q, N: sympy.I * q * N.x), r"`I` is not a real number"),
     "acceleration-in-a-load": (lambda: systems.pendulum_with(lambda q, N: mechanics.dynamicsymbols("u").diff() * N.x), r"not on their rates"),
     "rate-of-an-input": (lambda: systems.pendulum_with(lambda q, N: y.diff() * N.x), r"`Derivative\(y\(t\), t\)` occurs.*make `y\(t\)` a coordinate"),
 }
@@ -252,7 +252,7 @@ CHANGED = {
     "two-angular-velocities": (
         systems.double_pendulum,
         lambda kane: kane.bodies[1].frame.set_ang_vel(kane.bodies[0].frame, 3 * kane.u[0] * kane.bodies[0].frame.z),
-        r"another angular velocity than its orientation",
+        r"an angular velocity that disagrees with its orientation",
     ),
     "inertia-that-changes": (systems.double_pendulum, lambda kane: _inertia_in(kane, kane._inertial), r"body `rod 2` in its own frame `B` changes in time"),
     "inertia-in-a-loose-frame": (systems.double_pendulum, lambda kane: _inertia_in(kane, LOOSE), r"body `rod 2` is stated in a frame that has no orientation"),

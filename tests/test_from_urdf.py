@@ -214,9 +214,9 @@ def test_elements_that_are_left_out_are_listed():
     extra = '<gazebo/><gazebo/><transmission name="t"/></robot>'
     mesh = '<visual><geometry><mesh filename="package://gone/part.stl"/></geometry></visual></inertial></link>'
     text = ROBOT.replace("</robot>", extra).replace("</inertial>\n  </link>", mesh, 1)
-    with pytest.warns(UserWarning, match=r"left out `gazebo` \(2\), `transmission`; `ignore` silences this"):
+    with pytest.warns(UserWarning, match=r"omitted `gazebo` \(2\), `transmission`; `ignore` silences this"):
         jj.from_urdf(text)
-    with pytest.warns(UserWarning, match=r"left out `transmission`;"):
+    with pytest.warns(UserWarning, match=r"omitted `transmission`;"):
         jj.from_urdf(text, ignore="gazebo")
 
 
@@ -239,7 +239,7 @@ BAD = {
     "no-links": ("<robot/>", r"it has no links"),
     "unknown-base": (_robot(_joint()), r"`base` is 'loose', expected one of 'fixed', 'planar', 'free'"),
     "unknown-type": (_robot(_joint("revolut")), r"joint `j` is of the type `revolut`; did you mean `revolute`"),
-    "unknown-link": (_robot(_joint(child="bb")), r"joint `j` has the child `bb`, which is no link; did you mean `b`"),
+    "unknown-link": (_robot(_joint(child="bb")), r"joint `j` has the child `bb`, which is not a link; did you mean `b`"),
     "no-parent": (_robot(_joint().replace('<parent link="a"/>', "")), r"joint `j` has no `parent`"),
     "two-parents": (_robot(_joint(), _joint(name="k")), r"link `b` is the child of joints `j` and `k`"),
     "two-roots": (_robot(), r"links `a`, `b` have none"),
@@ -253,12 +253,12 @@ BAD = {
     "axis-zero": (_robot(_joint(inside='<axis xyz="0 0 0"/>')), r"xyz of `axis` of joint `j` is zero"),
     "friction": (_robot(_joint(inside='<dynamics friction="0.1"/>')), r'the friction of joint `j` is not read.*ignore=\("friction",\)'),
     "negative-damping": (_robot(_joint(inside='<dynamics damping="-1"/>')), r"damping of `dynamics` of joint `j` is -1"),
-    "unknown-motor": (_robot(_joint()), r"`motors` names `jj`, which is no joint of one coordinate"),
-    "unknown-free-link": (_robot(_joint()), r"`free` names `bb`, which is no link; did you mean `b`"),
-    "unknown-leader": (_robot(_joint(inside='<mimic joint="x"/>')), r"`mimic` of joint `j`: `x` is no joint"),
+    "unknown-motor": (_robot(_joint()), r"`motors` names `jj`, which is not a joint with one coordinate"),
+    "unknown-free-link": (_robot(_joint()), r"`free` names `bb`, which is not a link; did you mean `b`"),
+    "unknown-leader": (_robot(_joint(inside='<mimic joint="x"/>')), r"`mimic` of joint `j`: `x` is not a joint"),
     "leader-of-itself": (_robot(_joint(inside='<mimic joint="j" multiplier="2"/>')), r"joint `j` mimics itself"),
-    "nothing-moves": (_robot(_joint("fixed")), r"no joint moves anything"),
-    "unknown-locked": (_robot(_joint("planar")), r"`locked` names `j`, which is no joint of one coordinate"),
+    "nothing-moves": (_robot(_joint("fixed")), r"no joint moves a body"),
+    "unknown-locked": (_robot(_joint("planar")), r"`locked` names `j`, which is not a joint with one coordinate"),
     "no-name": ("<robot><link/></robot>", r"a link has no `name`"),
     "two-names-become-one": (
         _robot(_joint(child="b-c"), _joint(child="b_c", name="k"), links=["a", "b-c", "b_c"]),

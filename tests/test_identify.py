@@ -214,7 +214,7 @@ def test_a_damping_of_zero_is_found_and_gets_a_one_sided_limit():
     for given in (unbounded(0.1), bounds(-1.0, 2.0)):
         other = fit(Cart(mass=2.2), released(0.002), {"mass": unbounded(), "damping": given})
         assert_allclose(other.values, found.values, rtol=1e-6)
-    with pytest.raises(ValueError, match=r"first guess of `damping` is -0\.5, but this parameter is declared as not negative"):
+    with pytest.raises(ValueError, match=r"first guess of `damping` is -0\.5, but this parameter is declared non-negative"):
         fit(Cart(), released(0.0), {"damping": jj.Estimate(-0.5, range=bounds(-1.0, 2.0))})
 
 
@@ -526,5 +526,5 @@ def test_start_values_that_depend_on_each_other_are_refused():
     # y_rate follows from the offset, which is to change
     with pytest.raises(ValueError, match=r"the start of run 0 no longer meets the constraints when the unknowns change.*`blade`"):
         fit(TRUTH, run(consistent), ("offset",))
-    with pytest.raises(ValueError, match=r"the start of run 1 is not admissible.*contradicts row `blade`"):
+    with pytest.raises(ValueError, match=r"the start of run 1 is not admissible.*violates constraint `blade`"):
         fit(TRUTH, [data, run({"y_rate": 1.0, "x_rate": 0.0, "heading_rate": 0.0})], ("inertia",))

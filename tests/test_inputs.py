@@ -49,9 +49,9 @@ def test_a_start_meets_rows_that_depend_on_inputs_at_its_time(speed):
 def test_given_values_are_compared_with_the_rows_at_the_inputs():
     kept = jj.start(OnBelt(), y=0.5, x_rate=4.5, inputs={"speed": 3.0})
     assert (kept["x_rate"], kept["y"]) == (4.5, 0.5)
-    with pytest.raises(ValueError, match=r"contradicts row `belt`: residual 1.5 is left"):
+    with pytest.raises(ValueError, match=r"violates constraint `belt`: residual 1.5 remains"):
         jj.start(OnBelt(), y=0.5, x_rate=4.5, inputs={"speed": 2.0})
-    with pytest.raises(ValueError, match=r"contradicts row `belt`: residual 4.5 is left"):
+    with pytest.raises(ValueError, match=r"violates constraint `belt`: residual 4.5 remains"):
         jj.start(OnBelt(), y=0.5, x_rate=4.5)
 
 
@@ -226,7 +226,7 @@ JUMPS = {
 @pytest.mark.parametrize("way", JUMPS)
 def test_an_input_of_a_row_that_jumps_is_refused(way):
     for motions, rates in ((jj.simulate, 1.0), (jj.rollout, np.array([1.0, 2.0]))):
-        with pytest.raises(ValueError, match=r"input `speed` of `Towed` jumps at t = .* s, and velocity rows depend on it"):
+        with pytest.raises(ValueError, match=r"input `speed` of `Towed` jumps at t = .* s, but velocity constraints depend on it"):
             motions(Towed(), {"x_rate": rates}, t1=2.0, inputs={"speed": JUMPS[way]})
 
 
@@ -241,7 +241,7 @@ def test_an_input_of_a_row_that_has_no_derivative_is_refused():
     def measured(t):
         return jax.pure_callback(lambda t: np.asarray(t) ** 2, jax.ShapeDtypeStruct((), t.dtype), t)
 
-    with pytest.raises(ValueError, match="rows depend on inputs, whose rates the accelerations need"):
+    with pytest.raises(ValueError, match="constraints depend on inputs, whose rates the accelerations need"):
         jj.simulate(Towed(), {"x_rate": 1.0}, t1=2.0, inputs={"speed": measured})
 
 

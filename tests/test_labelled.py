@@ -89,7 +89,7 @@ def test_a_missing_package_is_named_with_what_installs_it(motion, monkeypatch, p
 
 
 def test_wrong_names_and_traced_motions_are_refused(motion):
-    with pytest.raises(ValueError, match="`units` names `xx`, which is no coordinate or speed of `TiltingDiscQuaternion`"):
+    with pytest.raises(ValueError, match="`units` names `xx`, which is not a coordinate or speed of `TiltingDiscQuaternion`"):
         motion.to_xarray(units={"xx": "m"})
     with pytest.raises(TypeError, match="`to_xarray` was called inside jit"):
         jax.jit(lambda m: m.to_xarray() or 0)(motion)

@@ -178,10 +178,10 @@ def test_derivatives_pass_through_linearisation(derivative):
     ("asked", "options", "message"),
     [
         (("learn",), {}, "no coordinate `learn` to perturb; did you mean `lean`"),
-        (("pitch",), {"dependent": ("pitch",)}, "said to be dependent"),
+        (("pitch",), {"dependent": ("pitch",)}, "in `dependent`"),
         (("yaw",), {}, "not among the privileged speeds"),
         (("lean",), {"privileged": ("lean_rte",)}, "unknown privileged speed"),
-        (("lean", "pitch"), {}, "tie the asked coordinates"),
+        (("lean", "pitch"), {}, "make the given coordinates dependent"),
     ],
 )
 def test_wrong_names_are_answered_with_valid_ones(asked, options, message):
@@ -365,7 +365,7 @@ def test_a_family_along_a_parameter_ends_where_this_leaves_the_sign_declared_for
 
 
 class SplineBead(HoopBead):
-    """The bead with a field of many numbers, which is no parameter, before the one that varies."""
+    """The bead with a field of many numbers, which is not a parameter, before the one that varies."""
 
     weight: jj.Spline = jj.Spline(jnp.linspace(0.0, 1.0, 5), jnp.full(5, 9.81))
     pace: float = jj.parameter(3.0, unit="rad/s")
@@ -422,7 +422,7 @@ def test_what_cannot_be_followed_is_refused(guess, options, says):
 
 
 def test_a_motion_that_stands_alone_and_points_that_are_no_branch_points(turns, bicycle):
-    with pytest.raises(ValueError, match="stands alone"):
+    with pytest.raises(ValueError, match="is isolated"):
         jj.family(HoopBead(), {"angle": 0.0})
     with pytest.raises(ValueError, match="expected a branch point"):
         jj.family(bicycle, turns.folds[0])
@@ -562,12 +562,12 @@ def test_points_that_meet_are_no_functions_of_parameters():
 def test_critical_points_that_are_not_there_are_refused(bicycle, straight):
     with pytest.raises(ValueError, match=r"no such special point; it has: .*weave"):
         jj.critical(bicycle, straight, "fold in lean")
-    with pytest.raises(ValueError, match="the family is one of `WhippleBicycle`"):
+    with pytest.raises(ValueError, match="the family belongs to `WhippleBicycle`"):
         jj.critical(TiltingDisc(), straight, "weave")
 
 
 def test_critical_points_in_float32_are_refused(bicycle, straight):
-    with jax.enable_x64(False), pytest.raises(ValueError, match="in float64 alone; set"):
+    with jax.enable_x64(False), pytest.raises(ValueError, match="need float64; set"):
         jj.critical(bicycle, straight, "weave")
 
 

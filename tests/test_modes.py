@@ -423,7 +423,7 @@ def test_wrong_events_are_named():
         def events(self, motion):
             return {"floor": jj.Event(motion.q.z, jump={"w": 0.0})}
 
-    with pytest.raises(ValueError, match=r"event `floor` of `Wrong` moves `w`, which is no coordinate or speed"):
+    with pytest.raises(ValueError, match=r"event `floor` of `Wrong` moves `w`, which is not a coordinate or speed"):
         jj.simulate(Wrong())
 
     class WrongMode(Ball):
@@ -448,7 +448,7 @@ def test_wrong_events_are_named():
         def events(self, motion):
             return {"floor": jj.Event(motion.q.z, jump={"z": 1.0}, stop=True)}
 
-    with pytest.raises(ValueError, match="has nothing to switch"):
+    with pytest.raises(ValueError, match="cannot switch anything"):
         jj.simulate(Stops())
-    with pytest.raises(ValueError, match="does not go on after events"):
+    with pytest.raises(ValueError, match="cannot continue after events"):
         jj.simulate(Ball(), solver=diffrax.Kvaerno5())

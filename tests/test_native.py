@@ -120,7 +120,7 @@ def test_it_is_said_why_machine_code_is_not_taken(monkeypatch):
     monkeypatch.setattr(host, "reason_against", lambda: "")
     ffi.version.cache_clear()
     monkeypatch.setattr(jax.ffi, "include_dir", lambda: "/nowhere")
-    with pytest.warns(UserWarning, match="interface of this jaxlib is not known"):
+    with pytest.warns(UserWarning, match="this jaxlib has an unknown foreign function interface"):
         assert "interface" in set_up(disc).reason_against_machine_code
     ffi.version.cache_clear()
 

@@ -165,7 +165,7 @@ def test_residuals_beyond_all_measure_are_not_called_a_motion_that_fails(value, 
 
 def test_a_memory_needs_neighbours():
     runs = [run([0.5], {"x": [2.0 + 0.01 * k]}, 0.1, ("x",), t0=0.0, correlation_time=None) for k in range(3)]
-    with pytest.raises(ValueError, match="each run has one sample"):
+    with pytest.raises(ValueError, match="each run has only one sample"):
         jj.fit(Bead(), runs)
 
 

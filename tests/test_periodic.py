@@ -178,5 +178,5 @@ def test_a_family_of_orbits_tells_how_each_of_them_loses_its_stability(changed, 
     assert not found.stable[-1]
     assert [fold[vary] for fold in found.folds] == pytest.approx([0.0] * (vary == "push"), abs=1e-8)
     assert "periodic motions of Swaying" in str(found)
-    with pytest.raises(ValueError, match="`critical` takes a family of steady motions"):
+    with pytest.raises(ValueError, match="`critical` needs a family of steady motions"):
         jj.critical(scene, found, kind)

@@ -184,7 +184,7 @@ def test_elements_without_influence_on_the_motion_are_read_over():
     other = jj.from_urdf(calm, ignore=("gazebo", "transmission", "ros2_control"))()
     q, u = jj.start(own).q, jj.start(own).u
     assert_array_equal(jj.accelerations(own, 0.0, q, u).udot, jj.accelerations(other, 0.0, q, u).udot)
-    with pytest.raises(UserWarning, match=r"left out `gazebo`, `ros2_control`, `transmission`"):
+    with pytest.raises(UserWarning, match=r"omitted `gazebo`, `ros2_control`, `transmission`"):
         jj.from_urdf(calm)
 
 
@@ -245,10 +245,10 @@ def test_what_is_no_number_is_refused_with_its_place(number):
 @pytest.mark.parametrize("name", ["m" * 10_000 + ".stl", "package://p/" + "m" * 10_000, "a\ufffd.stl"])
 def test_meshes_that_are_nowhere_are_listed_in_short(name):
     text = URDF.replace('<sphere radius="0.1"/>', f'<mesh filename="{name}"/>')
-    with pytest.warns(UserWarning, match="left out `mesh ") as told:
+    with pytest.warns(UserWarning, match="omitted `mesh ") as told:
         jj.from_urdf(text)
     assert len(str(told[0].message)) < 300
-    with pytest.warns(UserWarning, match="left out `geom of type mesh`"):
+    with pytest.warns(UserWarning, match="omitted `geom of type mesh`"):
         jj.from_mjcf(MJCF.replace("m.obj", name).replace('<geom name="g" size="0.1"', '<geom type="mesh" mesh="m" mass="0"/><geom name="g" size="0.1"'))
 
 

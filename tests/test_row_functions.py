@@ -44,7 +44,7 @@ def of_skate(y_rate):
 def test_values_that_contradict_each_other_get_a_result_code_where_they_are_traced():
     seen = jax.jit(lambda y_rate: (lambda motion: (motion.result, motion.u[0], motion.moved_u))(of_skate(y_rate)))
     assert int(seen(0.5)[0]) == results.INCONSISTENT_START
-    with pytest.raises(ValueError, match="contradicts row `edge`"):
+    with pytest.raises(ValueError, match="violates constraint `edge`"):
         of_skate(0.5)
     for result, u, moved in (seen(1e-7), (lambda motion: (motion.result, motion.u[0], motion.moved_u))(of_skate(1e-7))):
         assert int(result) == results.SUCCESS

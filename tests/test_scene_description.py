@@ -108,7 +108,7 @@ def test_a_count_or_a_switch_must_be_a_static_field(value):
     class Chain(Bead):
         links: object = value
 
-    with pytest.raises(ValueError, match=rf"field `links` of `Chain` is {value} and no parameter; .*static=True, default={value}"):
+    with pytest.raises(ValueError, match=rf"field `links` of `Chain` is {value}, which is not a parameter; .*static=True, default={value}"):
         Chain()
 
     class Static(Bead):

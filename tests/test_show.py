@@ -302,5 +302,5 @@ def test_a_file_without_a_mesh_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"cannot read a mesh from `.*part\.xyzw`: .*not supported.*; give a file such as \.stl or \.obj"):
         jj.Visual.from_file(tmp_path / "part.xyzw")
     (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\n")
-    with pytest.raises(ValueError, match=r"`.*points\.obj` holds no faces, expected a mesh"):
+    with pytest.raises(ValueError, match=r"`.*points\.obj` has no faces, expected a mesh"):
         jj.Visual.from_file(tmp_path / "points.obj")

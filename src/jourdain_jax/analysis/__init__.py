@@ -1,4 +1,5 @@
-"""What can be said of a scene and of a state: integrability, report, energy, verification; and what measurements say of a scene.
+"""Analyses of scenes and states (integrability, report, energy, verification), and identification from
+measurements.
 
 The way of a fit, from what is given to what is told:
 

@@ -1,4 +1,5 @@
-"""Least squares with unknowns that all runs share and unknowns of one run, or of one piece of a run, each: an arrow, through which a chain may go.
+"""Least squares with unknowns shared by all runs and unknowns of single runs or pieces: an arrow-shaped
+matrix, which may contain a chain.
 
 minimise sum_i |r_i + J_i dx_i + S_i ds|^2 + sum_i |c_i + B_i dx_i + A_i dx_i-1 + C_i ds|^2 + lambda |D d|^2
          piece i: its own unknowns x_i, the shared ones s; its join with the piece before, if it has one
@@ -48,7 +49,7 @@ class ByMember:
                 kept[members] = one
 
     def replaced(self: Parts, members: np.ndarray, new: Parts, chosen: Bool[np.ndarray, "some"]) -> Parts:
-        """Return all members, with what is `new` of these where it is `chosen`."""
+        """Return all members, with the `new` values of the `chosen` ones."""
         count = len(next(x for x in self._parts() if isinstance(x, np.ndarray)))
         if len(members) == count and chosen.all():
             return new
@@ -58,7 +59,7 @@ class ByMember:
 
 
 def triangle(whole: Float[np.ndarray, "*batch samples width"]) -> Float[np.ndarray, "*batch width width"]:
-    """T of [J r]; with entries that are not finite where those of [J r] are not."""
+    """Return T of [J r], not finite where [J r] is not."""
     width = whole.shape[-1]
     if whole.shape[-2] < width:
         whole = np.concatenate([whole, np.zeros((*whole.shape[:-2], width - whole.shape[-2], width))], axis=-2)
@@ -89,7 +90,7 @@ class Arrow(ByMember):
 
     @property
     def _blocks(self) -> list[np.ndarray]:
-        """Rows whose columns are those of the shared unknowns; of a piece and these; of a piece, the one before and these."""
+        """Return rows in the shared unknowns; in a piece and these; in a piece, its predecessor and these."""
         return [x for x in (self.shared, self.local if self.local.shape[2] else None, self.joins) if x is not None]
 
     def _columns(self, x: Shaped[np.ndarray, "members unknowns"]) -> list[np.ndarray]:
@@ -113,7 +114,9 @@ class Arrow(ByMember):
         return replace(self._of_blocks(blocks), scores=self.scores * self.split(size)[0][:, None])
 
     def _by_unknown(self, of: Callable[[np.ndarray], np.ndarray]) -> ByUnknown:
-        """Return the sums over all rows of what is `of` rows: (..., rows, columns and residual) -> (..., columns)."""
+        """Return sums over all rows of the quantity `of` rows: (..., rows, columns and residual) -> (...,
+        columns).
+        """
         shared, *others = map(of, self._blocks)
         pieces, m, _ = self.counts
         own = np.zeros((len(shared), pieces, m))
@@ -142,7 +145,7 @@ class Arrow(ByMember):
         return sum(np.einsum("bi,bi->b", x, x) for x in (x.reshape(len(x), -1) for x in self._changes(d)))
 
     def _held(self, held: Bool[np.ndarray, "members unknowns"], moved: ByUnknown) -> "Arrow":
-        """Return the problem of all other unknowns, with the residuals where those that are `held` have `moved`."""
+        """Return the problem of all other unknowns, with the residuals after the `held` ones have `moved`."""
         blocks = [rows.copy() for rows in self._blocks]
         for rows, change, free in zip(blocks, self._changes(np.where(held, moved, 0.0)), self._columns(~held), strict=True):
             rows[..., -1] += change
@@ -166,7 +169,9 @@ class Arrow(ByMember):
 
 
 def with_prior(arrow: Arrow, residual: ByUnknown, weight: np.ndarray, M: Float[np.ndarray, "shared shared"]) -> Arrow:
-    """Add one `residual` (theta - mean) * weight for each unknown, zero where nothing is known; those of shared ones times M. The scores stay."""
+    """Add one `residual` (theta - mean) * weight for each unknown, zero without a prior; for shared ones
+    multiplied by M. The scores stay.
+    """
     (r_s, r_l), (J_s, J_l) = arrow.split(residual), arrow.split(np.broadcast_to(weight, residual.shape))
     tops, left = eliminated(arrow.local, J_l, residual=r_l)
     below = np.concatenate([M * J_s[:, None], M @ r_s[..., None]], axis=-1)
@@ -206,7 +211,9 @@ def _beside(rows: Float[np.ndarray, "*batch rows width"], m: int) -> Float[np.nd
 
 
 def by_singular_values(shared: np.ndarray, D: np.ndarray, damping: PerMember, cutoff: float) -> Float[np.ndarray, "members shared"]:
-    """The damped step of the shared unknowns, in unknowns times D: (S^2 + lambda) ds = - S U' c; what does not show stays as it is."""
+    """Return the damped step of the shared unknowns, in unknowns times D: (S^2 + lambda) ds = - S U' c;
+    undetermined directions stay.
+    """
     U, S, Vt = np.linalg.svd(shared[..., :-1] / D[:, None], full_matrices=False)
     hidden = S[:, :1] * cutoff >= S  # the first is the largest
     weight = S / (S * S + damping[:, None])

@@ -1,4 +1,5 @@
-"""Noise with a memory: an Ornstein-Uhlenbeck process in each channel, which at equal intervals is an AR(1) process.
+"""Correlated noise: an Ornstein-Uhlenbeck process in each channel, which is an AR(1) process at equal
+intervals.
 
     E e(t) e(t') = sigma^2 exp(-|t - t'| / tau),        rho_k = exp(-(t_k - t_j) / tau),      j: the last sample before k that is not missing
     whitened     w_k = (r_k - rho_k r_j) / sqrt(1 - rho_k^2),      w = r at the first sample:  independent, of variance one where r = e / sigma
@@ -26,7 +27,8 @@ SHORTEST = 0.1  # tau over the shortest interval: the noise is white
 
 
 def chain(weight: Float[Array | np.ndarray, "times *rest"], ts: Float[Array | np.ndarray, "times"], xp=np) -> tuple[Array | np.ndarray, Array | np.ndarray]:
-    """For each sample of a channel, the time index of the last one before it that is not missing (itself where there is none), and the time between, s.
+    """Return for each sample of a channel the time index of its last present predecessor (itself if there is
+    none), and the time between, s.
 
     That time is infinite where there is none, and for samples that are missing. `weight` is zero where a sample is missing. Both have its shape.
     """
@@ -75,7 +77,9 @@ class Chains:
         return Chains(before, gap, np.concatenate(known, axis=-1), unknown)
 
     def at(self, places: np.ndarray, members: np.ndarray, taus: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Places before, and rho, of lanes: runs at these places, of these members, with correlation times (lanes, channels) where they are not known."""
+        """Return indices of preceding samples, and rho, for lanes: these runs of these members, with
+        correlation times (lanes, channels) where unknown.
+        """
         tau = self.known[places].copy()
         for where, value in zip(self.unknown, taus.T, strict=True):
             tau[:, where] = value[:, None]
@@ -83,7 +87,8 @@ class Chains:
 
 
 def half_log_determinant(arrow: Arrow, size: Float[np.ndarray, "members unknowns"]) -> PerMember:
-    """`log det(J'J) / 2` in unknowns divided by `size`, with a constant for what does not show."""
+    """Return `log det(J'J) / 2` in unknowns divided by `size`, with a constant for undetermined directions.
+    """
     scaled, tiny = arrow.scaled(size), 1e-7  # of the length of a column
     runs, m, p = arrow.counts
     members = len(size)
@@ -111,7 +116,7 @@ def correlation_limits(runs: Sequence[Experiment], channel: str) -> tuple[float,
     """Shortest and longest correlation time that is looked for, s. ValueError where no run has two samples."""
     ts = [np.asarray(run.ts) for run in runs if channel in run.values and len(run.ts) > 1]
     if not ts:
-        raise ValueError("a correlation time is None, but each run has one sample, and neighbours in a run tell it; give a number in s, or 0 for white noise")
+        raise ValueError("a correlation time is None, but each run has only one sample, which cannot determine it; give a number in s, or 0 for white noise")
     # beyond ten spans hardly to be told from a bias
     return SHORTEST * min(float(np.min(np.diff(t))) for t in ts), 10.0 * max(float(t[-1] - t[0]) for t in ts)
 

@@ -43,7 +43,7 @@ class Energy(eqx.Module):
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """Whether T + V is conserved along every motion of a scene, and what changes it otherwise."""
+    """Conservation of T + V along every motion of a scene, or the loads that change it."""
 
     conserved: bool
     changed_by: tuple[str, ...]
@@ -53,13 +53,15 @@ class EnergyBalance:
 
 
 def energy(scene: Scene, t, q, u, inputs=None) -> Energy:
-    """Kinetic and potential energy (J) at (t, q, u). `inputs`: values of the scene's inputs (default: zero)."""
+    """Return the kinetic and potential energy (J) at (t, q, u). `inputs`: values of the scene's inputs
+    (default: zero).
+    """
     return Energy(*energies_at(scene, motion_at(scene, t, q, u, inputs)))
 
 
 @of_known_numbers
 def energy_balance(scene: Scene) -> EnergyBalance:
-    """Whether T + V is conserved, and what changes it otherwise; the powers are those of eqs. (71)-(73).
+    """Find out whether T + V is conserved, and what changes it otherwise; powers as in eqs. (71)-(73).
 
     Judged at eight random admissible states with random inputs, where a power counts as zero below 1e-9 of the powers at hand (1e-4 in
     single precision). A DifferentiationModeError where numbers are traced.

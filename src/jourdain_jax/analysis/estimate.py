@@ -1,4 +1,4 @@
-"""Numbers that a fit is to find: where it begins to look, between which ends, and what is known of them beforehand.
+"""Unknowns of a fit: first guess, range and prior.
 
 With a prior of mean m and standard deviation s, (theta - m) / s is one residual more: the estimate is the most probable value (maximum a posteriori).
 Source: G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), section 2.7.
@@ -39,7 +39,7 @@ Numbers = Float[Array, "*batch"]
 
 @dataclass(frozen=True)
 class Range:
-    """Bounds of an unknown (infinite where there is none), and a typical change of it."""
+    """Bounds of an unknown (infinite if there is none), and its typical change."""
 
     kind: Literal["bounds", "positive", "unbounded", "memory"]
     low: float = -np.inf
@@ -48,7 +48,9 @@ class Range:
     interval: float = 0.0  # h, s, of a memory
 
     def least_size(self, guess: float) -> float:
-        """What counts as a large change of an unknown that is near zero: the typical change, or a hundredth of the first guess or of the width."""
+        """Return the smallest large change of an unknown near zero: the typical change, or a hundredth of the
+        first guess or of the width.
+        """
         if self.kind == "unbounded":
             return self.scale or abs(guess) or 1.0
         return self.scale or 0.01 * (self.high - self.low if self.kind == "bounds" else abs(guess)) or 1.0
@@ -96,12 +98,14 @@ class Range:
 
 
 def positive() -> Range:
-    """The unknown is not below zero: `free={"mass": jj.positive()}`. The default of parameters declared positive or non-negative."""
+    """Keep an unknown at zero or above: `free={"mass": jj.positive()}`. The default of parameters declared
+    positive or non-negative.
+    """
     return Range("positive", low=0.0)
 
 
 def bounds(low: Number, high: Number) -> Range:
-    """The unknown stays between `low` and `high`, in its own unit: `free={"mass": jj.bounds(0.1, 10)}`.
+    """Keep an unknown between `low` and `high`, in its own unit: `free={"mass": jj.bounds(0.1, 10)}`.
 
     Raises ValueError unless both are finite and low < high.
     """
@@ -113,8 +117,8 @@ def bounds(low: Number, high: Number) -> Range:
 
 
 def unbounded(scale: Number | None = None) -> Range:
-    """The unknown may be any number, but for a parameter that is declared positive or non-negative, which stays so. `scale`, in its unit, is a typical change:
-    state it where the first guess is zero.
+    """Let an unknown take any number, within the declared sign of a parameter. `scale`, in its unit, is a
+    typical change: give it if the first guess is zero.
 
     Raises ValueError unless the scale is positive and finite.
     """
@@ -137,7 +141,8 @@ class Correlated:
 
 
 def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]:
-    """Priors of several parameters whose errors are correlated: `free=jj.joint_normal({"mass": 20.9, "inertia": 1.64}, covariance)`.
+    """Return priors of several parameters with correlated errors: `free=jj.joint_normal({"mass": 20.9,
+    "inertia": 1.64}, covariance)`.
 
     **Arguments**
     - `mean`: name -> mean, in the unit of the parameter, of one number each.
@@ -156,21 +161,24 @@ def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]
     n, names = len(means), list(mean)
     C = checked_known(covariance, "`covariance` of `joint_normal`", (n, n), advice=f"one row and one column for each of {', '.join(names)}")
     if not (np.all(np.isfinite(C)) and np.all(np.isfinite(means))):
-        raise ValueError("mean and covariance of `joint_normal` must be finite; leave out what is not known")
+        raise ValueError("mean and covariance of `joint_normal` must be finite; omit unknown quantities")
     for name, variance in zip(names, variances := np.diag(C), strict=True):
         if variance <= 0:
-            raise ValueError(f"the variance of `{name}` is {variance:g}, expected one above zero; a number that is known needs no estimate")
+            raise ValueError(f"the variance of `{name}` is {variance:g}, expected a number above zero; omit known quantities")
     sigma, round_off = np.sqrt(variances), 1e-9  # of correlations
     correlations = C / np.outer(sigma, sigma)
     if largest(correlations - correlations.T) > round_off:
         raise ValueError("`covariance` of `joint_normal` is not symmetric; give cov(a, b) = cov(b, a)")
     if (least := np.linalg.eigvalsh(correlations)[0]) < -n * round_off:
-        raise ValueError(f"`covariance` of `joint_normal` is no covariance: its correlations have the eigenvalue {least:.3g}, expected none below zero")
+        raise ValueError("`covariance` of `joint_normal` is not a covariance matrix: its correlations have the "
+            f"eigenvalue {least:.3g}, expected none below zero")
     return {name: Correlated(means[k], float(sigma[k]), k, C) for k, name in enumerate(names)}
 
 
 def whitening(priors: Sequence) -> Float[np.ndarray, "numbers numbers"]:
-    """M of numbers with these priors (None, or what has a mean and a sigma); the identity but for those that were measured together."""
+    """Return M for numbers with these priors (None, or a mean and a sigma): the identity except for jointly
+    measured numbers.
+    """
     M = np.eye(len(priors))
     together: dict[int, list[int]] = {}
     for k, prior in enumerate(priors):
@@ -187,7 +195,7 @@ def whitening(priors: Sequence) -> Float[np.ndarray, "numbers numbers"]:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number that a fit estimates, in place of one that is known.
+    """An unknown number, estimated by a fit.
 
         jj.Sensor("lean_rate", gain=jj.Estimate(1.0), bias=jj.Estimate(0.0, per_run=True))
         jj.fit(scene, data, free={"mass": jj.Estimate(prior=jj.Normal(20.9, 0.5))})        # kg

@@ -1,4 +1,5 @@
-"""What a fit estimated: values with their uncertainty, residuals, the fitted scene, and what the measurements cannot tell.
+"""Estimates of a fit: values with their uncertainty, residuals, the fitted scene, and undetermined
+combinations.
 
 What a fit tells of one unknown, and of the residuals of one channel.
 
@@ -82,7 +83,7 @@ PerRepeat = Float[np.ndarray, "*repeats"]
 PerUnknown = Float[np.ndarray, "*repeats unknowns"]
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """All that is told of a minimum besides where it lies."""
+    """Statistics of a minimum, besides its location."""
 
     scene: Scene  # with the estimates
     starts: tuple[dict[str, Float[Array | np.ndarray, "..."]], ...]  # initial values of each run, with the estimates
@@ -110,7 +111,7 @@ class Statistics:
 
 @np.errstate(over="ignore", invalid="ignore")  # of unknowns that no bound kept from growing beyond all measure
 def statistics(problem: Problem, found: Minimum, at_bounds: AtBounds) -> Statistics:
-    """Statistics of the minimum of each member; without the axis of members where the problem has none."""
+    """Statistics of the minimum."""
     unknowns, theta, single, one = problem.unknowns, found.theta, problem.single, problem.one
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
     here = lambda x: one(x[:, places])  # noqa: E731
@@ -170,7 +171,7 @@ def _determined(known: Information, unknowns: Unknowns) -> Float[np.ndarray, "me
 
 
 class Estimated(Printed, eqx.Module):
-    """One unknown, in its unit; NaN for what the measurements cannot tell."""
+    """One unknown, in its unit; NaN for quantities that the measurements do not determine."""
 
     value: PerRepeat
     standard_error: PerRepeat
@@ -249,11 +250,11 @@ class Estimates(Printed):
         return vars(self) | {"statistics": self.statistics, "work_out": None}  # what was compiled stays in its process
 
     def __getattr__(self, name: str) -> Any:
-        """A part of `statistics`, such as `standard_errors`, of what was asked, and of the unknowns."""
+        """Return an entry of `statistics`, such as `standard_errors`, of the request, or of the unknowns."""
         parts = {"statistics": Statistics.__dataclass_fields__, "asked": ("guesses", "errors"), "unknowns": ("labels", "units", "layout")}
         for part in (part for part, names in parts.items() if name in names):
             return getattr(getattr(self, part), name)
-        raise AttributeError(f"`{name}` has gone: {GONE[name]}" if name in GONE else f"`Fit` has no `{name}`; {nearest(name, dir(self))}")
+        raise AttributeError(f"`{name}` was removed: {GONE[name]}" if name in GONE else f"`Fit` has no `{name}`; {nearest(name, dir(self))}")
 
     def __getitem__(self, name: str) -> Estimated:
         check_name(name, self.labels, f"`{name}` was not estimated", UnknownNameError)
@@ -277,7 +278,9 @@ class Estimates(Printed):
 
     @property
     def reduced_chi_square(self) -> PerRepeat:
-        """Sum of squared residuals per degree of freedom, near 1 where scene and sigmas are right; NaN where there are as many unknowns as samples."""
+        """Sum of squared residuals per degree of freedom, near 1 for a correct scene and correct sigmas; NaN
+        with as many unknowns as samples.
+        """
         return np.asarray(self.chi_square / np.where(self.degrees_of_freedom > 0, self.degrees_of_freedom, np.nan))
 
     # Of one fit, not of a batch. -----------------------------------------------------------------------------------
@@ -289,7 +292,7 @@ class Estimates(Printed):
 
     @property
     def not_identifiable(self) -> tuple[str, ...]:
-        """What the measurements cannot tell, one sentence per combination of unknowns."""
+        """Undetermined combinations of unknowns, one sentence each."""
         if not np.isfinite(self.chi_square):
             return ()
         return hidden_combinations(self.information.hidden[0], self.information.least_part, self.sizes, self.values, self.labels)
@@ -308,7 +311,9 @@ class Estimates(Printed):
 
     @property
     def weak(self) -> tuple[str, ...]:
-        """Shared unknowns, and combinations of them, that the data tell with a relative standard error of 0.1 or more, weakest first, one sentence each."""
+        """Poorly determined shared unknowns and combinations, with a relative standard error of 0.1 or more,
+        weakest first, one sentence each.
+        """
         return weak_combinations(self.covariance, self.values, self.sizes, self.labels)
 
     @property
@@ -319,7 +324,9 @@ class Estimates(Printed):
 
     @property
     def autocorrelation(self) -> dict[str, tuple[float, float]]:
-        """For each channel, the correlation of neighbouring whitened residuals over all runs, and what white ones hardly exceed (3.5 / sqrt(pairs))."""
+        """Correlation of neighbouring whitened residuals of each channel over all runs, and the value that
+        white ones hardly exceed (3.5 / sqrt(pairs)).
+        """
         found = {}
         for name in dict.fromkeys(name for run in self.whitened for name in run):
             runs = [np.asarray(run[name]).reshape(len(run[name]), -1) for run in self.whitened if name in run]

@@ -1,4 +1,5 @@
-"""An experiment, what was measured in one run of a scene: times, named channels with a sigma and a sensor each, the start, sampled inputs.
+"""An experiment, the measurements of one run: times, named channels with a sigma and a sensor each, the
+start, sampled inputs.
 
 value_k = reading of the channel's sensor at t_k + sigma_k e_k,   e_k independent, standard normal
 """
@@ -22,7 +23,7 @@ _NO_INPUTS = Inputs(())
 
 
 class Experiment(eqx.Module):
-    """What was measured in one run of a scene; several runs are a list of these.
+    """Measurements of one run of a scene; several runs are a list of these.
 
         Experiment(ts, {"x": x, "gyro": w}, {"x": 0.01, "gyro": 0.02}, start={"x_rate": 0.6}, sensors={"gyro": jj.Sensor("heading_rate", lag=0.01)})
 
@@ -120,7 +121,7 @@ class Experiment(eqx.Module):
             if name not in self.sigma:
                 raise ValueError(f"channel `{name}` has no sigma; give `sigma` a number for it, or one number for all channels")
         if self.ended_by in (*self.sensors, *self.correlation_time):
-            raise ValueError(f"`{self.ended_by}` is an event, whose time has no sensor and no correlation time; leave them out, or rename the channel")
+            raise ValueError(f"`{self.ended_by}` is an event, whose time has no sensor and no correlation time; omit them, or rename the channel")
         for name, value in self.values.items():
             if not holds(lambda x: ~np.isinf(x), value):
                 raise ValueError(
@@ -128,7 +129,7 @@ class Experiment(eqx.Module):
                     "give NaN for samples that are missing"
                 )
             if not holds(lambda x: ~np.all(np.isnan(x)), value):
-                raise ValueError(f"channel `{name}` holds no value at all, only NaN; leave the channel out")
+                raise ValueError(f"channel `{name}` holds only NaN; omit the channel")
         for name, value in self.sigma.items():
             if not holds(lambda x: x > 0, value):
                 raise ValueError(f"sigma of channel `{name}` must be above zero (and not NaN); give the standard deviation of its noise")
@@ -137,13 +138,15 @@ class Experiment(eqx.Module):
     __getattribute__ = object.__getattribute__
 
     def changed(self, **fields) -> "Experiment":
-        """This run with other fields, without another look at all that was looked at when it was made."""
+        """Return this run with other fields, without repeated checks."""
         found = object.__new__(type(self))
         vars(found).update(vars(self) | fields)
         return found
 
     def sigma_of(self, name: str, repeats: bool = False) -> Numbers:
-        """Sigma of each measured value of the channel `name`, in its unit; `repeats`: the values have a leading axis of repeats."""
+        """Return sigma for each measured value of the channel `name`, in its unit; `repeats`: the values have
+        a leading axis of repeats.
+        """
         sigma, values = self.sigma[name], self.values[name]
         # one sigma per time acts on all components of the channel
         dimensions = values.ndim - int(repeats)
@@ -158,7 +161,7 @@ def _reals(what: str, given: Mapping, advice: str = "check how it is put togethe
 
 
 def _correlation_times(given: Mapping) -> dict[str, Array | np.ndarray]:
-    """Those that are not zero; zero where it is not known."""
+    """Return the nonzero correlation times; zero for unknown ones."""
     numbers = {name: 0.0 if value is None else value for name, value in given.items()}
     found = _reals("correlation time of channel", numbers, "give a time in s, or None where it is not known", ())
     for name, time in found.items():
@@ -214,7 +217,8 @@ def checked(scene: Scene, run: Experiment, index: int, repeats: bool) -> Experim
 
 
 def _quantity(scene: Scene, given: str | Callable | Instrument | None, channel_name: str, where: str):
-    """What a sensor measures: a function made ready, an instrument, or a name; and its shape."""
+    """Return the measured quantity of a sensor (a prepared function, an instrument, or a name) and its shape.
+    """
     if isinstance(given, Instrument):
         given.check(scene, channel_name, where)
         return given, (3,)
@@ -246,13 +250,13 @@ def _check_begin(run: Experiment, name: str, where: str, repeats: bool) -> None:
     first, t0 = float(run.ts[np.argmax(at_times)]), float(run.t0)
     if first - latest(delay) < t0 - 1e-9 * (float(run.ts[-1]) - t0):
         raise ValueError(
-            f"channel `{name}` of {where} begins at {first:g} s, and less its delay of up to {latest(delay):g} s that is before the start at t0 = {t0:g} s, "
+            f"channel `{name}` of {where} begins at {first:g} s; minus its delay of up to {latest(delay):g} s, this is before the start at t0 = {t0:g} s, "
             "where the motion is not known; give an earlier `t0` with the start there, or NaN for the first samples"
         )
 
 
 def _inputs(scene: Scene, run: Experiment, where: str, estimates: dict) -> tuple[Inputs, dict[str, Drive]]:
-    """All inputs, at the first guess of what is to be estimated; and the actuators that have such numbers."""
+    """Return all inputs, at the first guess of estimated numbers; and the actuators with such numbers."""
     if run.inputs is None and not len(scene.inputs):
         return _NO_INPUTS, {}
     given = run.inputs if isinstance(run.inputs, Mapping) else {}

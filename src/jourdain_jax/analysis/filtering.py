@@ -1,4 +1,4 @@
-"""Motions that are disturbed as they go on: the likelihood of measurements by an extended Kalman filter.
+"""The likelihood of measurements of disturbed motions, by an extended Kalman filter.
 
     x = (independent coordinates, independent speeds y),   y' = f(t, x) + w,   E w(t) w(t')' = W delta(t - t'),   W = diag(process noise)
 
@@ -47,7 +47,8 @@ _NODES, _WEIGHTS = gauss_legendre(5)
 def filtered_log_likelihood(
     scene: Scene | BuiltFor, data: Data, *, process_noise: Mapping, options: Options | None = None, **by_name: Unpack[OptionFields]
 ) -> Scalar:
-    """`log_likelihood` of a motion that is disturbed as it goes on, by an extended Kalman filter: a rider or rough ground is no noise of a sensor.
+    """Return `log_likelihood` for a motion with process noise, by an extended Kalman filter: a rider or rough
+    ground disturbs the motion, not the sensor.
 
     **Arguments**
     - `data`: one run or several. A start value is known, or a first guess with an `Estimate(prior=Normal(mean, sigma))` in `unknown_start`: the motion then
@@ -157,7 +158,9 @@ class _Filter:
         return tuple(jnp.where(moves, new, old) for new, old in ((q1, q), (x1, x), (F @ P @ F.T + added, P)))
 
     def _updated(self, t, q, x, P, values, weights):
-        """x and P with the samples at one time, and the logarithm of their density; those with a weight of zero are missing."""
+        """Return x and P after the samples at one time, and the logarithm of their density; samples with zero
+        weight are missing.
+        """
 
         def shown(x):
             found = self._shown(t, self._state(t, q, x))
@@ -186,28 +189,30 @@ class _Filter:
 
 def _check_supported(scene: Scene, runs: Sequence[Experiment]) -> None:
     if scene.coordinates.quaternions:
-        raise ValueError(f"`{type(scene).__name__}` has quaternions, whose spread a filter cannot tell yet; use a scene whose coordinates are angles")
+        raise ValueError(f"`{type(scene).__name__}` has quaternions, whose covariance the filter does not support; use a scene with angles as coordinates")
     check_known(runs, "a filter")
     for index, run in enumerate(runs):
         for name in (*run.correlation_time, *run.unknown_correlation):
-            raise ValueError(f"the noise of channel `{name}` has a correlation time, but a filter takes it as white; leave it out")
+            raise ValueError(f"the noise of channel `{name}` has a correlation time, but the filter assumes white noise; omit it")
         for name, reading in run.readings.items():
             if isinstance(reading.operation, StopEvent):
-                raise ValueError(f"run {index} gives the time of its event `{name}`, which a filter does not use; leave it out, and samples after it")
+                raise ValueError(f"run {index} gives the time of its event `{name}`, which the filter does not use; omit it, and the samples after it")
             which = f"sensor `{name}` of run {index}"
             if reading.is_late:
-                raise ValueError(f"{which} has a delay or a lag, which a filter does not know; shift its times by the delay, or use `fit`")
+                raise ValueError(f"{which} has a delay or a lag, which the filter does not support; shift its times by the delay, or use `fit`")
             if isinstance(reading.operation, Instrument):
-                raise ValueError(f"{which} shows accelerations, and so the white disturbance itself; leave it out, or use `fit`")
+                raise ValueError(f"{which} measures accelerations, which contain the white disturbance itself; omit it, or use `fit`")
         for name, given in run.unknown_start.items():
             if not isinstance(given, Estimate) or given.prior is None or isinstance(given.prior, Correlated):
                 raise ValueError(
-                    f"start value `{name}` of run {index} is unknown, but nothing says how far off it may be; give `jj.Estimate(prior=jj.Normal(mean, sigma))`"
+                    f"start value `{name}` of run {index} is unknown, but has no prior; give `jj.Estimate(prior=jj.Normal(mean, sigma))`"
                 )
 
 
 def _independent_speeds(scene: Scene, run: Experiment) -> tuple[int, ...]:
-    """Return those of the scene, or of a scene that names none others where they do not determine the rest at a known start."""
+    """Return the scene's independent speeds, or those of a scene with another choice where they do not
+    determine the rest at a known start.
+    """
     usual, inputs = privileged_speeds(scene), as_inputs(scene, run.inputs)
     begin = consistent_start(scene, t0=run.t0, inputs=inputs, **run.start)
 
@@ -226,8 +231,8 @@ def _intensities(scene: Scene, speeds: tuple[int, ...], given: Mapping) -> Speed
     for name, value in given.items():
         if name not in names:
             raise ValueError(
-                f"`process_noise` names `{name}`, which is no independent speed of `{type(scene).__name__}`; {nearest(name, names)} "
-                "Others can be made so by `privileged` of the scene."
+                f"`process_noise` names `{name}`, which is not an independent speed of `{type(scene).__name__}`; {nearest(name, names)} "
+                "To choose others, set `privileged` in the scene."
             )
         number = checked_real(value, f"process noise of `{name}`", (), advice="give one number")
         if not holds(lambda x: np.isfinite(x) & (x >= 0), number):

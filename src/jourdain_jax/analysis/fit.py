@@ -87,7 +87,9 @@ def minimum(problem: Problem, theta: np.ndarray) -> Minimum:
 
 
 def with_memory(problem: Problem, found: Minimum) -> Minimum:
-    """The minimum with the correlation times of the noise estimated: these and the unknowns take turns, from what was found as if the noise were white."""
+    """Return the minimum with estimated correlation times of the noise: these and the unknowns are estimated
+    in turns, starting from white noise.
+    """
     if not problem.with_memory:
         return found
     going = np.flatnonzero(np.isfinite(found.at.cost))
@@ -104,7 +106,9 @@ def with_memory(problem: Problem, found: Minimum) -> Minimum:
 
 
 def off_bounds(problem: Problem, found: Minimum) -> tuple[Minimum, AtBounds]:
-    """The minimum, gone on from where unknowns at a bound let it be lower away from it; and what is known of those that stay."""
+    """Return the minimum, continued where unknowns leave a bound to lower it; and the statistics of those
+    that stay.
+    """
     for _ in range(20):
         with problem.unmoved() if isinstance(problem, Piecewise) else nullcontext():
             told = limits_at_bounds(problem, found)
@@ -146,21 +150,21 @@ def fit(
       well above the relative accuracy of the simulation.
     - `tolerance` (1e-4): the fit has converged when a step changes no residual by more than about this many sigmas, and no unknown by
       more than about this fraction. `max_iterations` (50): steps tried at most, over each span.
-    - `loss`: `huber()` or `student_t()` where some samples are far out (default: least squares).
-    - `errors`: whence standard errors and intervals come. "sigmas" (default): from the sigmas, which holds for white noise. "runs": from how much runs differ
-      (the sandwich of clusters, which needs five runs or more), which holds whatever the noise within a run, also where the scene is not quite right; but for
-      what is a run's own, which takes noise within it as white.
+    - `loss`: `huber()` or `student_t()` for data with outliers (default: least squares).
+    - `errors`: the source of standard errors and intervals. "sigmas" (default): the sigmas, valid for white noise. "runs": the differences between runs
+      (the cluster sandwich, for five runs or more), valid for any noise within a run, also where the scene is not quite right; unknowns of
+      single runs still take noise within the run as white.
     - `options`: a `jj.Options`; or its fields, such as `rtol`, `solver`, `max_step`, `max_steps`. Stop events cut no run: what is given counts,
       and `Fit.warnings` names those that the fitted motion meets before a sample. Give samples up to where the real motion met one; were runs cut where the
       fitted one does, estimates whose motion ends early would have fewer residuals.
 
-    Where that finds no minimum, or one whose residuals are far beyond their sigmas, the fit is made once more over growing spans (unless `shooting` is
-    given): the first 1/32 of each run, then more of it, as far as the motion that was found follows the data, with the first guess as a weak prior (known to
-    its own size). So unstable motions are fitted that no first guess would follow to their end. The lower minimum counts, and `Fit.grown` says which one it
+    If this finds no minimum, or residuals far beyond their sigmas, the fit is repeated over growing spans (unless `shooting` is
+    given): the first 1/32 of each run, then more of it, as far as the fitted motion follows the data, with the first guess as a weak prior (known to
+    its own size). So unstable motions can be fitted that no first guess would follow to their end. The lower minimum counts, and `Fit.grown` tells which one it
     was.
 
-    **Returns** a `Fit`: estimates with covariance and 95 % intervals (sigmas that were given are taken as known; where they are None, or under a robust loss,
-    intervals are those of Student's t), residuals, the fitted scene, and in words what the measurements cannot tell. An unknown at its bound has a one-sided
+    **Returns** a `Fit`: estimates with covariance and 95 % intervals (given sigmas count as known; where they are None, or under a robust loss,
+    intervals are those of Student's t), residuals, the fitted scene, and sentences on undetermined combinations. An unknown at its bound has a one-sided
     interval, by profile likelihood. `converged` is False where no minimum was found. Runs of equal structure go through one compiled program, whatever their
     number and lengths; time and memory are proportional to the number of runs.
 
@@ -187,7 +191,7 @@ def fit_batch(
     free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
     **by_name: Unpack[FitFields],
 ) -> Fit:
-    """`fit` for many repeats of the same experiment, as one batch.
+    """Fit many repeats of one experiment as one batch.
 
     Every array in the `values` of `data` has a leading axis `repeats`; all else is shared. `free` and `by_name` as in `fit`.
 
@@ -198,7 +202,7 @@ def fit_batch(
 
 
 def _asked(scene: Scene | BuiltFor, free: Mapping | Iterable[str], by_name: FitFields, function: str) -> Asked:
-    """Return what was asked, checked; from one first guess of whole runs."""
+    """Return the checked request, for one first guess of whole runs."""
     rest: dict[str, Any] = dict(by_name)
     cutoff, tolerance, most_steps = (rest.pop(name, value) for name, value in (("cutoff", 1e-6), ("tolerance", 1e-4), ("max_iterations", 50)))
     loss, errors, options = rest.pop("loss", None), rest.pop("errors", "sigmas"), rest.pop("options", None)
@@ -260,10 +264,10 @@ def _check_noise(runs: Sequence[Experiment], asked: Asked) -> None:
         raise ValueError(f'errors="runs" takes standard errors from how runs differ, but there are {len(runs)}; give 5 or more, or errors="sigmas"')
     robust, unknown = asked.loss != LEAST_SQUARES, in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma)
     if unknown and robust:
-        raise ValueError(f"sigma of channel `{unknown[0]}` is None, but a robust loss needs to know what is far out; give a number")
+        raise ValueError(f"sigma of channel `{unknown[0]}` is None, but a robust loss needs the scale of outliers; give a number")
     coloured = sorted({name for run in runs for name in run.correlation_time})
     if coloured and robust:
-        raise ValueError(f"the noise of channel `{coloured[0]}` has a correlation time, but a robust loss takes samples as independent; leave out either")
+        raise ValueError(f"the noise of channel `{coloured[0]}` has a correlation time, but a robust loss assumes independent samples; omit one of them")
     in_all_or_none(runs, "the correlation time", lambda run: run.unknown_correlation)
 
 

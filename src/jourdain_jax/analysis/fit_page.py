@@ -1,4 +1,4 @@
-"""A fit as one HTML file for a browser: texts, tables and figures; nothing is loaded from elsewhere.
+"""A fit as one self-contained HTML file: texts, tables and figures.
 
 An interval from noise that is taken as white, but is AR(1) noise of correlation r_1, is too narrow by about sqrt((1 + r_1) / (1 - r_1)) where sensitivities
 change slowly: G. E. P. Box, G. M. Jenkins and G. C. Reinsel, Time Series Analysis, 3rd ed. (1994), section 2.1.5.
@@ -91,7 +91,7 @@ figure{{display:inline-block;margin:.4em .6em .4em 0;vertical-align:top}}figcapt
 
 
 class Section(NamedTuple):
-    """A part of the page: what it is about, lines of text, figures in HTML."""
+    """A part of the page: heading, lines of text, figures in HTML."""
 
     title: str
     about: str

@@ -75,7 +75,9 @@ def _of_residuals(fit: Estimates) -> Iterator[str]:
         yield f"the residuals{large[0].named} are larger than the sigmas allow: {why}"
 
     def larger(channels: list[str]) -> float:
-        """Residuals with a correlation rho of neighbours tell (1 + rho)/(1 - rho) times less."""
+        """Return the loss of information by correlated residuals: (1 + rho)/(1 - rho) for a correlation rho
+        of neighbours.
+        """
         return max((1 + rho) / max(1 - rho, 1e-9) for rho in (0.0, *(coloured.get(name, 0.0) for name in channels)))
 
     if small := [size for size in sizes if size.most * larger(size.channels) < _by_chance(size.wide, -sure)]:
@@ -109,12 +111,16 @@ class _Size(NamedTuple):
 
 
 def _by_chance(spread: float, deviations: float) -> float:
-    """A mean square so many standard deviations from 1: its cube root is nearly normal, also far out (Wilson and Hilferty). `spread`: one of it, near 1."""
+    """Return how many standard deviations a mean square is from 1: its cube root is nearly normal (Wilson and
+    Hilferty). `spread`: its standard deviation, near 1.
+    """
     return max(1 - spread**2 / 9 + deviations * spread / 3, 0.0) ** 3
 
 
 def _sizes_of_residuals(fit: Estimates) -> list[_Size]:
-    """Sizes of the residuals of all channels whose sigmas are known, then of one by one; under a robust loss those of most, since some are far out."""
+    """Return sizes of the residuals of all channels with known sigmas, then channel by channel; under a
+    robust loss by the median.
+    """
     robust, determined = fit.asked.loss != LEAST_SQUARES, float(fit.samples - fit.degrees_of_freedom)
     names = [name for name in dict.fromkeys(name for run in fit.whitened for name in run) if name not in fit.sigma]
     found = []
@@ -129,7 +135,9 @@ def _sizes_of_residuals(fit: Estimates) -> list[_Size]:
 
 
 def _mean_square(squares: np.ndarray, determined: float, robust: bool) -> tuple[float, float]:
-    """The mean square of residuals that determined so many unknowns, and its standard deviation where they are normal; `robust`: from their median."""
+    """Return the mean square of residuals that determined so many unknowns, and its standard deviation if
+    they are normal; `robust`: from their median.
+    """
     degrees = max(squares.size - determined, 1)
     if robust:  # the median of w^2 is 0.4549 for a normal w; relative to it, that of n has the standard deviation 2.33 / sqrt(n)
         return float(np.median(squares)) / 0.4549, 2.33 / degrees**0.5
@@ -138,7 +146,9 @@ def _mean_square(squares: np.ndarray, determined: float, robust: bool) -> tuple[
 
 @np.errstate(over="ignore", invalid="ignore")
 def text(fit: Estimates) -> str:
-    """The text of a fit of one experiment: estimates with their intervals, warnings, what the data do not tell, residuals by channel."""
+    """Return the text of a fit of one experiment: estimates with intervals, warnings, undetermined
+    combinations, residuals by channel.
+    """
     most = 8  # combinations of unknowns that are told poorly, pairs that correlate, pieces of runs
     lines = [
         f"Fit of {type(fit.scene).__name__}: {'converged' if fit.converged else 'NOT CONVERGED'} in {int(fit.steps)} steps; "
@@ -192,24 +202,26 @@ def batch_text(fit: Estimates) -> str:
 
 
 class Fit(Estimates):
-    """Estimates by name (`fit["offset"].value`), with covariance, residuals and the fitted scene; `print(fit)` shows a table.
+    """Estimates by name (`fit["offset"].value`), with covariance, residuals and the fitted scene;
+    `print(fit)` shows a table.
 
     From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too; what follows below is of one fit.
     """
 
     @property
     def warning(self) -> str:
-        """Why the estimates should not be relied on, the first reason in one sentence; empty where nothing speaks against them."""
+        """Return the most serious reason to doubt the estimates, in one sentence; empty if there is none."""
         return next(iter(self.warnings), "")
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why estimates or intervals should not be relied on, the most serious reason first, one sentence each."""
+        """Return all reasons to doubt estimates or intervals, the most serious first, one sentence each."""
         return warnings_of(self)
 
     def profiles(self, data: Data, names: str | Iterable[str] = ()) -> dict[str, Profile]:
-        """The profile likelihood of the unknowns in `names` (default: all that are not of one run alone), by name: how far each may be moved, all others
-        being fitted anew, before 2 (F - F_min) reaches 3.84, and whether that is "bounded", "one-sided" or "flat". `data`: the runs fitted.
+        """Return profile likelihoods of the unknowns in `names` (default: all that runs share), by name: the
+        range within which 2 (F - F_min) stays below 3.84 when all others are fitted again, "bounded",
+        "one-sided" or "flat". `data`: the runs of the fit.
 
         It takes some ten fits for each name. Where sigmas are estimated, a robust loss was used, or errors="runs", the rise is divided by what variances
         and quantiles are the larger for it. ValueError for a fit of a batch or one that failed, and other data than the fit's; KeyError for names that were
@@ -222,7 +234,8 @@ class Fit(Estimates):
         return profiles(*fitted, as_names(names) or of_all, errors, of_rise)
 
     def predict(self, runs: Data) -> tuple[dict[str, Prediction], ...]:
-        """What the fit predicts for `runs` that had no part in it, by channel: `prediction`, `error`, `rms` (in the unit of the channel) and `r_squared`.
+        """Predict `runs` that were not fitted, by channel: `prediction`, `error`, `rms` (in the unit of the
+        channel) and `r_squared`.
 
         What all runs share is held at its estimate; start values that are unknown, and numbers of sensors of each run, are fitted to the run itself.
         ValueError for a fit of a batch or one that failed, and for runs that do not fit its scene or whose motion fails.
@@ -239,8 +252,8 @@ class Fit(Estimates):
         profiles: "bool | str | Iterable[str] | Mapping[str, Profile]" = False,
         units: Mapping[str, str] | None = None,
     ) -> None:
-        """Write this fit as one HTML file that loads nothing from elsewhere: estimates, warnings, what the data do not tell, correlations, residuals, the way
-        to the minimum.
+        """Write this fit as one self-contained HTML file: estimates, warnings, undetermined combinations,
+        correlations, residuals, the path to the minimum.
 
         - `data`: the runs fitted; their samples are drawn beside the prediction, with R^2 = 1 - sum (prediction - value)^2 / sum (value - mean)^2, and it is
           told which run, channel and time span informs which unknown: shares a_k^2 / sum a^2, a = C J', of the variance of the estimate.
@@ -269,7 +282,7 @@ class Fit(Estimates):
 
     def _check_one(self) -> None:
         if self.values.ndim > 1 or not np.isfinite(self.chi_square):
-            raise ValueError("this is told of one fit whose motion does not fail; of a batch, and of a failed fit, see `print`")
+            raise ValueError("this needs a single fit whose motion does not fail; for a batch or a failed fit, use `print`")
 
     def _repr_html_(self) -> str:
         one = self.values.ndim == 1 and np.isfinite(self.chi_square)

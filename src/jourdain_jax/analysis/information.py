@@ -1,4 +1,4 @@
-"""What measurements tell about the unknowns: covariance where they do, and the combinations that they leave open.
+"""Information of measurements about the unknowns: covariance, and undetermined combinations.
 
     J_s = d r / d (theta / size),  an arrow of own unknowns x_i of each run and shared ones s      residuals r in units of sigma
     own        U S V' of a run's own columns; directions V_0 with S <= cutoff (the largest) do not show even where s is known
@@ -72,7 +72,7 @@ class Information:
         return whole[..., self.estimated[:, None], self.estimated]
 
     def only(self) -> "Information":
-        """That of the only member, without the axis of members."""
+        """Return the values of the only member, without the axis of members."""
         return replace(self, **{name: np.asarray(x[0]) for name, x in vars(self).items() if name not in ("hidden", "estimated")})
 
     def between_runs(self, scores: Float[np.ndarray, "*members runs shared"]) -> "Information":
@@ -87,7 +87,7 @@ class Information:
 
 
 def variances(shared: np.ndarray, own: np.ndarray, follow: np.ndarray) -> Float[np.ndarray, "*members places"]:
-    """Those of shared unknowns and of the runs' own ones, from the blocks of an `Information`."""
+    """Return variances of shared unknowns and of the runs' own ones, from the blocks of an `Information`."""
     of_own = np.diagonal(own, axis1=-2, axis2=-1) + np.einsum("...kij,...jl,...kil->...ki", follow, shared, follow)
     return np.concatenate([np.diagonal(shared, axis1=-2, axis2=-1), of_own.reshape(*of_own.shape[:-2], -1)], axis=-1)
 
@@ -141,7 +141,7 @@ def information(arrow: Arrow, size: Float[np.ndarray, "members places"], estimat
 
 
 def least_move(cutoff: float, largest):
-    """Standard errors by which something moves along a direction that does not show, to have a part in it.
+    """Return the smallest movement, in standard errors, that counts as part of an undetermined direction.
 
     An error of J by cutoff * largest (singular value) turns such a direction by as many.
     """
@@ -149,7 +149,9 @@ def least_move(cutoff: float, largest):
 
 
 def _hidden_directions(own: np.ndarray, shows: np.ndarray, shared: np.ndarray, follow: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Orthonormal directions of all places that do not show and move no place that is held; `own`: V' of each run, of which some directions show."""
+    """Return orthonormal undetermined directions that move no held place; `own`: V' of each run, with some
+    determined directions.
+    """
     (count, m, p), (runs, places) = follow.shape, np.nonzero(~shows)
     apart = np.zeros((len(runs), count, m))
     apart[range(len(runs)), runs] = own[runs, places]
@@ -173,7 +175,9 @@ def hidden_combinations(directions, least_part, size, values, labels: tuple[str,
 
 
 def _in_words(row: np.ndarray, relative: np.ndarray, power: np.ndarray, values: np.ndarray, labels: tuple[str, ...]) -> str:
-    """`power`: where a power of the unknown may stay as it is along this direction and along all others."""
+    """Return the direction in words. `power`: the power of the unknown that may stay constant along this
+    direction and all others.
+    """
     involved, close = np.flatnonzero(row), 0.01  # how far an exponent may be from a multiple of one half, and two changes from being equal
     if len(involved) == 1:
         return f"`{labels[involved[0]]}` does not show in any channel"

@@ -1,4 +1,4 @@
-"""A motion at one instant with its slopes: what small motions, steady ones and families of these are made of.
+"""A motion at one instant with its derivatives, for linearisation, steady motions and families.
 
     v = (dq/dt, du/dt, g, phi),    D = dv/d(t, q, u, f, p)        g: geometric rows and unit norms;  p: parameters that vary, where some do
 
@@ -183,12 +183,12 @@ def instant_of(scene: Scene | BuiltFor, constant: tuple[int, ...], masses: bool 
 
 
 def unseen(instant: "ByProgram | ByMatrices", scene: Scene) -> set[str]:
-    """Names of the coordinates on which no acceleration depends, of a quaternion those of its parts."""
+    """Names of the coordinates without influence on accelerations; for a quaternion, names of its parts."""
     return entries_of(scene, instant.program.held if isinstance(instant, ByProgram) else ignorable_coordinates(scene))
 
 
 def entries_of(scene: Scene, names: Iterable[str]) -> set[str]:
-    """Names of coordinates, of a quaternion or an angular velocity those of its parts."""
+    """Return names of coordinates; for a quaternion or an angular velocity, names of its parts."""
     groups = {group: scene.coordinate_names.entries[first : first + length] for group, first, length in scene.coordinate_names.groups}
     return {entry for name in names for entry in groups.get(name, (name,))}
 
@@ -202,7 +202,9 @@ def on_rows(scene: Scene) -> np.ndarray:
 
 
 def _copied(graph: Graph, parts: Sequence, of: Graph, variables: tuple, given: Sequence[int]) -> list[list[int]]:
-    """Lists of nodes of another graph in this one, with what is given in the place of its parameters by leaf, t, q, u and inputs."""
+    """Return lists of nodes of another graph in this one, with replacements for its parameters by leaf, t, q,
+    u and inputs.
+    """
     parameters, *rest = variables
     places = [int(n) for part in (*parameters, *rest) for n in np.ravel(part)]
     new = graph.copied([n for part in parts for n in part], of, {n: x for n, x in zip(places, given, strict=True) if n >= 0})
@@ -210,7 +212,9 @@ def _copied(graph: Graph, parts: Sequence, of: Graph, variables: tuple, given: S
 
 
 def _evaluated(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[np.ndarray], np.ndarray]:
-    """Values of nodes as a function of those of the variables: by machine code where it is made, otherwise by NumPy, operation by operation."""
+    """Return values of nodes as a function of variables: by machine code if possible, otherwise by NumPy,
+    operation by operation.
+    """
     if jax.config.jax_enable_x64 and is_made(graph, nodes):
         kernel = jax.jit(nodes_called(graph, nodes, variables, effort=0))
         return lambda given: np.asarray(kernel(given))
@@ -218,7 +222,9 @@ def _evaluated(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> 
 
 
 def differentiable(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[Array], Array]:
-    """Values of nodes as a function that JAX differentiates: by machine code where it is made, otherwise by XLA."""
+    """Return values of nodes as a function that JAX differentiates: by machine code if possible, otherwise by
+    XLA.
+    """
     if is_made(graph, nodes):
         return values_of_nodes(graph, nodes, variables)
     return lambda x: jnp.stack([jnp.asarray(value, x.dtype) for value in run(graph, nodes, dict(zip(variables, x, strict=True)))])

@@ -172,7 +172,7 @@ def _grow(fields: "_Fields", t, q, depth: int) -> tuple[tuple[int, ...], bool]:
 
 
 def _extended(spanned: np.ndarray, values: np.ndarray, smallest: float) -> tuple[np.ndarray, list[int]]:
-    """An orthonormal basis extended by those values that add to it, largest first; and which ones did."""
+    """Return an orthonormal basis extended by the values that add to it, largest first; and their indices."""
     chosen: list[int] = []
     while len(chosen) < len(values):
         rest = values - (values @ spanned.T) @ spanned

@@ -1,4 +1,4 @@
-"""Where every unknown is in a vector of them, and the scene, starts and sensors that such a vector makes.
+"""The layout of a vector of unknowns, and the scene, starts and sensors for such a vector.
 
 Shared unknowns are parameters of the scene, second moments and shears of bodies (`body_inertia`), and numbers of sensors. Parameters may follow from them
 (`ties`).
@@ -43,11 +43,12 @@ _OTHERWISE = "give its parameters ranges or ties of their own, or make its inert
 
 @dataclass(frozen=True)
 class PossibleInertia:
-    """What `possible_inertia` returns."""
+    """The value of `possible_inertia`."""
 
 
 def possible_inertia() -> PossibleInertia:
-    """The inertia of a body is unknown, and is always one that a body can have: `free={"rear frame": jj.possible_inertia()}`, with the name of the body.
+    """Free the inertia of a body, restricted to possible values: `free={"rear frame":
+    jj.possible_inertia()}`, with the name of the body.
 
         I = tr(S) 1 - S,   S = L diag(D) L',   D >= 0,   L = [1 l12 l13; 0 1 l23; 0 0 1]
 
@@ -119,7 +120,9 @@ class BodyInertia:
 
 
 def inertia_of_body(scene: Scene, name: str) -> BodyInertia:
-    """Which parameters are the inertia of the body of this name. ValueError where there is no such body, or its inertia is not made of parameters so."""
+    """Return the parameters of the inertia of the named body. ValueError if there is no such body, or its
+    inertia has another form.
+    """
     diagonal, products = _found(scene, name)
     axes: list[int] = []
     entries: list[Entry] = []
@@ -144,7 +147,7 @@ def inertia_of_body(scene: Scene, name: str) -> BodyInertia:
     if not np.all(np.isfinite(found.numbers(scene)[0])):
         moments = ", ".join(f"{entry.factor * float(np.asarray(getattr(scene, entry.name))[entry.index]):.4g}" for entry in diagonal)
         raise ValueError(
-            f"body `{name}` of `{type(scene).__name__}` has the moments of inertia {moments} kg m^2, which with its products no body with a thickness has: "
+            f"body `{name}` of `{type(scene).__name__}` has the moments of inertia {moments} kg m^2, which, with its products, no body with a thickness has: "
             "principal ones must be positive, each less than the sum of the other two; of a flat body, give the largest a little less than that sum"
         )
     return found
@@ -153,10 +156,10 @@ def inertia_of_body(scene: Scene, name: str) -> BodyInertia:
 def _found(scene: Scene, name: str) -> tuple[list[Entry], list[Entry | None]]:
     """Entries of the diagonal, and of the products 12, 23, 13."""
     known = {of: placed.body for of, placed in pose_at(scene, 0.0, scene.named()[0]).bodies.items()}
-    what = f"`free` asks for a possible inertia of `{name}`, which is no body of `{type(scene).__name__}`"
+    what = f"`free` asks for a possible inertia of `{name}`, which is not a body of `{type(scene).__name__}`"
     check_name(name, known, what)
     if not isinstance(known[name], RigidBody):
-        raise ValueError(f"`free` asks for a possible inertia of `{name}`, but that is a particle, which has none; name a rigid body")
+        raise ValueError(f"`free` asks for a possible inertia of `{name}`, but `{name}` is a particle; name a rigid body")
     names = [of for of, value, _ in parameters_of(scene) if np.issubdtype(np.asarray(value).dtype, np.floating)]
     values = {of: np.asarray(getattr(scene, of), float) for of in names}
     generator = np.random.default_rng(0)
@@ -200,7 +203,7 @@ def _refusal(scene: Scene, name: str, why: str) -> str:
 
 @dataclass(frozen=True)
 class Tie:
-    """A parameter, and what it is of the leaves of the scene."""
+    """A parameter, and its dependence on the leaves of the scene."""
 
     name: str
     function: Call
@@ -257,7 +260,8 @@ class Place:
 
 @dataclass(frozen=True)
 class Layout:
-    """Names and shapes of the shared unknowns and of those of each run, and the parameters that follow from them; hashable.
+    """Names and shapes of the shared unknowns and of those of each run, and the dependent parameters;
+    hashable.
 
     A single run has nothing of its own, unless it is cut into pieces: its unknowns are shared ones.
     """
@@ -279,7 +283,7 @@ class Layout:
 
     @property
     def following(self) -> tuple[str, ...]:
-        """Names of the parameters that follow from unknowns: moments of inertia of bodies, and what is tied to others."""
+        """Names of the dependent parameters: moments of inertia of bodies, and tied ones."""
         return tuple(dict.fromkeys([*(entry.name for body in self.bodies for entry in body.entries), *(tie.name for tie in self.ties)]))
 
     def scene(self, scene: Scene, shared: Float[Array | np.ndarray, "*members shared"]) -> Scene:
@@ -304,7 +308,7 @@ class Layout:
         return jax.tree.unflatten(treedef, [x if x is own else jnp.asarray(x) for x, own in zip(found, leaves, strict=True)])
 
     def start(self, start: dict, *vectors: Float[Array | np.ndarray, "*members _"]) -> dict:
-        """The start of a run with these shared unknowns and those of its own."""
+        """Return the start of a run for these shared unknowns and its own."""
         return start | {name: x for name, x in self._of_kind("start", vectors) if name in start}
 
     @property
@@ -317,5 +321,7 @@ class Layout:
         return dict(self._of_kind("sensor", vectors))
 
     def _of_kind(self, kind: Kind, vectors) -> Iterator:
-        """Names and numbers of the unknowns of a kind, in the vectors of the shared ones and of those of a run."""
+        """Return names and numbers of the unknowns of a kind, in the vectors of the shared ones and of those
+        of a run.
+        """
         return ((place.name, place.of(x)) for places, x in zip((self.shared, self.local), vectors, strict=True) for place in places if place.kind == kind)

@@ -1,4 +1,5 @@
-"""Levenberg-Marquardt within bounds, for residuals that are expensive: one simulation with all its derivatives per step tried.
+"""Levenberg-Marquardt within bounds, for expensive residuals: one simulation with all its derivatives per
+trial step.
 
 minimise F(theta), low <= theta <= high;      near theta   F + g' d + |J d|^2 / 2
 step       (J'J + lambda D^2) d = - g          D: lengths of the columns of J;  unknowns that would pass a bound end there, and the others are solved for again
@@ -64,7 +65,9 @@ class Minimum(ByMember):
 
     @staticmethod
     def begun(theta: ByUnknown, at: Linearised, what: str) -> "Minimum":
-        """Return the state before the first step; members whose motion fails do not go. `what`: says in the trace what is minimised."""
+        """Return the state before the first step; members whose motion fails do not take part. `what`: the
+        name of the objective in the trace.
+        """
         none, trace = np.zeros(len(theta), bool), np.empty(len(theta), object)
         trace[:] = [((what, (cost,)),) for cost in at.cost.tolist()]
         return Minimum(theta.copy(), at, np.isfinite(at.cost), none, none.copy(), none.astype(int), none.copy(), trace)
@@ -75,13 +78,13 @@ class Minimum(ByMember):
         return here, self.at.arrow if here.size == self.going.size else self.at.arrow.of(here), self.theta[here]
 
     def arrived(self, here: Members, done: Flags) -> np.ndarray:
-        """End the members that are done, and return those that try a step."""
+        """End the converged members, and return those that try a step."""
         self.converged[here[done]], self.going[here[done]] = True, False
         self.steps[here[~done]] += 1
         return here[~done]
 
     def go(self, here: Members, end: ByUnknown, trial: Linearised, better: Flags) -> None:
-        """Go to the end of the step where that is better."""
+        """Accept the step where it is better."""
         self.theta[here[better]] = end[better]
         self.at = self.at.replaced(here, trial, better)
         for b in here.tolist():
@@ -93,7 +96,7 @@ class Minimum(ByMember):
         self.stuck[members], self.going[members] = True, False
 
     def lowest(self) -> "Minimum":
-        """That of the member with the lowest value."""
+        """Return the member with the lowest value."""
         return self if len(self.theta) == 1 else self.of([int(np.argmin(self.at.cost))])
 
     def agreeing(self, apart: float) -> int:
@@ -101,22 +104,24 @@ class Minimum(ByMember):
         return int(np.sum(self.converged & (self.at.cost <= np.min(self.at.cost) + apart)))
 
     def lowered(self, members: Members, other: "Minimum") -> "Minimum":
-        """All members, with those minima of these that were found in another way, where they are lower; and the steps of that one."""
+        """Return all members, with the `other` minima where these are lower; and the steps."""
         found = self.replaced(members, other, other.at.cost < self.at.cost[members])
         found.steps[members] = other.steps
         return found
 
     def continued(self, members: Members, new: "Minimum") -> "Minimum":
-        """All members, with what was found for these once more; steps add up."""
+        """Return all members, with repeated results for these; steps add up."""
         return self.replaced(members, new.after(self, members), np.ones(len(members), bool))
 
     def after(self, before: "Minimum", members: Members) -> "Minimum":
-        """These members, with steps and trace of what was tried before."""
+        """Return these members, with steps and trace of the earlier attempt."""
         return replace(self, steps=before.steps[members] + self.steps, trace=before.trace[members] + self.trace, grown=before.grown[members])
 
 
 def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: ByUnknown, unknowns: Unknowns, control: Control, what: str = "") -> Minimum:
-    """Minimise from `theta`. `evaluate(theta, members)`: value and slopes of the members with these numbers; `what`: says in the trace what is minimised."""
+    """Minimise from `theta`. `evaluate(theta, members)`: value and derivatives of the members with these
+    numbers; `what`: the name of the objective in the trace.
+    """
     way = Minimum.begun(theta, evaluate(theta, np.arange(len(theta))), what)
     full = np.ones(len(theta))
     damping, growth, fall = 1e-3 * full, 4.0 * full, 10.0 * full  # factors by which it grows after a step that failed, and falls after a good one
@@ -166,7 +171,9 @@ def fallen(before: PerMember, trial: Linearised, d: ByUnknown, slope, promised, 
 
 
 def column_scaling(arrow: Arrow, size: ByUnknown) -> ByUnknown:
-    """D: lengths of the columns of J, and something positive for those that count as zero: times the sizes of their unknowns, by the longest."""
+    """Return D: lengths of the columns of J, and positive substitutes for zero ones: sizes of their unknowns
+    times the longest.
+    """
     norms = arrow.column_norms
     by_size = norms * size
     least = 1e-8 * by_size.max(axis=1, keepdims=True)

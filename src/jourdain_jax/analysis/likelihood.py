@@ -1,4 +1,4 @@
-"""What a scene predicts for measurements, and how likely it makes them.
+"""Predictions of a scene for measurements, and their likelihood.
 
 r = (reading - value) / sigma,   log L = - sum r^2 / 2 - sum log(sigma sqrt(2 pi));      where noise has a memory, as in `correlated_noise`
 
@@ -111,7 +111,7 @@ def as_fit_options(scene: Scene | BuiltFor, options: Options | None, by_name: Ma
 
 
 def as_runs(scene: Scene, data: Data, *, repeats: bool = False) -> tuple[Experiment, ...]:
-    """One run or several, checked against the scene; ValueError as in `checked`, and where there is no run.
+    """Return one run or several, checked against the scene; ValueError as in `checked`, and without any run.
 
     What is odd about a run (`oddities`) is warned of.
     """
@@ -129,7 +129,7 @@ def as_runs(scene: Scene, data: Data, *, repeats: bool = False) -> tuple[Experim
 
 
 def in_all_or_none(runs: Sequence[Experiment], what: str, unknown: Callable[[Experiment], tuple[str, ...]]) -> tuple[str, ...]:
-    """Channels of which something is not known; ValueError where it is None in one run and given in another."""
+    """Return channels with an unknown value; ValueError if it is None in one run and given in another."""
     names = tuple(sorted({name for run in runs for name in unknown(run)}))
     for name in names:
         if any(name in run.values and name not in unknown(run) for run in runs):
@@ -147,7 +147,8 @@ def check_known(runs: Sequence[Experiment], what: str) -> None:
 
 
 def log_likelihood(scene: Scene | BuiltFor, data: Data, *, options: Options | None = None, **by_name: Unpack[OptionFields]) -> Scalar:
-    """Logarithm of the probability density of the measurements `data` (one run or several): `- sum r^2 / 2 - sum log(sigma sqrt(2 pi))`.
+    """Return the logarithm of the probability density of the measurements `data` (one run or several): `- sum
+    r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 
     Differentiable in scene, start values, measured values, sigmas and numbers of sensors and actuators (reverse mode, unless `adjoint` says
     otherwise) and in known correlation times of the noise;
@@ -192,7 +193,7 @@ _CUTOFF = 1e-6  # of the largest singular value of the scaled sensitivities: wha
 
 
 class PlannedInformation(Printed, eqx.Module):
-    """What planned runs will tell of each unknown. `print` shows the standard errors that they lead to."""
+    """The information of planned runs about each unknown. `print` shows the expected standard errors."""
 
     matrix: Matrix  # F, in the units of the unknowns
     values: Float[Array | np.ndarray, "unknowns"]  # at which it is taken
@@ -202,12 +203,12 @@ class PlannedInformation(Printed, eqx.Module):
 
     @property
     def covariance(self) -> Matrix:
-        """F^-1. Entries grow beyond all bounds where a combination of unknowns does not show."""
+        """F^-1, with unbounded entries where a combination of unknowns is not determined."""
         return _inverse(self.matrix)
 
     @property
     def standard_errors(self) -> dict[str, Scalar]:
-        """The least that an unbiased estimate can have, by name, in the unit of the unknown."""
+        """Lower bounds of standard errors of unbiased estimates, by name, in the unit of the unknown."""
         return dict(zip(self.labels, jnp.sqrt(jnp.diagonal(self.covariance)), strict=True))
 
     def log_det(self, names: str | Iterable[str] = ()) -> Scalar:
@@ -221,13 +222,13 @@ class PlannedInformation(Printed, eqx.Module):
 
     @property
     def not_identifiable(self) -> tuple[str, ...]:
-        """What the planned runs will not tell, one sentence for each combination of unknowns."""
+        """Combinations of unknowns that the planned runs do not determine, one sentence each."""
         directions, size = self._hidden
         return hidden_combinations(directions, np.sqrt(_CUTOFF), size, np.asarray(self.values), self.labels)
 
     @property
     def _hidden(self) -> tuple[np.ndarray, np.ndarray]:
-        """Directions that do not show, in rows, and the sizes of the unknowns by which they are scaled."""
+        """Return undetermined directions, in rows, and the sizes of the unknowns by which they are scaled."""
         values = np.abs(np.asarray(self.values))
         size = np.where(values > 0, values, 1.0)
         squares, directions = np.linalg.eigh(np.asarray(self.matrix) * size * size[:, None])
@@ -263,7 +264,8 @@ def planned_information(
     options: Options | None = None,
     **by_name: Unpack[OptionFields],
 ) -> PlannedInformation:
-    """What runs that are planned will tell of the unknowns, taken at the values that the scene has.
+    """Return the information that planned runs will give on the unknowns, evaluated at the values of the
+    scene.
 
     **Arguments**
     - `plan`: one run or several, as they will be measured: times, channels and sigmas, start, inputs and sensors. Their `values` do not matter, but where they
@@ -273,7 +275,7 @@ def planned_information(
     **Returns** a `PlannedInformation`: `matrix`, `standard_errors`, `log_det`. It is differentiable with respect to parameters, start values and samples of
     inputs in forward mode (`jax.jacfwd`; second derivatives of the motion, by XLA for samples) and under `jit`: starts and inputs can be optimised.
 
-    **Raises** ValueError for what does not fit the scene, and for sigmas or correlation times that are None or noise with a memory.
+    **Raises** ValueError for data that do not fit the scene, sigmas or correlation times that are None, and correlated noise.
 
     **Example**
 
@@ -290,7 +292,7 @@ def planned_information(
         for name in run.unknown_sigma:
             raise ValueError(f"sigma of channel `{name}` is None, but a plan needs the standard deviation of its noise; give a number")
         for name in (*run.correlation_time, *run.unknown_correlation):
-            raise ValueError(f"the noise of channel `{name}` has a correlation time, of which a plan knows nothing; leave it out")
+            raise ValueError(f"the noise of channel `{name}` has a correlation time, which a plan does not support; omit it")
     numbers = [eqx.tree_at(lambda r: r.start, run, {n: np.zeros(x.shape) if is_traced(x) else x for n, x in run.start.items()}) for run in runs]
     unknowns = unknowns_of(with_reference_parameters(scene), numbers, free)
     places = unknowns.estimated
@@ -320,7 +322,7 @@ def _sensitivities(
 
 
 def _values(scene: Scene, runs: Sequence[Experiment], unknowns: Unknowns) -> Float[Array | np.ndarray, "places"]:
-    """All unknowns at the values that the scene and the runs have; those of parameters and starts may be traced."""
+    """Return all unknowns at the values of the scene and the runs; parameters and starts may be traced."""
     (shared, local), layout = unknowns.split(unknowns.guess), unknowns.layout
     of_bodies = {label: x for body in layout.bodies for label, x in zip(body.labels, body.numbers(scene), strict=True)}
 

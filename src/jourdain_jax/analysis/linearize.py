@@ -65,7 +65,7 @@ class Modes(eqx.Module):
 
 
 class Linearization(Printed, eqx.Module):
-    """Equations of small motions about a state; see the module's head."""
+    """Equations of small motions about a state; the module's docstring has the formulas."""
 
     A: Float[Array, "states states"]
     B: Float[Array, "states inputs"]
@@ -98,7 +98,9 @@ class Linearization(Printed, eqx.Module):
 
     @property
     def code(self) -> Count:
-        """0, or `SINGULAR_PARTITION` where the privileged speeds and coordinates do not determine the others: all is NaN there."""
+        """0, or `SINGULAR_PARTITION` if the privileged speeds and coordinates do not determine the others;
+        then all is NaN.
+        """
         return jnp.where(self.pivot >= SMALLEST_PIVOT, results.SUCCESS, results.SINGULAR_PARTITION)
 
     def eigenvalues(self) -> Complex[Array, "modes"]:
@@ -151,7 +153,7 @@ def linearize(
     dependent: str | tuple[str, ...] | None = None,
     privileged: str | tuple[str, ...] | None = None,
 ) -> Linearization:
-    """Linear equations of small motions about a steady `state`, with the residual of its steadiness.
+    """Linearise the equations of motion about a steady `state`, with the residual of its steadiness.
 
         bicycle = WhippleBicycle()
         small = linearize(bicycle, start(bicycle, **bicycle.upright(5.0)), ("lean", "steer"))
@@ -192,13 +194,13 @@ def linearize(
     if found.pivot < SMALLEST_PIVOT:
         raise ValueError(
             f"the dependent speeds or coordinates of `{type(scene).__name__}` do not follow from its rows at this state (pivot {float(found.pivot):.1e}): "
-            "name others by `privileged` or `dependent`, or linearize at a state beside it"
+            "choose others by `privileged` or `dependent`, or linearize at a nearby state"
         )
     return found
 
 
 def _warn_of_loads(scene: Scene, state: State, f) -> None:
-    """A warning where loads have no derivative; what is traced is not looked at."""
+    """Warn where loads have no derivative; traced values are not checked."""
     if not is_traced((scene, state, f)) and (rough := bent_load(scene, state.t, state.q, state.u, f)):
         text = (
             f"the linearization of `{type(scene).__name__}` leaves out that {rough} has no derivative at this state: it has a kink or jumps there, as dry "
@@ -225,7 +227,7 @@ def _about(instant, scene: Scene, state: State, f, y: tuple[int, ...], dependent
 
 
 def _matrices(scene: Scene, q, v, D, mass, independent: tuple[str, ...], y: tuple[int, ...], coordinates: tuple[str, ...]) -> dict:
-    """What `Linearization` holds."""
+    """Return the contents of `Linearization`."""
     at, names, xp, chosen = places_of(scene), perturbed_names(scene), array_module((q, D)), np.array(y, int)
     kept, (count, m) = np.array([names.index(name) for name in independent], int), (len(names), len(at.u))
     (S, turned), constant = perturbations(scene), at.udot[chosen]
@@ -250,7 +252,9 @@ def _matrices(scene: Scene, q, v, D, mass, independent: tuple[str, ...], y: tupl
 
 
 def _second_order(scene: Scene, A, B, mass, independent: tuple[str, ...], y, coordinates: tuple[str, ...]):
-    """M, C, K, F of the named coordinates and what couples them to the rest; `mass` is that of the privileged speeds."""
+    """Return M, C, K, F of the named coordinates and their coupling to the rest; `mass` is that of the
+    privileged speeds.
+    """
     count, k, xp = len(independent), len(coordinates), array_module(A)
     p = np.array([independent.index(name) for name in coordinates], int)
     # (ds, pdot, other privileged speeds) = change x
@@ -274,7 +278,7 @@ def _relative(neglected, kept):
 
 @_compiled
 def _decomposed(found: Linearization) -> tuple[Array, Array, Array, Array]:
-    """What `Modes` holds of the second-order form."""
+    """Return the contents of `Modes` for the second-order form."""
     values, left, right = jax.lax.linalg.eig(jax.lax.stop_gradient(found._companion()))
     order, k = jnp.lexsort((values.imag, values.real)), len(found.coordinates)
     values, left, right = values[order], left[:, order], right[:, order]

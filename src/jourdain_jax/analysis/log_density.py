@@ -93,16 +93,17 @@ class LogDensity(eqx.Module):
         return self.unconstrain({})
 
     def constrain(self, z: Points) -> Points:
-        """The unknowns at z, in their units and in the order of `labels`; of one vector or many."""
+        """Return the unknowns at z, in their units and in the order of `labels`; for one vector or many."""
         return self._each(Range.constrain, self._spread(self._checked(z)))
 
     def named(self, z: Points) -> dict[str, Float[Array, "*batch"]]:
-        """The unknowns at z by name, in their units; of one vector or many."""
+        """Return the unknowns at z by name, in their units; for one vector or many."""
         theta = self.constrain(z)
         return {label: theta[..., i] for i, label in enumerate(self.labels)}
 
     def unconstrain(self, values: Mapping) -> Point:
-        """z at these values of unknowns by name, in their units; those that are not given are at their first guess.
+        """Return z at these values of unknowns by name, in their units; missing ones are at their first
+        guess.
 
         Raises ValueError for names that are not unknown, and for values at or beyond a bound.
         """
@@ -119,7 +120,8 @@ class LogDensity(eqx.Module):
         return self.layout.scene(self.scene, self._split(self.constrain(z))[0])
 
     def whitened(self, fit: Fit) -> "LogDensity":
-        """The density in other unknowns z, which a fit of the same data takes to be independent and of variance one: samplers then need few steps.
+        """Return the density in transformed unknowns z, independent with unit variance according to a fit of
+        the same data, so that samplers need few steps.
 
         It is the density of the same unknowns: `constrain` and `named` lead to the same values. Where the fit is at its minimum, z is zero.
         ValueError for a fit of other unknowns, one of a batch, and unknowns that have no standard error, hidden in the data or at a bound.
@@ -130,7 +132,7 @@ class LogDensity(eqx.Module):
         for label, error in zip(fit.labels, fit.standard_errors, strict=True):
             if not np.isfinite(error):
                 raise ValueError(
-                    f"`{label}` has no standard error in the fit, so that nothing is known of its spread; give it a prior, or leave it out of `free`"
+                    f"`{label}` has no standard error in the fit, so its scale is unknown; give it a prior, or omit it from `free`"
                 )
         noise = [float(fit.sigma[name]) for name in self.sigmas] + [float(fit.correlation_time[name]) for name in self.with_memory]
         theta, end = np.concatenate([fit.values, noise]), len(self.labels) - len(self.with_memory)
@@ -156,7 +158,7 @@ class LogDensity(eqx.Module):
         return self.centre + z @ self.factor.T
 
     def _each(self, of: Callable, x: Points) -> Points:
-        """What is `of` the range of each unknown, at these numbers."""
+        """Return the value `of` the range of each unknown, at these numbers."""
         return jnp.stack([of(one, x[..., i]) for i, one in enumerate(self.ranges)], axis=-1)
 
     def _split(self, theta: Point) -> tuple[Float[Array, "shared"], Float[Array, "runs local"]]:
@@ -177,7 +179,8 @@ def log_density(
     options: Options | None = None,
     **by_name: Unpack[OptionFields],
 ) -> LogDensity:
-    """The posterior density of the unknowns of `fit`, as a function of a vector of any real numbers, for samplers such as those of BlackJAX and NumPyro.
+    """Return the posterior density of the unknowns of `fit`, as a function of an unconstrained vector, for
+    samplers such as those of BlackJAX and NumPyro.
 
     **Arguments**
     - `scene`, `data`, `free`, `options`, `by_name`: as of `fit`: parameters that are free, start values that are unknown, numbers of sensors and actuators
@@ -243,5 +246,5 @@ def _rms(scene: Scene, groups: Sequence[Run], name: str, options: AllOptions) ->
     samples = sum(np.count_nonzero(np.asarray(group.weights[name])) for group in groups)
     found = float(np.sqrt(sum(float(jnp.sum(r**2)) for r in residuals) / samples))
     if not np.isfinite(found):
-        raise ValueError(f"the motion fails at the first guess, so that the sigma of channel `{name}` has none; look at it with `simulate`")
+        raise ValueError(f"the motion fails at the first guess, so that the sigma of channel `{name}` has no first guess; examine the motion with `simulate`")
     return max(found, 1e-12)

@@ -1,4 +1,5 @@
-"""The predictions of runs that are cut into pieces, each with a start of its own; and those of the whole runs, condensed from them.
+"""Predictions of runs cut into pieces, each with its own start, and predictions of whole runs condensed from
+them.
 
     joined      all starts s_i of pieces are unknowns, continuity is a residual of some width: (x(t_i+1; s_i, theta) - s_i+1) / width
     condensed   continuity is solved for, to first order:   ds_i+1 = A_i ds_i + B_i dtheta + c_i,     c_i = x(t_i+1; s_i, theta) - s_i+1
@@ -38,7 +39,7 @@ class Shot:
 
 @dataclass
 class _Standing(ByMember):
-    """Where the pieces of all members are, and what was found there."""
+    """The location of the pieces of all members, and the results there."""
 
     local: Float[np.ndarray, "members pieces states_and_own"]  # unknowns of each piece, with its node
     theta: Float[np.ndarray, "members places"]  # those of the whole runs
@@ -49,7 +50,7 @@ class _Standing(ByMember):
 
 
 class Piecewise(Problem):
-    """The problem of whole runs that are worked out in pieces; `pieces`: that with nodes as unknowns, whose starts have nothing to do with each other."""
+    """The problem of whole runs computed in pieces; `pieces`: the same with nodes as independent unknowns."""
 
     def __init__(self, asked: Asked, runs: tuple[Experiment, ...], unknowns: Unknowns):
         super().__init__(asked, runs, unknowns)
@@ -61,7 +62,7 @@ class Piecewise(Problem):
         of_each = [in_pieces(run, ends, self.states) for run, ends in zip(runs, self.ends_of, strict=True)]
         parts = tuple(itertools.chain(*of_each))
         if len(parts) == len(runs):
-            raise ValueError("`shooting` leaves each run in one piece only; give a shorter `duration`, or leave out `shooting`")
+            raise ValueError("`shooting` leaves each run in one piece only; give a shorter `duration`, or omit `shooting`")
         self.run_of = np.repeat(np.arange(len(runs)), [len(of_run) for of_run in of_each])  # of each piece
         self.follows = np.concatenate([[False], np.diff(self.run_of) == 0])
         self.shared, self.own = layout.sizes
@@ -78,7 +79,7 @@ class Piecewise(Problem):
     # With nodes as unknowns. ----------------------------------------------------------------------------------------
 
     def _unknowns(self, pieces: int) -> Unknowns:
-        """Those of all pieces with their nodes."""
+        """Return the unknowns of all pieces with their nodes."""
         whole, free = self.unknowns, unbounded(1.0)
         ranges = self._each(np.array(whole.ranges, object), free, free, np.array([unbounded(float(size)) for size in self.node_sizes], object))
         means, weights = (self._each(x, 0.0, 0.0, 0.0, carried=False) for x in (whole.prior_mean, whole.prior_weight))
@@ -91,11 +92,13 @@ class Piecewise(Problem):
         self.pieces.unknowns = self._unknowns(len(self.follows))
 
     def spread(self, theta: Places) -> np.ndarray:
-        """Unknowns of whole runs as those of all pieces, with nodes at zero."""
+        """Return unknowns of whole runs as unknowns of all pieces, with nodes at zero."""
         return self._each(theta, 0.0, 0.0, 0.0)
 
     def _each(self, of_runs: np.ndarray, later, first_node, later_node, carried: bool = True) -> np.ndarray:
-        """What belongs to unknowns of whole runs as that of all pieces; `later`: of start values in later pieces, and `carried`: but of what these share."""
+        """Return values for unknowns of whole runs as values for all pieces; `later`: for start values in
+        later pieces; `carried`: without shared ones.
+        """
         shared, own = self.unknowns.split(of_runs)
         own = own[..., self.run_of, :]
         own[..., self.follows[:, None] & ~(np.isin(np.arange(self.own), self._carried) & carried)] = later
@@ -115,7 +118,7 @@ class Piecewise(Problem):
         return found, ends
 
     def _from_before(self, ends: np.ndarray, local: np.ndarray, piece: int) -> Float[np.ndarray, "members decided width"]:
-        """Return [A B c]: by the piece before, what a piece decides less what it is."""
+        """Return [A B c]: the end of a piece as a function of its predecessor, minus its value."""
         carried = np.zeros((len(local), self._carried.size, ends.shape[-1]))
         carried[:, range(self._carried.size), self._carried], carried[..., -1] = 1.0, local[:, piece - 1, self._carried]
         rows = np.concatenate([carried, ends[:, piece - 1]], axis=1)
@@ -123,7 +126,9 @@ class Piecewise(Problem):
         return rows
 
     def with_gaps(self, theta: np.ndarray, members: np.ndarray, width: float) -> Linearised:
-        """What is minimised with the starts of all pieces as unknowns: their gaps are residuals of this width, in sizes of the states."""
+        """Return the objective with the starts of all pieces as unknowns: gaps are residuals of this width,
+        in sizes of the states.
+        """
         (some, ends), local = self.with_ends(theta, members), self.pieces.unknowns.split(theta)[1]
         at = self.pieces.assembled(theta, members, some, np.zeros((len(theta), len(self.with_memory))))
         count, pieces, M = local.shape
@@ -142,7 +147,7 @@ class Piecewise(Problem):
     # Condensed. -----------------------------------------------------------------------------------------------------
 
     def put(self, theta: np.ndarray) -> ByUnknown:
-        """Puts the pieces of all members where they are here; the unknowns of the whole runs."""
+        """Place the pieces of all members here; return the unknowns of the whole runs."""
         shared, local = self.pieces.unknowns.split(theta)
         whole = np.concatenate([shared, local[:, ~self.follows, : self.own].reshape(len(theta), -1)], axis=1)
         slopes, jumps = np.zeros((*local.shape, self.own + self.shared)), np.full((*local.shape[:2], self.states), np.inf)
@@ -158,7 +163,7 @@ class Piecewise(Problem):
         self.put(whole)
 
     def told(self) -> Shot:
-        """How the pieces join where they are."""
+        """Return how well the pieces join at their location."""
         nodes = self.at.local[0, :, self.own :]
         return Shot(
             pieces=tuple(np.bincount(self.run_of).tolist()),
@@ -216,7 +221,9 @@ class Piecewise(Problem):
         return np.concatenate([own[:, self.run_of], np.broadcast_to(shared[:, None], (len(theta), len(self.run_of), self.shared))], axis=2)
 
     def growth(self, members: np.ndarray) -> PerMember:
-        """The factor by which small changes of the unknowns grow from the first node to where they are largest, in sizes of states and unknowns."""
+        """Return the factor by which small changes of the unknowns grow from the first node to their maximum,
+        in sizes of states and unknowns.
+        """
         sizes = self._by_piece(self.unknowns.sizes(self.at.theta[members]))
         slopes = self.at.slopes[members][:, :, self.own :] * sizes[:, :, None] / self.node_sizes[:, None]
         lengths = np.sqrt(np.sum(slopes**2, axis=(2, 3)))[:, self.follows]
@@ -281,7 +288,7 @@ class Piecewise(Problem):
         return found
 
     def _places_of(self, piece: int) -> tuple[np.ndarray, np.ndarray]:
-        """Those residuals of a piece that belong to its run, and their places there."""
+        """Return the residuals of a piece that belong to its run, and their places there."""
         run = int(self.run_of[piece])
         before = piece - int(np.flatnonzero(self.run_of == run)[0])
         first, firsts = self.ends_of[run][before], owned(self.runs[run], self.ends_of[run])

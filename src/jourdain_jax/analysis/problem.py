@@ -1,4 +1,4 @@
-"""What a fit minimises: residuals of all runs with their derivatives, whitened and weighted, at any numbers.
+"""The objective of a fit: whitened and weighted residuals of all runs, with derivatives.
 
 F = sum rho(w) + sum n log sigma + |M (theta - mean) / s|^2 / 2        w: whitened residuals (see `correlated_noise`)
 
@@ -64,7 +64,9 @@ class Loss:
         return rows if math.isinf(self.parameter) else np.sqrt(self.weight(r))[..., None] * rows
 
     def inflation(self, r: Residuals, determined: float) -> float:
-        """The factor by which the covariance (J'WJ)^-1 is to be multiplied, from the residuals that count, which determined so many unknowns."""
+        """Return the factor of the covariance (J'WJ)^-1 from the residuals that count, which determined so
+        many unknowns.
+        """
         if not np.isfinite(bend := self.bend(r)):
             return bend
         psi, slope = self.weight(r) * r, self._slope(r)
@@ -72,7 +74,9 @@ class Loss:
         return bend * K**2 * float(np.sum(psi**2) / left / np.mean(slope))
 
     def bend(self, r: Residuals) -> float:
-        """The factor by which (J'WJ)^-1 is to be multiplied to be the inverse of the second derivatives of F; infinite where F is not convex in residuals."""
+        """Return the factor that turns (J'WJ)^-1 into the inverse of the second derivatives of F; infinite
+        where F is not convex in the residuals.
+        """
         slope = float(np.mean(self._slope(r)))
         return float(np.mean(self.weight(r))) / slope if slope > 0 else math.inf
 
@@ -86,7 +90,8 @@ LEAST_SQUARES = Loss("least squares", np.inf)
 
 
 def huber(k: Number = 1.345) -> Loss:
-    """Residuals beyond `k` sigmas count by their magnitude, not by their square: `jj.fit(..., loss=jj.huber())`. The default keeps 95 % of the efficiency.
+    """Count residuals beyond `k` sigmas by their magnitude, not their square: `jj.fit(..., loss=jj.huber())`.
+    The default keeps 95 % of the efficiency.
 
     Raises ValueError unless k is positive and finite.
     """
@@ -94,7 +99,8 @@ def huber(k: Number = 1.345) -> Loss:
 
 
 def student_t(degrees: Number = 4.0) -> Loss:
-    """Noise with the tails of Student's t: residuals far out hardly count. `degrees` of freedom: fewer for heavier tails; sigma is the scale of the noise.
+    """Assume noise with the tails of Student's t, so that outliers hardly count. `degrees` of freedom: fewer
+    for heavier tails; sigma is the scale of the noise.
 
     Raises ValueError unless the degrees are positive and finite.
     """
@@ -104,7 +110,7 @@ def student_t(degrees: Number = 4.0) -> Loss:
 def _positive(x: Number, name: str, function: str) -> float:
     checked_real(x, f"`{name}` of `{function}`", ())
     if not (np.isfinite(x) and x > 0):
-        raise ValueError(f"{function}({x}): expected a positive finite number for `{name}`; leave it out for the default")
+        raise ValueError(f"{function}({x}): expected a positive finite number for `{name}`; omit it for the default")
     return float(x)
 
 
@@ -124,14 +130,18 @@ class Asked:
 
 @dataclass(frozen=True)
 class Span(ByMember):
-    """The first part of all runs. The first guess is a weak prior, known to its own size: what so few samples do not tell stays there."""
+    """The first part of all runs. The first guess is a weak prior, known to its own size, for undetermined
+    unknowns.
+    """
 
     shares: PerMember  # of the span of each run, from its start: samples beyond do not count
     begun: Places  # first guesses
 
 
 class Problem:
-    """What a fit was asked of its runs: residuals with their derivatives, of any members at any numbers. `repeats` of the experiment; None: it has none."""
+    """The objective of a fit over its runs: residuals with derivatives, for any members at any numbers.
+    `repeats` of the experiment; None: it has none.
+    """
 
     def __init__(self, asked: Asked, runs: tuple[Experiment, ...], unknowns: Unknowns, repeats: int | None = None):
         self.asked, self.runs, self.unknowns, self.single, self.count = asked, runs, unknowns, repeats is None, repeats or 1
@@ -146,7 +156,7 @@ class Problem:
         self.failed = False  # whether a motion has
 
     def one(self, x: np.ndarray) -> np.ndarray:
-        """What has an axis of members, without it where there are no repeats."""
+        """Return values with an axis of members without it if there are no repeats."""
         return np.asarray(x[0]) if self.single else x
 
     def taus(self, members: np.ndarray) -> np.ndarray:
@@ -167,7 +177,7 @@ class Problem:
             yield from group.evaluate(*self.unknowns.split(theta), members)
 
     def linearised(self, theta: np.ndarray, members: np.ndarray, span: Span | None = None) -> Linearised:
-        """Return what is minimised, with its arrow, of some members, over all of the runs or a span of them."""
+        """Return the objective with its arrow, for some members, over all runs or a span of them."""
         return self.assembled(theta, members, self.evaluated(theta, members), self.taus(members), span)
 
     def minimum(self, theta: np.ndarray, members: np.ndarray, what: str = "", control: Control | None = None, span: Span | None = None) -> Minimum:
@@ -185,7 +195,7 @@ class Problem:
         return minimise(lambda x, _: self.linearised(x, np.array([member])), begin, replace(unknowns, fixed=fixed), roughly)
 
     def assembled(self, theta: np.ndarray, members: np.ndarray, evaluated: Iterable[Some], taus: np.ndarray, span: Span | None = None) -> Linearised:
-        """What is minimised, from what was evaluated, with these correlation times."""
+        """Return the objective from evaluated residuals, with these correlation times."""
         (p, m), count, runs, kinds = self.unknowns.layout.sizes, len(theta), self.unknowns.runs, 1 + len(self.estimated)
         triangles = np.zeros((count, runs, kinds, m + p + 1, m + p + 1))
         costs, squares = np.zeros((count, runs)), np.zeros((count, kinds))
@@ -221,7 +231,9 @@ class Problem:
         return Linearised(cost, whole, kept, sigma, triangles, squares)
 
     def joined(self, theta: np.ndarray, triangles: np.ndarray, sigma: np.ndarray, span: Span | None = None) -> tuple[Arrow, np.ndarray | float]:
-        """The arrow of triangles (members, runs, kinds, width, width) with these sigmas (members, kinds) and all priors; what priors add to F."""
+        """Return the arrow of triangles (members, runs, kinds, width, width) with these sigmas (members,
+        kinds) and all priors; and the part of the priors in F.
+        """
         (p, m), (count, runs, kinds, *_) = self.unknowns.layout.sizes, triangles.shape
         together = triangles[:, :, 0]
         if kinds > 1 or np.any(sigma != 1):
@@ -237,7 +249,9 @@ class Problem:
         return with_prior(whole, r, weight, M), 0.5 * (np.sum((r[:, :p] @ M.T) ** 2, axis=1) + np.sum(r[:, p:] ** 2, axis=1))
 
     def is_followed(self, at: Linearised, shares: Float[np.ndarray, "shares"], most: float) -> Bool[np.ndarray, "members shares"]:
-        """Over which shares of the span the squares of residuals are on average at most so many times those of noise."""
+        """Return the shares of the span over which squared residuals average at most so many times those of
+        noise.
+        """
         good = np.isfinite(at.cost)
         squares, counted = np.zeros((2, good.sum(), len(shares)))
         for run in range(len(self.runs) if good.any() else 0):
@@ -263,14 +277,15 @@ class Problem:
         return changed
 
     def _restricted(self, theta, members: np.ndarray, evaluated: list, taus: np.ndarray) -> tuple[np.ndarray, Linearised]:
-        """What the restricted likelihood is made of, to be as low as possible."""
+        """Return the terms of the restricted likelihood, to be minimised."""
         at, logs = self.assembled(theta, members, evaluated, taus), np.zeros(len(members))
         for b, j, _ in evaluated:
             np.add.at(logs, b, self.group_of[int(j[0])].log_widths(j, members[b], taus[b]))
         return at.cost + logs + half_log_determinant(at.arrow, self.unknowns.sizes(theta)), at
 
     def doubt(self, theta: np.ndarray, of: Callable[[Arrow], tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-        """What estimated correlation times add, (members, unknowns): to each squared standard error C, relative to it; and the variance of log C.
+        """Return the part of estimated correlation times, (members, unknowns), in each squared standard error
+        C, relative to it; and the variance of log C.
 
         By moments over the restricted likelihood of each correlation time, with weights that are even in arcsin rho (Jeffreys' prior of AR(1) noise): C becomes
         mean C + variance of the estimates, which move with it. `of`: standard errors and changes of the estimates from an arrow. Zero where none is estimated.
@@ -308,8 +323,8 @@ class Problem:
         return sum(math.prod(np.shape(run.values[name])[int(not self.single) :]) for run, name in channels)
 
     def by_channel(self, run: int, at: Linearised, white: bool = False) -> dict[str, np.ndarray]:
-        """Residuals of a run in units of sigma by channel, (members, *samples); NaN where a sample is missing, or they were not worked out since another run
-        had failed. `white`: whitened ones.
+        """Return residuals of a run in units of sigma by channel, (members, *samples); NaN for missing
+        samples, or if another run had failed. `white`: whitened ones.
         """
         group = self.group_of[run]
         flat = [np.zeros(0) if r is None else r for r in at.residuals[:, run]]
@@ -334,12 +349,14 @@ class Problem:
 
 
 def closed(rows: np.ndarray, unknowns: int) -> np.ndarray:
-    """[J r] from [J g r], where pieces of a run do not join yet: g is what r will have changed by, to first order, once they do."""
+    """Return [J r] from [J g r], where pieces of a run do not join yet: g is the first-order change of r once
+    they do.
+    """
     if rows.shape[-1] == unknowns + 1:
         return rows
     return np.concatenate([rows[..., :unknowns], rows[..., unknowns:-1] + rows[..., -1:]], axis=-1)
 
 
 def _with(taus: np.ndarray, k: int, values: np.ndarray) -> np.ndarray:
-    """The correlation times with those of one channel changed."""
+    """Return the correlation times with those of one channel changed."""
     return np.where(np.arange(taus.shape[1]) == k, values[:, None], taus)

@@ -1,4 +1,4 @@
-"""Channels that are functions of a `Motion`: every fit traces them anew, and two are equal that compute the same.
+"""Channels that are functions of a `Motion`: traced by every fit, and equal if they compute equal values.
 
 A function is traced where it is handed over. What it closes over becomes arguments, what is left, the operations, is compared by value: a new lambda that
 does the same in every run is one channel, batched and compiled once; a function whose globals have changed is another one.
@@ -58,7 +58,9 @@ class Channel(eqx.Module):
 
 
 def channel(function: Callable, scene: Scene) -> Channel:
-    """A function of a motion of this scene as a channel; it is traced again where it is new, or what it reads has changed."""
+    """Return a function of a motion of this scene as a channel; it is traced again if it is new, or the
+    values it reads have changed.
+    """
     now = now_read_by(function)
     if now is None:
         return _traced(function, scene)
@@ -107,7 +109,7 @@ def _motion_shape(treedef, shapes) -> Motion:
 
 
 class Instrument(eqx.Module):
-    """What shows three components that depend on the accelerations of a scene."""
+    """An instrument with three components that depend on the accelerations of a scene."""
 
     @abstractmethod
     def check(self, scene: Scene, channel: str, where: str) -> None:
@@ -144,12 +146,12 @@ class Accelerometer(Instrument):
         self.gravity = checked_real(gravity, "`gravity` of `Accelerometer`", (3,), advice="give three components in the inertial frame, m/s^2")
 
     def check(self, scene: Scene, channel: str, where: str) -> None:
-        """ValueError, which names the `channel` and the run, where the scene has no such body."""
+        """Raise a ValueError that names the `channel` and the run, `where`, if the scene has no such body."""
         bodies = motion_shape(scene).bodies
         check_name(self.body, bodies, f"the accelerometer `{channel}` of {where} sits on body `{self.body}`, which is not there")
 
     def over_times(self, motion: Trajectory) -> OverTimes:
-        """What it feels at all times of one motion."""
+        """Return the readings at all times of one motion."""
         return jax.vmap(lambda *state: self._felt(motion.scene, *state))(motion.ts, motion.q, motion.u, motion.accelerations().udot)
 
     def _felt(self, scene: Scene, t, q, u, udot) -> Vector3:
@@ -182,16 +184,19 @@ class LoadCell(Instrument):
         self.contact = contact
 
     def check(self, scene: Scene, channel: str, where: str) -> None:
-        """ValueError, which names the `channel` and the run, where the scene has no such contact, or does not determine its force."""
+        """Raise a ValueError that names the `channel` and the run, `where`, if the scene has no such contact,
+        or its force is not determined.
+        """
         determined = _determined(scene)
         check_name(self.contact, determined, f"the load cell `{channel}` of {where} is under contact `{self.contact}`, which is not there")
         if not determined[self.contact]:
             raise ValueError(
-                f"the load cell `{channel}` of {where} is under contact `{self.contact}`, whose force is not determined: others share it; leave the channel out"
+                f"the load cell `{channel}` of {where} is under contact `{self.contact}`, whose force is not "
+                "determined, because other contacts share it; omit the channel"
             )
 
     def over_times(self, motion: Trajectory) -> OverTimes:
-        """What it shows at all times of one motion."""
+        """Return the readings at all times of one motion."""
         force = motion.contact_forces()[self.contact]
         return jnp.concatenate([force.tangential, force.normal[..., None]], axis=-1)
 
@@ -216,17 +221,21 @@ class StopEvent(eqx.Module):
         """ValueError where the scene has no such event."""
         if name not in (names := names_of_events(scene)):
             has = nearest(name, names) if names else "it has no stop events."
-            raise ValueError(f"`events` of {where} names `{name}`, which is no event of the scene; {has}")
+            raise ValueError(f"`events` of {where} names `{name}`, which is not an event of the scene; {has}")
         return StopEvent(name)
 
     def time(self, motion: Callable, t0, span) -> Scalar:
-        """When the motion stops at it, NaN where it does not. `motion`: of times, with its events; `span`: from the start to the observed time."""
+        """Return the time at which the motion stops at the event, NaN if it does not. `motion`: of times,
+        with its events; `span`: from the start to the observed time.
+        """
         found = motion((t0 + LATEST * span)[None])
         return jnp.where(found.event == found.event_names.index(self.name), found.t_end, jnp.nan)
 
 
 def cut(events: Mapping, t0, ts, values: dict, sigma: dict) -> tuple:
-    """Times, values and sigmas of a run up to its event, whose time is one channel more; a vector of times: of repeats. ValueError for what is no such time."""
+    """Return times, values and sigmas of a run up to its event, whose time is one more channel; a vector of
+    times: for repeats. ValueError for impossible times.
+    """
     if len(events) > 1:
         raise ValueError(f"`events` names {', '.join(f'`{name}`' for name in events)}, but a motion stops at the first of its events; give that one")
     ((name, given),) = events.items()
@@ -236,7 +245,8 @@ def cut(events: Mapping, t0, ts, values: dict, sigma: dict) -> tuple:
         raise ValueError(f"event `{name}` was given {given!r}, expected (time, sigma), both in s, such as (1.83, 0.005)")
     at, spread = (checked_known(x, f"{what} of event `{name}`", advice="give a number in s") for x, what in zip(given, ("the time", "sigma"), strict=True))
     if is_traced((ts, t0)) or at.ndim > 1 or not np.all(at > t0):
-        raise ValueError(f"the time of event `{name}` is {at} s, expected one after the start at t0 = {t0} s (of `fit_batch` a vector, one of each repeat)")
+        raise ValueError(f"the time of event `{name}` is {at} s, expected a time after the start at t0 = {t0} s "
+            "(for `fit_batch` a vector with one time per repeat)")
     last = min(int(np.searchsorted(ts, at.max())), len(ts) - 1)
     kept, axis = slice(last + 1), at.ndim
     after = ts[kept] > at[..., None]

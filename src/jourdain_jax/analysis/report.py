@@ -1,4 +1,6 @@
-"""What kind of system a scene is, in one table: freedoms, rows, rank, integrability, growth, cyclic and ignorable coordinates."""
+"""The kind of system, in one table: freedoms, constraints, rank, integrability, growth, cyclic and ignorable
+coordinates.
+"""
 
 import textwrap
 from collections.abc import Mapping
@@ -25,7 +27,8 @@ AS_IN_STRUCTURE = ("degrees_of_freedom", "rank", "redundant_rows", "rheonomic", 
 
 @dataclass(frozen=True, repr=False)
 class Report(Printed):
-    """Facts about a scene, found by probing at random and symmetric states of its domain; `print(report)` shows a table.
+    """Facts about a scene, found by probing at random and symmetric states of its domain; `print(report)`
+    shows a table.
 
     Row by row and taken together: eqs. (5)-(9), Frobenius; privileged velocities (25)-(31); cyclic coordinates (42).
 
@@ -64,7 +67,7 @@ class Report(Printed):
     conventions: str
 
     def as_dict(self) -> dict:
-        """The report for machines: the fields by name; what has no finite value is None."""
+        """Return the report for machines: the fields by name, with None for values that are not finite."""
         facts = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
         facts["domain"] = {name: list(bounds) for name, bounds in self.domain.items()}
         facts["frobenius_violations"] = {row: size if size < float("inf") else None for row, size in self.frobenius_violations.items()}
@@ -140,7 +143,8 @@ class Report(Printed):
 @shown_from_users_lines
 @of_known_numbers
 def report(scene: Scene | BuiltFor, *, depth: int = 4, start: "State | Mapping[str, Any] | None" = None) -> Report:
-    """Degrees of freedom, rows, rank, redundancy, integrability, growth vector, cyclic and ignorable coordinates of a scene.
+    """Report freedoms, constraints, rank, redundancy, integrability, growth vector, cyclic and ignorable
+    coordinates of a scene.
 
     `depth` bounds the number of fields in a bracket for the growth vector. `start`: a state, or named values as for `jj.start`, at which the rank is
     compared with that at generic states (default: the scene's example, where some configurations lose rank). `print(report(scene))` shows a table;

@@ -1,4 +1,4 @@
-"""A fit that is resumed: at its minimum, along a profile, and for other runs.
+"""Resumed fits: at the minimum, along a profile, and for other runs.
 
 What a fit predicts for runs that had no part in it.
 
@@ -45,7 +45,9 @@ from jourdain_jax.scene.printing import Printed
 
 
 def taken_up(fit: Estimates, data: Data) -> tuple[Problem, Minimum]:
-    """A `Fit` of one experiment where it ended, with residuals and derivatives computed anew. ValueError where `data` are not what it was fitted to."""
+    """Return a `Fit` of one experiment at its end, with residuals and derivatives computed again. ValueError
+    if `data` are not those of the fit.
+    """
     problem = for_runs(fit, data, fit.asked, fit.shooting is not None)
     unknowns, theta = problem.unknowns, problem.unknowns.guess[None].copy()
     if unknowns.labels != fit.labels:
@@ -60,12 +62,14 @@ def taken_up(fit: Estimates, data: Data) -> tuple[Problem, Minimum]:
         for name, r in residuals.items():
             here = np.nan_to_num(again[name][0] if name in again else np.nan) * (sigma.get(name, 1.0) / fit.sigma.get(name, 1.0))
             if here.shape != r.shape or largest(np.nan_to_num(r) - here) >= 0.01:
-                raise ValueError("`data` are not those of the fit: its residuals are others there; give the runs that it was fitted to")
+                raise ValueError("`data` differ from those of the fit (the residuals disagree); give the runs of the fit")
     return problem, Minimum.begun(theta, at, "")
 
 
 def for_runs(fit: Estimates, runs: Data, asked: Asked, apart: bool) -> Problem:
-    """The problem of a `Fit` for these runs; ValueError where they do not fit the scene. `apart`: what is a run's own is told from what runs share."""
+    """Return the problem of a `Fit` for these runs; ValueError if they do not match the scene. `apart`:
+    separate unknowns of runs from shared ones.
+    """
     checked = as_runs(asked.scene, runs)
     unknowns = unknowns_of(asked.scene, checked, asked.free, apart)
     problem = Problem(asked, checked, unknowns) if asked.shooting is None else Piecewise(asked, checked, unknowns)
@@ -114,7 +118,9 @@ def of_fitted(fit: Estimates, runs: Sequence[Experiment]) -> tuple[dict[str, Pre
 
 
 def of_held_out(fit: Estimates, runs: Data) -> tuple[dict[str, Prediction], ...]:
-    """Predictions of other runs; ValueError where they do not fit the scene, or share unknowns that the fit did not estimate."""
+    """Return predictions of other runs; ValueError if they do not match the scene, or share unknowns that the
+    fit did not estimate.
+    """
     runs = (runs,) if isinstance(runs, Experiment) else tuple(runs)
     problem = for_runs(fit, runs, replace(fit.asked, shooting=None), apart=True)
     unknowns, theta, shared = problem.unknowns, problem.unknowns.guess[None].copy(), problem.unknowns.layout.sizes[0]
@@ -126,7 +132,7 @@ def of_held_out(fit: Estimates, runs: Data) -> tuple[dict[str, Prediction], ...]
         theta = problem.minimum(theta, np.array([0])).theta
     at = problem.linearised(theta, np.array([0]))
     if not np.isfinite(at.cost[0]):
-        raise ValueError("a motion of the runs held out fails at the estimates; look at it with `simulate`")
+        raise ValueError("a motion of the held-out runs fails at the estimates; examine it with `simulate`")
     own = dict(zip(problem.estimated, at.sigma[0].tolist(), strict=True))
     # residuals are in units of sigmas, of which those that are not known were estimated from these very runs
     ratio = {name: sigma / fit.sigma.get(name, sigma) for name, sigma in own.items()}
@@ -164,11 +170,13 @@ class Informed:
 
     @property
     def of_priors(self) -> Float[np.ndarray, "unknowns"]:
-        """What priors tell, not the data."""
+        """Return the information of priors, without the data."""
         return 1 - self.of_runs.sum(axis=1)
 
     def half(self, unknown: int) -> tuple[int, float, float]:
-        """The run that tells most of an unknown, and the shortest time span, first and last sample, that holds half of what this run tells."""
+        """Return the run with most information on an unknown, and the shortest time span, first and last
+        sample, that holds half of it.
+        """
         run = int(np.argmax(self.of_runs[unknown]))
         told, ts = sum(share[unknown] for share in self.of_samples[run].values()), self.times[run]
         total = np.concatenate([[0.0], np.cumsum(told)])
@@ -225,7 +233,9 @@ class Profile(Printed):
 
 
 def profiles(problem: Problem, fitted: Minimum, names: Iterable[str], errors: dict[str, float], inflation: dict[str, float]) -> dict[str, Profile]:
-    """Profiles of the unknowns named. `errors`: standard errors by name, for the first step; `inflation`: by what the rise is divided."""
+    """Return profiles of the unknowns named. `errors`: standard errors by name, for the first step;
+    `inflation`: the divisor of the rise.
+    """
     unknowns, found = problem.unknowns, {}
     for name in names:
         check_name(name, unknowns.labels, f"`{name}` was not estimated", UnknownNameError)

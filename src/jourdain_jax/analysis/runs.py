@@ -1,4 +1,5 @@
-"""Runs made ready: measurements with weights, the motion of a scene and the residuals that it leaves; grouped by structure, and filled up to one length.
+"""Runs prepared for a fit: weighted measurements, motions and residuals, grouped by structure and padded to
+one length.
 
 r = (reading - value) / sigma, zero where a sample is missing
 
@@ -61,7 +62,7 @@ class Run(NamedTuple):
         return simulate(scene, begin(scene, self.start, self.t0), t0=self.t0, ts=ts, inputs=inputs, options=options)
 
     def residuals(self, scene: Scene, simulate: Callable, options: AllOptions) -> dict[str, Numbers]:
-        """`(reading - value) / sigma` by channel; of a piece of a run also what it ends at."""
+        """Return `(reading - value) / sigma` by channel; for a piece of a run also its end state."""
         ts = self.ts if self.grid is None else self.grid
         motion = self.motion(scene, simulate, ts, replace(options, events=False))
         states = motion.motions() if any(isinstance(sensor.operation, Channel) for sensor in self.sensors.values()) else None
@@ -154,7 +155,9 @@ def most_knots(runs: Sequence[Run]) -> list[int]:
 
 
 def filled_up(run: Run, times: int, knots: list[int]) -> Run:
-    """The run, with an axis of members, with as many times and knots as these; what is added is close behind its end, and does not count."""
+    """Return the run, with an axis of members, padded to as many times and knots as these; padding follows
+    its end closely, and does not count.
+    """
     more = times - run.ts.shape[0]
     counts = iter(knots)
 
@@ -266,7 +269,9 @@ class Group:
         return np.concatenate([np.repeat(early, count, axis=1) for count in counts], axis=1)
 
     def by_channel(self, run: int, flat: Float[np.ndarray, "members samples"]) -> dict[str, np.ndarray]:
-        """Weighted residuals of a run by channel, NaN where a sample is missing; all NaN where `flat` is empty, since they were not worked out."""
+        """Return weighted residuals of a run by channel, NaN for missing samples; all NaN where `flat` is
+        empty, since they were not computed.
+        """
         place, found = int(np.searchsorted(self.runs, run)), {}
         for name, where in self.channels.items():
             weight = self.weights[name][place]
@@ -277,7 +282,7 @@ class Group:
 
 
 def _of_members(run: Run, of: Callable) -> Run:
-    """The run with what differs by member changed."""
+    """Return the run with the values that differ by member."""
     return run._replace(**{name: {channel: of(x) for channel, x in getattr(run, name).items()} for name in _BY_MEMBER})
 
 

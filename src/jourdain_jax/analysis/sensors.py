@@ -1,4 +1,4 @@
-"""Sensors and actuators: what lies between a motion and its measurements, and between a command and the scene.
+"""Sensors and actuators: models between a motion and its measurements, and between a command and the scene.
 
     sensor      reading(t) = gain y(t - delay) + bias,      lag y' + y = x,      y(t0) = x(t0)      x: a quantity of the motion
     actuator    input(t) = gain y(t - delay) + bias         the same, of a command; y is its first value until then
@@ -45,7 +45,8 @@ Stated: TypeAlias = Number | Sequence[Number] | Estimate
 
 
 def intervals(t0, ts: Times, node) -> int:
-    """How many there are from the start to the last sample: those of the samples where these are equal, too; else none longer than their median.
+    """Return the number of intervals from the start to the last sample: those of the samples if equal; else
+    none longer than their median.
 
     Of traced times only their number is known: there are two intervals for each of theirs, as if the first sample were at the start. Of a piece of a run the
     intervals up to the next `node` are counted so, and there are more beyond.
@@ -60,7 +61,9 @@ def intervals(t0, ts: Times, node) -> int:
 
 
 def grid(t0, ts: Times, count: int, node=None) -> Float[Array | np.ndarray, "grid"]:
-    """So many intervals up to the last sample; those of a piece go on for at most one more, so that its next `node` is one of the times."""
+    """Return so many intervals up to the last sample; those of a piece continue for at most one more, so that
+    its next `node` is one of the times.
+    """
     end = ts[-1] if node is None else node
     until = count if node is None or node == ts[-1] else int(count * float((end - t0) / (ts[-1] - t0)) + 1e-9)
     xp = array_module((t0, end))
@@ -91,7 +94,8 @@ def read(
     lag=None,
     begin: Float[Array, "entries"] | None = None,
 ) -> tuple[Float[Array, "times *channel"], Float[Array | np.ndarray, "grid entries"]]:
-    """What is shown at `ts` of a quantity with these `values` at the times `grid` (s, at equal intervals, six or more), and y there; `lag` None: there is none.
+    """Return the reading at `ts` of a quantity with these `values` at the times `grid` (s, at equal
+    intervals, six or more), and y there; `lag` None: no lag.
 
     Times before the first of the grid count as that. `delay`, `lag` in s. `begin`: what the filter gives at first; None: it starts at rest.
     """
@@ -122,7 +126,7 @@ def read(
 
 
 def _relaxed(y: Float[Array, "channel"], polynomial: Float[Array, "powers channel"], begin, since, rho) -> Float[Array, "channel"]:
-    """What the filter gives `since` intervals after the place `begin`, where it gave `y`."""
+    """Return the filter's output `since` intervals after the place `begin`, where it was `y`."""
     small = rho < 0.2
     quick, slow = jnp.where(small, rho, 0.1), jnp.where(small, 1.0, rho)
     # P = p - rho p' + rho^2 p'' - ...
@@ -147,7 +151,8 @@ def held(ts: Knots, values: Knots) -> tuple[Float[Array, "more_knots"], Float[Ar
 
 
 def filtered(ts: Knots, values: Knots, lag, hold: bool = False) -> Knots:
-    """What the filter gives at the knots of a command that is linear in between, or is held until the next knot: exactly there.
+    """Return the filter's output at the knots of a command that is linear in between, or held until the next
+    knot: exactly there.
 
     y_k+1 = x_k+1 - lag m + (y_k - x_k + lag m) exp(-h / lag),     m = (x_k+1 - x_k) / h;      held: y_k+1 = x_k + (y_k - x_k) exp(-h / lag)
     """
@@ -171,7 +176,7 @@ OF_TIME = ("delay", "lag")
 
 
 class Sensor(eqx.Module):
-    """How a channel shows a quantity of the motion: `reading(t) = gain y(t - delay) + bias`, `lag y' + y = quantity`.
+    """A sensor of a channel: `reading(t) = gain y(t - delay) + bias`, `lag y' + y = quantity`.
 
         jj.Sensor("lean_rate", gain=jj.Estimate(1.0), bias=jj.Estimate(0.0, per_run=True), delay=jj.Estimate(0.02, range=jj.bounds(0.0, 0.1)), lag=0.01)
 
@@ -215,7 +220,8 @@ class Sensor(eqx.Module):
 
 
 class Actuator(eqx.Module):
-    """How an input follows its command: `input(t) = gain y(t - delay) + bias`, `lag y' + y = command`.
+    """An actuator that drives an input from its command: `input(t) = gain y(t - delay) + bias`, `lag y' + y =
+    command`.
 
         inputs={"steer_torque": jj.Actuator(jj.Sampled(ts, command), delay=jj.Estimate(0.02, range=jj.bounds(0.0, 0.1)), lag=jj.Estimate(0.03))}
 
@@ -271,9 +277,9 @@ def _check_estimate(where: str, name: str, value: Estimate) -> None:
     if isinstance(value.guess, tuple):
         raise ValueError(f"{where} is to be estimated from {len(value.guess)} guesses, expected one number")
     if name == "delay" and (value.range is None or not np.isfinite(value.range.high)):
-        raise ValueError(f"{where} is to be estimated, but nothing says how long it may be; give `range=jj.bounds(low, high)`, in s")
+        raise ValueError(f"{where} is to be estimated, but has no upper limit; give `range=jj.bounds(low, high)`, in s")
     if value.range is not None and value.range.low < 0:
-        raise ValueError(f"{where} may fall to {value.range.low:g} s, expected a range from zero or more")
+        raise ValueError(f"{where} may fall to {value.range.low:g} s, expected a range that begins at zero or above")
 
 
 def default_range(name: str):
@@ -282,7 +288,7 @@ def default_range(name: str):
 
 
 class Response(eqx.Module):
-    """The numbers of a sensor or actuator of one run, first guesses where they are to be estimated."""
+    """The numbers of a sensor or actuator of one run, first guesses for estimated ones."""
 
     numbers: dict[str, Numbers | float]
     unknown: tuple[str, ...] = eqx.field(static=True)  # names of numbers that are estimated
@@ -290,7 +296,7 @@ class Response(eqx.Module):
 
     @property
     def is_late(self) -> bool:
-        """Whether it shows something else than what is now."""
+        """Return whether it shows a past value."""
         return any(name in self.used for name in OF_TIME)
 
     @property
@@ -311,13 +317,17 @@ class Reading(Response):
     name: str = eqx.field(static=True)  # of that
 
     def quantity(self, motion: Trajectory, states: Motion | None) -> Float[Array, "times *channel"]:
-        """What it measures, along a motion; `states`: the same as bodies, where a channel is a function of them."""
+        """Return the measured quantity along a motion; `states`: the same as bodies, for channels that are
+        functions of them.
+        """
         if self.operation is None:
             return motion[self.name]
         return self.operation.over_times(motion) if isinstance(self.operation, Instrument) else jax.vmap(self.operation)(states)
 
     def shown(self, x, grid, ts, begin=None) -> tuple[Float[Array, "times *channel"], Float[Array | np.ndarray, "grid entries"] | None]:
-        """What it shows at `ts` of a quantity with values `x` at these times, or on a grid; and y on the grid, from what it is at first (None: at rest)."""
+        """Return the reading at `ts` of a quantity with values `x` at these times, or on a grid; and y on the
+        grid, from the initial value (None: at rest).
+        """
         y = None
         if grid is not None:
             x, y = read(x, grid, ts, self.numbers["delay"], self.numbers["lag"] if self.has_filter else None, begin)
@@ -325,7 +335,7 @@ class Reading(Response):
 
 
 def ideal(name: str, event: StopEvent | None = None) -> Reading:
-    """An ideal sensor of a coordinate or speed; or what shows the time of an event."""
+    """Return an ideal sensor of a coordinate or speed; or of the time of an event."""
     return Reading(dict(NUMBERS), (), (), event, name)
 
 
@@ -337,7 +347,7 @@ class Drive(Response):
     hold: bool = eqx.field(static=True)
 
     def signal(self) -> Sampled:
-        """What the scene is given."""
+        """Return the input of the scene."""
         ts, values = jnp.asarray(self.command.ts), jnp.asarray(self.command.values)
         if self.has_filter:
             values = filtered(ts, values, self.numbers["lag"], self.hold)
@@ -351,7 +361,9 @@ class Drive(Response):
 
 
 def response(owner: Sensor | Actuator) -> tuple[dict, tuple[str, ...], tuple[str, ...]]:
-    """Its numbers (first guesses where they are estimated), names of those that are, and names of all that matter."""
+    """Return its numbers (first guesses for estimated ones), names of the estimated ones, and names of all
+    that matter.
+    """
     given = {name: getattr(owner, name) for name in NUMBERS}
     unknown = tuple(name for name, value in given.items() if isinstance(value, Estimate))
     numbers = {name: value.guess if name in unknown else value for name, value in given.items()}
@@ -360,7 +372,7 @@ def response(owner: Sensor | Actuator) -> tuple[dict, tuple[str, ...], tuple[str
 
 
 def with_numbers(parts: Mapping[str, "Reading | Drive"], known: Mapping[str, Array | np.ndarray]) -> dict:
-    """Readings or drives with these numbers (`gyro.gain` -> number) in place of those that are estimated."""
+    """Return readings or drives with these numbers (`gyro.gain` -> number) in place of the estimated ones."""
     numbers = {label: part.numbers | {name: known[f"{label}.{name}"] for name in part.unknown} for label, part in parts.items()}
     return {label: eqx.tree_at(lambda p: p.numbers, part, numbers[label]) if part.unknown else part for label, part in parts.items()}
 

@@ -1,4 +1,4 @@
-"""Multiple shooting: how a run is cut into pieces, each with a start of its own, which continuity joins again.
+"""Multiple shooting: the division of a run into pieces with their own starts, joined by continuity.
 
     piece i of a run from t_i to t_i+1      state at its begin s_i,   motion x(t; s_i, theta),      s_0: the start of the run
     continuity                              x(t_i+1; s_i, theta) = s_i+1                            as an equation, not as something measured
@@ -38,7 +38,9 @@ NODE, LAST = "node of a piece", "time of the next node"  # in the start of a run
 
 
 def begin(scene: Scene, start: dict, t0):
-    """What `simulate` begins from: the start of a run; of a later piece its node, which `simulate` puts onto the constraints."""
+    """Return the beginning for `simulate`: the start of a run; for a later piece its node, which `simulate`
+    projects onto the constraints.
+    """
     if NODE in start:
         q, u, _ = jnp.split(start[NODE], np.cumsum([len(scene.coordinate_names), len(scene.speed_names)]))
         return state_of(scene, t0, q, u)
@@ -46,7 +48,7 @@ def begin(scene: Scene, start: dict, t0):
 
 
 def ended(motion: Trajectory, filters: Sequence[Float[Array, "times entries"]], start: dict, ts: Float[Array, "times"]) -> dict[str, Float[Array, "states"]]:
-    """What a piece of a motion with these times ends at, beside its residuals; nothing for a whole run."""
+    """Return the end state of a piece of a motion with these times; nothing for a whole run."""
     if LAST not in start:
         return {}
     last = jnp.argmin(jnp.abs(ts - start[LAST]))
@@ -55,7 +57,7 @@ def ended(motion: Trajectory, filters: Sequence[Float[Array, "times entries"]], 
 
 @dataclass(frozen=True)
 class MultipleShooting:
-    """Fit each run in pieces with starts of their own, which end where the next one begins.
+    """Fit each run in pieces with their own starts, each ending where the next one begins.
 
         jj.fit(guess, run, free=("mass", "length"), shooting=jj.MultipleShooting(duration=0.5))
 
@@ -73,7 +75,7 @@ class MultipleShooting:
 
     def __post_init__(self):
         if (self.pieces is None) == (self.duration is None):
-            raise ValueError("`MultipleShooting` expects one of `pieces` (how many each run has) and `duration` (of a piece, in s), such as `duration=0.5`")
+            raise ValueError("`MultipleShooting` expects either `pieces` (their number in each run) or `duration` (of a piece, in s), such as `duration=0.5`")
         if self.pieces is not None:
             checked_whole(self.pieces, "`pieces` of `MultipleShooting`", 2, expected="of two or more; for one piece leave out `shooting`")
         else:
@@ -83,15 +85,17 @@ class MultipleShooting:
 
 
 def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> Ends:
-    """Samples at which pieces begin, and the last sample. ValueError where there are fewer intervals than pieces, and for a run that ended by an event."""
+    """Return samples at which pieces begin, and the last sample. ValueError if there are fewer intervals than
+    pieces, or the run ended by an event.
+    """
     if run.ended_by:
-        raise ValueError(f"run {index} gives the time of its event `{run.ended_by}`, which `shooting` does not use; leave it out, and samples after it")
+        raise ValueError(f"run {index} gives the time of its event `{run.ended_by}`, which `shooting` does not use; omit it, and the samples after it")
     ts = np.asarray(run.ts)
     count = len(ts) - 1
     pieces = shooting.pieces
     if pieces is not None:
         if pieces > count:
-            raise ValueError(f"run {index} has {len(ts)} samples, too few for {pieces} pieces, each of which has an interval or more; ask for at most {count}")
+            raise ValueError(f"run {index} has {len(ts)} samples, too few for {pieces} pieces of at least one interval; give at most {count}")
         return np.round(np.linspace(0, count, pieces + 1)).astype(int)
     at = float(run.t0) + shooting.duration * np.arange(1, max(1, round((ts[-1] - float(run.t0)) / shooting.duration)))
     after = np.clip(np.searchsorted(ts, at), 1, count)
@@ -118,7 +122,9 @@ def owned(run: Experiment, ends: Ends) -> dict[str, Ends]:
 
 
 def in_pieces(run: Experiment, ends: Ends, states: int) -> list[Experiment]:
-    """The pieces of a run that was `checked`; all but the first begin at a node of so many numbers. Each goes on to the last sample that belongs to it."""
+    """Return the pieces of a `checked` run; all but the first begin at a node of so many numbers. Each
+    continues to its last sample.
+    """
     found, firsts = [], owned(run, ends)
     for k, (first, end) in enumerate(pairwise(ends)):
         last = max(end, *(own[k + 1] - 1 for own in firsts.values()))
@@ -145,7 +151,9 @@ def in_pieces(run: Experiment, ends: Ends, states: int) -> list[Experiment]:
 
 
 def _cut(run: Experiment, t0: float, t1: float) -> dict | Inputs | None:
-    """The inputs with the knots about this span only; those of actuators stay whole, since their numbers may move them."""
+    """Return the inputs with the knots about this span only; those of actuators stay whole, since their
+    numbers may move them.
+    """
     if not isinstance(run.inputs, Inputs):
         return run.inputs
     driven = {drive.index for drive in run.drives.values()}
@@ -162,6 +170,6 @@ def _cut(run: Experiment, t0: float, t1: float) -> dict | Inputs | None:
 
 
 def check_shooting(shooting) -> None:
-    """ValueError for what is no `MultipleShooting`."""
+    """Raise a ValueError for anything but a `MultipleShooting`."""
     if shooting is not None and not isinstance(shooting, MultipleShooting):
         raise ValueError(f"`shooting` is {shooting!r}, expected `jj.MultipleShooting(duration=...)`, `jj.MultipleShooting(pieces=...)`, or None")

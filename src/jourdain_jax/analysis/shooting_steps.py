@@ -1,4 +1,4 @@
-"""The minimum of a fit by multiple shooting: first with gaps between pieces that may be wide, then with none.
+"""The minimum of a fit by multiple shooting: first with gaps between pieces, then without.
 
 1. nodes from what was measured (`first_nodes`)
 2. the gaps c_i as residuals of a width that falls, by Levenberg-Marquardt: minimise F + sum (c_i / width)^2 / 2
@@ -91,7 +91,9 @@ def _rates(scene: Scene, t, q, u):
 
 
 def _parabola(ts: Float[np.ndarray, "times"], x: Float[np.ndarray, "times"], t: float) -> tuple[float, float]:
-    """Value and slope at a time of the parabola through the nearest samples; NaN where there are fewer than three."""
+    """Return value and derivative at a time of the parabola through the nearest samples; NaN if there are
+    fewer than three.
+    """
     there = np.flatnonzero(np.isfinite(x))
     near = there[np.argsort(np.abs(ts[there] - t), kind="stable")[:5]]
     if len(near) < 3:
@@ -157,7 +159,9 @@ def _start(problem: Piecewise, data: Experiment, theta: np.ndarray, run: int) ->
 
 
 def _put_starts(problem: Piecewise, local: np.ndarray, nodes: np.ndarray) -> None:
-    """Unknown start values of runs as they were measured, where that is within their bounds and nothing is known of them beforehand."""
+    """Set unknown start values of runs to measured ones, where these are within their bounds and have no
+    prior.
+    """
     unknowns, scene = problem.unknowns, problem.scene
     low, high = unknowns.low, unknowns.high
     for run, first in enumerate(np.flatnonzero(~problem.follows).tolist()):

@@ -1,4 +1,5 @@
-"""How far estimates are spread about a minimum: from sigmas, given or estimated, from correlation times that are not known, or from how much runs differ.
+"""Uncertainty of estimates about a minimum: from given or estimated sigmas, unknown correlation times, or
+differences between runs.
 
 interval     estimate -+ q e      e: standard error; q: 97.5 % quantile of the normal distribution, or of Student's t where noise is estimated, times the root
                                   of what correlation times and weights of channels that are estimated add to the variance
@@ -61,7 +62,7 @@ class Rise:
 
 @dataclass
 class AtBounds:
-    """What is known of unknowns at a bound, of fits that have converged; NaN for all others."""
+    """Statistics of unknowns at a bound, for converged fits; NaN for all others."""
 
     limit: ByUnknown  # infinite where the data give none
     beyond: ByUnknown  # by how many standard errors the data would put it beyond its bound
@@ -130,7 +131,7 @@ def limits_at_bounds(problem: Problem, found: Minimum) -> AtBounds:
 
 
 def _look_inward(problem: Problem, found: Minimum, told: AtBounds, b: int, place: int) -> None:
-    """Tell what one unknown at its bound shows when it is moved away from it."""
+    """Find out how the objective changes when one unknown leaves its bound."""
     bound, limits = found.theta[b, place], problem.unknowns
     inward = 1.0 if bound <= limits.low[place] else -1.0
     error, f, w, n = (x[b, place] for x in vars(told.if_free).values())
@@ -162,7 +163,8 @@ def moved_from_bounds(told: AtBounds, theta: np.ndarray, reach: np.ndarray, plac
 
 
 def too_narrow_near_bounds(problem: Problem, found: Minimum, told: AtBounds, errors: Float[np.ndarray, "unknowns"]) -> list[str]:
-    """Says which intervals of the first member are too narrow, since the squares rise less than `errors` foretell, those of all unknowns that are not fixed.
+    """Name the intervals of the first member that are too narrow, since the squares rise less than `errors`
+    predict (errors of all free unknowns).
 
     Looked at are bounds that an interval reaches, and where an unknown at its bound may leave it, the ends of the intervals of what runs share.
     """
@@ -205,7 +207,7 @@ def _root(slope: float, curvature: float, end: float) -> float:
 
 @dataclass(frozen=True)
 class NoiseLevels:
-    """A linearised problem with these sigmas, and what is known of them."""
+    """A linearised problem with these sigmas, and their statistics."""
 
     at: Linearised
     known: Information
@@ -215,8 +217,9 @@ class NoiseLevels:
 
 
 def noise_levels(problem: Problem, theta: np.ndarray, at: Linearised, told_by: Callable, of_loss: Callable[[np.ndarray, float], float]) -> NoiseLevels:
-    """What is known at theta. `told_by`: the information of an arrow; `of_loss`: the factor by which a loss multiplies variances, of the residuals of one
-    member and the number of unknowns that they determined.
+    """Return sigmas and their statistics at theta. `told_by`: the information of an arrow; `of_loss`: the
+    factor by which a loss multiplies variances, from the residuals of one member and the number of unknowns
+    that they determined.
     """
     members, places, count = np.arange(len(theta)), problem.unknowns.estimated, 1 + len(problem.estimated)
     known = told_by(at.arrow)
@@ -266,7 +269,7 @@ def _told_by_kind(known: Information, T: Float[np.ndarray, "members runs kinds w
 
 @dataclass(frozen=True)
 class Spread:
-    """What is told of how far estimates are spread, of all members."""
+    """Uncertainties of the estimates, of all members."""
 
     levels: NoiseLevels  # sigmas, and what is known with them
     known: Information  # the same, or from how much runs differ
@@ -275,7 +278,7 @@ class Spread:
 
 
 def spread(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members places"]) -> Spread:
-    """The spread of estimates; those at a `bound` are held there."""
+    """Return the uncertainties of estimates; those at a `bound` are held there."""
     unknowns, theta, scores, cutoff = problem.unknowns, found.theta, found.at.arrow.scores, problem.asked.control.cutoff
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
     told_by = partial(information, size=size, estimated=places, bound=bound, fails=fails, cutoff=cutoff)
@@ -299,7 +302,7 @@ def spread(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members pl
 
 
 def if_free(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members places"]) -> Rise:
-    """What is known of each unknown at a `bound`, as if it were free; NaN of others."""
+    """Return statistics of each unknown at a `bound`, as if it were free; NaN for others."""
     told = np.full((4, *bound.shape), np.nan)
     for place in np.flatnonzero(bound.any(axis=0)).tolist():
         others = np.where(np.arange(bound.shape[1]) == place, False, bound)
@@ -309,7 +312,7 @@ def if_free(problem: Problem, found: Minimum, bound: Bool[np.ndarray, "members p
 
 
 def _normal_or_t(of_memory: np.ndarray, of_sigmas: np.ndarray) -> np.ndarray:
-    """97.5 % quantile by which a standard error is multiplied: normal where the noise is known, else Student's t.
+    """Return the 97.5 % quantile in units of standard errors: normal if the noise is known, else Student's t.
 
     Its degrees of freedom are 2 / var(log C). The variances are those that estimated correlation times and sigmas leave. C is a mean over correlation times, so
     that t is to have that variance, without its n / (n - 2).

@@ -1,4 +1,5 @@
-"""What a scene states (bodies, loads, potentials, rows), checked piece by piece, so that a wrong one is named.
+"""Statements of a scene (bodies, loads, potentials, constraints), checked one by one, so that a wrong one is
+named.
 
 inertia        m >= 0,  I = I' >= 0,  I_3 <= I_1 + I_2,  R'R = 1      per body
                e.e = 1                                                per gravity
@@ -53,7 +54,7 @@ THRESHOLDS = {
 
 
 class Check(eqx.Module):
-    """One comparison: its relative size, what it may be, and what it is about."""
+    """One comparison: its relative size, its threshold, and its subject."""
 
     name: str = eqx.field(static=True)
     value: float
@@ -114,7 +115,9 @@ class Verification(Printed, eqx.Module):
 
     @property
     def certifies(self) -> bool:
-        """Whether passing means agreement to round-off of double precision; single precision shows gross errors only."""
+        """Whether passing means agreement to round-off of double precision; single precision shows only gross
+        errors.
+        """
         return all(check.threshold <= THRESHOLDS[check.name][0] for check in self.checks)
 
     @property
@@ -123,12 +126,14 @@ class Verification(Printed, eqx.Module):
         return all(check.passed for check in self.checks)
 
     def largest(self, *names: str) -> float:
-        """The largest value among the checks with these `names` (keys of `THRESHOLDS`); NaN where one is NaN, zero where there is none."""
+        """Return the largest value among the checks with these `names` (keys of `THRESHOLDS`); NaN if one is
+        NaN, zero if there is none.
+        """
         values = [check.value for check in self.checks if check.name in names]
         return float(np.max(values)) if values else 0.0
 
     def as_dict(self) -> dict:
-        """The result for machines: the largest values by kind, and every check."""
+        """Return the result for machines: the largest values by kind, and every check."""
         return {
             "max_disagreement": self.largest("reductions", "forms", "Newton"),
             "virtual_power": self.largest("virtual power"),
@@ -153,7 +158,7 @@ class Verification(Printed, eqx.Module):
 
 
 def derivative_exists(scene: Scene, t, q, u, direction: Scene, dq, inputs=None) -> bool:
-    """Whether accelerations have a derivative along a change of the parameters and coordinates.
+    """Return whether accelerations have a derivative along a change of the parameters and coordinates.
 
     They have none where the change splits rows that are dependent: `(1 - A A+) dA (1 - A+ A)` is not zero.
 
@@ -309,7 +314,7 @@ def _name(i: int, load: Load) -> str:
 
 
 def _pieces(scene: Scene, t, q, u, inputs) -> dict[str, Array]:
-    """All numbers that the scene states at (t, q, u), by what they are."""
+    """Return all numbers that the scene states at (t, q, u), by subject."""
     # poses by themselves: out of a motion they come differentiated once already, and a rule of the user's own may be passed over
     motion, pose = motion_at(scene, t, q, u, inputs), pose_at(scene, t, q)
     pieces = {"the coordinate rates": coordinate_rates(scene, t, q, u)}

@@ -1,4 +1,5 @@
-"""Steady motions by root finding: the privileged speeds are constant, and only coordinates that do not matter to them move.
+"""Steady motions by root finding: privileged speeds are constant, and only coordinates that do not influence
+them change.
 
     g(t, q) = 0,   phi(t, q, u) = 0,   dy/dt = 0,   qdot_j = 0        y: the privileged speeds;  j: the coordinates not ignorable
 
@@ -32,7 +33,7 @@ _REFUSED = dict.fromkeys({*SPAN, *OPTION_NAMES} - {"max_steps"}, "no motion is i
 
 
 class SteadyMotion(Printed, eqx.Module):
-    """A state of steady motion, and how steady it is."""
+    """A state of steady motion, and the residual of its steadiness."""
 
     state: State
     acceleration: Scalar  # largest |dy/dt| that is left
@@ -63,7 +64,8 @@ def steady(
     options: Options | None = None,
     **by_name: Unpack[OptionFields],
 ) -> SteadyMotion:
-    """The steady motion near a guess: `g = 0, phi = 0, dy/dt = 0`, and only coordinates move that do not matter.
+    """Find the steady motion near a guess: `g = 0, phi = 0, dy/dt = 0`, with motion only in coordinates that
+    do not matter.
 
         steady(disc, {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, held=("lean", "yaw_rate"))["spin_rate"]
 
@@ -112,7 +114,7 @@ def guessed(scene: Scene, guess, t0) -> tuple[Array, Array, Array]:
 
 
 class _Problem(eqx.Module):
-    """What vanishes at a steady motion, as a function of z = (q, u)."""
+    """The residual of a steady motion, as a function of z = (q, u)."""
 
     scene: Scene
     t: Scalar
@@ -122,7 +124,9 @@ class _Problem(eqx.Module):
     resting: tuple[int, ...] = eqx.field(static=True)  # coordinates that must not move
 
     def __call__(self, z: Float[Array, "unknowns"]) -> tuple[Array, Array, list[Scalar]]:
-        """What vanishes, its slopes, and the largest of the rows, of dy/dt, and of d2y/dt2."""
+        """Return the residual, its derivatives, and the largest entries of the constraints, of dy/dt, and of
+        d2y/dt2.
+        """
         at = places_of(self.scene)
         v, D, _ = self.instant(self.scene, self.t, z[: len(at.q)], z[len(at.q) :], self.f)
         y = at.udot[np.array(self.privileged, int)]

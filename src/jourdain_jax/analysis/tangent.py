@@ -1,4 +1,4 @@
-"""Small motions on the constraint manifold: all perturbations of a state, and which of them are independent.
+"""Small motions on the constraint manifold: perturbations of a state, and a choice of independent ones.
 
     dq = E ds,   dg = G ds = 0,   dphi = Phi_s ds + A du + Phi_f df = 0
 
@@ -24,7 +24,9 @@ from jourdain_jax.scene.scene import Scene
 
 
 def perturbed_names(scene: Scene) -> tuple[str, ...]:
-    """Names of `ds`: plain coordinates as they are, and three turns in body axes per quaternion: `attitude_turn_x`, `..._y`, `..._z`."""
+    """Return names of `ds`: plain coordinates, and three turns in body axes per quaternion:
+    `attitude_turn_x`, `..._y`, `..._z`.
+    """
     names = list(scene.coordinate_names.entries)
     for first, _ in reversed(scene.coordinates.quaternions):
         group = names[first].removesuffix("_w")
@@ -33,7 +35,8 @@ def perturbed_names(scene: Scene) -> tuple[str, ...]:
 
 
 def perturbations(scene: Scene) -> tuple[Float[np.ndarray, "coordinates perturbed"], Float[np.ndarray, "coordinates perturbed coordinates"]]:
-    """S and B of `dq = E ds`, `E = S + B q`: plain coordinates as they are, quaternions by half the product with a turn.
+    """Return S and B of `dq = E ds`, `E = S + B q`: the identity for plain coordinates, half the product with
+    a turn for quaternions.
 
     Of a unit quaternion the inverse of `x -> q x` is the transpose: `ds = (S + 4 B q)' dq`.
     """
@@ -51,7 +54,7 @@ _HALF_A_TURN = np.eye(4)[[[1, 2, 3], [0, 3, 2], [3, 0, 1], [2, 1, 0]]] * np.arra
 
 
 def inverse(x: Float[Entries, "rows columns"]) -> Float[Entries, "columns rows"]:
-    """The inverse, or the pseudo-inverse of what is not square; NaN where there is none."""
+    """Return the inverse, or the pseudo-inverse of a matrix that is not square; NaN if there is none."""
     try:
         return array_module(x).linalg.inv(x) if len(x) == x.shape[1] else array_module(x).linalg.pinv(x, rtol=rank_cutoff(x.dtype))
     except np.linalg.LinAlgError:
@@ -88,7 +91,9 @@ def _of_unit_length(rows: Float[Entries, "rows all"], dependent: Int[np.ndarray,
 
 
 def privileged_speeds(scene: Scene, names: str | tuple[str, ...] | None = None) -> tuple[int, ...]:
-    """Indices of the independent speeds: those named, else the scene's own choice, else the engine's."""
+    """Return indices of the independent speeds: the named ones, else the scene's own choice, else the
+    engine's.
+    """
     known = structure_of(scene)
     return known.independent if names is None else named_speeds(scene, names, known.degrees_of_freedom)
 
@@ -110,7 +115,8 @@ def _scaled_rows(scene: Scene, t, q, u, f):
 def dependent_coordinates(
     scene: Scene, state: State, named: tuple[str, ...], dependent: tuple[str, ...] | None, G: Float[np.ndarray, "rows coordinates"] | None = None
 ) -> Int[np.ndarray, "dependent"]:
-    """Indices of the perturbations `ds` that follow from the geometric rows: those named, else well conditioned ones.
+    """Return indices of the perturbations `ds` that follow from the geometric constraints: the named ones,
+    else well conditioned ones.
 
     `G`: dg/dq at the state, if it is known; otherwise the choice looks at states of the scene's domain.
     """
@@ -120,7 +126,7 @@ def dependent_coordinates(
         raise ValueError(f"`coordinates` names one twice ({', '.join(named)}); name each once")
     both = set(named) & set(dependent or ())
     if both:
-        raise ValueError(f"coordinate `{both.pop()}` is asked for in `coordinates` and said to be dependent; leave it out of one of the two")
+        raise ValueError(f"coordinate `{both.pop()}` is both in `coordinates` and in `dependent`; omit it from one of them")
     if dependent is not None:
         return np.array([names.index(name) for name in dependent], int)
     if not names_of_position_rows(scene):
@@ -136,7 +142,7 @@ def dependent_coordinates(
     chosen = np.delete(free, best_privileged(G[:, :, free], len(free), rank)) if len(free) >= rank else free
     if len(chosen) < rank or np.any(pivots_at(G, chosen.tolist(), rank) <= cutoff):
         raise ValueError(
-            f"the geometric rows of `{type(scene).__name__}` tie the asked coordinates to each other; ask for fewer in `coordinates`, or name the "
+            f"the geometric rows of `{type(scene).__name__}` make the given coordinates dependent; give fewer in `coordinates`, or name the "
             "`dependent` ones"
         )
     return chosen

@@ -1,4 +1,5 @@
-"""The unknowns of a fit: parameters of the scene, which all runs share, initial values of single runs, and numbers of sensors and actuators of both kinds.
+"""The unknowns of a fit: shared parameters of the scene, initial values of single runs, and numbers of
+sensors and actuators.
 
 theta = (shared, own of run 0, own of run 1, ...), every run with a place for each initial value that is unknown in any; where it is known, it is held. A single
 run has none of its own: there is nothing to tell them from those that runs share.
@@ -79,7 +80,7 @@ class Unknowns:
         return theta
 
     def split(self, theta: Shaped[np.ndarray, "*members places"]) -> tuple[np.ndarray, np.ndarray]:
-        """Shared unknowns (*members, shared), and those of the runs (*members, runs, local)."""
+        """Return shared unknowns (*members, shared), and those of the runs (*members, runs, local)."""
         shared, local = self.layout.sizes
         return theta[..., :shared], theta[..., shared:].reshape(*theta.shape[:-1], self.runs, local)
 
@@ -123,10 +124,10 @@ def unknowns_of(
             shared += [(label, "inertia", _entry(label, unit, None, default, np.asarray(guess))) for label, unit, default, guess in numbers]
             continue
         check_name(
-            name, parameters, f"`free` names `{name}`, which is no parameter of `{type(scene).__name__}`"
+            name, parameters, f"`free` names `{name}`, which is not a parameter of `{type(scene).__name__}`"
         )
         if isinstance(given, Estimate) and given.per_run:
-            raise ValueError(f"`free` asks for a `{name}` of each run, but all runs share the scene; leave out `per_run`, or fit the runs one by one")
+            raise ValueError(f"`free` asks for a `{name}` of each run, but all runs share the scene; omit `per_run`, or fit the runs one by one")
         if callable(given):
             functions[name] = given
             continue
@@ -170,7 +171,7 @@ def unknowns_of(
 def _not_negative(entry: "_Entry", positive: bool) -> "_Entry":
     """The range cut at zero, below which the scene has no motion; a little above it where it has none at zero either. ValueError for a guess below zero."""
     if np.any(entry.guess < 0):
-        raise ValueError(f"first guess of `{entry.label}` is {entry.guess}, but this parameter is declared as not negative; give one that is not below zero")
+        raise ValueError(f"first guess of `{entry.label}` is {entry.guess}, but this parameter is declared non-negative; give a guess of zero or more")
     # of the first guess: the bound of a parameter that is to be above zero
     cut = entry.range.not_below(1e-6 * float(entry.guess.min()) if positive else 0.0)
     return replace(entry, range=cut)
@@ -185,12 +186,12 @@ def _placed(parts: Iterable[tuple[str, tuple[int, ...], Kind]]) -> tuple[Place, 
 
 
 def _check_told_once(layout: Layout, functions: Mapping) -> None:
-    """ValueError where a moment of inertia is told twice."""
+    """Raise a ValueError if a moment of inertia is given twice."""
     told = {place.name: f"`{place.name}`" for place in layout.shared if place.kind == "scene"} | {name: f"a function for `{name}`" for name in functions}
     for body in layout.bodies:
         for entry in body.entries:
             if entry.name in told:
-                raise ValueError(f"`free` has {told[entry.name]} beside the possible inertia of `{body.body}`, which decides `{entry.name}`; leave one out")
+                raise ValueError(f"`free` has {told[entry.name]} and the possible inertia of `{body.body}`, which determines `{entry.name}`; omit one of them")
         told |= {entry.name: f"the possible inertia of `{body.body}`" for entry in body.entries}
 
 
@@ -209,7 +210,7 @@ def _of_all_runs(runs: Sequence[Experiment]) -> dict[str, Estimate]:
 
 
 def _of_run(label: str, place: Place, run: Experiment) -> _Entry:
-    """An unknown of one run; where it is known there, or does not exist, it is held."""
+    """Return an unknown of one run; it is held if it is known there, or does not exist."""
     if place.kind == "sensor":
         estimate = run.estimates.get(place.name)
         return _Entry(label, "", np.zeros(place.shape), unbounded(), fixed=True) if estimate is None else _of_sensor(label, place.name, estimate)
@@ -225,7 +226,9 @@ def _of_sensor(label: str, name: str, estimate: Estimate) -> _Entry:
 
 
 def _entry(label: str, unit: str, given, default: Range, value: np.ndarray) -> _Entry:
-    """An unknown from what was given for it: an `Estimate`, a range, a prior or None; after a look at its first guess."""
+    """Return an unknown from its description: an `Estimate`, a range, a prior or None; after a check of its
+    first guess.
+    """
     guess, found, prior = value, default, None
     if isinstance(given, Estimate):
         guess = value if given.guess is None else np.asarray(given.guess, float)
@@ -240,7 +243,7 @@ def _entry(label: str, unit: str, given, default: Range, value: np.ndarray) -> _
             "for a parameter that follows from others, a function of the scene"
         )
     if guess.shape != value.shape:
-        raise ValueError(f"first guess of `{label}` has shape {guess.shape}, expected {value.shape}; leave it out for the value that is there")
+        raise ValueError(f"first guess of `{label}` has shape {guess.shape}, expected {value.shape}; omit it to begin at the present value")
     if refusal := found.refusal(guess):
         raise ValueError(f"first guess of `{label}` is {guess}; {refusal}")
     if isinstance(prior, Correlated) and (value.shape or label.startswith("run ")):

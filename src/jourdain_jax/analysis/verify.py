@@ -1,4 +1,4 @@
-"""A scene's equations checked against each other at one state: different ways must give the same numbers.
+"""Verification of a scene's equations at one state: independent formulations must give equal numbers.
 
 inertia            masses and inertias are those of a body, orientations are rotations, directions of gravity unit vectors
                                                                             (this and the next two piece by piece: `statements`)
@@ -51,7 +51,7 @@ from jourdain_jax.scene.validated import loads_of, potential_of
 def verify(
     scene: Scene | BuiltFor, state: "State | Mapping[str, Any] | None" = None, inputs: "Numbers | Mapping[str, Any] | None" = None, *, seed: int = 0
 ) -> Verification:
-    """Check the equations of a scene, and what it states, at a consistent state; a failed check names its culprit.
+    """Check the equations and statements of a scene at a consistent state; a failed check names its culprit.
 
         print(verify(disc, start(disc, lean=0.3, spin_rate=-3.0)))
 
@@ -130,7 +130,9 @@ def _evaluate(scene, t, q, u, inputs, usual, plain) -> dict:
 
 
 def _gyroscopic(scene, t, q, u, partial) -> Speeds:
-    """Size of the inertia forces that may cancel inside `h`: of `m v omega` and `omega I omega`. What is left of them is round-off of this size."""
+    """Return the size of inertia forces that may cancel inside `h`: of `m v omega` and `omega I omega`. Their
+    difference has round-off of this size.
+    """
     weights, known = inertias(scene, t, q), velocities(scene, t, q, u)
     v, w = (jnp.linalg.norm(x, axis=1) for x in (known.linear, known.angular))
     force, torque = weights.mass * v * w, largest(weights.inertia, (1, 2)) * w**2
@@ -138,7 +140,7 @@ def _gyroscopic(scene, t, q, u, partial) -> Speeds:
 
 
 def _size(found: dict, *others) -> float:
-    """What differences of forces are relative to: the forces at hand, impressed and inertial ones among them."""
+    """Return the reference size for differences of forces: impressed and inertial forces."""
     forces = (found["impressed"], found["gyroscopic"], *others)
     return sum(largest(force) for force in forces) + np.finfo(found["M"].dtype).tiny
 

@@ -1,4 +1,4 @@
-"""The parameters of a bicycle from what was read off its parts, with their covariance.
+"""Parameters of a bicycle from raw measurements of its parts, with their covariance.
 
     y: readings with standard deviations s;   theta(y): parameters
     covariance of theta = J diag(s^2) J',     J = d theta / d y
@@ -31,7 +31,8 @@ Values = dict[str, Scalar]
 
 
 def benchmark_from_measurements(path: str | Path) -> MeasuredBicycle:
-    """The 26 parameters of a bicycle with their covariance, from periods, hang angles and lengths of its parts.
+    """Return the 26 parameters of a bicycle with their covariance, from periods, hang angles and lengths of
+    its parts.
 
         bicycle = benchmark_from_measurements("Browser")  # shipped; or the path of a file
         bicycle.values["IBxx"], bicycle.covariance        # kg m^2; in the order of the names in `values`
@@ -75,7 +76,7 @@ def _misses(readings: Readings) -> tuple[str, ...]:
 
 
 def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> tuple[str, ...]:
-    """A sentence for each part whose upright lines do not meet, as far as their sigmas tell."""
+    """Return a sentence for each part whose upright lines do not meet within their sigmas."""
     names, warnings = _misses(readings), []
     for part in readings.hangings:
         here = [i for i, name in enumerate(names) if name.startswith(f"miss {part}")]
@@ -168,7 +169,8 @@ def _moments_about_y(y: Values, lengths: Values) -> Values:
 
 
 def _moments_in_plane(y: Values, hangings: dict[str, tuple[int, ...]], tilts: dict[str, Float[Array, "_"]]) -> Values:
-    """Ixx, Izz, Ixz of the parts and Ixx of the wheels, kg m^2, from the periods of their twists; those of more than three are met as nearly as may be.
+    """Return Ixx, Izz, Ixz of the parts and Ixx of the wheels, kg m^2, from the periods of their twists, by
+    least squares for more than three.
 
     A bar of known inertia gauges the rod. The wheels are on the rod by their rims, the parts with n = (-sin tilt, 0, cos tilt).
     """

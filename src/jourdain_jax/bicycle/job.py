@@ -36,13 +36,13 @@ CAVEAT = (
 
 @dataclass(frozen=True)
 class Refused:
-    """A file that describes no bicycle, and why."""
+    """A file that describes no possible bicycle, with the reason."""
 
     path: str
     error: str
 
     def as_dict(self) -> dict:
-        """One object of `result.json`."""
+        """Return one object of `result.json`."""
         return {"file": self.path, "bicycle": None, "error": self.error} | dict.fromkeys(SPEEDS)
 
 
@@ -57,7 +57,7 @@ class Rides:
 
 @dataclass(frozen=True)
 class Study:
-    """What was found out about one bicycle."""
+    """Results for one bicycle."""
 
     path: str
     bicycle: MeasuredBicycle
@@ -69,7 +69,7 @@ class Study:
     rides: Rides
 
     def as_dict(self) -> dict:
-        """One object of `result.json`."""
+        """Return one object of `result.json`."""
         lanes = self.rides.lanes
         rides = [
             {
@@ -97,7 +97,7 @@ class Study:
 
 
 def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Refused:
-    """Everything about one file; `Refused`, not an exception, where it describes no bicycle."""
+    """Study one file; returns `Refused`, without an exception, if it describes no bicycle."""
     try:
         bicycle = benchmark_from_measurements(path) if holds_readings(Path(path)) else read_bicycle(path)
     except ValueError as error:
@@ -123,7 +123,9 @@ def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Re
 
 
 def ride_speeds(weave: float, capsize: float, stable: bool) -> dict[str, float]:
-    """Speeds (m/s) by label: below, inside and above the stable range; fixed ones, and so labelled, where there is no range."""
+    """Return speeds (m/s) by label: below, inside and above the stable range; fixed ones, labelled
+    accordingly, if there is no range.
+    """
     if not stable or not np.isfinite(weave):
         return {f"no stable range, {v:.1f} m/s": v for v in (3.0, 5.0, 8.0)}
     if not np.isfinite(capsize) or capsize <= weave:  # stable from the weave speed on
@@ -160,7 +162,9 @@ def _interval(values, physical) -> dict | None:
 
 
 def _speeds_to_draw(weave: float, capsize: float, double_root: float) -> np.ndarray:
-    """Even speeds beyond those that are known, and closer ones about the double root, where two eigenvalues leave each other like a square root."""
+    """Return uniform speeds beyond the known ones, and denser ones about the double root, where two
+    eigenvalues separate like a square root.
+    """
     known = [v for v in (weave, capsize) if np.isfinite(v)]
     top = float(np.clip(1.6 * max(known, default=6.0), 8.0, 20.0))
     close = np.nan_to_num(double_root) + 0.1 * top * np.linspace(-1.0, 1.0, 20) ** 3
@@ -177,13 +181,13 @@ def run(paths: Sequence[str | Path], *, samples: int = 2000, seed: int = 0, prog
 
 
 def write_results(studies: Sequence[Study | Refused], path: str | Path) -> None:
-    """`result.json`: a list, one object per file."""
+    """Write `result.json`: a list, one object per file."""
     with open(path, "w", encoding="utf-8") as file:
         json.dump([one.as_dict() for one in studies], file, indent=2)
 
 
 def table(studies: Sequence[Study | Refused]) -> str:
-    """The printed table, with what the limits mean."""
+    """Return the printed table, with an explanation of the limits."""
     lines = [f"{'bicycle':<18}{'weave':>26}{'capsize':>26}{'double root':>26}   stable range"]
     lines.append(f"{'':<18}" + f"{'m/s   95 % limits':>26}" * 3)
     for one in studies:

@@ -22,13 +22,17 @@ _DEPENDENT = ("pitch",)
 
 
 def upright_running(bicycle: WhippleBicycle, speed, lean_rate=0.0) -> State:
-    """Running straight and upright at `speed` (m/s): an exact steady motion; or with a kick in `lean_rate` (rad/s). Both meet the constraints as they stand."""
+    """Return upright straight running at `speed` (m/s), an exact steady motion; or with a kick in `lean_rate`
+    (rad/s). Both satisfy the constraints exactly.
+    """
     q, u, _ = bicycle.named(**bicycle.upright(speed), lean_rate=lean_rate)
     return state_of(bicycle, 0.0, q, u)
 
 
 def linear_matrices(values: Mapping[str, float | Scalar]) -> BicycleMatrices:
-    """M, C1, K0, K2 (2x2, in lean and steer) and g from the 26 parameters by name. Runs under jit and vmap."""
+    """Return M, C1, K0, K2 (2x2, in lean and steer) and g from the 26 parameters by name. Runs under jit and
+    vmap.
+    """
     return _matrices({name: jnp.asarray(value) for name, value in values.items()})
 
 

@@ -43,7 +43,7 @@ class MeasuredBicycle:
 
     @property
     def with_independent_errors(self) -> "MeasuredBicycle":
-        """The bicycle as if its parameters had nothing to do with each other: without covariance."""
+        """Return the bicycle with independent errors of its parameters, without covariance."""
         return replace(self, covariance=None)
 
     @property
@@ -53,12 +53,16 @@ class MeasuredBicycle:
 
     @property
     def prior(self) -> dict[str, Normal]:
-        """How the parameters are distributed by their measurement, for `jj.Study(bicycle.scene, vary=bicycle.prior)`: independent, and none without sigma."""
+        """Distributions of the parameters from their measurement, for `jj.Study(bicycle.scene,
+        vary=bicycle.prior)`: independent, without those that have no sigma.
+        """
         return {name: Normal(self.values[name], sigma) for name, sigma in self.sigmas.items() if sigma > 0}
 
     @property
     def joint_prior(self) -> dict[str, Normal | Correlated]:
-        """What their measurement says of the parameters, with its covariance where that is known: `jj.fit(bicycle.scene, data, free=bicycle.joint_prior)`."""
+        """The joint prior of the parameters from their measurement, with its covariance if known:
+        `jj.fit(bicycle.scene, data, free=bicycle.joint_prior)`.
+        """
         if self.covariance is None:
             return dict(self.prior)
         known = np.array([sigma > 0 for sigma in self.sigmas.values()])
@@ -66,7 +70,7 @@ class MeasuredBicycle:
 
 
 def measured_bicycle(name: str) -> MeasuredBicycle:
-    """One of the bicycles that come with the package, by its name: `measured_bicycle("Browser")`.
+    """Return one of the bicycles shipped with the package, by its name: `measured_bicycle("Browser")`.
 
     **Raises** ValueError: an unknown name, with the nearest known ones; and as `read_bicycle`.
     """
@@ -76,12 +80,15 @@ def measured_bicycle(name: str) -> MeasuredBicycle:
 
 
 def shipped_bicycles() -> dict[str, Path]:
-    """The parameter files that come with the package, name -> path (`Tms` is among them, and is degenerate)."""
+    """Return the parameter files shipped with the package, name -> path (including `Tms`, which is
+    degenerate).
+    """
     return _shipped("Benchmark")
 
 
 def shipped_measurements() -> dict[str, Path]:
-    """The files of raw measurements that come with the package, name -> path, for `benchmark_from_measurements`.
+    """Return the files of raw measurements shipped with the package, name -> path, for
+    `benchmark_from_measurements`.
 
     Those of `Silver` hold none of its parts; those of `Gyro`, `Rigidcl` and `Stratos` have no published parameters.
     """
@@ -153,7 +160,9 @@ def text_lines(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _yaml_lines(text: str, path: Path) -> Iterator[tuple[int, str]]:
-    """Numbers and content of the lines of a set in YAML, written as in a text file: those of the section `values`, or all where there is none."""
+    """Return numbers and content of the lines of a set in YAML, as in a text file: of the section `values`,
+    or all if there is none.
+    """
     lines = [(number, line.partition("#")[0].rstrip()) for number, line in enumerate(text.splitlines(), start=1)]
     has_section = any(line.partition(":")[0] == "values" for _, line in lines)
     inside = not has_section
@@ -173,7 +182,9 @@ def _yaml_lines(text: str, path: Path) -> Iterator[tuple[int, str]]:
 
 
 def entries(path: Path, lines: Iterable[tuple[int, str]], form: str, again: str) -> Iterator[tuple[str, str, str]]:
-    """Yield for each line where it stands, its name and what is right of `=`. ValueError for another `form`, and for a name that was given before."""
+    """Yield for each line its place, its name and the text after `=`. ValueError for another `form`, and for
+    a repeated name.
+    """
     given: dict[str, int] = {}
     for number, line in lines:
         where = f"{path}, line {number}"
@@ -187,13 +198,15 @@ def entries(path: Path, lines: Iterable[tuple[int, str]], form: str, again: str)
 
 
 def with_sigma(text: str, name: str, where: str, what: str) -> tuple[float, float | None]:
-    """The finite number in `text` and its sigma (None where not given); `what`: a value or a reading, of the name."""
+    """Return the finite number in `text` and its sigma (None if not given); `what`: a value or a reading, of
+    the name.
+    """
     parts = text.replace("±", "+/-").split("+/-", 1)
     advice = f"; form: {_FORMAT}. Measure it, or leave this bicycle out."
     value, *rest = (files.number(part, f"{where}: {kind} of `{name}`", advice=advice) for part, kind in zip(parts, (what, "sigma"), strict=False))
     sigma = rest[0] if rest else None
     if sigma is not None and sigma < 0:
-        raise ValueError(f"{where}: sigma of `{name}` is {sigma:g}, expected a standard deviation >= 0. Give its size, or leave `+/-` out if it is not known.")
+        raise ValueError(f"{where}: sigma of `{name}` is {sigma:g}, expected a standard deviation >= 0. Give its magnitude, or omit `+/-` if it is unknown.")
     return value, sigma
 
 

@@ -1,4 +1,4 @@
-"""The parameters of the Whipple bicycle and what values a real bicycle can have.
+"""The parameters of the Whipple bicycle, and the values that a real bicycle can have.
 
 Names of Meijaard, Papadopoulos, Ruina & Schwab (Proc. R. Soc. A 463, 2007, table 1): origin at the rear contact, x
 forward, z down; R rear wheel, B rear frame with rider, H handlebar and fork, F front wheel. Wheels have Izz = Ixx.
@@ -20,7 +20,8 @@ PARAMETER_NAMES: tuple[str, ...] = tuple(PARAMETERS)
 
 
 def violations(values: Mapping[str, float | Array]) -> dict[str, Bool[Array, "*samples"]]:
-    """What makes a bicycle impossible: each condition as a sentence, and where it is broken (NaN breaks it).
+    """Return conditions that make a bicycle impossible: each as a sentence, with marks of violations (NaN
+    violates it).
 
     **Arguments:** `values`, every name of `PARAMETER_NAMES` to a number or to an array of samples, all of one shape.
     **Returns:** sentence -> True where the values break it.
@@ -37,7 +38,7 @@ def violations(values: Mapping[str, float | Array]) -> dict[str, Bool[Array, "*s
 
 
 def doubts(values: Mapping[str, float]) -> tuple[str, ...]:
-    """What is odd about one bicycle's values though they can be simulated: one sentence each.
+    """Return oddities of one bicycle's values that still can be simulated: one sentence each.
 
     A rigid body's inertia matrix is positive definite, and each principal moment is at most the sum of the other two.
     **Arguments:** `values`, every name of `PARAMETER_NAMES` to a number.

@@ -32,7 +32,9 @@ _FEWEST = 3  # hangings, for three numbers in the plane of symmetry
 
 @dataclass(frozen=True)
 class Readings:
-    """What was read off one bicycle, as means and their standard deviations; `hangings`: numbers of the hangings of each part, such as B: (1, 2, 3)."""
+    """The readings of one bicycle, as means and their standard deviations; `hangings`: numbers of the
+    hangings of each part, such as B: (1, 2, 3).
+    """
 
     path: str
     means: dict[str, float]
@@ -71,7 +73,7 @@ def read_readings(path: str | Path) -> Readings:
         missing += [f"{what}{part}{k + 1}" for k in range(len(found), _FEWEST) for what in ("alpha", "a", "Tt")]
     if missing:
         raise ValueError(
-            f"{path}: missing {listed(missing)}; the parameters of a bicycle do not follow without. Measure them, and add a line {_FORM} for each."
+            f"{path}: missing {listed(missing)}, which the parameters of a bicycle need. Measure them, and add a line {_FORM} for each."
         )
     used = {*needed, *(f"{what}{part}{k}" for part, found in hangings.items() for k in found for what in ("alpha", "a", "Tt"))}
     return Readings(
@@ -85,7 +87,7 @@ def read_readings(path: str | Path) -> Readings:
 
 
 def _hangings(means: dict[str, float], part: str) -> tuple[int, ...]:
-    """The hangings of a part of which all three readings are there."""
+    """Return the hangings of a part with all three readings."""
     numbers = sorted(int(name[len(f"Tt{part}") :]) for name in means if re.fullmatch(rf"Tt{part}\d+", name))
     return tuple(k for k in numbers if f"alpha{part}{k}" in means and f"a{part}{k}" in means)
 

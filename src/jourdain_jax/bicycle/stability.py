@@ -46,7 +46,7 @@ class BicycleMatrices(NamedTuple):
 
 
 class StabilitySpeeds(eqx.Module):
-    """The speeds at which a bicycle's stability changes, m/s; NaN where there is none up to the largest speed.
+    """The speeds at which a bicycle's stability changes, m/s; NaN if there is none up to the largest speed.
 
     Eigenvalues there: `jj.critical`, `eigenvalues`.
     """
@@ -67,7 +67,7 @@ def eigenvalues(
     g: ArrayLike,
     speeds: Float[ArrayLike, " speeds"],
 ) -> Complex[Array, "speeds 4"]:
-    """The four eigenvalues (1/s) at each speed (m/s), in the order castering, capsize, weave, weave.
+    """Return the four eigenvalues (1/s) at each speed (m/s), in the order castering, capsize, weave, weave.
 
     Ascending real parts name the modes (at rest: two decaying, then two growing real eigenvalues), except that of two
     real eigenvalues on either side of a pair the lower is castering, the higher capsize, and the pair is weave. A pair
@@ -92,7 +92,7 @@ def stability_speeds(
     *,
     max_speed: ArrayLike = 50.0,
 ) -> StabilitySpeeds:
-    """Weave, capsize and double-root speed of one bicycle, differentiable in the matrices and g.
+    """Return weave, capsize and double-root speed of one bicycle, differentiable in the matrices and g.
 
         speeds = stability_speeds(M, C1, K0, K2, 9.81)
         jax.vmap(stability_speeds)(*many)  # a leading axis on each of the five, g included

@@ -1,4 +1,4 @@
-"""Limits on what follows from the parameters, by Monte Carlo from measured standard deviations.
+"""Limits of quantities that depend on the parameters, by Monte Carlo from measured standard deviations.
 
 Parameters are drawn from a normal distribution with the measured values and their covariance; where that is not known, as from files of parameters, each
 with its sigma independently of the others. A quantity that only some bicycles have (a capsize speed) is reported with the fraction of
@@ -20,19 +20,20 @@ from .parameters import PARAMETER_NAMES, violations
 
 
 class ParameterSamples(eqx.Module):
-    """Sampled parameters of one bicycle, in SI units, and which samples are bicycles at all."""
+    """Sampled parameters of one bicycle, in SI units, with marks of the possible ones."""
 
     values: Float[Array, "samples parameters"]  # columns in the order of `PARAMETER_NAMES`
     physical: Bool[Array, " samples"]  # False where a sample has, say, a negative radius
     refused: dict[str, Array]  # condition that some samples break, as a sentence -> how many break it
 
     def by_name(self) -> dict[str, Float[Array, " samples"]]:
-        """One array of samples per parameter, for `jax.vmap` over a function of a dict of parameters."""
+        """Return one array of samples per parameter, for `jax.vmap` over a function of a dict of parameters.
+        """
         return dict(zip(PARAMETER_NAMES, self.values.T, strict=True))
 
 
 class Interval(eqx.Module):
-    """A quantity with the limits that contain 95 % of the samples which have it."""
+    """A quantity with limits that contain 95 % of the samples that have it."""
 
     value: Scalar  # NaN where there is none
     low: Scalar  # 2.5 % quantile, NaN if no sample has the quantity
@@ -79,7 +80,7 @@ def interval(
     nominal: ArrayLike | None = None,
     counted: Bool[Array, " samples"] | None = None,
 ) -> Interval:
-    """Limits of a sampled quantity, over those samples that have it (that are finite).
+    """Return limits of a sampled quantity, over the samples that have it (finite ones).
 
     **Arguments:** `values`, one per sample, NaN where a sample has no such quantity; `nominal`, the quantity of the
     bicycle as measured (default: the median of the samples); `counted`, False for samples to leave out altogether, such

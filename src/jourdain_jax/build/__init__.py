@@ -1,1 +1,3 @@
-"""What is found once about a scene: states to look at, rank, privileged speeds, what depends on time, the traced graph of scalars."""
+"""Facts found once about a scene: probed states, rank, privileged speeds, time dependence, the traced graph
+of scalars.
+"""

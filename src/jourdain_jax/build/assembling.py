@@ -1,4 +1,5 @@
-"""Random states of the domain, and configurations put on the geometric rows, to round-off and within the domain; on NumPy, all at once.
+"""Random states of the domain, and configurations projected onto the geometric constraints within the domain,
+on NumPy, all at once.
 
     q <- q - G+ g(q),   G = dg/dq          Gauss-Newton, which keeps what is near
 
@@ -75,7 +76,9 @@ def assemble(look: Look, pattern: Pattern, q: np.ndarray, low: np.ndarray, high:
 
 
 def typical_lengths(lengths: np.ndarray) -> np.ndarray:
-    """What a row's length is at most states: the median, or the largest for a row that vanishes at half of them; 1 for one that always does."""
+    """Return the typical length of a constraint row: the median over states, or the largest for a row that
+    vanishes at half of them; 1 for one that always does.
+    """
     typical = usual_lengths_of(lengths)
     return np.where(typical > 0, typical, 1.0)
 

@@ -1,4 +1,4 @@
-"""What is looked at of a scene at each probed state, on its scalar graph: derivatives are taken on the graph, everything is evaluated on NumPy.
+"""A scene probed on its scalar graph: derivatives on the graph, evaluation on NumPy at all probed states.
 
     A = d phi/du,   beta = dv/du,   gamma = d omega/du,   M = sum m beta' beta + gamma' I gamma
     q <- q - G+ g(q),   G = dg/dq,           u <- u - M^-1 A' (A M^-1 A')+ phi(u)
@@ -37,7 +37,7 @@ _MOTION = frozenset({"rows", "poses", "inertias", "coordinate rates", "rows at r
 
 
 class Probed(eqx.Module):
-    """What is found at one state, or with a leading axis at all; trees have arrays as leaves."""
+    """Findings at one state, or with a leading axis at all; trees have arrays as leaves."""
 
     q: Float[Entries, "*states coordinates"]  # on the geometric rows
     position_error: Float[Entries, "*states"]  # of these rows, as the next two from `Assembled`
@@ -61,7 +61,7 @@ def generic_inputs(scene: Scene) -> np.ndarray:
 
 @dataclass(frozen=True)
 class LookedAt:
-    """The graph of a class of scenes, with what is looked at as nodes."""
+    """The graph of a class of scenes, with the probed quantities as nodes."""
 
     traced: TracedScene
     rows: list[dict[int, int]]  # d phi/du, each row by the nodes of the speeds
@@ -83,7 +83,7 @@ class LookedAt:
 
 @partial(once_per_class, most=64)
 def looked_at(scene: Scene) -> LookedAt:
-    """What is looked at of a class of scenes."""
+    """Return the probed quantities of a class of scenes."""
     traced = traced_scene(scene)
     g, at, u = traced.graph, traced.at, traced.u.tolist()
     flat = [*at.phi.tolist(), *at.v.ravel().tolist(), *at.omega.ravel().tolist()]
@@ -119,7 +119,9 @@ def coordinates_on_rows(scene: Scene) -> np.ndarray:
 
 
 def _passing(kinds, traced: TracedScene, vanishing: dict[str, list[int]], rows: list[dict[int, int]]) -> frozenset[str]:
-    """What passes an operation of these kinds; "rank" where rows do so, "nonlinear" where they do so with the speeds."""
+    """Return the quantities that pass an operation of these kinds; "rank" for constraints, "nonlinear" for
+    constraints with the speeds.
+    """
     g, u = traced.graph, traced.u.tolist()
     entries = [node for row in rows for node in row.values()]
     passing = passes(g, entries, kinds)
@@ -130,7 +132,8 @@ def _passing(kinds, traced: TracedScene, vanishing: dict[str, list[int]], rows: 
 
 
 def probed_on_graph(scene: Scene, t, q, u, u_other, generic, **limits: int) -> Probed:
-    """The scene at states (t, q, u), put on the geometric rows; and its rows at `u_other`. `generic`: which states are random ones.
+    """Probe the scene at states (t, q, u), projected onto the geometric constraints; and its constraints at
+    `u_other`. `generic`: marks of random states.
 
     `limits`: of `assemble`. `Unsupported` where a call has no derivative in JAX.
     """
@@ -138,7 +141,7 @@ def probed_on_graph(scene: Scene, t, q, u, u_other, generic, **limits: int) -> P
 
 
 def sampled_on_graph(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled]:
-    """Coordinates and speeds put on the rows, and how well that went for the coordinates."""
+    """Return projected coordinates and speeds, and the accuracy of the coordinates."""
     at = _AtStates(looked_at(scene), scene, t, q, u, np.zeros(len(scene.inputs)), np.ones(len(q), bool))
     return at.real(at.q), at.real(at.speeds_on_rows()), at.found
 
@@ -160,7 +163,7 @@ def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
 
 
 def generic_states(traced: TracedScene, near: Probes) -> IdentityProbes:
-    """Generic states on the geometric rows, at generic parameters; found from those `near`."""
+    """Return generic states on the geometric constraints, at generic parameters; found from those `near`."""
     coordinates = {f"q_{i}": n for i, n in enumerate(traced.q.tolist())}
     attitudes = [f"q_{first + i}" for first in traced.quaternions for i in range(4)]
     return on_rows(identity_probes(near, attitudes), near, traced.closures, coordinates)
@@ -205,7 +208,7 @@ class _AtStates:
         return _values(self.values, nodes)
 
     def real(self, x: np.ndarray) -> np.ndarray:
-        """Numbers in the precision that is in use; what is looked at is computed in double precision."""
+        """Return numbers in the precision in use; probes are computed in double precision."""
         return np.asarray(x, real_type())
 
     def _matrices(self, probes: Probes, entries: list[dict[int, int]], columns: list[int]) -> np.ndarray:

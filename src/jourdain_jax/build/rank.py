@@ -1,4 +1,4 @@
-"""Rank of rows at probed states, and which of them may be left out.
+"""The rank of constraints at probed states, and the redundant ones among them.
 
 A^ = d A c,  M^ = c M c        rows and inertias in scaled speeds (`scaling.py`)
 """
@@ -19,7 +19,7 @@ from jourdain_jax.scene.scene import Scene
 
 
 class Scaled(eqx.Module):
-    """What decides ranks and pivots, at every probed state."""
+    """The quantities that decide ranks and pivots, at every probed state."""
 
     A: Float[np.ndarray, "states rows speeds"]  # scaled rows in scaled speeds
     lengths: Float[np.ndarray, "states rows"]  # of the rows before
@@ -94,7 +94,9 @@ def redundant_rows(
 
 
 def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarray:
-    """The coefficients of the rows `rest` in row s, each in its usual length, at states where all rows have their rank; infinite where they do not give it."""
+    """Return the coefficients of the rows `rest` in row s, each in its usual length, at states of full rank;
+    infinite where they do not give it.
+    """
     tiny, made = np.finfo(found.A.dtype).tiny, []
     lengths = np.maximum(found.lengths, tiny)
     usual = np.median(lengths, axis=0)

@@ -1,4 +1,5 @@
-"""Rows of a class of scenes as a scalar program, by which a start is put onto them and checked: residuals, their derivatives, the mass matrix.
+"""Constraints of a class of scenes as a scalar program for projecting and checking starts: residuals, their
+derivatives, the mass matrix.
 
     g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M = sum m beta' beta + gamma' I gamma
 

@@ -1,5 +1,5 @@
-"""States of a scene's domain, put on its rows: random ones, and the symmetric configurations (zero and right angles), where partitions that look well
-at random states are singular.
+"""States of a scene's domain, projected onto its constraints: random ones, and the symmetric configurations
+(zero and right angles), where partitions that are regular at random states may be singular.
 """
 
 import itertools
@@ -25,7 +25,8 @@ class NoStateFoundError(ValueError):
 
 @of_known_numbers
 def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """At most `count` random admissible states (t, q, u) from the scene's domain, on the rows, each with a leading axis of states.
+    """Return at most `count` random admissible states (t, q, u) from the scene's domain, on the constraints,
+    each with a leading axis of states.
 
     `seed`: of the generator. ValueError where no state meets the geometric rows, or rows are numbers at none; a DifferentiationModeError where the
     scene's parameters are traced.
@@ -58,7 +59,9 @@ def no_numbers(scene: Scene, count: int) -> NoStateFoundError:
 
 
 def drawn_states(scene: Scene, count: int, generator: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """States from the domain, not yet on the rows; then, where these do not serve, states near the scene's example, if it states one."""
+    """Yield states from the domain, not yet projected; then, if these fail, states near the scene's example,
+    if it has one.
+    """
     yield random_states(scene, count, generator)
     if scene.example:
         t, q, u = random_states(scene, count, generator)
@@ -68,7 +71,9 @@ def drawn_states(scene: Scene, count: int, generator: np.random.Generator) -> It
 
 
 def guesses_of(scene: Scene, states: np.ndarray, q, free) -> Float[Array | np.ndarray, "guesses coordinates"]:
-    """Configurations near q, those of the `states` on the rows (first those whose coordinates that are not `free` are nearest), and elsewhere in the domain."""
+    """Yield configurations near q: of the `states` on the constraints (nearest in coordinates that are not
+    `free` first), and elsewhere in the domain.
+    """
     on = array_module(q)
     q = np.asarray(q) if on is np else jax.lax.stop_gradient(q)
     low, high = coordinate_bounds(scene)
@@ -81,7 +86,8 @@ def guesses_of(scene: Scene, states: np.ndarray, q, free) -> Float[Array | np.nd
 
 
 def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) -> np.ndarray:
-    """Which states serve: on the geometric rows to round-off, and inside the domain; where few random ones are inside, those nearest to it as well.
+    """Return marks of usable states: on the geometric constraints to round-off, and inside the domain; if few
+    random ones are inside, the nearest ones as well.
 
     ValueError where no random state lies on the rows.
     """

@@ -1,4 +1,5 @@
-"""Whether bodies move smoothly: a pose whose velocity jumps loses its force of inertia, which is a second derivative.
+"""Smoothness of the motion of bodies: where the velocity of a pose jumps, its force of inertia, a second
+derivative, is lost.
 
     r(t, q), R(t, q), g(t, q)      once continuously differentiable, or mass times a jump of velocity is lost in silence
     qdot(t, q, u)                  continuous, for the same reason

@@ -1,4 +1,5 @@
-"""What holds of a scene at every state, found once by probing: rank, privileged velocities, which kind of rows.
+"""Facts that hold at every state of a scene, found once by probing: rank, privileged velocities, kinds of
+constraints.
 
 States are drawn from the scene's domain, together with the symmetric configurations (zero and right angles), where partitions that look
 well at random states are singular; all are projected onto the geometric rows. Probing runs on concrete numbers also while a scene's
@@ -67,7 +68,7 @@ class Structure:
 
     @property
     def decisions(self) -> tuple:
-        """What decides how a motion of the scene is integrated; what is left describes the scene."""
+        """Return the findings that decide the integration of the scene; the others describe it."""
         of_rows = self.row_names, self.rank, self.redundant_rows, self.may_set_in, self.affine, self.homogeneous, self.rows_of_inputs
         of_speeds = self.independent, self.chosen_by_user, self.well_conditioned, self.typical_pivot >= WELL_CONDITIONED
         return *of_rows, *of_speeds, self.timed, self.driven, self.massless, self.varying_inertia, self.potentials_of_inputs
@@ -99,7 +100,9 @@ class Structure:
 
     @property
     def rows_may_contradict(self) -> bool:
-        """Whether rows depend on each other and ask for motion even at rest: then those that are left out do not follow from the others by themselves."""
+        """Return whether constraints are redundant and prescribe motion even at rest: then the omitted ones
+        do not follow from the others automatically.
+        """
         return self.rank < len(self.row_names) and not (self.affine and self.homogeneous)
 
     @property
@@ -109,7 +112,7 @@ class Structure:
 
     @property
     def well_conditioned(self) -> bool:
-        """Whether the privileged velocities serve everywhere in the domain."""
+        """Return whether the privileged velocities are usable everywhere in the domain."""
         # of a chain of n rows that each hold two neighbours that value falls as 1/n, although no pivot does
         return not self.may_set_in and self.worst_pivot >= WELL_CONDITIONED * min(1.0, 24 / max(self.rank, 1))
 
@@ -145,12 +148,12 @@ def _look(scene: Scene, t, q, u, u_other, generic) -> Probed:
         return replace(found, unproved=(found.unproved - found.in_calls) | (found.in_calls & _seen(beyond, u)))
     except Unsupported as reason:
         raise ValueError(
-            f"the motion of `{type(scene).__name__}` needs {reason}, which JAX does not have in forward mode; give that part a rule with `jax.custom_jvp`"
+            f"the motion of `{type(scene).__name__}` needs {reason}, for which JAX has no forward mode; give that part a rule with `jax.custom_jvp`"
         ) from None
 
 
 def _seen(found: Probed, u: np.ndarray) -> frozenset[str]:
-    """What is other than zero at states far off; rows, where it is more than round-off."""
+    """Return the nonzero quantities at distant states; for constraints, those above round-off."""
     some = np.sqrt(np.finfo(found.A.dtype).eps)
     seen = {name for name, rates in found.vanishing.items() if _moves(rates)} - {"rows at rest"}
     rows = {"rows at rest"} if _exceeds(found.vanishing["rows at rest"], some, _speeds(found, u)) else set()
@@ -159,12 +162,13 @@ def _seen(found: Probed, u: np.ndarray) -> frozenset[str]:
 
 
 def _speeds(found: Probed, u: np.ndarray) -> np.ndarray:
-    """What the terms of every row amount to at the probed speeds."""
+    """Return the sizes of the terms of every constraint at the probed speeds."""
     return np.einsum("srk,sk->sr", np.abs(found.A), np.abs(u))
 
 
 def structure_of(scene: Scene) -> Structure:
-    """Static facts about a scene: rank of its rows, privileged velocities and their conditioning, kinds of rows; eqs. (25)-(31).
+    """Return static facts about a scene: rank of its constraints, privileged velocities and their
+    conditioning, kinds of constraints; eqs. (25)-(31).
 
     Probed once per class and parameter values, at random and symmetric states of the domain; concrete numbers stand in for traced parameters.
     ValueError where no admissible state is found, where bodies do not move smoothly, where a motion that the rows leave free has no inertia, or
@@ -289,7 +293,9 @@ def _probed_structure(scene: Scene) -> Structure:
 
 
 def _at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray, Probed]:
-    """Times, speeds, which states are random, and what is found: at the given random states and at the symmetric ones."""
+    """Return times, speeds, marks of random states, and findings: at the given random states and at the
+    symmetric ones.
+    """
     symmetric = symmetric_configurations(scene)
     t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
     generic = np.arange(len(t)) < RANDOM_PROBES
@@ -316,13 +322,16 @@ def _check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
     moving = [f"`{name}`" for name, part in zip(scene.speed_names.entries, share, strict=True) if part > 1e-3]
     names = ", ".join(moving) + (" together" if len(moving) > 1 else "")
     raise ValueError(
-        f"nothing in `{type(scene).__name__}` has inertia along {names}: no mass moves with it and no row holds it, so that its acceleration is not "
-        "determined; give a body that moves with it a mass (or inertia), hold it by a row, or leave the coordinate out"
+        f"nothing in `{type(scene).__name__}` has inertia along {names}: no mass moves with it and no "
+        "constraint determines it, so that its acceleration is not "
+        "determined; give a body that moves with it a mass (or inertia), add a constraint, or omit the coordinate"
     )
 
 
 def _far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> Scaled:
-    """Scaled rows with coordinates up to half a turn away from those given, where they are on the geometric rows."""
+    """Return scaled rows with coordinates up to half a turn away from the given ones, where these satisfy the
+    geometric constraints.
+    """
     generator = np.random.default_rng(4)
     t, q, u = (x[:RANDOM_PROBES].repeat(2, 0) for x in (t, q, u))
     turned = q + generator.uniform(-np.pi, np.pi, q.shape)
@@ -339,7 +348,7 @@ def _describe(scene: Scene, q: np.ndarray) -> str:
 
 
 class Reference:
-    """A scene whose numbers stand in for traced parameters of its class; a static argument of what is compiled.
+    """A scene whose numbers replace traced parameters of its class; a static argument of compiled functions.
 
     Two are equal where their scenes lead to the same decisions (`Structure.decisions`): then one program serves both. So what a call runs is decided by its own
     arguments, and not by which call was the first. Of parameters that are traced already, the class's defaults stand in.

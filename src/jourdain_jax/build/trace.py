@@ -1,4 +1,5 @@
-"""A scene at the level of velocities, traced to a graph of scalars: what Jourdain's principle needs, before any derivative is taken.
+"""A scene traced to a graph of scalars, at the level of velocities: the input of Jourdain's principle before
+any derivative.
 
 v, omega (body axes), phi, qdot      of (t, q, u)
 g                                    geometric rows at the level of positions
@@ -44,7 +45,7 @@ PerBody = Num[Entries, "bodies 3"]
 
 
 class VelocityQuantities(eqx.Module):
-    """What is traced; arrays of numbers, or of nodes."""
+    """Traced quantities; arrays of numbers, or of nodes."""
 
     v: PerBody
     omega: PerBody  # body axes
@@ -70,7 +71,7 @@ class VelocityQuantities(eqx.Module):
 
 
 class Particulars(eqx.Module):
-    """What only probing looks at; arrays of numbers, or of nodes."""
+    """Quantities for probing only; arrays of numbers, or of nodes."""
 
     numbers: Numbers
     potentials: Num[Entries, "loads"]  # of the loads; zero where a load has none
@@ -94,7 +95,9 @@ def explicit_rates(scene: Scene, motion: Motion) -> dict[str, PyTree]:
 
 
 def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...] = (), with_events: bool = True) -> VelocityQuantities:
-    """What is traced, computed on numbers; `of_inputs`: numbers of the loads whose potential depends on inputs."""
+    """Return the traced quantities, computed on numbers; `of_inputs`: numbers of the loads whose potential
+    depends on inputs.
+    """
     at = At(scene, motion) if scene.switching.contacts else None
     stated = loads_at(scene, motion, at.found if at else None)  # once: a second time a callback would be another one
     velocities, weights, loads = velocities_of(motion), inertias_of(motion), impressed(scene, motion, stated)
@@ -124,7 +127,7 @@ def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]
 
 
 def event_values(scene: Scene, motion: Motion, at: At | None = None) -> Float[Array, "events"]:
-    """Values of the events, sorted by name; `at`: contacts that switch, where they are known already."""
+    """Return values of the events, sorted by name; `at`: switching contacts, if already known."""
     values = {name: event.value for name, event in events_of(scene, motion).items()}
     if scene.switching.contacts:
         values |= contact_events(at or At(scene, motion))
@@ -132,7 +135,8 @@ def event_values(scene: Scene, motion: Motion, at: At | None = None) -> Float[Ar
 
 
 def event_resets(scene: Scene, motion: Motion, of_inputs: tuple[int, ...], at: At | None = None) -> Float[Array, "events rows"]:
-    """Coordinates, speeds and modes after each event, sorted by name, and by how much what the loads `of_inputs` store rises.
+    """Return coordinates, speeds and modes after each event, sorted by name, and the rise of the energy
+    stored by the loads `of_inputs`.
 
     Without rows where all events stop the motion.
     """
@@ -190,13 +194,14 @@ class TracedScene(Variables):
 
     @property
     def motion(self) -> list[np.ndarray]:
-        """What poses and rows make of the state, and derivatives are taken of."""
+        """The functions of the state, from poses and constraints, of which derivatives are taken."""
         at = self.at
         return [at.v, at.omega, at.position, at.orientation, at.mass, at.inertia, at.phi, at.closure, at.qdot]
 
 
 def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = ()) -> TracedScene:
-    """The scene as a new graph; parts without scalar form, and those with a derivative of their own, are calls.
+    """Return the scene as a new graph; parts without scalar form, and those with their own derivative, are
+    calls.
 
     `of_inputs`: numbers of the loads whose potential depends on inputs.
     """
@@ -227,7 +232,8 @@ def jaxpr_of_scene(scene: Scene, of_inputs: tuple[int, ...]):
     closed, shape = jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
     if is_traced(closed.consts):
         raise ValueError(
-            f"a method of `{type(scene).__name__}`, or what it calls, reads a number that JAX is tracing (jit, grad, vmap) and that is no field of it; "
+            f"a method of `{type(scene).__name__}`, or a function that it calls, reads a number that JAX is "
+            "tracing (jit, grad, vmap) and that is not a field of the scene; "
             "make it one, `name: float = jj.parameter(unit=...)`, and pass it to the scene"
         )
     return closed, shape
@@ -258,7 +264,9 @@ def named_values(scene: Scene, t, q, u, inputs) -> dict[str, np.ndarray]:
 
 
 def owned(scene: Scene, **fields: np.ndarray) -> dict[int, str]:
-    """Return node -> what it belongs to, in words, for nodes of some fields of `VelocityQuantities`; the first that has it counts."""
+    """Return node -> its owner, in words, for nodes of some fields of `VelocityQuantities`; the first owner
+    counts.
+    """
     of_bodies = dict.fromkeys(("position", "orientation", "v", "omega"), "pose of") | {"mass": "mass of", "inertia": "inertia of"}
     of_bodies |= {"force": "force on", "torque": "torque on"}
     named = {field: [f"the {what} body `{name}`" for name in names_of_bodies(scene)] for field, what in of_bodies.items()}
@@ -301,7 +309,7 @@ def _of_driven_poses(scene: Scene, motion: Motion) -> Scalar:
 
 
 def forces_for_potentials(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Scalar:
-    """Power in W of the loads `of_inputs` less the explicit rate of what they store."""
+    """Return the power in W of the loads `of_inputs` minus the explicit rate of their stored energy."""
     if not of_inputs:
         return jnp.zeros_like(motion.t)
     stored = explicit_rate(scene, motion, lambda scene, motion: stored_by_inputs(scene, motion, of_inputs))
@@ -334,6 +342,8 @@ def explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Scalar:
 
 
 def _only_what_is_needed(f: Callable, *like) -> Callable:
-    """`f` without what its result does not depend on: forces that the same loads state need not have a derivative."""
+    """Return `f` without the parts that its result does not need: forces stated by the same loads need not
+    have a derivative.
+    """
     pruned = jaxpr_as_fun(needed_only(jax.make_jaxpr(f)(*like)))
     return lambda *given: pruned(*given)[0]

@@ -1,4 +1,5 @@
-"""Functions whose values are computed in one way and whose derivatives in another: by JAX, of a function that computes the same, or by rules.
+"""Functions with values from one computation and derivatives from another: from JAX, of an equivalent
+function, or from rules.
 
 Derivatives of f(x) in both modes, to the second order, come from two functions that JAX differentiates forward:
 
@@ -42,7 +43,7 @@ THIRD_ORDER_MESSAGE = (
 
 
 class DifferentiationModeError(TypeError):
-    """A motion has no derivative of the mode and order that was asked for; the text says which one it has.
+    """A motion has no derivative of the requested mode and order; the text names a supported one.
 
     Raised where the derivative is taken, evaluated or compiled; and by functions that need numbers, such as `fit`, inside `jit`, `vmap` or a derivative.
     """
@@ -88,7 +89,7 @@ def put(values: Sequence, which: Sequence[int], new: Sequence) -> list:
 
 
 def by_jax(own: LinearMap, count: int, which: list[int]) -> LinearMap:
-    """The derivative of a map along those of so many arrays that it is taken at, in forward mode."""
+    """Return the derivative of a map along so many arrays of its arguments, in forward mode."""
 
     def pushed(at, arrays):
         return jax.jvp(lambda *new: own.apply(put(at[:count], which, new), at[count:]), tuple(at[i] for i in which), tuple(arrays))[1]
@@ -97,7 +98,9 @@ def by_jax(own: LinearMap, count: int, which: list[int]) -> LinearMap:
 
 
 def _in_lanes(own: LinearMap, axes: list, count: int, size: int) -> LinearMap:
-    """That of lanes side by side, along these axes of what it is taken at, and along the first axis of the arrays, of which there are so many."""
+    """Return the derivative for a batch, along these axes of the arguments, and along the first axis of the
+    arrays.
+    """
     transposed = own.transposed
 
     def along(which: list[int]) -> LinearMap | None:
@@ -167,7 +170,9 @@ mlir.register_lowering(linear_map_p, mlir.lower_fun(_evaluated, multiple_results
 
 
 class BothWays(NamedTuple):
-    """x is a list of arrays like the `leaves`, what is found one like `found`, with numbers at the `places`."""
+    """A linear map with x like the `leaves` and values like `found`, with numbers at the `places`, in both
+    modes.
+    """
 
     rates: Callable[[list[int]], Callable]  # which leaves move -> function of the leaves and of their tangents: tangents of numbers
     pulled: Callable[[list[int]], Callable]  # which leaves move -> function of the leaves, of what is found, and of cotangents of numbers: those of the leaves
@@ -177,7 +182,7 @@ class BothWays(NamedTuple):
     places: list[int]
 
     def pushes(self, moving: list[int]) -> LinearMap:
-        """The map of tangents of leaves, at the leaves and what is found."""
+        """Return the map of tangents of leaves, at the leaves and the result."""
 
         def pushed(at, along):
             return self.rates(moving)(list(at[: len(self.leaves)]), *along)
@@ -219,7 +224,9 @@ class BothWays(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """Derivatives of a function; trees of tangents and cotangents have None where there is none. A rule that does not serve raises an error that says so."""
+    """Derivative rules of a function; trees of tangents and cotangents have None for zeros. An inapplicable
+    rule raises an error with the reason.
+    """
 
     push: Callable  # (arguments, tangents): the result and its tangents; JAX differentiates it forward
     pull: Callable  # (perturbed, arguments, result, cotangents): cotangents of those arguments that vary; JAX differentiates it forward
@@ -244,7 +251,7 @@ def _parted(arguments: tuple) -> tuple[list, _Leaves]:
 
 
 def is_zero(tangent) -> bool:
-    """Return whether nothing changes, as a rule with symbolic zeros is told."""
+    """Return whether a tangent is zero, as for a rule with symbolic zeros."""
     return isinstance(tangent, SymbolicZero) or tangent.dtype == jax.dtypes.float0
 
 
@@ -254,7 +261,9 @@ def filled(tangent):
 
 
 def _with_rates(run: Callable, rates: Callable) -> Callable:
-    """Return `run` with a derivative; `rates`: (arguments as leaves, leaves, which of them move, how, what is found) -> tangents of that."""
+    """Return `run` with a derivative; `rates`: (arguments as leaves, leaves, which of them move, how, result)
+    -> tangents of the result.
+    """
 
     def called(*arguments):
         leaves, of = _parted(arguments)
@@ -323,7 +332,9 @@ def with_rules(run: Callable, rules: Rules) -> Callable:
             return eqx.combine(varies, jax.tree.map(lambda _: False, of.rest))
 
         def pulled(moving: list[int]) -> Callable:
-            """Cotangents of the leaves that are moving, as a function of the leaves, of what is found and of cotangents of the numbers of that."""
+            """Return cotangents of the moving leaves, as a function of the leaves, of the result and of
+            cotangents of its numbers.
+            """
             varies = perturbed(moving)
 
             def cotangents(leaves, ends, given):
@@ -343,7 +354,7 @@ def with_rules(run: Callable, rules: Rules) -> Callable:
 
 
 def _without_gaps(found, rates: list):
-    """The tangents of all that was found, given those of numbers."""
+    """Return the tangents of the whole result, given those of its numbers."""
     left = iter(rates)
     return jax.tree.map(lambda x: next(left) if _is_number(x) else np.zeros(x.shape, jax.dtypes.float0), found)
 

@@ -1,4 +1,5 @@
-"""Files: those of others, of a limited size, with numbers as text and things within things; and our own, which are whole or absent.
+"""Reading files of others (limited in size, nested, with numbers as text), and writing our own, which are
+whole or absent.
 
 Every fault of what others wrote is a ValueError that names its source: the path of a file, with a line or an element where that is known.
 
@@ -22,7 +23,9 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(inf(inity)?|n
 
 
 def read_bytes(path: str | os.PathLike, limit: int, what: str = "a file") -> bytes:
-    """Return the content of the file `path`, of at most `limit` bytes; `what` it should be, for the error, such as "a URDF file"."""
+    """Return the content of the file `path`, of at most `limit` bytes; `what`: its kind, for the error, such
+    as "a URDF file".
+    """
     try:
         with open(path, "rb") as file:
             content = file.read(limit + 1)
@@ -60,7 +63,7 @@ def number(text: str, what: str, *, finite: bool = True, advice: str = "") -> fl
 
 
 def whole_number(text: str, what: str, low: int, high: int) -> int:
-    """Return the whole number from `low` to `high` that `text` is; `what` as of `number`."""
+    """Return the whole number from `low` to `high` in `text`; `what` as in `number`."""
     plain = text.strip(" \t\r\n")
     if not re.fullmatch(r"[+-]?\d{1,30}", plain, re.ASCII) or not low <= int(plain) <= high:
         raise ValueError(f"{what} is `{shortened(plain)}`, expected a whole number from {low} to {high}")
@@ -68,8 +71,8 @@ def whole_number(text: str, what: str, low: int, high: int) -> int:
 
 
 def parsed(parse: Callable, content, source: str, what: str):
-    """Return what `parse` makes of the content of `source`. Whatever a parser raises (of XML a SyntaxError, of archives half a dozen kinds), or runs out of,
-    becomes a ValueError that names the source and `what` was expected.
+    """Return the result of `parse` on the content of `source`. Any error of a parser (for XML a SyntaxError,
+    for archives half a dozen kinds) becomes a ValueError that names the source and `what` was expected.
     """
     try:
         return parse(content)
@@ -80,7 +83,7 @@ def parsed(parse: Callable, content, source: str, what: str):
 
 
 def check_depth(root, inner: Callable[..., Iterable], source: str) -> None:
-    """Raise a ValueError where things are nested deeper than `DEEPEST`. `inner`: thing -> those in it."""
+    """Raise a ValueError for nesting deeper than `DEEPEST`. `inner`: value -> its inner values."""
     level = [root]
     for _ in range(DEEPEST):
         level = [thing for holder in level for thing in inner(holder)]

@@ -1,4 +1,4 @@
-"""What JAX traced, read: which operations its results need, what a call stands for, and which loops it holds."""
+"""Analysis of traced programs: operations that results need, targets of calls, and loops."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
@@ -14,7 +14,9 @@ _CALLS |= dict.fromkeys(("closed_call", "core_call", "custom_jvp_call", "custom_
 
 
 def evaluated(closed: ClosedJaxpr, arguments: Sequence, results: Callable, number: Callable = lambda x, aval: np.asarray(x, aval.dtype)) -> list:
-    """Outputs at the given arguments: `results(equation, inputs)` are those of one operation, and `number(x, aval)` stands for a constant."""
+    """Return outputs at the given arguments: `results(equation, inputs)` evaluates one operation, `number(x,
+    aval)` a constant.
+    """
     jaxpr = closed.jaxpr
     values = {v: number(x, v.aval) for v, x in zip(jaxpr.constvars, closed.consts, strict=True)} | dict(zip(jaxpr.invars, arguments, strict=True))
 
@@ -27,14 +29,18 @@ def evaluated(closed: ClosedJaxpr, arguments: Sequence, results: Callable, numbe
 
 
 def needed_only(closed: ClosedJaxpr, outputs: Sequence[int] | None = None) -> ClosedJaxpr:
-    """`closed` with the operations alone that its `outputs` (numbers of them, in order; default: all) depend on, also inside of what it calls."""
+    """Return `closed` with only the operations that its `outputs` (their numbers, in order; default: all)
+    need, also inside calls.
+    """
     jaxpr = closed.jaxpr
     of_wanted = jaxpr if outputs is None else jaxpr.replace(outvars=[jaxpr.outvars[i] for i in outputs])
     return ClosedJaxpr(dce_jaxpr(of_wanted, [True] * len(of_wanted.outvars), instantiate=True)[0], closed.consts)
 
 
 def called(name: str, params: Mapping) -> ClosedJaxpr | None:
-    """The function that an operation of this name calls, and nothing besides; None where it is no call."""
+    """Return the function that an operation of this name calls, if it does nothing else; None for other
+    operations.
+    """
     if name not in _CALLS:
         return None
     found = params[_CALLS[name]]
@@ -64,7 +70,7 @@ def inner_jaxprs(params: Mapping) -> list[Jaxpr]:
 
 
 def loops(jaxpr: Jaxpr) -> Iterator[str]:
-    """The names of its loops, in order, also of those inside of what it calls."""
+    """Return the names of its loops, in order, also inside calls."""
     for equation in jaxpr.eqns:
         if equation.primitive.name in LOOPS:
             yield equation.primitive.name

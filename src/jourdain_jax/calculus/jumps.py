@@ -1,4 +1,6 @@
-"""Where functions along a line jump: intervals at whose ends the values differ are halved until the difference has gone, or is a jump."""
+"""Jumps of functions along a line: intervals with differing end values are halved until the difference
+vanishes or is a jump.
+"""
 
 from collections.abc import Callable, Iterator
 

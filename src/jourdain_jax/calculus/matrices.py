@@ -1,4 +1,5 @@
-"""The truncated pseudo-inverse, and orthonormal bases of the null space of a wide matrix, with derivatives that are right wherever the rank is constant.
+"""The truncated pseudo-inverse, and orthonormal bases of the null space of a wide matrix, with derivatives
+that are exact where the rank is constant.
 
     dA+ = -A+ dA A+  +  A+ A+' dA' (1 - A A+)  +  (1 - A+ A) dA' A+' A+
     A Z = 0,   dZ = -A+ dA Z

@@ -1,4 +1,4 @@
-"""Modules that are imported when something of them is first asked for: what a first motion does not need costs it nothing.
+"""Modules imported on first use, so that a first motion does not pay for what it does not need.
 
 There are two ways, both known to users of Python, and both for names that static tools are told of by a plain import under `if TYPE_CHECKING:`.
 
@@ -27,12 +27,13 @@ class _OnFirstUse(ModuleType):
 
 
 def module_on_first_use(name: str) -> Any:
-    """What stands for a module: it is imported when one of its attributes is asked for."""
+    """Return a placeholder for a module, which is imported at the first access of an attribute."""
     return _OnFirstUse(name)
 
 
 def needed(module: str, purpose: str, extra: str = "") -> Any:
-    """An optional package, or a `module` of one; an ImportError where it is missing, which says for what it is needed and what to install.
+    """Return an optional package, or a `module` of one; if it is missing, raise an ImportError with its
+    purpose and the command that installs it.
 
     `extra`: of this package, that brings it.
     """

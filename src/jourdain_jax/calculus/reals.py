@@ -1,4 +1,5 @@
-"""Numbers as a user writes them (plain, of NumPy, in a list), made into floating-point arrays; and functions of arrays, compiled or run in JAX's usual modes.
+"""Numbers from users (plain, NumPy, nested lists) as floating-point arrays; and functions of arrays, compiled
+or run in JAX's default modes.
 
 Compiled functions have a tenth of the overhead of `equinox.filter_jit`, and options of XLA where compiling takes longer than running. Types and ranks of
 arrays combine as JAX's defaults have it in this package's own lines, also where the user has set stricter modes for theirs.
@@ -36,7 +37,7 @@ PerLane = Float[Array, "*lanes"]
 
 
 def real_type() -> np.dtype:
-    """The default floating-point type: double precision where it is switched on."""
+    """Return the default floating-point type: double precision if enabled."""
     return dtypes.canonicalize_dtype(float)  # at a fortieth of the time of `jnp.result_type(float)`
 
 
@@ -54,7 +55,8 @@ def passing_cutoff(dtype: jnp.dtype) -> float:
 
 
 def undecided(dtype: jnp.dtype) -> float:
-    """Beside its usual size, the size of a row below which round-off decides on which branch a motion goes on: 8 roots of the round-off of `dtype`.
+    """Return the relative size of a row below which round-off decides the branch of a motion: 8 roots of the
+    round-off of `dtype`.
 
     Where two branches of g = 0 cross, g = e is a hyperbola that turns from one into the other, as near as the root of e to their crossing.
     """
@@ -67,7 +69,8 @@ def is_array(x) -> bool:
 
 
 def as_real(x) -> Float[Array, "*shape"]:
-    """`x` as a floating-point array: integers become the default float, floats keep their type; never weakly typed, so that one trace serves all.
+    """Return `x` as a floating-point array: integers become the default float, floats keep their type; never
+    weakly typed, so that one trace suffices.
 
     TypeError for complex numbers, whose imaginary parts are not dropped, and truth values.
     """
@@ -115,7 +118,7 @@ def checked_real(value, what: str, shape: tuple[int, ...] | None = None, *, advi
 
 
 def checked_positive(value, what: str, shape: tuple[int, ...] | None = (), *, advice: str = "give it in m") -> Array:
-    """As `checked_real`, with numbers above zero. ValueError where they are known not to be."""
+    """Check as `checked_real`, for numbers above zero. ValueError for known values that are not."""
     found = checked_real(value, what, shape, advice=advice)
     if not np.all(known_numbers(found) > 0):
         raise ValueError(f"{what} is {np.asarray(found).tolist()}, expected more than zero; {advice}")
@@ -137,21 +140,24 @@ def checked_known(value, what: str, shape: tuple[int, ...] | None = None, *, adv
 
 
 def checked_unless_traced(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str):
-    """`value` in the default float: on NumPy where it is known, also inside `jit`; a JAX array where it is traced. A ValueError as of `checked_real`."""
+    """Return `value` in the default float: on NumPy if known, also inside `jit`; a JAX array if traced.
+    ValueError as in `checked_real`.
+    """
     if type(value) is not float and is_traced(value):
         return checked_real(value, what, shape, advice=advice).astype(real_type())
     return checked_known(value, what, shape, advice=advice)
 
 
 def checked_whole(value, what: str, low: int, high: int | None = None, *, expected: str) -> int:
-    """A whole number from `low` to `high`. ValueError, which says that one was `expected`, for anything else."""
+    """Return a whole number from `low` to `high`. ValueError, with the `expected` range, for anything else.
+    """
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low or (high is not None and value > high):
         raise ValueError(f"{what} is {value!r}, expected a whole number {expected}")
     return int(value)
 
 
 def holds(condition: Callable, *numbers) -> bool:
-    """Whether a condition holds of all numbers; of those that are traced nothing is known, and it counts as holding."""
+    """Return whether a condition holds for all numbers; it counts as holding for traced ones."""
     return is_traced(*numbers) or bool(np.all(condition(*map(np.asarray, numbers))))
 
 
@@ -163,7 +169,7 @@ def has_unit(x) -> bool:
 
 
 def as_array(x, dtype):
-    """An array of this type: on NumPy where its numbers are known, of JAX where they are traced."""
+    """Return an array of this type: on NumPy if its numbers are known, of JAX if they are traced."""
     return array_module(x).asarray(x, dtype)
 
 
@@ -207,12 +213,13 @@ def is_traced(*trees) -> bool:
 
 
 def known_numbers(x) -> np.ndarray:
-    """Return numbers for a check where they are handed over; none where they are traced, so that the check has nothing to refuse."""
+    """Return numbers for a check if they are known; none otherwise, so that the check passes."""
     return np.zeros(0) if is_traced(x) else np.asarray(x)
 
 
 def largest(x, axis: int | tuple[int, ...] | None = None, keepdims: bool = False):
-    """Return the largest magnitude in an array, of JAX or of NumPy, or along axes of it; zero where it is empty."""
+    """Return the largest magnitude in an array, of JAX or of NumPy, or along axes of it; zero if it is empty.
+    """
     return abs(x).max(axis, keepdims=keepdims, initial=0.0)
 
 
@@ -250,7 +257,7 @@ F = TypeVar("F", bound=Callable)
 
 
 def with_usual_promotion(function: F) -> F:
-    """The function, run and traced in those defaults: one that is called from outside, or that JAX calls once the call that asked for it has returned."""
+    """Return the function, run and traced in JAX's default modes, even when JAX calls it later."""
 
     @wraps(function)
     def called(*args, **kwargs):

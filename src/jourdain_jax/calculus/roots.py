@@ -1,4 +1,5 @@
-"""Roots of rows: by Newton's method, by damped least squares where it runs away, by an iteration to its fixed point, and on NumPy at many states at once.
+"""Roots of residuals: by Newton's method, by damped least squares where it diverges, by fixed-point
+iteration, and on NumPy at many states at once.
 
     F(x, theta) = 0   =>   dx = - (dF/dx)^-1 (dF/dtheta) dtheta                                             `newton_root`
     min |f(x)|^2:   x <- x - J' (J J' + damping)^-1 f,   J = df/dx                                          `damped_search`
@@ -79,7 +80,7 @@ def _matrix(linear: Callable, like) -> Float[Array, "unknowns unknowns"]:
 
 
 class Nearest(eqx.Module):
-    """Where a search ended, and what is left of the rows there."""
+    """The end of a search, and the residual there."""
 
     x: Unknowns
     left: Scalar  # largest of the rows
@@ -104,7 +105,8 @@ class Search(eqx.Module):
 
 
 def damped_search(rows: Callable, guess: Unknowns, size: Unknowns, tolerance: float, low=-np.inf, high=np.inf, most_steps=80) -> Search:
-    """Search for x near `guess` from `low` to `high` at which no row exceeds the `tolerance`; it ends where they are smallest. J is per size of an unknown.
+    """Search for x near `guess` from `low` to `high` with no residual above the `tolerance`; it ends at the
+    smallest residual. J is per size of an unknown.
 
     `rows`: x -> f and J. `size`: of each unknown, by which steps are measured; zero for one that is held. Rows should be of order one where unknowns change
     by their size.
@@ -144,7 +146,8 @@ def smooth_root(look: Callable, rows: Callable, guess: Unknowns, x, size, tolera
 
 
 def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, tolerance: float, good: float, *bounds) -> tuple[Nearest, Count]:
-    """The root that is found from the first of the `guesses` that leads to one, and its number; where none does, what comes nearest.
+    """Return the root found from the first successful one of the `guesses`, and its number; without any, the
+    nearest approach.
 
     A root leaves at most `good`; all else, also the `bounds`, is as for `damped_search`.
     """
@@ -172,7 +175,7 @@ ROUND_OFF = 1e3  # units of it, relative to 1 + |x|: a change
 
 
 def fixed_point(step: Callable, a: Any, x: Float[Array, "entries"], most: int, prepare: Callable | None = None) -> Float[Array, "entries"]:
-    """x after at most so many steps; what is not a number has settled.
+    """Return x after at most so many steps; a value that is NaN has settled.
 
     `prepare`: takes a to what steps are given in its place, a pair whose second has no derivatives.
     """
@@ -211,7 +214,7 @@ def _iterated_jvp(primals, tangents, *, step, most, prepare):
 
 
 def _loop(step: Callable, carry: tuple, most: int) -> tuple:
-    """So many steps of a tuple; the first of it tells when it has settled."""
+    """Take so many steps of a tuple, whose first entry tells when it has settled."""
     if most <= QUIET:
         return jax.lax.scan(lambda carry, _: (step(carry), None), carry, length=most)[0]
 
@@ -234,7 +237,8 @@ Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 def nearest_root(
     look: Look, solve: Callable, x: np.ndarray, *, most: int = 25, longest: np.ndarray | float = np.inf, within: tuple = (-np.inf, np.inf)
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return x with g(x) = 0 near the given x, shape (states, unknowns), and the last corrections relative to 1 + |x|, infinite where they are no numbers.
+    """Return x with g(x) = 0 near the given x, shape (states, unknowns), and the last corrections relative to
+    1 + |x|, infinite where they are NaN.
 
     `solve`: from G and g to the shortest d with G d = g. No step is longer than `longest` in an entry, and none leads out of the bounds `within`.
     """
@@ -261,7 +265,9 @@ def shortest(G: np.ndarray, g: np.ndarray, typical: np.ndarray | float = 0.0) ->
 
 
 def pseudo_inverses(G: np.ndarray, typical: np.ndarray | float = 0.0) -> np.ndarray:
-    """Return G+ at every state, with rows scaled to a length of one, or to less where they are shorter than they typically are; NaN where G is no number."""
+    """Return G+ at every state, with rows scaled to unit length, or less where they are shorter than typical;
+    NaN where G is.
+    """
     lengths = np.maximum(np.linalg.norm(G, axis=2), typical)
     d = 1 / np.where(lengths > 0, lengths, 1.0)
     found, finite = np.full(np.swapaxes(G, 1, 2).shape, np.nan), np.all(np.isfinite(G), axis=(1, 2))

@@ -33,7 +33,7 @@ def _angle(angle: Number) -> Scalar:
 
 
 def rot_x(angle: Number) -> Matrix3:
-    """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the x axis.
+    """Return the rotation matrix (3, 3), body to space, for a rotation by `angle` (rad) about the x axis.
 
     With x ahead and z up a positive angle leans to the right. Column k, `R[:, k]`, is body axis k in the inertial frame.
     """
@@ -44,7 +44,7 @@ def rot_x(angle: Number) -> Matrix3:
 
 
 def rot_y(angle: Number) -> Matrix3:
-    """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the y axis.
+    """Return the rotation matrix (3, 3), body to space, for a rotation by `angle` (rad) about the y axis.
 
     With x ahead and z up a positive angle pitches the nose down, and rolls a wheel ahead. Column k, `R[:, k]`, is body axis k in the inertial frame.
     """
@@ -55,7 +55,7 @@ def rot_y(angle: Number) -> Matrix3:
 
 
 def rot_z(angle: Number) -> Matrix3:
-    """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the z axis.
+    """Return the rotation matrix (3, 3), body to space, for a rotation by `angle` (rad) about the z axis.
 
     With z up a positive angle turns to the left. Column k, `R[:, k]`, is body axis k in the inertial frame.
     """
@@ -78,13 +78,14 @@ def vee(S: Matrix3) -> Vector3:
 
 
 def quaternion_to_matrix(quaternion: Real[Array | np.ndarray, "4"] | Sequence[Number]) -> Matrix3:
-    """Rotation matrix (3, 3), body to space, of a `quaternion` (w, x, y, z) of any norm but zero (the formula divides by the squared norm).
+    """Return the rotation matrix (3, 3), body to space, of a `quaternion` (w, x, y, z) of any norm but zero
+    (the formula divides by the squared norm).
 
     ValueError where it is known to be zero; NaN where a traced one is.
     """
     quaternion = checked_real(quaternion, "quaternion", (4,), advice="give (w, x, y, z)")
     if not holds(np.any, quaternion):
-        raise ValueError("quaternion is (0, 0, 0, 0), which is no attitude; give (w, x, y, z) of any other length, such as (1, 0, 0, 0) for none turned")
+        raise ValueError("quaternion is (0, 0, 0, 0), which is not an attitude; give (w, x, y, z) of nonzero length, such as (1, 0, 0, 0) for no rotation")
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     # R = 1 + 2 (w [v]x + [v]x^2) / (w^2 + v.v): unchanged by the norm, so that a drifting norm never scales an inertia.
     two = 2.0 / (w * w + x * x + y * y + z * z)
@@ -134,7 +135,9 @@ def quaternion_product(p: Attitude, q: Attitude) -> Attitude:
 
 
 def quaternion_from_axis_angle(axis: Vector, angle: Number) -> Attitude:
-    """The unit quaternion (w, x, y, z) `(cos(angle/2), sin(angle/2) axis)` of a turn by `angle` (rad) about the unit vector `axis`."""
+    """Return the unit quaternion (w, x, y, z) `(cos(angle/2), sin(angle/2) axis)` of a rotation by `angle`
+    (rad) about the unit vector `axis`.
+    """
     half = _angle(angle) / 2
     axis = checked_real(axis, "axis of a quaternion", (3,), advice="give a unit vector")
     return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis])

@@ -1,4 +1,5 @@
-"""Scalar functions of values that carry a bound of their round-off (Higham, 2002, 3.3): the bounds follow the values in one array.
+"""Scalar functions of values with bounds of their round-off (Higham, 2002, 3.3), stored beside the values in
+one array.
 
     a + b: e_a + e_b + eps |a + b|        a b: |a| e_b + |b| e_a + e_a e_b + eps |a b|        a/b: (e_a + |a/b| e_b)/(|b| - e_b) + eps |a/b|
 
@@ -14,7 +15,7 @@ LOST = 1e3  # bounds of round-off below which a divisor, or what a root is taken
 
 
 def with_bound(value: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """A value, with the bound of what it is made from and of its own rounding."""
+    """Return a value, with the bound from its arguments and its own rounding."""
     error += EPS * np.abs(value)
     return np.concatenate([value, error])
 

@@ -1,4 +1,4 @@
-"""Functions of scalars that a scene may use, and all that the package knows of each: its value, its derivative, its round-off, and how it is written.
+"""The table of scalar functions that a scene may use: value, derivative, round-off, and code of each.
 
 Whatever works on scalars looks here: values on NumPy arrays, code for JAX, derivatives, proofs of identities, source code. A new function is a new entry.
 """

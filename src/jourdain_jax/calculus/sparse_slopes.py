@@ -1,4 +1,5 @@
-"""Derivatives of rows at many states by their entries; where many rows hold few coordinates each, as in a long chain, linear systems are sparse.
+"""Derivatives of constraints at many states by their entries; with few coordinates per constraint, as in a
+long chain, linear systems are sparse.
 
     G G' y = f,   x = G' y
 
@@ -64,7 +65,9 @@ class Pattern:
         return found
 
     def solved(self, values: np.ndarray, f: np.ndarray) -> np.ndarray:
-        """`(G G')^-1 f` at every state, all of them as one sparse system; NaN where it is singular, or no number."""
+        """Return `(G G')^-1 f` at every state, all as one sparse system; NaN where it is singular, or not
+        finite.
+        """
         from scipy import sparse
         from scipy.sparse.linalg import splu
 
@@ -83,7 +86,7 @@ class Pattern:
 
 
 def _summed(groups: np.ndarray, count: int, values: np.ndarray) -> np.ndarray:
-    """Sums of the values in each of so many groups, with a leading axis of states."""
+    """Return sums of the values in each of so many groups, with a leading axis of states."""
     found = np.zeros((len(values), count))
     np.add.at(found, (slice(None), groups), values)
     return found

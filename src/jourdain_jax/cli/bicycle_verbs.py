@@ -58,7 +58,9 @@ def _job(options) -> bool:
 
 
 def prefixes(names: list[str]) -> list[str]:
-    """What stands before the names of figures: nothing for one bicycle; otherwise the bicycle's name, with a number from the second of a name on."""
+    """Return prefixes of file names of figures: empty for one bicycle; otherwise the bicycle's name, with a
+    number for repeated names.
+    """
     plain = [re.sub(r"[^\w.-]", "_", name) for name in names]
     return (
         [f"{name}-{number}-" if (number := plain[: k + 1].count(name)) > 1 else f"{name}-" for k, name in enumerate(plain)]

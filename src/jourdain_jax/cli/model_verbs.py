@@ -118,7 +118,7 @@ def _model_row(name: str) -> dict:
 
 
 def _description(row: dict) -> str:
-    """What a model has, for people."""
+    """Return the description of a model, for readers."""
     values = {key: f"{key}={entry['value']:g} {entry['unit'] or ''}".strip() for key, entry in row["parameters"].items()}
     lines = {
         "parameters (--set)": ", ".join([*values.values(), *(f"{key}={entry['value']}" for key, entry in row["counts"].items())]),
@@ -201,7 +201,7 @@ def _motion_row(name: str, trajectory: Trajectory) -> dict:
 
 
 def plain(x):
-    """Numbers, texts and lists of them as JSON has them; what it has no number for is none."""
+    """Return numbers, texts and lists of them for JSON; values without a JSON number are null."""
     if isinstance(x, Mapping):
         return {key: plain(value) for key, value in x.items()}
     if isinstance(x, tuple | list):

@@ -1,4 +1,4 @@
-"""The verb `sweep`: run a study that a file describes, look at it, go on with it, export it.
+"""The verb `sweep`: run, inspect, resume and export a study described by a file.
 
 model = "tilting-disc"                       # a name of `jourdain-jax models`
 t1 = 2.0                                     # s
@@ -76,7 +76,7 @@ def _sweep(options) -> bool:
     if action == "resume":
         text = load_study(paths[0]).store.study["command"]
         if not text:
-            raise ValueError(f"`{paths[0]}` was begun from Python; run the same program again to go on")
+            raise ValueError(f"`{paths[0]}` was begun from Python; run the same program again to continue")
         return _run(text, f"{paths[0]}/run/study.json", paths[0], options)
     found = merge_studies(paths[0], paths[1:]) if action == "merge" else load_study(paths[0])
     if action == "export":
@@ -132,7 +132,7 @@ def _varying(name: str, how):
         raise ValueError(f"`{name}` varies as {described(how)}; write, for example, {name} = {{ normal = [1.0, 0.1] }}")
     ((kind, numbers),) = how.items()
     if kind not in kinds or not isinstance(numbers, list):
-        raise ValueError(f"`{name}` varies as `{kind}` = {numbers}, expected a list of numbers by one of these names; {nearest(kind, kinds)}")
+        raise ValueError(f"`{name}` varies as `{kind}` = {numbers}, expected a distribution with a list of numbers; {nearest(kind, kinds)}")
     if kind not in VARYING:
         return Levels(numbers) if kind == "levels" else numbers
     if len(numbers) != 2:

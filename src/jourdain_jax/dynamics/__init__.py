@@ -1,1 +1,3 @@
-"""What is asked of one state: accelerations, constraint forces, power, and the equations reduced by ignorable coordinates."""
+"""Quantities at one state: accelerations, constraint forces, power, and the equations reduced by ignorable
+coordinates.
+"""

@@ -1,4 +1,4 @@
-"""Accelerations of a scene at one state: the whole of the dynamics below time integration.
+"""Accelerations of a scene at one state: all dynamics below time integration.
 
 kinematics -> virtual power (M, h, Q) -> rows (A, drift) -> reduction -> udot, lambda
 """
@@ -45,7 +45,7 @@ class Baumgarte(eqx.Module):
 
 
 class Accelerations(eqx.Module):
-    """Accelerations of one state, with what is needed to trust them: `M udot + h = Q + A' lambda`, `A udot = -drift`.
+    """Accelerations of one state with their diagnostics: `M udot + h = Q + A' lambda`, `A udot = -drift`.
 
     Units are those of the speeds (per s) and of the rows; a `constraint_force` is per speed, in N or N m.
     """
@@ -60,7 +60,7 @@ class Accelerations(eqx.Module):
 
 
 def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:
-    """All reductions by short name, set up with the scene's privileged velocities.
+    """Return all reductions by short name, set up with the scene's privileged velocities.
 
     Names: "privileged", "qr", "svd", "kkt", "udwadia-kalaba", "gibbs-appell".
     """
@@ -102,18 +102,18 @@ def as_stabilisation(stabilisation) -> Baumgarte | None:
 def accelerations(
     scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None, usual: UsualRows | None = None
 ) -> Accelerations:
-    """Accelerations, multipliers and diagnostics of a scene at (t, q, u).
+    """Return accelerations, multipliers and diagnostics of a scene at (t, q, u).
 
         M udot + h = Q + A' lambda,   A udot = -drift
 
     - `inputs`: values of the scene's inputs (default: zero), which count as constant.
     - `reduction`: a strategy object or one of the names "privileged", "qr" (default), "svd", "kkt", "udwadia-kalaba", "gibbs-appell".
     - `stabilisation`: Baumgarte terms (default: none).
-    - `usual`: what the rows are at most states, by which is judged whether they lose rank at this one (default: as found for this scene).
+    - `usual`: typical sizes of the constraint rows, relative to which a loss of rank is judged (default: as found for this scene).
 
-    Pure: works under any nesting of jit, vmap, jvp and vjp, with right derivatives wherever the rank of the rows is constant. Look at `applicable`
-    and `residual`: nothing is raised for a state that a reduction cannot serve. ValueError for an unknown reduction, and for known parameters with which
-    numbers of bodies, loads or planes cannot be. Eqs. (41), (68)-(70).
+    Pure: works under any nesting of jit, vmap, jvp and vjp, with exact derivatives where the rank is constant. Look at `applicable`
+    and `residual`: nothing is raised where a reduction does not apply. ValueError for an unknown reduction, and for known parameters with impossible
+    values of bodies, loads or planes. Eqs. (41), (68)-(70).
     """
     f = inputs if inputs is None or isinstance(inputs, ChangingInputs) else as_input_vector(scene, inputs)
     arguments = as_time(t), as_coordinates(scene, q), as_speeds(scene, u), f

@@ -1,4 +1,5 @@
-"""The equations of Newton and Euler, body by body: what is left over of them is the force and torque that hold the body on its way.
+"""The equations of Newton and Euler for each body: their residual is the constraint force and torque on the
+body.
 
     R = m a - F,   I alpha + omega x I omega - L
 
@@ -22,7 +23,8 @@ from jourdain_jax.scene.validated import potential_of
 
 @eager_if_concrete
 def newton_residual(scene: Scene, t, q, u, udot, inputs=None) -> Velocities:
-    """The constraint force and torque on each body, `R = m a - F` (N) and `I alpha + omega x I omega - L` (N m, about the mass centre); (1)-(3).
+    """Return the constraint force and torque on each body, `R = m a - F` (N) and `I alpha + omega x I omega -
+    L` (N m, about the mass centre); (1)-(3).
 
     Shape (bodies, 3), inertial frame, bodies sorted by name. `udot`: the accelerations. `inputs`: values of the scene's inputs (default: zero).
     Impressed forces that a scene states on its speeds, not on bodies, cannot be told apart from constraint forces here.

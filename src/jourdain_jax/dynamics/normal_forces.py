@@ -1,4 +1,4 @@
-"""Normal forces of contacts that are built into the coordinates, from Newton's equations for the bodies that they carry.
+"""Normal forces of contacts built into the coordinates, from Newton's equations of the carried bodies.
 
     sum_i N_i n_i = f = sum_j (m_j a_j - F_j - R_j)                                        over the carried bodies j and the contacts i that touch them
     sum_i N_i (p_i - o) x n_i = sum_j (r_j - o) x (m_j a_j - F_j - R_j) + T_j              R_j, T_j: of the rows; T also of inertia and loads

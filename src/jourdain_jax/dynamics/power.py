@@ -72,7 +72,8 @@ def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) 
 
 
 def rate_of_work(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced, of_inputs: tuple[int, ...]) -> Scalar:
-    """What is integrated for the work done, in W: the power, with the forces of the loads `of_inputs` in place of their potentials.
+    """Return the integrand of work, in W: the power, with the forces of the loads `of_inputs` in place of
+    their potentials.
 
     `of_inputs`: numbers of the loads whose potential depends on inputs; what they store (`stored_by_inputs`) is added to the integral.
     """
@@ -80,7 +81,7 @@ def rate_of_work(scene: Scene, motion: Motion, accelerations: Accelerations | Re
 
 
 def _power_of_drives(scene: Scene, motion: Motion, udot) -> Scalar:
-    """The constraint forces of bodies that move while all speeds are zero, times those velocities."""
+    """Return the power of constraint forces on bodies that move while all speeds are zero."""
     t, q, u, inputs = motion.t, motion.q.array, motion.u.array, motion.inputs.array
     total = newton_residual(scene, t, q, u, udot, inputs)
     at_rest = motion_at(scene, t, q, jnp.zeros_like(u), inputs)

@@ -34,7 +34,9 @@ from jourdain_jax.scene.validated import contacts_of
 
 
 class RowReactions(eqx.Module):
-    """The constraint force of every row on every body, and what it does directly on the speeds; along a motion with a first axis of times."""
+    """The constraint force of every constraint on every body, and its direct part on the speeds; along a
+    motion with a first axis of times.
+    """
 
     multipliers: Float[Array, "*times rows"]
     force: Float[Array, "*times rows bodies 3"]  # N
@@ -86,7 +88,9 @@ def _reactions(scene: Scene, motion: Motion, unit: tuple, multipliers) -> RowRea
 
 
 def _per_multiplier(scene: Scene, motion: Motion, inputs) -> tuple[Wrenches, Array, Array]:
-    """What rows (leading axes) exert on bodies and on speeds where their multipliers are one; and `_spare_multipliers`."""
+    """Return the forces of constraints (leading axes) on bodies and on speeds for unit multipliers; and
+    `_spare_multipliers`.
+    """
     bodies, q, u = motion.bodies.values(), motion.q.array, motion.u.array
     if not names_of_rows(scene):
         nothing = jnp.zeros((0, len(bodies), 3), q.dtype)
@@ -166,7 +170,7 @@ def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=N
 
 
 def _size_of_forces(scene: Scene, motion: Motion, total) -> Scalar:
-    """Size of the forces at hand (N): of `m a - F`, of F and of `m |v| |omega|` on the bodies."""
+    """Return the reference size of forces (N): of `m a - F`, of F and of `m |v| |omega|` on the bodies."""
     size = largest(total) + largest(resultants(scene, motion).force)
     for body in motion.bodies.values():
         size = size + body.mass * largest(body.velocity) * largest(body.angular_velocity)

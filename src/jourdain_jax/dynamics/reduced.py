@@ -1,4 +1,4 @@
-"""Coordinates that may be left out of the equations, found by probing, and the reduced Appell equations (42) without them (row S9).
+"""Ignorable coordinates, found by probing, and the reduced Appell equations (42) without them (S9).
 
 A dependent coordinate (its rate is no privileged velocity) is *cyclic* when nothing of the following depends on it, all of it
 in the inertial frame and in the privileged velocities y: B and b of `qdot = B y + b`, the partial velocities beta and partial
@@ -48,7 +48,7 @@ class AdmissibleRates(eqx.Module):
 
 
 class Dependence(eqx.Module):
-    """What depends on which coordinate (columns), anywhere among the probed states."""
+    """Dependence of quantities on coordinates (columns), anywhere among the probed states."""
 
     cyclic_quantities: Bool[np.ndarray, "coordinates"]  # anything of what a cyclic coordinate must not appear in
     rates: Bool[np.ndarray, "coordinates coordinates"]  # B y + b, row by row
@@ -93,7 +93,7 @@ def _named(scene: Scene, chosen) -> tuple[str, ...]:
 
 @once_per_values
 def dependence(scene: Scene) -> Dependence:
-    """What depends on which coordinate: what changes when that coordinate alone is displaced, at random states.
+    """Find the dependence of quantities on coordinates, by displacing each coordinate alone at random states.
 
     The states lie off the geometric rows, so that a coordinate is not found absent only because its value is held. Rows must be
     affine in the speeds.
@@ -132,7 +132,9 @@ def _probe(scene: Scene, t, q, u, shifts):
 
 
 def _quantities(scene: Scene, t, q, u) -> dict[str, Float[Array, "entries"]]:
-    """The rates `B y + b`, the privileged accelerations, and what a cyclic coordinate must not appear in (inertial frame)."""
+    """Return the rates `B y + b`, the privileged accelerations, and the terms from which a cyclic coordinate
+    must be absent (inertial frame).
+    """
     structure = structure_of(scene)
     chosen = np.array(structure.independent, int)
     y = u[chosen]
@@ -188,10 +190,13 @@ class ReducedCoordinates:
 
 
 def reduced_coordinates(scene: Scene) -> ReducedCoordinates:
-    """What to keep and what to drop; a ValueError for rows nonlinear in the speeds, which have no linear B and b."""
+    """Return the coordinates to keep and to omit; a ValueError for constraints nonlinear in the speeds, which
+    have no linear B and b.
+    """
     structure = structure_of(scene)
     if not structure.affine:
-        raise ValueError(f"`{type(scene).__name__}` has rows nonlinear in the speeds, and so no reduced equations; integrate all coordinates and speeds")
+        raise ValueError(f"`{type(scene).__name__}` has constraints nonlinear in the speeds, and therefore no "
+            "reduced equations; integrate all coordinates and speeds")
     found, names = dependence(scene), scene.coordinate_names.entries
     cyclic_or_ignorable = (~found.cyclic_quantities & ~found.privileged) | ~found.accelerations
     groups = _groups(set(np.flatnonzero(cyclic_or_ignorable).tolist()), found.rates)

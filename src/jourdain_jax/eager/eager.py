@@ -1,4 +1,4 @@
-"""Functions of numbers run at once on NumPy, uncompiled: a first call at a prompt takes a tenth of the time that compiling takes."""
+"""Functions run once on NumPy, uncompiled: a first call takes a tenth of the time of compilation."""
 
 from collections.abc import Callable
 from functools import lru_cache, wraps

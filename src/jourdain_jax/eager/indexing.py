@@ -1,4 +1,5 @@
-"""`gather` and `scatter` on NumPy arrays, as far as plain indexing makes them: whole slices along all axes but those that are indexed.
+"""`gather` and `scatter` on NumPy arrays where plain indexing suffices: whole slices along all axes that are
+not indexed.
 
 All other cases (windows, indices out of bounds) are answered with None.
 """

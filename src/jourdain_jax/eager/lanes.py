@@ -1,4 +1,6 @@
-"""A traced function run on NumPy, one operation after another: for one set of arguments, or for many lanes at once, by JAX's `vmap`."""
+"""A traced function run on NumPy, one operation after another: for one set of arguments, or for a batch, by
+JAX's `vmap`.
+"""
 
 from collections.abc import Callable
 from functools import lru_cache, wraps

@@ -1,4 +1,4 @@
-"""Operations of JAX on NumPy arrays: for what is looked at once, where compiling takes longer than running.
+"""Operations of JAX on NumPy arrays, for single evaluations, where compiling takes longer than running.
 
 Primitives without a rule here run one by one in JAX, which compiles each: tens of milliseconds.
 """
@@ -77,8 +77,8 @@ def _while(equation, inputs) -> list[np.ndarray]:
         carry = new if going.ndim == 0 else [np.where(going.reshape(going.shape + (1,) * (n.ndim - going.ndim)), n, o) for n, o in zip(new, carry, strict=True)]
     if np.all(going):
         raise ValueError(
-            f"a `while_loop` in {_where(equation)} does not end: it still turned after {MOST_TURNS} times; give it a count of turns at most, "
-            "such as `lambda state: (state[0] < 50) & ...`, and check what it waits for"
+            f"a `while_loop` in {_where(equation)} does not end after {MOST_TURNS} iterations; bound the number of iterations, "
+            "such as `lambda state: (state[0] < 50) & ...`, and check its condition"
         )
     # where some lanes have ended, what the others would have found is not known
     return [np.where(going.reshape(going.shape + (1,) * (x.ndim - going.ndim)), np.nan, x).astype(x.dtype) if x.dtype.kind == "f" else x for x in carry]

@@ -23,7 +23,8 @@ from jourdain_jax.scene.scene import Scene
 
 
 def gibbs_function(scene: Scene, t, q, u, udot) -> Scalar:
-    """The Gibbs function `G = sum m a.a/2 + alpha.I alpha/2 + alpha.(omega x I omega)` in kg m^2/s^4, up to terms without accelerations; (12)-(14).
+    """Return the Gibbs function `G = sum m a.a/2 + alpha.I alpha/2 + alpha.(omega x I omega)` in kg m^2/s^4,
+    up to terms without accelerations; (12)-(14).
 
     `udot`: accelerations of all speeds, free: they need not obey the rows.
     """
@@ -38,7 +39,8 @@ def gibbs_function(scene: Scene, t, q, u, udot) -> Scalar:
 
 @eager_if_concrete
 def gibbs_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
-    """M, h and Q of `M udot + h = Q` from the Gibbs function: its Hessian, and its gradient at `udot = 0`; (12)-(17).
+    """Return M, h and Q of `M udot + h = Q` from the Gibbs function: its Hessian, and its gradient at `udot =
+    0`; (12)-(17).
 
     `inputs`: values of the scene's inputs (default: zero).
     """

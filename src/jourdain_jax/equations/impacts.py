@@ -1,4 +1,4 @@
-"""Impacts, and how contacts go on afterwards: speeds, modes and directions of slip as a contact closes.
+"""Impacts: speeds, modes and directions of slip after a contact closes.
 
     u+ = u- + M^-1 A' P,   w_n+ = -e w_n-,   |P_t| <= mu P_n, and w_t+ = 0 or P_t against w_t+
 
@@ -42,7 +42,8 @@ class Struck(NamedTuple):
 
 
 def _struck(at: At, i: int, strikes: Flag, restitution: Scalar) -> Struck:
-    """Return the impulses as contact i closes: those that stop its slip, or of an impact if it `strikes`."""
+    """Return the impulses as contact i closes: impulses that stop its slip, or of an impact if it `strikes`.
+    """
     impact = list(switching_contacts(at.scene, at.motion.pose()).values())[i].impact
 
     def tried(modes: Modes, lawful: Flag | None = None) -> Struck:

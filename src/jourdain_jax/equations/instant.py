@@ -1,4 +1,5 @@
-"""One instant of a scene: all velocities and rows, and their derivatives in the speeds and along the motion, worked out together.
+"""One instant of a scene: all velocities and constraints, with derivatives in the speeds and along the
+motion, computed together.
 
     v, omega, phi              at (t, q, u)
     beta, gamma, A             their derivatives in u             (for rows affine in u they do not depend on u)
@@ -54,7 +55,8 @@ def rows_of(scene: Scene, instant: Instant) -> ConstraintRows:
 
 @eager_if_concrete
 def constraint_rows(scene: Scene, t, q, u, inputs=None) -> ConstraintRows:
-    """phi, `A = d phi/du` and the drift `d phi/dt` at `udot = 0` of all rows, with their names: `A udot = -drift`; eqs. (5)-(9), (25).
+    """Return phi, `A = d phi/du` and the drift `d phi/dt` at `udot = 0` of all constraint rows, with their
+    names: `A udot = -drift`; eqs. (5)-(9), (25).
 
     `inputs`: values of the scene's inputs (default: zero). Geometric rows enter by their rate and come first.
     """

@@ -40,7 +40,7 @@ class Inertias(eqx.Module):
 
 
 def coordinate_rates(scene: Scene, t, q: Numbers, u: Numbers) -> Float[Array, "coordinates"]:
-    """`qdot = N(q,t) u + nu(q,t)`, shape (coordinates,), per s; eq. (53)."""
+    """Return `qdot = N(q,t) u + nu(q,t)`, shape (coordinates,), per s; eq. (53)."""
     t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     return coordinate_rates_of(scene, t, scene.coordinate_names.view(q), scene.speed_names.view(u))
 
@@ -53,7 +53,7 @@ def rates_by_own_speeds(scene: Scene, t, q: Numbers) -> Float[Array, "speeds coo
 
 
 def pose_at(scene: Scene, t, q: Numbers) -> Pose:
-    """Poses of all bodies (m, inertial frame), sorted by name: the order in which JAX returns dictionaries, so that it is the same everywhere."""
+    """Return poses of all bodies (m, inertial frame), sorted by name, the order of dictionaries in JAX."""
     t, q = as_time(t), as_coordinates(scene, q)
     named = scene.coordinate_names.view(q)
     return Pose(t, named, {name: BodyPose(name, body) for name, body in sorted(bodies_of(scene, t, named).items())})
@@ -72,7 +72,9 @@ def motion_at(scene: Scene, t, q, u, inputs=None) -> Motion:
 
 
 def shapes_along_motion(look: Callable[[Scene, Motion], Any], scene: Scene):
-    """Shapes of what `look(scene, motion)` returns, by tracing it at no state in particular: at numbers, JAX would compile operation by operation."""
+    """Return shapes of the values of `look(scene, motion)`, by tracing it without a state: with numbers, JAX
+    would compile each operation.
+    """
     numbers = [jax.ShapeDtypeStruct(shape, real_type()) for shape in ((), (len(scene.coordinate_names),), (len(scene.speed_names),))]
     return jax.eval_shape(lambda scene, t, q, u: look(scene, motion_at(scene, t, q, u)), scene, *numbers)
 
@@ -105,7 +107,9 @@ def velocities_of(motion: Motion) -> Velocities:
 
 @eager_if_concrete
 def partial_velocities(scene: Scene, t, q, u) -> Velocities:
-    """`beta = dv/du` (inertial frame) and `gamma = d omega/du` (body axes), shape (bodies, 3, speeds), bodies sorted by name; eqs. (26)-(31), (49)."""
+    """Return `beta = dv/du` (inertial frame) and `gamma = d omega/du` (body axes), shape (bodies, 3, speeds),
+    bodies sorted by name; eqs. (26)-(31), (49).
+    """
     return jax.jacfwd(lambda u: velocities(scene, t, q, u))(as_speeds(scene, u))
 
 

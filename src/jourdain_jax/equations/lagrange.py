@@ -17,7 +17,8 @@ from jourdain_jax.scene.scene import Scene
 
 @eager_if_concrete
 def lagrange_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
-    """M, h and Q of `M udot + h = Q` from derivatives of the kinetic energy: `d/dt dT/dqdot - dT/dq = Q`; eq. (11).
+    """Return M, h and Q of `M udot + h = Q` from derivatives of the kinetic energy: `d/dt dT/dqdot - dT/dq =
+    Q`; eq. (11).
 
     `inputs`: values of the scene's inputs (default: zero). ValueError where the speeds are not the coordinate rates.
     """

@@ -1,4 +1,4 @@
-"""The least change that takes the residual of rows away, and its derivative in closed form.
+"""The smallest change that removes the residual of constraints, and its derivative in closed form.
 
     x = K r:   |D (A x - r)| least, and among such x' M x least          K = C L'^-1 (D A C L'^-1)+ D,   C M C = L L'
     dx = K (dr - dA x) + K D^-2 K' dA' D^2 (r - A x) + (1 - K A) M^-1 (dA' mu - dM x),   M x = A' mu
@@ -37,7 +37,8 @@ def least_change(
     *,
     determined: bool = False,
 ) -> Change:
-    """What moves least in the metric `M` (None: that of the coordinates as they are), of what is `free`; the identity where `M` is singular.
+    """Return the map of least change in the metric `M` (None: that of the coordinates), within the `free`
+    ones; the identity if `M` is singular.
 
     `typical`: lengths of the rows, in the scaled speeds where there is a metric, by which one counts as vanishing (default: none does, unless it is zero).
     Rows count as dependent below `cutoff` (default: `rank_cutoff`). Differentiable in any mode where the rank does not change.

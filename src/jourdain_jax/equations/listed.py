@@ -1,4 +1,4 @@
-"""What a scene consists of, by name, without evaluating it: all of it is found by tracing the scene once, at no state in particular."""
+"""The parts of a scene by name, found by tracing it once, without evaluation at a state."""
 
 from typing import NamedTuple
 
@@ -51,7 +51,9 @@ def has_load_without_potential(scene: Scene) -> bool:
 
 @once_per_class
 def names_of_invariants(scene: Scene) -> tuple[str, ...]:
-    """Names of the invariants that the scene states, sorted. A motion needs none: what is wrong with them is said when they are asked for."""
+    """Return names of the invariants that the scene states, sorted. A motion does not need them, so errors
+    are raised on access.
+    """
     return tuple(shapes_along_motion(invariants_of, scene))  # JAX returns dictionaries sorted by name
 
 

@@ -1,4 +1,5 @@
-"""Appell's equations in the minimal state (q, y), y the privileged speeds, for rows linear or affine in the speeds.
+"""Appell's equations in the minimal state (q, y), y the privileged speeds, for constraints linear or affine
+in the speeds.
 
     u    = C y + c                     from the rows themselves, which so hold exactly                   (25)-(31)
     udot = C ydot + c'                 from their rates
@@ -25,7 +26,7 @@ from jourdain_jax.scene.scene import Scene
 
 
 class MinimalKinematics(eqx.Module):
-    """All speeds from the privileged ones, with what was needed on the way."""
+    """All speeds from the privileged ones, with intermediate results."""
 
     u: Speeds
     partial: VelocityLevel  # beta, gamma, A

@@ -34,7 +34,7 @@ class RowFunctions(NamedTuple):
     parameters: Callable | None = None  # scene -> what the first two may be given in its place
 
     def given(self, scene: Scene):
-        """What the first two functions are given of a scene."""
+        """Return the arguments of the first two functions, from a scene."""
         return scene if self.parameters is None else self.parameters(scene)
 
 
@@ -66,7 +66,8 @@ def project_positions(
     typical=None,
     by: RowFunctions = BY_AUTODIFF,
 ) -> Float[Array, "coordinates"]:
-    """Coordinates on the geometric rows, near q; only coordinates that are `free` move. At most so many `iterations`.
+    """Return coordinates on the geometric constraints, near q; only `free` coordinates move. At most so many
+    `iterations`.
 
     `typical`: lengths of the rows by which one counts as vanishing, from `closure_lengths` (default: none does, unless it is zero).
     `by`: how rows are evaluated.
@@ -87,7 +88,7 @@ def project_positions(
 
 
 def _normalised(scene: Scene, q: Float[Array, "coordinates"]) -> Float[Array, "coordinates"]:
-    """Where there are unit norms only, what the iteration converges to: `q / |q|` of every quaternion."""
+    """Return the limit of the iteration for unit norms only: `q / |q|` for every quaternion."""
     for first, _ in scene.coordinates.quaternions:
         wxyz = q[first : first + 4]
         squared = wxyz @ wxyz

@@ -43,7 +43,7 @@ class Reduction(eqx.Module):
 
 
 class Reduced(eqx.Module):
-    """What a reduction finds, before multipliers and diagnostics are worked out."""
+    """The result of a reduction, before multipliers and diagnostics."""
 
     udot: Speeds
     constraint_force: Speeds  # A' lambda = M udot + h - Q
@@ -65,7 +65,8 @@ def reduced(udot, pivot, applicable, equations: UnconstrainedEquations) -> Reduc
 
 
 def smallest_that_counts(sigma: Float[Array, "values"], usual: UsualRows | None = None) -> Scalar:
-    """The last singular value of the usual rank, which goes to zero where rank is lost; where that is not known, the smallest above the cut-off.
+    """Return the last singular value of the usual rank, which vanishes at a loss of rank; if that rank is
+    unknown, the smallest above the cut-off.
 
     1 where there is none.
     """
@@ -78,7 +79,9 @@ def smallest_that_counts(sigma: Float[Array, "values"], usual: UsualRows | None 
 
 
 def cholesky(M: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Flag]:
-    """Lower Cholesky factor, and whether M is positive definite; the identity's factor where it is not."""
+    """Return the lower Cholesky factor, and whether M is positive definite; the factor of the identity if it
+    is not.
+    """
     factor = jnp.linalg.cholesky(jax.lax.stop_gradient(M))
     # a pivot at round-off means a singular matrix, whatever its sign came out as
     definite = jnp.all(jnp.isfinite(factor)) & (jnp.min(jnp.diagonal(factor), initial=1.0) ** 2 > 16 * M.shape[0] * jnp.finfo(M.dtype).eps)
@@ -87,7 +90,9 @@ def cholesky(M: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Flag]:
 
 
 def solve_definite(M: Float[Array, "n n"], f: Float[Array, "n"]) -> tuple[Float[Array, "n"], Flag]:
-    """`M^-1 f` by Cholesky, and whether M is positive definite; NaN where it is not, so that no invented number passes for a solution."""
+    """Return `M^-1 f` by Cholesky, and whether M is positive definite; NaN if it is not, so that no invented
+    number passes for a solution.
+    """
     factor, definite = cholesky(M)
     return jnp.where(definite, jax.scipy.linalg.cho_solve((factor, True), f), jnp.nan), definite
 
@@ -108,7 +113,9 @@ class Privileged(Reduction):
 
 
 def appell(M, f, C, c, pivot):
-    """`udot = C yddot + c` from `C' M C yddot = C' (f - M c)`, the pivot, and whether both serve (eq. (41))."""
+    """Return `udot = C yddot + c` from `C' M C yddot = C' (f - M c)`, the pivot, and whether both are valid
+    (eq. (41)).
+    """
     yddot, definite = solve_definite(C.T @ M @ C, C.T @ (f - M @ c))
     return C @ yddot + c, pivot, definite & (pivot > APPLICABLE_PIVOT)
 

@@ -25,7 +25,7 @@ from jourdain_jax.scene.validated import contacts_of, geometric_constraints_of, 
 
 
 class UsualRows(eqx.Module):
-    """What the rows are at most states of a scene: what they are at one state is judged by this."""
+    """Typical constraint rows of a scene, by which rows at one state are judged."""
 
     lengths: Float[Array | np.ndarray, "rows"]  # of `A` in scaled speeds
     rank: Int[Array | np.ndarray, ""]
@@ -41,7 +41,7 @@ class ConstraintRows(eqx.Module):
     usual: UsualRows | None = None  # None: each row is judged by its length at this state
 
     def judged_by(self, usual: UsualRows | None) -> "ConstraintRows":
-        """These rows, judged by what they usually are (`structure.usual_rows`)."""
+        """Return these rows, judged by their typical values (`structure.usual_rows`)."""
         return ConstraintRows(self.phi, self.A, self.drift, self.names, usual)
 
 
@@ -107,7 +107,9 @@ def flatten_rows(rows: dict[str, Array], dtype) -> Float[Array, "rows"]:
 
 
 def position_residual(scene: Scene, t, q) -> Float[Array, "geometric_rows"]:
-    """`g(t, q)` of all geometric rows, shape (geometric rows,), in their own units; zero on the constraints. Eq. (5)."""
+    """Return `g(t, q)` of all geometric constraints, shape (geometric rows,), in their own units; zero on the
+    constraints. Eq. (5).
+    """
     return _position_residual(scene, as_time(t), as_coordinates(scene, q))
 
 
@@ -117,7 +119,8 @@ def _position_residual(scene: Scene, t: Scalar, q):
 
 
 def velocity_residual(scene: Scene, t, q, u, inputs=None) -> Float[Array, "rows"]:
-    """`phi(t, q, u)` of all rows, shape (rows,), in their own units per s; zero on the constraints. Eqs. (6)-(9).
+    """Return `phi(t, q, u)` of all constraints, shape (rows,), in their own units per s; zero on the
+    constraints. Eqs. (6)-(9).
 
     `inputs`: values of the scene's inputs (default: zero).
     """

@@ -1,4 +1,4 @@
-"""Units out of the linear algebra: speeds scaled by their own inertia, rows by their length, before any rank is decided.
+"""Scaling before rank decisions: speeds by their inertia, constraint rows by their length.
 
     M^ = c M c,  f^ = c (Q - h),  A^ = d A c,  b^ = -d drift,   udot = c w,   c_i = M_ii^(-1/2),  d_s = 1/max(|A_s c|, l_s)
 
@@ -37,7 +37,8 @@ def speed_scale(M: Float[Array, "speeds speeds"]) -> Speeds:
 
 
 def row_scale(A: Float[Array, "rows speeds"], typical: Float[Array | np.ndarray, "rows"] | None = None) -> Float[Array, "rows"]:
-    """One over the length of each row, or over its `typical` length where it is shorter than that; 1 for a row that vanishes, where none is known.
+    """Return one over the length of each row, or over its `typical` length where it is shorter; 1 for a
+    vanishing row without a typical length.
 
     So a row that shrinks along a motion counts less and less, and not at all once it is round-off of what it typically is.
     """

@@ -1,4 +1,4 @@
-"""Contacts that fly, roll, slip and strike: what ends each phase, and what comes after it.
+"""Contacts that fly, roll, slip and strike: the end of each phase, and the next one.
 
     M du/dt = h + A' L
 
@@ -59,7 +59,7 @@ def contact_events(at: At) -> dict[str, Scalar]:
 
 
 def contact_changes(at: At) -> dict[str, Event]:
-    """Return what each event of the contacts that switch makes of the state and the modes."""
+    """Return the state and the modes after each event of the switching contacts."""
     events = {}
     for i, name in enumerate(at.scene.switching.contacts):
         number = at.number[i]

@@ -60,7 +60,8 @@ class Resultants(eqx.Module):
 def resultants(
     scene: Scene, motion: Motion, *, conservative: bool | None = None, among: tuple[int, ...] | None = None, loads: tuple[Load, ...] | None = None
 ) -> Resultants:
-    """Sum of the loads per body and per speed; only those with (`conservative=True`) or without a potential (`False`), or with the numbers `among`.
+    """Return the sum of the loads per body and per speed; only loads with (`conservative=True`) or without a
+    potential (`False`), or with the numbers `among`.
 
     `loads`: of the scene at this motion, where they are known already.
     """
@@ -81,7 +82,9 @@ def resultants(
 
 
 def potential_energy(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> Scalar:
-    """V in J at a `motion`: the potentials of the loads and of the scene. `loads`: those of the scene at this motion, where they are known already."""
+    """Return V in J at a `motion`: the potentials of the loads and of the scene. `loads`: the scene's loads
+    at this motion, if already known.
+    """
     if not isinstance(motion, Motion):
         raise ValueError(f"`motion` is {described(motion)}, expected a motion, such as `jj.motion_at(scene, t, q, u)`")
     V = jnp.zeros_like(motion.t)
@@ -93,12 +96,12 @@ def potential_energy(scene: Scene, motion: Motion, loads: tuple[Load, ...] | Non
 
 
 def kinetic_energy(scene: Scene, t, q, u) -> Scalar:
-    """T = sum m v.v/2 + omega.I omega/2 in J."""
+    """Return T = sum m v.v/2 + omega.I omega/2 in J."""
     return _kinetic_energy(motion_at(scene, t, as_coordinates(scene, q), as_speeds(scene, u)))
 
 
 def energies_at(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> tuple[Scalar, Scalar]:
-    """T and V in J at a `motion`. `loads`: those of the scene at this motion, where they are known already."""
+    """Return T and V in J at a `motion`. `loads`: the scene's loads at this motion, if already known."""
     return _kinetic_energy(motion), potential_energy(scene, motion, loads)
 
 
@@ -110,7 +113,7 @@ def _kinetic_energy(motion: Motion) -> Scalar:
 
 @eager_if_concrete
 def unconstrained_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
-    """M, h and Q of `M udot + h = Q`, the equations without constraint forces; eqs. (50), (56).
+    """Return M, h and Q of `M udot + h = Q`, the equations without constraint forces; eqs. (50), (56).
 
     M: (speeds, speeds), kg or kg m^2; h, Q: (speeds,), N or N m. `inputs`: values of the scene's inputs (default: zero).
     """
@@ -164,7 +167,7 @@ def inertia_resultants(weights: Inertias, velocity: Velocities, acceleration: Ve
 
 @eager_if_concrete
 def generalized_forces(scene: Scene, t, q, u, inputs=None) -> Speeds:
-    """`Q = sum beta' F + gamma' L + Q_direct - N' dV/dq`, shape (speeds,), in N or N m; eq. (41).
+    """Return `Q = sum beta' F + gamma' L + Q_direct - N' dV/dq`, shape (speeds,), in N or N m; eq. (41).
 
     `inputs`: values of the scene's inputs (default: zero).
     """
@@ -178,7 +181,9 @@ def _generalized_forces(scene: Scene, motion: Motion, partial: Velocities, loads
 
 
 class ContactResponse(eqx.Module):
-    """Contacts that switch at one state, with what their forces L do: `du/dt = free + impulses L`, `dw/dt = G L + b`."""
+    """Switching contacts at one state, with the effect of their forces L: `du/dt = free + impulses L`, `dw/dt
+    = G L + b`.
+    """
 
     rows: ContactRows
     impulses: Float[Array, "speeds rows"]  # M^-1 A', along the rows that always hold
@@ -230,7 +235,7 @@ def slip_turns(scene: Scene, motion: Motion, found: ContactResponse) -> Float[Ar
 
 
 def coordinate_rates_in_modes(scene: Scene, motion: Motion) -> Float[Array, "coordinates"]:
-    """Rates of all coordinates, with those of directions of slip."""
+    """Return rates of all coordinates, including directions of slip."""
     if not scene.switching.contacts:
         return motion.qdot.array
     turns = slip_turns(scene, motion, contact_response(scene, motion))
@@ -248,7 +253,9 @@ def switching_forces(scene: Scene, motion: Motion, found: ContactResponse) -> Fl
 
 
 def loads_at(scene: Scene, motion: Motion, found: ContactResponse | None = None) -> tuple[Load, ...]:
-    """The loads of a scene, and the forces of contacts that switch, which depend on them; `found`: how these respond, where it is known already."""
+    """Return the loads of a scene, and the forces of switching contacts, which depend on them; `found`: the
+    contacts' response, if already known.
+    """
     own = loads_of(scene, motion)
     if not scene.switching.contacts:
         return own
@@ -274,7 +281,8 @@ def _potential_gradient(scene: Scene, motion: Motion) -> Speeds:
 
 
 def virtual_power(scene: Scene, t, q, u, udot, virtual_velocity, inputs=None) -> Scalar:
-    """Jourdain's variational equation (18) as a residual: `sum (m a - F) . delta_1 v = delta u . (M udot + h - Q)`, in W.
+    """Return the residual of Jourdain's variational equation (18): `sum (m a - F) . delta_1 v = delta u . (M
+    udot + h - Q)`, in W.
 
     `udot`: the accelerations; `virtual_velocity`: `delta u`, any, shape (speeds,). `inputs`: values of the scene's inputs (default: zero).
     Zero for every virtual velocity with `A delta u = 0` if and only if `udot` is the constrained acceleration.

@@ -1,1 +1,1 @@
-"""Scenes from what other tools write: SymPy's mechanics, URDF and MJCF files."""
+"""Scenes imported from SymPy's mechanics, URDF and MJCF files."""

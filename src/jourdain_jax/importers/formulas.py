@@ -1,4 +1,4 @@
-"""Values of SymPy expressions on JAX or NumPy: each common subexpression once, each function by its counterpart there."""
+"""Evaluation of SymPy expressions on JAX or NumPy, with common subexpressions evaluated once."""
 
 from collections.abc import Mapping, Sequence
 from functools import reduce
@@ -24,7 +24,7 @@ _KNOWN = {*_FUNCTIONS, *_OF_MANY, "Pow", "Piecewise", "ExprCondPair", "sinc", "e
 
 
 def sympy_package() -> Any:
-    """The package `sympy`; an ImportError that says how to get it where it is missing."""
+    """Return the package `sympy`; if it is missing, an ImportError tells how to install it."""
     needed("sympy.physics.mechanics", "a scene from SymPy")
     return needed("sympy", "a scene from SymPy")
 
@@ -42,7 +42,9 @@ class Formulas:
         self._steps, self._results = sympy.cse(flat, symbols=sympy.numbered_symbols("s", cls=sympy.Dummy))
 
     def values(self, leaves: Mapping[Any, Any], on: ModuleType = jnp) -> dict[Any, list]:
-        """The values of all lists where the `leaves` have these, worked out by the functions of `on`: `jax.numpy` or `numpy`."""
+        """Return the values of all lists for these `leaves`, computed by the functions of `on`: `jax.numpy`
+        or `numpy`.
+        """
         known = dict(leaves)
         for symbol, expression in self._steps:
             known[symbol] = _value(expression, known, on)
@@ -57,15 +59,17 @@ class Formulas:
 
 
 def check_functions(expression, leaves) -> None:
-    """A ValueError that names a function in the expression, apart from the `leaves`, which JAX does not have, or what is no real number."""
+    """Raise a ValueError that names a function in the expression, apart from the `leaves`, that JAX does not
+    have, or that is not real.
+    """
     if expression.is_Atom and expression.is_number and not expression.is_extended_real:
-        raise ValueError(f"`{expression}` is no real number; check the expressions that it stands in")
+        raise ValueError(f"`{expression}` is not a real number; check the expressions that contain it")
     if expression in leaves or expression.is_Atom:
         return
     name = type(expression).__name__
     if name not in _KNOWN:
         raise ValueError(
-            f"the function `{name}` in `{shortened(expression)}` has no counterpart in JAX; write it by elementary functions, or give it as an input"
+            f"the function `{name}` in `{shortened(expression)}` has no counterpart in JAX; write it in elementary functions, or make it an input"
         )
     for argument in expression.args:
         check_functions(argument, leaves)

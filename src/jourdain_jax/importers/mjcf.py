@@ -32,7 +32,7 @@ _LOOKS |= {kind: (kind, [1, 2]) for kind in ("capsule", "cylinder")}
 
 
 def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> type[Scene]:
-    """A class of scenes from an MJCF file: its bodies, joints, inertias, springs, dampers and motors.
+    """Return a class of scenes from an MJCF file: its bodies, joints, inertias, springs, dampers and motors.
 
         Arm = jj.from_mjcf("arm.xml", ignore=("armature",))
         jj.simulate(Arm(), {"elbow": 0.3}, t1=1.0)
@@ -93,14 +93,14 @@ class _Reader:
         return Tree(name, tuple(self.links), gravity, motors, ties, free, self.start)
 
     def _ties(self, joints: list[str]) -> Iterable[Follower | Closure]:
-        """What `equality` states, as rows that hold exactly."""
+        """Return the ties of `equality`, as exact constraints."""
         stated = () if "equality" in self.file.ignore else self.file.root.findall("equality/*")
         for k, element in enumerate(stated):
             tie, follows = Part(self.file, f"{element.tag} {k + 1} of `equality`", element), element.tag == "joint"
             one, other = (element.get(f"{'joint' if follows else 'body'}{end}") for end in (1, 2))
             known = joints if follows else [link.name for link in self.links]
             for end in (one, other or one):
-                self.file.check_name(str(end), known, f"{tie.what} names `{end}`, which is no {'hinge or slide' if follows else 'body'}")
+                self.file.check_name(str(end), known, f"{tie.what} names `{end}`, which is not a {'hinge or slide' if follows else 'body'}")
             if element.get("active") == "false":
                 continue
             if follows:
@@ -236,7 +236,9 @@ class _Reader:
         return None
 
     def _place(self, given: Part) -> Place:
-        """Position and rotation that attributes state. ValueError for several rotations, or numbers that say none."""
+        """Return position and rotation from attributes. ValueError for several rotations, or numbers that
+        define none.
+        """
         position = given.numbers("pos", 3, np.zeros(3))
         stated = [word for word in _TURNS if word in given]
         if not stated:
@@ -247,7 +249,7 @@ class _Reader:
         with np.errstate(invalid="ignore"):
             turn = self._turn(word, given.numbers(word, _TURNS[word]))
         if not np.all(np.isfinite(turn)):
-            raise given.fault(word, f"`{given.given[word]}`, which is no rotation")
+            raise given.fault(word, f"`{given.given[word]}`, which is not a rotation")
         return position, turn
 
     def _turn(self, word: str, x: np.ndarray) -> Matrix:
@@ -282,7 +284,7 @@ class _Reader:
                 force, moment = np.pad(gear, (0, 6 - len(gear))).reshape(2, 3) @ turn.T
                 gear, push = np.ones(1), Push(link, position, force, moment)
             elif joint not in names:
-                raise self.file.fault(f"{motor.what} pushes `{joint}`, which is no hinge or slide; {nearest(joint, names)}")
+                raise self.file.fault(f"{motor.what} pushes `{joint}`, which is not a hinge or slide; {nearest(joint, names)}")
             yield Motor(name, joint, float(gear[0]), self._limits(motor, "ctrl"), self._limits(motor, "force"), push)
 
     def _limits(self, motor: Part, what: str) -> tuple[float, float] | None:

@@ -1,4 +1,4 @@
-"""What MJCF's elements may hold here, and the defaults of its classes.
+"""Supported contents of MJCF elements, and the defaults of their classes.
 
 Source: the XML reference of MuJoCo's documentation, version 3.
 """

@@ -1,4 +1,4 @@
-"""Known rotation matrices: by angles about fixed or turned axes, by quaternions, by axes; and masses put together."""
+"""Constant rotation matrices from angles, quaternions and axes; and the combination of masses."""
 
 import numpy as np
 from jaxtyping import Float
@@ -13,7 +13,9 @@ def about(axis: Vector, angle: float) -> Matrix:
 
 
 def by_euler_angles(angles: Vector, sequence: str) -> Matrix:
-    """MJCF's `euler`: about axes in turn (rad), those of the turned frame in lower case, fixed ones in upper case."""
+    """Return the rotation of MJCF's `euler`: about successive axes (rad), of the turned frame in lower case,
+    fixed ones in upper case.
+    """
     turn = np.eye(3)
     for letter, angle in zip(sequence, angles, strict=True):
         one = Rotation.from_euler(letter.lower(), angle).as_matrix()

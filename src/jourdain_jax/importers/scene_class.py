@@ -1,4 +1,4 @@
-"""A class of scenes made from a description: its parameters become fields with defaults, like those that a user writes.
+"""Scene classes made from a description: parameters become fields with defaults, as in handwritten classes.
 
 Names of other tools become names of Python, for fields, coordinates, speeds and inputs.
 """
@@ -14,14 +14,18 @@ _TAKEN = ("t", "array", "slots", "keys")  # by the time and by the container of 
 
 
 def identifier(name: str) -> str:
-    """The name as one of Python: what is no letter, digit or underscore becomes an underscore, `left-wheel` is `left_wheel`."""
+    """Return the name as a Python identifier: other characters than letters, digits and underscores become
+    underscores, `left-wheel` is `left_wheel`.
+    """
     plain = re.sub(r"\W+", "_", name).strip("_") or "unnamed"
     plain = f"_{plain}" if plain[0].isdigit() else plain
     return f"{plain}_" if keyword.iskeyword(plain) or plain in _TAKEN else plain
 
 
 def identifiers(names: Iterable[str], kind: str, taken: Iterable[str] = ()) -> dict[str, str]:
-    """Name -> its identifier, with an underscore at its end where that is among the `taken` ones; ValueError where two are equal, or become so."""
+    """Return name -> its identifier, with an underscore at its end if it is `taken`; ValueError if two are
+    equal, or become so.
+    """
     found: dict[str, str] = {}
     taken = set(taken)
     for name in names:
@@ -37,8 +41,8 @@ def identifiers(names: Iterable[str], kind: str, taken: Iterable[str] = ()) -> d
 
 
 def scene_class(base: type[Scene], name: str, about: str, fields: dict[str, Any], attributes: dict[str, Any]) -> type[Scene]:
-    """A subclass of `base` called `name`, of which `my-robot` becomes `MyRobot`, whose docstring is `about`, with `fields`, made by `parameter`, and further
-    class `attributes`.
+    """Return a subclass of `base` called `name` (`my-robot` becomes `MyRobot`), with docstring `about`,
+    `fields` made by `parameter`, and further class `attributes`.
     """
     words = [word for word in re.split(r"[\W_]+", name) if word]
     name = identifier("".join(word[0].upper() + word[1:] for word in words) or "Scene")

@@ -1,4 +1,4 @@
-"""Poses of SymPy's bodies, and the coordinates that they need besides those of SymPy.
+"""Poses of SymPy's bodies, and the additional coordinates that they need.
 
 SymPy lets velocities be stated apart from positions: a rolling disc whose contact point rests, a wheel that turns at a speed without having an angle. Here
 velocities are the rates of poses. Where both disagree, coordinates are added whose rates make up the difference,
@@ -53,7 +53,9 @@ def poses_of(system: MechanicalSystem) -> tuple[MechanicalSystem, list[Pose]]:
 
 
 def _pose(system: MechanicalSystem, body, angles: dict[Any, tuple]) -> tuple[MechanicalSystem, Pose | None]:
-    """The pose of a body, at the position that SymPy has for it (zero where it has none); None where it does not move or weighs nothing."""
+    """Return the pose of a body, at SymPy's position (zero if it has none); None if it does not move or has
+    no mass.
+    """
     sympy = sympy_package()
     name = str(getattr(body, "name", body))  # a `Particle` of SymPy 1.12 has its name as its text
     rigid = isinstance(body, sympy.physics.mechanics.RigidBody) and getattr(body, "is_rigidbody", True)  # its `Body` may be a particle
@@ -79,7 +81,7 @@ def _pose(system: MechanicalSystem, body, angles: dict[Any, tuple]) -> tuple[Mec
         return system, None
     mass = system.resolved(body.mass)
     if not system.is_constant(mass):
-        raise ValueError(f"the mass of body `{name}` is `{mass}`, which changes in time; expected constants")
+        raise ValueError(f"the mass of body `{name}` is `{mass}`, which changes in time; expected a constant")
     return system, Pose(name, mass, inertia, position, orientation, centre, frame)
 
 
@@ -117,7 +119,7 @@ def _by_an_angle(system: MechanicalSystem, frame) -> tuple[MechanicalSystem, tup
 
 
 def _constant(system: MechanicalSystem, matrix, what: str):
-    """The matrix without coordinates, on which its value does not depend. ValueError where it does."""
+    """Return the matrix without coordinates, if its value does not depend on them. ValueError if it does."""
     sympy = sympy_package()
     matrix = system.resolved(matrix)
     if system.is_constant(matrix):
@@ -126,7 +128,7 @@ def _constant(system: MechanicalSystem, matrix, what: str):
     for sample in sampled(system, {what: matrix, f"{what}, at zero": still}):
         moving, zero = (sample.values[name] for name in (what, f"{what}, at zero"))
         if largest(moving - zero) > _SAME * largest(zero):
-            raise ValueError(f"the {what} changes in time, so that it is no rigid body; state it in the frame of the body")
+            raise ValueError(f"the {what} changes in time, so the body is not rigid; state it in the frame of the body")
     return still
 
 
@@ -141,13 +143,13 @@ def _check_angular_velocity(system: MechanicalSystem, pose: Pose) -> None:
         omega = np.array([S[2, 1], S[0, 2], S[1, 0]])
         if largest(omega - sample.values[stated]) > _SAME * (1.0 + largest(omega)):
             raise ValueError(
-                f"frame `{pose.frame.name}` has another angular velocity than its orientation changes by; "
-                "check the kinematic equations, or state the angular velocity by `orient_axis` and its like alone"
+                f"frame `{pose.frame.name}` has an angular velocity that disagrees with its orientation; "
+                "check the kinematic equations, or let `orient_axis` and similar methods define the angular velocity"
             )
 
 
 def _moved(system: MechanicalSystem, poses: list[Pose]) -> tuple[MechanicalSystem, list[Pose]]:
-    """Positions whose rates are the stated velocities, by further coordinates where they are not yet."""
+    """Return positions whose rates are the given velocities, with further coordinates if necessary."""
     sympy = sympy_package()
     stated = [system.resolved(pose.centre.vel(system.frame).to_matrix(system.frame)) for pose in poses]
     places, speeds = ([f"{what} of body `{pose.name}`" for pose in poses] for what in ("position", "velocity"))

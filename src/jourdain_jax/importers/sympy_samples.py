@@ -1,4 +1,6 @@
-"""Numbers of SymPy's expressions at random states: by these it is seen what is constant, what is the rate of what, and which rows repeat others."""
+"""Values of SymPy expressions at random states, which show constants, rates of coordinates, and repeated
+constraints.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -75,7 +77,9 @@ def sampled(system: MechanicalSystem, lists: Mapping[str, Iterable[Any]], rows: 
 
 
 def affine(values: Callable[[dict], np.ndarray], leaves: dict[Any, float], speeds: Sequence[Any]) -> Float[np.ndarray, "rows columns"]:
-    """`[A b]` of rows A u + b, whose `values` at given leaves are known: the values at rest, and what each speed adds."""
+    """Return `[A b]` of rows A u + b from their `values` at given leaves: the values at rest, and the
+    increments by each speed.
+    """
     rest = leaves | dict.fromkeys(speeds, 0.0)
     b = values(rest)
     return np.stack([*(values(rest | {speed: 1.0}) - b for speed in speeds), b], axis=1)

@@ -1,4 +1,6 @@
-"""Scenes from SymPy's mechanics: poses, loads and rows are SymPy's expressions, evaluated on JAX; the equations of motion are those of this engine."""
+"""Scenes from SymPy's mechanics: poses, loads and constraints are SymPy expressions evaluated on JAX; the
+equations of motion are derived here.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -65,7 +67,7 @@ class SympyScene(Scene):
         return jnp.stack(self._expressions.values("rates", self, t, q, u)["rates"])
 
     def loads(self, motion):
-        """SymPy's loads; those that are constant have a potential."""
+        """Return SymPy's loads; constant ones have a potential."""
         kinds: dict[str, dict] = {"weight": {}, "force": {}, "torque": {}, "generalized": {}}
         for (kind, name), value in self._expressions.values("loads", self, motion.t, motion.q, motion.u, motion.inputs).items():
             kinds[kind][name] = value[0] if kind == "generalized" else jnp.stack(value)
@@ -84,7 +86,8 @@ class SympyScene(Scene):
 
 
 def from_sympy(system, origin=None, values: Mapping[Any, Any] | None = None, *, name: str = "SympyScene") -> type[Scene]:
-    """A class of scenes from the mechanics of SymPy: what moves, what pushes and what holds comes from there, the equations of motion from here.
+    """Return a class of scenes from SymPy's mechanics: poses, loads and constraints are imported, the
+    equations of motion are derived here.
 
         Pendulum = jj.from_sympy(kane, O, {m: 1.0, l: 0.5, g: 9.81})
         jj.simulate(Pendulum(), {"q": 0.3}, t1=5.0)
@@ -216,10 +219,10 @@ def _check_input(system: MechanicalSystem, x, of_poses: set[Any]) -> None:
     if isinstance(x, sympy_package().Derivative):
         speed = x.args[0] in system.speeds
         advice = "loads and rows may depend on speeds, not on their rates" if speed else f"make `{x.args[0]}` a coordinate or a speed"
-        raise ValueError(f"`{x}` occurs, and no kinematic equation gives it; {advice}")
+        raise ValueError(f"`{x}` occurs, but no kinematic equation determines it; {advice}")
     if x in of_poses:
         advice = "make it a coordinate; to drive it as a function of time, define `prescribed(self, t)` in a subclass"
-        raise ValueError(f"`{x}` occurs in a position, an orientation or a configuration constraint, and is neither coordinate nor speed; {advice}")
+        raise ValueError(f"`{x}` occurs in a position, an orientation or a configuration constraint, but is neither a coordinate nor a speed; {advice}")
 
 
 def _check_values(given: Mapping[str, float], names: set[str]) -> None:

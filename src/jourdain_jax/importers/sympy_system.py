@@ -1,4 +1,6 @@
-"""What is taken from SymPy's mechanics: coordinates, speeds, their kinematic equations, bodies, loads and rows; no equation of motion."""
+"""Parts imported from SymPy's mechanics: coordinates, speeds, kinematic equations, bodies, loads and
+constraints, but no equation of motion.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -30,7 +32,7 @@ class MechanicalSystem:
         return sympy_package().sympify(expression).xreplace(self.rates).xreplace(zero)
 
     def rates_of_configuration(self) -> tuple[Any, ...]:
-        """Rates of what vanishes, in those of the coordinates."""
+        """Return rates of configuration constraints, in rates of the coordinates."""
         return tuple(sympy_package().sympify(row).diff(self.time) for row in self.configuration)
 
     def with_coordinates(self, rates: dict[Any, Any]) -> "MechanicalSystem":
@@ -49,7 +51,9 @@ class MechanicalSystem:
 
 
 def mechanical_system(system, origin, given: Mapping[str, float]) -> MechanicalSystem:
-    """What a `KanesMethod`, a `JointsMethod` whose equations are formed, or a `System` of SymPy says. ValueError for anything else, and for what is missing."""
+    """Return the parts of a `KanesMethod`, a `JointsMethod` with formed equations, or a `System` of SymPy.
+    ValueError for anything else, and for missing parts.
+    """
     mechanics = sympy_package().physics.mechanics
     system = getattr(system, "method", None) or system  # of a JointsMethod
     if isinstance(system, mechanics.KanesMethod):
@@ -61,7 +65,7 @@ def mechanical_system(system, origin, given: Mapping[str, float]) -> MechanicalS
             f"`system` is {described(system)}, expected a `KanesMethod` or a `System` of sympy.physics.mechanics, or a `JointsMethod` after its `form_eoms()`"
         )
     if not isinstance(origin, mechanics.Point):
-        raise ValueError(f"`origin` is {described(origin)}, expected the point of SymPy that positions count from, such as Point('O')")
+        raise ValueError(f"`origin` is {described(origin)}, expected the point of SymPy that is the origin of positions, such as Point('O')")
     frame, rates, loads, *several = read(system)
     q, u, bodies, configuration, velocity, auxiliary = map(tuple, several)
     pairs = tuple((load[0], load[1]) for load in loads)
@@ -74,7 +78,7 @@ def _of_kane(kane) -> tuple:
     try:
         rates = kane.kindiffdict()
     except AttributeError:
-        raise ValueError("the `KanesMethod` has no kinematic equations; give it `kd_eqs=`, which say how speeds move coordinates") from None
+        raise ValueError("the `KanesMethod` has no kinematic equations; give it `kd_eqs=`, the rates of the coordinates in terms of the speeds") from None
     velocity = kane._k_nh * kane.u + kane._f_nh if kane._f_nh else ()
     return kane._inertial, rates, kane.forcelist or (), kane.q, kane.u, kane.bodies, kane._f_h, velocity, kane._uaux
 

@@ -1,4 +1,4 @@
-"""Links and joints as files of robots describe them: a tree of frames, each placed in that of its parent and moved by its joints.
+"""Links and joints of robot files: a tree of frames, each placed in its parent and moved by its joints.
 
 All numbers are known ones, in SI units and radians; rotation matrices take components in the link's frame to those in its parent's.
 """
@@ -14,7 +14,7 @@ Matrix = Float[np.ndarray, "3 3"]
 
 @dataclass(frozen=True)
 class Joint:
-    """How a link moves from where it is placed; `name` "" for the base."""
+    """The motion of a link from its place; `name` "" for the base."""
 
     name: str
     kind: str  # "hinge", "slide", "ball", "free" or "planar"
@@ -29,7 +29,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class Mass:
-    """What a link weighs."""
+    """The mass properties of a link."""
 
     mass: float  # kg
     centre: Vector  # m, mass centre in the link's frame
@@ -64,7 +64,9 @@ class Link:
 
 @dataclass(frozen=True)
 class Follower:
-    """A joint whose coordinate follows that of another, or stays where it is: `q - reference = sum of c_k (q_leader - its reference)^k`."""
+    """A joint whose coordinate follows that of another, or stays constant: `q - reference = sum of c_k
+    (q_leader - its reference)^k`.
+    """
 
     joint: str
     leader: str  # "" for none
@@ -94,7 +96,9 @@ class Push:
 
 @dataclass(frozen=True)
 class Motor:
-    """An input that pushes a hinge or slide with `gear` times its value, which is held between limits: those of the input first, then those of the force."""
+    """An input that drives a hinge or slide with `gear` times its value, limited first as an input, then as a
+    force.
+    """
 
     name: str
     joint: str  # "" where it pushes none

@@ -1,4 +1,4 @@
-"""Scenes of links and joints: poses by going through the tree, gravity, springs, dampers and motors of joints, looks."""
+"""Scenes of links and joints: poses along the tree, gravity, springs, dampers, motors, and shapes."""
 
 from functools import lru_cache
 from typing import Any, ClassVar
@@ -83,7 +83,7 @@ class TreeScene(Scene):
         return found
 
     def visuals(self, pose):
-        """Shapes of the file; those of links without a body stand in the inertial frame."""
+        """Return shapes of the file; those of links without a body are fixed in the inertial frame."""
         frames = self._frames(pose.q)
         found: dict[str, list[Visual]] = {}
         for link in self._tree.links:
@@ -168,7 +168,8 @@ def _about(axis, angle) -> Matrix3:
 
 
 def _in_plane(normal) -> Float[np.ndarray, "2 3"]:
-    """Two unit vectors in a plane: x and y where its normal is z, y and z where it is x, z and x where it is y."""
+    """Return two unit vectors in a plane: x and y if its normal is z, y and z if it is x, z and x if it is y.
+    """
     k = int(np.argmax(np.abs(normal)))
     if np.isclose(normal[k], 1.0):
         return np.eye(3)[[(k + 1) % 3, (k + 2) % 3]]
@@ -190,15 +191,16 @@ def _mesh(path: str) -> Any:
 
 
 def tree_scene(tree: Tree, source: str, ignore: tuple[str, ...]) -> type[Scene]:
-    """The class of scenes of a mechanism. ValueError, which names the `source`, where nothing moves, what moves weighs nothing, or moments are impossible.
+    """Return the class of scenes of a mechanism. ValueError, which names the `source`, if nothing moves, a
+    moving part has no mass, or moments are impossible.
 
     `ignore`: with "inertia" in it, such moments are taken as they are.
     """
     moving = tree.moving()
     if not moving:
-        raise ValueError(f'{source}: no joint moves anything; expected at least one that does, or a base that moves, such as base="free"')
+        raise ValueError(f'{source}: no joint moves a body; expected at least one moving joint, or a moving base, such as base="free"')
     _check_masses(tree, source, ignore)
-    check_names(tree.free, [link.name for link in tree.links], "`free` names `{}`, which is no link")
+    check_names(tree.free, [link.name for link in tree.links], "`free` names `{}`, which is not a link")
     joints = [joint for link in tree.links for joint in link.joints]
     link_names = identifiers([link.name for link in tree.links], "link")
     of_base = () if all(joint.name for joint in joints) else ("x", "y", "z", "heading", "attitude")
@@ -246,7 +248,9 @@ def _mass_parameters(link: Link, name: str) -> dict[str, Any]:
 
 
 def _check_masses(tree: Tree, source: str, ignore: tuple[str, ...]) -> None:
-    """A ValueError for a joint beyond which nothing has a mass, and for moments of inertia that no body has; those of links fixed to each other together."""
+    """Raise a ValueError for a joint that carries no mass, and for impossible moments of inertia; of links
+    fixed to each other together.
+    """
     heavy: set[str] = set()
     fixed: dict[str | None, list[Mass]] = {link.name: [] if link.mass is None else [link.mass] for link in tree.links} | {None: []}
     for link in reversed(tree.links):
@@ -259,7 +263,8 @@ def _check_masses(tree: Tree, source: str, ignore: tuple[str, ...]) -> None:
             heavy.add(link.parent)
         if link.joints and link.mass is None and link.name not in heavy:
             joint = link.joints[0].name or "the base"
-            raise ValueError(f"{source}: link `{link.name}`, which `{joint}` moves, has no mass, nor has any that it carries; give it an `inertial`")
+            raise ValueError(f"{source}: link `{link.name}`, which `{joint}` moves, has no mass, and neither "
+                "has any link that it carries; give it an `inertial`")
 
 
 def _check_moments(mass: Mass, what: str) -> None:
@@ -269,5 +274,5 @@ def _check_moments(mass: Mass, what: str) -> None:
         raise ValueError(
             f"{what} has principal moments of inertia {least:.4g}, {middle:.4g} and {largest:.4g} kg m^2, which no body has; expected none below zero, and the "
             f"largest at most the sum of the others (within {ROUNDED:.0%}): check signs, units and products of inertia, or give "
-            'ignore=("inertia",) to take them as they are'
+            'ignore=("inertia",) to accept them'
         )

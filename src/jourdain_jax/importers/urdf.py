@@ -64,7 +64,7 @@ def from_urdf(
     packages: Mapping[str, str] | None = None,
     ignore: Iterable[str] = (),
 ) -> type[Scene]:
-    """A class of scenes from a URDF file: its links are bodies, its joints coordinates.
+    """Return a class of scenes from a URDF file: its links are bodies, its joints coordinates.
 
         class Robot(jj.from_urdf("robot.urdf", base="planar", motors=["left_wheel", "right_wheel"])):
             def contacts(self, pose):
@@ -110,7 +110,7 @@ class _Reader:
             raise file.fault("it has no links")
         for name in self.locked:
             if name not in self.joints or _KINDS.get(self.joints[name].given.get("type", "")) not in ("hinge", "slide"):
-                raise ValueError(f"`locked` names `{name}`, which is no joint of one coordinate; {nearest(name, self.joints)}")
+                raise ValueError(f"`locked` names `{name}`, which is not a joint with one coordinate; {nearest(name, self.joints)}")
 
     def tree(self, base: str, motors: tuple[str, ...], free: tuple[str, ...]) -> Tree:
         """The whole mechanism."""
@@ -133,7 +133,7 @@ class _Reader:
             raise self.file.fault(f"link `{lost}` hangs in a loop of joints; a URDF is a tree, close loops by `geometric_constraints` in a subclass")
         joints = [joint for link in links for joint in link.joints]
         names = [joint.name for joint in joints if joint.kind in ("hinge", "slide")]
-        check_names(motors, names, "`motors` names `{}`, which is no joint of one coordinate")
+        check_names(motors, names, "`motors` names `{}`, which is not a joint with one coordinate")
         mimics = {joint.name: self.joints[joint.name].child("mimic") for joint in joints if joint.name}
         followers = tuple(self._follower(name, mimic, names) for name, mimic in mimics.items() if mimic.element is not None)
         pushed = tuple(Motor(f"{name}_motor", name) for name in motors)
@@ -143,7 +143,7 @@ class _Reader:
         link = joint.child(which).given.get("link")
         if link is None:
             raise self.file.fault(f"{joint.what} has no `{which}`; name a link")
-        self.file.check_name(link, self.links, f"{joint.what} has the {which} `{link}`, which is no link")
+        self.file.check_name(link, self.links, f"{joint.what} has the {which} `{link}`, which is not a link")
         return link
 
     def _link(self, name: str, label: str, parent: str) -> Link:
@@ -170,7 +170,7 @@ class _Reader:
     def _follower(self, name: str, mimic: Part, names: list[str]) -> Follower:
         leader = mimic.given.get("joint") or ""
         for end in (name, leader):
-            self.file.check_name(end, names, f"{mimic.what}: `{end}` is no joint of one coordinate")
+            self.file.check_name(end, names, f"{mimic.what}: `{end}` is not a joint with one coordinate")
         if leader == name:
             raise self.file.fault(f"joint `{name}` mimics itself; expected another joint")
         return Follower(name, leader, (mimic.number("offset", 0.0), mimic.number("multiplier", 1.0)))

@@ -1,4 +1,4 @@
-"""Reading XML: files, what each element may hold, numbers in attributes. What is left out is refused or listed, never passed over without a word."""
+"""Reading XML: files, contents of elements, numbers in attributes. Omitted contents are refused or listed."""
 
 import difflib
 import os
@@ -25,7 +25,7 @@ LARGEST = 100_000_000  # bytes of a file
 
 @dataclass(frozen=True)
 class Holds:
-    """What an element may hold, by name: names are separated by blanks."""
+    """Supported contents of an element, by name: names are separated by spaces."""
 
     read: str = ""  # attributes
     one: str = ""  # children, each at most once
@@ -37,7 +37,7 @@ class Holds:
 
 
 class XmlFile:
-    """A file of a robot while it is read: its root, where it lies, and what of it is left out."""
+    """A robot file during reading: its root, its location, and omitted parts."""
 
     def __init__(self, path, table: Mapping[str, Holds], format_name: str, ignore: Iterable[str]):
         """The file at `path`, or the text itself; `table`: what elements may hold, the root first. ValueError where it cannot be read or holds more."""
@@ -61,7 +61,9 @@ class XmlFile:
         self._check(self.root, f"`{root_tag}`", root_tag)
 
     def _include(self, holder: Element, known: set[Path]) -> None:
-        """Put what other files hold in place of elements `include`; ValueError for a file that is included twice, or in itself."""
+        """Replace elements `include` by the contents of other files; ValueError for a file that is included
+        twice, or in itself.
+        """
         for k, child in reversed(list(enumerate(holder))):
             if child.tag != "include":
                 self._include(child, known)
@@ -75,7 +77,9 @@ class XmlFile:
             holder[k : k + 1] = list(inner)
 
     def _check(self, element: Element, what: str, kind: str) -> None:
-        """A ValueError for anything in an element that the table does not have, unless it is to be ignored; `what`: the element, in words."""
+        """Raise a ValueError for anything in an element outside the table, unless it is to be ignored;
+        `what`: the element, in words.
+        """
         holds = self.table[kind]
         self.check_attributes(kind, element.attrib, what)
         self.check_text(element, what)
@@ -119,18 +123,20 @@ class XmlFile:
             raise ValueError(f'{self.source}: {what} is not read; {meant}{advice}, and give ignore=("{shortened(key)}",) to read the file without')
 
     def warn(self) -> None:
-        """A warning that lists what was left out, apart from what `ignore` names."""
+        """Warn of omitted elements, apart from those that `ignore` names."""
         counted = {what: count for what, count in sorted(self._left_out.items()) if what not in self.ignore}
         listed = [f"`{shortened(what)}`{f' ({count})' if count > 1 else ''}" for what, count in counted.items()]
         if listed:
-            warnings.warn(f"{self.source}: left out {', '.join(listed)}; `ignore` silences this", UserWarning, stacklevel=users_level())
+            warnings.warn(f"{self.source}: omitted {', '.join(listed)}; `ignore` silences this", UserWarning, stacklevel=users_level())
 
     def fault(self, what: str) -> ValueError:
         """The error of this file."""
         return ValueError(f"{self.source}: {what}")
 
     def check_name(self, name: str, valid: Iterable[str], what: str) -> None:
-        """The error of this file, which says `what` is wrong, unless the name is among the valid ones."""
+        """Raise the error of this file that describes `what` is wrong, unless the name is among the valid
+        ones.
+        """
         check_name(name, valid, f"{self.source}: {what}")
 
     def named(self, kind: str) -> "dict[str, Part]":
@@ -153,7 +159,9 @@ def _parsed(content: str | bytes, source: str) -> Element:
 
 
 class Part:
-    """An element while it is read: its attributes and children, and what it is called in messages; None stands for an element that is not there."""
+    """An element during reading: its attributes and children, and its name in messages; None stands for a
+    missing element.
+    """
 
     def __init__(self, file: XmlFile, what: str, element: Element | None, attributes: Mapping[str, str] | None = None):
         """`attributes`: where they are not those of the element alone."""
@@ -172,7 +180,9 @@ class Part:
         return Part(self.file, f"`{kind}` of {self.what}", next(iter(self.children(kind)), None))
 
     def numbers(self, word: str, count: int | None, default=None) -> Float[np.ndarray, "_"]:
-        """The numbers in an attribute, as many as `count` (None: any). `default` where there is no attribute; ValueError without one."""
+        """Return the numbers in an attribute, as many as `count` (None: any). `default` without the
+        attribute; ValueError without either.
+        """
         text, what = self.given.get(word), f"{word} of {self.what}"
         if text is None:
             if default is None:
@@ -199,7 +209,9 @@ class Part:
         return self.file.fault(f"{word} of {self.what} is {what}")
 
     def mass(self, mass: float, centre: Vector, inertia: Matrix, *, moved: bool) -> Mass | None:
-        """What an element weighs; None where it states zeros. ValueError for other masses that are not positive, but for those of 0 that no joint moves."""
+        """Return the mass properties of an element; None if it states zeros. ValueError for other masses that
+        are not positive, except zero masses that no joint moves.
+        """
         if mass == 0 and not np.any(inertia):
             return None
         if not mass > 0 and (moved or mass < 0):
@@ -207,7 +219,7 @@ class Part:
         return Mass(mass, centre, inertia)
 
     def colour(self) -> tuple[str | None, float]:
-        """Colour and opacity as `jj.Visual` takes them; those of a body where none is stated."""
+        """Return colour and opacity for `jj.Visual`; the body's defaults if none is stated."""
         if "rgba" not in self:
             return None, 1.0
         *levels, opacity = np.clip(self.numbers("rgba", 4), 0.0, 1.0)

@@ -40,7 +40,7 @@ class Strategy:
 
     @property
     def description(self) -> str:
-        """What was done, in words."""
+        """Description of the derivation."""
         way = "dependent speeds put in before differentiation" if self.explicit else "rows differentiated through the bodies' velocities"
         solved = "accelerations by determinants in normal form" if self.by_determinants else "accelerations by elimination"
         return f"{way}, {solved}"
@@ -111,7 +111,7 @@ class AppellOnGraph:
         return Equations(qdot, ydot, z, pivots, sorted(guards), power, events, resets, [T, V], directions, found.squares)
 
     def _of_state(self, resets: np.ndarray) -> list[int]:
-        """Return what events change of a state, without dependent speeds."""
+        """Return the changes of a state by events, without dependent speeds."""
         first = len(self.traced.q)
         return np.delete(resets, [first + k for k in self.dependent], axis=1).ravel().tolist() if resets.size else []
 
@@ -149,7 +149,8 @@ class AppellOnGraph:
         return moved, speeds
 
     def _power(self, k: "_Kinematics", ydot: list[int]) -> int:
-        """Power of loads without a potential and of potentials in time, and of rows that do work, of what drives poses, and of masses that change.
+        """Return the power of loads without a potential, of explicit time in potentials, of constraints that
+        do work, of prescribed poses, and of changing masses.
 
         `sum (m a - F).v + (I alpha + omega x I omega - L).omega - Q_direct.u + (mdot v.v + omega.(dI/dt omega))/2`
         """
@@ -190,7 +191,7 @@ class AppellOnGraph:
         return solve_symmetric(self.graph, M, [f]).solution[0]
 
     def _true_rates(self, kinematics: "_Kinematics", forms: NormalForms) -> tuple[list[int], list[int], list[int]]:
-        """Dependent speeds and rates at the true coordinates: those that do not depend on held ones are taken over, the others follow."""
+        """Return dependent speeds and rates at the true coordinates: rates independent of held ones are copied, the others recomputed."""
         g, at, u = self.graph, self.traced.at, self.traced.u.tolist()
         phi = [int(at.phi[s]) for s in self.rows]
         phi = g.substituted(phi, unaffected(self.identity_probes, [*phi, *at.qdot.tolist()], kinematics.held))
@@ -349,7 +350,7 @@ class _Kinematics:
         return a if self.graph.operations(a) <= self.graph.operations([*b]) else b
 
     def _cut(self, levels) -> dict[int, int]:
-        """Traced nodes with what stands for them (zero where nothing is given); numbers stay numbers."""
+        """Return traced nodes with their replacements (zero if none is given); numbers stay numbers."""
         pairs: dict[int, int] = {}
         for nodes, values in levels:
             flat = np.ravel(nodes).tolist()

@@ -1,4 +1,6 @@
-"""When two programs, or a program and dense matrices, have the same rates: at probes, relative to the usual size of each rate, where both serve."""
+"""Equality of the rates of two programs, or of a program and dense matrices: at probes where both are valid,
+relative to the typical size of each rate.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -23,12 +25,12 @@ def rates_of(found: Equations) -> list[int]:
 
 
 def values_at(found: Equations, probes: Probes) -> np.ndarray:
-    """Rates at all probes, NaN where a pivot is small: there the program does not serve."""
+    """Return rates at all probes, NaN where a pivot is small: there the program is not valid."""
     return np.where(pivots_ok(found.pivots, probes), probes(rates_of(found)), np.nan)
 
 
 def agree(values: np.ndarray, expected: np.ndarray) -> bool:
-    """Whether two programs agree wherever the second serves."""
+    """Return whether two programs agree wherever the second is valid."""
     usable = np.all(np.isfinite(expected), axis=0)
     # 1e-9 between programs at the probes, relative to the size of each rate
     return bool(enough(usable) and np.all(np.abs(values - expected)[:, usable] <= 1e-9 * _sizes(expected[:, usable])))
@@ -42,7 +44,9 @@ def _sizes(rates: np.ndarray) -> np.ndarray:
 
 
 def enough(usable: np.ndarray) -> bool:
-    """Whether a program serves at enough of the probed states; of long chains only some are assembled."""
+    """Return whether a program is valid at enough of the probed states; of long chains only some are
+    assembled.
+    """
     # at 12 probes programs can be compared, where so many were found
     return int(np.count_nonzero(usable)) >= min(12, max(4, len(usable) // 2))
 
@@ -69,7 +73,7 @@ def check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGra
     usable = usable[chosen] & np.all(np.isfinite(expected), axis=0)
     error = np.max(np.abs(values - expected)[:, usable] / _sizes(expected[:, usable]), axis=1, initial=0.0)
     if not enough(usable):
-        raise NotLowered("its scalar program serves at too few of the probed states")
+        raise NotLowered("its scalar program is valid at too few of the probed states")
     # between the program (in double precision) and the dense path at the probes, relative to the size of each rate
     limit = 1e-8 if real_type() == jnp.float64 else 1e-3
     if np.max(error) > limit:

@@ -1,4 +1,6 @@
-"""Contacts that switch, in normal forms: what they are made of is simplified once, and loads, events, resets and starts are rebuilt from it."""
+"""Normal forms of switching contacts: their parts are simplified once, and loads, events, resets and starts
+are rebuilt from them.
+"""
 
 from collections.abc import Callable
 
@@ -11,7 +13,9 @@ MOST_TERMS = (8, 60)  # of normal forms that are tried
 
 
 def simplify_contacts(traced: TracedScene, forms: Callable[[int], NormalForms]) -> None:
-    """Put normal forms in the place of `responses`; at states after others these are functions of those. `forms`: normal forms of at most so many terms."""
+    """Replace `responses` by normal forms; at states after others these are functions of those. `forms`:
+    normal forms of at most so many terms.
+    """
     g, at = traced.graph, traced.at
     state = [*traced.q.tolist(), *traced.u.tolist(), *traced.inputs.tolist()]
     first, *later = (row[len(state) :] for row in at.responses.tolist())

@@ -1,4 +1,4 @@
-"""Rates of a scene by dense matrices on NumPy, which a scalar program is compared with: derivatives are JAX's, of what JAX traced.
+"""Rates of a scene by dense matrices on NumPy, the reference of a scalar program, with JAX's derivatives.
 
     beta, gamma, A          derivatives of v, omega, phi along each speed
     a_0, alpha_0, drift     along (1, qdot, 0)
@@ -77,7 +77,7 @@ def _rates(functions: tuple[Callable, Callable], structure: Structure, independe
 
 
 def accelerations(M, f, A, drift, row_lengths: np.ndarray, rank: int) -> np.ndarray:
-    """Return udot of `M udot - A' lambda = f`, `A udot = -drift` at many states; NaN where it is not determined.
+    """Return udot of `M udot - A' lambda = f`, `A udot = -drift` at many states; NaN if it is not determined.
 
     `rank`: of the rows. No more count: at coordinates that were rounded to single precision, rows that depend on each other are independent by some 1e-8.
     """

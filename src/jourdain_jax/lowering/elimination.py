@@ -23,13 +23,15 @@ class Eliminated:
 
 
 def pivots_ok(pivots: list[int], probes: Probes | IdentityProbes) -> Bool[np.ndarray, "probes"]:
-    """The probes at which what was divided by these pivots is more than round-off: none of them is small beside its usual size."""
+    """Return the probes at which quotients by these pivots are accurate: no pivot is small relative to its
+    typical size.
+    """
     sizes = np.abs(probes(pivots))
     return np.all(sizes > SMALLEST_PIVOT * usual(sizes)[:, None], axis=0)
 
 
 def usual(sizes: Float[np.ndarray, "nodes probes"]) -> Float[np.ndarray, "nodes"]:
-    """The median of each over the probes at which it is a number; NaN where it is none at any."""
+    """Return the median of each over the probes with finite values; NaN if there are none."""
     known = np.any(~np.isnan(sizes), axis=1)
     found = np.full(len(sizes), np.nan)
     found[known] = np.nanmedian(sizes[known], axis=1)
@@ -62,7 +64,7 @@ def eliminate(graph: Graph, A: list[list[int]], right: list[list[int]], probes: 
 
 
 def quotient(graph: Graph, a: int, b: int) -> int:
-    """a/b, by the reciprocal of b where that is in the graph already."""
+    """Return a/b, by the reciprocal of b if that is in the graph already."""
     return graph.mul(a, graph.div(graph.one, b))
 
 

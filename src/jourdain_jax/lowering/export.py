@@ -1,4 +1,6 @@
-"""A lowered scene for people: a summary of what was done, and the program as Python, C, SymPy or LaTeX (functions of a `Lowered`)."""
+"""A lowered scene for readers: a summary, and the program as Python, C, SymPy or LaTeX (functions of a
+`Lowered`).
+"""
 
 import re
 
@@ -12,7 +14,9 @@ _ARGUMENTS = ("parameters", "t", "coordinates", "speeds", "inputs", "out")
 
 
 def summary(lowered) -> str:
-    """Operations after each step, what was dropped and why, the privileged speeds, pivots and guards, parameters with their units."""
+    """Return operations after each step, omitted parts with reasons, the privileged speeds, pivots and
+    guards, parameters with their units.
+    """
     lines = [
         f"Lowered equations of {lowered.scene_name}: {lowered.operations} operations for {len(lowered.qdot)} rates and {len(lowered.ydot)} accelerations",
         *(f"  {stage.operations:6d} operations: {stage.name}" for stage in lowered.stages),
@@ -44,7 +48,7 @@ def _shown(lowered, nodes) -> str:
 
 
 def _alone(graph, pivot: int) -> int:
-    """What a pivot is a multiple or the sign of."""
+    """Return the text that describes a pivot as a multiple or sign of another value."""
     args = graph.args[pivot]
     return next((a for a in args if graph.varies[a]), args[0]) if graph.op[pivot] in ("mul", "sign") else pivot
 
@@ -94,7 +98,7 @@ def _prefix(letter: str, names) -> str:
 
 
 def python_source(lowered) -> str:
-    """Two functions: what depends on parameters alone, and the rates."""
+    """Return two functions: values of parameters only, and the rates."""
     names, rates = identifiers(lowered), results(lowered)
     c, k, s = (_prefix(letter, names.values()) for letter in "cks")
     parameters = [names[int(n)] for nodes in lowered.traced.parameters for n in np.ravel(nodes)]

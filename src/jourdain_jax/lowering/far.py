@@ -1,5 +1,6 @@
-"""Probes outside the domain. Angles take any value, since a pivot that is large in the domain may vanish at another heading. Speeds lie on the velocity
-rows, since dependent rows have a solution only there.
+"""Probes outside the domain. Angles take any value, since a pivot that is large in the domain may vanish at
+another heading. Speeds satisfy the velocity constraints, since redundant constraints have a solution only
+there.
 """
 
 from collections.abc import Callable
@@ -15,7 +16,8 @@ from jourdain_jax.program.onto_rows import onto_rows
 
 
 def full_turns(probes: Probes, traced: TracedScene) -> Callable[[], Probes]:
-    """Probes with coordinates up to half a turn away from those given, put onto the geometric rows where Newton's method arrives; made when first asked for.
+    """Return probes with coordinates up to half a turn away from the given ones, projected onto the geometric
+    constraints where Newton's method converges; made on first use.
 
     Quaternions are drawn anew.
     """

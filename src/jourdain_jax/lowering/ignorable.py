@@ -1,4 +1,4 @@
-"""Which coordinates the privileged accelerations do not depend on, anywhere: they are held at the reference in the program."""
+"""Coordinates without influence on privileged accelerations, which the program holds at the reference."""
 
 from dataclasses import replace
 
@@ -16,8 +16,9 @@ FEW = 6  # probes that show most coordinates to count
 
 
 def _with_slopes(builder: AppellOnGraph, ydot: list[int], coordinates: list[int], regular: np.ndarray) -> set[int]:
-    """Coordinates (nodes) in which `sum w ydot` surely has a slope at some generic probe, however small: values do not show what is less than their round-off,
-    as the heading of the last of many trailers. Said of operations alone that are taken for what they are.
+    """Return coordinates (nodes) in which `sum w ydot` has a nonzero derivative at some generic probe, even
+    below the round-off of values, such as the heading of the last of many trailers. Considers only operations
+    that the identity test evaluates exactly.
     """
     graph, generic = builder.graph, builder.identity_probes
     inputs = [n for n in graph.reachable(ydot) if graph.op[n] == "input"]
@@ -48,7 +49,9 @@ def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expect
         return bool(np.all(equal(elsewhere(equations.ydot), here, regular & pivots_ok(equations.pivots, elsewhere))))
 
     def surely_changed(groups) -> np.ndarray:
-        """Which groups a few probes show to count, those of all groups evaluated together: in a long chain nearly all do."""
+        """Return groups that influence results at a few probes, evaluated all together: in a long chain
+        nearly all do.
+        """
         at = np.flatnonzero(regular)[:FEW]
         if len(groups) < FEW or not at.size or builder.graph.calls(equations.ydot):
             return np.zeros(len(groups), bool)

@@ -1,4 +1,5 @@
-"""Rows that are kept while all speeds stay in the state: by multipliers, or by privileged speeds where multipliers are not determined.
+"""Constraints kept while all speeds stay in the state: by multipliers, or by privileged speeds where
+multipliers are not determined.
 
 A udot = -drift:   udot = C ydot + c          by elimination of the dependent speeds, with as many rows as there are
 C' M C ydot = C' (f - M c)                                                                             (41)
@@ -29,13 +30,13 @@ class KeptRows:
         return "rows kept by multipliers, by elimination" + (", with inertia along the rows" if self.massless else "")
 
     def accelerations(self, M: Columns, f: list[int], A: Columns, drift: list[int], forms: NormalForms) -> Accelerations:
-        """The accelerations under all rows, and what must not vanish on the way."""
+        """Return the accelerations under all constraints, and the pivots."""
         if self.by_partition:
             return self._accelerations_by_partition(M, f, A, drift, forms)
         return accelerations_by_multipliers(self.graph, self._inertia(M, A), f, A, drift, self.probes, forms, affine=self.affine)
 
     def projected_speeds(self, M: Columns, u: list[int], phi: list[int], forms: NormalForms) -> list[int]:
-        """The speeds on `phi = 0`; where privileged speeds serve, these as they are."""
+        """Return the speeds on `phi = 0`; if privileged speeds are used, unchanged."""
         A = matrix(self.graph, phi, u)
         if not self.by_partition:
             return projected_speeds(self.graph, self._inertia(M, A), A, u, phi, forms)

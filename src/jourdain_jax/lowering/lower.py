@@ -1,5 +1,5 @@
-"""The lowered equations of a scene: candidates are built in several ways, compared with each other and with the dense path, and the
-one with the fewest operations is kept. A scene that cannot be lowered says why.
+"""The lowered equations of a scene: candidates are built in several ways and compared with each other and
+with dense matrices; the one with the fewest operations is kept. If lowering fails, the reason is reported.
 """
 
 import time
@@ -57,7 +57,8 @@ def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLower
 
 
 def lower(scene: Scene | BuiltFor, every_speed: bool | None = None) -> Lowered:
-    """The lowered equations of `scene`'s class: the scalar program that `simulate` and `rollout` integrate. Raises `NotLowered` with the reason.
+    """Return the lowered equations of `scene`'s class: the scalar program that `simulate` and `rollout`
+    integrate. Raises `NotLowered` with the reason.
 
     print(jj.lower(disc))                     operations after each step, what was dropped and why
     print(jj.lower(disc).python_source())     the equations, readable; also c_source(), expressions() and latex() (SymPy)
@@ -74,7 +75,7 @@ def lower(scene: Scene | BuiltFor, every_speed: bool | None = None) -> Lowered:
 
 @once_per_class
 def _lowered(scene: Scene, every_speed: bool, massless: bool, kept: tuple) -> Lowered | NotLowered:
-    """The program, which depends on what is `kept` of the structure, not on the values of parameters."""
+    """Return the program, which depends on the structure's `kept` part, not on the values of parameters."""
     begin = time.perf_counter()
     try:
         with np.errstate(all="ignore"):  # what is no number at a probe does not count there
@@ -86,12 +87,12 @@ def _lowered(scene: Scene, every_speed: bool, massless: bool, kept: tuple) -> Lo
 
 def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool) -> Lowered:
     if not (structure.affine or every_speed):
-        raise NotLowered("its rows are nonlinear in the speeds")
+        raise NotLowered("its constraints are nonlinear in the speeds")
     if structure.may_set_in:
         named = ", ".join(f"`{name}`" for name in structure.may_set_in)
-        raise NotLowered(f"rows {named} follow from the others at all probed states, but nothing says that they do elsewhere or later")
+        raise NotLowered(f"rows {named} are redundant at all probed states, but this could not be proved for others")
     if every_speed and structure.dependent_rows and not structure.well_conditioned:
-        raise NotLowered("its rows depend on each other, though none may be left out everywhere")
+        raise NotLowered("its constraints are redundant, but none can be omitted at all configurations")
     try:
         traced = traced_scene(scene, structure.potentials_of_inputs)
         if traced.effects:
@@ -109,13 +110,13 @@ def _built(scene: Scene, structure: Structure, every_speed: bool, massless: bool
     except Unsupported as reason:
         raise NotLowered(f"{reason} has no scalar form") from None
     except ZeroDivisionError:
-        raise NotLowered("its rows are dependent in a way that no elimination order avoids") from None
+        raise NotLowered("its constraints are redundant for every order of elimination") from None
 
 
 def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
-    """Configurations on the geometric rows, random and symmetric ones, as the structure was found at, with any speeds, and parameters off their values,
-    so that what is zero or equal by chance does not count: larger by up to a tenth; smaller, or by less, where the scene has no numbers there, or moments of
-    inertia that no body has.
+    """Return configurations on the geometric constraints, random and symmetric ones, with any speeds, and
+    parameters off their values, so that accidental zeros and equalities do not count: larger by up to a
+    tenth; smaller, or by less, where the scene would be undefined, or moments of inertia impossible.
     """
     generator = np.random.default_rng(1)
     # 56 probes at most
@@ -148,7 +149,7 @@ def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
 
 
 def _least_moments(traced: TracedScene, probes: Probes) -> Float[np.ndarray, "probes bodies"]:
-    """The smallest principal moment of each body at each probe; NaN where it is none."""
+    """Return the smallest principal moment of each body at each probe; NaN if it is undefined."""
     I = np.moveaxis(probes(traced.at.inertia.ravel().tolist()).reshape(-1, 3, 3, probes.count), -1, 0)
     known = np.all(np.isfinite(I), axis=(2, 3))
     return np.where(known, np.linalg.eigvalsh(np.where(known[..., None, None], I, 0.0))[..., 0], np.nan)
@@ -238,13 +239,16 @@ def _check_resets(scene: Scene, builder: AppellOnGraph, found: Equations) -> Non
             speeds = scene.speed_names.entries
             free, tied = (", ".join(f"`{speeds[k]}`" for k in which) for which in (builder.independent, builder.dependent))
             raise ValueError(
-                f"event `{name}` of `{type(scene).__name__}` moves speeds against the velocity rows, by which {tied} follow from {free}; give all of them "
-                "values that satisfy the rows, or state the independent ones as `privileged`"
+                f"event `{name}` of `{type(scene).__name__}` sets speeds that violate the velocity constraints, "
+                f"by which {tied} follow from {free}; give values for all of them "
+                "that satisfy the constraints, or state the independent ones as `privileged`"
             )
 
 
 def _divisors(graph: Graph, qdot: list[int]) -> list[int]:
-    """What the rates of coordinates are divided by, as in w/sin q; a choice by `where` keeps away from zero itself."""
+    """Return divisors in the rates of coordinates, as in w/sin q; a choice by `where` keeps away from zero
+    itself.
+    """
     nodes = [n for n in graph.reachable(qdot) if graph.varies[n]]
     found = [graph.args[n][1] for n in nodes if graph.op[n] == "div"]
     found += [graph.call("cos", *graph.args[n]) for n in nodes if graph.op[n] == "tan"]
@@ -252,7 +256,7 @@ def _divisors(graph: Graph, qdot: list[int]) -> list[int]:
 
 
 def _strategies(builder: AppellOnGraph, held: tuple[int, ...], small: bool, plainly: int) -> Iterator[Strategy]:
-    """What is worth trying; `plainly`: operations without normal forms.
+    """Yield strategies worth trying; `plainly`: operations without normal forms.
 
     Over all models, with all speeds and without, nothing else took fewer operations (twelve were tried).
     """
@@ -269,17 +273,19 @@ def _strategies(builder: AppellOnGraph, held: tuple[int, ...], small: bool, plai
 
 
 def _relative(graph: Graph, probes: Probes, pivots: list[int]) -> list[int]:
-    """Pivots over what each of them is, for the same parameters, at a probed state; signs of those that never vary."""
+    """Return pivots relative to their values, for the same parameters, at a probed state; signs of those that
+    never vary.
+    """
     return [graph.div(n, probes.in_the_middle(n)) if graph.varies[n] else graph.call("sign", n) for n in pivots]
 
 
 def _operands(graph: Graph, call: int) -> list[int]:
-    """The scalars that a call is given, those that other calls compute left out."""
+    """Return the scalar operands of a call, without those that other calls compute."""
     return [n for a in graph.args[call] if graph.op[a] == "array" for n in graph.args[a]]
 
 
 def _with_equal_calls_once(generic: IdentityProbes, outputs: list[int]) -> list[int]:
-    """The outputs, with one call in place of those that compute the same of what is equal, though it is not written in the same way."""
+    """Merge calls that compute equal values."""
     graph = generic.graph
     calls = sorted(graph.calls(outputs), key=lambda call: (graph.operations(graph.args[call]), call))  # so none is replaced by one made from it
     kept: dict = {}

@@ -1,4 +1,4 @@
-"""The lowered equations of a scene: which program was chosen, what it computes, and how it runs in JAX."""
+"""The lowered equations of a scene: the chosen program, its outputs, and its execution in JAX."""
 
 import functools
 import importlib.util
@@ -21,7 +21,7 @@ from jourdain_jax.scene.scene import Scene
 
 
 class NotLowered(Exception):
-    """Why a scene is not lowered."""
+    """The reason why a scene is not lowered."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Lowered:
         return self.graph.operations([*self.qdot, *self.ydot])
 
     def summary(self) -> str:
-        """Operations after each step, what was dropped and why, the chosen privileged speeds."""
+        """Operations after each step, omitted parts with reasons, the chosen privileged speeds."""
         return export.summary(self)
 
     def __str__(self) -> str:
@@ -117,7 +117,9 @@ class Lowered:
         return "$$\\begin{aligned}\n" + self.latex() + "\n\\end{aligned}$$"
 
     def fixed_values(self, scene: Scene) -> tuple[Num[Array, "..."], ...]:
-        """The values of what depends on parameters alone, for the parameters of `scene`; computed once per motion."""
+        """Return the values that depend on parameters only, for the parameters of `scene`; computed once per
+        motion.
+        """
         place = {int(n): (k, i) for k, nodes in enumerate(self.traced.parameters) for i, n in enumerate(np.ravel(nodes))}
         leaves = [jnp.reshape(leaf, -1) for leaf in jax.tree.leaves(scene)]
         known: dict = {}
@@ -133,7 +135,8 @@ class Lowered:
         return tuple(jnp.asarray(x) for x in run(self.graph, self.fixed, known))
 
     def rates(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple[tuple, tuple, PerLane | None]:
-        """`qdot` and `ydot`, tuples of scalars, and the power (W) where `with_power` asks for it; NaN where a guard is not positive.
+        """Return `qdot` and `ydot`, tuples of scalars, and the power (W) if `with_power`; NaN where a guard
+        is not positive.
 
         `fixed`: from `fixed_values`; `q`, `y`: coordinates and privileged speeds, one scalar (or array of lanes) each; `inputs`: a vector.
         """
@@ -163,14 +166,14 @@ class Lowered:
         return [*self.fixed, traced.t, *state, *map(int, traced.inputs)]
 
     def speeds_and_pivot(self, fixed, t, q: Sequence, y: Sequence, inputs) -> tuple[Float[Array, "speeds *lanes"], PerLane]:
-        """All speeds, and the smallest pivot: it changes sign where the elimination does not serve.
+        """Return all speeds, and the smallest pivot: it changes sign where the elimination fails.
 
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
         """
         return self.all_speeds(fixed, t, q, y, inputs), smallest_pivot(self.values(self.pivots, fixed, t, q, y, inputs))
 
     def all_speeds(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "speeds *lanes"]:
-        """Return the speeds of the state and those that follow from them. `fixed`, `q`, `y`, `inputs`: as in `rates`."""
+        """Return the integrated speeds and the dependent ones. `fixed`, `q`, `y`, `inputs`: as in `rates`."""
         every = [*y, *self.values(self.z, fixed, t, q, y, inputs)]
         return jnp.stack([every[i] for i in np.argsort([*self.independent, *self.dependent])])
 
@@ -179,7 +182,8 @@ class Lowered:
         return self.values(self.energies, *jax.lax.stop_gradient((fixed, t, q, y, inputs)))
 
     def projected(self, fixed, t, q: Sequence, y: Sequence, inputs, affine: bool) -> tuple[tuple, tuple]:
-        """Coordinates and integrated speeds put back onto the rows; `affine`: rows are, so that one step is exact for the speeds.
+        """Project coordinates and integrated speeds onto the constraints; `affine`: they are affine, so that
+        one step is exact for the speeds.
 
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
         """
@@ -195,7 +199,9 @@ class Lowered:
         return q, jax.lax.scan(lambda y, _: (step(self.projected_u, q, y), None), tuple(y), length=1 if affine else 2)[0]
 
     def watched(self, has_events: bool) -> tuple[int, ...]:
-        """The numbers whose signs are watched over every step, in the rates and, where it `has_events`, in those."""
+        """Return the numbers whose signs are monitored over every step, in the rates and, if it `has_events`,
+        in the events.
+        """
         return (*self.relations, *(self.event_relations if has_events else ()))
 
     def values(self, nodes: Sequence[int], fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "nodes *lanes"]:
@@ -213,7 +219,9 @@ class Lowered:
 
     @property
     def calls(self) -> tuple[str, ...]:
-        """Why each call of JAX in the rates and stop events is one: a part of a load or event that has no scalar form."""
+        """Reasons for each call of JAX in the rates and stop events: a part of a load or event without a
+        scalar form.
+        """
         return tuple(self.graph.value[n].reason for n in self.graph.calls([*self.qdot, *self.ydot, *self.events]))
 
 

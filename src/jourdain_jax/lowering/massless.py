@@ -1,4 +1,4 @@
-"""Whether the inertias of a scene are singular for parameters in use, or for those that traced ones may stand for."""
+"""Singular inertias of a scene, for its parameters or for the values that traced ones may take."""
 
 from dataclasses import fields
 
@@ -12,7 +12,8 @@ from jourdain_jax.scene.scene import Scene
 
 
 def may_be_massless(scene: Scene, structure: Structure) -> bool:
-    """Whether M is singular at the parameters of `scene`, or with zero for those traced ones that need not be positive.
+    """Return whether M is singular at the parameters of `scene`, or with zero for those traced ones that need
+    not be positive.
 
     These are parameters declared `non_negative` and those whose default is zero; where privileged speeds serve, so that it costs nothing, all that are not
     declared `positive`.
@@ -29,7 +30,7 @@ def may_be_massless(scene: Scene, structure: Structure) -> bool:
 
 
 def _with_zeros(scene: Scene, every: bool) -> Scene | None:
-    """Numbers for the scene's parameters, with all zeros that may be; None where there are none."""
+    """Return numbers for the scene's parameters, with all permitted zeros; None if there are none."""
     may_vanish = {f.name for f in fields(scene) if (every and not f.metadata.get("positive")) or f.metadata.get("non_negative") or np.array_equal(f.default, 0)}
     given, treedef = jax.tree_util.tree_flatten_with_path(scene)
     zeros = [is_traced(x) and jax.tree_util.keystr(path[:1]).strip(".") in may_vanish for path, x in given]

@@ -1,4 +1,4 @@
-"""Rows kept by multipliers, and states put back onto rows, on the graph; all speeds stay in the state.
+"""Constraints kept by multipliers, and projected states, on the graph; all speeds stay in the state.
 
     M udot = f + A' lambda,   A udot = -drift          S lambda = -(drift + A M^-1 f),   S = A M^-1 A'
     q <- q - G' (G G')^-1 g(t, q)                      one step of Gauss-Newton; G = dg/dq
@@ -28,7 +28,7 @@ Columns = list[list[int]]
 
 
 class Accelerations(NamedTuple):
-    """Nodes of the solution, and of what must not vanish on the way."""
+    """Nodes of the solution, and of its pivots."""
 
     udot: list[int]
     sines: list[int]  # one per row, between that row and those before it; or the pivots of privileged speeds
@@ -40,7 +40,9 @@ class Accelerations(NamedTuple):
 def accelerations_by_multipliers(
     graph: Graph, M: Columns, f: list[int], A: Columns, drift: list[int], probes: Probes, forms: NormalForms, *, affine: bool
 ) -> Accelerations:
-    """The accelerations under all rows; `probes` give the sizes by which entries are judged; `affine`: whether rows are, in the speeds."""
+    """Return the accelerations under all constraints; `probes` give the typical sizes of entries; `affine`:
+    whether constraints are affine in the speeds.
+    """
     *impulses, free = (list(column) for column in solve_symmetric(graph, M, [*A, f]).solution)  # M^-1 A' column by column, M^-1 f
     S = _products(graph, A, impulses, forms)
     for r in range(len(A)):

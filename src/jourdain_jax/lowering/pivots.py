@@ -1,4 +1,4 @@
-"""What a linear system of nodes is eliminated by: pivots that are large wherever the system itself is regular.
+"""Pivots for eliminating a linear system of nodes: large wherever the system itself is regular.
 
 A pivot that is a number or depends on parameters alone cannot vanish on the way and is taken first; the others are judged by the smallest
 value they take, relative to their row, at all probes. Among good pivots the one that fills in least is taken. Where only entries that may
@@ -39,7 +39,7 @@ class Pivot:
 
 @dataclass(frozen=True)
 class _Entry:
-    """What a place promises as a pivot."""
+    """The quality of a place as a pivot."""
 
     worst: float  # of its row, at the worst probe
     fixed: bool  # it depends on parameters alone
@@ -131,7 +131,7 @@ class Pivots:
         return self._judged[row]
 
     def _is_fixed(self, node: int) -> bool:
-        """Whether a node depends on parameters alone, none of which turns it through zero."""
+        """Return whether a node depends on parameters only, and no parameter changes its sign."""
         graph = self.graph
         return not graph.varies[node] and (graph.is_const(node) or not any(turns(graph, n) for n in graph.reachable([node])))
 
@@ -180,13 +180,15 @@ class Pivots:
         return near if self._far is None else np.concatenate([near, self._far()(nodes)], axis=1)
 
     def _size(self, row: int) -> np.ndarray:
-        """The size of what a row was made of, at all probes."""
+        """Return the size of the terms of a row, at all probes."""
         if row not in self._sizes:
             self._sizes[row] = largest(self._at(self.A[row]), 0)
         return self._sizes[row]
 
     def _sizes_at(self, places, count: int | None = None) -> np.ndarray | None:
-        """What entries are compared with besides their row, at the first probes; None where a row that vanishes makes the system singular anyway."""
+        """Return reference sizes of entries besides their row, at the first probes; None if a vanishing row
+        makes the system singular anyway.
+        """
         if not self._tall:
             return None
         return np.stack([np.fmax(self._size(r), np.nanmedian(self._size(r)))[:count] for r, _ in places])
@@ -194,7 +196,9 @@ class Pivots:
     # two rows and two columns
 
     def _best_pair(self) -> Pivot | None:
-        """Two rows and columns whose determinant depends on parameters alone, with the least fill-in; None where there are none."""
+        """Return two rows and columns whose determinant depends on parameters only, with the least fill-in;
+        None if there are none.
+        """
         graph, A = self.graph, self.A
         used = {r: set(self._in_row(r)) for r in self.rows}
         users: dict[int, list[int]] = {c: [] for c in self.columns}
@@ -228,7 +232,9 @@ class Pivots:
     # rows combined
 
     def _by_column(self, single: tuple[int, int]) -> Pivot:
-        """One column by all rows that hold it, combined; the entry at the place `single` where that is no better."""
+        """Return one column combined from all rows that contain it; the entry at the place `single` if that
+        is no better.
+        """
         graph, A, regular = self.graph, self.A, self._regular
         found = []
         for c in sorted(self.columns):

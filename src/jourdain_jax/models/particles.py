@@ -1,4 +1,6 @@
-"""Single particles under one row: sheets that bend paths, and a row that is nonlinear in the velocities."""
+"""Single particles with one constraint: sheets that bend paths, and a constraint that is nonlinear in the
+velocities.
+"""
 
 import jax.numpy as jnp
 

@@ -1,4 +1,6 @@
-"""Pendulums of particles in a vertical plane: in angles, or in Cartesian coordinates with rods as geometric rows."""
+"""Pendulums of particles in a vertical plane: in angles, or in Cartesian coordinates with rods as geometric
+constraints.
+"""
 
 import equinox as eqx
 import jax.numpy as jnp

@@ -48,12 +48,12 @@ def model(name: str, **parameters) -> Scene:
 
 
 def known_model(name: str) -> type[Scene]:
-    """The class of a model; a ValueError with the nearest name where there is none."""
+    """Return the class of a model; a ValueError with the nearest name if there is none."""
     if not isinstance(name, str) or name not in MODELS:
         raise ValueError(f"unknown model `{name}`; {nearest(name, MODELS)}")
     return MODELS[name]
 
 
 def counts_of(kind: type[Scene]) -> tuple[str, ...]:
-    """Names of the whole numbers that decide what a scene consists of, such as a number of links."""
+    """Return names of the whole numbers that decide the structure of a scene, such as a number of links."""
     return tuple(field.name for field in fields(kind) if field.metadata.get("static") and isinstance(field.default, int))

@@ -1,4 +1,4 @@
-"""Single bodies that turn, without weight."""
+"""Single rotating bodies without weight."""
 
 import jax.numpy as jnp
 

@@ -28,7 +28,7 @@ from jourdain_jax.scene.visuals import Visual
 
 
 class _TwoWheelAxle(Scene):
-    """What the four scenes share: the parameters, a wheel, the weight, the known integrals."""
+    """Shared parts of the four scenes: the parameters, a wheel, the weight, the known integrals."""
 
     radius: Parameter = parameter(0.3, unit="m", positive=True, about="a, of the wheels")
     length: Parameter = parameter(0.8, unit="m", positive=True, about="l, of the axle")

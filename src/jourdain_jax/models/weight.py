@@ -1,4 +1,4 @@
-"""The load of models on which weight alone acts."""
+"""The load of models with weight only."""
 
 from jourdain_jax.scene.loads import gravity
 from jourdain_jax.scene.scene import Scene

@@ -1,4 +1,4 @@
-"""Likely mistakes of a scene in one table: it can be computed, but is hardly meant.
+"""Likely mistakes of a scene, in one table: computable, but hardly intended.
 
 smoothness        poses, rows and rates of coordinates that jump, or whose velocities do, on lines through states of the domain
 grounds           what the ground of a contact does, and what is stated of it
@@ -21,7 +21,9 @@ from jourdain_jax.scene.scene import Scene
 
 @dataclass(frozen=True, repr=False)
 class Checked(Printed):
-    """Findings of `check`: subject -> sentences on what looks wrong, none where all is plausible. Printed as a table."""
+    """Findings of `check`: subject -> sentences on likely mistakes, none if all is plausible. Printed as a
+    table.
+    """
 
     scene: str
     found: dict[str, tuple[str, ...]]
@@ -39,7 +41,8 @@ class Checked(Printed):
 @shown_from_users_lines
 @of_known_numbers
 def check(scene: Scene | BuiltFor) -> Checked:
-    """Look for likely mistakes of a scene: kinks and jumps, grounds that other bodies carry, impossible bodies, a program that differs from JAX.
+    """Check a scene for likely mistakes: kinks and jumps, grounds that other bodies carry, impossible bodies,
+    a program that differs from JAX.
 
         print(jj.check(scene))
 

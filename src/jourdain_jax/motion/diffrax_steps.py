@@ -1,5 +1,5 @@
-"""Solvers of diffrax: `diffrax.diffeqsolve` of a scene's rates as it is, with its step-size control, its events and its adjoints: `ForwardMode` in forward
-mode, `RecursiveCheckpointAdjoint` in reverse mode.
+"""Solvers of diffrax: `diffrax.diffeqsolve` of a scene's rates, with its step-size control, events and
+adjoints (`ForwardMode`, `RecursiveCheckpointAdjoint`).
 
 Steps end at the saved times (`step_ts`) and at knots of the inputs (`jump_ts`), and are no longer than `max_step` (`dtmax`). States are put onto the rows where
 they are saved, not after each step; one that has left them by more than errors of its steps explain ends in a result code. A stop event is one that has
@@ -155,11 +155,11 @@ def check(setup: Setup) -> None:
     """Raise ValueError where the scene does work, which solvers of diffrax do not integrate; warn where it has relations, which they do not watch."""
     name, solver = type(setup.scene).__name__, setup.integrator.name
     if not all(setup.field.stops):
-        raise ValueError(f"solver=diffrax.{solver}() does not go on after events of `{name}`; omit `solver`")
+        raise ValueError(f"solver=diffrax.{solver}() cannot continue after events of `{name}`; omit `solver`")
     if setup.field.with_work:
         raise ValueError(
-            f"solver=diffrax.{solver}() does not integrate the work that no potential of `{name}` accounts for; "
-            "give work=False, or omit `solver`: the default one integrates it"
+            f"solver=diffrax.{solver}() cannot integrate the work of loads of `{name}` without a potential; "
+            "give work=False, or omit `solver`: the default solver integrates it"
         )
     if reason_against_watching(setup):
         text = f"diffrax.{solver} does not watch the relations that loads or events of `{name}` have: it may step over them; the default solver does"

@@ -1,4 +1,4 @@
-"""What `build` finds about a scene, in words: its rows, freedoms, what depends on time, and what is conserved."""
+"""The findings of `build`, in words: constraints, freedoms, time dependence, conserved quantities."""
 
 from dataclasses import dataclass
 
@@ -34,7 +34,7 @@ class Freedoms:
 
 @dataclass(frozen=True)
 class Dependence:
-    """What depends on time by itself, and what changes along the motion."""
+    """Explicit dependence on time, and quantities that change along the motion."""
 
     on_time: tuple[str, ...]  # rows, poses, inertias, coordinate rates, loads, potential
     driven: bool  # bodies move while all speeds are zero
@@ -44,7 +44,7 @@ class Dependence:
 
 @dataclass(frozen=True)
 class Conserved:
-    """What stays as it is along a motion."""
+    """Conserved quantities of a motion."""
 
     energy: bool  # kinetic and potential energy together, without integrated work
     ignorable: tuple[str, ...]  # coordinates that no acceleration depends on; empty where there is no scalar program

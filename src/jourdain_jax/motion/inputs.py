@@ -1,4 +1,4 @@
-"""Inputs of a scene as functions of time: constants, callables by name, or samples with linear interpolation in between.
+"""Inputs of a scene as functions of time: constants, callables by name, or linearly interpolated samples.
 
 Functions of time are looked at anew in every call, their numbers kept apart from what is done with them.
 A function is traced where it is handed over. What it closes over (arrays, traced numbers) and the plain numbers in its sums, products, quotients and
@@ -68,7 +68,7 @@ class TimeProgram:
 
     @property
     def shapes(self) -> list[tuple[int, ...]]:
-        """The shapes of the arguments before the time: the plain numbers, and what the function closes over."""
+        """Return the shapes of the arguments before the time: the plain numbers, and the captured values."""
         return [x.shape for x in self.closed.in_avals[:-1]]
 
     def __call__(self, numbers, held, t):
@@ -106,12 +106,12 @@ class FunctionOfTime(eqx.Module):
     held: tuple
 
     def __call__(self, t):
-        """Value at time t."""
+        """Return the value at time t."""
         return self.program(self.numbers, self.held, t)
 
 
 def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
-    """A function of one time as it is now, and the shape of what it returns; no `FunctionOfTime` where that is not one number.
+    """Return a function of one time at its present values, and the shape of its result; None unless it is a number.
 
     It is traced again where it is another function, or what it reads (`scene/identity.py`) has changed or has state.
     """
@@ -136,7 +136,7 @@ def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
 
 
 class _Trace:
-    """The last trace of a function that is given again, and what it read then; of one that is given once, as most in loops are, its program alone is kept."""
+    """The last trace of a function, and the values it read then."""
 
     def __init__(self) -> None:
         self.again = False
@@ -151,12 +151,12 @@ def _trace(function: Callable) -> _Trace:
 
 
 def for_programs(f: Callable, options: Callable | None = None) -> Callable[[Hashable], Callable]:
-    """`f` compiled for a set of input programs; what was compiled for one is dropped, machine code included, when as many other sets were used since."""
+    """Return `f` compiled for a set of input programs; the least recently used is dropped."""
     return lru_cache(maxsize=16)(lambda programs: compiled(f, options))
 
 
 class Sampled(eqx.Module):
-    """An input as `values` at given times `ts` (s, increasing), linear in between, constant beyond the ends.
+    """An input with `values` at given times `ts` (s, increasing), linear between, constant beyond.
 
     Steps end at its knots, so that no feature is passed over, however short: a blow of 1 ms in a motion of 10 s is felt at any tolerance. Knots at which the
     values are on a straight line, to within a tenth of `rtol` (at most 1e-5) of their range, do not count. Samples of something rough cost a step each.
@@ -185,7 +185,7 @@ class Constant(eqx.Module):
 
 
 class Mode(eqx.Module):
-    """A mode: the number of its value at the start, and of those after each transition of a motion."""
+    """A mode: the number of its value at the start, and after each transition."""
 
     value: Float[Array | np.ndarray, ""]
     ts: Float[Array, "transitions"] | None = None  # s, times the direction of time; infinite after the last one
@@ -216,7 +216,7 @@ class Inputs(eqx.Module):
 
     @property
     def programs(self) -> tuple:
-        """What is done with time, of the channels that are functions."""
+        """Return the operations on time of the channels that are functions."""
         return tuple(channel.program for channel in self.channels if isinstance(channel, FunctionOfTime))
 
     def near(self, t) -> ChangingInputs:
@@ -227,7 +227,7 @@ class Inputs(eqx.Module):
         except (ValueError, TypeError, NotImplementedError) as error:
             said = str(error).splitlines()[0]
             raise ValueError(
-                f"rows depend on inputs, whose rates the accelerations need, but one of them cannot be differentiated ({said}); give it as `jj.Sampled`"
+                f"constraints depend on inputs, whose rates the accelerations need, but one of them cannot be differentiated ({said}); give it as `jj.Sampled`"
             ) from None
         return ChangingInputs(t, values, rates)
 
@@ -235,7 +235,7 @@ class Inputs(eqx.Module):
 def in_phases(
     inputs: Inputs, ts: Float[Array, "transitions"], modes: Float[Array | np.ndarray, "modes transitions"], direction
 ) -> Inputs:
-    """Return inputs whose modes change after each transition of a motion, of which those that did not happen have no finite time."""
+    """Return inputs whose modes change after each transition, at infinity if it did not happen."""
     if not len(modes):
         return inputs
     ts = jnp.where(jnp.isfinite(ts), ts * direction, jnp.inf)
@@ -279,7 +279,7 @@ def _as_channel(f: Callable, where: str) -> Callable:
 
 
 def as_inputs(scene: Scene, given) -> Inputs:
-    """Inputs from a dictionary of name -> number, function of time or `Sampled`; what is not named is zero."""
+    """Return inputs from a dictionary of name -> number, function of time or `Sampled`; default zero."""
     if isinstance(given, Inputs):
         if len(given.channels) != len(scene.inputs):
             raise ValueError(f"`inputs` has {len(given.channels)} channels, but `{type(scene).__name__}` has {len(scene.inputs)} inputs; give them by name")
@@ -308,11 +308,11 @@ def as_inputs(scene: Scene, given) -> Inputs:
 
 
 def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
-    """A ValueError that names an input on which velocity rows depend and which jumps between the times t0 and t1; nothing where one of these is traced."""
+    """Raise a ValueError for an input of velocity constraints that jumps between t0 and t1."""
     traced = looked_at(scene).traced
     for name, node in zip(scene.inputs.entries, traced.inputs.tolist(), strict=True):
         if name in dict(scene.modes.pairs) and any(depend_on(traced.graph, traced.at.phi.tolist(), [node])):
-            raise ValueError(f"rows of `{type(scene).__name__}` depend on mode `{name}`; a row holds in all modes, loads and potentials may switch")
+            raise ValueError(f"rows of `{type(scene).__name__}` depend on mode `{name}`; only loads and potentials may switch")
     if not structure_of(scene).rows_of_inputs or is_traced(scene, inputs, t0, t1):
         return
     for name, node, channel in zip(scene.inputs.entries, traced.inputs.tolist(), inputs.channels, strict=True):
@@ -322,7 +322,7 @@ def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
             values, ts = uncompiled_lanes(channel), np.linspace(float(t0), float(t1), 257)[:, None]
             for _, _, behind in jumps(lambda t, values=values: np.asarray(values(t[:, 0]), float)[:, None], ts[:-1], ts[1:]):
                 raise ValueError(
-                    f"input `{name}` of `{type(scene).__name__}` jumps at t = {behind[0]:.6g} s, and velocity rows depend on it: {SPEEDS_WOULD_JUMP}"
+                    f"input `{name}` of `{type(scene).__name__}` jumps at t = {behind[0]:.6g} s, but velocity constraints depend on it: {SPEEDS_WOULD_JUMP}"
                 )
 
 
@@ -391,7 +391,7 @@ class SeenFromWithin(eqx.Module):
 
 
 def seen_from_within(inputs: Inputs, middle: PerLane) -> Inputs:
-    """`inputs` whose samples are looked at in a step with this middle (s); infinite where there is no step yet."""
+    """Return `inputs` with samples as seen inside a step with this middle (s); infinite: no step yet."""
 
     def within(channel):
         sampled = channel.sampled if isinstance(channel, SeenFromWithin) else channel

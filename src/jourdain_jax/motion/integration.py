@@ -61,17 +61,19 @@ _compiled = for_programs(_one_motion, lambda setup: None if setup.reason_against
 
 
 def _numbers(setup: Setup) -> dict:
-    """What a motion is differentiated with respect to."""
+    """Return the numbers with respect to which a motion is differentiated."""
     return {name: getattr(setup, name) for name in ("scene", "start", "inputs", "t0", "t1", "ts")}
 
 
 def _prepared(setup: Setup) -> Setup:
-    """The setup with all numbers in the default precision (derivatives keep the type of what is differentiated)."""
+    """Return the setup with all numbers in the default precision (derivatives keep their own type)."""
     return setup._replace(**in_default_precision(_numbers(setup)))
 
 
 def _with_machine_code(setup: Setup) -> Setup:
-    """The setup, where machine code integrates it also with machine code for what is seen of it, if that can be made."""
+    """Return the setup, with machine code also for quantities beside the steps where machine code integrates
+    it, if possible.
+    """
     field = setup.field
     if setup.reason_against_machine_code or not isinstance(field, ByProgram) or values.beside(field.program) is None:
         return setup
@@ -88,8 +90,8 @@ def integrate_lanes(setups: Setup) -> Trajectory:
 
 
 def _entered(setup: Setup) -> tuple[Setup, Scalar]:
-    """The setup, whose derivatives are zero where nothing is asked of its motion, and NaN where what failed is;
-    and the zero by which `_finish` tells (`calculus/markers.py`).
+    """Return the setup, with derivatives that are zero if nothing of its motion is used, and NaN after a
+    failure; and the zero by which `_finish` tells (`calculus/markers.py`).
     """
     numbers, rest = eqx.partition(_numbers(setup), eqx.is_inexact_array)
     leaves, treedef = jax.tree.flatten(numbers)
@@ -228,7 +230,9 @@ def _step_errors(setup: Setup, free: Integrated, y: Integrated) -> Scalar:
 
 
 def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
-    """Return whether parameters, bodies and contacts are right, and the start: NaN where they are not, so that such a lane ends at once."""
+    """Check parameters, bodies, contacts and the start: NaN if they are invalid, so that such a sample ends
+    at once.
+    """
     scene, field, at = setup.scene, setup.field, (setup.t0, start.q, start.u, setup.inputs(setup.t0))
     program = row_program(scene) if isinstance(field, ByProgram) and field.native else None
     if program is None or unsupported(program.graph, [program.right]):
@@ -239,7 +243,7 @@ def _without_faults(setup: Setup, start: State) -> tuple[Flag, State]:
 
 
 def _result(setup: Setup, begun: Begun, solved: Solved, code, pivot) -> Count:
-    """Return the result code, with the cause where one is known; what comes later counts more."""
+    """Return the result code, with the cause if known; later conditions take precedence."""
     start, end = begun.start, solved.y_end
     eps, finite = jnp.finfo(start.q.dtype).eps, lambda *parts: jnp.all(jnp.isfinite(jnp.concatenate(parts)))
     code = jnp.where(finite(end.q, end.v), code, results.NOT_FINITE)
@@ -288,7 +292,8 @@ def energy_lost(energies: Float[Array, "2 times 2"], steps) -> Flag:
 
 
 def rows_violated(setup: Setup, t: Float[Array, "times"], q: Float[Array, "times coordinates"], u: Float[Array, "times speeds"]) -> Flag:
-    """Whether some row is violated at some of these states; those that were not reached are NaN, and do not count.
+    """Return whether some constraint is violated at some of these states; unreached ones are NaN, and do not
+    count.
 
     |phi| > 1 % of |phi - A u| + |A| |u|, where that is largest
     """

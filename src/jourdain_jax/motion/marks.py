@@ -1,4 +1,4 @@
-"""Times that a motion did not reach hold NaN on purpose; `jax_debug_nans` must not report them as an error."""
+"""NaN at times that a motion did not reach is intended; `jax_debug_nans` must not report it."""
 
 from functools import wraps
 

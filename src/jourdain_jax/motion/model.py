@@ -1,4 +1,6 @@
-"""Models: scenes with the choices that `build` made for their motions. `simulate` and its kin take a model in place of a scene."""
+"""Models: scenes with the choices of `build`. `simulate` and similar functions accept a model in place of a
+scene.
+"""
 
 import os
 from collections.abc import Callable, Hashable
@@ -40,7 +42,7 @@ _BACKENDS = ("auto", "native", "xla", "dense")
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Model(BuiltFor, Printed):
-    """A scene with how its motions are integrated, made by `build`. Printed as a table.
+    """A scene with the choices for its integration, made by `build`. Printed as a table.
 
     It is a tree whose leaves are the parameters of `scene`. `model.replace(radius=r)` has other parameters and keeps the state, the backend, and, where `r`
     is traced by JAX, all choices that numbers decided. It is pickled as its scene, and built again where it is loaded.
@@ -59,12 +61,12 @@ class Model(BuiltFor, Printed):
 
     @property
     def reference(self) -> Reference:
-        """The scene whose numbers stand in for traced ones."""
+        """The scene whose numbers replace traced ones."""
         return self.decided or Reference(self.scene)
 
     @property
     def standing_in(self) -> AbstractContextManager:
-        """A context in which the numbers that decided stand in for traced ones."""
+        """Return a context in which the numbers used for decisions replace traced ones."""
         return nullcontext() if self.decided is None else self.decided.stands_in()
 
     @property
@@ -73,11 +75,15 @@ class Model(BuiltFor, Printed):
         return structure_of(self.scene if self.decided is None else self.decided.scene)
 
     def field(self, constant: bool = True, work: bool = True) -> VectorField:
-        """Return what is integrated, with `constant` inputs or with others, and with the `work` that no potential accounts for."""
+        """Return the integrated vector field, with `constant` inputs or others, and with the `work` of loads
+        without a potential.
+        """
         return self.once((constant, work), lambda: _vector_field(self, constant, work))
 
     def usual(self, determined: bool) -> Usual:
-        """Return the sizes by which states are put onto the rows; `determined`: rows determine the speeds that are free."""
+        """Return the typical sizes for projecting states; `determined`: constraints determine the free
+        speeds.
+        """
 
         def sizes() -> Usual:
             found = usual_sizes(self.scene, determined, self.backend in ("auto", "native"))  # what it traces must not be computed at once
@@ -87,11 +93,11 @@ class Model(BuiltFor, Printed):
         return self.once(determined, sizes)
 
     def inputs(self, given) -> Inputs:
-        """Return the inputs that are given by name; those at rest are made once."""
+        """Return the inputs that are given by name; constant ones are made once."""
         return self.once("inputs at rest", lambda: as_inputs(self.scene, None)) if given is None else as_inputs(self.scene, given)
 
     def once(self, case: Hashable, make: Callable[[], Any]) -> Any:
-        """Return what `make` finds for these numbers, made once for each case."""
+        """Return the result of `make` for these numbers, computed once for each case."""
         if self.made is None:
             return modelled(self).once(case, make)
         if case not in self.made:
@@ -101,31 +107,31 @@ class Model(BuiltFor, Printed):
 
     @property
     def state(self) -> str:
-        """What is integrated: "minimal", coordinates and privileged speeds, or "full", all speeds."""
+        """The integrated state: "minimal", coordinates and privileged speeds, or "full", all speeds."""
         return self.formulation.state
 
     @property
     def rows(self) -> Rows:
-        """Which rows hold the scene."""
+        """The constraints of the scene: names, rank, redundant ones."""
         known = self.structure
         return Rows(known.row_names, known.rank, known.redundant_rows, known.may_set_in, known.rank_losses, known.affine, known.homogeneous)
 
     @property
     def freedoms(self) -> Freedoms:
-        """Which speeds are independent."""
+        """The independent speeds."""
         known, names = self.structure, self.scene.speed_names.entries
         dependent = tuple(name for i, name in enumerate(names) if i not in known.independent)
         return Freedoms(tuple(names[i] for i in known.independent), dependent, known.chosen_by_user, known.worst_pivot, known.typical_pivot)
 
     @property
     def dependence(self) -> Dependence:
-        """What depends on time and on the motion."""
+        """Quantities that depend on time and on the motion."""
         known = self.structure
         return Dependence(known.timed, known.driven, known.varying_inertia, known.massless)
 
     @property
     def conserved(self) -> Conserved:
-        """What stays as it is along a motion."""
+        """Conserved quantities of a motion."""
         held = () if self.program is None else self.program.held
         return Conserved(not needs_work(self.reference.scene, self.structure), held, names_of_invariants(self.scene))
 
@@ -137,7 +143,7 @@ class Model(BuiltFor, Printed):
 
     @property
     def not_lowered(self) -> str:
-        """Why there is no scalar program; empty where there is one."""
+        """The reason why there is no scalar program; empty if there is one."""
         found = self._lowered
         return "" if isinstance(found, Lowered) else str(found)
 
@@ -152,7 +158,9 @@ class Model(BuiltFor, Printed):
 
     @property
     def way(self) -> str:
-        """How motions with constant inputs are integrated, machine code, XLA or dense matrices, and why no faster way serves."""
+        """The integrator of motions with constant inputs (machine code, XLA or dense matrices), and why no
+        faster one applies.
+        """
         scene, field = self.reference.scene, self.field()
         if field.lowered is None:
             return f"dense matrices: {self.not_lowered or 'as asked'}"
@@ -161,7 +169,7 @@ class Model(BuiltFor, Printed):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences on what to look at."""
+        """Sentences on points to check."""
         said, rows = [], self.rows
         if rows.rank_losses:
             said.append(f"the rows lose rank at {len(rows.rank_losses)} of the probed configurations, first at {rows.rank_losses[0]}")
@@ -177,13 +185,13 @@ class Model(BuiltFor, Printed):
         return tuple(said)
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write what `build` found for the numbers of the scene to the file `path`, for `jj.load_model`.
+        """Write the findings of `build` for the numbers of the scene to the file `path`, for `jj.load_model`.
 
         ValueError for a model with a reduction or a stabilisation of its own, and where the scene has parts that are kept as calls of JAX.
         """
         scene, formulation = self.reference.scene, self.formulation
         if formulation.reduction is not None or formulation.baumgarte is not None:
-            raise ValueError("a model with a reduction or a stabilisation of its own has no file; build it anew")
+            raise ValueError("a model with its own reduction or stabilisation cannot be saved; build it again instead")
         how = {"state": formulation.state, "projects": formulation.projects, "backend": self.backend, "memory": self.memory}
         every = self.state == "full"
         found: dict[Hashable, Any] = {("_structure",): self.structure, ("_lowered", every or not self.structure.row_names): lowered(scene, every)}
@@ -222,7 +230,7 @@ class Model(BuiltFor, Printed):
 
 
 def _decisions_where_traced(scene: Scene) -> tuple:
-    """Return what decides about a scene all of whose parameters JAX traces."""
+    """Return the decisions about a scene with all parameters traced by JAX."""
     found: list[tuple] = []
     jax.eval_shape(lambda scene: found.append(structure_whatever_its_faults(scene).decisions), scene)
     return found[0]
@@ -245,8 +253,8 @@ jax.tree_util.register_pytree_node(Model, _flattened, _unflattened)
 
 @shown_from_users_lines
 def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backend: str = "auto", memory: int | float | str | None = None) -> Model:
-    """Settle once how motions of a scene are integrated: rank, redundant rows, privileged speeds, what depends on time, what is conserved, the state,
-    the scalar program, the backend.
+    """Settle once how motions of a scene are integrated: rank, redundant constraints, privileged speeds, time
+    dependence, conserved quantities, the state, the scalar program, the backend.
 
         model = jj.build(disc)
         print(model), model.freedoms.privileged, model.program.operations
@@ -255,11 +263,11 @@ def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backe
 
     `formulation`, `backend`: as of `simulate`. `memory`: bytes, or a text such as "2GB", that chunks of a `rollout` and what reverse mode keeps of
     motions may take (default: 4 GiB), and, where it is stated, the processes of a `Study`. All functions of a scene build on first use and keep what they
-    found. `start`, `simulate`, `rollout`, `fit`, `fit_batch`, `linearize`, `steady`, `report`, `verify`, `lower` and `Study` take what this returns in the
+    found. `start`, `simulate`, `rollout`, `fit`, `fit_batch`, `linearize`, `steady`, `report`, `verify`, `lower` and `Study` accept the model in
     place of `scene`; all others take its `.scene`.
-    The first call for a class warns with the table of `check` where something looks wrong.
-    ValueError as of `structure_of` (no admissible state, no inertia along a free motion, numbers of bodies that cannot be), and where the formulation or
-    the backend does not serve the scene.
+    The first call for a class warns with the table of `check` if it has findings.
+    ValueError as of `structure_of` (no admissible state, no inertia along a free motion, impossible bodies), and where the formulation or
+    the backend does not apply to the scene.
     """
     scene = as_scene(scene)
     structure_of(scene)  # says what is wrong
@@ -274,7 +282,7 @@ def build(scene: Scene | BuiltFor, formulation: Formulation | None = None, backe
 
 
 def load_model(path: str | os.PathLike, scene: Scene) -> Model:
-    """Build the model of a scene from the file that `Model.save` wrote for it: in a fresh process nothing is traced, probed or lowered.
+    """Load the model of a scene from a file of `Model.save`, without tracing, probing or lowering.
 
         jj.build(bicycle).save("bicycle.model")
         model = jj.load_model("bicycle.model", bicycle)
@@ -289,7 +297,9 @@ def load_model(path: str | os.PathLike, scene: Scene) -> Model:
 
 
 def modelled(scene: Scene | BuiltFor, formulation: Formulation | None = None, backend: str = "auto") -> Model:
-    """Return a scene, or a model, with this formulation and backend (by default those of the model), and with the choices that are kept for its values."""
+    """Return a scene, or a model, with this formulation and backend (by default the model's), and with the
+    choices kept for its values.
+    """
     decided = memory = None
     if isinstance(scene, Model):
         if formulation is None:
@@ -367,10 +377,10 @@ def _program(scene: Scene, minimal: bool, backend: str, formulation: Formulation
 def _check(scene: Scene, structure: Structure, state, backend) -> None:
     check_name(backend, _BACKENDS, f"unknown backend `{backend}`")
     if state == "minimal" and not structure.affine:
-        raise ValueError(f"the rows of `{type(scene).__name__}` are nonlinear in the speeds and have no minimal state; use jj.Formulation('full')")
+        raise ValueError(f"the rows of `{type(scene).__name__}` are nonlinear in the speeds, so there is no minimal state; use jj.Formulation('full')")
     if state == "minimal" and structure.may_set_in:
         named = ", ".join(f"`{name}`" for name in structure.may_set_in)
-        raise ValueError(f"rows {named} of `{type(scene).__name__}` may set in where they do not follow from the others; use jj.Formulation('full')")
+        raise ValueError(f"rows {named} of `{type(scene).__name__}` may become independent of the others during a motion; use jj.Formulation('full')")
 
 
 def _cutoff(structure: Structure) -> float | None:
@@ -379,7 +389,9 @@ def _cutoff(structure: Structure) -> float | None:
 
 
 def _default_reduction(structure: Structure, independent: tuple[int, ...] | None, program: Lowered | None) -> Reduction:
-    """Privileged velocities for the minimal state; for the full one what a lowered program does, otherwise the null space by QR."""
+    """Return the default reduction: privileged velocities for the minimal state; for the full one that of a
+    lowered program, otherwise the null space by QR.
+    """
     if independent is not None:
         return Privileged(independent)
     if program is None:

@@ -1,4 +1,4 @@
-"""Files of models: what `build` found about a scene, as JSON behind a line that says what it is of.
+"""Files of models: the findings of `build` as JSON, after a line with digests.
 
     {"format", "version", "jax", "precision", "scene", "sha256"}      digests of the class, its methods and values, and of what follows
     [how, {what: finding}]                                            what: the function that finds it, and which case
@@ -29,21 +29,26 @@ KINDS = {kind.__name__: kind for kind in (Structure, Lowered, Stage, RowProgram,
 
 
 def write(path: str | os.PathLike, scene: Scene, how: dict, found: Mapping[Hashable, Any]) -> None:
-    """Write what was found about a scene, by the functions that find it and the first part of their case, and `how` it was asked to be built."""
+    """Write the findings about a scene, by the functions that find them and the first part of their case, and
+    `how` to build it.
+    """
     try:
         content = json.dumps(_encoded([how, dict(found)])).encode()
     except TypeError as error:
-        raise ValueError(f"`{type(scene).__name__}` has parts that are kept as calls of JAX, and its model has no file ({error})") from None
+        raise ValueError(f"`{type(scene).__name__}` has parts that are kept as calls of JAX, so its model "
+            f"cannot be saved; build it again instead ({error})") from None
     write_whole(path, json.dumps(_about(scene, content)).encode() + b"\n" + content)
 
 
 def read(path: str | os.PathLike, scene: Scene) -> tuple[dict[Hashable, Any], dict]:
-    """Return what was found about a scene, and how it is built; a ValueError where the file is damaged or of something else."""
+    """Return the findings about a scene, and how it is built; a ValueError if the file is damaged or does not
+    match.
+    """
     head, _, content = read_bytes(path, 2**30, "a model").partition(b"\n")
     stated, expected = parsed(json.loads, head, f"`{path}`", "a model"), _about(scene, content)
     if stated != expected:
         other = ", ".join(name for name, value in expected.items() if not isinstance(stated, dict) or stated.get(name) != value)
-        raise ValueError(f"`{path}` is no model of this `{type(scene).__name__}`: what differs is {other}; build and save it anew")
+        raise ValueError(f"`{path}` is not a model of this `{type(scene).__name__}`: they differ in {other}; build and save it again")
     how, found = _decoded(json.loads(content))
     return found, how
 

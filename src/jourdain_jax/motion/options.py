@@ -1,4 +1,6 @@
-"""Options of a simulation: one object that `simulate`, `rollout`, `fit`, `Study` and their kin take, as it is or by the names of its fields."""
+"""Options of a simulation: one object for `simulate`, `rollout`, `fit`, `Study` and similar functions, which
+also accept its fields by name.
+"""
 
 import difflib
 import math
@@ -26,22 +28,22 @@ TOLERANCE, MOST_STEPS = 1e-8, 100_000
 
 @dataclass(frozen=True)
 class Options:
-    """How motions are integrated.
+    """Options of integration.
 
     - `rtol`, `atol`: tolerances of a step, relative and absolute.
     - `solver`: a solver of diffrax, which runs `diffrax.diffeqsolve` (but Tsit5, Dopri5 and Dopri8 are our own), or one of `jj.Taylor`, `jj.RadauIIA`,
       `jj.ImplicitMidpoint`, `jj.DiscreteLagrangeDAlembert`, `jj.DiscreteGradient`; the last three take equal steps of at most their `step` between saved
       times. None: Tsit5 for rtol >= 1e-6, Dopri8 below.
     - `max_steps`: the most steps; `max_step`: the longest one (s). None: 1/16 of the span, so that a load that acts on a part of the way, or a dip of an event,
-      is not stepped over where nothing else keeps steps short; inf: no bound.
-    - `events`: stop where an event value of the scene falls through zero. False: pass over events that stop a motion; those after which it goes on stay.
-      `work`: integrate the work that no potential accounts for.
-    - `max_transitions`: the most events after which a motion goes on (`jj.Event`).
-    - `retry`: run a motion again that left the domain of its privileged speeds (with the full state), or that is stiff (by an implicit solver, unless
-      `solver` is given); `trajectory.fallback` and its summary say so. Inside your own `jit` or `vmap`, and without it, the result code
+      is not missed where nothing else keeps steps short; inf: no bound.
+    - `events`: stop where an event value of the scene falls through zero. False: ignore events that stop a motion; those at which it continues stay.
+      `work`: integrate the work of loads without a potential.
+    - `max_transitions`: the largest number of events at which a motion continues (`jj.Event`).
+    - `retry`: repeat a motion that left the domain of its privileged speeds (with the full state), or that is stiff (by an implicit solver, unless
+      `solver` is given); `trajectory.fallback` and its summary report it. Inside your own `jit` or `vmap`, and without it, the result code
       stays.
 
-    `simulate` and its kin take an `Options`, or its fields by name, which take precedence.
+    `simulate` and similar functions take an `Options`, or its fields by name, which take precedence.
 
     **Examples**
 
@@ -63,7 +65,7 @@ class Options:
 
 @dataclass(frozen=True)
 class AllOptions(Options):
-    """Options with what else says how a motion is integrated."""
+    """Options with all further settings of the integration."""
 
     solver: "diffrax.AbstractSolver | ImplicitMethod | Taylor | Method | None" = None
     formulation: "Formulation | None" = None
@@ -73,7 +75,7 @@ class AllOptions(Options):
 
 
 class OptionFields(TypedDict, total=False):
-    """The fields of `Options` by name, and what else says how a motion is integrated."""
+    """The fields of `Options` by name, and all further settings of the integration."""
 
     rtol: Number
     atol: Number
@@ -149,7 +151,7 @@ def as_options(
         if name in refusals:
             raise TypeError(f"{function}() takes no `{name}`: {refusals[name]}")
         if name in GONE:
-            raise TypeError(f"`{name}` is no option any more: {GONE[name]}")
+            raise TypeError(f"`{name}` is no longer an option: {GONE[name]}")
         if name not in OPTION_NAMES:
             known = [option for option in (*SPAN, *OPTION_NAMES) if option not in refusals]
             raise TypeError(f"{function}() got an unexpected keyword argument '{name}'; {nearest(name, known)}")
@@ -159,7 +161,9 @@ def as_options(
 
 
 def bytes_of(memory: Any) -> int:
-    """Bytes that `memory` says: a number of bytes, or a text such as "2GB" (10^9 bytes) or "500 MiB" (2^20); ValueError otherwise."""
+    """Return the bytes for `memory`: a number of bytes, or a text such as "2GB" (10^9 bytes) or "500 MiB"
+    (2^20); ValueError otherwise.
+    """
     found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+(?:e[0-9]+)?)\s*(?:(?:([kmgt])(i?))?b)?\s*", str(memory).lower())
     if isinstance(memory, bool) or not found or not math.isfinite(float(found[1])):
         raise ValueError(f"`memory` is {described(memory)}, expected a number of bytes, or a text such as '2GB' or '500MB'")
@@ -167,7 +171,7 @@ def bytes_of(memory: Any) -> int:
 
 
 def alongside(options: AllOptions) -> AllOptions:
-    """Return options by which one run gives values and tangents, of `jvp` and `jacfwd` alone."""
+    """Return options for computing values and tangents in one run, for `jvp` and `jacfwd` only."""
     return replace(options, alongside=True)
 
 

@@ -1,4 +1,5 @@
-"""Our own loop over steps as an integrator, with its derivatives: machine code where it serves, otherwise on arrays of JAX.
+"""Our own loop over steps as an integrator, with its derivatives: by machine code where possible, otherwise
+on arrays of JAX.
 
 There lanes of a scalar program run side by side in blocks of `width`.
 """
@@ -75,7 +76,7 @@ class OwnSteps(Integrator):
         return _on_times(run if self.alongside else with_rules(run, rules), mover, setup, begun)
 
     def _loop(self, setup: Setup, begun: Begun) -> tuple[Loop, Start, int]:
-        """The loop on arrays, what it is given, and how many lanes run side by side."""
+        """Return the loop on arrays, its arguments, and the number of lanes side by side."""
         program, relations = setup.field.lowered, watched(setup.field, setup.inputs, bool(self.event_names))
         at_once = 0 if program is None or not isinstance(self.solver, Method) else width(program)
         return *on_arrays.loop_of(self.solver, setup, begun, relations, {"most": self.most, "stopping": self.stopping}), at_once
@@ -85,7 +86,7 @@ class OwnSteps(Integrator):
         return native_motion.solved(of.form, start.goals, on_arrays.flow(of, at_once)(start))
 
     def _pulled_on_arrays(self, perturbed: tuple, arguments: tuple[Setup, Begun], found: Solved, g: Solved) -> tuple:
-        """Cotangents of what varies, from those of the motion that was found."""
+        """Return cotangents of varying values, from those of the motion."""
         setup, begun = arguments
         of, start, at_once = self._loop(setup, begun)
         varies = [v for v, x in zip(jax.tree.leaves(perturbed[1].args), jax.tree.leaves(begun.args), strict=True) if eqx.is_array(x)]
@@ -105,7 +106,7 @@ class OwnSteps(Integrator):
         return native_motion.solved(form, start.goals, flow(form, self.solver, self.order)(start))
 
     def _pulled(self, perturbed: tuple, arguments: tuple[Setup, Begun], found: Solved, g: Solved) -> tuple:
-        """Cotangents of what varies, from those of the motion that was found."""
+        """Return cotangents of varying values, from those of the motion."""
         setup, begun = arguments
         sampled = [channel for channel in (*perturbed[0].inputs.channels, *perturbed[1].args[2].channels) if isinstance(channel, Sampled)]
         if any(jax.tree.leaves(sampled)):

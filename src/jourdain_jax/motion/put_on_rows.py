@@ -1,4 +1,5 @@
-"""Coordinates and speeds put onto the rows: by machine code where that serves, by XLA where not, and for derivatives.
+"""Projection of coordinates and speeds onto the constraints: by machine code where possible, otherwise and
+for derivatives by XLA.
 
 g(t, q) = 0,  phi(t, q, u) = 0
 
@@ -43,7 +44,7 @@ OFF = 1e4  # units of round-off: a residual that is more
 
 
 class State(Printed, eqx.Module):
-    """A state on the constraints, and how far the guess was from it; `state["yaw"]`, `print(state)`.
+    """A state on the constraints, and its distance from the guess; `state["yaw"]`, `print(state)`.
 
     q and u in the units of the scene's coordinates and speeds (SI, rad).
     """
@@ -78,13 +79,13 @@ class State(Printed, eqx.Module):
 
 
 def state_of(scene: Scene, t, q, u, moved_q=0.0, moved_u=0.0, residual=0.0) -> State:
-    """Return a state of a scene that nothing else has put onto the constraints."""
+    """Return a state of a scene that has not been projected yet."""
     t, moved_q, moved_u, residual = (jnp.asarray(x, real_type()) for x in (t, moved_q, moved_u, residual))
     return State(t, q, u, moved_q, moved_u, residual, (scene.coordinate_names, scene.speed_names))
 
 
 class Usual(eqx.Module):
-    """Sizes by which rows and coordinates are measured, and of what kind rows are."""
+    """Typical sizes of constraints and coordinates, and kinds of constraints."""
 
     closures: Float[Array | np.ndarray, "closures"]
     rows: Float[Array | np.ndarray, "rows"]  # in scaled speeds; where rows determine the speeds that are free, in the speeds as they are
@@ -114,7 +115,9 @@ def usual_sizes(scene: Scene, determined: bool, native: bool) -> Usual:
 
 
 def put_positions(scene: Scene, t, q, free, usual: Usual, known: tuple | None = None) -> tuple[Float[Array, "coordinates"], Float[Array, "closures"]]:
-    """The coordinates on the geometric rows nearest to q, and what is left of the rows; of what is `known`, both get their derivatives."""
+    """Return the coordinates on the geometric constraints nearest to q, and the residual; both have
+    derivatives in the `known` values.
+    """
     if usual.program is not None and not usual.program.g:
         return q, jnp.zeros(0, q.dtype)
 
@@ -133,7 +136,7 @@ def put_positions(scene: Scene, t, q, free, usual: Usual, known: tuple | None = 
 
 
 def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Float[Array, "speeds"], Float[Array, "rows"]]:
-    """The speeds on the velocity rows nearest to u, and what is left of the rows."""
+    """Return the speeds on the velocity constraints nearest to u, and the residual."""
     affine, determined = usual.affine, usual.determined
     if usual.program is not None and not usual.program.phi:
         return u, jnp.zeros(0, u.dtype)
@@ -165,7 +168,7 @@ def _kernel(rows: Rows, given_in: np.dtype):
 
 
 def _put(rows: Rows, scene: Scene, t, *vectors) -> tuple[Array, Array]:
-    """What moved, and what is left of the rows, by machine code."""
+    """Return the projected quantities and the residual, by machine code."""
     real, given = real_type(), (*entries(scene, rows.program.parameters), t[None], *vectors)
     found = _kernel(rows, real)(jnp.concatenate([jnp.asarray(x, real) for x in given]))[0]
     return found[: len(rows.moving)], found[len(rows.moving) :]
@@ -226,7 +229,9 @@ def put_onto_constraints(scene: Scene, t, start: Guess, inputs, guesses) -> tupl
 
 
 def left_of(g: Float[Array, "closures"]) -> Float[Array, ""]:
-    """Largest residual of the geometric rows that counts: what is no number is infinite, what is round-off is zero."""
+    """Return the largest significant residual of the geometric constraints: infinite for NaN, zero for
+    round-off.
+    """
     left = jax.lax.stop_gradient(jnp.max(jnp.abs(g), initial=0.0))
     return jnp.where(left < contradiction(g.dtype), 0.0, jnp.where(jnp.isfinite(left), left, jnp.inf))
 
@@ -239,7 +244,7 @@ def _arrived(q, near_q, g, start: Guess) -> Bool[Array, ""]:
 
 
 class _Put(NamedTuple):
-    """Coordinates put onto the rows, without derivatives."""
+    """Projected coordinates, without derivatives."""
 
     q: Float[Array, "coordinates"]
     g: Float[Array, "closures"]
@@ -293,7 +298,9 @@ def _loses_rank(matrices, free) -> bool:
 
 @lru_cache(maxsize=64)
 def row_functions(program: RowProgram) -> RowFunctions:
-    """g and G, phi and A, and M, by the program; of what is no machine code, by autodiff."""
+    """Return g and G, phi and A, and M, by the program; parts without machine code by automatic
+    differentiation.
+    """
     nodes = [*program.g, *program.G.values(), *program.phi, *program.A.values(), *(program.M or {}).values()]
     if unsupported(program.graph, nodes) or program.graph.operations(nodes) > projection.LARGEST_PROGRAM:
         return BY_AUTODIFF

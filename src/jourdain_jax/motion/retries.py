@@ -1,4 +1,4 @@
-"""Retries of failed motions, with `retry=True`: one rule for single motions and for the lanes of rollouts.
+"""Retries of failed motions, with `retry=True`: one rule for single motions and for batches.
 
 FULL_STATE    it left the domain in which its privileged speeds, or its program, serve: the full state, dense matrices
 IMPLICIT      an explicit solver ran out of steps that stability kept short: Radau's method
@@ -37,7 +37,7 @@ RERUN_FIELDS = ("state_form", "reduction", "solver", "projected", "unwatched")  
 
 
 def retried(run: Callable[[AllOptions], tuple[Setup, Trajectory]], setup: Setup, motion: Trajectory, options: AllOptions) -> Trajectory:
-    """Return the motion, run again until a way succeeds or none is left; as it is where its result is traced."""
+    """Return the motion, repeated until a way succeeds or none is left; unchanged if its result is traced."""
     while retries := _next_retry(setup.field, motion, setup.t0, options):
         setup, motion = run(_with_retries(retries, options))
         motion = _marked(motion, retries)
@@ -78,7 +78,7 @@ def _next_retries(form: Callable[[AllOptions], VectorField], lanes: Trajectory, 
 
 
 def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajectory:
-    """Replace the lanes at `index` by those of another run."""
+    """Replace the samples at `index` by those of another run."""
     leaves, treedef = jax.tree.flatten(lanes)
     new = [np.array(x) for x in leaves]
     for old, y in zip(new, jax.tree.leaves(again), strict=True):
@@ -87,7 +87,7 @@ def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajec
 
 
 def _next_retry(field: VectorField, motion: Trajectory, t0, options: AllOptions) -> int:
-    """The retries of a `motion` from `t0`: those already made and one more; AS_ASKED where none is left.
+    """Return the retries of a `motion` from `t0`: those already made and one more; AS_ASKED if none is left.
 
     `field`: how it was integrated; `options`: those that were given.
     """
@@ -116,7 +116,9 @@ def _with_retries(retries: int, options: AllOptions) -> AllOptions:
 
 
 def _marked(motion: Trajectory, retries: int) -> Trajectory:
-    """A motion, or several, marked as run again by these retries; where it is out of steps once more, it is called stiff."""
+    """Return a motion, or several, marked as repeated by these retries; out of steps once more, it counts as
+    stiff.
+    """
     code = motion.result
     if retries & results.IMPLICIT:
         code = jnp.where(jnp.isin(code, jnp.array(OUT_OF_STEPS)), results.STIFF, code).astype(code.dtype)

@@ -1,4 +1,5 @@
-"""Warnings about derivatives through motions that amplify errors, by what differentiation finds out anyway, or that crossed a jump of their loads.
+"""Warnings about derivatives through motions that amplify errors, as measured by differentiation itself, or
+that cross a jump of their loads.
 
 A value L of a motion has the cotangents g = dL/dy at the states it looks at and g_0 = dL/dy_0 at the start. With s = atol + rtol |y|, what the step-size
 control lets pass at one state,
@@ -34,11 +35,13 @@ from jourdain_jax.scene.arguments import users_level
 
 
 class SensitivityWarning(UserWarning):
-    """A derivative was taken through a motion that amplifies errors so much that few of its digits are right, or whose loads jump."""
+    """A derivative through a motion that amplifies errors so much that few of its digits are right, or whose
+    loads jump.
+    """
 
 
 def _judge(amplification: float, rtol: float, steps: int) -> None:
-    """A warning where so many steps, each as wrong as the tolerance lets it be, spoil a derivative."""
+    """Warn if so many steps, each wrong by the tolerance, spoil a derivative."""
     error = steps * amplification * rtol
     if error > 0.05:
         text = (
@@ -62,7 +65,7 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
     looked_at: list[float] = []  # the ends that are looked at, weighed by their cotangents
 
     def weighed(values, cotangents) -> float:
-        """Return `sum |g| (atol + rtol |y|)`; what is not finite does not count."""
+        """Return `sum |g| (atol + rtol |y|)`; values that are not finite do not count."""
         return float(sum(np.sum(np.nan_to_num(np.abs(g) * (atol + rtol * np.abs(y)), posinf=0.0)) for y, g in zip(values, cotangents, strict=True)))
 
     def start_varies(tangents):
@@ -102,7 +105,9 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
 
 
 def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -> None:
-    """Warn where one of the differentiated `motions` crossed relations at which rates jump; do nothing where that is not known."""
+    """Warn if one of the differentiated `motions` crossed relations at which rates jump; unknown crossings do
+    not warn.
+    """
     crossings = numbers_where_known(motions.crossings)
     if crossings is None or not np.any(crossings):
         return
@@ -118,6 +123,6 @@ def warn_of_jumps(field: VectorField, motions: Trajectory, scene_varies: bool) -
 
 
 def numbers_where_known(values):
-    """Return the values with numbers where they are being differentiated outside of `jit`; None where they have none."""
+    """Return the values with numbers if they are differentiated outside `jit`; None if they have none."""
     bare = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, values)
     return None if is_traced(bare) else jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, bare)

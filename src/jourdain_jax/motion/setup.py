@@ -1,4 +1,4 @@
-"""What is to be integrated and how, and what an integrator finds.
+"""The integration problem of a motion, and the results of an integrator.
 
 Time counts from the start, tau = t - t0: far from zero a clock has few digits, and what does not depend on it is to be as right there as at t0 = 0.
 Rates, projection and events are given tau, and the scene and its inputs t0 + tau.
@@ -58,7 +58,7 @@ NONE_PASSED = Passed(np.zeros(0), np.zeros(0, np.int32), np.zeros(0), np.zeros((
 
 
 class Solved(eqx.Module):
-    """What an integrator finds."""
+    """The result of an integrator."""
 
     ts: Float[Array, "times *lanes"]  # as t_end, since the start
     ys: PyTree
@@ -126,7 +126,9 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     reference: Reference | None = None  # of a model: what is compiled for one serves those that decide alike
 
     def fitting(self) -> "Setup":
-        """The setup with times that serve any loop: none beyond an end by round-off, and those of a short span where its own do not go together."""
+        """Return the setup with times for any loop: none beyond an end by round-off, and those of a short
+        span if they are inconsistent.
+        """
         ts, t0, t1 = self.ts, self.t0, self.t1
         fits, direction = times_fit(ts, t0, t1), jnp.sign(t1 - t0)
         inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
@@ -139,11 +141,11 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
         return self.integrator.reason_against_machine_code(self)
 
     def most_steps(self, knots: Float[Array, "knots"] | None) -> int:
-        """How many steps may be taken; those that end at knots do not count."""
+        """Return the largest number of steps; those that end at knots do not count."""
         return self.integrator.max_steps + (0 if knots is None else len(knots))
 
     def goals(self, ts) -> Float[Array, "times *lanes"]:
-        """Times since the start to go to: those to save at, and the end."""
+        """Times since the start to reach: the saved times, and the end."""
         return jnp.concatenate([ts, self.t1[None]]) - self.t0
 
     @property

@@ -1,4 +1,5 @@
-"""Simulation: a scene and a start in, a `Trajectory` out, by our own loop over steps or by a solver of diffrax.
+"""Simulation: from a scene and a start to a `Trajectory`, by our own loop over steps or by a solver of
+diffrax.
 
 The default state is the minimal one (coordinates and privileged speeds) where the privileged velocities are well conditioned over the scene's
 domain and the rows are linear or affine; otherwise the full one (coordinates and all speeds), projected after every step.
@@ -68,14 +69,14 @@ def simulate(
       default one; "xla", that program compiled by XLA: also for third derivatives, derivatives with respect to samples, `jax.export` and other devices, which
       machine code refuses; "dense", the dense matrices; "auto" (default), the first of these that serves. The first two take the same steps.
 
-    Derivatives in forward and in reverse mode serve all motions. Where machine code integrates, so do those of the second order in all combinations
-    (`jax.hessian`); elsewhere forward mode of forward mode does, to any order.
+    All motions have derivatives in forward and in reverse mode. Machine code also has second derivatives in all combinations
+    (`jax.hessian`); elsewhere forward mode of forward mode works, to any order.
 
     **Returns** a `Trajectory`, with a result code instead of an exception, whose message says what to do; `trajectory.raise_if_failed()` raises
     `SimulationError`.
 
     **Raises** TypeError for unknown options, ValueError for bad arguments or a start that contradicts the constraints, `DifferentiationModeError` for
-    derivatives that there are not.
+    unsupported derivatives.
 
     **Examples**
 
@@ -121,7 +122,7 @@ def _set_up(model: Model, start, t0, t1, ts, inputs, options: AllOptions) -> Set
     scene, max_step, (solver, order) = model.scene, options.max_step, solver_of(options)
     if isinstance(solver, FixedStepMethod):
         if max_step is not None:
-            raise ValueError(f"`max_step` does not go with `{solver.name}`, whose steps are at most as long as its `step`: jj.{solver.name}(step=...)")
+            raise ValueError(f"`max_step` cannot be combined with `{solver.name}`, whose steps are at most its `step`: give jj.{solver.name}(step=...)")
         max_step = solver.step
     native = options.backend in ("auto", "native")
     inputs = model.inputs(inputs)
@@ -154,7 +155,9 @@ _BY_SERIES = "solver=jj.Taylor()", "omit `solver`, or use solver=diffrax.Dopri8(
 
 
 def _start(model: Model, given, t0, inputs: Inputs) -> tuple[State, Usual | None]:
-    """Return the start on its constraints; or a `State` as it is, and the sizes by which the program that integrates projects it."""
+    """Return the start on its constraints; or a `State` unchanged, with the sizes by which the integrating
+    program projects it.
+    """
     if not (isinstance(given, State) and model.formulation.projects):
         return as_state(model, given, t0=t0, inputs=inputs_at(inputs, t0)), None
     q, u = as_coordinates(model.scene, given.q), as_speeds(model.scene, given.u)
@@ -170,13 +173,13 @@ def solver_of(options: AllOptions) -> tuple["diffrax.AbstractSolver | ImplicitMe
     rtol, solver = options.rtol, options.solver
     if real_type() == np.float32 and np.any(known_numbers(rtol) < 1e-5):
         warnings.warn(
-            f"rtol = {rtol} asks for more digits than float32 has; set jax.config.update('jax_enable_x64', True), or loosen rtol and atol to 1e-5",
+            f"rtol = {rtol} needs more digits than float32 has; set jax.config.update('jax_enable_x64', True), or loosen rtol and atol to 1e-5",
             stacklevel=users_level(),
         )
     if isinstance(solver, Taylor):
         return DOPRI8, solver.order or order_for(rtol)
     if solver is None and is_traced(rtol):
-        raise ValueError("`rtol` is traced, and the default solver is chosen by its value; give a `solver` too, such as diffrax.Dopri8()")
+        raise ValueError("`rtol` is traced, but the default solver is chosen by its value; give a `solver` too, such as diffrax.Dopri8()")
     return solver or (TSIT5 if rtol >= 1e-6 else DOPRI8), None
 
 
@@ -201,7 +204,7 @@ def as_state(model: Model | Scene, given, *, what: str = "start", t0=None, input
 
 
 def span_and_times(scene: Scene, start, t0, t1, ts):
-    """t0, the times to save at, t1; a ValueError where they are known and do not go together."""
+    """Return t0, the times to save at, t1; a ValueError if known values are inconsistent."""
     from_state = isinstance(start, State)
     if from_state and start.q.ndim != 1:
         raise ValueError(f"`start` holds a batch of shape {start.q.shape[:-1]}; use `jj.rollout` or `jax.vmap` for many starts")
@@ -217,12 +220,15 @@ def span_and_times(scene: Scene, start, t0, t1, ts):
     if ts is None:
         ts = t0 + (t1 - t0) * _EVEN.astype(t0.dtype)  # of known ends: nothing to compile
     elif not known_numbers(times_fit(ts, t0, t1)).all():
-        raise ValueError(f"`ts` runs from {ts[0]} to {ts[-1]} s, outside of the span from t0 = {t0} to t1 = {t1} s or against it; give `t0` and `t1` around it")
+        raise ValueError(f"`ts` runs from {ts[0]} to {ts[-1]} s, outside the span from t0 = {t0} to t1 = {t1} s "
+            "or in the opposite direction; give `t0` and `t1` that enclose it")
     return t0, ts, t1
 
 
 def saved_times(ts) -> "Float[Array, 'times'] | Float[np.ndarray, 'times']":
-    """Times to save at, on NumPy where they are known; a ValueError where they are no monotonic vector of finite numbers."""
+    """Return times to save at, on NumPy if known; a ValueError unless they are a monotonic vector of finite
+    numbers.
+    """
     ts = vector_of_times(ts)
     steps = np.diff(known_numbers(ts))
     if not ((steps > 0).all() or (steps < 0).all()) or not np.isfinite(known_numbers(ts)).all():

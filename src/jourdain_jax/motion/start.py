@@ -1,4 +1,4 @@
-"""Consistent starts: a guess of q and u put onto the constraints, with a report of how far it moved.
+"""Consistent starts: a guess of q and u projected onto the constraints, with the size of the change.
 
 g(t, q) = 0,  phi(t, q, u) = 0
 """
@@ -32,7 +32,8 @@ _NOTHING: Mapping = MappingProxyType({})
 
 
 def consistent(scene: Scene | BuiltFor, t, q: Numbers, u: Numbers, inputs=None, *, held: tuple[str, ...] = ()) -> State:
-    """The state on the constraints nearest to (q, u): positions by Gauss-Newton, speeds M-orthogonally; g(t, q) = 0, phi(t, q, u) = 0.
+    """Return the state on the constraints nearest to (q, u): positions by Gauss-Newton, speeds
+    M-orthogonally; g(t, q) = 0, phi(t, q, u) = 0.
 
     `inputs`: values of the scene's inputs (default: zero). `held`: names of coordinates and speeds that do not move.
 
@@ -44,14 +45,16 @@ def consistent(scene: Scene | BuiltFor, t, q: Numbers, u: Numbers, inputs=None, 
     t, q, u = one_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     for name in held:
         if name not in coordinates + speeds:
-            raise ValueError(f"`held` names `{name}`, which is no coordinate or speed; {nearest(name, coordinates + speeds)}")
+            raise ValueError(f"`held` names `{name}`, which is not a coordinate or speed; {nearest(name, coordinates + speeds)}")
     free_q, free_u = (free_entries(names, tuple(held)) for names in (coordinates, speeds))
     guess = Guess(q, u, free_q, free_u, ~free_entries(coordinates, ()), model.usual(False))
     return _consistent(scene, t, guess, _as_input_vector(scene, inputs, q.dtype))
 
 
 def _consistent(scene: Scene, t, start: Guess, inputs, guesses: Callable | None = None) -> State:
-    """Return the nearest state; where Newton's method does not arrive, what a damped search finds from q, and then from other configurations, `guesses()`."""
+    """Return the nearest state; if Newton's method fails, the result of a damped search from q, and then from
+    other configurations, `guesses()`.
+    """
     given = scene, t, start, inputs
     if not nothing_is_traced() and is_traced(given):  # the first takes less time
         return _compiled_projection(*given, None if guesses is None else guesses())[0]
@@ -65,7 +68,7 @@ def _consistent(scene: Scene, t, start: Guess, inputs, guesses: Callable | None 
 
 
 def _as_input_vector(scene: Scene, inputs, dtype):
-    """A vector on NumPy as it is, which is not traced and takes no time."""
+    """Return a vector on NumPy unchanged, without tracing."""
     return inputs if isinstance(inputs, np.ndarray) and inputs.shape == (len(scene.inputs),) else as_input_vector(scene, inputs, dtype)
 
 
@@ -75,12 +78,13 @@ _uncompiled_projection = eval_numpy(put_onto_constraints)
 
 @shown_from_users_lines
 def start(scene: Scene | BuiltFor, given: Any = None, *, near: Any = None, t0: Number = 0.0, inputs: Any = None, **values: Any) -> State:
-    """A consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`, or `start(disc, {"lean": 0.3, "spin_rate": -3.0})`.
+    """Return a consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`,
+    or `start(disc, {"lean": 0.3, "spin_rate": -3.0})`.
 
     `values`, by keyword or in a dictionary `given` (where both name one, the keyword counts), are kept, at time `t0` (s); values that contradict each other by
     no more than a few typed digits do, 1.5e-5, move onto the constraints.
     Coordinates that are not given begin at zero (a quaternion at the identity) and follow from the rows; where that leads nowhere, or out of the `domain`
-    that the scene states, they begin at those of states of the domain, nearest first, and the state says so (`guess`). `near`: coordinates by name, with
+    that the scene states, they begin at those of states of the domain, nearest first, as `guess` of the state tells. `near`: coordinates by name, with
     values from which they begin but at which they are not held; those may be found outside of the domain, as may coordinates of which the rows leave no choice.
     Of a quaternion that is given in part, `attitude_w=cos(a / 2), attitude_x=sin(a / 2)`, the other parts are zero.
     Privileged speeds that are not given stay zero and the dependent speeds follow from the rows;
@@ -109,7 +113,7 @@ def named_start(model: Model, values: Mapping, t, inputs, *, near: Mapping = _NO
         given = vectors_named(scene, values)[2]
         for name in near:
             if name not in scene.coordinate_names:
-                raise ValueError(f"`near` names `{name}`, which is no coordinate; {nearest(name, scene.coordinate_names.entries)}")
+                raise ValueError(f"`near` names `{name}`, which is not a coordinate; {nearest(name, scene.coordinate_names.entries)}")
     inputs = _as_input_vector(scene, inputs, q.dtype)
     if is_traced(q, u, t) or not (np.isfinite(q).all() and np.isfinite(u).all() and np.isfinite(t)):  # one look where all is known, and right
         for name, value in {**near, **values, "t0": t}.items():
@@ -150,7 +154,7 @@ def _held(model: Model, given: tuple[str, ...], about: tuple[str, ...]) -> tuple
 
 
 def _moved_if_near(model: Model, start: State, inputs) -> State:
-    """Move the start as a whole where it is off the rows by less than counts as a contradiction.
+    """Move the start as a whole if its residual is too small to be a contradiction.
 
     Where it is off by round-off alone, its numbers stay as they are, but what is traced gets the derivatives of a start that is moved: values that agree at
     these parameters contradict each other at others.
@@ -173,8 +177,8 @@ def _check_residual(scene: Scene, start: Guess, state: State, inputs, given: tup
     for k in outside[:1] if float(left_of(jnp.asarray(g))) == 0 else ():
         name, found = scene.coordinate_names.entries[k], float(state.q[k])
         raise ValueError(
-            f"no start of `{who}` was found with `{name}` in its `domain`, {scene.domain[name]}, while the given values are held ({held}): the nearest one has "
-            f'{found:.6g}; give other values, a wider `domain`, or near={{"{name}": {found:.2g}}}, from where it is looked for, outside of the domain as well'
+            f"no start of `{who}` was found with `{name}` in its `domain`, {scene.domain[name]}, with the given values held ({held}): the nearest one has "
+            f'{found:.6g}; give other values, a wider `domain`, or near={{"{name}": {found:.2g}}}, to search near it, also outside the domain'
         )
     phi = np.abs(np.asarray(velocity_residual(scene, state.t, state.q, state.u, inputs)))
     names = list(names_of_position_rows(scene))
@@ -183,6 +187,6 @@ def _check_residual(scene: Scene, start: Guess, state: State, inputs, given: tup
     within = any(bounded and name in scene.domain for name, bounded in zip(scene.coordinate_names.entries, start.bounded, strict=True))
     elsewhere = ", give some as guesses by `near=`, which are looked for outside of the `domain` as well" if within else ""
     raise ValueError(
-        f"the start of `{who}` contradicts row `{names[worst]}`: residual {np.concatenate([g, phi])[worst]:.3g} is left with the given values "
+        f"the start of `{who}` violates constraint `{names[worst]}`: residual {np.concatenate([g, phi])[worst]:.3g} remains with the given values "
         f"held ({held}); give fewer values and let the constraints decide the rest{elsewhere}, or use `jj.consistent(scene, t, q, u)` to move all of them"
     )

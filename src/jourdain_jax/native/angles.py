@@ -1,4 +1,5 @@
-"""Sine, cosine and tangent of vectors of doubles, and their inverses, by polynomials; and numbers in two doubles, of which these are made.
+"""Sine, cosine and tangent of vectors of doubles, and their inverses, by polynomials, with double-double
+numbers.
 
 Angles lose whole quarter turns: pi/2 has the three parts of `program/emit.py`, and the angle that is left a second part, by which it is over. That serves
 while the multiple of pi/2 has 20 bits; angles beyond are multiplied by as many bits of 2/pi as matter (M. Payne and R. Hanek, ACM SIGNUM Newsletter 18

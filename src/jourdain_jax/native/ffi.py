@@ -1,4 +1,5 @@
-"""Machine code as a function of JAX: the call frame of XLA's foreign function interface, the registering of handlers, and lanes of a batch among threads.
+"""Machine code as a function of JAX: the call frame of XLA's foreign function interface, registered handlers,
+and lanes divided among threads.
 
 Layouts are those of `xla/ffi/api/c_api.h` on 64-bit machines (major version 0). The header that comes with jaxlib says which version it speaks; another
 major version, or a frame with other members, is one that is not known here.
@@ -48,7 +49,8 @@ def version() -> tuple[int, int] | None:
     """Major and minor version of the interface; None, with a warning, where it is not known."""
     found = _stated_version()
     if found is None:
-        warnings.warn("the foreign function interface of this jaxlib is not known: motions are integrated by XLA, more slowly", stacklevel=2)
+        warnings.warn("this jaxlib has an unknown foreign function interface: motions are integrated by XLA, "
+            "more slowly; install a supported version of jaxlib", stacklevel=2)
     return found
 
 

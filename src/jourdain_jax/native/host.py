@@ -1,4 +1,4 @@
-"""The machine that runs this process: whether machine code can be made for it, how many lanes it takes at once; how code is made, and kept on disk.
+"""The host processor: support of machine code, number of lanes, compilation, and the cache on disk.
 
 Code is kept between processes in the folder of JAX's compilation cache where one is set, otherwise in the user's cache. A file is named by what its code was
 made from. It begins with a digest of that name, of what made it and of the code, so that one that is torn, changed or exchanged for another is made again.
@@ -208,7 +208,7 @@ def _against(found: os.stat_result) -> str:
 @functools.cache
 def _warn(place: Path, against: str) -> None:
     warnings.warn(
-        f"the folder `{place}` is not used for machine code, which is compiled anew in each process: "
+        f"the folder `{place}` is not used as cache of machine code, which is therefore compiled in each process: "
         f"{against}; name a folder of your own in JOURDAIN_JAX_CACHE (0: none)",
         stacklevel=2,
     )

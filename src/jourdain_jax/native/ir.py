@@ -1,4 +1,4 @@
-"""LLVM IR as text, written by operators on values: vectors with one number per lane, and the scalars that control loops.
+"""LLVM IR as text, by operators on values: vectors with one number per lane, and scalars for loops.
 
 `a + b`, `a < b`, `where(c, a, b)` each append an instruction to the function that is being written. Numbers of Python become literals. There are no
 flags that let LLVM change results: every lane is rounded as it is written here, whatever the width.

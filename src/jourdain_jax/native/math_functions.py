@@ -1,4 +1,5 @@
-"""Functions of vectors of doubles by their names in the table of operations, `calculus/scalar_operations.py`; exponentials, logarithms and powers.
+"""Functions of vectors of doubles by their names in `calculus/scalar_operations.py`: exponentials, logarithms
+and powers.
 
     e^x = 2^k (1 + p),  k = round(x/ln 2),  p = r + r^2 P(r),  r = x - k ln 2
     log x = k ln 2 + log m,  sqrt(1/2) < m < sqrt(2),  log m = 2 s (1 + z/3 + z^2/5 + z^3 P(z)),  s = (m - 1)/(m + 1),  z = s^2

@@ -1,4 +1,5 @@
-"""NVIDIA GPUs: the driver, text for it by LLVM, and kernels that it has compiled. No toolkit is needed; calls go to `libcuda` by ctypes.
+"""NVIDIA GPUs: the driver, PTX from LLVM, and compiled kernels. No toolkit is needed; calls go to `libcuda`
+by ctypes.
 
 A kernel is loaded for all devices at once (`cuLibraryLoadData`, of CUDA 12), and the driver compiles it for each where it is first used; it keeps what it
 has compiled between processes.

@@ -1,4 +1,4 @@
-"""The grounds of a motion, to be drawn: the planes that its contacts roll on, meshes of other surfaces, or a floor below the bodies."""
+"""Grounds for drawing: planes of contacts, meshes of other surfaces, or a floor below the bodies."""
 
 import jax
 import jax.numpy as jnp

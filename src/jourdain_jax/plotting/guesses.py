@@ -1,4 +1,4 @@
-"""What a body looks like that its scene says nothing of: by what it was made as, by its outline, by what rolls in its contacts, or by its inertia."""
+"""Default looks of bodies: from their constructor, their outline, their contacts, or their inertia."""
 
 import numpy as np
 

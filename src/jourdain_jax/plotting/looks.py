@@ -1,4 +1,6 @@
-"""What there is to draw of a motion: bodies with their looks at all saved times that were reached, and their contacts with the ground."""
+"""The drawing of a motion: bodies with their looks at all reached saved times, and their contacts with the
+ground.
+"""
 
 from dataclasses import dataclass
 
@@ -65,7 +67,7 @@ def looks_of(trajectory: Trajectory, what: str = "draw", most: int | None = None
     """What there is to draw of a motion, at most so many of its saved times, evenly chosen; ValueError where it reached none of them."""
     reached = np.flatnonzero(np.asarray(trajectory.valid))
     if reached.size == 0:
-        raise ValueError(f"the motion reached none of its saved times; there is nothing to {what}")
+        raise ValueError(f"the motion reached none of its saved times, so there is nothing to {what}; give earlier `ts`")
     if most is not None and most < reached.size:
         reached = reached[np.linspace(0, reached.size - 1, most).astype(int)]
     return _drawn(np.asarray(trajectory.ts)[reached], reached, _at(map_over_times(_seen, trajectory), reached))

@@ -1,4 +1,4 @@
-"""Motions as data for the page that shows them: a description in JSON, and one run of 32-bit floats that it points into."""
+"""Motions as data for the 3D page: a description in JSON, and an array of 32-bit floats that it refers to."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

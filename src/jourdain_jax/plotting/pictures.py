@@ -1,4 +1,6 @@
-"""Pictures by matplotlib, straight from a scene's bodies: animations, stills at a few times, and what a notebook shows of a scene."""
+"""Pictures by matplotlib from a scene's bodies: animations, stills at a few times, and the view of a scene in
+a notebook.
+"""
 
 import os
 from collections.abc import Sequence
@@ -123,7 +125,7 @@ def scene_picture(scene) -> str:
 
 def _check_one(trajectory, where: str, example: str) -> None:
     if not isinstance(trajectory, Trajectory) or trajectory.q.ndim != 2:
-        raise ValueError(f"{where} was given {described(trajectory)}, expected one motion; of a rollout take one lane: {example}")
+        raise ValueError(f"{where} was given {described(trajectory)}, expected one motion; for a rollout give one lane: {example}")
 
 
 def _traces(trajectory: Trajectory, drawn: Drawn, ends: Sequence) -> list[np.ndarray]:

@@ -1,4 +1,6 @@
-"""Named quantities of motions against time, and of families of steady motions against one another; of many motions, the bands that hold given parts of them."""
+"""Named quantities of motions against time, and of families against each other; for many motions, bands that
+hold given fractions of them.
+"""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -104,7 +106,7 @@ def _plot_motions(motions: list, names: tuple[str, ...], units, labels: list[str
 def _plot_family(family: Family, names: tuple[str, ...], units, title: str | None, axes):
     """Every further name against the first one: stable parts in full, others dashed, special points marked."""
     if len(names) < 2:
-        raise ValueError(f"`plot` of a family takes the name along the horizontal axis and those against it, and {len(names)} were given")
+        raise ValueError(f"`plot` of a family takes the name on the horizontal axis and at least one name on the vertical axis, but {len(names)} were given")
     scene = family.equations.scene
     sizes = dict.fromkeys(names, ("", 1.0)) | _checked_units(units, [scene])
     label = {name: f"{name} in {unit}" if unit else name for name, (unit, _) in sizes.items()}
@@ -169,7 +171,7 @@ def _checked_labels(labels, count: int) -> list[str]:
     if labels is None:
         return [""] if count == 1 else [f"motion {k}" for k in range(count)]
     if isinstance(labels, str) or len(labels) != count:
-        raise ValueError(f"`labels` is {labels!r}, expected a list of as many as there are motions, {count}")
+        raise ValueError(f"`labels` is {labels!r}, expected a list with one label for each of {count} motions")
     return [str(label) for label in labels]
 
 
@@ -179,7 +181,7 @@ def _checked_bands(bands) -> list[float]:
     except (TypeError, ValueError):
         parts = [np.nan]
     if not all(0 < part < 1 for part in parts):
-        raise ValueError(f"`bands` is {bands!r}, expected parts of the lanes between 0 and 1, such as (0.5, 0.95)")
+        raise ValueError(f"`bands` is {bands!r}, expected fractions of the lanes between 0 and 1, such as (0.5, 0.95)")
     return parts
 
 

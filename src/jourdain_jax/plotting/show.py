@@ -1,4 +1,4 @@
-"""Motions to be turned, zoomed and played: a page of HTML that holds everything it needs, drawn by three.js in the browser."""
+"""Motions to turn, zoom and play: a self-contained HTML page, drawn by three.js."""
 
 import base64
 import html
@@ -42,7 +42,7 @@ class View:
 
 @of_known_numbers
 def show(motion: "Trajectory | Rollout | Sequence[Trajectory]", path: str | os.PathLike[str] | None = None, **how: Any) -> View:
-    """A 3D view of a `motion` to turn, zoom, play and scrub, in a notebook or any browser.
+    """Show a 3D view of a `motion` to turn, zoom, play and scrub, in a notebook or any browser.
 
     - `motion`: from `jj.simulate`; or several in a list, or the lanes of a rollout (at most 12, evenly chosen), drawn one over the other, all but the first
       translucent.
@@ -53,7 +53,7 @@ def show(motion: "Trajectory | Rollout | Sequence[Trajectory]", path: str | os.P
     - `paths`: (body, body-frame point in m) pairs to trace (default: contact points, or mass centres where there is no contact).
     - `forces`: arrows of the contact forces (default: they are drawn). `colours`: name of a body -> "#rrggbb".
 
-    What bodies look like, a scene says in `visuals`, see `jj.Visual`; otherwise it is guessed. Returns a `View`. ValueError for what cannot be shown.
+    Looks of bodies come from the scene's `visuals`, see `jj.Visual`; otherwise they are guessed. Returns a `View`. ValueError for other arguments.
 
     **Examples**
 
@@ -65,7 +65,7 @@ def show(motion: "Trajectory | Rollout | Sequence[Trajectory]", path: str | os.P
     motions = _motions(motion)
     display = Display(**{"title": type(motions[0].scene).__name__} | {name: value for name, value in how.items() if value is not None})
     names = list(dict.fromkeys(name for one in motions for name in one.motions().bodies))
-    check_names(display.colours, names, "`colours` names `{}`, which is no body")
+    check_names(display.colours, names, "`colours` names `{}`, which is not a body")
     if np.shape(display.view) != (2,):
         raise ValueError(f"`view` is {display.view!r}, expected elevation and azimuth in degrees, such as (22, -60)")
     description, numbers = page_data(motions, display)

@@ -1,4 +1,4 @@
-"""Shapes as flat faces with four corners each, of which the last two are one in a triangle."""
+"""Shapes as flat quadrilaterals, of which triangles repeat the last corner."""
 
 from itertools import pairwise
 

@@ -1,4 +1,4 @@
-"""Bodies in space by matplotlib: their faces in the light, on a floor with their shadows, within axes in metres."""
+"""Bodies in space by matplotlib: lit faces and shadows on a floor, within axes in metres."""
 
 from collections.abc import Sequence
 

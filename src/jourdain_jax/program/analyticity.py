@@ -1,5 +1,6 @@
-"""Which expressions are analytic. An expression of +, -, *, /, roots, sines and cosines that is zero at random states is zero everywhere. An expression
-with a branch, a function that is flat somewhere, or an opaque call may be zero at every probe and not elsewhere.
+"""Analytic expressions. An expression of +, -, *, /, roots, sines and cosines that is zero at random states
+is zero everywhere. An expression with a branch, a function that is flat somewhere, or an opaque call may be
+zero at every probe and not elsewhere.
 """
 
 from collections.abc import Callable, Collection, Iterable

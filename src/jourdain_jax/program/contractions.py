@@ -1,4 +1,4 @@
-"""Arrays of nodes taken together over some of their axes: sums, products, extremes, products of matrices."""
+"""Arrays of nodes reduced over axes: sums, products, extremes, products of matrices."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Derivatives on the graph, by forward mode: nodes for the derivative of nodes along a direction given at some of them.
+"""Derivatives on the graph, by forward mode: nodes for directional derivatives.
 
 A program of JAX has a rule of differentiation of its own, tangents by its Jacobian, derived on the graph:
 

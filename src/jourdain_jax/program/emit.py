@@ -1,4 +1,4 @@
-"""A graph as JAX code: one array per scalar, so that a batch is a structure of arrays and nothing is stacked.
+"""A graph as JAX code: one array per scalar, so that a batch is a structure of arrays without stacking.
 
 Deep programs run in pieces: XLA gives each result a loop of its own, computes in it whatever it needs, and so computes what long chains share many
 times over. A piece ends where values that later pieces need are computed together.

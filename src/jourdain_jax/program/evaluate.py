@@ -1,4 +1,4 @@
-"""Values of nodes on NumPy arrays, all probes at once: nothing is compiled."""
+"""Values of nodes on NumPy arrays, at all probes at once, without compilation."""
 
 from collections.abc import Callable, Iterable, Mapping
 

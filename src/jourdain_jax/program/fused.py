@@ -1,4 +1,4 @@
-"""Several values of one shape computed in one loop over their elements, so that what they share is computed once.
+"""Several values of one shape computed in one loop over their elements, with shared parts computed once.
 
 XLA on a CPU gives each result of a program a loop of its own and computes in each whatever it needs. A reduction over several operands is one
 loop, though; so each value is reduced with a zero beside it. To JAX this is the identity: linear, element by element.

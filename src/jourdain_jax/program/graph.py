@@ -1,4 +1,5 @@
-"""A hash-consed graph of scalar expressions: equal expressions are one node, and what can be known while building is folded.
+"""A hash-consed graph of scalar expressions: equal expressions are one node, and constants are folded while
+building.
 
 Folded: constants, 0 + x, 0 x, 1 x, signs (pulled outwards, so that a - (-b) = a + b), x - x, squares of square roots, sin(-x), cos(-x).
 Arguments of sums and products are ordered, so that a b and b a are one node.

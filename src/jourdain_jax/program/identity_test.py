@@ -1,4 +1,4 @@
-"""Probes that prove identities: what two expressions have in common at them, they have in common everywhere.
+"""Probes that prove identities: expressions equal at these are equal everywhere.
 
 Sums, products, quotients, roots, sines and cosines of generic numbers agree at random only if they agree everywhere (Schwartz, 1980; Zippel, 1979). Numbers
 near those of a scene are not generic, though (a parameter may be tiny, time may stop before a switch), and a function that has branches, or saturates, may do

@@ -1,4 +1,4 @@
-"""Probes put onto rows of a graph: inputs move by Gauss-Newton until the rows vanish."""
+"""Projection of probes on a graph: inputs move by Gauss-Newton until the constraints vanish."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""A jaxpr run over scalars but for the parts that have no scalar form: these become calls in the graph.
+"""A jaxpr run over scalars, with parts that have no scalar form as calls in the graph.
 
 An equation without a rule is opaque. So are those that hand large arrays to it, those that go on with large arrays from it, and what lies between
 two opaque ones; so a network is one call. Opaque equations that follow on one another, with nothing else in between, are one call:

@@ -1,4 +1,4 @@
-"""The part of a graph that some nodes need, as a graph of its own."""
+"""The part of a graph needed by some nodes, as a separate graph."""
 
 from collections.abc import Iterable
 

@@ -1,4 +1,6 @@
-"""A graph as text: readable Python, C, or SymPy expressions. What is used more than once gets a name of its own."""
+"""A graph as text: readable Python, C, or SymPy expressions, with names for values that are used more than
+once.
+"""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -55,8 +57,8 @@ def _needed(graph: Graph, outputs: Sequence[int], names: Mapping[int, str] | dic
     reasons = dict.fromkeys(graph.value[n].reason for n in nodes if graph.op[n] == "opaque")
     if reasons:
         raise ValueError(
-            f"what is kept as a call of JAX ({'; '.join(reasons)}) cannot be written as text; "
-            "print the scene without the load it belongs to, or give that load a scalar form"
+            f"calls of JAX ({'; '.join(reasons)}) cannot be written as text; "
+            "print the scene without that load, or write it in scalar operations"
         )
     return nodes
 

@@ -1,1 +1,1 @@
-"""What a scene is made of: coordinates, bodies, loads, constraints, contacts. No algorithms."""
+"""The parts of a scene: coordinates, bodies, loads, constraints, contacts. No algorithms."""

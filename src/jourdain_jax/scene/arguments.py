@@ -1,4 +1,4 @@
-"""What is handed to a public function besides the scene's description: the scene itself, vectors of q and u, inputs. Checked by name.
+"""Checks of arguments of public functions: the scene, vectors of q and u, inputs.
 
 Kinds and shapes are known while a function is traced: no compiled program contains these checks.
 
@@ -48,7 +48,7 @@ class BuiltFor:
     reference: Any
 
     def __getattr__(self, name: str):
-        raise AttributeError(f"`{type(self).__name__}` has no `{name}`; where a scene is asked for, pass its `.scene`")
+        raise AttributeError(f"`{type(self).__name__}` has no `{name}`; where a scene is expected, pass its `.scene`")
 
 
 def as_scene(scene) -> Scene:
@@ -67,7 +67,7 @@ def as_rolling(scene, what: str) -> Scene:
     scene = as_scene(scene)
     if scene.switching.contacts:
         named = ", ".join(f"`{name}`" for name in scene.switching.contacts)
-        raise ValueError(f"`{what}` serves contacts that roll, and {named} of `{type(scene).__name__}` may slip and fly; omit `friction=` there")
+        raise ValueError(f"`{what}` needs rolling contacts, but {named} of `{type(scene).__name__}` may slip and lift off; omit `friction=` there")
     return scene
 
 
@@ -82,7 +82,7 @@ def of_known_numbers(function: F) -> F:
         known = known.scene if isinstance(known, BuiltFor) else known
         if is_traced(known, args, kwargs):
             raise DifferentiationModeError(
-                f"`{function.__name__}` was called inside jit, vmap or a derivative, with numbers that are not known there; call it outside of them"
+                f"`{function.__name__}` was called inside jit, vmap or a derivative, with numbers that are unknown there; call it outside"
             )
         with at_once():
             return function(known, *args, **kwargs)

@@ -1,4 +1,5 @@
-"""Particles and rigid bodies: what they weigh and where they are, as functions of the coordinates. Velocities come by autodiff.
+"""Particles and rigid bodies: mass, inertia and pose as functions of the coordinates. Velocities follow by
+automatic differentiation.
 
 A body states its pose in the inertial frame; `outline` is a line in its own frame, for drawing only.
 """

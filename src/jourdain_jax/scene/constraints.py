@@ -1,4 +1,4 @@
-"""Ready-made constraint rows.
+"""Ready-made constraints.
 
 Geometric rows are functions of a `Pose` and vanish; the engine differentiates them in time. Velocity rows are functions of a
 `Motion` and vanish. Each function returns the value of its row or rows, to be named in `geometric_constraints` or
@@ -18,7 +18,8 @@ def _point(position: Vector, what: str) -> Vector3:
 
 
 def knife_edge(body: BodyMotion, contact: Vector, lateral: Vector) -> Scalar:
-    """Velocity row of a blade or skate: `v(contact) . lateral`, in m/s. The point of `body` at `contact` does not move along `lateral`.
+    """Return the velocity constraint of a blade or skate: `v(contact) . lateral`, in m/s. The point of `body`
+    at `contact` does not move along `lateral`.
 
     - `body`: `motion["name"]`; `contact` (m) and the unit vector `lateral`, both in the inertial frame. Eq. (7). The body's own axis y is
       `body.orientation[:, 1]`, a column.
@@ -28,7 +29,8 @@ def knife_edge(body: BodyMotion, contact: Vector, lateral: Vector) -> Scalar:
 
 
 def rod(a: Vector, b: Vector, length: Number) -> Scalar:
-    """Geometric row of a massless rod of the given `length` (m) between two points `a`, `b` (m, inertial frame): `(|b - a|^2 - l^2)/(2 l)`, in m.
+    """Return the geometric constraint of a massless rod of the given `length` (m) between two points `a`, `b`
+    (m, inertial frame): `(|b - a|^2 - l^2)/(2 l)`, in m.
 
     To first order the excess length; its multiplier is the thrust (positive, N) in the rod. Smooth also where the points meet. Eq. (5).
     """
@@ -38,7 +40,8 @@ def rod(a: Vector, b: Vector, length: Number) -> Scalar:
 
 
 def pin(a: Vector, b: Vector, *, axes: str = "xyz") -> Float[Array, "axes"]:
-    """Geometric rows `b - a` of a joint that keeps two points `a`, `b` (m, inertial frame) together.
+    """Return the geometric constraints `b - a` of a joint that keeps two points `a`, `b` (m, inertial frame)
+    together.
 
     `axes`: letters of the inertial axes along which it holds (`"xy"` in a plane); ValueError for others. Eq. (5).
     """
@@ -48,7 +51,7 @@ def pin(a: Vector, b: Vector, *, axes: str = "xyz") -> Float[Array, "axes"]:
 
 
 def weld(first: BodyPose, second: BodyPose, *, at_first=(0.0, 0.0, 0.0), at_second=(0.0, 0.0, 0.0), turn=None) -> Float[Array, "6"]:
-    """Geometric rows (6,) of a weld of two bodies `first`, `second` (`pose["name"]`).
+    """Return the geometric constraints (6,) of a weld of two bodies `first`, `second` (`pose["name"]`).
 
     The points `at_first`, `at_second` (m, body frames, from the mass centres) coincide, and `R_second = R_first turn` (`turn`: (3, 3), the
     identity by default). The rotation rows are `vee` of the antisymmetric part of `turn' R_first' R_second`, the rotation vector to first order.

@@ -1,4 +1,5 @@
-"""Where a convex body touches a ground: the two points with opposite normals, and the gap along the normal.
+"""The contact point of a convex body and a ground: two points with opposite normals, and the gap along the
+normal.
 
     P(n)    the lowest point of the body where the unit vector n points up
     x + gap n(x) = P(n(x)),   f(x) = 0

@@ -22,7 +22,9 @@ IMPACTS = ("moreau", "newton", "poisson", "energetic")
 
 
 class Coulomb(eqx.Module):
-    """Coulomb's law of friction: `sliding` is the coefficient of a contact that slips, `static` >= `sliding` that of one that does not (default: the same)."""
+    """Coulomb's law of friction, with coefficient `sliding` for a slipping contact and `static` >= `sliding`
+    for one at rest (default: equal).
+    """
 
     sliding: Scalar
     static: Scalar
@@ -41,19 +43,20 @@ class Slipping(TypedDict, total=False):
 
 
 class Contact(eqx.Module):
-    """A point contact of a body with the ground, rolling without slip; for what `ball_contact` and its like do not know.
+    """A point contact of a body with the ground, rolling without slip; for contacts beyond `ball_contact` and
+    similar functions.
 
     - `body`: `pose["name"]`, or its name. `point` (m, inertial frame): the body's point that touches.
     - `plane`: a `jj.Plane`, tangent to the ground at the point (default: `ground.plane_at(point)`; without a ground z = 0 at rest).
     - `ground`: a `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap`; pictures show it.
-    - `height`: "coordinates" where they keep the point on the ground by themselves, "row" for a geometric row.
+    - `height`: "coordinates" if they keep the point on the ground, "row" for a geometric constraint.
     - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all of the scene), for the normal
       force where `height="coordinates"`.
     - `distance` (m): the gap, where it is not the point's height above the plane.
-    - `shape`: left to `ball_contact` and its like, for pictures; how any other body looks is said by the scene's `visuals`.
+    - `shape`: set by `ball_contact` and similar functions, for pictures; other looks are given by the scene's `visuals`.
     - `friction`, `restitution`: as in `ball_contact`.
 
-    Where the point is known in the coordinates, this spares the search for it: `jj.Contact(pose["disc"], p, ground=hill)`.
+    If the coordinates determine the point, this avoids the search for it: `jj.Contact(pose["disc"], p, ground=hill)`.
     ValueError for an unknown height, or anything of another kind or shape.
     """
 
@@ -83,7 +86,10 @@ class Contact(eqx.Module):
             _checked_ground(ground, self.body)
         if shape is not None and not isinstance(shape, get_args(Shape)):
             advice = "omit it, and state the body's look in `visuals`"
-            raise ValueError(f"`shape` of the contact of `{self.body}` is {described(shape)}, expected what `ball_contact` and its like fill in; {advice}")
+            raise ValueError(
+                f"`shape` of the contact of `{self.body}` is {described(shape)}, "
+                f"expected a shape set by `ball_contact` or a similar function; {advice}"
+            )
         self.point = checked_real(point, f"point of the contact of `{self.body}`", (3,), advice="give three components in the inertial frame, m")
         self.plane = plane if plane is not None else Plane() if ground is None else ground.plane_at(self.point)
         self.height = _checked_height(height)
@@ -107,16 +113,16 @@ class Rolling(Slipping, total=False):
 
 
 def ball_contact(body: BodyPose, radius: Any, **options: Unpack[Rolling]) -> Contact:
-    """Rolling of a ball on a ground, without slip; the contact point is `c - a n`.
+    """Return the rolling contact of a ball with a ground, without slip; the contact point is `c - a n`.
 
     - `body`: `pose["name"]`; `radius` a in m. The `options`, here and of the other contacts, are
     - `centre`: c (3,) of what rolls in m, body frame (default: the mass centre).
     - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest).
-    - `height`: "coordinates" where they keep the body on the ground by themselves, "row" for a geometric row.
+    - `height`: "coordinates" if they keep the body on the ground, "row" for a geometric constraint.
     - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all), for the normal force where
       `height="coordinates"`.
     - `friction`: Coulomb's coefficient, or a `jj.Coulomb(sliding, static)`. With it the contact flies, rolls or slips (`motion.phase`), and needs
-      `height="row"`; None (default): it rolls, whatever friction that needs. `restitution` e, from 0 (default) to 1, of impacts.
+      `height="row"`; None (default): it rolls, with whatever friction it needs. `restitution` e, from 0 (default) to 1, of impacts.
     - `impact`: "moreau" (default): w_n+ = -e w_n, and Coulomb's law on the slip afterwards. Along the normal impulse, with friction against the slip of
       each moment: "newton", until w_n+ = -e w_n; "poisson", until the impulse of restitution is e times that of compression; "energetic", until its work is
       -e^2 times. These three are for balls and for slip that keeps its direction, as in a plane: a result code where it would turn.
@@ -128,7 +134,8 @@ def ball_contact(body: BodyPose, radius: Any, **options: Unpack[Rolling]) -> Con
 
 
 def ellipsoid_contact(body: BodyPose, semi_axes: Any, **options: Unpack[Rolling]) -> Contact:
-    """Rolling of an ellipsoid on a ground, without slip; the contact point is `c - R S n'/sqrt(n'.S n')`, `n' = R' n`, `S = diag(a^2, b^2, c^2)`.
+    """Return the rolling contact of an ellipsoid with a ground, without slip, at `c - R S n'/sqrt(n'.S n')`,
+    `n' = R' n`, `S = diag(a^2, b^2, c^2)`.
 
     - `body`: `pose["name"]`; `semi_axes` (a, b, c) in m, along the axes of its body frame. `options`: as in `ball_contact`.
 
@@ -143,7 +150,7 @@ def ellipsoid_contact(body: BodyPose, semi_axes: Any, **options: Unpack[Rolling]
 
 
 def disc_contact(body: BodyPose, radius: Any, *, axis: str = "y", **options: Unpack[Rolling]) -> Contact:
-    """Rolling of the edge of a thin disc on a ground, without slip.
+    """Return the rolling contact of the edge of a thin disc with a ground, without slip.
 
     The contact is the lowest point of the circle, `c - a (n - (n.k) k)/|n - (n.k) k|` with the ground's normal n and disc axis k. Undefined for
     a disc lying flat.
@@ -156,7 +163,8 @@ def disc_contact(body: BodyPose, radius: Any, *, axis: str = "y", **options: Unp
 
 
 def wheel_contact(body: BodyPose, radius: Any, tyre: Any, *, axis: str = "y", **options: Unpack[Rolling]) -> Contact:
-    """Rolling of a wheel with a tyre of circular section (a torus) on a ground, without slip.
+    """Return the rolling contact of a wheel with a tyre of circular section (a torus) with a ground, without
+    slip.
 
     The contact is the wheel's outermost point along `-n`: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n`, with the ground's normal n, the axle k. R is
     the wheel's outer radius, R - r that of the circle within the tyre; a tyre of r = 0 makes a `disc_contact`. Undefined for a wheel lying flat.
@@ -205,7 +213,7 @@ def _slipping(body: str, height: str, friction=None, restitution=0.0, impact="mo
         return None, None, impact
     if height != "row":
         raise ValueError(
-            f'the contact of `{body}` has friction, and `height="coordinates"`, by which it cannot leave the ground; '
+            f'the contact of `{body}` has friction, but with `height="coordinates"` it cannot leave the ground; '
             'give the body coordinates of its own for its height, and write height="row"'
         )
     law = friction if isinstance(friction, Coulomb) else Coulomb(checked_real(friction, f"friction of the contact of `{body}`", ()))

@@ -1,4 +1,5 @@
-"""Generalized coordinates `q` and generalized speeds `u`: their names, and how they go together when the user says nothing.
+"""Generalized coordinates `q` and generalized speeds `u`: their names, and the default correspondence between
+them.
 
 A plain coordinate `x` has the speed `x_rate = xdot`. A quaternion `attitude` has as speeds the three body components of the
 angular velocity, `attitude_omega_x`, `..._y`, `..._z`, with `d attitude/dt = 1/2 attitude (0, omega)`.
@@ -75,7 +76,8 @@ class Coordinates:
 
 
 def quaternion(name: str) -> Quaternion:
-    """A quaternion coordinate called `name`, for use in `coordinates(...)`: four coordinates `name_w`, ..., three speeds `name_omega_x`, ...
+    """Return a quaternion coordinate called `name`, for `coordinates(...)`: four coordinates `name_w`, ...,
+    three speeds `name_omega_x`, ...
 
     The speeds are the body components of the angular velocity (rad/s), `d name/dt = 1/2 name (0, omega)`.
     """
@@ -85,7 +87,8 @@ def quaternion(name: str) -> Quaternion:
 
 
 def coordinates(*parts: str | Quaternion) -> Coordinates:
-    """Names of a scene's coordinates from `parts`: strings of names parted by blanks, and quaternions, in order.
+    """Return the names of a scene's coordinates from `parts`: strings of names separated by spaces, and
+    quaternions, in order.
 
     Example: `coordinates("x y z", quaternion("attitude"))` has 7 coordinates and 6 default speeds: `x_rate`, ..., `attitude_omega_z`.
     ValueError for a name that is no identifier, is used twice or is taken.
@@ -112,7 +115,8 @@ def coordinates(*parts: str | Quaternion) -> Coordinates:
 
 
 def speeds(names: str) -> Names:
-    """Names of user-defined generalized speeds (quasi-velocities), parted by blanks in `names`; eqs. (53)-(56).
+    """Return the names of user-defined generalized speeds (quasi-velocities), separated by spaces in `names`;
+    eqs. (53)-(56).
 
     The scene then states `coordinate_rates(t, q, u)`. ValueError as in `coordinates`.
     """
@@ -120,7 +124,9 @@ def speeds(names: str) -> Names:
 
 
 def inputs(names: str) -> Names:
-    """Names of a scene's inputs (actuator torques, say), parted by blanks in `names`; their unit is the scene's. ValueError as in `coordinates`."""
+    """Return the names of a scene's inputs (such as actuator torques), separated by spaces in `names`; their
+    unit is the scene's. ValueError as in `coordinates`.
+    """
     return _named(names, "input")
 
 
@@ -132,7 +138,7 @@ def _named(names, kind: str) -> Names:
 
 def _split(names, what: str) -> list[str]:
     if not isinstance(names, str):
-        raise ValueError(f"`{what}` was given {described(names)}, expected names in one text, parted by blanks: jj.{what}('a b c')")
+        raise ValueError(f"`{what}` was given {described(names)}, expected names in one text, separated by spaces: jj.{what}('a b c')")
     return names.split()
 
 
@@ -142,10 +148,10 @@ def _check_names(names: Sequence[str], kind: str) -> None:
         if not name.isidentifier():
             raise ValueError(f"{kind} name `{name}` is not an identifier; use letters, digits and underscores")
         if keyword.iskeyword(name):
-            raise ValueError(f"{kind} name `{name}` is a word of Python's own, so that `q.{name}` cannot be written; choose another")
+            raise ValueError(f"{kind} name `{name}` is a keyword of Python, so `q.{name}` cannot be written; choose another")
         if counts[name] > 1:
             raise ValueError(f"{kind} name `{name}` is used twice; every {kind} needs a name of its own")
         if name == "t" and kind != "input":
-            raise ValueError(f'{kind} name `t` is taken by the time, so that `motion["t"]` would be two things; choose another')
+            raise ValueError(f'{kind} name `t` is reserved for time (`motion["t"]`); choose another')
         if name in ("array", "slots", "keys"):
-            raise ValueError(f"{kind} name `{name}` is taken by the container itself; choose another")
+            raise ValueError(f"{kind} name `{name}` is an attribute of the container; choose another")

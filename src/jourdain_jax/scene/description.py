@@ -1,4 +1,4 @@
-"""Whether a scene's class says what its author meant: names of methods spelt right, names of coordinates that exist, ordered bounds.
+"""Checks of a scene's class: spelling of methods, existing coordinate names, ordered bounds.
 
 A method with a misspelt name would be left out without a word, and with it a force or a row.
 """
@@ -57,13 +57,13 @@ def check_description(scene, base: Any) -> None:
         raise ValueError(f"`modes` of `{kind.__name__}` is {described(scene.modes)}, expected jj.modes(gear=('first', 'second'))")
     if scene.speeds is not None and kind.coordinate_rates is base.coordinate_rates:
         raise ValueError(
-            f"`{kind.__name__}` has speeds of its own ({', '.join(scene.speeds.entries)}) but does not say how they move its coordinates; "
+            f"`{kind.__name__}` has speeds of its own ({', '.join(scene.speeds.entries)}) but not the rates of its coordinates; "
             "define `coordinate_rates(self, t, q, u)`, which returns the rates of all coordinates"
         )
     _check_counts(scene)
     for name in scene.speed_names.entries:
         if name in scene.coordinate_names.entries:
-            raise ValueError(f"`{kind.__name__}` has a coordinate and a speed of the name `{name}`; give one of them another name")
+            raise ValueError(f"`{kind.__name__}` has a coordinate and a speed named `{name}`; rename one of them")
     _check_domain(scene)
     example = inspect.getattr_static(kind, "example")
     if isinstance(example, dict):
@@ -119,7 +119,7 @@ def _check_counts(scene) -> None:
         value = getattr(scene, field.name)
         if isinstance(value, int) and not field.metadata.get("static") and not field.metadata.get("parameter"):
             raise ValueError(
-                f"field `{field.name}` of `{type(scene).__name__}` is {value} and no parameter; for a count or switch write "
+                f"field `{field.name}` of `{type(scene).__name__}` is {value}, which is not a parameter; for a count or switch write "
                 f"`{field.name}: {type(value).__name__} = eqx.field(static=True, default={value})`, for a number `{field.name} = jj.parameter({float(value)})`"
             )
 
@@ -140,4 +140,4 @@ def _is_ordered(pair: np.ndarray) -> bool:
 def _check_keys(kind: type, what: str, given, valid) -> None:
     if not isinstance(given, dict):
         raise ValueError(f"`{what}` of `{kind.__name__}` is {described(given)}, expected a dictionary of coordinate or speed names")
-    check_names(as_names(given), valid, f"`{what}` of `{kind.__name__}` names `{{}}`, which is no coordinate or speed")
+    check_names(as_names(given), valid, f"`{what}` of `{kind.__name__}` names `{{}}`, which is not a coordinate or speed")

@@ -91,15 +91,17 @@ class Plane(_Ground):
         return jnp.concatenate([self.tangents, self.normal[None]]).T
 
     def height_of(self, position: Vector) -> Scalar:
-        """Signed distance (m) of the point at `position` (m, inertial frame) from the plane, positive along the normal."""
+        """Return the signed distance (m) of the point at `position` (m, inertial frame) from the plane,
+        positive along the normal.
+        """
         return self.normal @ (as_real(position) - self.origin)
 
     def value(self, point: Vector) -> Scalar:
-        """f (m) at a `point` (m, inertial frame): its height above the plane."""
+        """Return f (m) at a `point` (m, inertial frame): its height above the plane."""
         return self.height_of(point)
 
     def plane_at(self, point: Vector) -> "Plane":
-        """The tangent plane at a `point` (m, inertial frame) of the plane: the plane itself."""
+        """Return the tangent plane at a `point` (m, inertial frame): the plane itself."""
         checked_real(point, "point of a plane", (3,))
         return self
 
@@ -155,7 +157,7 @@ class Cylinder(_Round):
         self.axis = checked_real(axis, "axis of a cylinder", (3,), advice="give a unit vector")
 
     def arm_to(self, point: Vector) -> Vector3:
-        """The vector from the nearest point of the axis to the `point` (m, inertial frame)."""
+        """Return the vector from the nearest point of the axis to the `point` (m, inertial frame)."""
         arm = as_real(point) - self.origin
         return arm - (arm @ self.axis) * self.axis
 
@@ -175,7 +177,7 @@ class Sphere(_Round):
         self._is("a sphere", radius, side, motion)
 
     def arm_to(self, point: Vector) -> Vector3:
-        """The vector from the sphere's centre to the `point` (m, inertial frame)."""
+        """Return the vector from the sphere's centre to the `point` (m, inertial frame)."""
         return as_real(point) - self.origin
 
     def _tangents(self, normal: Vector3) -> Tangents:
@@ -198,12 +200,12 @@ class Surface(_Ground):
         self._moves("a surface", **motion)
 
     def value(self, point: Vector) -> Scalar:
-        """f at a `point` (m, inertial frame)."""
+        """Return f at a `point` (m, inertial frame)."""
         x, y, z = as_real(point)
         return checked_real(self.f(x, y, z), "f(x, y, z) of a surface", (), advice="return one number, positive on the side of the bodies")
 
     def plane_at(self, point: Vector) -> Plane:
-        """The tangent plane at a `point` (m, inertial frame) of the surface."""
+        """Return the tangent plane at a `point` (m, inertial frame) of the surface."""
         point = as_real(point)
         normal = normal_at(self, point)
         return self._tangent(point, normal, tangents_of(normal))
@@ -225,16 +227,17 @@ class HeightMap(_Ground):
         self._moves("a height map", **motion)
 
     def height_at(self, x, y) -> Scalar:
-        """h (m) at `x`, `y` (m)."""
+        """Return h (m) at `x`, `y` (m)."""
         return checked_real(self.h(x, y), "h(x, y) of a height map", (), advice="return one height, m")
 
     def value(self, point: Vector) -> Scalar:
-        """`z - h(x, y)` (m) at a `point` (m, inertial frame)."""
+        """Return `z - h(x, y)` (m) at a `point` (m, inertial frame)."""
         x, y, z = as_real(point)
         return z - self.height_at(x, y)
 
     def plane_at(self, point: Vector) -> Plane:
-        """The tangent plane at a `point` (m, inertial frame) of the surface; only its x and y count."""
+        """Return the tangent plane at a `point` (m, inertial frame) of the surface; only its x and y count.
+        """
         x, y, _ = as_real(point)
         o, i = jnp.zeros_like(x), jnp.ones_like(x)
         height, along_x = jax.jvp(self.height_at, (x, y), (i, o))
@@ -244,7 +247,7 @@ class HeightMap(_Ground):
         return self._tangent(jnp.stack([x, y, height]), normal, jnp.stack([first, jnp.cross(normal, first)]))
 
     def point_at(self, x, y) -> Vector3:
-        """The point (m, inertial frame) of the surface at `x`, `y` (m)."""
+        """Return the point (m, inertial frame) of the surface at `x`, `y` (m)."""
         return jnp.stack([as_real(x), as_real(y), self.height_at(x, y)])
 
 

@@ -1,4 +1,5 @@
-"""What is found of a scene once: by its class, what its methods read (`names_read.py`) and the shapes of its parameters, or by their values, too.
+"""Results kept per scene: by class, names read by its methods (`names_read.py`) and shapes of parameters, or
+also by values.
 
 Reference parameters are numbers that stand in for parameters that JAX traces. What holds of a scene at every
 state, such as the rank of its rows and which speeds are independent, must be known before anything is

@@ -54,7 +54,7 @@ def _real_parts(kind: str, parts: dict | None) -> dict[str, Array]:
 
 
 def gravity(motion: Motion, strength: Any, direction: Any = (0.0, 0.0, -1.0)) -> Load:
-    """Uniform gravity `m g e` on every body of a `motion`, with its potential `- sum m g e . r`.
+    """Return uniform gravity `m g e` on every body of a `motion`, with its potential `- sum m g e . r`.
 
     `strength`: g in m/s^2; `direction`: e, a unit vector of the inertial frame. ValueError for a direction of another length, where its scene is built.
     """
@@ -67,13 +67,16 @@ def gravity(motion: Motion, strength: Any, direction: Any = (0.0, 0.0, -1.0)) ->
 
 
 def point_force(point: Point, force: Any) -> Load:
-    """A `force` (3,) (N, inertial frame) on a `point` of a body, `motion["body"].point(local)`; no potential."""
+    """Return a `force` (3,) (N, inertial frame) on a `point` of a body, `motion["body"].point(local)`; no
+    potential.
+    """
     point = _as_point(point, "point of a force")
     return _on_point(point, checked_real(force, f"force on a point of `{point.body}`", (3,), advice="give three components in the inertial frame, N"))
 
 
 def torque(motion: Motion, body: str, moment: Any, *, reaction: str | None = None) -> Load:
-    """A torque `moment` (3,) (N m, inertial frame) on a `body` of a `motion`, with the opposite torque on `reaction` where that body is named.
+    """Return a torque `moment` (3,) (N m, inertial frame) on a `body` of a `motion`, with the opposite torque
+    on `reaction` if that body is named.
 
     No potential. ValueError for an unknown body.
     """
@@ -85,7 +88,7 @@ def torque(motion: Motion, body: str, moment: Any, *, reaction: str | None = Non
 
 
 def spring(a: Point, b: Point, stiffness: Any, rest_length: Any = 0.0) -> Load:
-    """A linear spring between two points `a`, `b`: tension `k (l - l0)`, potential `k (l - l0)^2 / 2`.
+    """Return a linear spring between two points `a`, `b`: tension `k (l - l0)`, potential `k (l - l0)^2 / 2`.
 
     Points: `motion["body"].point(local)` or `fixed_point(position)`. `stiffness` k in N/m, `rest_length` l0 in m.
     """
@@ -98,7 +101,7 @@ def spring(a: Point, b: Point, stiffness: Any, rest_length: Any = 0.0) -> Load:
 
 
 def damper(a: Point, b: Point, damping: Any) -> Load:
-    """A linear damper between two points `a`, `b`: tension `c dl/dt` along the line; no potential.
+    """Return a linear damper between two points `a`, `b`: tension `c dl/dt` along the line; no potential.
 
     Points: `motion["body"].point(local)` or `fixed_point(position)`. `damping` c in N s/m.
     """
@@ -108,7 +111,8 @@ def damper(a: Point, b: Point, damping: Any) -> Load:
 
 
 def generalized_force(motion: Motion, **forces: Any) -> Load:
-    """Forces on speeds by name, `generalized_force(motion, steer_rate=torque)`: power `sum Q_k u_k`; no potential.
+    """Return forces on speeds by name, `generalized_force(motion, steer_rate=torque)`: power `sum Q_k u_k`;
+    no potential.
 
     `forces`: speed -> force, in N or N m. ValueError for an unknown speed.
     """
@@ -119,7 +123,7 @@ def generalized_force(motion: Motion, **forces: Any) -> Load:
 
 def _motion(motion: Motion, what: str) -> Motion:
     if not isinstance(motion, Motion):
-        raise ValueError(f"`{what}` was given {described(motion)}, expected a motion: what `loads(self, motion)` is handed")
+        raise ValueError(f"`{what}` was given {described(motion)}, expected a motion: the argument of `loads(self, motion)`")
     return motion
 
 

@@ -1,4 +1,5 @@
-"""Modes: inputs that events of the motion switch, and events after which a motion goes on, with a state that may jump.
+"""Modes, inputs switched by events of the motion, and events at which a motion continues, possibly with a
+jump of the state.
 
     t_e:  c(t, q, u) falls through zero      (q, u) <- R(t, q, u),   mode <- another one
 
@@ -38,7 +39,7 @@ class Modes:
             check_name(value, names, f"{where} gives mode `{name}` the value `{value}`")
             return float(names.index(value))
         if not is_traced(value) and not (np.shape(value) == () and float(value) in range(len(names))):
-            raise ValueError(f"{where} gives mode `{name}` the value {described(value)}; {nearest('', names)} Or give the number of one")
+            raise ValueError(f"{where} gives mode `{name}` the value {described(value)}; {nearest('', names)} Or give its number")
         return value
 
 
@@ -62,7 +63,7 @@ def modes(**values) -> Modes:
 
 @dataclass(frozen=True)
 class Event:
-    """An event of a scene after which the motion goes on: what its methods `events` return in place of a plain value.
+    """An event of a scene at which the motion continues, returned by `events` in place of a plain value.
 
     - `value`: the event happens where it falls through zero.
     - `to`: mode -> its value afterwards, by name.

@@ -1,4 +1,4 @@
-"""What the methods of a scene are given: poses, and poses with velocities, of all bodies at one instant.
+"""The arguments of a scene's methods: poses, and poses with velocities, of all bodies at one instant.
 
 `Pose` (t, q, bodies) is given to geometric constraints and contacts; `Motion` adds `u`, `qdot`, inputs and velocities and is given to
 loads, velocity constraints and events. Velocities are those of the mass centres and angular velocities in space components.
@@ -29,7 +29,7 @@ class Point(eqx.Module):
 
 
 def fixed_point(position: Any) -> Point:
-    """A point at rest at `position` (3,) (m, inertial frame), for springs, dampers and rods."""
+    """Return a point at rest at `position` (3,) (m, inertial frame), for springs, dampers and rods."""
     position = checked_real(position, "position of a fixed point", (3,), advice="give three components in the inertial frame, m")
     return Point(position, jnp.zeros_like(position), jnp.zeros_like(position))
 

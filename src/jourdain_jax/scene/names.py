@@ -1,4 +1,4 @@
-"""Named access to flat arrays, and error texts that list the valid names and the nearest one."""
+"""Named access to flat arrays, and error texts with the valid and the nearest names."""
 
 import difflib
 from collections.abc import Iterable
@@ -37,7 +37,7 @@ def check_names(names: Iterable[str], valid: Iterable[str], what: str, error: ty
 def as_names(names: "str | Iterable[str]") -> tuple[str, ...]:
     """Names as a tuple; those in a text are parted by blanks, as in `jj.coordinates`."""
     if not isinstance(names, str | Iterable):
-        raise ValueError(f"names were expected, in one text or several, and `{names}` was given")
+        raise ValueError(f"`{names}` was given, expected names in one text or several")
     return tuple(names.split() if isinstance(names, str) else names)
 
 
@@ -57,7 +57,7 @@ class Named(eqx.Module):
             if slot == name:
                 return self.array[..., first] if length == 0 else self.array[..., first : first + length]
         if not isinstance(name, str):
-            raise TypeError(f"entries are reached by name, and `{name}` was given; write `q.yaw`, `q['yaw']`, or `q.array[0]` for the first of all")
+            raise TypeError(f"`{name}` was given, but entries are accessed by name; write `q.yaw`, `q['yaw']`, or `q.array[0]` for the first of all")
         raise UnknownNameError(f"no `{name}` here; {nearest(name, [slot for slot, _, _ in self.slots])}")
 
     def __getattr__(self, name: str):

@@ -1,4 +1,4 @@
-"""Names that methods read besides their arguments.
+"""Names that methods read from outside their arguments.
 
 As everywhere in JAX, a method is traced once, and what it reads that is no field of the scene is a constant of the trace: a part of the structure of the
 scene, looked at when its class is made and again at each call. Looked at are the members of the class, and the global names and the variables of enclosing
@@ -178,8 +178,8 @@ def _key_of(x: Any, name: str = "", where: str = "") -> Hashable:
             return _Same(x)
     what = f"an object ({'array' if isinstance(x, jax.Array) else type(x).__name__}) that may change without being noticed"
     raise StatefulError(
-        f"{where} reads `{name}`, {'which JAX is tracing (jit, grad, vmap) and which is no field of the scene' if is_traced(x) else what}; "
-        f"make it a field, `{name}: ... = jj.parameter(...)`, or, where it holds no numbers, `eqx.field(static=True)`; or a tuple of numbers"
+        f"{where} reads `{name}`, {'which JAX is tracing (jit, grad, vmap) and which is not a field of the scene' if is_traced(x) else what}; "
+        f"make it a field, `{name}: ... = jj.parameter(...)`, or `eqx.field(static=True)` if it holds no numbers, or replace it by a tuple of numbers"
     )
 
 

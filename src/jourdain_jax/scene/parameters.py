@@ -1,4 +1,4 @@
-"""Physical parameters of a scene: differentiable leaves, stated once, checked where their values are known."""
+"""Physical parameters of a scene: differentiable leaves, checked where their values are known."""
 
 from collections.abc import Iterator
 from dataclasses import MISSING
@@ -21,7 +21,8 @@ def _as_leaf(value):
 
 
 def parameter(default: Any = ..., *, unit: str = "", positive: bool = False, non_negative: bool = False, about: str = "") -> Any:
-    """A field of a scene that is a physical parameter: converted to a floating-point array, so that it is a differentiable leaf.
+    """Declare a field of a scene as a physical parameter: converted to a floating-point array, and therefore
+    a differentiable leaf.
 
     - `default`: a number or an array; without it the parameter must be given. `unit` and `about` describe it.
     - `positive`, `non_negative`: checked (ValueError, as are numbers that are not finite) when the scene is built with known values.

@@ -1,4 +1,5 @@
-"""Moments of inertia that a body can have, as numbers that may be anything: positive definite, each principal moment at most the sum of the other two.
+"""Possible moments of inertia, parametrised by unconstrained numbers: positive definite, each principal
+moment at most the sum of the other two.
 
     I = tr(S) 1 - S,      S = A A'       A = [exp(d1) s12 s13; 0 exp(d2) s23; 0 0 exp(d3)]
 
@@ -15,7 +16,8 @@ from jourdain_jax.calculus.reals import Matrix3, checked_real, known_numbers, la
 
 
 def inertia_from_log_cholesky(numbers) -> Matrix3:
-    """Inertia matrix (3, 3) about the mass centre in kg m^2, possible whatever the numbers are.
+    """Return an inertia matrix (3, 3) about the mass centre in kg m^2, possible for all values of the
+    numbers.
 
     **Arguments:** `numbers`, (d1, d2, d3, s12, s23, s13), d: logarithms of lengths times square roots of masses, s: these themselves, sqrt(kg) m; or, of a body
     that is symmetric about its x-z plane, (d1, d2, d3, s13): Ixy = Iyz = 0.
@@ -31,7 +33,7 @@ def inertia_from_log_cholesky(numbers) -> Matrix3:
     if numbers.shape not in ((6,), (4,)):
         raise ValueError(
             f"`numbers` of `inertia_from_log_cholesky` has shape {numbers.shape}, expected (6,), or (4,) of a body that is symmetric about its x-z plane; "
-            "`log_cholesky` makes them of an inertia matrix"
+            "make them from an inertia matrix by `log_cholesky`"
         )
     zero = jnp.zeros((), numbers.dtype)
     d1, d2, d3 = jnp.exp(numbers[:3])
@@ -43,7 +45,8 @@ def inertia_from_log_cholesky(numbers) -> Matrix3:
 
 
 def log_cholesky(inertia, *, symmetric: bool = False) -> Float[Array, "numbers"]:
-    """The numbers (6,) of which `inertia_from_log_cholesky` makes this inertia matrix, (3, 3) or three principal moments, kg m^2, about the mass centre.
+    """Return the numbers (6,) from which `inertia_from_log_cholesky` makes this inertia matrix, (3, 3) or
+    three principal moments, kg m^2, about the mass centre.
 
     `symmetric`: four numbers, of a body that is symmetric about its x-z plane. **Raises** ValueError for another shape, a matrix that is not symmetric or has
     Ixy or Iyz where `symmetric` says that there are none, and for moments that no body with a thickness has; traced matrices give NaN there instead.
@@ -66,7 +69,7 @@ def _check(I: np.ndarray, S: np.ndarray, symmetric: bool) -> None:
     if not np.all(np.abs(I - I.T) <= 1e-9 * size):
         raise ValueError("`inertia` of `log_cholesky` is not symmetric; give Ixy = Iyx, Ixz = Izx, Iyz = Izy")
     if symmetric and max(abs(I[0, 1]), abs(I[1, 2])) > 1e-9 * size:
-        raise ValueError(f"`inertia` of `log_cholesky` has Ixy = {I[0, 1]:g} and Iyz = {I[1, 2]:g}, but `symmetric` says that there are none; leave it out")
+        raise ValueError(f"`inertia` of `log_cholesky` has Ixy = {I[0, 1]:g} and Iyz = {I[1, 2]:g}, but `symmetric` excludes them; omit `symmetric`")
     if not np.all(np.linalg.eigvalsh(S) > 0):
         raise ValueError(
             f"no body with a thickness has the principal moments of inertia {np.linalg.eigvalsh(I)} kg m^2 (`inertia` of `log_cholesky`): each must be "

@@ -1,4 +1,4 @@
-"""How results show themselves: their text in a console, the same in a notebook, and shapes while they are being traced."""
+"""Text of results in a console and in a notebook, with shapes in place of traced values."""
 
 import dataclasses
 import html
@@ -28,7 +28,7 @@ class Printed:
         return ""
 
     def _text(self) -> str:
-        raise NotImplementedError(f"`{type(self).__name__}` does not say how it is printed; define `_text(self)`")
+        raise NotImplementedError(f"`{type(self).__name__}` has no text for `print`; define `_text(self)`")
 
 
 _picture: Callable = lambda scene: ""  # noqa: E731

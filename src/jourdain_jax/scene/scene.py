@@ -1,5 +1,6 @@
-"""The scene: one module whose fields are physical parameters and whose methods say, in plain JAX, where the bodies are, what pushes
-them and what holds them. Everything else (velocities, partial velocities, mass matrix, rows) comes by automatic differentiation.
+"""The scene: a module whose fields are physical parameters and whose methods describe, in plain JAX, bodies,
+loads and constraints. Velocities, partial velocities, mass matrix and constraint rows follow by automatic
+differentiation.
 """
 
 import inspect
@@ -30,7 +31,8 @@ from jourdain_jax.scene.visuals import Visual
 
 
 class Scene(eqx.Module):
-    """Base class of all scenes. Subclass it, state `coordinates` and `bodies`, and what else the scene needs.
+    """Base class of all scenes. Subclass it and define `coordinates`, `bodies`, and whatever else the scene
+    needs.
 
     Class attributes (or properties, where they depend on a static field such as a number of bodies)
     - `coordinates`: names, from `jj.coordinates(...)` (required).
@@ -43,11 +45,11 @@ class Scene(eqx.Module):
     - `conventions`: one text: axes, signs, frames.
     - `example`: coordinate or speed name -> value, a typical start; `example_span`: its duration in s.
 
-    Methods are traced once, as everywhere in JAX: what they read besides the fields of the scene is a constant. Numbers, texts, tuples of them and functions
-    that a method itself reads as global names, or as variables of a function around it, may be bound anew: the next call notices that, as it does a method
-    that is replaced, and code that `%autoreload` puts into functions. Arrays, lists, dictionaries and objects
-    with state are refused by name: make them parameters or static fields. Not noticed is a change
-    of what helpers read, of attributes of modules and classes, and of files: `jj.clear_caches()` starts anew.
+    Methods are traced once, as everywhere in JAX: values from outside the fields of the scene are constants. Numbers, texts, tuples of them and functions
+    that a method itself reads as global names, or as variables of an enclosing function, may change: the next call notices it, as well as a replaced method
+    and code changed by `%autoreload`. Arrays, lists, dictionaries and objects
+    with state are refused by name: make them parameters or static fields. Changes of values read by
+    helper functions, of attributes of modules and classes, and of files are not noticed: `jj.clear_caches()` starts anew.
     """
 
     coordinates: ClassVar[Coordinates]
@@ -94,42 +96,56 @@ class Scene(eqx.Module):
             object.__setattr__(self, "switching", switching_of(self))
 
     def bodies(self, t: Scalar, q: Named) -> Mapping[str, Body]:
-        """Poses of all bodies by name at time t (s) and coordinates q, `q.name`; in the inertial frame. Required."""
-        raise NotImplementedError(f"scene `{type(self).__name__}` does not say where its bodies are; define `bodies(self, t, q)`")
+        """Return poses of all bodies by name at time t (s) and coordinates q, `q.name`; in the inertial
+        frame. Required.
+        """
+        raise NotImplementedError(f"scene `{type(self).__name__}` has no bodies; define `bodies(self, t, q)`")
 
     def coordinate_rates(self, t: Scalar, q: Named, u: Named) -> Float[Array, "coordinates"]:
-        """`qdot = N(q,t) u + nu(q,t)`, affine in u. The default: every coordinate's own rate, quaternions by body angular velocity."""
+        """Return `qdot = N(q,t) u + nu(q,t)`, affine in u. Default: every coordinate's own rate, quaternions
+        by body angular velocity.
+        """
         return self.coordinates.default_rates(q.array, u.array)
 
     def loads(self, motion: Motion) -> tuple[Load, ...]:
-        """Impressed forces at a `motion` (t, q, u, inputs, velocities)."""
+        """Return impressed forces at a `motion` (t, q, u, inputs, velocities)."""
         return ()
 
     def potential(self, pose: Pose) -> Scalar | None:
-        """Potential energy (J) at a `pose` besides that of the loads, a function of time and coordinates; None where there is none."""
+        """Return potential energy (J) at a `pose` besides that of the loads, a function of time and
+        coordinates; None if there is none.
+        """
         return None
 
     def gauge(self, pose: Pose) -> Scalar | None:
-        """A function S (J s) of a `pose` whose rate is taken off the Lagrangian, L = T - V - dS/dt; None where there is none.
+        """Return a function S (J s) of a `pose` whose rate is subtracted from the Lagrangian, L = T - V -
+        dS/dt; None if there is none.
 
-        The motion does not depend on it. Integrators built on a discrete Lagrangian do: it shows what they owe to a lucky choice of L.
+        The motion does not depend on it, but integrators built on a discrete Lagrangian do: it shows how far their accuracy depends on the choice of L.
         """
         return None
 
     def prescribed(self, t: Scalar) -> Mapping[str, Scalar]:
-        """Coordinates driven as given functions of time: name -> value. The multiplier of the row is the actuator's force."""
+        """Return prescribed coordinates as functions of time: name -> value. The multiplier of the constraint
+        is the actuator's force.
+        """
         return {}
 
     def geometric_constraints(self, pose: Pose) -> Mapping[str, Array]:
-        """Geometric rows g(q, t) = 0 at a `pose`, by name, each a scalar or a vector; eq. (5)."""
+        """Return geometric constraints g(q, t) = 0 at a `pose`, by name, each a scalar or a vector; eq. (5).
+        """
         return {}
 
     def velocity_constraints(self, motion: Motion) -> Mapping[str, Array]:
-        """Velocity rows phi(q, u, t) = 0 at a `motion`, by name, each a scalar or a vector: linear, affine or nonlinear in u; (6)-(9)."""
+        """Return velocity constraints phi(q, u, t) = 0 at a `motion`, by name, each a scalar or a vector:
+        linear, affine or nonlinear in u; (6)-(9).
+        """
         return {}
 
     def contacts(self, pose: Pose) -> Mapping[str, Contact]:
-        """Rolling contacts at a `pose`, by name; each adds its no-slip rows, and its height row if it says so."""
+        """Return rolling contacts at a `pose`, by name; each adds its no-slip constraints, and with
+        `height="row"` its height constraint.
+        """
         return {}
 
     def events(self, motion: Motion) -> Mapping[str, Scalar | Event]:
@@ -144,13 +160,16 @@ class Scene(eqx.Module):
         return {}
 
     def invariants(self, motion: Motion) -> Mapping[str, Scalar]:
-        """Named quantities of a `motion` that this scene is known to conserve, besides its energy; for checks and summaries."""
+        """Return named quantities of a `motion` that this scene conserves, besides its energy; for checks and
+        summaries.
+        """
         return {}
 
     def visuals(self, pose: Pose) -> Mapping[str, Visual | Sequence[Visual]]:
-        """What bodies look like at a `pose`, by name, `""` for what stands in the inertial frame; for pictures only. See `jj.Visual`.
+        """Return looks of bodies at a `pose`, by name, `""` for shapes fixed in the inertial frame; for
+        pictures only. See `jj.Visual`.
 
-        Bodies that are left out are drawn by their `outline`, what rolls in their contacts, or their inertia.
+        Omitted bodies are drawn by their `outline`, their contacts, or their inertia.
         """
         return {}
 
@@ -172,7 +191,8 @@ class Scene(eqx.Module):
         return scene_html(self)
 
     def replace(self, **changes: Any) -> Self:
-        """A copy of this scene with some parameters changed: `changes`, name -> value in the parameter's unit.
+        """Return a copy of this scene with changed parameters: `changes`, name -> value in the parameter's
+        unit.
 
         ValueError for an unknown name (with the nearest valid one) or a value that the parameter does not allow.
         """
@@ -183,7 +203,8 @@ class Scene(eqx.Module):
         return replace(self, **changes)
 
     def named(self, **values: Any) -> tuple[Float[Array, "coordinates"], Speeds, tuple[str, ...]]:
-        """q and u with the named `values`, the rest at the reference (zero; the identity for quaternions); and the names that were given.
+        """Return q and u with the named `values`, the rest at the reference (zero; the identity for
+        quaternions); and the given names.
 
         A quaternion or its angular velocity may be given whole, by its own name; of a quaternion that is named in part, the other parts are zero.
         ValueError for an unknown name or a wrong shape, and for parts of a quaternion that are no attitude without the others.
@@ -224,8 +245,8 @@ def _completed(parts: tuple[str, ...], q: list, first: int, given: list[str]) ->
     if np.any(abs(known_numbers(square) - 1) > 1e-4):  # parts may be typed with a few digits
         group, told = parts[0].removesuffix("_w"), ", ".join(f"`{name}`" for name in named)
         raise ValueError(
-            f"of the quaternion `{group}` only {told} is given, the squares of which sum up to {float(square):.4g}: many attitudes have that; give all four "
-            f"parts, {group}=(w, x, y, z), or those whose squares sum up to 1, the others being zero"
+            f"of the quaternion `{group}` only {told} is given, with squares that sum to {float(square):.4g}, not an attitude; give all four "
+            f"parts, {group}=(w, x, y, z), or parts whose squares sum to 1, with zero for the others"
         )
     return [name for name in parts if name not in named]
 
@@ -295,7 +316,7 @@ def hold_leaves(scene) -> None:
         if text is not None:
             raise ValueError(
                 f"field `{field.name}` of `{type(scene).__name__}` holds {described(text)}, expected numbers; "
-                f"give the number, or for what is none write `{field.name}: str = eqx.field(static=True, default={text!r})`"
+                f"give the number, or for a text write `{field.name}: str = eqx.field(static=True, default={text!r})`"
             )
         if any(callable(leaf) or type(leaf) is float for leaf in leaves):
             object.__setattr__(scene, field.name, jax.tree.map(held, value))

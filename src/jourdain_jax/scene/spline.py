@@ -1,4 +1,4 @@
-"""A smooth curve through samples: a cubic spline, for poses and prescribed coordinates that are known at some times only.
+"""A cubic spline through samples, for poses and prescribed coordinates that are known at some times only.
 
 On [t_k, t_k+1], of length h, with a = (t_k+1 - t)/h, b = 1 - a and the second derivatives m_k at the knots (Press et al., Numerical Recipes, 3.3):
 
@@ -19,7 +19,8 @@ from jourdain_jax.calculus.reals import checked_real, known_numbers, real_type
 
 
 class Spline(eqx.Module):
-    """A twice continuously differentiable function of time through `values` at the times `ts`; beyond the ends it goes on along its tangents.
+    """A twice continuously differentiable function of time through `values` at the times `ts`; linear beyond
+    the ends.
 
         class Cart(jj.Scene):
             ...
@@ -60,7 +61,7 @@ def checked_samples(kind: str, ts, values, least: int, of: str) -> tuple[Float[A
         raise ValueError(f"the times of `{kind}` must be finite and increase from one to the next; sort the samples by time and merge repeated ones")
     if not np.all(np.isfinite(numbers)):
         first = int(np.argmin(np.isfinite(numbers)))
-        raise ValueError(f"value {first} of `{kind}` is {numbers[first]}, expected finite numbers; leave samples out that were not measured")
+        raise ValueError(f"value {first} of `{kind}` is {numbers[first]}, expected finite numbers; omit missing samples")
     return ts, values
 
 

@@ -1,4 +1,4 @@
-"""Contacts with friction as what a scene declares: a mode, three events and a direction of slip for each of them.
+"""Contacts with friction as declarations of a scene: a mode, three events and a direction of slip each.
 
 Which contacts have friction is a fact of structure, found when a scene is made, once for each structure. It then has, besides what its class states,
 

@@ -1,4 +1,5 @@
-"""What the methods of a scene return, checked: of the right kind and shape, or a ValueError that names the method and what to return.
+"""Return values of a scene's methods, checked for kind and shape, or a ValueError that names the method and
+its expected result.
 
 The checks look at kinds and shapes, which are known while a scene is traced: no compiled program contains any of them.
 """
@@ -103,7 +104,7 @@ def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
         if not isinstance(contact, Contact):
             raise ValueError(f"contact `{name}` of `{_name(scene)}` is {described(contact)}, expected a `jj.disc_contact(...)` or another contact")
         if (contact.friction is not None) != (name in scene.switching.contacts):
-            raise ValueError(f"contact `{name}` of `{_name(scene)}` got its friction outside of the method `contacts`; state `friction=` in that method itself")
+            raise ValueError(f"contact `{name}` of `{_name(scene)}` got its friction outside the method `contacts`; state `friction=` in that method")
     return contacts
 
 
@@ -117,9 +118,9 @@ def events_of(scene: Scene, motion: Motion) -> dict[str, Event]:
             if not isinstance(changed, Mapping):
                 raise ValueError(f"`{what}` of {where} is {described(changed)}, expected a dictionary by name")
         if event.stop and (event.to or event.jump):
-            raise ValueError(f"{where} stops the motion and has nothing to switch; omit `to` and `jump`, or `stop`")
-        check_names(event.to, dict(scene.modes.pairs), f"{where} switches `{{}}`, which is no mode")
-        check_names(event.jump, scene.coordinate_names.entries + scene.speed_names.entries, f"{where} moves `{{}}`, which is no coordinate or speed")
+            raise ValueError(f"{where} stops the motion, so it cannot switch anything; omit `to` and `jump`, or `stop`")
+        check_names(event.to, dict(scene.modes.pairs), f"{where} switches `{{}}`, which is not a mode")
+        check_names(event.jump, scene.coordinate_names.entries + scene.speed_names.entries, f"{where} moves `{{}}`, which is not a coordinate or speed")
         found[name] = Event(
             checked_real(event.value, where, (), advice=advice),
             {mode: checked_real(scene.modes.number(mode, value, where), f"mode `{mode}` of {where}", ()) for mode, value in event.to.items()},
@@ -141,7 +142,7 @@ def visuals_of(scene: Scene, pose: Pose) -> dict[str, tuple[Visual, ...]]:
     found = {}
     for name, looks in given.items():
         if name and name not in pose:
-            raise ValueError(f'`visuals` of `{_name(scene)}` names `{name}`, which is no body, nor "", the inertial frame; {nearest(name, pose.bodies)}')
+            raise ValueError(f'`visuals` of `{_name(scene)}` names `{name}`, which is neither a body nor "" (the inertial frame); {nearest(name, pose.bodies)}')
         found[name] = (looks,) if isinstance(looks, Visual) else tuple(looks) if isinstance(looks, list | tuple) else (looks,)
         for look in found[name]:
             if not isinstance(look, Visual):

@@ -1,4 +1,4 @@
-"""What bodies look like: shapes in the frame of their body, for pictures only; no equation knows of them.
+"""Looks of bodies: shapes in the frame of their body, for pictures only.
 
 A scene states them in `visuals(self, pose)`; bodies that it leaves out are drawn by what is known of them otherwise: the line that a body was given as its
 `outline`, what rolls in its contacts, its inertia.
@@ -131,7 +131,7 @@ class Visual(eqx.Module):
             raise ValueError(f"vertices of a mesh have shape {corners.shape}, expected (points, 3), finite, m")
         polygons = tuple(tuple(int(i) for i in face) for face in faces)
         if not polygons or any(len(face) < 3 or min(face) < 0 or max(face) >= len(corners) for face in polygons):
-            raise ValueError(f"faces of a mesh: expected for each at least three numbers from 0 to {len(corners) - 1}, of its vertices in order")
+            raise ValueError(f"faces of a mesh need at least three vertex numbers each, from 0 to {len(corners) - 1}, in order")
         factors = jnp.broadcast_to(_lengths(scale, "scale of a mesh"), (3,))
         return shape("mesh", factors, faces=Faces(corners, polygons), **look)
 
@@ -149,7 +149,7 @@ class Visual(eqx.Module):
         except (NotImplementedError, ValueError, IndexError, KeyError) as reason:
             raise ValueError(f"cannot read a mesh from `{os.fspath(path)}`: {reason}; give a file such as .stl or .obj") from None
         if not len(read.faces):
-            raise ValueError(f"the file `{os.fspath(path)}` holds no faces, expected a mesh")
+            raise ValueError(f"the file `{os.fspath(path)}` has no faces, expected a mesh")
         return Visual.mesh(read.vertices, read.faces, scale=scale, **look)
 
 

@@ -1,4 +1,6 @@
-"""Charts of stability: where in a plane of two numbers modes of a steady motion pass the axis, as curves of critical points."""
+"""Stability charts: curves of critical points in a plane of two numbers, where eigenvalues of a steady motion
+cross the axis.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -74,7 +74,7 @@ def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held
     z = equations.start
     look = equations(z)
     if not largest(look.R) < 1e-6:
-        raise ValueError(f"this motion of `{type(scene).__name__}` is not steady, and its eigenvalues have no derivatives; `jj.steady` finds one that is")
+        raise ValueError(f"this motion of `{type(scene).__name__}` is not steady, so its eigenvalues have no derivatives; find a steady one by `jj.steady`")
     fixed = _held(equations, look, as_names(held))
     (values, right), (same, left) = np.linalg.eig(F := look.small[0]), np.linalg.eig(F.T)
     apart = np.abs(values - s)
@@ -103,7 +103,9 @@ def sensitivities(small: tuple[Scene, State, Array], mode: str, s: complex, held
 
 
 def _held(equations: SteadyEquations, look: Look, named: tuple[str, ...]) -> list[int]:
-    """Unknowns that tell a steady motion apart from those beside it: those named, otherwise speeds in their order, then coordinates."""
+    """Return unknowns that distinguish a steady motion from its neighbours: the named ones, otherwise speeds
+    in order, then coordinates.
+    """
     beside = null_space(look.J)
     count, speeds = beside.shape[1], equations.scene.speed_names.entries
     chosen: list[int] = []
@@ -111,7 +113,7 @@ def _held(equations: SteadyEquations, look: Look, named: tuple[str, ...]) -> lis
         if len(chosen) < count and np.linalg.matrix_rank(beside[[*chosen, k]], tol=1e-6) > len(chosen):
             chosen.append(k)
     if not len(chosen) == count >= len(named):
-        raise ValueError(f"the steady motions near this one have {count} freedoms; name as many in `held` that tell them apart ({', '.join(named)} do not)")
+        raise ValueError(f"the steady motions near this one have {count} freedoms; name as many in `held` that distinguish them ({', '.join(named)} do not)")
     return chosen
 
 
@@ -136,7 +138,7 @@ class CriticalPoint(Printed, eqx.Module):
 
     @property
     def message(self) -> str:
-        """What the code says."""
+        """Explanation of the code."""
         return MEANINGS[int(self.code)]
 
     def _text(self) -> str:
@@ -147,7 +149,9 @@ class CriticalPoint(Printed, eqx.Module):
 
 
 class _Program:
-    """R, what `F (a b) = (a b) S` leaves, C a and C b, with their slopes: functions of all numbers, a, b, and S by rows."""
+    """R, the residual of `F (a b) = (a b) S`, C a and C b, with their derivatives, as functions of all
+    numbers, a, b, and S by rows.
+    """
 
     def __init__(self, scene: Scene, instant: ByProgram, of: tuple[tuple[int, ...], ...]) -> None:
         graph, (rows, rates, states, of_states, places) = instant.graph, of
@@ -204,13 +208,15 @@ class Special(eqx.Module):
         return jnp.concatenate([z, a / size, b if self.kind == ZERO else b / size, w])
 
     def given(self, numbers: Float[Array, "numbers"], X: Unknowns) -> Float[Array, "all_numbers"]:
-        """What the program takes: all numbers, a, b, and S(w) by rows."""
+        """Arguments of the program: all numbers, a, b, and S(w) by rows."""
         _, a, b, w = self.parts(X)
         of_w, fixed = np.array(SHAPES[self.kind])
         return jnp.concatenate([numbers, a, b, of_w * w + fixed])
 
     def linear(self, near: Unknowns) -> tuple[Array, Array]:
-        """Rows L with L X = c: what keeps its value, size and phase of a and b by a normal point near by, and w where it is zero."""
+        """Return rows L with L X = c: they fix given values, size and phase of a and b relative to a nearby
+        point, and w where it is zero.
+        """
         z, a0, b0, _ = self.parts(near)
         no, held = 0 * a0, self.equations.held
         of_ab = {  # of a zero eigenvalue, b is zero unless steady motions go on at the same parameters
@@ -286,7 +292,8 @@ def followed_to(special: Special, scene: Scene) -> tuple[Array, Array, Array, Ar
 
 @shown_from_users_lines
 def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint") -> CriticalPoint:
-    """A special point of a family as a function of the scene's parameters: where a mode passes the axis of stability, or two modes meet.
+    """Return a special point of a family as a function of the scene's parameters: where a mode crosses the
+    imaginary axis, or two modes meet.
 
         straight = jj.family(bicycle, {"x_rate": 5.0, "rear_spin_rate": 16.7, "front_spin_rate": 14.3})
         jax.grad(lambda c: jj.critical(bicycle.replace(c=c), straight, "weave").speed)(0.08)
@@ -303,9 +310,9 @@ def critical(scene: Scene | BuiltFor, motions: Family, what: "str | FamilyPoint"
     """
     scene, equations = as_scene(scene), motions.equations
     if not isinstance(equations, SteadyEquations):
-        raise ValueError("`critical` takes a family of steady motions, and this is one of periodic motions")
+        raise ValueError("`critical` needs a family of steady motions, but this is a family of periodic motions")
     if type(scene) is not type(equations.scene):
-        raise ValueError(f"the family is one of `{type(equations.scene).__name__}`, and the scene a `{type(scene).__name__}`")
+        raise ValueError(f"the family belongs to `{type(equations.scene).__name__}`, but the scene is a `{type(scene).__name__}`")
     with jax.ensure_compile_time_eval():
         special = special_at(equations, _chosen(motions, what))
     return _solution(special, scene)
@@ -325,7 +332,7 @@ def _chosen(curve: Family, what: "str | FamilyPoint") -> FamilyPoint:
 def special_at(equations: SteadyEquations, point: FamilyPoint) -> Special:
     """The equations, with vectors a and b at the point of the family."""
     if not jax.config.jax_enable_x64:
-        raise ValueError("a critical point is found in float64 alone; set jax.config.update('jax_enable_x64', True)")
+        raise ValueError("critical points need float64; set jax.config.update('jax_enable_x64', True)")
     z, s = equations.place(point), point.eigenvalues
     look = equations(z)
     F, C = look.small
@@ -334,7 +341,8 @@ def special_at(equations: SteadyEquations, point: FamilyPoint) -> Special:
     freedoms = equations.freedoms(look)
     if point.kind == ZERO:
         if freedoms.shape[1] > 1:
-            raise ValueError(f"steady motions go on in {freedoms.shape[1]} ways at the same parameters: there a zero eigenvalue is no special point")
+            raise ValueError(f"steady motions continue in {freedoms.shape[1]} directions at equal parameters, "
+                "so a zero eigenvalue is not a special point; hold more, by `held`")
         b = np.sum(freedoms, axis=1) / max(np.linalg.norm(freedoms), 1e-300)
         a = E @ np.linalg.svd(np.vstack([A, b @ E]))[2][-1]
     elif point.kind == PAIR:

@@ -1,4 +1,5 @@
-"""Curves of solutions by pseudo-arclength (H. B. Keller, 1977): they pass points where an unknown turns back.
+"""Curves of solutions by pseudo-arclength (H. B. Keller, 1977), which follow an unknown past its turning
+points.
 
     R(z) = 0,   t.(z - z_i) = s        t: unit tangent at z_i, J t = 0;   s: distance along it
 
@@ -49,7 +50,9 @@ def solved(
 
 
 def along(equations: Motions, point: Point, s: float, guess: Vector | None = None, with_modes: bool = True) -> Point | None:
-    """The point of the curve at a distance along the tangent of another one; None where none is found. Without modes it has those of the other one."""
+    """Return the point of the curve at a distance along the tangent of another one; None if none is found.
+    Without modes it copies those of the other one.
+    """
     t = point.tangent
     found = solved(equations, point.z + s * t if guess is None else guess, t[None], t[None] @ point.z + s)
     if found is None:

@@ -56,23 +56,23 @@ class Motions(ABC):
     held: Int[np.ndarray, "held"]  # numbers of unknowns that keep their values at the start
 
     def index(self, name: str) -> int:
-        """Number of an unknown; a ValueError with the nearest names where there is none."""
+        """Return the number of an unknown; a ValueError with the nearest names if there is none."""
         check_name(name, self.unknowns, f"`{name}` is no unknown of the {self.what} of `{type(self.scene).__name__}`")
         return self.unknowns.index(name)
 
     def at(self, z: Vector) -> np.ndarray:
-        """All numbers, those of the unknowns by z."""
+        """Return all numbers, with the unknowns from z."""
         given = self.given.copy()
         given[self.places] = z * self.size
         return given
 
     def values(self, z: Vector) -> dict[str, float]:
-        """Coordinates, speeds and what varies, by name."""
+        """Return coordinates, speeds and varying quantities, by name."""
         numbers = self.at(z)
         return {name: float(numbers[k]) for name, k in self.by_name.items()}
 
     def place(self, point) -> Vector:
-        """z of what has the values of the unknowns by name."""
+        """Return z for given values of the unknowns by name."""
         return np.array([point[name] for name in self.unknowns]) / self.size
 
     @abstractmethod
@@ -127,7 +127,9 @@ class SteadyEquations(Motions):
         return self.with_held(v[self.rows], J, z, (F, C))
 
     def freedoms(self, look: Look) -> Float[np.ndarray, "states free"]:
-        """Directions of (q, y), in columns, along which steady motions go on at the same parameters, in SI units."""
+        """Return directions of (q, y), in columns, along which steady motions continue at equal parameters,
+        in SI units.
+        """
         count, states = 1 + len(self.held) - len(self.vary), len(self.start) - len(self.vary)
         return self._in_states(np.linalg.svd(look.J[: len(self.rows), :states])[2][states - count :].T)
 
@@ -148,7 +150,7 @@ class SteadyEquations(Motions):
         return values[np.lexsort((-values.imag, values.real))]
 
     def split(self, numbers):
-        """q, u and what varies, by name."""
+        """Return q, u and varying quantities, by name."""
         first, n, m = self.instant.states
         return numbers[first : first + n], numbers[first + n : first + n + m], {name: numbers[self.by_name[name]] for name in self.vary}
 

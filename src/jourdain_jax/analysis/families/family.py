@@ -1,4 +1,5 @@
-"""Families of steady and of periodic motions: the whole curve through one of them, with what is special on it."""
+"""Families of steady and of periodic motions: the whole curve through one of them, with its special points.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -30,7 +31,7 @@ SHOWN = 1e-9  # sizes by which an unknown changes that is printed
 
 @dataclass(frozen=True, repr=False, eq=False)
 class FamilyPoint(Printed):
-    """A point of a family; `point["lean"]`, `point.state`. `kind` says what is special about it."""
+    """A point of a family; `point["lean"]`, `point.state`. `kind` names a special point."""
 
     kind: str
     state: State
@@ -56,7 +57,8 @@ class FamilyPoint(Printed):
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Family(Printed):
-    """Steady or periodic motions along a curve, in its order; `family["lean"]`, `print(family)`. Of a periodic one, values are those where a period begins.
+    """Steady or periodic motions along a curve, in order; `family["lean"]`, `print(family)`. Values of a
+    periodic one are those at the start of a period.
 
     Eigenvalues keep their columns along the curve; the zeros that belong to going on along the family, or to what is held, are left out. Of periodic
     motions they are multipliers, all of them.
@@ -104,7 +106,7 @@ class Family(Printed):
     def at(self, **named: float) -> tuple[FamilyPoint, ...]:
         """Every point of the curve with this value of one coordinate, speed or parameter: `family.at(lean=0.4)`."""
         if len(named) != 1:
-            raise ValueError(f"`at` takes one name with its value, and {len(named)} were given: a curve has points for one value")
+            raise ValueError(f"`at` takes one name with its value, but {len(named)} were given; give one")
         ((name, value),) = named.items()
         k = self.equations.index(name)
         past = lambda p: p.z[k] - float(value) / self.equations.size[k]  # noqa: E731

@@ -1,4 +1,4 @@
-"""Following a curve of steady motions: where it begins, its eigenvalues, where it ends, and what is special on the way."""
+"""Continuation of a curve of steady motions: its beginning, eigenvalues, end, and special points."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -13,7 +13,9 @@ from jourdain_jax.calculus.reals import largest
 
 
 def followed(equations: Motions, begin: Point, targets: Targets, most: int) -> tuple[list[Point], tuple[str, str]]:
-    """All points of a curve, in order, and why it ends at the first and at the last of them; towards the targets alone, where there are some."""
+    """Return all points of a curve, in order, and the reasons why it ends at the first and the last; only
+    towards the targets, if there are any.
+    """
     ahead = [(target - begin.z[k]) * begin.tangent[k] for k, target in targets]
     if (ahead[0] if ahead else begin.tangent[np.argmax(np.abs(begin.tangent))]) < 0:
         begin = reversed_at(begin)
@@ -25,7 +27,7 @@ def followed(equations: Motions, begin: Point, targets: Targets, most: int) -> t
 
 
 def special(equations: Motions, points: Sequence[Point], turning: dict[str, int]) -> Iterator[tuple[Test, Point]]:
-    """What is special between the points, in their order."""
+    """Return special points between the points, in order."""
     for here, there in pairwise(_with_dips(equations, points, turning)):
         found = []
         for test in tests_between(equations, here, there, turning):
@@ -56,7 +58,9 @@ def _with_dips(equations: Motions, points: Sequence[Point], turning: dict[str, i
 
 
 def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
-    """The steady motion near the guess: what is named keeps its value as long as the rest can be found, then what is held or followed alone."""
+    """Return the steady motion near the guess: named values are kept as long as the rest can be found, then
+    only held or followed ones.
+    """
     z, scene, look = equations.start, type(equations.scene).__name__, equations(equations.start)
     if not np.all(np.isfinite(look.R)):
         raise ValueError(f"the equations of `{scene}` are undefined near the guess; start at another state")
@@ -66,12 +70,12 @@ def first_point(equations: Motions, named: list[str], kept: list[str]) -> Point:
         if found and largest(found[1].R) < 1e-9:
             break
     else:
-        raise ValueError(f"no {equations.what[:-1]} of `{scene}` is found near the guess; `jj.steady` may find one from afar")
+        raise ValueError(f"no {equations.what[:-1]} of `{scene}` was found near the guess; search from further away by `jj.steady`")
     z, look, _ = found
     sigma, V = np.linalg.svd(look.J)[1:]
     count = len(z) - int(np.sum(sigma >= 1e-8 * sigma[0]))
     if count == 0:
-        raise ValueError(f"this {equations.what[:-1]} of `{scene}` stands alone: no freedom is left; hold less, or name a parameter by `vary`")
+        raise ValueError(f"this {equations.what[:-1]} of `{scene}` is isolated: no freedom is left; hold fewer quantities, or name a parameter by `vary`")
     if count > 1:
         free = [f"`{name}`" for name, share in zip(equations.unknowns, np.linalg.norm(V[-count:], axis=0), strict=True) if share > 1e-3]
         raise ValueError(

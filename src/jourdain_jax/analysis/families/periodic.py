@@ -136,7 +136,7 @@ def periodic(
     names = entries + scene.speed_names.entries
     who, shift = f"`{type(scene).__name__}`", dict(shift or {})
     if until is not None:
-        check_name(until, events, f"`until` names `{until}`, which is no event of {who}")
+        check_name(until, events, f"`until` names `{until}`, which is not an event of {who}")
         if timed := structure_of(scene).timed:
             raise ValueError(f"`until` finds the period where nothing depends on time, and in {who} {' and '.join(timed)} do; give `period` alone")
     for given, valid in ((held, names), (shift, entries)):
@@ -204,7 +204,7 @@ class _Shooting(eqx.Module):
         return v[rows], D[rows][:, np.concatenate([at.q, at.u])]
 
     def aligned(self, there: States, here: States) -> States:
-        """The state `there`, with those signs of its quaternions that bring it nearest to `here`."""
+        """Return the state `there`, with the signs of its quaternions that bring it nearest to `here`."""
         for first, _ in self.scene.coordinates.quaternions:
             part = slice(first, first + 4)
             there = there.at[part].multiply(jnp.where(there[part] @ here[part] < 0, -1.0, 1.0))
@@ -215,7 +215,7 @@ class _Shooting(eqx.Module):
         return jnp.reshape(x[:-1], (self.pieces, -1)), x[-1]
 
     def rows(self, t, x: Unknowns, ends: Float[Array, "pieces states"]) -> Float[Array, "rows"]:
-        """R, in units of the sizes of what is compared, where the pieces end at `ends`."""
+        """Return R, in units of the sizes of its entries, for pieces that end at `ends`."""
         zs, _ = self.pieces_of(x)
         there = jnp.roll(zs, -1, axis=0)
         changes = (jax.vmap(self.aligned)(ends.at[-1].add(-self.shift), there) - there) / self.sizes
@@ -301,7 +301,9 @@ def _found(problem: _Shooting, start: State, period: Scalar) -> PeriodicMotion:
 
 
 class OrbitEquations(Motions):
-    """R with its slopes, and multipliers, of one scene as functions of z: what is unknown of a periodic motion, and a parameter that varies."""
+    """R with its derivatives, and multipliers, of one scene as functions of z: the unknowns of a periodic
+    motion, and a varying parameter.
+    """
 
     what, modes = "periodic motions", "multipliers"
     growth = staticmethod(lambda modes: np.abs(modes) - 1)

@@ -24,7 +24,7 @@ SURE = 1e-7  # relative to 1 + |s|: a real part, or a distance of two eigenvalue
 
 @dataclass(frozen=True)
 class Test:
-    """What changes its sign at a special point of a kind, and by how much it surely does."""
+    """A function that changes its sign at a special point of a kind, with its reliable size."""
 
     kind: str
     of: Callable[[Point], float]
@@ -51,7 +51,9 @@ def dip(at: tuple[float, ...], f: tuple[float, ...], least: float) -> float | No
 
 
 def tests_between(equations: Motions, here: Point, there: Point, unknowns: dict[str, int]) -> Iterator[Test]:
-    """The tests between two neighbours: of folds of the named unknowns, branch points, and what eigenvalues do."""
+    """Return the tests between two neighbours: of folds of the named unknowns, branch points, and
+    eigenvalues.
+    """
     held = len(here.z) - 1
     U = np.linalg.svd(here.look.J)[0][:, :held]
 

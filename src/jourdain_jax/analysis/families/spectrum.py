@@ -1,4 +1,4 @@
-"""Eigenvalues of small motions about the points of a family, each in its column all along the curve."""
+"""Eigenvalues of small motions about the points of a family, each in one column along the whole curve."""
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -18,13 +18,15 @@ def null_space(C: Float[np.ndarray, "rows states"]) -> Float[np.ndarray, "states
 
 
 def matched(before: Modes, now: Modes) -> Modes:
-    """The eigenvalues in the columns of those before: in the order that moves them least, of equals the first."""
+    """Return the eigenvalues in the columns of their predecessors: in the order of least movement."""
     apart, place = np.abs(before[:, None] - now), np.arange(len(now))
     return now[optimize.linear_sum_assignment(apart - 1e-12 * (1 + largest(now)) * np.outer(place, place))[1]]
 
 
 def surely_matched(before: Modes, now: Modes) -> bool:
-    """Whether every eigenvalue moved by less than half of what separates it from others that are no partner of it."""
+    """Return whether every eigenvalue moved by less than half of its distance to others that are not its
+    partner.
+    """
     columns = range(len(now))
     beside = np.array([[k == j or are_partners(before, now, k, j) for j in columns] for k in columns])
     apart = np.where(beside, np.inf, np.abs(before[:, None] - before))

@@ -30,7 +30,9 @@ SLOTS = (
 
 
 class _Record(NamedTuple):
-    """Hold a motion on its way, the number of tries, their window, and a checkpoint for `every` so many windows."""
+    """Hold the forward steps of a motion, their number, their window, and a checkpoint for `every` so many
+    windows.
+    """
 
     going: Going
     tries: Int[Array, ""]

@@ -26,7 +26,7 @@ from jourdain_jax.motion.vector_fields.field import Integrated
 
 @dataclass(frozen=True)
 class ArrayForm(Form):
-    """Hold the sizes of what is integrated, where there is no scalar program to count them in."""
+    """Hold the sizes of the integrated state without a scalar program."""
 
     program: None  # type: ignore[assignment]
     coordinates: int = 0  # type: ignore[assignment]
@@ -40,12 +40,12 @@ class ArrayForm(Form):
 
     @property
     def monitored(self) -> range:  # type: ignore[override]
-        """Return what is watched at all stages of a step, as of a program."""
+        """Return the monitored quantities at all stages of a step, as of a program."""
         return range(self.pivots + self.turning + len(self.squares))
 
     @property
     def known(self) -> dict[str, int]:
-        """Return nothing: what is known are arrays that all steps share."""
+        """Return nothing: known values are arrays shared by all steps."""
         return {}
 
 
@@ -250,7 +250,9 @@ class Functions:
         self._store([x[None] for x in times], self.w.at(after, of["t"].start), 1)
 
     def pull_reset(self, state: Pointer, t, y: Pointer, event, g: Pointer, to_y: Pointer, to_known: Pointer) -> None:
-        """Pull cotangents back through the state after an event; that of its time is added after those of the arrays."""
+        """Pull cotangents back through the state after an event; that of its time is added after those of the
+        arrays.
+        """
         known, of_state = sum(self.sizes()), lambda y, *shared: self._reset(event, t, y, *shared)[: self.count]
         self._pull(of_state, y, g, self.count, to_y, to_known)
         at, g_y = self.w.load(y, self.y), self.w.load(g, self.y)
@@ -275,7 +277,7 @@ class Functions:
         self.w.store(solved, told)
 
     def onto_rows(self, state: Pointer, t, y: Pointer, told: Pointer) -> None:
-        """Put a state back onto its rows; store how far that moved it, relative to the step, as `told[1]`."""
+        """Project a state onto its constraints; store the change, relative to the step, as `told[1]`."""
         free = self.w.load(y, self.y)
         self.project(state, t, y)
         rows = jax.lax.stop_gradient((self.w.load(state, self.y), free, self.w.load(y, self.y)))
@@ -366,6 +368,6 @@ def split(args: PyTree) -> tuple[tuple, tuple]:
 
 
 def joined(rest: tuple, arrays: Sequence) -> PyTree:
-    """Return the tree of which `split` made these."""
+    """Return the tree from the parts made by `split`."""
     (treedef, leaves), left = rest, iter(arrays)
     return treedef.unflatten([next(left) if x is None else x for x in leaves])

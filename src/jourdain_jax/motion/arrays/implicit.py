@@ -1,4 +1,4 @@
-"""A step of an implicit method (`implicit_steps.py`) on arrays, which run under `vmap` where there are lanes.
+"""A step of an implicit method (`implicit_steps.py`) on arrays, under `vmap` for batches.
 
 Trials of the search for an event are steps of the method too; its last shifts, which are tiny, are steps of
 Tsit5, with the derivatives of the motion. A step whose equations are not solved has an infinite error. Methods

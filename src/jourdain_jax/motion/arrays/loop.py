@@ -62,7 +62,7 @@ class Loop(NamedTuple):
 
     @property
     def log(self) -> list[range]:
-        """The rows of transitions, those of one kind together."""
+        """Return the rows of transitions, grouped by kind."""
         names = [name for name in ("log_event", "log_mode", "log_lost", "log_t") if name in self.form.rows]
         most = max(self.form.transitions, 1)
         return [range(k, k + most) for name in names for k in range(self.form.rows[name].start, self.form.rows[name].stop, most)]

@@ -1,4 +1,4 @@
-"""The writer by which the source of a step (`motion/native/step.py`) runs on arrays of JAX.
+"""The writer that runs the source of a step (`motion/native/step.py`) on arrays of JAX.
 
 Lanes are the last axes of arrays, stages are one loop with one copy of the rates to compile, and a branch is
 `lax.cond`. What a branch or a loop stores to is found by tracing it first.
@@ -147,7 +147,7 @@ class ArrayWriter:
         return [room for room in stored if room.number < newest], shapes
 
     def _within(self, rooms: list[Room], arrays: list[Array], body: Callable) -> tuple[list[Array], Any]:
-        """Return the rooms after the body, and what it returns."""
+        """Return the memory after the body, and its result."""
         for room, array in zip(rooms, arrays, strict=True):
             self._stored.setdefault(room, list(room.rows))
             room.rows = [(array, i) for i in range(len(array))]
@@ -165,7 +165,7 @@ class ArrayWriter:
         self._within(rooms, found, lambda: None)
 
     def over_stages(self, stages: int, body: Callable[[Any, Any], Any], found: Any) -> Any:
-        """Return what the body makes of what was found, stage by stage."""
+        """Return the result of the body on the stages, stage by stage."""
         rooms, shapes = self._traced(lambda: body(jnp.zeros((), jnp.int32), found))
         found = jax.tree.map(
             lambda x, like: jnp.broadcast_to(jnp.asarray(x, like.dtype), like.shape), found, shapes
@@ -216,5 +216,5 @@ class ArrayWriter:
         return jnp.sum(value(Rows(rows.start, len(rows))) ** 2, axis=0)
 
     def largest(self, rows: range, value: Callable[[Rows], Array]) -> Array:
-        """Return the largest of the values of all rows, none of which is negative."""
+        """Return the largest of the values of all rows, all of them non-negative."""
         return jnp.max(value(Rows(rows.start, len(rows))), axis=0, initial=0.0)

@@ -1,4 +1,5 @@
-"""Batches of motions: many starts, many parameters, or both; a result per lane, and one bad lane harms no other.
+"""Batches of motions with different starts, parameters, or both; each sample has its own result, and a
+failing one does not affect the others.
 
 Lanes of one chunk run in lockstep as one vmapped integration; chunks run one after another through the same compiled program.
 """
@@ -55,7 +56,7 @@ class Rollout(Printed, eqx.Module):
         return name in self.lanes
 
     def lane(self, index: int) -> Trajectory:
-        """The motion of the lane with number `index`, as a `Trajectory`; IndexError where there is none."""
+        """Return the motion of sample `index` as a `Trajectory`; IndexError if there is none."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"lane {index} does not exist; this rollout has {len(self)} lanes, 0 to {len(self) - 1}")
         lane = jax.tree.map(lambda x: x[index], self.lanes)
@@ -66,31 +67,34 @@ class Rollout(Printed, eqx.Module):
 
     @property
     def result(self) -> np.ndarray:
-        """Result code of every lane, shape (lanes,); see `jourdain_jax.motion.trajectories.results`."""
+        """Result code of every sample, shape (lanes,); see `jourdain_jax.motion.trajectories.results`."""
         return np.asarray(self.lanes.result)
 
     @property
     def failed(self) -> np.ndarray:
-        """Numbers of the lanes that reached neither their end nor an event."""
+        """Numbers of the samples that reached neither their end nor an event."""
         return np.flatnonzero(self.result > results.EVENT)
 
     @property
     def continued(self) -> np.ndarray:
-        """Numbers of the lanes that lost their privileged speeds and were run again with the full state."""
+        """Numbers of the samples that lost their privileged speeds and were repeated with the full state."""
         return np.flatnonzero(np.asarray(self.lanes.fallback) & results.FULL_STATE)
 
     @property
     def crossed_together(self) -> np.ndarray:
-        """Numbers of the lanes of which a step crossed two or more relations at once: what acts between them may be missed."""
+        """Numbers of the samples with a step that crossed two or more relations, between which an effect may
+        be missed.
+        """
         return np.flatnonzero(np.isfinite(self.lanes.together))
 
     def quantiles(self, name: str, levels: Sequence[float] = (0.025, 0.5, 0.975)) -> np.ndarray:
-        """Quantiles over lanes of the coordinate or speed `name` at all times, for the given `levels` (0 to 1), shape (levels, times).
+        """Return quantiles over the batch of the coordinate or speed `name` at all times, for the given
+        `levels` (0 to 1), shape (levels, times).
 
         Lanes that ended are left out from then on; NaN where none is left. ValueError where lanes were saved at times of their own.
         """
         if not np.all((ts := np.asarray(self.lanes.ts)) == ts[:1]):
-            raise ValueError("lanes were saved at times of their own, so that they have no quantiles in common; give all of them one start time, or one `ts`")
+            raise ValueError("lanes were saved at different times, so there are no common quantiles; give all of them one start time, or one `ts`")
         values, quantiles = np.asarray(self[name]), np.asarray(checked_real(levels, "`levels`", advice="give numbers from 0 to 1"))
         if quantiles.ndim != 1 or not np.all((quantiles >= 0) & (quantiles <= 1)):
             raise ValueError(f"`levels` are {levels}, expected a list of numbers from 0 to 1")
@@ -100,14 +104,17 @@ class Rollout(Printed, eqx.Module):
         return out
 
     def to_xarray(self, units: Mapping[str, str] | None = None):
-        """Coordinates, speeds, result codes and parameters as an `xarray.Dataset` along `lane` and `time` (s).
+        """Return coordinates, speeds, result codes and parameters as an `xarray.Dataset` along `lane` and
+        `time` (s).
 
         `units`: name of a coordinate or speed -> its unit, as in `Trajectory.to_xarray`. ImportError without xarray.
         """
         return labelled.to_xarray(self.lanes, units)
 
     def to_pandas(self):
-        """Coordinates and speeds as a `pandas.DataFrame`, one row for each lane and time (s). ImportError without pandas."""
+        """Return coordinates and speeds as a `pandas.DataFrame`, one row for each sample and time (s).
+        ImportError without pandas.
+        """
         return labelled.to_pandas(self.lanes)
 
     def _picture(self) -> str:
@@ -151,7 +158,7 @@ def rollout(
     options: Options | None = None,
     **by_name: Unpack[MotionFields],
 ) -> Rollout:
-    """Simulate many lanes.
+    """Simulate a batch of motions; the samples of the batch are called lanes.
 
     - `starts`: name -> number or array of shape (lanes,) (as in `jj.start`; the rest is solved for), or a `State` with a leading axis of lanes.
     - `parameters`: parameter name -> array with a leading axis of lanes, where lanes differ in parameters.
@@ -257,7 +264,7 @@ def _with_arrays(options: AllOptions) -> AllOptions:
 
 
 def _lanes(scene: Scene, starts, parameters: dict):
-    """Start values common to all lanes, those that vary, and the number of lanes."""
+    """Return shared start values, varying ones, and the size of the batch."""
     known = [name for name, _, _ in parameters_of(scene)]
     check_names(parameters, known, f"scene `{type(scene).__name__}` has no parameter `{{}}`")
     lengths = {f"parameter `{name}`": value.shape[0] if value.ndim else None for name, value in parameters.items()}

@@ -114,7 +114,7 @@ def _energy(args, t, z, n: int) -> Float[Array, ""]:
 
 
 def _fault(scene: Scene, field: VectorField, asked: str) -> str:
-    """Why the method does not apply; empty where it does."""
+    """Return the reason why the method does not apply; empty if it does."""
     structure = structure_of(scene)
     if needs_work(scene, structure):
         return "its T + V is not constant (loads without a potential, rows that do work, or something that depends on time)"

@@ -53,7 +53,7 @@ def momentum(scene: Scene, t, q, u, inputs) -> Float[Array, "speeds"]:
 
 
 class Interval(eqx.Module):
-    """The span of one step, and the rule by which it is seen."""
+    """The span of one step, and the quadrature rule."""
 
     t0: Float[Array, ""]
     h: Float[Array, ""]  # its length, s
@@ -78,7 +78,9 @@ def discrete_lagrangian(scene: Scene, over: Interval, q0, q1, inputs: Callable) 
 
 
 def discrete_momenta(scene: Scene, over: Interval, q0, q1, inputs: Callable):
-    """`p^+ = -D_1 L_d - f^-` at the beginning and `p^- = D_2 L_d + f^+` at the end of the interval: what free motion would leave with."""
+    """Return `p^+ = -D_1 L_d - f^-` at the beginning and `p^- = D_2 L_d + f^+` at the end of the interval:
+    momenta of the unconstrained motion.
+    """
     d0, d1 = jax.grad(lambda q0, q1: discrete_lagrangian(scene, over, q0, q1, inputs), argnums=(0, 1))(q0, q1)
     if not _has_forces(scene, over.t0, q0):
         return -d0, d1
@@ -197,16 +199,16 @@ def _projected(args, over: Interval, q0, q1) -> Float[Array, "speeds"]:
 
 
 def _kept(scene: Scene, rows: Float[Array, "rows"]) -> Float[Array, "kept_rows"]:
-    """The rows without those that may be left out everywhere."""
+    """Return the constraints without those that are redundant everywhere."""
     return rows[np.array(structure_of(scene).kept_rows, int)]
 
 
 def _fault(scene: Scene, structure: Structure) -> str:
-    """Why the principle does not apply; empty where it does."""
+    """Return the reason why the principle does not apply; empty if it does."""
     if not speeds_are_rates(scene):
         return "its speeds are quasi-velocities or angular velocities, not the coordinates' own rates"
     if not structure.affine:
-        return "its rows are nonlinear in the speeds"
+        return "its constraints are nonlinear in the speeds"
     if structure.varying_inertia:
         return "its masses or inertias change along the motion, which a Lagrangian does not describe"
     if structure.dependent_rows:

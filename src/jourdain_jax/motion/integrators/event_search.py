@@ -1,4 +1,4 @@
-"""Which stop event of a step came first, and when: trials of shorter steps from the last state before it.
+"""The first stop event of a step and its time: trials of shorter steps from the last state before it.
 
 The formulas are those of arrays of JAX and of values of machine code, as `w`, the writer of a step, has them (`motion/native/step.py`). Values of events
 are lists, one for each event.
@@ -58,7 +58,7 @@ def no_event(values: Values):
 
 
 def chosen(w, index, values: Values):
-    """Return the value with this index, of the first one where there is none."""
+    """Return the value with this index, the first one without an index."""
     found = values[0]
     for i in range(1, len(values)):
         found = w.where(w.equal(index, i), values[i], found)
@@ -104,7 +104,9 @@ def cubic(h, a, slope_a, b, slope_b) -> tuple:
 
 
 def falls_through(w, h, a, slope_a, b, slope_b):
-    """Return after which part of a step that cubic falls to zero; where Newton's method does not tell, the straight line."""
+    """Return the fraction of a step at which the cubic falls to zero; where Newton's method fails, that of
+    the straight line.
+    """
     m, A, B = cubic(h, a, slope_a, b, slope_b)
     s = line = a / (a - b)
     for _ in range(4):
@@ -140,7 +142,7 @@ def trial(w, t, c, step, last, guess) -> tuple:
 
 
 class Search(NamedTuple):
-    """What is known of the event's time.
+    """Bounds of the event's time.
 
     A bracket: three times with the values of all events there, the last one tried, one on the other side of the event, and one that was either before.
     """
@@ -205,7 +207,9 @@ def _follow(w: StepWriter, form: Form, p: Lanes, begins: Number, changes: Number
 
 
 def is_flat(w, c_dot, slope):
-    """Return whether a value has no slope where it falls through zero, as far as its digits tell, beside its mean `slope` over the step."""
+    """Return whether a value has no slope where it falls through zero, within its accuracy, relative to its
+    mean `slope` over the step.
+    """
     return w.magnitude(c_dot) <= FLAT * slope
 
 
@@ -238,7 +242,8 @@ def ahead(w, h, c_0: Values, c_dot_0: Values, c_1: Values, c_dot_1: Values, sink
 def monitored(
     w: StepWriter, form: Form, p: Lanes, k: tuple[Number, Number], y1: Number, new: dict[str, Number], h: Number, accept: Number
 ) -> dict[str, Number]:
-    """Return what becomes of a step `h` in which an event may have happened or is being located, or before which one has; changes the state `y1` after it.
+    """Return the outcome of a step `h` in which an event may have happened or is being located, or before
+    which one has; changes the state `y1` after it.
 
     `k`: slopes at its ends; `new`: time, step size, code and counts after it; `accept`: it is a step of the motion.
     """
@@ -250,7 +255,7 @@ def monitored(
         return [[w.load(place, i) for i in range(count)] for place in (values, rates)]
 
     def armed(found: list[list[Number]]) -> list[list[Number]]:
-        """Take events that have not been left since they happened for none, and those that are to be passed over."""
+        """Exclude events that have not been left since they happened, and ignored ones."""
         if not form.transitions:
             return found
         over = [w.literal(stops and not form.stopping, w.truth) for stops in form.stops]
@@ -258,7 +263,9 @@ def monitored(
         return [[w.where(off, value, x) for x, off in zip(part, disarmed, strict=True)] for part, value in zip(found, (1.0, 0.0), strict=True)]
 
     def with_rises(found: list[list[Number]]) -> list[list[Number]]:
-        """Take those that have not been left with the other sign: one that rises above zero within a step and falls again happens again."""
+        """Reverse the sign of events that have not been left: one that rises above zero within a step and
+        falls again happens again.
+        """
         if not form.transitions:
             return found
         off = p.every("disarmed")
@@ -345,7 +352,7 @@ def slope_is_flat(w: StepWriter, p: Lanes, rate: Number) -> Number:
 
 
 def put_tangents(w: StepWriter, form: Form, p: Lanes, k: Number, found: Number, t: Number, rate: list[Number], y1: Number) -> None:
-    """Where an event is found at the time t in the state `y1`, the tangents of that time, and those of the state there; `k`: the rates.
+    """Store the tangents of the time t of an event, and of the state `y1` there; `k`: the rates.
 
     Each tangent of time is found in turn, the state being moved by it, with e the directions taken together in it,
 
@@ -377,7 +384,7 @@ def put_tangents(w: StepWriter, form: Form, p: Lanes, k: Number, found: Number, 
 
 
 def _move_rows(w: StepWriter, form: Form, y: Number, k: Number, rows: int, rates: int, dt: Number, moves: Number) -> None:
-    """Adds the rates that begin with row `rates` of `k`, times `dt`, to those that begin with row `rows` of `y`."""
+    """Add the rates from row `rates` of `k`, times `dt`, to the rows from `rows` of `y`."""
 
     def moved(i: int | Number) -> Number:
         before = w.load(y, i + rows)

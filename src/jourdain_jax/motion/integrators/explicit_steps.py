@@ -1,4 +1,4 @@
-"""The explicit Runge-Kutta methods of our own loop: their tableaus, and how long their steps are.
+"""The explicit Runge-Kutta methods of our own loop: tableaus and step sizes.
 
     k_i = f(t + c_i h, y + h sum_j a_ij k_j),   y_1 = y + h sum b_i k_i,   e = h sum (b_i - b^_i) k_i
 
@@ -49,12 +49,14 @@ class Method:
 
     @property
     def at_the_end(self) -> int:
-        """The last stage that a step takes, of those at its end (of those at all, where none is)."""
+        """Return the last stage of a step at its end (or of all stages, if none is at the end)."""
         return int(max(np.flatnonzero(self.c[: self.needed] == 1.0), default=self.needed - 1))
 
 
 def _method(name: str, order: int, c: list, rows: list[list], b_hat: list) -> Method:
-    """A method from its nodes and the rows of A, both without those of the first stage, and the weights of its embedded method."""
+    """Return a method from its nodes and the rows of A, both without the first stage, and the weights of its
+    embedded method.
+    """
     stages = len(c) + 1
     A = np.zeros((stages, stages))
     for i, row in enumerate(rows):

@@ -1,4 +1,4 @@
-"""The implicit midpoint rule, on whatever form of the state is integrated."""
+"""The implicit midpoint rule, on any form of the integrated state."""
 
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree

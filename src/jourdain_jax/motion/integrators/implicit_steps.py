@@ -1,4 +1,4 @@
-"""Methods of our own loop whose steps are equations, solved by Newton's method: what such a method is.
+"""Implicit methods of our own loop, with the equations of a step solved by Newton's method.
 
 Each takes steps of one motion; lanes of a batch run under `vmap`. Structure-preserving methods keep something exactly or nearly so (an energy, a quadratic
 integral, a symmetry under reversed time) as long as their steps do not change, and have no error estimate: they carry their step. Between two times at
@@ -20,7 +20,7 @@ from jourdain_jax.scene.scene import Scene
 
 
 class Solution(NamedTuple):
-    """What a step changes."""
+    """The changes by a step."""
 
     change: PyTree  # of the state; zero where the equations of the step were not solved
     error: PyTree | None  # None: the method has no estimate

@@ -1,4 +1,5 @@
-"""What the loops over steps integrate: rates, projection and events as functions of (tau, y, args), for one motion and for lanes side by side.
+"""The integrands of the loops: rates, projection and events as functions of (tau, y, args), for one motion
+and for batches.
 
 `args`: the vector field, the scene, its inputs, what the rates need of the scene, and the time from which tau counts; of lanes, with their axis first.
 """
@@ -82,5 +83,5 @@ def _values(inputs, t) -> Float[Array, "inputs"]:
 
 
 def _at(values, inputs, t):
-    """`values(inputs, t)`, of every lane where there are lanes."""
+    """Return `values(inputs, t)`, for every sample of a batch."""
     return eqx.filter_vmap(values, out_axes=-1)(inputs, t) if jnp.ndim(t) else values(inputs, t)

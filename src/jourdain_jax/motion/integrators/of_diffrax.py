@@ -1,4 +1,4 @@
-"""diffrax, and our modules that define solvers for it: imported when a motion first asks for something of them (`calculus/on_first_use.py`)."""
+"""diffrax, and our modules that define solvers for it, imported on first use (`calculus/on_first_use.py`)."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Taylor series as a choice of solver: their order, and how it follows from a tolerance."""
+"""Taylor series as a solver: the order, by default chosen from the tolerance."""
 
 import math
 
@@ -26,7 +26,7 @@ class Taylor(eqx.Module):
 
     def __check_init__(self) -> None:
         if self.order is not None and (not isinstance(self.order, int) or isinstance(self.order, bool) or not LEAST <= self.order <= MOST):
-            raise ValueError(f"`order` is {self.order!r}, expected a whole number from {LEAST} to {MOST}, or None for that which suits the tolerance")
+            raise ValueError(f"`order` is {self.order!r}, expected a whole number from {LEAST} to {MOST}, or None to choose it by the tolerance")
 
 
 def order_for(rtol: Number) -> int:

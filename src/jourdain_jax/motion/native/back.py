@@ -1,4 +1,5 @@
-"""The loop over steps, gone through once more and then back, as machine code: cotangents of the start from those of the states and the end.
+"""Reverse mode of the loop over steps as machine code: cotangents of the start from those of the states and
+the end.
 
 Lanes side by side begin and end together here. On the way forth every try of a step leaves a slot: the state before it, the slopes of its stages, by how
 far the state went on (zero where the step was refused, or the lane had ended), and how many times had been saved before it
@@ -43,7 +44,9 @@ from jourdain_jax.native.ir import Value
 
 
 def write_back(w: MachineWriter, form: Form, method: Method, asked: Sequence[int], memory: int) -> None:
-    """The module; `asked`: of which of the numbers that the rates are given cotangents are asked; `memory`: bytes that the records of all threads may take."""
+    """Write the module; `asked`: marks of the numbers whose cotangents are needed; `memory`: bytes for the
+    records of all threads.
+    """
     write_functions(w, form, method)
     write_pulled(w, form, asked)
     prepare(w, form, method, memory)
@@ -192,7 +195,9 @@ def step_back(w: StepWriter, form: Form, method: Method, asked: int, state: Numb
 
 
 def _write_project_back(w: MachineWriter, form: Form) -> None:
-    """`project_back(state, t, free, g, added)`: cotangents of a state put back onto the rows become those of the state `free` before."""
+    """Write `project_back(state, t, free, g, added)`, which turns cotangents of a projected state into those
+    of the state `free` before it.
+    """
     moves, count = form.moves, form.integrated
     with w.procedure("project_back", "state t1:real free g added") as (state, t1, free, g, added):
         before = w.room(count * len(moves))
@@ -243,7 +248,7 @@ def is_located(w: StepWriter, lanes: Lanes) -> Number:
 
 
 def event_back(w: StepWriter, form: Form, asked: int, state: Number, located: Number, g_t: Number, g: Number, by_known: Number) -> None:
-    """Make cotangents at the time and state of an event those of a state at a number for a time."""
+    """Turn cotangents of a state at a given time into those at the time and state of an event."""
     lanes, count = Lanes(w, form, state), form.integrated
     f, out, pivots, added = (w.room(max(n, 1)) for n in (count, count, len(form.monitored), asked + 1))
     values, rates, weights = (w.room(form.events) for _ in range(3))
@@ -274,7 +279,9 @@ def event_back(w: StepWriter, form: Form, asked: int, state: Number, located: Nu
 
 
 def _moved_back(w: StepWriter, form: Form, lanes: Lanes, usable: Number, cotangents: tuple, rooms: tuple, asked: int) -> Number:
-    """The derivative along time of what an event adds to a tangent; changes the cotangents `g` of the state, the first of these, and adds to the others."""
+    """Return the derivative with respect to time of an event's part of a tangent; changes the cotangents `g`
+    of the state, the first of these, and adds to the others.
+    """
     (g, g_dt), (out, added) = cotangents, rooms
     given, count = w.room(form.integrated + 2), form.integrated
     copied(w, count, g, given)
@@ -297,8 +304,8 @@ def kernel_back(form: Form, method: Method, asked: tuple[int, ...], memory: int)
 
 
 def flow_back(form: Form, method: Method, asked: tuple[int, ...], memory: int) -> Callable[..., Float[Array, "found"]]:
-    """Cotangents of the start's state, and of the numbers `asked` for of those known, as a function of the start, and of cotangents of the states at the
-    goals, and of the end and its time.
+    """Return cotangents of the start's state, and of the known numbers `asked` for, as a function of the
+    start, and of cotangents of the states at the goals, and of the end and its time.
     """
     n = form.y
 

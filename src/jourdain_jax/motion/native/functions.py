@@ -1,4 +1,5 @@
-"""Rates, projection and stop events of a lowered scene as functions of machine code: of the rows of lanes, time since the start, and a state in memory.
+"""Rates, projection and stop events of a lowered scene as functions in machine code: of the rows of lanes,
+time since the start, and a state in memory.
 
 Where a tangent is pushed along, it follows its state in memory, and each function also gives the tangents of what it gives; others give cotangents:
 
@@ -92,7 +93,9 @@ def known_values(w: MachineWriter, form: Form, state: Value, tau: Value, y: Valu
 
 
 def write_rates(w: MachineWriter, form: Form) -> None:
-    """`rates(state, tau, y, k, pivots)`: the rates of the state `y` into `k`, and what is monitored, pivots first."""
+    """Write `rates(state, tau, y, k, pivots)`: the rates of the state `y` into `k`, and the monitored
+    quantities, pivots first.
+    """
     program = form.program
     # 120 operations: so few are written anew at each stage
     how = "alwaysinline" if program.operations <= 120 else "noinline"
@@ -129,7 +132,9 @@ def write_projection(w: MachineWriter, form: Form) -> None:
 
 
 def _write_along(w: MachineWriter, form: Form) -> None:
-    """`along(state, tau, y)`: after a state `y` on the rows stands its error, which becomes the part of it along the rows: what a projection leaves."""
+    """Write `along(state, tau, y)`: the error after a state `y` on the constraints is replaced by its part
+    along them, which a projection leaves.
+    """
     program, moved = form.program, replace(form, moving=((),), time_moves=False)
     with w.procedure("along", "state tau:real y") as (state, tau, y):
         for nodes, first in ((program.projected_q, 0), (program.projected_u, form.coordinates)):
@@ -196,12 +201,12 @@ class Pulled(NamedTuple):
 def check_derivatives(form: Form, order: int) -> None:
     """Raise a DifferentiationModeError where machine code that integrates a form has no derivatives of an order."""
     if reason := reason_against_derivatives(form, order):
-        raise DifferentiationModeError(f'{reason}; `jj.simulate(..., backend="xla")` has them')
+        raise DifferentiationModeError(f'{reason}; use `jj.simulate(..., backend="xla")`')
 
 
 @lru_cache(maxsize=64)
 def reason_against_derivatives(form: Form, order: int) -> str:
-    """Return why machine code that integrates a form cannot differentiate it so many times, in words; empty where it can."""
+    """Return the reason why machine code cannot differentiate a form so many times; empty if it can."""
     if order > len(LARGEST_DERIVATIVE):
         return "`simulate` was differentiated three times, and machine code has derivatives of the first two orders"
     for nodes in steps_of(form).values():
@@ -216,7 +221,8 @@ def reason_against_derivatives(form: Form, order: int) -> str:
 
 
 def write_pulled(w: MachineWriter, form: Form, asked: Sequence[int]) -> None:
-    """`pull_rates`, `pull_q`, `pull_u` and `pull_events`, each `(state, tau, y, g, to_y, to_known)`; `asked`: which of the numbers known.
+    """Write `pull_rates`, `pull_q`, `pull_u` and `pull_events`, each `(state, tau, y, g, to_y, to_known)`;
+    `asked`: the requested known numbers.
 
     Of a state with a tangent also `pull_moved`; events are then those of the state alone.
     """
@@ -227,7 +233,7 @@ def write_pulled(w: MachineWriter, form: Form, asked: Sequence[int]) -> None:
 
 
 def steps_of(form: Form) -> dict[str, list[int]]:
-    """What a step consists of: rates, all of a state after either part of a projection, stop events."""
+    """Return the parts of a step: rates, the whole state after either part of a projection, stop events."""
     program, (_, _, y, _) = form.program, form.split(form.program.variables)
     q, u = y[: form.coordinates], y[form.coordinates :]
     found = {"rates": form.rates}

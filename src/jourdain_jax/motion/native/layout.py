@@ -1,4 +1,5 @@
-"""Where the numbers of a lane are: a lane is a column of rows, one row per number, and a row is one vector for all lanes side by side.
+"""The memory layout of lanes: a lane is a column, each number is a row, and a row is one vector for all lanes
+side by side.
 
 A lane is handed over with all rows of `Form.given`, its progress at the start among them, and handed back with those of its progress. Where tangents are
 pushed along, the state is followed by its own, and so are the numbers that the rates are given; `dt` are those of time, which only an event's has. Of
@@ -33,7 +34,7 @@ CONTROL = ("direction", "last_goal", "rtol", "atol", "shortest", "longest", "max
 
 @dataclass(frozen=True)
 class Form:
-    """What is integrated: a lowered scene, with or without work, projection, events and pivots that are monitored."""
+    """The integrated form: a lowered scene, with or without work, projection, events and monitored pivots."""
 
     program: Lowered
     with_work: bool
@@ -58,7 +59,7 @@ class Form:
 
     @property
     def relations(self) -> tuple[int, ...]:
-        """The numbers whose signs are watched; none where there are too many."""
+        """Return the numbers whose signs are monitored; none if there are too many."""
         found = self.program.watched(self.has_events)
         return found if len(found) <= MOST_WATCHED else ()
 
@@ -69,7 +70,9 @@ class Form:
 
     @property
     def monitored(self) -> list[int]:
-        """What is watched at all stages of a step: pivots first, then directions of rows, then how far rows are from losing rank."""
+        """Return the monitored quantities at all stages of a step: pivots first, then directions of rows,
+        then distances from a loss of rank.
+        """
         return [*self.program.pivots[: self.pivots], *self.program.directions, *self.squares]
 
     @property
@@ -89,7 +92,7 @@ class Form:
 
     @property
     def squares(self) -> tuple[int, ...]:
-        """What is left of rows beside those before them, and their sizes, by turns."""
+        """Return the squared parts of rows normal to their predecessors, and squared sizes, alternating."""
         return self.program.squares if self.projects else ()
 
     @property
@@ -106,7 +109,7 @@ class Form:
         return [*self.rates, *program.guards, *program.pivots, *program.directions, *self.squares, *projected, *events, *self.watched]
 
     def split(self, variables: list[int]) -> tuple[list[int], int, list[int], list[int]]:
-        """Nodes of what is fixed, of time, of the state without work, and of the inputs."""
+        """Return nodes of fixed values, of time, of the state without work, and of the inputs."""
         t = len(self.program.fixed)
         end = t + 1 + self.q_and_v
         return variables[:t], variables[t], variables[t + 1 : end], variables[end:]
@@ -123,7 +126,9 @@ class Form:
 
     @property
     def rows_of_transition(self) -> dict[str, range]:
-        """What a transition makes: the state after it, modes, by how much the energy falls, and its time with its tangents."""
+        """Return the results of a transition: the state after it, modes, the loss of energy, and its time
+        with its tangents.
+        """
         counts = {"y": self.integrated, "mode": len(self.switched), "lost": 1, "t": 1 + len(self.moving)}
         return _in_a_row(counts)
 
@@ -154,7 +159,7 @@ class Form:
 
     @property
     def parts(self) -> list[range]:
-        """Rows of the coordinates, of the speeds and of the work, where there are any."""
+        """Return rows of the coordinates, of the speeds and of the work, if there are any."""
         ends = [0, self.coordinates, self.q_and_v, self.y]
         return [range(a, b) for a, b in pairwise(ends) if b > a]
 
@@ -223,18 +228,18 @@ class MachineWriter(Writer):
         return power(self, x, exponent)
 
     def if_any(self, condition: Value, body: Callable[[], object]) -> None:
-        """Run what the body writes where the condition holds in any lane."""
+        """Run the body's code if the condition holds in any lane."""
         with self.when(self.any(condition)):
             body()
 
     def over_stages(self, count: int, body: Callable[[int, Any], Any], found: Any) -> Any:
-        """Return what the body makes of what was found, stage by stage."""
+        """Return the result of the body on the stages, stage by stage."""
         for i in range(count):
             found = body(i, found)
         return found
 
     def in_step(self, t: Value, h: Value) -> None:
-        """Begin with the stages of a step: what samples say is looked up by the time alone."""
+        """Begin with the stages of a step: samples are interpolated by the time only."""
 
     def is_first(self, i: int) -> bool:
         """Return whether this is known to be the first stage."""
@@ -284,7 +289,7 @@ class MachineWriter(Writer):
         return self._total(rows, lambda total, i: self.fma(x := value(i), x, total))
 
     def largest(self, rows: range, value: Callable[[Any], Value]) -> Value:
-        """Return the largest of the values of all rows, none of which is negative."""
+        """Return the largest of the values of all rows, all of them non-negative."""
         return self._total(rows, lambda total, i: self.larger(total, value(i)))
 
 
@@ -325,12 +330,12 @@ class Lanes:
 
 
 def each_row(w: StepWriter, rows: range | int, into: Number, value: Callable[[int | Number], Number | float]) -> None:
-    """Sets rows of a state in memory, so many of them, or these."""
+    """Set rows of a state in memory, so many of them, or these."""
     w.each(range(rows) if isinstance(rows, int) else rows, lambda i: w.store(value(i), into, i))
 
 
 def copied(w: StepWriter, rows: int, source: Number, into: Number, where: Number | None = None) -> None:
-    """Sets so many rows to those from another place, in lanes `where` this holds."""
+    """Copy so many rows from another place, in lanes `where` this holds."""
     each_row(w, rows, into, lambda i: w.load(source, i) if where is None else w.where(where, w.load(source, i), w.load(into, i)))
 
 
@@ -340,7 +345,7 @@ def arguments_of_samples(form: Form) -> int:
 
 
 def set_goal(w: MachineWriter, lanes: Lanes, lane: Value, goal: Value) -> None:
-    """A lane goes on to the goal, or to the next knot where that comes first."""
+    """Set the next time of a lane: the goal, or the next knot if that comes first."""
     if lanes.form.sampled:
         knot = w.load(lanes.of("knot", lane, "ptr"), type="double")
         goal = w.where((knot - goal) * lanes.of("direction", lane) < 0.0, knot, goal)

@@ -1,4 +1,5 @@
-"""The loop over steps as machine code, and as a function of JAX: from rows of starts and times to save at, to states, and rows of ends.
+"""The loop over steps as machine code, and as a function of JAX: from starts and times to save, to states and
+ends.
 
 Lanes of a batch run side by side in several threads, in the widest registers, each replaced by the next one when it has ended. One motion by itself runs in
 narrow registers, in which an instruction takes less time. What a lane computes does not depend on the width. A call is given two arrays with one row per
@@ -59,7 +60,7 @@ def write_loop(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> No
 
 
 def write_functions(w: MachineWriter, form: Form, method: Method | TaylorSteps) -> None:
-    """`step`, and what it calls."""
+    """Write `step`, and its callees."""
     if form.sampled:
         write_sampled_inputs(w, form, form.time_moves)
     write_rates(w, form)
@@ -122,7 +123,9 @@ def _write_lanes(w: MachineWriter, form: Form, method: Method | TaylorSteps, job
 
 
 def begin_lane(w: MachineWriter, form: Form, job: Value, goals: Value, lanes: Lanes, lane: Value, number: Value, there: Value) -> None:
-    """The lane of the batch with this number takes a place; where it is not there, the place is idle, and goes by samples of the first one."""
+    """Assign the sample with this number to a place; if it does not exist, the place is idle, with samples of
+    the first one.
+    """
     if form.sampled:
         begin_samples(w, form, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load(job, COUNT, "i64"), lanes, lane, w.where(there, number, 0))
     with w.when(there):
@@ -153,7 +156,9 @@ def _write_begin(w: MachineWriter, form: Form) -> None:
 
 
 def _write_serve(w: MachineWriter, form: Form) -> None:
-    """`serve(job, state, who, lane)`: saves what is due, and where the lane has ended, hands it back and begins with the next one."""
+    """Write `serve(job, state, who, lane)`: saves due states, and if the sample has ended, returns it and
+    begins the next one.
+    """
     with w.procedure("serve", "job state who lane:i64") as (job, state, who, lane):
         lanes = Lanes(w, form, state)
         with w.repeated() as leave:
@@ -174,7 +179,9 @@ def _write_serve(w: MachineWriter, form: Form) -> None:
 
 
 def _write_save_within(w: MachineWriter, form: Form, method: TaylorSteps) -> None:
-    """`save_within(job, state, who, k)`: saves what is due before the end of a step, by the Taylor coefficients `k` of its start."""
+    """Write `save_within(job, state, who, k)`: saves due states before the end of a step, by the Taylor
+    coefficients `k` of its start.
+    """
     with w.procedure("save_within", "job state who k") as (job, state, who, k):
         lanes = Lanes(w, form, state)
         every, flags, y = form.integrated, w.room(), w.room(form.integrated)
@@ -224,7 +231,9 @@ MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the pro
 
 
 class Start(NamedTuple):
-    """A motion as a loop is given it; the state and what is known are followed by their tangents (`Form`)."""
+    """Arguments of a loop for a motion; the state and the known numbers are followed by their tangents
+    (`Form`).
+    """
 
     of_samples: tuple[Array, ...]  # as `layout.py` has them; of a loop on arrays the knots alone
     control: tuple[Float[Array, "*lanes"], ...]  # rtol, atol, shortest, longest and first step, most steps
@@ -279,7 +288,8 @@ class Found(NamedTuple):
         )
 
     def shared(self, given: Start) -> tuple["Found", "Found"]:
-        """Return what `vmap` finds, without lanes in the parts that have none, and which have them; `given`: what of the start has.
+        """Return the result of `vmap`, without batch axes for shared parts, and marks of batched ones;
+        `given`: the parts of the start that have one.
 
         A tangent has lanes where anything has that it depends on: all directions share the values of one motion.
         """
@@ -293,7 +303,7 @@ class Found(NamedTuple):
 
 @lru_cache(maxsize=MOST_KERNELS)
 def kernel(form: Form, method: Method, order: int | None = None) -> Callable[[Start], Found]:
-    """The motion of what is integrated, by a tableau, or by Taylor series up to an order."""
+    """Return the kernel of the integrated form, by a tableau, or by Taylor series up to an order."""
     steps = method if order is None else TaylorSteps(order)
 
     def shapes(*arguments):

@@ -1,4 +1,5 @@
-"""One motion by machine code, and when: what a kernel is given of it, and what is found from what the kernel returns.
+"""One motion by machine code: when it applies, arguments of the kernel, and quantities derived from its
+results.
 
 Inputs that are functions of time become part of the scalar program: time and their numbers take the place of their values.
 
@@ -58,7 +59,9 @@ MOST_NUMBERS = 200  # in a function of time; of a long table each is a row of a 
 
 @lru_cache(maxsize=64)
 def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) -> Lowered | str:
-    """The program with these functions in the place of inputs, or why there is none, in words; their numbers come last among what is `fixed`."""
+    """Return the program with these functions in place of inputs, or the reason why there is none; their
+    numbers come last among the `fixed` ones.
+    """
     numbers = sum(math.prod(shape) for function in functions if function is not None for shape in function.shapes)
     if numbers > MOST_NUMBERS:
         return f"inputs are functions of time with {numbers} numbers, more than {MOST_NUMBERS}"
@@ -106,12 +109,16 @@ def _random(graph: Graph, nodes: Iterable[int]) -> Probes:
 
 
 def numbers_of(channel: FunctionOfTime) -> list:
-    """Each number of a function of time; of a tree of flags or of tangents in its place, what stands for each (None: nothing does)."""
+    """Return each number of a function of time; for a tree of flags or of tangents in its place, the
+    replacements (None: nothing).
+    """
     return [x for part, shape in zip((channel.numbers, *channel.held), _shapes(channel), strict=True) for x in _each(part, shape)]
 
 
 def parts_from(channel: FunctionOfTime, numbers: Iterator) -> list:
-    """`channel.numbers`, and all that is `channel.held`, from the next of what stands for each number; None where nothing does."""
+    """Return `channel.numbers`, and all of `channel.held`, from the next replacements of each number; None if
+    there is none.
+    """
     found = [(list(islice(numbers, math.prod(shape))), shape) for shape in _shapes(channel)]
     return [None if any(x is None for x in each) else jnp.stack(each).reshape(shape) if each else jnp.zeros(shape) for each, shape in found]
 
@@ -127,7 +134,7 @@ def _each(part, shape: tuple[int, ...]) -> list:
 
 
 def moved(rates: Callable[[Float[Array, "z"]], Float[Array, "z"]]) -> Callable[[Float[Array, "z"], Float[Array, ""]], Float[Array, "z"]]:
-    """Return z itself as a function of z and of the time by which it is moved along its `rates`, which is zero."""
+    """Return z as a function of z and of a zero displacement of time along its `rates`."""
 
     def moving_with_time(slope: Callable) -> Callable:
         @jax.custom_jvp
@@ -158,7 +165,9 @@ def moved(rates: Callable[[Float[Array, "z"]], Float[Array, "z"]]) -> Callable[[
 
 
 def _rates(form: Form) -> Callable[[Float[Array, "z"]], Float[Array, "z"]]:
-    """Rates of z: the state, time, the numbers known, and how fast those of them change that samples give; zero but for the first two and what samples give."""
+    """Return rates of z: the state, time, the known numbers, and the slopes of samples; zero except for the
+    first two and samples.
+    """
     graph, rates, variables = on_its_own(form.program.graph, form.rates, form.program.variables)
     fixed, t, y, inputs = form.split(variables)
     work = [graph.input("work", True)] if form.with_work else []
@@ -171,7 +180,7 @@ def _rates(form: Form) -> Callable[[Float[Array, "z"]], Float[Array, "z"]]:
 
 @jax.custom_jvp
 def scaled(slope: Float[Array, "y"], by: Float[Array, "..."]) -> Float[Array, "y"]:
-    """Their product; zero, whatever the slope, where it is multiplied by zero."""
+    """Return their product; zero, whatever the slope, where it is multiplied by zero."""
     return jnp.where(by == 0.0, 0.0, slope * by)
 
 
@@ -241,7 +250,9 @@ def driven(program: Lowered, inputs: Inputs) -> Lowered | str:
 
 
 def form_of(field: VectorField, inputs: Inputs, has_events: bool, most: int, stopping: bool) -> Form:
-    """What machine code integrates; `most`: transitions of a motion; `stopping`: whether other events end it."""
+    """Return the form for machine code; `most`: transitions of a motion; `stopping`: whether other events end
+    it.
+    """
     assert isinstance(field, ByProgram)
     sampled = tuple(i for i, channel in enumerate(_others(inputs)) if isinstance(channel, Sampled))
     program = driven(field.program, inputs)
@@ -257,7 +268,8 @@ def modes_among(inputs: Inputs) -> tuple[int, ...]:
 
 
 def cotangents(form: Form, method: Method, start: Start, asked: Sequence[bool], memory: int, g: Solved) -> tuple[Integrated, list]:
-    """Cotangents of the start, and of each of the numbers that the rates are given, where it is `asked` for, from those of what was found.
+    """Return cotangents of the start, and of each number of the rates that is `asked` for, from those of the
+    results.
 
     `memory`: bytes that records of steps may take.
     """
@@ -270,13 +282,15 @@ def cotangents(form: Form, method: Method, start: Start, asked: Sequence[bool], 
 
 
 def cotangents_of_states(g: Solved) -> Float[Array, "times y"]:
-    """Cotangents of the states at all times to go to, from those of what was found."""
+    """Return cotangents of the states at all goals, from those of the results."""
     states = jax.vmap(lambda y: y.rows)(g.ys)
     return jnp.concatenate([states, jnp.zeros_like(states[:1])])  # nobody asks for the last one: it is that of the end
 
 
 def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integrated]:
-    """The state at a time t, as a function of it, of t, and of a time d that is zero, by which it is moved along its rates."""
+    """Return the state at a time t, as a function of it, of t, and of a zero time d, by which it is moved
+    along its rates.
+    """
     others, fixed, along_rates = _others(args[2]), len(form.program.fixed), moved(_rates(form))
 
     def moved_by(y, t, d):
@@ -291,7 +305,7 @@ def mover(args: tuple, form: Form) -> Callable[[Integrated, Array, Array], Integ
 
 
 def start_of(setup: Setup, begun: Begun) -> Start:
-    """What a kernel is given of a motion."""
+    """Return the arguments of a kernel for a motion."""
     knots, goals = setup.knots, setup.goals(setup.ts)
     known = tuple(jnp.asarray(0.0 if x is None else x, real_type()) for x in known_of(begun.args))  # what samples say is looked up
     origin, modes = jnp.asarray(begun.args[-1], real_type()), modes_at_start(begun.args[2])
@@ -310,14 +324,16 @@ def control_of(setup: Setup, knots: Float[Array, "knots"] | None) -> tuple[Float
 
 
 def known_of(args: tuple) -> list:
-    """What is known of the numbers that the rates are given: those of parameters alone, of functions of time, and constant inputs; None of samples."""
+    """Return the known numbers of the rates: those of parameters only, of functions of time, and constant
+    inputs; None for samples.
+    """
     _, _, inputs, fixed, _ = args
     functions = [x for channel in inputs.channels if isinstance(channel, FunctionOfTime) for x in numbers_of(channel)]
     return [*fixed, *functions, *(channel.value if isinstance(channel, Constant) else None for channel in _others(inputs))]
 
 
 def with_known(inputs: Inputs, known: Sequence) -> Inputs:
-    """Inputs with what stands for their numbers, in the order of `known_of` and without what is fixed, in the place of these."""
+    """Return inputs with replacements of their numbers, in the order of `known_of` and without fixed ones."""
     each = iter(known)
     new = [x for channel in inputs.channels if isinstance(channel, FunctionOfTime) for x in parts_from(channel, each)]
     new += [x for channel, x in zip(_others(inputs), each, strict=True) if isinstance(channel, Constant)]
@@ -336,7 +352,8 @@ def _others(inputs: Inputs) -> list[Callable]:
 
 
 def _samples(args: tuple, goals: Float[Array, "times"], knots: Float[Array, "knots"] | None) -> tuple[Array, ...]:
-    """Tables of the inputs that are given by samples, and the knots, as the kernel takes them; nothing where there are none."""
+    """Return tables of the sampled inputs, and the knots, in the kernel's layout; nothing if there are none.
+    """
     _, _, inputs, _, origin = args
     origin = jax.lax.stop_gradient(origin)  # what samples say at a time since the start is that of a number
     channels = [channel for channel in inputs.channels if isinstance(channel, Sampled)]
@@ -352,7 +369,7 @@ def _samples(args: tuple, goals: Float[Array, "times"], knots: Float[Array, "kno
 
 
 def solved(form: Form, goals: Float[Array, "times"], found: Found) -> Solved:
-    """What a loop found, in words."""
+    """Return the result of a loop as a `Solved`."""
     h, code, accepted, rejected, event, pivot, crossings, together, count = found.rest[:9]
     (states,), (end,), (t,), (log,) = found[:4]
     code, accepted, rejected, event, crossings = (x.astype(jnp.int32) for x in (code, accepted, rejected, event, crossings))

@@ -1,4 +1,5 @@
-"""Coordinates or speeds put onto rows as machine code: `equations/projection.py` on the scalar program of the rows, lanes side by side.
+"""Projection of coordinates or speeds as machine code: `equations/projection.py` on the scalar program of the
+constraints, lanes side by side.
 
     x <- x - W (d A W)+ d r(x),   A = dr/dx over what is free,   d: one over the lengths of the rows
 
@@ -28,7 +29,7 @@ from jourdain_jax.native.scalar_program import as_real, unsupported, written_in_
 
 
 def _product_of_rows(w: MachineWriter, a: Value, b: Value, count) -> Value:
-    """The sum of products of so many numbers from two places on."""
+    """Return the sum of products of so many numbers from two places on."""
     total = w.room()
     w.store(0.0, total)
     with w.counted(0, count) as k:
@@ -37,7 +38,7 @@ def _product_of_rows(w: MachineWriter, a: Value, b: Value, count) -> Value:
 
 
 def cleared(w: MachineWriter, place: Value, count: int) -> None:
-    """Zeros at so many places from one on."""
+    """Store zeros at so many places from one on."""
     with w.counted(0, count) as k:
         w.store(0.0, place, k)
 
@@ -97,7 +98,9 @@ def write_solved(w: MachineWriter, rows: int, columns: int) -> None:
 
 
 def write_cholesky(w: MachineWriter, n: int) -> None:
-    """`cholesky(M)`: L in place of the lower triangle of M; the identity where M is not positive definite to round-off, NaN where it is not finite."""
+    """Write `cholesky(M)`: L in place of the lower triangle of M; the identity if M is not positive definite
+    to round-off, NaN if it is not finite.
+    """
     with w.procedure("cholesky", "M") as (M,):
         finite, smallest = w.room(), w.room()
         w.store(0.0, finite)  # stays zero where all entries are finite
@@ -142,7 +145,7 @@ Kind = Literal["positions", "speeds", "determined speeds"]
 
 @dataclass(frozen=True)
 class Rows:
-    """What moves onto which rows."""
+    """The moving quantities and their constraints."""
 
     program: RowProgram
     kind: Kind
@@ -150,7 +153,7 @@ class Rows:
 
     @property
     def moving(self) -> tuple[int, ...]:
-        """Nodes of what moves."""
+        """Nodes of the moving quantities."""
         return self.program.q if self.kind == "positions" else self.program.u
 
     @property
@@ -170,7 +173,9 @@ class Rows:
 
     @property
     def given(self) -> list[int]:
-        """Nodes of what a lane is given, before what is free and the typical lengths of the rows."""
+        """Nodes of the arguments of a sample, before marks of free ones and the typical lengths of the
+        constraints.
+        """
         program = self.program
         parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
         return [*parameters, program.t, *program.q, *(() if self.kind == "positions" else (*program.u, *program.inputs))]
@@ -191,7 +196,8 @@ class Rows:
 
 
 def write(w: MachineWriter, of: Rows, cutoff: float) -> None:
-    """The module: a lane is given `of.given`, what is free, and lengths, and returns what moved, and what is left of the rows.
+    """Write the module: from `of.given`, marks of free ones, and lengths, to the projected quantities and the
+    residual.
 
     `cutoff`: singular values of rows below this share of the largest one count as zero.
     """
@@ -274,7 +280,9 @@ def _write_factored(w: MachineWriter, of: Rows) -> None:
 
 
 def _write_moved(w: MachineWriter, of: Rows) -> None:
-    """`moved(state, L, c, B, d, weights, x)`: what moves after one step, by the matrix of the rows that was `factored`."""
+    """Write `moved(state, L, c, B, d, weights, x)`: the quantities after one step, by the `factored` matrix
+    of the constraints.
+    """
     rows, columns, first_free = len(of.residuals), len(of.moving), len(of.given)
     first = of.given.index(of.moving[0])
     with w.procedure("moved", "state L c B d weights x") as (state, L, c, B, d, weights, x):
@@ -293,7 +301,7 @@ def _write_moved(w: MachineWriter, of: Rows) -> None:
 
 
 def _write_row(w: MachineWriter, of: Rows) -> None:
-    """`row(state, found)`: the lanes of a block, from what they are given to what they return."""
+    """Write `row(state, found)`: a block of samples, from arguments to results."""
     rows, columns = len(of.residuals), len(of.moving)
     first = of.given.index(of.moving[0])
     with w.procedure("row", "state found") as (state, found):
@@ -306,7 +314,7 @@ def _write_row(w: MachineWriter, of: Rows) -> None:
 
 
 def _write_putting(w: MachineWriter, of: Rows, first: int, state: Value, factors: list[Value], x: Value) -> None:
-    """What moves, put onto the rows in its place."""
+    """Write the projection in place."""
     if of.metric is not None:
         w.run("metric", state, *factors[:2])
     if not of.affine:
@@ -320,7 +328,7 @@ def _write_putting(w: MachineWriter, of: Rows, first: int, state: Value, factors
 
 
 def _write_iteration(w: MachineWriter, of: Rows, first: int, places: tuple[Value, ...]) -> None:
-    """Steps until they change nothing, as those of `calculus/roots.py`."""
+    """Write steps until they change nothing, as in `calculus/roots.py`."""
     state, *factors, x = places
     columns, quiet, changed = len(of.moving), w.room(), w.room()
     w.store(0.0, quiet)

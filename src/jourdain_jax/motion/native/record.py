@@ -1,4 +1,5 @@
-"""The record of steps of a motion's way forth, by which its cotangents go back (`back.py`): one slot for each try of a step, for all lanes of a block.
+"""The record of the steps of a motion for reverse mode (`back.py`): one slot for each trial step, for all
+lanes of a block.
 
 The number of slots is bounded by the memory of the model, which all threads share; on a CPU the record grows up to it with the steps.
 If a motion takes more steps, its lanes run forward again for each window of slots, the last window first.
@@ -21,7 +22,8 @@ FIRST_SLOTS = 64  # for which there is memory at first; then twice as many, and 
 
 
 class Slot(NamedTuple):
-    """Rows of a slot: those of a state come first, then those of its slopes; those that a transition left last; `all`: how many there are."""
+    """Rows of a slot: the state first, then its derivatives; rows of a transition last; `all`: their number.
+    """
 
     y: int
     t: int
@@ -102,7 +104,7 @@ def write_record(w: MachineWriter, form: Form, method: Method, asked: int, memor
 
 
 def prepare(w: MachineWriter, form: Form, method: Method, memory: int) -> None:
-    """What the record, of so many bytes of memory, needs in the module."""
+    """Write the parts of the module needed by a record of so many bytes."""
     if w.device:
         w.scratch = Slot.of(form, method).all, memory
     else:
@@ -110,7 +112,9 @@ def prepare(w: MachineWriter, form: Form, method: Method, memory: int) -> None:
 
 
 def _write_more_room(w: MachineWriter) -> None:
-    """`more_room(old, bytes)`: twice as many bytes, the first of them as before; null where there are none."""
+    """Write `more_room(old, bytes)`: twice as many bytes, beginning with the old ones; null if there are
+    none.
+    """
     with w.function("more_room", "ptr", {"old": "ptr", "bytes": "i64"}, attributes="noinline") as (old, size):
         new = w.external("aligned_alloc", "ptr", w.literal(64, "i64"), size * 2)
         there = w.converted("ptrtoint", new, "i64").differs(0)
@@ -161,7 +165,7 @@ def _on_gpu(w: MachineWriter, slot: Slot, job: Value) -> _Places:
 
 
 def _take(w: MachineWriter, job: Value, who: Value) -> None:
-    """The next lanes of the batch; -1 where there is none."""
+    """Return the next samples of the batch; -1 if there is none."""
     with w.counted(0, w.lanes) as lane:
         number = next_lane(w, job, NEXT)
         w.store(w.where(number < w.load(job, COUNT, "i64"), number, -1), who, lane)

@@ -1,4 +1,4 @@
-"""Inputs that are given by samples, as machine code looks them up: between samples lie straight lines:
+"""Linear interpolation of sampled inputs in machine code:
 
     f(t) = f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k),   t_k <= t < t_{k+1};   constant before the first sample and after the last
     df/dt = (f_{k+1} - f_k)/(t_{k+1} - t_k)
@@ -16,7 +16,7 @@ _TABLES, _KNOTS, _TABLE_COUNT, _KNOT_COUNT, _SAMPLES, _KNOTS_EACH = range(WORDS_
 
 
 def store_samples(w: MachineWriter, words: Value, given: list[Given]) -> None:
-    """The words of a job that say where samples are."""
+    """Store the location of samples in the words of a job."""
     tables, knots = given
     for word, value in (
         (_TABLES, tables.data),
@@ -30,7 +30,7 @@ def store_samples(w: MachineWriter, words: Value, given: list[Given]) -> None:
 
 
 def begin_samples(w: MachineWriter, form: Form, words: Value, count: Value, lanes: Lanes, lane: Value, number: Value) -> None:
-    """A place takes the table and the knots of the lane with this number, of so many."""
+    """Assign the table and the knots of the sample with this number, of so many, to a place."""
     size = w.load(words, _SAMPLES, "i64")
 
     def share(of: int) -> Value:

@@ -69,7 +69,7 @@ def write_step(w: StepWriter, form: Form, method: Method | TaylorSteps) -> None:
 
 
 def step(w: StepWriter, form: Form, method, p: Lanes, k: Number, tried: Callable) -> None:
-    """Try one step of all lanes that are on their way, by what `tried` makes of it."""
+    """Try one step of all lanes under way, judged by `tried`."""
     if form.relations:
         first_signs(w, form, p)
     take(w, form, method, p, k, tried(w, form, method, p, k))
@@ -95,7 +95,7 @@ def tried_by_stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Numb
 
 
 def _compensate(w: StepWriter, form: Form, p: Lanes, y1: Number, increment: Callable[[Any], Number]) -> None:
-    """Sum state and increments with what rounding has left off (Kahan), and note what it leaves off now."""
+    """Add increments to the state with the round-off of earlier sums (Kahan), and store the new round-off."""
     rest, first = w.at(p.pointer, form.rows["rest"].start), w.at(p.pointer, form.rows["next_rest"].start)
 
     def sums(i: Any) -> None:
@@ -155,7 +155,7 @@ def _tried_by_series(w: StepWriter, form: Form, method: TaylorSteps, p: Lanes, k
 
 
 def take(w: StepWriter, form: Form, method, p: Lanes, k: Number, trial: Trial) -> None:
-    """What becomes of the lanes after a step that was tried; `k`: slopes, the one at the start first."""
+    """Update the lanes after a tried step; `k`: derivatives at the stages, at the start first."""
     y, count = p.pointer, form.integrated
     if form.transitions:
         p["left"] = w.number(0.0)
@@ -226,13 +226,15 @@ def stages(w: StepWriter, form: Form, method: Method, p: Lanes, k: Number, t: Nu
 
 
 def unseen(w: StepWriter, form: Form) -> tuple:
-    """Return what is known of pivots and directions before the first stage: the first directions, extremes of pivots, whether a row turned round."""
+    """Return the initial values for monitoring pivots and directions: first directions, extremes of pivots,
+    whether a row turned round.
+    """
     low, high = ([w.number(x)] * form.pivots for x in (math.inf, -math.inf))
     return [w.number(0.0)] * form.turning, low, high, w.literal(0, w.truth)
 
 
 def seen(w: StepWriter, form: Form, i: Number, pivots: Number, known: tuple) -> tuple:
-    """Return this after a stage, of which `pivots` are the numbers that are monitored."""
+    """Return the monitoring values after a stage with monitored numbers `pivots`."""
     first, low, high, turned = known
     now, directions = ([w.load(pivots, j) for j in range(a, a + count)] for a, count in ((0, form.pivots), (form.pivots, form.turning)))
     first = [w.at_first(i, new, old) for new, old in zip(directions, first, strict=True)]
@@ -248,13 +250,13 @@ def worst(w: StepWriter, known: tuple) -> tuple[Number, Number]:
 
 
 def squares_of(w: StepWriter, form: Form, monitored: Number) -> list[tuple[Number, Number]]:
-    """What is left of each row beside those before it, and its size, squared."""
+    """Return the squared part of each row normal to its predecessors, and its squared size."""
     found = [w.load(monitored, j) for j in range(len(form.monitored) - len(form.squares), len(form.monitored))]
     return list(zip(found[::2], found[1::2], strict=True))
 
 
 def near_rank_loss(squares: list[tuple[Number, Number]]) -> Number:
-    """Whether some row is nearly one of those before it."""
+    """Return whether some row nearly depends on its predecessors."""
     return any_of([left < NEAR_SINE**2 * size for left, size in squares])
 
 
@@ -318,7 +320,9 @@ def project(w: StepWriter, form: Form, p: Lanes, t1: Number, y1: Number, error: 
 
 
 def norm(w: StepWriter, form: Form, p: Lanes, error: Number, y1: Number) -> Number:
-    """Root mean square of the errors of coordinates and speeds, relative to what is allowed; infinite where one is no number."""
+    """Return the root mean square of the errors of coordinates and speeds, relative to the tolerance;
+    infinite if one is NaN.
+    """
     rtol, atol, count = p["rtol"], p["atol"], form.q_and_v
 
     def relative(i: int | Number) -> Number:

@@ -1,4 +1,5 @@
-"""Steps by Taylor series: the coefficients of a state along its motion, how far they reach, and the state at any time within reach.
+"""Steps by Taylor series: coefficients of a state along its motion, their radius, and the state at any time
+within it.
 
     y(t + s) = sum_{k=0}^p y_k s^k,        h = safety min((1/N_{p-1})^{1/(p-1)}, (1/N_p)^{1/p}),   N_k = rms(y_k/(atol + rtol |y_0|))
 
@@ -69,11 +70,11 @@ class Series:
                 series.append(graph.div(self._at(rate, k), graph.const(k + 1)))
 
     def _at(self, node: int, k: int) -> int:
-        """The coefficient of a node; those beyond the last one known of what is given are zero."""
+        """Return the coefficient of a node; coefficients beyond the known ones of given values are zero."""
         return self.of[node][k] if k < len(self.of[node]) else self.graph.zero
 
     def _with_derivatives(self, nodes: Sequence[int], given: set[int]) -> list[int]:
-        """The nodes in order, with those of the derivatives that their recurrences ask for."""
+        """Return the nodes in order, with those of the derivatives that their recurrences need."""
         graph, found, left = self.graph, set(nodes), list(nodes)
         while left:
             node = left.pop()
@@ -135,7 +136,8 @@ Terms = list[tuple[tuple[int, ...], int]]  # a sum of products: factors that var
 
 
 def with_few_products(graph: Graph, outputs: Sequence[int], moving: Iterable[int]) -> list[int]:
-    """Nodes for the same numbers, up to round-off, by fewer products of what varies, each of which is a sum in every coefficient; `moving`: inputs that vary.
+    """Return nodes for equal numbers, up to round-off, with fewer products of varying values, each of which
+    is a sum in every coefficient; `moving`: inputs that vary.
 
     Sums and products are taken apart into terms. Then what saves most products is shared, one after the other: x y where several terms hold it, and
     x y + x z = x (y + z) in one sum. Accelerations of a disc with s, c = sin, cos of its lean take 12, and after that 7, with p = v w/c and q = c u:
@@ -233,14 +235,16 @@ class TaylorSteps:
 
 
 class Monitored(NamedTuple):
-    """What must not change its sign."""
+    """The quantities that must not change sign."""
 
     holds: Value  # whether all guards are positive
     values: list[Value]  # as `Form.monitored`
 
 
 def jet(w: MachineWriter, form: Form, p: Lanes, t: Value, order: int) -> tuple[list[Coefficients], Monitored]:
-    """The Taylor series of every number that is integrated, tangents too, at the time t, and what is monitored there."""
+    """Return the Taylor series of every integrated number, tangents too, at the time t, and the monitored
+    quantities there.
+    """
     y, rates = p.pointer, form.rates
     own = outputs_of(form, [*rates, *_monitored(form)], len(rates))
     known = dict(zip(own.variables, known_values(w, form, y, t, y).values(), strict=True))
@@ -270,7 +274,7 @@ def _monitored(form: Form) -> list[int]:
 
 
 def monitored_at(w: MachineWriter, form: Form, p: Lanes, t: Value, y: Value) -> Monitored:
-    """What is monitored, at a state in memory."""
+    """Return the monitored quantities, at a state in memory."""
     known = known_values(w, form, p.pointer, t, y)
     return _judged(w, form, written(w, form.program.graph, _monitored(form), known))
 

@@ -1,4 +1,4 @@
-"""Events after which a motion goes on: the state and the modes after one, and derivatives through it.
+"""Events at which a motion continues: the state and modes afterwards, and derivatives through them.
 
     z+ = R(t_e, z-, p),   c(t_e, z-, p) = 0        f, f+: rates before and after
 
@@ -27,7 +27,7 @@ from jourdain_jax.program.graph import Graph
 
 
 class Reset(NamedTuple):
-    """What an event makes of a state with its tangents, at a number for a time, on a graph of its own."""
+    """The state with its tangents after an event, on a separate graph."""
 
     own: Outputs  # without values
     event: int  # input: which one it is
@@ -97,7 +97,9 @@ def reset_program(form: Form) -> Reset:
 
 
 def write_reset(w: MachineWriter, form: Form) -> None:
-    """`reset(state, tau, y, event, after)`: what an event makes of the state `y`; rows as in `Form.rows_of_transition`."""
+    """Write `reset(state, tau, y, event, after)`: the state after an event from the state `y`; rows as in
+    `Form.rows_of_transition`.
+    """
     reset = reset_program(form)
     with w.procedure("reset", "state tau:real y event:real after") as (state, tau, y, event, after):
         for i, x in written_in_turn(w, reset.graph, reset.found, _given(w, form, reset, state, tau, y, event)):
@@ -105,7 +107,9 @@ def write_reset(w: MachineWriter, form: Form) -> None:
 
 
 def write_reset_back(w: MachineWriter, form: Form, asked: Sequence[int]) -> None:
-    """`pull_reset(state, tau, y, event, g, to_y, to_known)`: `g`: of the state, then of the times; after the numbers `asked` for comes the time."""
+    """Write `pull_reset(state, tau, y, event, g, to_y, to_known)`: `g`: of the state, then of the times;
+    after the numbers `asked` for comes the time.
+    """
     reset, each = reset_program(form), form.y
     graph, (fixed, t, y, inputs) = reset.graph, form.split(reset.own.variables)
     weights = [graph.input(f"cotangent {row}", True) for row in range(form.integrated + len(reset.times))]
@@ -132,7 +136,7 @@ def _given(w: MachineWriter, form: Form, reset: Reset, state: Value, tau: Value,
 
 
 def goes_on(w: StepWriter, form: Form, event: Number) -> Number:
-    """Return whether a motion goes on after this event."""
+    """Return whether a motion continues after this event."""
     found = w.literal(0, w.truth) if form.stops[0] else w.literal(1, w.truth)
     for i, stops in enumerate(form.stops):
         found = w.where(w.equal(event, float(i)), w.literal(not stops, w.truth), found) if i else found
@@ -145,7 +149,7 @@ def is_left(w: StepWriter, c: Number, rate: Number, noise: Number) -> Number:
 
 
 class Happened(NamedTuple):
-    """An event after which lanes go on."""
+    """An event after which lanes continue."""
 
     event: Number
     t: Number
@@ -156,7 +160,7 @@ class Happened(NamedTuple):
 
 
 def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happened, stuck: Number) -> None:
-    """Put the state after an event into `y1`; note the event, and what was before.
+    """Store the state after an event in `y1`; record the event, and the state before.
 
     `stuck` becomes 1 where the event's value rises afterwards, but so slowly that round-off hides it, and 1 - m where a mode is m < 0: no motion follows.
     """
@@ -209,7 +213,8 @@ def pass_event(w: StepWriter, form: Form, p: Lanes, y1: Number, happened: Happen
 
 
 def reset_back(w: StepWriter, form: Form, asked: int, state: Number, left: Number, g_t: Number, g: Number, by_known: Number) -> None:
-    """Make cotangents after a transition those before it, in lanes that have `left` something by one, and put the modes back.
+    """Turn cotangents after a transition into those before it, in lanes that have `left` a phase by one, and
+    restore the modes.
 
     `left`: as the rows of this name; `g_t`: cotangents of its time and of the tangents of that.
     """

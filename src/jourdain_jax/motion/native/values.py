@@ -1,4 +1,5 @@
-"""Modules of LLVM IR as functions of JAX, and by them values of nodes of a graph, and numbers beside the steps of a motion.
+"""Modules of LLVM IR as functions of JAX, and with them values of graph nodes and quantities beside the steps
+of a motion.
 
 Arrays without lanes go in, and under `vmap` all lanes go to one call. Many lanes run side by side in the widest registers; one by itself runs in narrow ones,
 in which an instruction takes less time. What a lane computes does not depend on the width.
@@ -133,14 +134,16 @@ def nodes_called(graph: Graph, nodes: Sequence[int], variables: Sequence[int], e
 
 
 def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> Callable[[Array], Array]:
-    """Values of nodes, of which zeros cost nothing, as a function of the values of the variables."""
+    """Return values of nodes, with free zeros, as a function of the values of the variables."""
     graph, nodes, variables = on_its_own(graph, nodes, variables)
     by_xla, by_machine_code = _both(graph, nodes, variables)
     there = np.flatnonzero([n != graph.zero for n in nodes])
 
     @cache
     def derivative(back: bool, order: int) -> Callable[[Array], Array] | None:
-        """The derivative as a function of x, v or g, and w in a row; None where it is too large, or no machine code."""
+        """Return the derivative as a function of x, v or g, and w in a row; None if it is too large, or there
+        is no machine code.
+        """
         weights = [graph.input(f"v {i}", True) for i in range(len(there if back else variables))]
         w = [graph.input(f"w {i}", True) for i in range(len(variables))]
 
@@ -158,7 +161,7 @@ def values_of_nodes(graph: Graph, nodes: Sequence[int], variables: Sequence[int]
         return differentiated_as(*_both(graph, found, [*variables, *weights, *(w if order == 2 else ())]))
 
     def linear(back: bool) -> Callable[[Array, Array], Array]:
-        """A function of x and v, or (`back`) g; its derivative along x is machine code where that serves."""
+        """Return a function of x and v, or (`back`) g; its derivative along x is machine code if possible."""
 
         def taken(v):
             return v[there] if back else v
@@ -214,7 +217,7 @@ def _both(graph: Graph, nodes: Sequence[int], variables: Sequence[int]) -> tuple
 
 
 class Beside(NamedTuple):
-    """Machine code of what stands beside the steps of a program."""
+    """Machine code for quantities beside the steps of a program."""
 
     needed: tuple[tuple[int, ...], ...]  # nodes of those entries of the scene's parameters on which something that is fixed depends, -1 for others
     fixed: Callable[[Array], Array]  # of those entries
@@ -223,7 +226,7 @@ class Beside(NamedTuple):
 
 
 class AtStates(NamedTuple):
-    """Functions of what is fixed, of time, coordinates, privileged speeds and inputs."""
+    """Functions of fixed values, time, coordinates, privileged speeds and inputs."""
 
     speeds: Callable[..., Array] | None  # all of them; None where XLA is quicker
     numbers: Callable[..., Array]  # pivots, then energies, which JAX does not differentiate
@@ -255,7 +258,7 @@ def _at_states(program: Lowered) -> AtStates:
 
 
 def _at_state(program: Lowered, nodes: Sequence[int], function: Callable) -> Callable[..., Array]:
-    """Machine code of nodes, which is given those numbers alone that it needs of what is fixed."""
+    """Return machine code of nodes, which takes only the fixed numbers that it needs."""
     used = set(program.graph.reachable(nodes))
     which = [k for k, n in enumerate(program.fixed) if n in used]
     run = function(program.graph, nodes, [*(program.fixed[k] for k in which), *program.variables[len(program.fixed) :]])
@@ -268,7 +271,9 @@ def _at_state(program: Lowered, nodes: Sequence[int], function: Callable) -> Cal
 
 
 def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:
-    """Those entries of a scene's parameters that have a node; `nodes`: of each leaf, entry by entry, -1 for none."""
+    """Return the entries of a scene's parameters that have a node; `nodes`: of each leaf, entry by entry, -1
+    for none.
+    """
     found = []
     for leaf, of_leaf in zip(jax.tree.leaves(scene), nodes, strict=True):
         needed = np.flatnonzero(np.ravel(np.asarray(of_leaf, int)) >= 0)

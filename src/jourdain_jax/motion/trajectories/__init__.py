@@ -1,1 +1,1 @@
-"""What a motion leaves: states over time, result codes, diagnostics, files."""
+"""Results of motions: states over time, result codes, diagnostics, files."""

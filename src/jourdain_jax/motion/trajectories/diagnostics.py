@@ -1,4 +1,4 @@
-"""Numbers by which a motion can be trusted: drifts, residuals, conditioning, contact forces, and their printed summary."""
+"""Diagnostics of a motion: drifts, residuals, conditioning, contact forces, and their printed summary."""
 
 import equinox as eqx
 import jax
@@ -29,17 +29,19 @@ class Energies(eqx.Module):
     @property
     @with_nan_as_a_mark
     def balance(self) -> Float[Array, "*lanes times"]:
-        """T + V - W + D; W is the work of forces without potential and of rows that do work, D what events took."""
+        """T + V - W + D; W is the work of forces without potential and of constraints that do work, D the
+        energy lost in events.
+        """
         return sum((x for x in (self.potential, self.lost) if x is not None), start=self.kinetic) - (0.0 if self.work is None else self.work)
 
     @property
     def kind(self) -> str:
-        """What `balance` is, in words."""
+        """Description of `balance`."""
         return "T + V" + " less the work done" * (self.work is not None) + " and what events took" * (self.lost is not None)
 
 
 class Diagnostics(eqx.Module):
-    """Extremes of what can be checked along a motion."""
+    """Extremes of diagnostic quantities along a motion."""
 
     energy_drift: Scalar  # J, max - min of T + V, less the work done where it is tracked
     energy_kind: str = eqx.field(static=True)
@@ -53,7 +55,7 @@ class Diagnostics(eqx.Module):
 
 
 class ContactExtremes(eqx.Module):
-    """What a rolling contact had to bear."""
+    """Extreme forces of a rolling contact."""
 
     lowest_normal: Scalar  # N; negative: it would have had to pull
     highest_normal: Scalar  # N
@@ -69,12 +71,13 @@ class ContactExtremes(eqx.Module):
 
 
 def diagnose(trajectory: Record) -> Diagnostics:
-    """Drifts, residuals, conditioning and contact extremes of one `trajectory` (not of a batch: use `jax.vmap` or `rollout.lane(i)`).
+    """Return drifts, residuals, conditioning and contact extremes of one `trajectory` (for a batch:
+    `jax.vmap` or `rollout.lane(i)`).
 
     Times that were not reached do not count. ValueError for anything else than a trajectory.
     """
     if not hasattr(trajectory, "scene"):
-        raise ValueError(f"`diagnose` was given a {type(trajectory).__name__}, expected a `Trajectory`; of a rollout take one lane, as `rollout.lane(0)`")
+        raise ValueError(f"`diagnose` was given a {type(trajectory).__name__}, expected a `Trajectory`; for a rollout give one lane: `rollout.lane(0)`")
     checks = Checks(jax.device_put(usual_rows(trajectory.scene)))
     return _diagnosed(trajectory, map_over_times(checks, trajectory, by_inputs=True), _lacks_work(trajectory))
 
@@ -102,7 +105,9 @@ def _diagnosed(trajectory: Record, found: Checked, lacks_work: bool) -> Diagnost
 
 
 def lost_of(trajectory: Record) -> Float[Array, "*lanes times"] | None:
-    """Return the energy that events took until each saved time, J; None where no event lets the motion go on."""
+    """Return the energy lost in events until each saved time, J; None without events at which the motion
+    continues.
+    """
     return trajectory.phases.lost_until(trajectory.ts) if trajectory.phases.ts.shape[-1] else None
 
 
@@ -126,7 +131,7 @@ def _largest(values) -> Scalar:
 
 
 def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
-    """What the diagnostics of a motion speak against, in words."""
+    """Return warnings from the diagnostics of a motion, in words."""
     low, high = (int(rank) for rank in found.rank)
     smallest, usual = float(found.smallest_singular_value), int(usual_rows(trajectory.scene).rank)
     warned = []
@@ -232,7 +237,7 @@ def _left_domain(trajectory: Record) -> str:
 
 
 def _channel_text(channel) -> str:
-    """An input as it was given; those that were not are zero."""
+    """Return the text of an input; missing ones are zero."""
     if isinstance(channel, Mode):
         return "a mode"
     if isinstance(channel, Constant):

@@ -1,4 +1,5 @@
-"""Motions as labelled arrays: an `xarray.Dataset` or a `pandas.DataFrame` with names, times, result codes, parameters, and units where they are known.
+"""Motions as labelled arrays: an `xarray.Dataset` or a `pandas.DataFrame` with names, times, result codes,
+parameters, and known units.
 
 A scene states the units of its parameters. Of its coordinates and speeds only those of quaternions and their angular velocities are known; others are given.
 """
@@ -43,7 +44,7 @@ def to_xarray(record: Record, units: Mapping[str, str] | None = None):
         if name in found or name == "lane":
             raise ValueError(
                 f"`{name}` would name two arrays of the dataset of a `{type(record.scene).__name__}`; coordinates, speeds and parameters need names of "
-                f"their own, other than {', '.join(('time', 'lane', *OF_LANES))}: call it otherwise in the scene, or take `to_pandas()`"
+                f"their own, different from {', '.join(('time', 'lane', *OF_LANES))}: rename it in the scene, or use `to_pandas()`"
             )
         found[name] = (axes, values, about)
 
@@ -83,10 +84,10 @@ def _columns(record: Record) -> dict[str, np.ndarray]:
 
 
 def _units(scene, given: Mapping[str, str] | None) -> dict[str, str]:
-    """Units of quaternions, their angular velocities, and those that are given."""
+    """Return units of quaternions, their angular velocities, and given ones."""
     known: dict[str, str] = {}
     for names, unit in ((scene.coordinate_names, "1"), *(((scene.speed_names, "rad/s"),) if scene.speeds is None else ())):
         known |= {name: unit for _, first, length in names.groups for name in names.entries[first : first + length]}
     valid = (*scene.coordinate_names.entries, *scene.speed_names.entries)
-    check_names(given or {}, valid, f"`units` names `{{}}`, which is no coordinate or speed of `{type(scene).__name__}`")
+    check_names(given or {}, valid, f"`units` names `{{}}`, which is not a coordinate or speed of `{type(scene).__name__}`")
     return known | dict(given or {})

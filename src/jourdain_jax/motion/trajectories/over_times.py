@@ -28,7 +28,7 @@ from jourdain_jax.scene.validated import invariants_of
 
 
 class Phases(eqx.Module, Printed):
-    """The phases of a motion, which goes from one to the next by an event after which it goes on."""
+    """The phases of a motion, separated by events at which it continues."""
 
     ts: Float[Array, "transitions"]  # s, of these events; NaN after the last one
     events: Int[Array, "transitions"]  # index into `event_names`; -1 after the last one
@@ -135,7 +135,9 @@ _compiled = for_programs(_mapped)
 
 
 def _at_one_time(f, record: Record, by_inputs: bool, t, q, u):
-    """`f` at one state; NaN where that was not reached, in place of which f is run at the end of the motion."""
+    """Return `f` at one state; NaN for a time that was not reached, where f is run at the end of the motion
+    instead.
+    """
     reached = jnp.all(jnp.isfinite(q))
     t, q, u = (jnp.where(reached, a, b) for a, b in ((t, record.t_end), (q, record.q_end), (u, record.u_end)))
     values = f(record.scene, t, q, u, record.inputs.near(t) if by_inputs else record.inputs(t))
@@ -143,7 +145,7 @@ def _at_one_time(f, record: Record, by_inputs: bool, t, q, u):
 
 
 def _largest_block(record: Record) -> int:
-    """The number of times at which quantities are worked out together."""
+    """Return the number of times at which quantities are computed together."""
     # of square matrices of the coordinates, at once: of 200 trailers at 201 times the derivatives of all poses took more than 23 GB
     return max(1, 4_000_000 // record.q.shape[-1] ** 2)
 
@@ -183,7 +185,9 @@ class InputOf(eqx.Module):
 
 
 class AccelerationsBySvd(eqx.Module):
-    """Accelerations, multipliers, rank and smallest singular value; `usual`: what the rows are at most states, None: as found for the scene at hand."""
+    """Accelerations, multipliers, rank and smallest singular value; `usual`: typical constraint rows, None:
+    as found for the scene.
+    """
 
     usual: UsualRows | None = None
 
@@ -212,7 +216,7 @@ def invariants(scene, t, q, u, inputs):
 
 
 class Checked(NamedTuple):
-    """What is looked at along a motion to trust it."""
+    """Diagnostic quantities along a motion."""
 
     energies: tuple[Array, Array]  # kinetic and potential
     residuals: tuple[Array, Array]  # of the geometric rows and of the velocity rows
@@ -223,7 +227,7 @@ class Checked(NamedTuple):
 
 
 class Checks(eqx.Module):
-    """`Checked` at one state; `usual`: what the rows are at most states."""
+    """`Checked` at one state; `usual`: typical constraint rows."""
 
     usual: UsualRows
 

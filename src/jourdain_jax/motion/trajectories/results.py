@@ -1,4 +1,4 @@
-"""How a motion ended: a code per lane, never an exception inside.
+"""Result codes of motions: one per sample, in place of exceptions.
 
 Codes up to `EVENT` are those of motions that reached the end of their span, or an event; all others failed.
 """

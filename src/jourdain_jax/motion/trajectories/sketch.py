@@ -1,4 +1,4 @@
-"""Small figures of motions for notebooks: coordinates against time, from the saved numbers alone."""
+"""Small figures of motions for notebooks: coordinates against time, from the saved numbers."""
 
 import numpy as np
 
@@ -12,7 +12,8 @@ def sketch(record: Record) -> str:
 
 
 def sketch_of_lanes(record: Record) -> str:
-    """Draw many motions, with a leading axis of lanes: the median, and the bands that hold half and 95 % of those that are under way.
+    """Draw many motions, with a leading batch axis: the median, and the bands that hold half and 95 % of the
+    samples under way.
 
     Return "" for lanes that were saved at times of their own.
     """

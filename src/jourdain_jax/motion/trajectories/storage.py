@@ -1,4 +1,4 @@
-"""Saving and loading motions: NumPy's `.npz`, readable by anything that reads `.npz`.
+"""Saving and loading motions as NumPy's `.npz`.
 
 Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `work` (times; absent where not tracked), `t_end`, `q_end`, `u_end`,
 `result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `last_step`, `crossings`, `together`, `fallback`, `inputs` (times, inputs;
@@ -157,11 +157,11 @@ def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajecto
     except _NEEDS_NUMBERS:
         raise
     except TypeError as error:
-        raise refused(path, f"does not hold what makes a `{kind.__name__}` ({str(error).splitlines()[0]})") from None
+        raise refused(path, f"lacks the data of a `{kind.__name__}` ({str(error).splitlines()[0]})") from None
     parameters, static = _stored_fields(scene)
     if missing := sorted({*parameters, *static} - {*values, *header["static"]}):  # their defaults would stand in for what moved
         raise ValueError(
-            f"`{path}` lacks the parameter `{missing[0]}` of `{kind.__name__}`; it is damaged, or was written when the class had none: "
+            f"`{path}` lacks the parameter `{missing[0]}` of `{kind.__name__}`; it is damaged, or was written before the class had it: "
             "pass the class as it was when the file was written"
         )
     then, now = header["units"], {name: about["unit"] for name, _, about in parameters_of(scene)}
@@ -203,12 +203,14 @@ def _samples(ts: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict) -> type[Scene]:
-    """The class of the scene; a ValueError where it is not the one in the file, or has other parameters or names than at that time."""
+    """Return the class of the scene; a ValueError if it is not the one in the file, or its parameters or
+    names have changed.
+    """
     kind = scene if isinstance(scene, type) else type(scene)
     if not issubclass(kind, Scene):
-        raise ValueError(f"`scene` is {described(scene)}, expected the class of the scene that moved, or any scene of that class")
+        raise ValueError(f"`scene` is {described(scene)}, expected the class of the simulated scene, or a scene of that class")
     if header["scene"] != kind.__name__:
-        raise ValueError(f"`{path}` holds a {header['kind']} of `{header['scene']}`, expected `{kind.__name__}`; pass the class it was made with")
+        raise ValueError(f"`{path}` holds a {header['kind']} of `{header['scene']}`, expected `{kind.__name__}`; pass its class")
     known, parameters = [field.name for field in fields(kind)], _parameters(arrays)
     check_names((*parameters, *header["static"]), known, f"`{path}` has a parameter `{{}}` that `{kind.__name__}` has not")
     for name, value in parameters.items():
@@ -252,7 +254,9 @@ def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type
 
 
 def _unpacked(file) -> dict[str, np.ndarray]:
-    """The arrays of a zip archive by name, each as large as its content: what a member claims beyond that is never allocated."""
+    """Return the arrays of a zip archive by name, each as large as its content: claims beyond that are never
+    allocated.
+    """
     found = {}
     with zipfile.ZipFile(file) as archive:
         for member in archive.infolist():
@@ -261,7 +265,7 @@ def _unpacked(file) -> dict[str, np.ndarray]:
                 continue
             # bytes that a compressed one stands for, at most: deflate's longest match
             if name in found or member.file_size > 1100 * member.compress_size + 1000:
-                raise ValueError(f"`{name}` is there twice" if name in found else f"`{name}` claims {member.file_size} bytes")
+                raise ValueError(f"`{name}` occurs twice" if name in found else f"`{name}` claims {member.file_size} bytes")
             content = archive.read(member)
             head = io.BytesIO(content)
             of_version = np.lib.format.read_array_header_1_0 if np.lib.format.read_magic(head) == (1, 0) else np.lib.format.read_array_header_2_0
@@ -278,14 +282,16 @@ def _parameters(arrays: dict) -> dict:
 
 
 def _stored_fields(scene: Scene) -> tuple[dict, dict]:
-    """Fields that are arrays, parameters among them, and those that are plain numbers or texts, such as a number of bodies."""
+    """Return fields that are arrays, including parameters, and plain numbers or texts, such as a number of
+    bodies.
+    """
     values = {field: getattr(scene, field.name) for field in fields(scene) if field.init}
     arrays = {field.name: value for field, value in values.items() if isinstance(value, jax.Array | np.ndarray) and not field.metadata.get("static")}
     return arrays, {field.name: value for field, value in values.items() if isinstance(value, int | float | str | bool)}
 
 
 def refused(path, sentence: str) -> ValueError:
-    """The error for a file that cannot be what it says."""
+    """Return the error for an inconsistent file."""
     return ValueError(f"`{path}` {sentence}; it is damaged or was not written by `save`")
 
 
@@ -333,7 +339,7 @@ def _check_codes(path, header: dict, arrays: dict) -> None:
         ranges["phases.events"] = (arrays["phases.events"] >= -1) & (arrays["phases.events"] < len(header["event_names"]))
     for name, right in ranges.items():
         if not np.all(right):
-            raise refused(path, f"has {arrays.get(name, header.get(name))} as `{name}`, which no motion has")
+            raise refused(path, f"has {arrays.get(name, header.get(name))} as `{name}`, impossible for a motion")
 
 
 def _check_finite(path, arrays: dict) -> None:
@@ -342,24 +348,25 @@ def _check_finite(path, arrays: dict) -> None:
     for name in ("t_end", "q_end", "u_end", "moved_q", "moved_u"):
         good = np.isfinite(arrays[name])
         if not np.all(good.reshape(*whole.shape, -1)[whole]):
-            raise refused(path, f"has numbers in `{name}` that are not finite, in a motion that did not fail")
+            raise refused(path, f"has numbers in `{name}` that are not finite, though the motion did not fail")
     for name in ("ts", "together"):
         if np.any(np.isnan(arrays[name])):
-            raise refused(path, f"has times in `{name}` that are no numbers")
+            raise refused(path, f"has times in `{name}` that are NaN")
     reached = np.all(np.isfinite(arrays["q"]), axis=-1)
     if np.any(whole & ~_go_one_way(arrays, reached)):
-        raise refused(path, "has times in `ts` that do not go one way, towards the end of the motion")
+        raise refused(path, "has times in `ts` that are not ordered towards the end of the motion")
     due = np.isfinite(arrays["ts"]) & (np.asarray(arrays["result"]) == SUCCESS)[..., None]
     for name in ("q", "u", "inputs", *(["work"] if "work" in arrays else [])):
         values = arrays[name].reshape(*arrays["ts"].shape, -1)
         finite = np.all(np.isfinite(values), axis=-1)
         apart = (np.any(np.isfinite(values), axis=-1) if name in ("q", "u") else reached) & ~finite
         if np.any((due | (apart & whole[..., None])) & ~finite):
-            raise refused(path, f"has numbers in `{name}` that are not finite at times that were reached")
+            raise refused(path, f"has numbers in `{name}` that are not finite at times that the motion reached")
 
 
 def _go_one_way(arrays: dict, reached: np.ndarray) -> np.ndarray:
-    """Whether the saved times that each lane reached go one way, and to its end but for round-off."""
+    """Return whether the saved times that each sample reached are monotonic, up to its end within round-off.
+    """
     ts, end = np.asarray(arrays["ts"], float), np.asarray(arrays["t_end"], float)[..., None]
     with np.errstate(invalid="ignore"):  # of motions that failed
         steps = np.diff(np.concatenate([np.where(np.isfinite(ts) & reached, ts, end), end], axis=-1), axis=-1)
@@ -373,7 +380,7 @@ def check_scenes(path, scene: Scene, result) -> None:
         wrong = np.flatnonzero(np.asarray(fault) & (np.asarray(result) != BAD_PARAMETER))
         if wrong.size:
             value = f"{np.asarray(getattr(scene, name))[wrong[0]]} as a value of the parameter `{name}`"
-            raise refused(path, f"has {value}, which is not finite or has the wrong sign, in a motion that did not fail for it")
+            raise refused(path, f"has {value}, which is not finite or has the wrong sign, though the motion did not fail")
 
     def quantities(scene):
         q, u, _ = scene.named()

@@ -1,4 +1,4 @@
-"""A motion in time, with named access and everything needed to trust it."""
+"""A trajectory, with named access and its diagnostics."""
 
 from collections.abc import Mapping
 
@@ -32,7 +32,7 @@ from jourdain_jax.scene.printing import Printed
 
 
 class Trajectory(Record, Printed):
-    """The motion of a scene. Times after an early end (event, failure) hold NaN.
+    """A motion over time. Times after an early end (event, failure) hold NaN.
 
     `t_end`, `q_end`, `u_end` are the last state that was reached, of a failed motion the one at which it failed, with derivatives of
     NaN. What is made of them by itself, such as a loss to be minimised, takes `motion.nan_if_failed()`, or looks at `motion.succeeded`.
@@ -48,7 +48,7 @@ class Trajectory(Record, Printed):
                     return names.view(array)[name]
         if name in names_of_bodies(self.scene):
             raise UnknownNameError(
-                f"`{name}` is a body of `{type(self.scene).__name__}`, and no coordinate or speed; "
+                f"`{name}` is a body of `{type(self.scene).__name__}`, not a coordinate or speed; "
                 f'`motion.point("{name}")` is the path of its mass centre, `motion.motions()["{name}"]` its pose and velocities at all times'
             )
         valid = (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries, "t")
@@ -64,12 +64,13 @@ class Trajectory(Record, Printed):
 
     @property
     def valid(self) -> Bool[Array, "*lanes times"]:
-        """Which times were reached."""
+        """Marks of the times that the motion reached."""
         return jnp.all(jnp.isfinite(self.q), axis=-1)
 
     @property
     def end(self) -> State:
-        """The last state that was reached, put onto the constraints; of many motions a batch. Another motion goes on from it, at its time.
+        """The last state reached, projected onto the constraints; a batch for many motions. Another motion
+        can continue from it, at its time.
 
         motion = jj.simulate(scene, motion.end, t1=motion.t_end + 1.0)
         """
@@ -78,54 +79,69 @@ class Trajectory(Record, Printed):
         return consistent(self.scene, self.t_end, self.q_end, self.u_end, inputs_at(self.inputs, self.t_end))
 
     def phase(self, mode: str) -> Float[Array, "*lanes times"]:
-        """Return the number of a mode's value at all times; at an event that switches it the one after it."""
+        """Return the number of a mode's value at all times; at an event that switches it, the value
+        afterwards.
+        """
         check_name(mode, self.scene.modes.names, f"`{type(self.scene).__name__}` has no mode `{mode}`")
         return map_over_times(over_times.InputOf(mode), self)
 
     def motions(self) -> Motion:
-        """Poses and velocities (inertial frame) of all bodies at all times (leading axis: times)."""
+        """Return poses and velocities (inertial frame) of all bodies at all times (leading axis: times)."""
         return map_over_times(motion_at, self)
 
     def point(self, body: str, local=(0.0, 0.0, 0.0)) -> Float[Array, "*lanes times 3"]:
-        """Path (m, inertial frame) of the point of `body` with body-frame coordinates `local` (m, from the mass centre)."""
+        """Return the path (m, inertial frame) of the point of `body` with body-frame coordinates `local` (m,
+        from the mass centre).
+        """
         local = checked_real(local, f"point of body `{body}`", (3,), advice="give three components in its body frame, m")
         return map_over_times(over_times.BodyPoint(body, local.astype(self.q.dtype)), self)
 
     def energies(self) -> Energies:
-        """Kinetic and potential energy, and the work where it is tracked, in J; `.balance` is constant for a right motion."""
+        """Return kinetic and potential energy, and tracked work, in J; `.balance` is constant for a correct
+        motion.
+        """
         kinetic, potential = map_over_times(over_times.energies, self)
         return Energies(kinetic, potential, self.work, lost_of(self))
 
     def accelerations(self) -> Accelerations:
-        """Accelerations, multipliers, rank and smallest singular value at all times."""
+        """Return accelerations, multipliers, rank and smallest singular value at all times."""
         usual = None if self.q.ndim > 2 else jax.tree.map(jnp.asarray, usual_rows(self.scene))  # lanes of a batch have parameters of their own
         return map_over_times(over_times.AccelerationsBySvd(usual), self, by_inputs=True)
 
     def constraint_forces(self) -> RowReactions:
-        """Constraint forces per row and per body at all times, eqs. (68)-(70); `.forces_on("disc")` by row, in N, inertial frame."""
+        """Return constraint forces per constraint and per body at all times, eqs. (68)-(70);
+        `.forces_on("disc")` by constraint, in N, inertial frame.
+        """
         return map_over_times(over_times.reactions, self, by_inputs=True)
 
     def contact_forces(self) -> dict[str, ContactForce]:
-        """Normal and tangential force (N) on the body and friction coefficient needed, of every rolling contact at all times."""
+        """Return normal and tangential force (N) on the body and needed friction coefficient of every rolling
+        contact at all times.
+        """
         return map_over_times(over_times.contacts, self, by_inputs=True)
 
     def residuals(self) -> tuple[Float[Array, "*lanes times closures"], Float[Array, "*lanes times rows"]]:
-        """Residuals of the geometric rows (and quaternion norms), and of the velocity rows, at all times."""
+        """Return residuals of the geometric constraints (and quaternion norms), and of the velocity
+        constraints, at all times.
+        """
         return map_over_times(over_times.residuals, self)
 
     def invariants(self) -> dict[str, Float[Array, "*lanes times"]]:
-        """The quantities that the scene states to be conserved, by name at all times; without the energy."""
+        """Return the quantities that the scene declares conserved, by name at all times; without the energy.
+        """
         return map_over_times(over_times.invariants, self)
 
     def to_xarray(self, units: Mapping[str, str] | None = None):
-        """Coordinates, speeds, result code and parameters as an `xarray.Dataset` along `time` (s).
+        """Return coordinates, speeds, result code and parameters as an `xarray.Dataset` along `time` (s).
 
         `units`: name of a coordinate or speed -> its unit, kept as `attrs["units"]`: a scene states those of its parameters only. ImportError without xarray.
         """
         return labelled.to_xarray(self, units)
 
     def to_pandas(self):
-        """Coordinates and speeds as a `pandas.DataFrame`, one row for each time (s). ImportError without pandas."""
+        """Return coordinates and speeds as a `pandas.DataFrame`, one row for each time (s). ImportError
+        without pandas.
+        """
         return labelled.to_pandas(self)
 
     def _text(self) -> str:
@@ -149,7 +165,8 @@ class Trajectory(Record, Printed):
     @property
     @of_known_numbers
     def warnings(self) -> tuple[str, ...]:
-        """What speaks against a motion, in words, most serious first; empty where nothing does. The printed summary shows them.
+        """Reasons to doubt the motion, the most serious first; empty if there are none. The printed summary
+        shows them.
 
         A failure; rows that gain or lose rank, or come near it, so that constraint forces and what follows may not be unique; privileged speeds of a
         reduction that do not determine the others in this precision; contacts that would have to pull.
@@ -165,7 +182,7 @@ class Trajectory(Record, Printed):
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """What can be named of the cause of a failure, as it stands in messages.
+        """Return known causes of a failure, as texts for messages.
 
         Parameters that are not finite or have the wrong sign, otherwise what bodies, contacts and gravity cannot have; where steps became short, a load that
         jumps or has a kink.
@@ -182,7 +199,8 @@ class Trajectory(Record, Printed):
         return tuple(fault for fault, wrong in known_faults_at(self.scene, self.t_end, q, u, inputs).items() if bool(wrong))
 
     def nan_if_failed(self) -> "Trajectory":
-        """The trajectory itself, with NaN in place of its states where it reached neither its end nor an event: under `jit`, `vmap` and `grad`, lane by lane.
+        """Return the trajectory with NaN in place of its states if it reached neither its end nor an event:
+        under `jit`, `vmap` and `grad`, for each sample.
 
             loss = lambda radius: jj.simulate(disc.replace(radius=radius), start, t1=2.0).nan_if_failed().q_end[0]
 
@@ -195,7 +213,8 @@ class Trajectory(Record, Printed):
 
     @of_known_numbers
     def raise_if_failed(self) -> "Trajectory":
-        """The trajectory itself; a SimulationError with reason and time where it did not reach its end or an event.
+        """Return the trajectory itself; raise a SimulationError with reason and time if it did not reach its
+        end or an event.
 
         A DifferentiationModeError under `jit` and `vmap`, where numbers are not known; `nan_if_failed` serves there.
         """

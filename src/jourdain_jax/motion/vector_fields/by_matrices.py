@@ -1,4 +1,6 @@
-"""Rates by dense matrices that JAX differentiates, in the minimal or the full state: for scenes without a program, and for reductions that a user chooses."""
+"""Rates by dense matrices that JAX differentiates, in the minimal or the full state: for scenes without a
+program, and for reductions chosen by the user.
+"""
 
 import equinox as eqx
 import jax
@@ -76,7 +78,7 @@ def _of_own_speeds(scene: Scene) -> Float[Array, "own_speeds"]:
 
 
 class ByMatrices(VectorField):
-    """What both states have in common."""
+    """Shared parts of both states."""
 
     stabilisation: Baumgarte | None
     usual: UsualLengths  # of the rows
@@ -160,7 +162,7 @@ class FullByMatrices(ByMatrices):
 
     @property
     def needs_pivot(self) -> bool:
-        """A state that is all there goes on, with a warning."""
+        """Return False: the full state continues, with a warning."""
         return False
 
     @property

@@ -1,4 +1,4 @@
-"""The state that is integrated, and what every form of its rates can do.
+"""The integrated state, and the interface of its rates.
 
     minimal: qdot = N u + nu,  u = C y + c,  ydot = privileged rows of udot     (velocity rows hold exactly)
     full:    qdot = N u + nu,  udot                                               (kept on the rows by projection)
@@ -35,13 +35,14 @@ _STATES = ("auto", "minimal", "full")
 
 
 class Formulation(eqx.Module):
-    """Which equations `simulate` integrates. The default takes what serves the scene.
+    """The equations that `simulate` integrates. The default is chosen for the scene.
 
     - `state`: "minimal", coordinates q and privileged speeds y; "full", coordinates and all speeds u; "auto" (default), the minimal one where the
       privileged speeds are well conditioned over the scene's domain and the rows are linear or affine.
     - `reduction`: how accelerations are found, a name or an object as in `accelerations` (default: the scene's scalar program where there is one).
-    - `stabilisation`: what keeps the state on rows that its form does not keep by itself, the start included: "projection" (default) puts it back after
-      each step; `jj.Baumgarte(alpha, beta)` adds its terms to the rows, for comparison; None leaves it alone.
+    - `stabilisation`: how start and state are kept on constraints that the integrated state does not satisfy by
+      construction: "projection" (default) projects it after each step; `jj.Baumgarte(alpha, beta)` adds its terms to
+      the constraints, for comparison; None does nothing.
 
     ValueError for anything else.
 
@@ -87,14 +88,16 @@ def as_formulation(formulation) -> Formulation:
 
 
 def reason_for_matrices(structure: Structure, constant: bool) -> str:
-    """Why dense matrices are integrated also of a scene with a scalar program, in words; empty where that serves. `constant`: all inputs are."""
+    """Return the reason why dense matrices are integrated for a scene with a scalar program; empty if the
+    program is used. `constant`: all inputs are.
+    """
     if structure.rows_of_inputs and not constant:
         return "velocity rows with inputs that change with time need dense matrices"
     return ""
 
 
 class Integrated(eqx.Module):
-    """The integrated state: coordinates, speeds (all, or the privileged ones), work done so far (J) where it is tracked."""
+    """The integrated state: coordinates, speeds (all, or the privileged ones), tracked work (J)."""
 
     q: Float[Array, "coordinates *lanes"]
     v: Float[Array, "integrated_speeds *lanes"]
@@ -107,7 +110,7 @@ class Integrated(eqx.Module):
 
     @staticmethod
     def of(rows: Float[Array, "rows *lanes"], form) -> "Integrated":
-        """Return the state with these rows; `form`: with so many `coordinates` and, with them, `q_and_v`."""
+        """Return the state from these rows; `form`: with so many `coordinates` and, with them, `q_and_v`."""
         n, end = form.coordinates, form.q_and_v
         return Integrated(rows[:n], rows[n:end], rows[end] if len(rows) > end else None)
 
@@ -183,7 +186,7 @@ class VectorField(eqx.Module):
         return ()
 
     def now(self, inputs, t):
-        """What the rates need of the inputs at a time."""
+        """Return the inputs' part of the rates at a time."""
         return inputs(t)
 
     def pack(self, q, u) -> Integrated:
@@ -192,7 +195,9 @@ class VectorField(eqx.Module):
         return Integrated(q, v, jnp.zeros((), q.dtype) if self.with_work else None)
 
     def stored(self, scene: Scene, t, q, inputs) -> Scalar:
-        """What loads whose potential depends on inputs store, J: with its change, the integrated work is the work done."""
+        """Return the energy stored in loads whose potential depends on inputs, J: with its change, the
+        integrated work is the work done.
+        """
         if not (self.with_work and self.of_inputs):
             return jnp.zeros((), q.dtype)
         return stored_by_inputs(scene, motion_at(scene, t, q, jnp.zeros(len(scene.speed_names), q.dtype), inputs), self.of_inputs)
@@ -267,7 +272,8 @@ class ByProgram(VectorField):
 
     @property
     def pivots(self) -> int:
-        """Return how many are monitored: all, or with multipliers only those of the coordinate rates."""
+        """Return the number of monitored pivots: all, or with multipliers only those of the coordinate rates.
+        """
         return self.program.divisors if self.independent is None and not self.program.by_partition else len(self.program.pivots)
 
     @property
